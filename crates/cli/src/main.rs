@@ -1,0 +1,4 @@
+//! The `ratn` command: see `ratn::main`.
+fn main() -> std::process::ExitCode {
+    ratn::main()
+}

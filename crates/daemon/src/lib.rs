@@ -1,0 +1,1 @@
+//! The daemons: resource manager, world pool, process manager.

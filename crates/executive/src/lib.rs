@@ -1,0 +1,1 @@
+//! The window of task node instances, and the sequential interpreter.

@@ -1,0 +1,152 @@
+//! The one expression grammar: ports, facts, preconditions, effects and selectors are all written in it.
+//!
+//! This file is the syntax tree. Names are resolved when a program is loaded, so a tree can be evaluated anywhere
+//! given a scope; evaluation is pure.
+
+use crate::id::StateId;
+use crate::value::Value;
+use serde::{Deserialize, Serialize};
+
+/// An expression with its names resolved.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Expr {
+    /// A constant. A bare word is the individual of that name: a string.
+    Literal(Value),
+    /// `$name`: a loop variable or a task parameter.
+    Variable(String),
+    /// A bare word that names an output of the state itself (only in its effects).
+    Output(String),
+    /// `state.port`: an output of another state, of its latest visit before this one in program order.
+    Port {
+        /// The state that writes it.
+        state: StateId,
+        /// Its output port.
+        port: String,
+    },
+    /// `value.field`
+    Field(Box<Expr>, String),
+    /// `list[index]`
+    Index(Box<Expr>, Box<Expr>),
+    /// `[a, b]`
+    List(Vec<Expr>),
+    /// A YAML mapping of expressions.
+    Map(Vec<(String, Expr)>),
+    /// A built-in pure function.
+    Call(Function, Vec<Expr>),
+    /// `predicate(a, ?)`: the value of the first fact that matches, in the order of keys; null when none does.
+    Fact(FactExpr),
+    /// `exists predicate(a, ?)`: whether a fact matches.
+    Exists(FactExpr),
+    /// `not a`, `-a`
+    Unary(UnaryOperator, Box<Expr>),
+    /// `a + b`, `a and b`, `a = b`, `a in b`, …
+    Binary(BinaryOperator, Box<Expr>, Box<Expr>),
+}
+
+/// `predicate(argument, …)` with expressions as arguments.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FactExpr {
+    /// The predicate.
+    pub predicate: String,
+    /// `None` is `?`.
+    pub arguments: Vec<Option<Expr>>,
+}
+
+/// An effect as written: bound to [`crate::fact::Change`]s once its arguments are known.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EffectExpr {
+    /// `set p(a) = v`; without `= v` the value is true.
+    Set(FactExpr, Expr),
+    /// `delete p(a, ?)`
+    Delete(FactExpr),
+    /// `increase p(a) by v`; a decrease is an increase by the negative.
+    Increase(FactExpr, Expr),
+    /// The effects once per element of a list.
+    ForEach {
+        /// The variable bound to the element.
+        variable: String,
+        /// The list.
+        collection: Expr,
+        /// What holds of every element.
+        effects: Vec<EffectExpr>,
+    },
+}
+
+/// The built-in functions. All are pure.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Function {
+    /// `len(list | map | string)` → int
+    Len,
+    /// `range(n)` or `range(from, to)` → list of ints, the end excluded
+    Range,
+    /// `min(a, b, …)`
+    Min,
+    /// `max(a, b, …)`
+    Max,
+    /// `abs(x)`
+    Abs,
+    /// `if(condition, a, b)`; only the chosen one is evaluated
+    If,
+    /// `pose(x, y, z)` or `pose(x, y, z, roll, pitch, yaw)`: metres, radians
+    Pose,
+    /// `joints(a, b, …)`: radians
+    Joints,
+    /// `compose(a, b)`: pose b as seen from pose a, in a's reference frame
+    Compose,
+    /// `inverse(a)` of a pose
+    Inverse,
+    /// `between(a, b)`: b as seen from a, both in one reference frame
+    Between,
+    /// `grasp_pose({pose, size})` → list of poses of the gripper's tool frame that take the box from above, fingers
+    /// across its shorter horizontal side: the two that differ by half a turn
+    GraspPose,
+    /// `place_pose(target, in_gripper)`: the tool pose that brings a held object to the pose `target`
+    PlacePose,
+    /// `concat(a, b, …)` of strings, ints
+    Concat,
+}
+
+/// Operators of one operand.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum UnaryOperator {
+    /// `not`
+    Not,
+    /// `-`
+    Negate,
+}
+
+/// Operators of two operands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BinaryOperator {
+    /// `or`
+    Or,
+    /// `and`
+    And,
+    /// `=`
+    Equal,
+    /// `!=`
+    NotEqual,
+    /// `<`
+    Less,
+    /// `<=`
+    LessOrEqual,
+    /// `>`
+    Greater,
+    /// `>=`
+    GreaterOrEqual,
+    /// `in`
+    In,
+    /// `+`
+    Add,
+    /// `-`
+    Subtract,
+    /// `*`
+    Multiply,
+    /// `/`
+    Divide,
+}

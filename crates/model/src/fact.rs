@@ -1,0 +1,207 @@
+//! The names of facts: keys, patterns over keys, and bound changes. The facts themselves are kept in `ratn-world`.
+
+use crate::value::Value;
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// An argument of a fact: an individual by name, or a whole number.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Term {
+    /// A whole number.
+    Int(i64),
+    /// An individual.
+    Name(String),
+}
+
+/// `predicate(argument, …)`: what a fact gives a value to.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct FactKey {
+    /// Its predicate.
+    pub predicate: String,
+    /// Its arguments, in order; may be none.
+    pub arguments: Vec<Term>,
+}
+
+/// `predicate(argument or ?, …)`: the keys of one predicate and arity whose arguments fit.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct FactPattern {
+    /// The predicate.
+    pub predicate: String,
+    /// `None` (written `?`) matches every term.
+    pub arguments: Vec<Option<Term>>,
+}
+
+/// A set of facts, by patterns.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Footprint {
+    /// Every fact: what a state without the annotation reads or writes.
+    Everything,
+    /// The union of these; empty means none.
+    Patterns(Vec<FactPattern>),
+}
+
+/// One change of the world, with every argument bound.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Change {
+    /// The fact has this value from now on.
+    Set {
+        /// Which fact.
+        fact: FactKey,
+        /// Its value.
+        value: Value,
+    },
+    /// Every matching fact is gone from now on.
+    Delete {
+        /// Which facts.
+        pattern: FactPattern,
+    },
+    /// A numeric fact grows by this much (an absent one counts as 0).
+    Increase {
+        /// Which fact.
+        fact: FactKey,
+        /// By how much; negative decreases.
+        by: f64,
+    },
+}
+
+/// The predicates that the geometric scene is derived from; `reads: [scene]` stands for them.
+pub const SCENE_PREDICATES: [(&str, usize); 3] = [("at", 1), ("shape", 1), ("in_gripper", 1)];
+
+impl FactPattern {
+    /// The pattern that matches only `key`.
+    pub fn of(key: &FactKey) -> FactPattern {
+        FactPattern { predicate: key.predicate.clone(), arguments: key.arguments.iter().cloned().map(Some).collect() }
+    }
+
+    /// Whether `key` fits.
+    pub fn matches(&self, key: &FactKey) -> bool {
+        self.predicate == key.predicate
+            && self.arguments.len() == key.arguments.len()
+            && self.arguments.iter().zip(&key.arguments).all(|(want, have)| want.as_ref().is_none_or(|w| w == have))
+    }
+
+    /// Whether some key fits both.
+    pub fn overlaps(&self, other: &FactPattern) -> bool {
+        self.predicate == other.predicate
+            && self.arguments.len() == other.arguments.len()
+            && self.arguments.iter().zip(&other.arguments).all(|pair| match pair {
+                (Some(a), Some(b)) => a == b,
+                _ => true,
+            })
+    }
+}
+
+impl Footprint {
+    /// No fact.
+    pub const NOTHING: Footprint = Footprint::Patterns(Vec::new());
+
+    /// Whether no fact is in it.
+    pub fn is_nothing(&self) -> bool {
+        matches!(self, Footprint::Patterns(patterns) if patterns.is_empty())
+    }
+
+    /// Whether `key` is in it.
+    pub fn contains(&self, key: &FactKey) -> bool {
+        match self {
+            Footprint::Everything => true,
+            Footprint::Patterns(patterns) => patterns.iter().any(|p| p.matches(key)),
+        }
+    }
+
+    /// Whether some fact may be in both.
+    pub fn overlaps(&self, other: &Footprint) -> bool {
+        match (self, other) {
+            (Footprint::Everything, o) | (o, Footprint::Everything) => !o.is_nothing(),
+            (Footprint::Patterns(a), Footprint::Patterns(b)) => a.iter().any(|p| b.iter().any(|q| p.overlaps(q))),
+        }
+    }
+
+    /// The union of both.
+    pub fn union(self, other: Footprint) -> Footprint {
+        match (self, other) {
+            (Footprint::Patterns(mut a), Footprint::Patterns(b)) => {
+                a.extend(b);
+                Footprint::Patterns(a)
+            }
+            _ => Footprint::Everything,
+        }
+    }
+}
+
+impl Change {
+    /// The facts that the change writes.
+    pub fn pattern(&self) -> FactPattern {
+        match self {
+            Change::Set { fact, .. } | Change::Increase { fact, .. } => FactPattern::of(fact),
+            Change::Delete { pattern } => pattern.clone(),
+        }
+    }
+}
+
+impl fmt::Display for Term {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Term::Int(i) => write!(f, "{i}"),
+            Term::Name(name) => f.write_str(name),
+        }
+    }
+}
+
+impl fmt::Display for FactKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", FactPattern::of(self))
+    }
+}
+
+impl fmt::Display for FactPattern {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}(", self.predicate)?;
+        for (i, argument) in self.arguments.iter().enumerate() {
+            f.write_str(if i == 0 { "" } else { ", " })?;
+            match argument {
+                Some(term) => write!(f, "{term}")?,
+                None => f.write_str("?")?,
+            }
+        }
+        f.write_str(")")
+    }
+}
+
+impl fmt::Display for Change {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Change::Set { fact, value } => write!(f, "set {fact} = {value}"),
+            Change::Delete { pattern } => write!(f, "delete {pattern}"),
+            Change::Increase { fact, by } => write!(f, "increase {fact} by {by}"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pattern(predicate: &str, arguments: &[Option<&str>]) -> FactPattern {
+        FactPattern {
+            predicate: predicate.into(),
+            arguments: arguments.iter().map(|a| a.map(|name| Term::Name(name.into()))).collect(),
+        }
+    }
+
+    #[test]
+    fn an_unbound_argument_overlaps_everything_of_its_predicate() {
+        assert!(pattern("at", &[None]).overlaps(&pattern("at", &[Some("box")])));
+        assert!(!pattern("at", &[Some("cup")]).overlaps(&pattern("at", &[Some("box")])));
+        assert!(!pattern("at", &[None]).overlaps(&pattern("on", &[None])));
+        assert!(!pattern("at", &[None]).overlaps(&pattern("at", &[None, None])));
+    }
+
+    #[test]
+    fn everything_overlaps_all_but_nothing() {
+        assert!(Footprint::Everything.overlaps(&Footprint::Everything));
+        assert!(!Footprint::Everything.overlaps(&Footprint::NOTHING));
+    }
+}

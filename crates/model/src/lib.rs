@@ -1,0 +1,15 @@
+//! The task model: what a task program *is*.
+//!
+//! Owns the values that flow between states, the expression grammar, the tree of states with its annotations
+//! ([`program::Program`]), the catalogue of what a system offers, loading from YAML and the rules of `check`.
+//! It deliberately knows no clock, no socket, no process and no world: facts are named here, kept in `ratn-world`.
+
+pub mod catalogue;
+pub mod expression;
+pub mod fact;
+pub mod id;
+pub mod pose;
+pub mod program;
+pub mod resource;
+pub mod time;
+pub mod value;

@@ -1,0 +1,1 @@
+//! Robot kinematics, collision, path planning and time parameterisation.

@@ -1,0 +1,1 @@
+//! Depth rendering, segmentation and pose estimation.

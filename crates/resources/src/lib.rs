@@ -1,0 +1,1 @@
+//! The resource pool as a state machine: operations, leases, wait queue.

@@ -1,0 +1,1 @@
+//! All cores together in virtual time: the paper's tables.

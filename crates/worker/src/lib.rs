@@ -1,0 +1,1 @@
+//! The worker SDK: serve the action protocol, fence by lease token, cancel.

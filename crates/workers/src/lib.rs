@@ -1,0 +1,1 @@
+//! The bundled workers: path planner and detector.
