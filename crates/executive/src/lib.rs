@@ -1,1 +1,7 @@
-//! The window of task node instances, and the sequential interpreter.
+//! The executive: what a task control decides.
+//!
+//! A pure core. [`protocol::Event`]s come in, [`protocol::Command`]s come out, time is an argument. The shell performs
+//! commands (over gRPC in `ratn run`, in virtual time in `ratn-simulation`) and answers only with events, so the log of
+//! events and commands is the whole story of a run.
+
+pub mod protocol;

@@ -88,3 +88,32 @@ impl fmt::Display for Requirement {
         Ok(())
     }
 }
+
+/// What an acquire was granted: every blocked resource of one node, under one lease.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Lease {
+    /// Its id.
+    pub id: crate::id::LeaseId,
+    /// Grows strictly over all leases of a resource manager; who does the work refuses an older one than it has seen.
+    pub token: crate::id::FencingToken,
+    /// The resources, in the order of the requirements.
+    pub resources: Vec<LeasedResource>,
+}
+
+/// A resource under a lease.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LeasedResource {
+    /// Its id, `path-planner-1@compute`.
+    pub id: String,
+    /// Its kind.
+    pub kind: String,
+    /// Where its action service is served (`http://127.0.0.1:4000` or `unix:/path`); empty where it performs nothing.
+    pub endpoint: String,
+}
+
+impl Lease {
+    /// The first leased resource of a kind.
+    pub fn resource(&self, kind: &str) -> Option<&LeasedResource> {
+        self.resources.iter().find(|r| r.kind == kind)
+    }
+}

@@ -1,0 +1,280 @@
+//! What goes into and comes out of the executive. Both are the event log, line by line.
+
+use ratn_model::fact::{Change, FactKey, Footprint};
+use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision, StateId};
+use ratn_model::resource::{Lease, Requirement};
+use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// How a task is executed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mode {
+    /// As written: one state after the other.
+    Hsm,
+    /// As a concurrent dataflow task network.
+    Cdtn,
+}
+
+/// What happened.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Event {
+    /// The run begins. Always the first event, once.
+    Started {
+        /// The task's name.
+        task: String,
+        /// The task file's digest.
+        digest: String,
+        /// How it is executed.
+        mode: Mode,
+        /// Every parameter's value.
+        parameters: BTreeMap<String, Value>,
+        /// What every random choice of this run is derived from.
+        seed: u64,
+        /// The root world at the start.
+        world: Vec<(FactKey, Value)>,
+        /// The revision of that world.
+        revision: Revision,
+    },
+    /// The resource manager granted an [`Command::Acquire`].
+    Granted {
+        /// For which instance.
+        instance: InstanceId,
+        /// What.
+        lease: Lease,
+    },
+    /// The resource manager will not grant it.
+    Refused {
+        /// For which instance.
+        instance: InstanceId,
+        /// Why, and what to do.
+        reason: String,
+    },
+    /// The world pool made the projection of a [`Command::Project`].
+    Projected {
+        /// For which instance.
+        instance: InstanceId,
+        /// In which attempt.
+        attempt: u32,
+        /// Its id.
+        projection: ProjectionId,
+    },
+    /// A goal says how far it is. Logged; changes nothing.
+    Progressed {
+        /// Which instance.
+        instance: InstanceId,
+        /// In which attempt.
+        attempt: u32,
+        /// What it says.
+        message: String,
+    },
+    /// A goal has ended and says how.
+    Finished {
+        /// Which instance.
+        instance: InstanceId,
+        /// In which attempt.
+        attempt: u32,
+        /// Its outcome.
+        outcome: String,
+        /// Its output ports.
+        outputs: BTreeMap<String, Value>,
+        /// Facts as measured, where the provider measured any that its effects declare.
+        measured: Vec<(FactKey, Value)>,
+        /// Why, when the outcome is not success; else empty.
+        reason: String,
+    },
+    /// The attempt ended without an answer: the worker died, the connection broke, the lease was lost, the world pool failed.
+    Crashed {
+        /// Which instance.
+        instance: InstanceId,
+        /// In which attempt.
+        attempt: u32,
+        /// What is known of it.
+        reason: String,
+    },
+    /// The resource manager or world pool did not do what a retirement needs.
+    RetirementFailed {
+        /// Which instance.
+        instance: InstanceId,
+        /// Why.
+        reason: String,
+    },
+    /// The user wants the run to end now.
+    AbortRequested {
+        /// Why.
+        reason: String,
+    },
+}
+
+/// What the shell shall do. Performed in order; commits and projections reach the world pool in this order.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "command", rename_all = "snake_case")]
+pub enum Command {
+    /// Nothing to do: a change in an instance's life, for the log.
+    Note(Note),
+    /// Ask the resource manager; answered by `Granted` or `Refused`.
+    Acquire {
+        /// For which instance.
+        instance: InstanceId,
+        /// Blocks, consumes and exists, all or nothing.
+        requirements: Vec<Requirement>,
+        /// Larger first.
+        priority: i64,
+    },
+    /// Withdraw an acquire that was not answered yet (a grant that crosses it is released by the shell).
+    Withdraw {
+        /// Of which instance.
+        instance: InstanceId,
+    },
+    /// Make a projection: the world at `base` with the changes applied; answered by `Projected` or `Crashed`.
+    Project {
+        /// For which instance.
+        instance: InstanceId,
+        /// In which attempt.
+        attempt: u32,
+        /// The root's revision below it.
+        base: Revision,
+        /// The effects of the older instances that are not real yet, in program order.
+        changes: Vec<Change>,
+        /// What of it may be seen.
+        reads: Footprint,
+    },
+    /// Give a provider a goal; answered by `Finished` or `Crashed`.
+    Start {
+        /// Which instance.
+        instance: InstanceId,
+        /// In which attempt, from 1. (run, instance, attempt) is the goal's idempotent id.
+        attempt: u32,
+        /// What to do.
+        goal: Goal,
+    },
+    /// Stop a goal; its answer, if any, is ignored.
+    Cancel {
+        /// Which instance.
+        instance: InstanceId,
+        /// In which attempt.
+        attempt: u32,
+    },
+    /// Give back what an instance holds.
+    Release {
+        /// Which instance.
+        instance: InstanceId,
+        /// Its lease, if it has one.
+        lease: Option<LeaseId>,
+        /// Its projection, if it has one.
+        projection: Option<ProjectionId>,
+    },
+    /// Make effects real in the root world.
+    Commit {
+        /// Whose effects.
+        instance: InstanceId,
+        /// In order. The root has revision `revision` afterwards.
+        changes: Vec<Change>,
+        /// What the root's revision will be.
+        revision: Revision,
+    },
+    /// Create and delete task resources.
+    Operate {
+        /// Whose annotations.
+        instance: InstanceId,
+        /// Creates and deletes.
+        operations: Vec<Requirement>,
+    },
+    /// The run has ended; everything was released before.
+    End {
+        /// The task's outcome.
+        outcome: String,
+        /// The task's outputs, when the outcome is success.
+        outputs: BTreeMap<String, Value>,
+        /// Why, when it is not; else empty.
+        reason: String,
+    },
+}
+
+/// A change in an instance's life.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "note", rename_all = "snake_case")]
+pub enum Note {
+    /// It is in the window now.
+    Expanded {
+        /// Its id.
+        instance: InstanceId,
+        /// Its state.
+        state: StateId,
+        /// Its path with visit numbers, `place_all[2]/plan_transfer`.
+        path: String,
+        /// Whether a condition on its path is undecided.
+        speculative: bool,
+    },
+    /// A condition or a loop's collection is decided.
+    Decided {
+        /// Its id.
+        instance: InstanceId,
+        /// What it came to: `then`, `else`, or the number of elements.
+        decision: String,
+    },
+    /// It has its resources and, where it needs one, its projection: its goal starts.
+    Running {
+        /// Its id.
+        instance: InstanceId,
+        /// In which attempt.
+        attempt: u32,
+    },
+    /// Its result is known.
+    Finished {
+        /// Its id.
+        instance: InstanceId,
+        /// Its outcome.
+        outcome: String,
+    },
+    /// Its result is real.
+    Retired {
+        /// Its id.
+        instance: InstanceId,
+    },
+    /// It is discarded: its branch is not taken, or the task ended before it.
+    Squashed {
+        /// Its id.
+        instance: InstanceId,
+    },
+}
+
+/// A goal for a provider.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Goal {
+    /// The provider of the catalogue, `path_planner`.
+    pub provider: String,
+    /// Its action, `plan`.
+    pub action: String,
+    /// Its input ports.
+    pub inputs: BTreeMap<String, Value>,
+    /// What the action's random choices are derived from.
+    pub seed: u64,
+    /// What it may use; the provider is the resource of its kind in it.
+    pub lease: Option<Lease>,
+    /// The world it works on; `None` for a node that reads no world model.
+    pub projection: Option<ProjectionId>,
+}
+
+/// One line of an event log.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LogLine {
+    /// When, in the robot's time since the start of the run.
+    pub at: Timestamp,
+    /// What.
+    #[serde(flatten)]
+    pub entry: LogEntry,
+}
+
+/// What happened, or what was decided then.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum LogEntry {
+    /// An event.
+    Event(Event),
+    /// A command.
+    Command(Command),
+}
