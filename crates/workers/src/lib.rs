@@ -1,1 +1,3 @@
 //! The bundled workers: path planner and detector.
+
+pub mod path_planner;

@@ -1,0 +1,1 @@
+//! The path planner worker (being written).
