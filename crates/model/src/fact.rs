@@ -83,6 +83,13 @@ impl FactPattern {
             && self.arguments.iter().zip(&key.arguments).all(|(want, have)| want.as_ref().is_none_or(|w| w == have))
     }
 
+    /// Whether every key that fits `other` fits this one.
+    pub fn covers(&self, other: &FactPattern) -> bool {
+        self.predicate == other.predicate
+            && self.arguments.len() == other.arguments.len()
+            && self.arguments.iter().zip(&other.arguments).all(|(mine, its)| mine.is_none() || mine == its)
+    }
+
     /// Whether some key fits both.
     pub fn overlaps(&self, other: &FactPattern) -> bool {
         self.predicate == other.predicate
