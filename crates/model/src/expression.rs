@@ -1,7 +1,20 @@
 //! The one expression grammar: ports, facts, preconditions, effects and selectors are all written in it.
 //!
 //! This file is the syntax tree. Names are resolved when a program is loaded, so a tree can be evaluated anywhere
-//! given a scope; evaluation is pure.
+//! given a [`scope::Scope`]; evaluation is pure.
+//!
+//! - [`scope`]: where names get their values
+//! - [`evaluate`]: expression → value; [`function`] holds the built-ins
+//! - [`bind`]: facts, effects and resources with their arguments evaluated; which facts an effect may write
+//! - [`walk`]: what an expression mentions
+//! - [`display`]: back to text, for messages
+
+pub mod bind;
+pub mod display;
+pub mod evaluate;
+pub mod function;
+pub mod scope;
+pub mod walk;
 
 use crate::id::StateId;
 use crate::value::Value;
@@ -107,6 +120,8 @@ pub enum Function {
     PlacePose,
     /// `concat(a, b, …)` of strings, ints
     Concat,
+    /// `repeat(value, n)` → list of n times the value
+    Repeat,
 }
 
 /// Operators of one operand.

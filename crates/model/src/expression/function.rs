@@ -1,0 +1,275 @@
+//! The built-in functions, on values.
+//!
+//! The two geometric ones know one thing about a gripper: its tool frame sits between the fingertips, z points out of the
+//! gripper, y is the direction in which the fingers close. Both give two poses that differ by half a turn about the
+//! vertical, because a box looks the same from both.
+
+use super::Function;
+use super::evaluate::{MAX_LIST, described, number, order};
+use crate::pose::Pose;
+use crate::value::Value;
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// How far below an object's top the tool frame's origin goes in a grasp from above, in metres; half the height of
+/// something lower than twice that.
+pub const GRASP_DEPTH_M: f64 = 0.03;
+
+impl Function {
+    /// Every function.
+    pub const ALL: [Function; 15] = [
+        Function::Len,
+        Function::Range,
+        Function::Min,
+        Function::Max,
+        Function::Abs,
+        Function::If,
+        Function::Pose,
+        Function::Joints,
+        Function::Compose,
+        Function::Inverse,
+        Function::Between,
+        Function::GraspPose,
+        Function::PlacePose,
+        Function::Concat,
+        Function::Repeat,
+    ];
+
+    /// Its name in an expression.
+    pub fn name(self) -> &'static str {
+        match self {
+            Function::Len => "len",
+            Function::Range => "range",
+            Function::Min => "min",
+            Function::Max => "max",
+            Function::Abs => "abs",
+            Function::If => "if",
+            Function::Pose => "pose",
+            Function::Joints => "joints",
+            Function::Compose => "compose",
+            Function::Inverse => "inverse",
+            Function::Between => "between",
+            Function::GraspPose => "grasp_pose",
+            Function::PlacePose => "place_pose",
+            Function::Concat => "concat",
+            Function::Repeat => "repeat",
+        }
+    }
+
+    /// The function of a name.
+    pub fn named(name: &str) -> Option<Function> {
+        Function::ALL.into_iter().find(|f| f.name() == name)
+    }
+
+    /// How it is called.
+    pub fn usage(self) -> &'static str {
+        match self {
+            Function::Len => "len(list)",
+            Function::Range => "range(n) or range(from, to)",
+            Function::Min => "min(a, b, …)",
+            Function::Max => "max(a, b, …)",
+            Function::Abs => "abs(x)",
+            Function::If => "if(condition, a, b)",
+            Function::Pose => "pose(x, y, z) or pose(x, y, z, roll, pitch, yaw)",
+            Function::Joints => "joints(a, b, …)",
+            Function::Compose => "compose(pose, pose)",
+            Function::Inverse => "inverse(pose)",
+            Function::Between => "between(pose, pose)",
+            Function::GraspPose => "grasp_pose(object), an object being {pose, size}",
+            Function::PlacePose => "place_pose(target, in_gripper)",
+            Function::Concat => "concat(a, b, …)",
+            Function::Repeat => "repeat(value, n)",
+        }
+    }
+
+    /// Whether it can be called with so many arguments.
+    pub fn takes(self, arguments: usize) -> bool {
+        match self {
+            Function::Len | Function::Abs | Function::Inverse | Function::GraspPose => arguments == 1,
+            Function::Range => matches!(arguments, 1 | 2),
+            Function::Compose | Function::Between | Function::PlacePose | Function::Repeat => arguments == 2,
+            Function::If => arguments == 3,
+            Function::Pose => matches!(arguments, 3 | 6),
+            Function::Min | Function::Max | Function::Joints | Function::Concat => arguments >= 1,
+        }
+    }
+}
+
+/// The value of a call; the error says what is wrong with the arguments. `if` is not here: it does not evaluate all.
+pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, String> {
+    if !function.takes(arguments.len()) {
+        return Err(format!("expected `{}`", function.usage()));
+    }
+    match (function, arguments) {
+        (Function::Len, [Value::List(items)]) => Ok(length(items.len())),
+        (Function::Len, [Value::Map(fields)]) => Ok(length(fields.len())),
+        (Function::Len, [Value::Joints(joints)]) => Ok(length(joints.len())),
+        (Function::Len, [Value::String(text)]) => Ok(length(text.chars().count())),
+        (Function::Len, [other, ..]) => Err(format!("{} has no length", described(other))),
+        (Function::Range, [to]) => range(0, int(to)?),
+        (Function::Range, [from, to]) => range(int(from)?, int(to)?),
+        (Function::Min, _) => extreme(arguments, std::cmp::Ordering::Less),
+        (Function::Max, _) => extreme(arguments, std::cmp::Ordering::Greater),
+        (Function::Abs, [Value::Int(i)]) => i.checked_abs().map(Value::Int).ok_or_else(|| "too large".to_owned()),
+        (Function::Abs, [x]) => Ok(Value::Float(number(x)?.abs())),
+        (Function::Pose, _) => {
+            let n = arguments.iter().map(number).collect::<Result<Vec<f64>, _>>()?;
+            let angle = |i: usize| n.get(i).copied().unwrap_or(0.0);
+            Ok(Value::Pose(Pose::from_rpy([n[0], n[1], n[2]], angle(3), angle(4), angle(5))))
+        }
+        (Function::Joints, _) => Ok(Value::Joints(arguments.iter().map(number).collect::<Result<_, _>>()?)),
+        (Function::Compose, [a, b]) => Ok(Value::Pose(pose(a)?.compose(pose(b)?))),
+        (Function::Between, [a, b]) => Ok(Value::Pose(pose(a)?.inverse().compose(pose(b)?))),
+        (Function::Inverse, [a]) => Ok(Value::Pose(pose(a)?.inverse())),
+        (Function::GraspPose, [object]) => grasp_poses(object),
+        (Function::PlacePose, [target, in_gripper]) => Ok(place_poses(pose(target)?, pose(in_gripper)?)),
+        (Function::Concat, _) => {
+            let parts = arguments.iter().map(|part| match part {
+                Value::String(text) => Ok(text.clone()),
+                Value::Int(i) => Ok(i.to_string()),
+                other => Err(format!("expected strings and ints, found {}", described(other))),
+            });
+            Ok(Value::String(parts.collect::<Result<String, _>>()?))
+        }
+        (Function::Repeat, [value, times]) => {
+            let times =
+                usize::try_from(int(times)?).map_err(|_| "cannot repeat a negative number of times".to_owned())?;
+            if times > MAX_LIST {
+                return Err(format!("the list is longer than {MAX_LIST}"));
+            }
+            Ok(Value::List(vec![value.clone(); times]))
+        }
+        _ => Err(format!("expected `{}`", function.usage())),
+    }
+}
+
+fn length(n: usize) -> Value {
+    Value::Int(i64::try_from(n).unwrap_or(i64::MAX))
+}
+
+fn int(value: &Value) -> Result<i64, String> {
+    match value {
+        Value::Int(i) => Ok(*i),
+        other => Err(format!("expected an int, found {}", described(other))),
+    }
+}
+
+fn pose(value: &Value) -> Result<&Pose, String> {
+    match value {
+        Value::Pose(pose) => Ok(pose),
+        other => Err(format!("expected a pose, found {}", described(other))),
+    }
+}
+
+fn range(from: i64, to: i64) -> Result<Value, String> {
+    if to.saturating_sub(from) > i64::try_from(MAX_LIST).unwrap_or(i64::MAX) {
+        return Err(format!("the list is longer than {MAX_LIST}"));
+    }
+    Ok(Value::List((from..to).map(Value::Int).collect()))
+}
+
+/// The least or greatest of the arguments, or of the elements of the only one.
+fn extreme(arguments: &[Value], wanted: std::cmp::Ordering) -> Result<Value, String> {
+    let candidates = match arguments {
+        [Value::List(items)] => items.as_slice(),
+        _ => arguments,
+    };
+    let mut best = candidates.first().ok_or("the list is empty")?;
+    if !matches!(best, Value::String(_)) {
+        number(best)?;
+    }
+    for candidate in &candidates[1..] {
+        if order(candidate, best)? == wanted {
+            best = candidate;
+        }
+    }
+    Ok(best.clone())
+}
+
+fn grasp_poses(object: &Value) -> Result<Value, String> {
+    let expected = || "expected an object {pose: pose, size: [x, y, z]}".to_owned();
+    let (Some(Value::Pose(centre)), Some(Value::List(size))) = (object.field("pose"), object.field("size")) else {
+        return Err(expected());
+    };
+    let edges = size.iter().map(number).collect::<Result<Vec<f64>, _>>()?;
+    let [x, y, z] = <[f64; 3]>::try_from(edges).map_err(|_| expected())?;
+    let forward = centre.rotate([1.0, 0.0, 0.0]);
+    let yaw = forward[1].atan2(forward[0]);
+    // Turned upside down (roll π), the tool's y axis points along -y of the object; a quarter turn puts it along x.
+    let across = if x <= y { FRAC_PI_2 } else { 0.0 };
+    let top = centre.position[2] + z / 2.0;
+    let origin = [centre.position[0], centre.position[1], top - GRASP_DEPTH_M.min(z / 2.0)];
+    let turned = |by: f64| Value::Pose(Pose::from_rpy(origin, PI, 0.0, yaw + across + by));
+    Ok(Value::List(vec![turned(0.0), turned(PI)]))
+}
+
+fn place_poses(target: &Pose, in_gripper: &Pose) -> Value {
+    let half_turn = Pose::from_rpy([0.0; 3], 0.0, 0.0, PI);
+    let tool = |target: &Pose| Value::Pose(target.compose(&in_gripper.inverse()));
+    Value::List(vec![tool(target), tool(&target.compose(&half_turn))])
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+    use super::*;
+
+    fn poses(value: &Value) -> Vec<Pose> {
+        let Value::List(items) = value else { return Vec::new() };
+        items.iter().map(|item| *pose(item).unwrap()).collect()
+    }
+
+    fn object(yaw: f64, size: [f64; 3]) -> Value {
+        Value::map([
+            ("pose", Value::Pose(Pose::from_rpy([0.7, 0.1, 0.75], 0.0, 0.0, yaw))),
+            ("size", Value::List(size.map(Value::Float).to_vec())),
+        ])
+    }
+
+    fn close(a: [f64; 3], b: [f64; 3]) -> bool {
+        a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-9)
+    }
+
+    #[test]
+    fn a_grasp_comes_from_above_with_the_fingers_across_the_shorter_side() {
+        for yaw in [0.0, 0.7, -2.0] {
+            let body = Pose::from_rpy([0.0; 3], 0.0, 0.0, yaw);
+            for (size, across) in [([0.08, 0.14, 0.10], [1.0, 0.0, 0.0]), ([0.14, 0.08, 0.10], [0.0, 1.0, 0.0])] {
+                let grasps = poses(&call(Function::GraspPose, &[object(yaw, size)]).unwrap());
+                let (there, back) = (body.rotate(across), body.rotate(across.map(|c| -c)));
+                assert_eq!(grasps.len(), 2);
+                assert!((grasps[0].angle(&grasps[1]) - PI).abs() < 1e-6);
+                for grasp in grasps {
+                    assert!(close(grasp.rotate([0.0, 0.0, 1.0]), [0.0, 0.0, -1.0]));
+                    let closing = grasp.rotate([0.0, 1.0, 0.0]);
+                    assert!(close(closing, there) || close(closing, back));
+                    assert!(close(grasp.position, [0.7, 0.1, 0.77]));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_low_object_is_grasped_at_half_its_height() {
+        let grasps = poses(&call(Function::GraspPose, &[object(0.0, [0.05, 0.2, 0.02])]).unwrap());
+        assert!((grasps[0].position[2] - 0.75).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_held_object_placed_at_its_target_is_there() {
+        let target = Pose::from_rpy([-0.2, 0.1, 0.65], 0.0, 0.0, 0.4);
+        let in_gripper = Pose::from_rpy([0.01, 0.0, 0.02], PI, 0.0, 0.3);
+        let tools = poses(&call(Function::PlacePose, &[Value::Pose(target), Value::Pose(in_gripper)]).unwrap());
+        let first = tools[0].compose(&in_gripper);
+        assert!(first.distance(&target) < 1e-9 && first.angle(&target) < 1e-6);
+        let second = tools[1].compose(&in_gripper);
+        assert!(second.distance(&target) < 1e-9 && (second.angle(&target) - PI).abs() < 1e-6);
+    }
+
+    #[test]
+    fn every_function_is_found_by_its_name() {
+        for function in Function::ALL {
+            assert_eq!(Function::named(function.name()), Some(function));
+        }
+    }
+}

@@ -1,0 +1,101 @@
+//! Where the names of an expression get their values.
+//!
+//! Values are borrowed where the scope has them: a field of an element of a long list costs no copy of the list.
+
+use crate::fact::FactPattern;
+use crate::id::StateId;
+use crate::value::Value;
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+
+/// Gives names their values. `None` and [`Lookup::Unknown`] mean not known *yet*: a scope never guesses.
+pub trait Scope {
+    /// `$name`: a loop variable or a task parameter.
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>>;
+    /// An output of the state itself (only its effects may name it).
+    fn output(&self, name: &str) -> Option<Cow<'_, Value>>;
+    /// An output of another state.
+    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>>;
+    /// The first fact that matches, in the order of keys.
+    fn fact(&self, pattern: &FactPattern) -> Lookup<'_>;
+}
+
+/// What a scope knows of a fact.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Lookup<'a> {
+    /// The scope does not know (yet) which facts hold.
+    Unknown,
+    /// No fact matches.
+    Absent,
+    /// The value of the first that matches.
+    Holds(Cow<'a, Value>),
+}
+
+/// The scope in which nothing is known.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct NothingKnown;
+
+impl Scope for NothingKnown {
+    fn variable(&self, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+
+    fn output(&self, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+
+    fn port(&self, _: StateId, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+
+    fn fact(&self, _: &FactPattern) -> Lookup<'_> {
+        Lookup::Unknown
+    }
+}
+
+/// The scope in which only these variables are known.
+impl Scope for BTreeMap<String, Value> {
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.get(name).map(Cow::Borrowed)
+    }
+
+    fn output(&self, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+
+    fn port(&self, _: StateId, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+
+    fn fact(&self, _: &FactPattern) -> Lookup<'_> {
+        Lookup::Unknown
+    }
+}
+
+/// Another scope with one variable more, which hides one of the same name.
+pub struct WithVariable<'a> {
+    /// The scope around it.
+    pub outer: &'a dyn Scope,
+    /// The variable.
+    pub name: &'a str,
+    /// Its value; `None` while it is not known.
+    pub value: Option<&'a Value>,
+}
+
+impl Scope for WithVariable<'_> {
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
+        if name == self.name { self.value.map(Cow::Borrowed) } else { self.outer.variable(name) }
+    }
+
+    fn output(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer.output(name)
+    }
+
+    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
+        self.outer.port(state, port)
+    }
+
+    fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
+        self.outer.fact(pattern)
+    }
+}
