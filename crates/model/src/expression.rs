@@ -16,6 +16,9 @@ pub mod function;
 pub mod scope;
 pub mod walk;
 
+pub use evaluate::EvaluateError;
+pub use scope::{Lookup, Scope};
+
 use crate::id::StateId;
 use crate::value::Value;
 use serde::{Deserialize, Serialize};
