@@ -1,0 +1,160 @@
+//! To and from the wire: `From<T> for v1::T` never fails, `TryFrom<v1::T> for T` says what is wrong and where.
+//!
+//! What the schema cannot say is checked here, so that no core ever sees it: a choice that is not made, a number that is
+//! not finite, a pose that is none, a trajectory that runs backwards, names without bound, nesting without end.
+
+mod action;
+mod fact;
+mod process;
+mod resource;
+mod value;
+
+use ratn_model::fact::FactKey;
+use ratn_model::value::Value;
+use std::collections::BTreeMap;
+use std::fmt;
+
+use crate::v1;
+
+/// Lists and maps nest at most this deep.
+pub const MAX_DEPTH: usize = 16;
+/// A value has at most this many elements, over all its lists and maps.
+pub const MAX_ELEMENTS: usize = 200_000;
+/// Ids, kinds, predicates and port names have at most this many bytes.
+pub const MAX_NAME_BYTES: usize = 1024;
+
+/// A message that fits the schema and still means nothing.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{path}: {problem}")]
+pub struct Malformed {
+    /// The field, from the message down: `goal.inputs[start].joints[2]`.
+    pub path: String,
+    /// What is wrong with it, and what would be right.
+    pub problem: String,
+}
+
+impl Malformed {
+    /// A problem of the field `field`.
+    pub fn new(field: impl fmt::Display, problem: impl Into<String>) -> Malformed {
+        Malformed { path: field.to_string(), problem: problem.into() }
+    }
+
+    /// The same problem as seen from the message around it.
+    #[must_use]
+    pub fn within(mut self, field: impl fmt::Display) -> Malformed {
+        let dot = if self.path.is_empty() || self.path.starts_with('[') { "" } else { "." };
+        self.path = format!("{field}{dot}{}", self.path);
+        self
+    }
+}
+
+impl From<Malformed> for tonic::Status {
+    fn from(malformed: Malformed) -> tonic::Status {
+        tonic::Status::invalid_argument(malformed.to_string())
+    }
+}
+
+/// A message field that must be there, converted.
+///
+/// # Errors
+/// [`Malformed`] when it is missing, or as its conversion.
+pub fn required<W, T>(message: Option<W>, field: &str) -> Result<T, Malformed>
+where
+    T: TryFrom<W, Error = Malformed>,
+{
+    let message = message.ok_or_else(|| Malformed::new(field, "is missing"))?;
+    T::try_from(message).map_err(|malformed| malformed.within(field))
+}
+
+/// Every element of a repeated field, converted.
+///
+/// # Errors
+/// [`Malformed`] of the first that cannot be.
+pub fn each<W, T>(messages: Vec<W>, field: &str) -> Result<Vec<T>, Malformed>
+where
+    T: TryFrom<W, Error = Malformed>,
+{
+    let convert = |(i, message)| T::try_from(message).map_err(|m: Malformed| m.within(format!("{field}[{i}]")));
+    messages.into_iter().enumerate().map(convert).collect()
+}
+
+/// A repeated field from the cores' types.
+pub fn all<T, W: From<T>>(items: impl IntoIterator<Item = T>) -> Vec<W> {
+    items.into_iter().map(W::from).collect()
+}
+
+/// Ports or attributes.
+///
+/// # Errors
+/// [`Malformed`] of the first that is none.
+pub fn ports(fields: BTreeMap<String, v1::Value>, field: &str) -> Result<BTreeMap<String, Value>, Malformed> {
+    let convert = |(port, value): (String, v1::Value)| {
+        name(&port, "name").map_err(|m| m.within(field))?;
+        let value = Value::try_from(value).map_err(|m| m.within(format!("{field}[{port}]")))?;
+        Ok((port, value))
+    };
+    fields.into_iter().map(convert).collect()
+}
+
+/// Ports or attributes onto the wire.
+pub fn wire_ports(fields: BTreeMap<String, Value>) -> BTreeMap<String, v1::Value> {
+    fields.into_iter().map(|(name, value)| (name, value.into())).collect()
+}
+
+/// Facts with their revisions dropped.
+///
+/// # Errors
+/// [`Malformed`] of the first that is none.
+pub fn facts(facts: Vec<v1::Fact>, field: &str) -> Result<Vec<(FactKey, Value)>, Malformed> {
+    let records: Vec<crate::types::FactRecord> = each(facts, field)?;
+    Ok(records.into_iter().map(|record| (record.key, record.value)).collect())
+}
+
+/// Facts without a revision onto the wire.
+pub fn wire_facts(facts: Vec<(FactKey, Value)>) -> Vec<v1::Fact> {
+    let fact =
+        |(key, value): (FactKey, Value)| v1::Fact { key: Some(key.into()), value: Some(value.into()), revision: 0 };
+    facts.into_iter().map(fact).collect()
+}
+
+/// A name that must be there: not empty, not endless, nothing in it that a terminal would obey.
+///
+/// # Errors
+/// [`Malformed`] otherwise.
+pub fn name(text: &str, field: &str) -> Result<(), Malformed> {
+    if text.is_empty() {
+        return Err(Malformed::new(field, "is empty"));
+    }
+    label(text, field)
+}
+
+/// As [`name`], but may be empty.
+///
+/// # Errors
+/// [`Malformed`] when it is too long or holds control characters.
+pub fn label(text: &str, field: &str) -> Result<(), Malformed> {
+    if text.len() > MAX_NAME_BYTES {
+        return Err(Malformed::new(field, format!("has {} bytes: at most {MAX_NAME_BYTES} are allowed", text.len())));
+    }
+    if text.chars().any(char::is_control) {
+        return Err(Malformed::new(field, "holds control characters"));
+    }
+    Ok(())
+}
+
+fn finite(number: f64, field: impl fmt::Display) -> Result<f64, Malformed> {
+    if number.is_finite() { Ok(number) } else { Err(Malformed::new(field, format!("is {number}: it must be finite"))) }
+}
+
+fn all_finite(numbers: &[f64], field: &str) -> Result<(), Malformed> {
+    for (i, number) in numbers.iter().enumerate() {
+        if !number.is_finite() {
+            return Err(Malformed::new(format!("{field}[{i}]"), format!("is {number}: it must be finite")));
+        }
+    }
+    Ok(())
+}
+
+fn missing_choice(choices: &str) -> Malformed {
+    Malformed::new("kind", format!("is not set: one of {choices} is needed"))
+}

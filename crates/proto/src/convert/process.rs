@@ -1,0 +1,70 @@
+//! Worker processes and pools.
+
+use super::{Malformed, all, each, label, name};
+use crate::types::{PoolStatus, WorkerState, WorkerStatus};
+use crate::v1;
+
+impl From<WorkerStatus> for v1::WorkerStatus {
+    fn from(worker: WorkerStatus) -> v1::WorkerStatus {
+        let state = match worker.state {
+            WorkerState::Starting => v1::WorkerState::Starting,
+            WorkerState::Ready => v1::WorkerState::Ready,
+            WorkerState::Exited => v1::WorkerState::Exited,
+        };
+        v1::WorkerStatus {
+            id: worker.id,
+            template: worker.template,
+            state: state.into(),
+            pid: worker.pid,
+            endpoint: worker.endpoint,
+            reason: worker.reason,
+        }
+    }
+}
+
+impl TryFrom<v1::WorkerStatus> for WorkerStatus {
+    type Error = Malformed;
+
+    fn try_from(worker: v1::WorkerStatus) -> Result<WorkerStatus, Malformed> {
+        name(&worker.id, "id")?;
+        name(&worker.template, "template")?;
+        label(&worker.endpoint, "endpoint")?;
+        let state = match v1::WorkerState::try_from(worker.state) {
+            Ok(v1::WorkerState::Starting) => WorkerState::Starting,
+            Ok(v1::WorkerState::Ready) => WorkerState::Ready,
+            Ok(v1::WorkerState::Exited) => WorkerState::Exited,
+            Ok(v1::WorkerState::Unspecified) => return Err(Malformed::new("state", "is not set")),
+            Err(_) => return Err(Malformed::new("state", format!("{} is no worker state", worker.state))),
+        };
+        Ok(WorkerStatus {
+            id: worker.id,
+            template: worker.template,
+            state,
+            pid: worker.pid,
+            endpoint: worker.endpoint,
+            reason: worker.reason,
+        })
+    }
+}
+
+impl From<PoolStatus> for v1::Pool {
+    fn from(pool: PoolStatus) -> v1::Pool {
+        v1::Pool { template: pool.template, kind: pool.kind, min: pool.min, max: pool.max, workers: all(pool.workers) }
+    }
+}
+
+impl TryFrom<v1::Pool> for PoolStatus {
+    type Error = Malformed;
+
+    fn try_from(pool: v1::Pool) -> Result<PoolStatus, Malformed> {
+        name(&pool.template, "template")?;
+        name(&pool.kind, "kind")?;
+        Ok(PoolStatus {
+            template: pool.template,
+            kind: pool.kind,
+            min: pool.min,
+            max: pool.max,
+            workers: each(pool.workers, "workers")?,
+        })
+    }
+}

@@ -1,0 +1,278 @@
+//! Resources, requirements, leases, events of the pool.
+
+use super::{Malformed, all, each, label, missing_choice, name, ports, required, wire_ports};
+use crate::types::{Holding, Resource, ResourceEvent, ResourceEventKind, ResourceState, ResourceUpdate};
+use crate::v1;
+use ratn_model::id::{FencingToken, LeaseId, Revision};
+use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceClass, ResourceOperation};
+
+impl From<ResourceClass> for v1::ResourceClass {
+    fn from(class: ResourceClass) -> v1::ResourceClass {
+        match class {
+            ResourceClass::System => v1::ResourceClass::System,
+            ResourceClass::Process => v1::ResourceClass::Process,
+            ResourceClass::Module => v1::ResourceClass::Module,
+            ResourceClass::World => v1::ResourceClass::World,
+            ResourceClass::Task => v1::ResourceClass::Task,
+        }
+    }
+}
+
+/// The class of an enum field; unspecified is `None`.
+fn class(number: i32) -> Result<Option<ResourceClass>, Malformed> {
+    let class = v1::ResourceClass::try_from(number)
+        .map_err(|_| Malformed::new("class", format!("{number} is no resource class")))?;
+    Ok(match class {
+        v1::ResourceClass::Unspecified => None,
+        v1::ResourceClass::System => Some(ResourceClass::System),
+        v1::ResourceClass::Process => Some(ResourceClass::Process),
+        v1::ResourceClass::Module => Some(ResourceClass::Module),
+        v1::ResourceClass::World => Some(ResourceClass::World),
+        v1::ResourceClass::Task => Some(ResourceClass::Task),
+    })
+}
+
+impl From<ResourceOperation> for v1::ResourceOperation {
+    fn from(operation: ResourceOperation) -> v1::ResourceOperation {
+        match operation {
+            ResourceOperation::Block => v1::ResourceOperation::Block,
+            ResourceOperation::Consume => v1::ResourceOperation::Consume,
+            ResourceOperation::Create => v1::ResourceOperation::Create,
+            ResourceOperation::Delete => v1::ResourceOperation::Delete,
+            ResourceOperation::Exists => v1::ResourceOperation::Exists,
+        }
+    }
+}
+
+fn operation(number: i32) -> Result<ResourceOperation, Malformed> {
+    match v1::ResourceOperation::try_from(number) {
+        Ok(v1::ResourceOperation::Block) => Ok(ResourceOperation::Block),
+        Ok(v1::ResourceOperation::Consume) => Ok(ResourceOperation::Consume),
+        Ok(v1::ResourceOperation::Create) => Ok(ResourceOperation::Create),
+        Ok(v1::ResourceOperation::Delete) => Ok(ResourceOperation::Delete),
+        Ok(v1::ResourceOperation::Exists) => Ok(ResourceOperation::Exists),
+        Ok(v1::ResourceOperation::Unspecified) => Err(Malformed::new("operation", "is not set")),
+        Err(_) => Err(Malformed::new("operation", format!("{number} is no resource operation"))),
+    }
+}
+
+impl From<Requirement> for v1::Requirement {
+    fn from(requirement: Requirement) -> v1::Requirement {
+        v1::Requirement {
+            operation: v1::ResourceOperation::from(requirement.operation).into(),
+            kind: requirement.kind,
+            class: requirement.class.map_or(v1::ResourceClass::Unspecified, v1::ResourceClass::from).into(),
+            attributes: wire_ports(requirement.attributes),
+            count: requirement.count,
+        }
+    }
+}
+
+impl TryFrom<v1::Requirement> for Requirement {
+    type Error = Malformed;
+
+    fn try_from(requirement: v1::Requirement) -> Result<Requirement, Malformed> {
+        name(&requirement.kind, "kind")?;
+        if requirement.count == 0 {
+            return Err(Malformed::new("count", "is 0: it must be at least 1"));
+        }
+        Ok(Requirement {
+            operation: operation(requirement.operation)?,
+            kind: requirement.kind,
+            class: class(requirement.class)?,
+            attributes: ports(requirement.attributes, "attributes")?,
+            count: requirement.count,
+        })
+    }
+}
+
+impl From<Lease> for v1::Lease {
+    fn from(lease: Lease) -> v1::Lease {
+        v1::Lease { id: lease.id.0, token: lease.token.0, resources: all(lease.resources) }
+    }
+}
+
+impl TryFrom<v1::Lease> for Lease {
+    type Error = Malformed;
+
+    fn try_from(lease: v1::Lease) -> Result<Lease, Malformed> {
+        Ok(Lease {
+            id: LeaseId(lease.id),
+            token: FencingToken(lease.token),
+            resources: each(lease.resources, "resources")?,
+        })
+    }
+}
+
+impl From<LeasedResource> for v1::LeasedResource {
+    fn from(resource: LeasedResource) -> v1::LeasedResource {
+        v1::LeasedResource { id: resource.id, kind: resource.kind, endpoint: resource.endpoint }
+    }
+}
+
+impl TryFrom<v1::LeasedResource> for LeasedResource {
+    type Error = Malformed;
+
+    fn try_from(resource: v1::LeasedResource) -> Result<LeasedResource, Malformed> {
+        name(&resource.id, "id")?;
+        name(&resource.kind, "kind")?;
+        label(&resource.endpoint, "endpoint")?;
+        Ok(LeasedResource { id: resource.id, kind: resource.kind, endpoint: resource.endpoint })
+    }
+}
+
+impl From<Holding> for v1::Holding {
+    fn from(holding: Holding) -> v1::Holding {
+        v1::Holding {
+            lease_id: holding.lease.0,
+            token: holding.token.0,
+            units: holding.units,
+            session_id: holding.session,
+            holder: holding.holder,
+        }
+    }
+}
+
+impl TryFrom<v1::Holding> for Holding {
+    type Error = Malformed;
+
+    fn try_from(holding: v1::Holding) -> Result<Holding, Malformed> {
+        Ok(Holding {
+            lease: LeaseId(holding.lease_id),
+            token: FencingToken(holding.token),
+            units: holding.units,
+            session: holding.session_id,
+            holder: holding.holder,
+        })
+    }
+}
+
+impl From<Resource> for v1::Resource {
+    fn from(resource: Resource) -> v1::Resource {
+        let state = match resource.state {
+            ResourceState::Free => v1::ResourceState::Free,
+            ResourceState::Leased => v1::ResourceState::Leased,
+            ResourceState::Exhausted => v1::ResourceState::Exhausted,
+        };
+        v1::Resource {
+            id: resource.id,
+            class: v1::ResourceClass::from(resource.class).into(),
+            kind: resource.kind,
+            attributes: wire_ports(resource.attributes),
+            capacity: resource.capacity,
+            host: resource.host,
+            session_id: resource.session,
+            revision: resource.revision.0,
+            state: state.into(),
+            free: resource.free,
+            holdings: all(resource.holdings),
+        }
+    }
+}
+
+impl TryFrom<v1::Resource> for Resource {
+    type Error = Malformed;
+
+    fn try_from(resource: v1::Resource) -> Result<Resource, Malformed> {
+        label(&resource.id, "id")?;
+        name(&resource.kind, "kind")?;
+        label(&resource.host, "host")?;
+        if resource.capacity == 0 {
+            return Err(Malformed::new("capacity", "is 0: a resource has at least one unit"));
+        }
+        let state = match v1::ResourceState::try_from(resource.state) {
+            Ok(v1::ResourceState::Unspecified | v1::ResourceState::Free) => ResourceState::Free,
+            Ok(v1::ResourceState::Leased) => ResourceState::Leased,
+            Ok(v1::ResourceState::Exhausted) => ResourceState::Exhausted,
+            Err(_) => return Err(Malformed::new("state", format!("{} is no resource state", resource.state))),
+        };
+        Ok(Resource {
+            id: resource.id,
+            class: class(resource.class)?.ok_or_else(|| Malformed::new("class", "is not set"))?,
+            kind: resource.kind,
+            attributes: ports(resource.attributes, "attributes")?,
+            capacity: resource.capacity,
+            host: resource.host,
+            session: resource.session_id,
+            revision: Revision(resource.revision),
+            state,
+            free: resource.free,
+            holdings: each(resource.holdings, "holdings")?,
+        })
+    }
+}
+
+impl From<ResourceEvent> for v1::ResourceEvent {
+    fn from(event: ResourceEvent) -> v1::ResourceEvent {
+        let kind = match event.kind {
+            ResourceEventKind::Created => v1::ResourceEventKind::Created,
+            ResourceEventKind::Updated => v1::ResourceEventKind::Updated,
+            ResourceEventKind::Deleted => v1::ResourceEventKind::Deleted,
+            ResourceEventKind::Leased => v1::ResourceEventKind::Leased,
+            ResourceEventKind::Released => v1::ResourceEventKind::Released,
+        };
+        let (lease, token) = event.lease.unwrap_or_default();
+        v1::ResourceEvent {
+            revision: event.revision.0,
+            kind: kind.into(),
+            resource: Some(event.resource.into()),
+            lease_id: lease.0,
+            token: token.0,
+            reason: event.reason,
+        }
+    }
+}
+
+impl TryFrom<v1::ResourceEvent> for ResourceEvent {
+    type Error = Malformed;
+
+    fn try_from(event: v1::ResourceEvent) -> Result<ResourceEvent, Malformed> {
+        let kind = match v1::ResourceEventKind::try_from(event.kind) {
+            Ok(v1::ResourceEventKind::Created) => ResourceEventKind::Created,
+            Ok(v1::ResourceEventKind::Updated) => ResourceEventKind::Updated,
+            Ok(v1::ResourceEventKind::Deleted) => ResourceEventKind::Deleted,
+            Ok(v1::ResourceEventKind::Leased) => ResourceEventKind::Leased,
+            Ok(v1::ResourceEventKind::Released) => ResourceEventKind::Released,
+            Ok(v1::ResourceEventKind::Unspecified) => return Err(Malformed::new("kind", "is not set")),
+            Err(_) => return Err(Malformed::new("kind", format!("{} is no kind of event", event.kind))),
+        };
+        Ok(ResourceEvent {
+            revision: Revision(event.revision),
+            kind,
+            resource: required(event.resource, "resource")?,
+            lease: matches!(kind, ResourceEventKind::Leased | ResourceEventKind::Released)
+                .then_some((LeaseId(event.lease_id), FencingToken(event.token))),
+            reason: event.reason,
+        })
+    }
+}
+
+impl From<ResourceUpdate> for v1::ResourceServiceWatchResponse {
+    fn from(update: ResourceUpdate) -> v1::ResourceServiceWatchResponse {
+        use v1::resource_service_watch_response::Kind;
+        let kind = match update {
+            ResourceUpdate::Snapshot { revision, resources } => {
+                Kind::Snapshot(v1::ResourceSnapshot { revision: revision.0, resources: all(resources) })
+            }
+            ResourceUpdate::Event(event) => Kind::Event(event.into()),
+        };
+        v1::ResourceServiceWatchResponse { kind: Some(kind) }
+    }
+}
+
+impl TryFrom<v1::ResourceServiceWatchResponse> for ResourceUpdate {
+    type Error = Malformed;
+
+    fn try_from(update: v1::ResourceServiceWatchResponse) -> Result<ResourceUpdate, Malformed> {
+        use v1::resource_service_watch_response::Kind;
+        match update.kind.ok_or_else(|| missing_choice("snapshot, event"))? {
+            Kind::Snapshot(snapshot) => Ok(ResourceUpdate::Snapshot {
+                revision: Revision(snapshot.revision),
+                resources: each(snapshot.resources, "snapshot.resources")?,
+            }),
+            Kind::Event(event) => {
+                ResourceEvent::try_from(event).map(ResourceUpdate::Event).map_err(|m| m.within("event"))
+            }
+        }
+    }
+}

@@ -1,0 +1,252 @@
+//! What the services speak of and no core owns: resources as the resource manager lists them, facts with their revision,
+//! worker processes, goals and their results. Plain data.
+
+use ratn_model::fact::FactKey;
+use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
+use ratn_model::resource::{Lease, ResourceClass};
+use ratn_model::value::Value;
+use std::collections::BTreeMap;
+
+/// The attribute of a resource that says where its action service is.
+pub const ENDPOINT_ATTRIBUTE: &str = "endpoint";
+
+/// What a resource is doing.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum ResourceState {
+    /// At least one unit can be had.
+    #[default]
+    Free,
+    /// No unit can be had now; some come back when a lease ends.
+    Leased,
+    /// Every unit has been consumed.
+    Exhausted,
+}
+
+/// Units of a resource under a lease.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Holding {
+    /// The lease.
+    pub lease: LeaseId,
+    /// Its fencing token.
+    pub token: FencingToken,
+    /// Units.
+    pub units: u32,
+    /// The session of the lease.
+    pub session: String,
+    /// What the holder said it is, for people.
+    pub holder: String,
+}
+
+/// A resource. A provider fills in the first six fields, the manager the rest.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Resource {
+    /// Unique among all resources, `path-planner-1@compute`; empty in a create lets the manager choose.
+    pub id: String,
+    /// Its class.
+    pub class: ResourceClass,
+    /// Its kind, `PathPlanner`.
+    pub kind: String,
+    /// What selectors compare with.
+    pub attributes: BTreeMap<String, Value>,
+    /// Units in all, at least 1.
+    pub capacity: u32,
+    /// The host that it is on; may be empty.
+    pub host: String,
+    /// The session that owns it.
+    pub session: String,
+    /// The revision of the pool that changed it last.
+    pub revision: Revision,
+    /// What it is doing.
+    pub state: ResourceState,
+    /// Units that can be had now.
+    pub free: u32,
+    /// Who has units of it.
+    pub holdings: Vec<Holding>,
+}
+
+impl Resource {
+    /// A resource of one unit without attributes, as a provider offers it.
+    pub fn new(id: impl Into<String>, class: ResourceClass, kind: impl Into<String>) -> Resource {
+        Resource {
+            id: id.into(),
+            class,
+            kind: kind.into(),
+            attributes: BTreeMap::new(),
+            capacity: 1,
+            host: String::new(),
+            session: String::new(),
+            revision: Revision(0),
+            state: ResourceState::Free,
+            free: 1,
+            holdings: Vec::new(),
+        }
+    }
+
+    /// With an attribute.
+    #[must_use]
+    pub fn with_attribute(mut self, name: impl Into<String>, value: Value) -> Resource {
+        self.attributes.insert(name.into(), value);
+        self
+    }
+
+    /// With its action service at `endpoint`.
+    #[must_use]
+    pub fn with_endpoint(self, endpoint: impl ToString) -> Resource {
+        self.with_attribute(ENDPOINT_ATTRIBUTE, Value::String(endpoint.to_string()))
+    }
+
+    /// With this many units.
+    #[must_use]
+    pub fn with_capacity(mut self, capacity: u32) -> Resource {
+        self.capacity = capacity;
+        self.free = capacity;
+        self
+    }
+
+    /// On a host.
+    #[must_use]
+    pub fn on_host(mut self, host: impl Into<String>) -> Resource {
+        self.host = host.into();
+        self
+    }
+
+    /// Where its action service is; empty where it performs nothing.
+    pub fn endpoint(&self) -> &str {
+        match self.attributes.get(ENDPOINT_ATTRIBUTE) {
+            Some(Value::String(endpoint)) => endpoint,
+            _ => "",
+        }
+    }
+}
+
+/// What happened to a resource.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ResourceEventKind {
+    /// It is new.
+    Created,
+    /// Its attributes or its capacity changed, or units were consumed.
+    Updated,
+    /// It is gone; a lease of it has ended.
+    Deleted,
+    /// Units of it went to a lease.
+    Leased,
+    /// A lease of it ended: released, expired, or lost.
+    Released,
+}
+
+/// One change of one resource.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ResourceEvent {
+    /// The pool's revision with it.
+    pub revision: Revision,
+    /// What happened.
+    pub kind: ResourceEventKind,
+    /// The resource after it (before it, when deleted).
+    pub resource: Resource,
+    /// The lease, when leased or released.
+    pub lease: Option<(LeaseId, FencingToken)>,
+    /// Why, where there is something to say.
+    pub reason: String,
+}
+
+/// What a watch of resources tells: the snapshot first, once.
+#[derive(Debug, Clone, PartialEq)]
+pub enum ResourceUpdate {
+    /// What is there; events follow from the next revision on.
+    Snapshot {
+        /// The pool's revision.
+        revision: Revision,
+        /// In the order of ids.
+        resources: Vec<Resource>,
+    },
+    /// What happened since.
+    Event(ResourceEvent),
+}
+
+/// A fact with the revision of the world that wrote it (0 for a measured one).
+#[derive(Debug, Clone, PartialEq)]
+pub struct FactRecord {
+    /// Which fact.
+    pub key: FactKey,
+    /// What it says.
+    pub value: Value,
+    /// Who wrote it.
+    pub revision: Revision,
+}
+
+/// What a worker process is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WorkerState {
+    /// It was spawned and is not serving yet.
+    Starting,
+    /// Its health is SERVING and its resource exists.
+    Ready,
+    /// The process is gone.
+    Exited,
+}
+
+/// A worker process.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct WorkerStatus {
+    /// Its id, also that of its resource.
+    pub id: String,
+    /// The template that it was started from.
+    pub template: String,
+    /// What it is doing.
+    pub state: WorkerState,
+    /// The process id.
+    pub pid: u32,
+    /// Where its action service is; empty before it is ready.
+    pub endpoint: String,
+    /// Why it exited, else empty.
+    pub reason: String,
+}
+
+/// A pool of workers of one template.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PoolStatus {
+    /// The template's name.
+    pub template: String,
+    /// The kind of resource that its workers are.
+    pub kind: String,
+    /// At least so many workers are kept.
+    pub min: u32,
+    /// At most so many are started.
+    pub max: u32,
+    /// In the order of ids.
+    pub workers: Vec<WorkerStatus>,
+}
+
+/// A goal as a provider gets it.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Goal {
+    /// Unique to the attempt, `run/instance/attempt`.
+    pub id: String,
+    /// The action's name, `plan`.
+    pub action: String,
+    /// The input ports.
+    pub inputs: BTreeMap<String, Value>,
+    /// What the action's random choices are derived from.
+    pub seed: u64,
+    /// What the action may use; the provider is in it.
+    pub lease: Option<Lease>,
+    /// The world that it works on.
+    pub projection: Option<ProjectionId>,
+    /// Where the world pool is; empty where the action needs none.
+    pub world_pool: String,
+    /// Cancelled this long after its arrival, in milliseconds of wall time; 0 never.
+    pub deadline_ms: u64,
+}
+
+/// How a goal has ended.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct GoalOutcome {
+    /// `success`, `aborted`, `preempted`, or one of the action's own.
+    pub outcome: String,
+    /// The output ports.
+    pub outputs: BTreeMap<String, Value>,
+    /// Facts as measured.
+    pub measured: Vec<(FactKey, Value)>,
+    /// Why, when the outcome is not success; else empty.
+    pub reason: String,
+}
