@@ -1,0 +1,139 @@
+//! The camera model: a pinhole without distortion, and the depth images it makes.
+//!
+//! The optical frame has z forward, x right and y down, as in image processing. A depth is the z coordinate of the point
+//! seen, in metres; 0 means that nothing came back.
+
+use ratn_model::pose::Pose;
+use serde::{Deserialize, Serialize};
+
+/// What a pinhole camera is made of; all in pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Intrinsics {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Focal length along x.
+    pub fx: f64,
+    /// Focal length along y.
+    pub fy: f64,
+    /// Column of the optical axis.
+    pub cx: f64,
+    /// Row of the optical axis.
+    pub cy: f64,
+}
+
+/// A camera in its place.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    /// Its optics.
+    pub intrinsics: Intrinsics,
+    /// Its optical frame in the world.
+    pub pose: Pose,
+}
+
+/// A depth image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DepthImage {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Metres along the optical axis, row by row from the upper left; 0 is no return.
+    pub depth: Vec<f32>,
+}
+
+/// Bytes that are not the depth image they are said to be.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ImageError {
+    /// The wrong number of bytes.
+    #[error("a depth image of {width} × {height} has {expected} bytes (f32, row by row), not {found}")]
+    Length {
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+        /// What there should be.
+        expected: usize,
+        /// What there is.
+        found: usize,
+    },
+    /// More pixels than anybody's camera has.
+    #[error("an image of {width} × {height} is larger than {MAX_SIDE} × {MAX_SIDE}")]
+    TooLarge {
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+    },
+}
+
+/// The largest side of an image that is accepted.
+pub const MAX_SIDE: usize = 4096;
+
+impl Intrinsics {
+    /// 320 × 240 pixels and 57° × 44°: modest, so that a frame costs milliseconds, and wide enough for the table.
+    pub const DEFAULT: Intrinsics = Intrinsics { width: 320, height: 240, fx: 296.0, fy: 296.0, cx: 159.5, cy: 119.5 };
+
+    /// The direction of a pixel's ray in the optical frame, with z = 1: times the depth it is the point.
+    pub fn ray(&self, column: usize, row: usize) -> [f64; 3] {
+        [(column as f64 - self.cx) / self.fx, (row as f64 - self.cy) / self.fy, 1.0]
+    }
+
+    /// Column and row at which a point of the optical frame appears; `None` behind the camera.
+    pub fn project(&self, point: [f64; 3]) -> Option<[f64; 2]> {
+        (point[2] > 1e-6).then(|| [self.fx * point[0] / point[2] + self.cx, self.fy * point[1] / point[2] + self.cy])
+    }
+}
+
+impl DepthImage {
+    /// The image as little-endian f32.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        self.depth.iter().flat_map(|d| d.to_le_bytes()).collect()
+    }
+
+    /// The image from little-endian f32.
+    ///
+    /// # Errors
+    /// [`ImageError`] when the size and the bytes do not fit together.
+    pub fn from_bytes(width: usize, height: usize, bytes: &[u8]) -> Result<DepthImage, ImageError> {
+        if width > MAX_SIDE || height > MAX_SIDE {
+            return Err(ImageError::TooLarge { width, height });
+        }
+        let expected = width * height * size_of::<f32>();
+        if bytes.len() != expected {
+            return Err(ImageError::Length { width, height, expected, found: bytes.len() });
+        }
+        let depth = bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+        Ok(DepthImage { width, height, depth })
+    }
+
+    /// The depth of a pixel, `None` where nothing came back.
+    pub fn at(&self, column: usize, row: usize) -> Option<f64> {
+        let depth = *self.depth.get(row * self.width + column)?;
+        (depth.is_finite() && depth > 0.0).then_some(f64::from(depth))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn an_image_reads_back_from_its_bytes() {
+        let image = DepthImage { width: 2, height: 2, depth: vec![0.0, 1.5, 2.25, 0.125] };
+        assert_eq!(DepthImage::from_bytes(2, 2, &image.to_bytes()).unwrap(), image);
+        assert!(DepthImage::from_bytes(2, 3, &image.to_bytes()).is_err());
+        assert!(DepthImage::from_bytes(1 << 40, 1 << 40, &[]).is_err());
+    }
+
+    #[test]
+    fn a_pixel_projects_to_itself() {
+        let camera = Intrinsics::DEFAULT;
+        let ray = camera.ray(17, 230);
+        let back = camera.project([ray[0] * 1.7, ray[1] * 1.7, 1.7]).unwrap();
+        assert!((back[0] - 17.0).abs() < 1e-9 && (back[1] - 230.0).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,132 @@
+//! What a depth sensor does to the truth: noise that grows with the square of the distance, as of every sensor that
+//! triangulates, and pixels that do not return, more of them at edges.
+//!
+//! Every sample is a hash of (seed, frame, pixel), so an image does not depend on the order in which it is made.
+
+use crate::camera::DepthImage;
+use serde::{Deserialize, Serialize};
+
+/// How noisy a camera is.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Noise {
+    /// Standard deviation of a depth at one metre, in metres; grows with the square of the distance.
+    pub sigma_at_1m: f64,
+    /// How many of the pixels return nothing, 0 to 1.
+    pub missing: f64,
+    /// How many of the pixels at an edge return nothing, 0 to 1.
+    pub missing_at_edges: f64,
+}
+
+/// A step of the depth between neighbours that makes an edge, in metres.
+const EDGE: f32 = 0.05;
+/// No image is averaged over more frames.
+pub const MAX_FRAMES: u32 = 1000;
+
+impl Noise {
+    /// A structured-light camera of the usual kind.
+    pub const DEFAULT: Noise = Noise { sigma_at_1m: 0.0015, missing: 0.002, missing_at_edges: 0.1 };
+    /// None at all.
+    pub const NONE: Noise = Noise { sigma_at_1m: 0.0, missing: 0.0, missing_at_edges: 0.0 };
+}
+
+/// The average of frames `first_frame ..` of a scene that stands still; a pixel counts in the frames that returned it.
+pub fn observe(clean: &DepthImage, noise: &Noise, seed: u64, first_frame: u64, frames: u32) -> DepthImage {
+    let edges = edges(clean);
+    let frames = frames.clamp(1, MAX_FRAMES);
+    let mut depth = vec![0.0; clean.depth.len()];
+    for (pixel, (out, truth)) in depth.iter_mut().zip(&clean.depth).enumerate() {
+        if *truth <= 0.0 {
+            continue;
+        }
+        let truth = f64::from(*truth);
+        let missing = if edges[pixel] { noise.missing_at_edges } else { noise.missing };
+        let sigma = noise.sigma_at_1m * truth * truth;
+        let (mut sum, mut returned) = (0.0, 0_u32);
+        for frame in 0..u64::from(frames) {
+            let bits = hash(seed ^ hash(first_frame + frame) ^ (pixel as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+            let [a, b, c] = [bits, bits >> 21, bits >> 42].map(|b| (b & 0x1F_FFFF) as f64 / f64::from(0x20_0000));
+            let d = uniform(hash(bits ^ 1));
+            if d < missing {
+                continue;
+            }
+            // Three uniforms have variance 1/4: twice their centred sum is close to a standard normal.
+            sum += sigma * 2.0 * (a + b + c - 1.5);
+            returned += 1;
+        }
+        if returned > 0 {
+            *out = (truth + sum / f64::from(returned)) as f32;
+        }
+    }
+    DepthImage { width: clean.width, height: clean.height, depth }
+}
+
+fn edges(image: &DepthImage) -> Vec<bool> {
+    let (width, height) = (image.width, image.height);
+    let mut edges = vec![false; image.depth.len()];
+    for row in 0..height {
+        for column in 0..width {
+            let here = row * width + column;
+            let right = (column + 1 < width).then_some(here + 1);
+            let below = (row + 1 < height).then_some(here + width);
+            for next in [right, below].into_iter().flatten() {
+                if (image.depth[here] - image.depth[next]).abs() > EDGE {
+                    edges[here] = true;
+                    edges[next] = true;
+                }
+            }
+        }
+    }
+    edges
+}
+
+fn uniform(bits: u64) -> f64 {
+    (bits >> 11) as f64 / (1_u64 << 53) as f64
+}
+
+/// The finaliser of SplitMix64 (Steele, Lea, Flood 2014): every input bit reaches every output bit.
+fn hash(x: u64) -> u64 {
+    let x = x.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    let x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    let x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    x ^ (x >> 31)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn wall(distance: f32) -> DepthImage {
+        DepthImage { width: 100, height: 100, depth: vec![distance; 10_000] }
+    }
+
+    fn deviation(image: &DepthImage, truth: f64) -> f64 {
+        let seen: Vec<f64> = image.depth.iter().filter(|d| **d > 0.0).map(|d| f64::from(*d) - truth).collect();
+        (seen.iter().map(|e| e * e).sum::<f64>() / seen.len() as f64).sqrt()
+    }
+
+    #[test]
+    fn noise_grows_with_the_square_of_the_distance_and_falls_with_frames() {
+        let near = deviation(&observe(&wall(1.0), &Noise::DEFAULT, 1, 0, 1), 1.0);
+        let far = deviation(&observe(&wall(2.0), &Noise::DEFAULT, 1, 0, 1), 2.0);
+        let averaged = deviation(&observe(&wall(2.0), &Noise::DEFAULT, 1, 0, 16), 2.0);
+        assert!((near / 0.0015 - 1.0).abs() < 0.05, "{near}");
+        assert!((far / near - 4.0).abs() < 0.3, "{far}");
+        assert!((far / averaged - 4.0).abs() < 0.3, "{averaged}");
+    }
+
+    #[test]
+    fn the_same_seed_sees_the_same_and_another_does_not() {
+        let one = observe(&wall(1.0), &Noise::DEFAULT, 7, 3, 2);
+        assert_eq!(one, observe(&wall(1.0), &Noise::DEFAULT, 7, 3, 2));
+        assert_ne!(one, observe(&wall(1.0), &Noise::DEFAULT, 8, 3, 2));
+        assert_ne!(one, observe(&wall(1.0), &Noise::DEFAULT, 7, 4, 2));
+    }
+
+    #[test]
+    fn a_few_pixels_are_missing() {
+        let image = observe(&wall(1.0), &Noise { missing: 0.1, ..Noise::DEFAULT }, 7, 0, 1);
+        let missing = image.depth.iter().filter(|d| **d == 0.0).count();
+        assert!((800..1200).contains(&missing), "{missing}");
+    }
+}

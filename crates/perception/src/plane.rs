@@ -1,0 +1,132 @@
+//! The supporting plane: RANSAC (Fischler and Bolles 1981) over points of the region, then least squares over its inliers.
+//!
+//! Points are in the region's frame, whose z axis is roughly the plane's normal: the plane is a height field.
+
+use crate::vector::{Vector, cross, length, scale, sub};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// `z = slope_x · x + slope_y · y + height`
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Plane {
+    pub(crate) slope_x: f64,
+    pub(crate) slope_y: f64,
+    pub(crate) height: f64,
+}
+
+/// Samples of three points.
+const ATTEMPTS: usize = 80;
+/// Points that vote; more are thinned out evenly.
+const VOTERS: usize = 1500;
+/// How far a point of the plane may lie from it, in metres.
+const INLIER: f64 = 0.008;
+/// How steep the plane may be in the region's frame.
+const MAX_SLOPE: f64 = 0.1;
+/// With fewer inliers there is no plane.
+const MIN_INLIERS: usize = 40;
+
+impl Plane {
+    /// How far a point is above the plane.
+    pub(crate) fn above(&self, p: Vector) -> f64 {
+        p[2] - self.at(p[0], p[1])
+    }
+
+    /// The plane's height at a place.
+    pub(crate) fn at(&self, x: f64, y: f64) -> f64 {
+        self.slope_x * x + self.slope_y * y + self.height
+    }
+
+    /// The plane that most points lie on.
+    pub(crate) fn find(points: &[Vector], seed: u64) -> Option<Plane> {
+        let stride = points.len().div_ceil(VOTERS).max(1);
+        let voters: Vec<Vector> = points.iter().step_by(stride).copied().collect();
+        if voters.len() < MIN_INLIERS {
+            return None;
+        }
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let mut best: Option<(usize, Plane)> = None;
+        for _ in 0..ATTEMPTS {
+            let mut pick = || voters[random.random_range(0..voters.len())];
+            let Some(plane) = Plane::through(pick(), pick(), pick()) else { continue };
+            let votes = voters.iter().filter(|p| plane.above(**p).abs() < INLIER).count();
+            if best.is_none_or(|(most, _)| votes > most) {
+                best = Some((votes, plane));
+            }
+        }
+        let (votes, mut plane) = best?;
+        if votes < MIN_INLIERS {
+            return None;
+        }
+        for _ in 0..2 {
+            let inliers = points.iter().copied().filter(|p| plane.above(*p).abs() < INLIER);
+            plane = Plane::least_squares(inliers).unwrap_or(plane);
+        }
+        Some(plane)
+    }
+
+    fn through(a: Vector, b: Vector, c: Vector) -> Option<Plane> {
+        let normal = cross(sub(b, a), sub(c, a));
+        let area = length(normal);
+        if area < 1e-4 {
+            return None;
+        }
+        let n = scale(normal, 1.0 / area);
+        if n[2].abs() < 0.5 {
+            return None;
+        }
+        let (slope_x, slope_y) = (-n[0] / n[2], -n[1] / n[2]);
+        (slope_x.hypot(slope_y) < MAX_SLOPE).then(|| Plane {
+            slope_x,
+            slope_y,
+            height: a[2] - slope_x * a[0] - slope_y * a[1],
+        })
+    }
+
+    fn least_squares(points: impl Iterator<Item = Vector> + Clone) -> Option<Plane> {
+        let (mut n, mut mean) = (0.0, [0.0; 3]);
+        for p in points.clone() {
+            n += 1.0;
+            for axis in 0..3 {
+                mean[axis] += p[axis];
+            }
+        }
+        let mean = scale(mean, 1.0 / n);
+        let (mut xx, mut xy, mut yy, mut xz, mut yz) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        for p in points {
+            let [x, y, z] = sub(p, mean);
+            xx += x * x;
+            xy += x * y;
+            yy += y * y;
+            xz += x * z;
+            yz += y * z;
+        }
+        let determinant = xx * yy - xy * xy;
+        (determinant > 1e-9).then(|| {
+            let slope_x = (xz * yy - yz * xy) / determinant;
+            let slope_y = (yz * xx - xz * xy) / determinant;
+            Plane { slope_x, slope_y, height: mean[2] - slope_x * mean[0] - slope_y * mean[1] }
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn a_plane_is_found_among_points_that_are_not_on_it() {
+        let truth = Plane { slope_x: 0.01, slope_y: -0.02, height: 0.003 };
+        let grid = (0..1600).map(|i| (f64::from(i % 40) / 40.0, f64::from(i / 40) / 40.0));
+        let points: Vec<Vector> =
+            grid.map(|(x, y)| [x, y, if (x * 7.0 + y * 5.0) % 1.0 < 0.35 { 0.09 } else { truth.at(x, y) }]).collect();
+        let found = Plane::find(&points, 5).unwrap();
+        assert!((found.at(0.5, 0.5) - truth.at(0.5, 0.5)).abs() < 1e-6);
+        assert!((found.slope_x - truth.slope_x).abs() < 1e-6);
+    }
+
+    #[test]
+    fn three_points_are_not_a_plane() {
+        assert_eq!(Plane::find(&[[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], 0), None);
+    }
+}

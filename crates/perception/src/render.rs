@@ -1,0 +1,156 @@
+//! Depth images by ray casting (parry3d).
+//!
+//! One ray per pixel through its centre. A body is only tried for the pixels that the projection of its bounding box
+//! covers, so the cost is about the area that the bodies cover in the image.
+
+use crate::camera::{Camera, DepthImage, Intrinsics};
+use parry3d::math::{Pose, Rotation, Vector};
+use parry3d::query::Ray;
+use parry3d::shape::SharedShape;
+use ratn_world::scene::Shape;
+
+/// A shape in the world, as the camera sees it.
+#[derive(Clone)]
+pub struct Body {
+    /// Its shape.
+    pub shape: SharedShape,
+    /// Where it is.
+    pub pose: Pose,
+}
+
+/// No surface farther than this is seen, in metres.
+pub const FAR: f32 = 8.0;
+
+impl Body {
+    /// A shape of the scene. parry's cylinders stand along y, ours along z.
+    pub fn new(shape: &Shape, pose: &ratn_model::pose::Pose) -> Body {
+        let world = parry_pose(pose);
+        match *shape {
+            Shape::Box { size } => {
+                let [x, y, z] = size.map(|edge| edge as f32 / 2.0);
+                Body { shape: SharedShape::cuboid(x, y, z), pose: world }
+            }
+            Shape::Cylinder { radius, length } => Body {
+                shape: SharedShape::cylinder(length as f32 / 2.0, radius as f32),
+                pose: world * Pose::from_rotation(Rotation::from_rotation_x(std::f32::consts::FRAC_PI_2)),
+            },
+        }
+    }
+}
+
+/// Our pose as parry's.
+pub fn parry_pose(pose: &ratn_model::pose::Pose) -> Pose {
+    let [x, y, z] = pose.position.map(|c| c as f32);
+    let [i, j, k, w] = pose.quaternion_xyzw.map(|c| c as f32);
+    Pose::from_parts(Vector::new(x, y, z), Rotation::from_xyzw(i, j, k, w))
+}
+
+/// The depth image of the bodies, without noise.
+pub fn render(camera: &Camera, bodies: &[Body]) -> DepthImage {
+    let Intrinsics { width, height, .. } = camera.intrinsics;
+    let eye = parry_pose(&camera.pose);
+    let mut depth = vec![FAR; width * height];
+    for body in bodies {
+        let seen = eye.inverse() * body.pose;
+        let Some(window) = window(&camera.intrinsics, body, &seen) else { continue };
+        for row in window.rows.clone() {
+            for column in window.columns.clone() {
+                let [x, y, _] = camera.intrinsics.ray(column, row);
+                // The direction has z = 1, so the time of impact is the depth.
+                let ray = Ray::new(Vector::ZERO, Vector::new(x as f32, y as f32, 1.0));
+                let nearest = &mut depth[row * width + column];
+                if let Some(hit) = body.shape.cast_ray(&seen, &ray, *nearest, true)
+                    && hit < *nearest
+                {
+                    *nearest = hit;
+                }
+            }
+        }
+    }
+    for d in &mut depth {
+        if *d >= FAR {
+            *d = 0.0;
+        }
+    }
+    DepthImage { width, height, depth }
+}
+
+struct Window {
+    columns: std::ops::Range<usize>,
+    rows: std::ops::Range<usize>,
+}
+
+/// The pixels that a body can cover: all of them when it reaches behind the camera.
+fn window(camera: &Intrinsics, body: &Body, seen: &Pose) -> Option<Window> {
+    let bounds = body.shape.compute_local_aabb();
+    let corners = (0..8).map(|corner: u32| {
+        let pick = |bit: u32, low: f32, high: f32| if corner & bit == 0 { low } else { high };
+        seen.transform_point(Vector::new(
+            pick(1, bounds.mins.x, bounds.maxs.x),
+            pick(2, bounds.mins.y, bounds.maxs.y),
+            pick(4, bounds.mins.z, bounds.maxs.z),
+        ))
+    });
+    let (mut low, mut high, mut behind) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2], 0);
+    for corner in corners {
+        match camera.project([f64::from(corner.x), f64::from(corner.y), f64::from(corner.z)]) {
+            Some(pixel) => {
+                for axis in 0..2 {
+                    low[axis] = low[axis].min(pixel[axis]);
+                    high[axis] = high[axis].max(pixel[axis]);
+                }
+            }
+            None => behind += 1,
+        }
+    }
+    match behind {
+        8 => None,
+        0 => {
+            let range = |axis: usize, size: usize| {
+                let start = (low[axis].floor().max(0.0) as usize).min(size);
+                start..((high[axis].ceil() + 1.0).max(0.0) as usize).min(size)
+            };
+            let window = Window { columns: range(0, camera.width), rows: range(1, camera.height) };
+            (!window.columns.is_empty() && !window.rows.is_empty()).then_some(window)
+        }
+        _ => Some(Window { columns: 0..camera.width, rows: 0..camera.height }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_model::pose::Pose as ModelPose;
+
+    fn looking_forward() -> Camera {
+        Camera { intrinsics: Intrinsics::DEFAULT, pose: ModelPose::IDENTITY }
+    }
+
+    #[test]
+    fn the_depth_of_a_wall_is_its_distance_along_the_axis_in_every_pixel() {
+        let wall = Body::new(&Shape::Box { size: [6.0, 6.0, 0.2] }, &ModelPose::at(0.0, 0.0, 2.1));
+        let image = render(&looking_forward(), &[wall]);
+        assert!(image.depth.iter().all(|d| (d - 2.0).abs() < 1e-4));
+    }
+
+    #[test]
+    fn the_nearer_body_hides_the_farther_and_empty_pixels_are_zero() {
+        let far = Body::new(&Shape::Box { size: [1.0, 1.0, 0.2] }, &ModelPose::at(0.0, 0.0, 2.1));
+        let near = Body::new(&Shape::Cylinder { radius: 0.1, length: 0.4 }, &ModelPose::at(0.0, 0.0, 1.2));
+        for bodies in [[far.clone(), near.clone()], [near, far]] {
+            let image = render(&looking_forward(), &bodies);
+            assert!((image.at(160, 120).unwrap() - 1.0).abs() < 1e-3);
+            assert!((image.at(160, 152).unwrap() - 2.0).abs() < 1e-3);
+            assert_eq!(image.at(0, 0), None);
+        }
+    }
+
+    #[test]
+    fn a_body_that_reaches_behind_the_camera_is_seen() {
+        let floor = Body::new(&Shape::Box { size: [4.0, 0.2, 20.0] }, &ModelPose::at(0.0, 1.1, 0.0));
+        let image = render(&looking_forward(), &[floor]);
+        let ray = Intrinsics::DEFAULT.ray(160, 239);
+        assert!((image.at(160, 239).unwrap() - 1.0 / ray[1]).abs() < 1e-3);
+    }
+}

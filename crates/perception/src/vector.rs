@@ -1,0 +1,36 @@
+//! The few operations on points that detection needs.
+
+/// A point or a direction, in metres.
+pub(crate) type Vector = [f64; 3];
+
+pub(crate) fn sub(a: Vector, b: Vector) -> Vector {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+pub(crate) fn scale(a: Vector, k: f64) -> Vector {
+    [a[0] * k, a[1] * k, a[2] * k]
+}
+
+pub(crate) fn dot(a: Vector, b: Vector) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+pub(crate) fn cross(a: Vector, b: Vector) -> Vector {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+pub(crate) fn length(a: Vector) -> f64 {
+    dot(a, a).sqrt()
+}
+
+/// The median; reorders its argument. `None` of nothing.
+pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
+    quantile(values, 0.5)
+}
+
+/// The value below which a fraction of the values lies; reorders its argument. `None` of nothing.
+pub(crate) fn quantile(values: &mut [f64], fraction: f64) -> Option<f64> {
+    let last = values.len().checked_sub(1)?;
+    let index = ((last as f64) * fraction.clamp(0.0, 1.0)).round() as usize;
+    Some(*values.select_nth_unstable_by(index, f64::total_cmp).1)
+}
