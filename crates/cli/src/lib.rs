@@ -1,6 +1,35 @@
 //! The command of the user, as a library so that tests run the same code.
+//!
+//! [`main`] reads the command line and runs one of the commands in `command/`. Task control (`task_control/`) is the shell
+//! around `ratn-executive`; `system/` starts and finds the other processes; `report/` reads event logs.
+//! Results go to stdout, everything else to stderr. Exit code 0 is success, 1 a failure, 2 something refused before anything
+//! was started: a task file, a config or a command line.
+
+mod arguments;
+mod command;
+mod failure;
+mod report;
+mod system;
+mod task_control;
+
+use clap::Parser;
+use std::process::ExitCode;
 
 /// Runs the command line of this process.
-pub fn main() -> std::process::ExitCode {
-    std::process::ExitCode::SUCCESS
+pub fn main() -> ExitCode {
+    let arguments = match arguments::Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            // clap gives 0 to --help and --version and 2 to a usage error, as we want it.
+            let _ = error.print();
+            return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(1));
+        }
+    };
+    match command::run(arguments.command) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("{failure}");
+            failure.exit_code()
+        }
+    }
 }

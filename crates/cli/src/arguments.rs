@@ -1,0 +1,273 @@
+//! The command line.
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use std::path::PathBuf;
+
+/// Runs robot tasks, written as sequential state machines, as fast as their real dependencies allow.
+#[derive(Debug, Parser)]
+#[command(name = "ratn", version, arg_required_else_help = true)]
+pub(crate) struct Arguments {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Fetch boxes in the simulated cell three times (HSM, CDTN with one planner, CDTN with several) and compare
+    Demo(DemoArguments),
+    /// Start a whole system on this machine and keep it running in the foreground
+    Up(UpArguments),
+    /// Run a task on a running system, or on one started for it
+    Run(RunArguments),
+    /// Check a task file without starting anything
+    Check(CheckArguments),
+    /// Say where the time of a run went, from its event log
+    Report(ReportArguments),
+    /// Replay the paper's tables in virtual time
+    Tables(TablesArguments),
+    /// Own the resources: who has what, and who waits (host compute)
+    ResourceManager(RoleArguments),
+    /// Hold the root world model and its projections (host compute)
+    WorldPool(RoleArguments),
+    /// Spawn and watch this host's worker processes
+    ProcessManager(ProcessManagerArguments),
+    /// Be the simulated cell: robot, table, boxes, sensors, controllers (host sim)
+    Cell(CellArguments),
+    /// Be a worker process; the process manager starts these
+    Worker(WorkerArguments),
+}
+
+/// What every daemon takes.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct RoleArguments {
+    /// The system's config, TOML; without it the built-in default
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Read the config, say whether it is good, and end
+    #[arg(long)]
+    pub(crate) check_config: bool,
+    /// Where endpoint files are; $RATN_RUNTIME_DIR, $XDG_RUNTIME_DIR/ratn or /tmp/ratn-UID unless given
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+    /// Where to listen: `127.0.0.1:0`, `unix:/path`; the config's unless given
+    #[arg(long, value_name = "ADDRESS")]
+    pub(crate) listen: Option<String>,
+    /// End when standard input ends: whoever started this is gone
+    #[arg(long)]
+    pub(crate) exit_with_parent: bool,
+    /// Robot's seconds per second; the config's unless given
+    #[arg(long, value_name = "X")]
+    pub(crate) speed: Option<f64>,
+}
+
+/// How tasks are executed, on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum ModeArgument {
+    /// One state after the other, as written
+    Hsm,
+    /// As parallel as its dependencies allow
+    Cdtn,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ProcessManagerArguments {
+    #[command(flatten)]
+    pub(crate) role: RoleArguments,
+    /// Keep this many workers of a template, `path-planner=2`; may be repeated
+    #[arg(long = "pool", value_name = "TEMPLATE=N", value_parser = pool_size)]
+    pub(crate) pools: Vec<(String, u32)>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct CellArguments {
+    #[command(flatten)]
+    pub(crate) role: RoleArguments,
+    /// Boxes on the table
+    #[arg(long, value_name = "N")]
+    pub(crate) boxes: Option<usize>,
+    /// What the boxes' places and the sensors' noise are derived from
+    #[arg(long, value_name = "N")]
+    pub(crate) seed: Option<u64>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct WorkerArguments {
+    /// What it does
+    #[arg(value_enum)]
+    pub(crate) kind: WorkerKind,
+    /// Its resource's id, `path-planner-1@compute`
+    #[arg(long, value_name = "ID", default_value = "")]
+    pub(crate) id: String,
+    #[command(flatten)]
+    pub(crate) role: RoleArguments,
+}
+
+/// The bundled workers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum WorkerKind {
+    /// Plans motions of the arm
+    PathPlanner,
+    /// Finds boxes in depth images
+    Detector,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct CheckArguments {
+    /// The task file
+    #[arg(value_name = "TASK")]
+    pub(crate) task: PathBuf,
+    /// The system to check it against; without it the built-in default
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ReportArguments {
+    /// The event log
+    #[arg(value_name = "LOG")]
+    pub(crate) log: PathBuf,
+    /// Print one JSON document
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Write a Gantt chart; `.svg` or HTML
+    #[arg(long, value_name = "FILE")]
+    pub(crate) gantt: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct TablesArguments {
+    /// Print one JSON array
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Write a Gantt chart of every run into this folder
+    #[arg(long, value_name = "DIR")]
+    pub(crate) gantt: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct RunArguments {
+    /// The task file
+    #[arg(value_name = "TASK")]
+    pub(crate) task: PathBuf,
+    /// How it is executed
+    #[arg(long, value_enum, default_value = "cdtn")]
+    pub(crate) mode: ModeArgument,
+    /// Give a parameter of the task a value, `boxes=3`; may be repeated
+    #[arg(long = "set", value_name = "NAME=VALUE")]
+    pub(crate) set: Vec<String>,
+    /// Write the event log here
+    #[arg(long, value_name = "FILE")]
+    pub(crate) log: Option<PathBuf>,
+    /// Write a Gantt chart; `.svg` or HTML
+    #[arg(long, value_name = "FILE")]
+    pub(crate) gantt: Option<PathBuf>,
+    /// What every random choice is derived from
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub(crate) seed: u64,
+    /// The system's config, TOML; without it the built-in default
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Where a running system's endpoint files are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+    /// Robot's seconds per second; a running system's own or the config's unless given
+    #[arg(long, value_name = "X", value_parser = speed)]
+    pub(crate) speed: Option<f64>,
+    /// Print one JSON document on standard output
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct UpArguments {
+    /// The system's config, TOML; without it the built-in default
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Where the endpoint files go
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) system: SystemArguments,
+}
+
+/// What differs from a system's config.
+#[derive(Debug, Clone, Default, Args)]
+pub(crate) struct SystemArguments {
+    /// Boxes on the cell's table
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=9))]
+    pub(crate) boxes: Option<u32>,
+    /// Path planner processes
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=32))]
+    pub(crate) planners: Option<u32>,
+    /// Robot's seconds per second
+    #[arg(long, value_name = "X", value_parser = speed)]
+    pub(crate) speed: Option<f64>,
+    /// What the boxes' places and the sensors' noise are derived from
+    #[arg(long, value_name = "N")]
+    pub(crate) seed: Option<u64>,
+}
+
+/// What planners may do with their time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Budget {
+    /// The time that the task gives them: as long as the paper's planners took
+    Task,
+    /// What they need for a path, no more
+    None,
+    /// One row for each
+    Both,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct DemoArguments {
+    /// Boxes to fetch
+    #[arg(long, value_name = "1..9", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=9))]
+    pub(crate) boxes: u32,
+    /// Path planner processes of the last run
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=32))]
+    pub(crate) planners: u32,
+    /// Robot's seconds per second
+    #[arg(long, value_name = "X", default_value_t = 8.0, value_parser = speed)]
+    pub(crate) speed: f64,
+    /// What planners may do with their time
+    #[arg(long, value_enum, default_value = "both")]
+    pub(crate) budget: Budget,
+    /// What everything random is derived from
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub(crate) seed: u64,
+    /// Print one JSON document on standard output
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Where event logs and charts go; a new folder under the system's temporary one unless given
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// The system's config, TOML; without it the built-in default
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+}
+
+const SLOWEST: f64 = 0.01;
+const FASTEST: f64 = 1000.0;
+
+fn speed(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(x) if (SLOWEST..=FASTEST).contains(&x) => Ok(x),
+        _ => Err(format!("expected a number from {SLOWEST} to {FASTEST}")),
+    }
+}
+
+fn pool_size(text: &str) -> Result<(String, u32), String> {
+    let pair = text.split_once('=').and_then(|(template, n)| Some((template.to_owned(), n.parse().ok()?)));
+    pair.ok_or_else(|| "expected TEMPLATE=N".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_well_formed() {
+        use clap::CommandFactory;
+        Arguments::command().debug_assert();
+    }
+}

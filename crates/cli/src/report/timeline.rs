@@ -1,0 +1,262 @@
+//! An event log folded into what each instance did when: the common ground of statistics and charts.
+//!
+//! Everything is in the robot's seconds since the start of the run. Only what the log says is used, so a log can be read
+//! without the task file and the system that made it.
+
+use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Mode, Note};
+use ratn_model::id::InstanceId;
+use ratn_model::program::WORLD_MODEL;
+use ratn_model::value::Value;
+use serde::Serialize;
+use std::collections::BTreeMap;
+
+/// A run, as its log tells it.
+#[derive(Debug, Clone)]
+pub(crate) struct Timeline {
+    pub(crate) task: String,
+    pub(crate) mode: Mode,
+    pub(crate) seed: u64,
+    pub(crate) parameters: BTreeMap<String, Value>,
+    /// `None` when the log ends before the run does.
+    pub(crate) outcome: Option<String>,
+    pub(crate) reason: String,
+    pub(crate) outputs: BTreeMap<String, Value>,
+    /// When the run (or the log) ends.
+    pub(crate) end_s: f64,
+    /// In the order of expansion.
+    pub(crate) instances: Vec<Instance>,
+}
+
+/// One visit of a state.
+#[derive(Debug, Clone)]
+pub(crate) struct Instance {
+    pub(crate) id: InstanceId,
+    /// With visit numbers, `place_all[2]/plan_transfer`.
+    pub(crate) path: String,
+    pub(crate) waits: Vec<Wait>,
+    pub(crate) jobs: Vec<Job>,
+    pub(crate) finished: bool,
+    pub(crate) retired: bool,
+    pub(crate) squashed: bool,
+}
+
+/// From asking for resources to their grant.
+#[derive(Debug, Clone)]
+pub(crate) struct Wait {
+    pub(crate) from_s: f64,
+    pub(crate) to_s: f64,
+    /// What was granted in the end.
+    pub(crate) resources: Vec<String>,
+}
+
+/// From giving a provider a goal to its end.
+#[derive(Debug, Clone)]
+pub(crate) struct Job {
+    pub(crate) provider: String,
+    pub(crate) action: String,
+    pub(crate) activity: Activity,
+    pub(crate) attempt: u32,
+    pub(crate) from_s: f64,
+    pub(crate) to_s: f64,
+    pub(crate) ending: Ending,
+    /// Ids of the resources that it held, room for projections left out; first the performing one.
+    pub(crate) resources: Vec<String>,
+    pub(crate) outputs: BTreeMap<String, Value>,
+    /// Some instance that was expanded earlier had not finished when this began.
+    pub(crate) ahead_of_time: bool,
+}
+
+/// What a job is, as far as a log tells.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Activity {
+    /// It changes the environment.
+    Motion,
+    /// It looks at the environment.
+    Detection,
+    /// It works on a projection.
+    Planning,
+}
+
+/// How a job ended.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Ending {
+    /// With an outcome and, when it is not success, the reason.
+    Outcome(String, String),
+    /// Without an answer.
+    Crashed(String),
+    /// It was told to stop.
+    Cancelled,
+    /// The log ends before it.
+    Open,
+}
+
+/// Kinds whose holder looks at the environment.
+const LOOKING: [&str; 2] = ["Camera", "Detector"];
+
+impl Timeline {
+    /// Folds a log.
+    pub(crate) fn of(lines: &[LogLine]) -> Timeline {
+        let mut fold = Fold::default();
+        for line in lines {
+            let at = line.at.seconds();
+            fold.run.end_s = fold.run.end_s.max(at);
+            match &line.entry {
+                LogEntry::Event(event) => fold.event(at, event),
+                LogEntry::Command(command) => fold.command(at, command),
+            }
+        }
+        let mut run = fold.run;
+        for job in run.instances.iter_mut().flat_map(|i| &mut i.jobs).filter(|j| j.ending == Ending::Open) {
+            job.to_s = run.end_s;
+        }
+        run
+    }
+
+    /// Every job with its instance.
+    pub(crate) fn jobs(&self) -> impl Iterator<Item = (&Instance, &Job)> {
+        self.instances.iter().flat_map(|instance| instance.jobs.iter().map(move |job| (instance, job)))
+    }
+}
+
+#[derive(Debug)]
+struct Fold {
+    run: Timeline,
+    index: BTreeMap<InstanceId, usize>,
+    asked: BTreeMap<InstanceId, f64>,
+}
+
+impl Default for Fold {
+    fn default() -> Self {
+        let run = Timeline {
+            task: String::new(),
+            mode: Mode::Hsm,
+            seed: 0,
+            parameters: BTreeMap::new(),
+            outcome: None,
+            reason: String::new(),
+            outputs: BTreeMap::new(),
+            end_s: 0.0,
+            instances: Vec::new(),
+        };
+        Fold { run, index: BTreeMap::new(), asked: BTreeMap::new() }
+    }
+}
+
+impl Fold {
+    fn event(&mut self, at: f64, event: &Event) {
+        match event {
+            Event::Started { task, mode, parameters, seed, .. } => {
+                self.run.task.clone_from(task);
+                self.run.mode = *mode;
+                self.run.parameters.clone_from(parameters);
+                self.run.seed = *seed;
+            }
+            Event::Granted { instance, lease } => {
+                if let Some(from_s) = self.asked.remove(instance) {
+                    let resources = named(lease.resources.iter().map(|r| (r.kind.as_str(), r.id.as_str())));
+                    self.instance(*instance).waits.push(Wait { from_s, to_s: at, resources });
+                }
+            }
+            Event::Refused { instance, .. } => {
+                self.asked.remove(instance);
+            }
+            Event::Finished { instance, attempt, outcome, outputs, reason, .. } => {
+                self.end(*instance, *attempt, at, Ending::Outcome(outcome.clone(), reason.clone()), outputs);
+            }
+            Event::Crashed { instance, attempt, reason } => {
+                self.end(*instance, *attempt, at, Ending::Crashed(reason.clone()), &BTreeMap::new());
+            }
+            Event::Projected { .. }
+            | Event::Progressed { .. }
+            | Event::RetirementFailed { .. }
+            | Event::AbortRequested { .. } => {}
+        }
+    }
+
+    fn command(&mut self, at: f64, command: &Command) {
+        match command {
+            Command::Note(Note::Expanded { instance, path, .. }) => {
+                self.instance(*instance).path.clone_from(path);
+            }
+            Command::Note(Note::Finished { instance, .. }) => self.instance(*instance).finished = true,
+            Command::Note(Note::Retired { instance }) => self.instance(*instance).retired = true,
+            Command::Note(Note::Squashed { instance }) => self.instance(*instance).squashed = true,
+            Command::Note(_) => {}
+            Command::Acquire { instance, .. } => {
+                self.asked.insert(*instance, at);
+            }
+            Command::Withdraw { instance } => {
+                self.asked.remove(instance);
+            }
+            Command::Start { instance, attempt, goal } => {
+                let leased = goal.lease.iter().flat_map(|lease| &lease.resources);
+                let looks = leased.clone().any(|r| LOOKING.contains(&r.kind.as_str()));
+                let activity = match (goal.projection.is_some(), looks) {
+                    (true, _) => Activity::Planning,
+                    (false, true) => Activity::Detection,
+                    (false, false) => Activity::Motion,
+                };
+                let ahead_of_time = self
+                    .run
+                    .instances
+                    .iter()
+                    .any(|other| other.id < *instance && !(other.finished || other.retired || other.squashed));
+                let job = Job {
+                    provider: goal.provider.clone(),
+                    action: goal.action.clone(),
+                    activity,
+                    attempt: *attempt,
+                    from_s: at,
+                    to_s: at,
+                    ending: Ending::Open,
+                    resources: named(leased.map(|r| (r.kind.as_str(), r.id.as_str()))),
+                    outputs: BTreeMap::new(),
+                    ahead_of_time,
+                };
+                self.instance(*instance).jobs.push(job);
+            }
+            Command::Cancel { instance, attempt } => {
+                self.end(*instance, *attempt, at, Ending::Cancelled, &BTreeMap::new());
+            }
+            Command::End { outcome, outputs, reason } => {
+                self.run.outcome = Some(outcome.clone());
+                self.run.outputs.clone_from(outputs);
+                self.run.reason.clone_from(reason);
+            }
+            Command::Project { .. } | Command::Release { .. } | Command::Commit { .. } | Command::Operate { .. } => {}
+        }
+    }
+
+    fn end(&mut self, id: InstanceId, attempt: u32, at: f64, ending: Ending, outputs: &BTreeMap<String, Value>) {
+        let open = |job: &&mut Job| job.ending == Ending::Open && job.attempt == attempt;
+        if let Some(job) = self.instance(id).jobs.iter_mut().rev().find(open) {
+            job.to_s = at;
+            job.ending = ending;
+            job.outputs.clone_from(outputs);
+        }
+    }
+
+    fn instance(&mut self, id: InstanceId) -> &mut Instance {
+        let instances = &mut self.run.instances;
+        let index = *self.index.entry(id).or_insert_with(|| {
+            let path = id.to_string();
+            instances.push(Instance {
+                id,
+                path,
+                waits: vec![],
+                jobs: vec![],
+                finished: false,
+                retired: false,
+                squashed: false,
+            });
+            instances.len() - 1
+        });
+        &mut instances[index]
+    }
+}
+
+/// Ids of resources; room for projections is no place where something happens.
+fn named<'a>(resources: impl Iterator<Item = (&'a str, &'a str)>) -> Vec<String> {
+    resources.filter(|(kind, _)| *kind != WORLD_MODEL).map(|(_, id)| id.to_owned()).collect()
+}

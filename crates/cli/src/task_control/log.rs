@@ -1,0 +1,179 @@
+//! The event log: one JSON object per line, every event that the executive was given and every command that it gave.
+//!
+//! It is the single source of Gantt charts, statistics, replay and resume, so each line is on its way to the file before the
+//! commands of its event are performed. Reading says which line is wrong and why; a torn last line (the writer was killed) is
+//! named as such.
+
+use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
+use ratn_model::time::Timestamp;
+use std::fs::File;
+use std::io::{BufRead, BufReader, BufWriter, Read, Write};
+use std::path::{Path, PathBuf};
+
+/// A longer line is not written by any task; whoever wrote it is not `ratn`.
+const MAX_LINE_BYTES: usize = 16 << 20;
+/// A run whose log grows beyond this is ended rather than filling the disk.
+const MAX_LOG_BYTES: u64 = 4 << 30;
+
+/// Why an event log cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum LogError {
+    #[error("cannot {what} the event log {}", path.display())]
+    Io { what: &'static str, path: PathBuf, source: std::io::Error },
+    #[error("the event log {} would grow beyond {MAX_LOG_BYTES} bytes; the run ends here", path.display())]
+    TooLong { path: PathBuf },
+    #[error(
+        "{}:{line}: the last line is torn (its writer was interrupted); remove it to read what is before it",
+        path.display()
+    )]
+    Torn { path: PathBuf, line: usize },
+    #[error("{}:{line}: not a line of an event log: {reason}", path.display())]
+    Foreign { path: PathBuf, line: usize, reason: String },
+    #[error("{} is empty: an event log begins with the event `started`", path.display())]
+    Empty { path: PathBuf },
+}
+
+/// Writes an event log.
+#[derive(Debug)]
+pub(crate) struct LogWriter {
+    path: PathBuf,
+    file: BufWriter<File>,
+    written: u64,
+}
+
+impl LogWriter {
+    /// Creates the file, or empties it.
+    pub(crate) fn create(path: &Path) -> Result<Self, LogError> {
+        let file =
+            File::create(path).map_err(|source| LogError::Io { what: "create", path: path.to_owned(), source })?;
+        Ok(LogWriter { path: path.to_owned(), file: BufWriter::new(file), written: 0 })
+    }
+
+    /// Writes what happened and what was decided then, and hands it to the operating system.
+    pub(crate) fn append(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Result<(), LogError> {
+        self.write(&LogLine { at, entry: LogEntry::Event(event.clone()) })?;
+        for command in commands {
+            self.write(&LogLine { at, entry: LogEntry::Command(command.clone()) })?;
+        }
+        self.file.flush().map_err(|source| self.io(source))
+    }
+
+    fn write(&mut self, line: &LogLine) -> Result<(), LogError> {
+        let mut text = serde_json::to_vec(line).map_err(|source| self.io(source.into()))?;
+        text.push(b'\n');
+        self.written += text.len() as u64;
+        if self.written > MAX_LOG_BYTES {
+            return Err(LogError::TooLong { path: self.path.clone() });
+        }
+        self.file.write_all(&text).map_err(|source| self.io(source))
+    }
+
+    fn io(&self, source: std::io::Error) -> LogError {
+        LogError::Io { what: "write", path: self.path.clone(), source }
+    }
+}
+
+/// Reads a whole event log.
+///
+/// # Errors
+/// [`LogError`] names the line.
+pub(crate) fn read(path: &Path) -> Result<Vec<LogLine>, LogError> {
+    let io = |source| LogError::Io { what: "read", path: path.to_owned(), source };
+    let mut reader = BufReader::new(File::open(path).map_err(io)?);
+    let mut lines = Vec::new();
+    let mut text = Vec::new();
+    loop {
+        text.clear();
+        let limit = MAX_LINE_BYTES as u64 + 1;
+        let length = reader.by_ref().take(limit).read_until(b'\n', &mut text).map_err(io)?;
+        if length == 0 {
+            break;
+        }
+        let line = lines.len() + 1;
+        let foreign = |reason: String| LogError::Foreign { path: path.to_owned(), line, reason };
+        if text.last() != Some(&b'\n') {
+            if length as u64 == limit {
+                return Err(foreign(format!("longer than {MAX_LINE_BYTES} bytes")));
+            }
+            return Err(LogError::Torn { path: path.to_owned(), line });
+        }
+        let parsed: LogLine = serde_json::from_slice(&text)
+            .map_err(|error| foreign(explain(&text, &error)))?;
+        if lines.is_empty() && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
+            return Err(foreign("an event log begins with the event `started`".into()));
+        }
+        lines.push(parsed);
+    }
+    if lines.is_empty() {
+        return Err(LogError::Empty { path: path.to_owned() });
+    }
+    Ok(lines)
+}
+
+/// serde's message for an untagged enum says nothing; this one says what the line claims to be.
+fn explain(text: &[u8], error: &serde_json::Error) -> String {
+    let Ok(value) = serde_json::from_slice::<serde_json::Value>(text) else {
+        return format!("not JSON: {error}");
+    };
+    if value.get("at").is_none() {
+        return "it has no time `at`".into();
+    }
+    let known = ["event", "command"].iter().find_map(|key| Some((*key, value.get(key)?)));
+    match known {
+        Some(("event", _)) => said(serde_json::from_value::<Event>(value.clone()).err(), "event"),
+        Some((_, _)) => said(serde_json::from_value::<Command>(value.clone()).err(), "command"),
+        None => "it has neither `event` nor `command`".into(),
+    }
+}
+
+fn said(error: Option<serde_json::Error>, what: &str) -> String {
+    error.map_or_else(|| format!("not a {what} of this version"), |error| format!("not a known {what}: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_executive::protocol::{Mode, Note};
+    use ratn_model::id::{InstanceId, Revision};
+
+    fn started() -> Event {
+        Event::Started {
+            task: "t".into(),
+            digest: "d".into(),
+            mode: Mode::Cdtn,
+            parameters: Default::default(),
+            seed: 7,
+            world: vec![],
+            revision: Revision(3),
+        }
+    }
+
+    fn refusal(text: &str) -> String {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        read(file.path()).unwrap_err().to_string().replace(&file.path().display().to_string(), "LOG")
+    }
+
+    #[test]
+    fn a_log_reads_back_as_written() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let mut log = LogWriter::create(file.path()).unwrap();
+        let command = Command::Note(Note::Retired { instance: InstanceId(1) });
+        log.append(Timestamp(0), &started(), std::slice::from_ref(&command)).unwrap();
+        let lines = read(file.path()).unwrap();
+        assert_eq!(lines[0], LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) });
+        assert_eq!(lines[1], LogLine { at: Timestamp(0), entry: LogEntry::Command(command) });
+    }
+
+    #[test]
+    fn a_torn_or_foreign_line_is_named() {
+        let first = serde_json::to_string(&LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) }).unwrap();
+        assert!(refusal(&format!("{first}\n{{\"at\":1,")).starts_with("LOG:2: the last line is torn"));
+        assert!(refusal(&format!("{first}\nhello\n")).starts_with("LOG:2: not a line of an event log: not JSON"));
+        let strange = format!("{first}\n{{\"at\":1,\"event\":\"rained\"}}\n");
+        assert!(refusal(&strange).starts_with("LOG:2: not a line of an event log: not a known event: unknown variant"));
+        assert!(refusal("").contains("is empty"));
+        assert!(refusal("{\"at\":1,\"command\":\"note\",\"note\":\"retired\",\"instance\":1}\n").contains("begins with"));
+    }
+}
