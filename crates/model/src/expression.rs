@@ -6,6 +6,7 @@
 //! - [`scope`]: where names get their values
 //! - [`evaluate`]: expression → value; [`function`] holds the built-ins
 //! - [`bind`]: facts, effects and resources with their arguments evaluated; which facts an effect may write
+//! - [`parse`]: text → expression
 //! - [`walk`]: what an expression mentions
 //! - [`display`]: back to text, for messages
 
@@ -13,7 +14,9 @@ pub mod bind;
 pub mod display;
 pub mod evaluate;
 pub mod function;
+pub mod parse;
 pub mod scope;
+mod token;
 pub mod walk;
 
 pub use evaluate::EvaluateError;

@@ -1,0 +1,635 @@
+//! Text → expression, by recursive descent.
+//!
+//! ```text
+//! or         = and { "or" and }
+//! and        = not { "and" not }
+//! not        = "not" not | comparison
+//! comparison = sum [ ("=" | "==" | "!=" | "<" | "<=" | ">" | ">=" | "in") sum ]
+//! sum        = product { ("+" | "-") product }
+//! product    = unary { ("*" | "/") unary }
+//! unary      = "-" unary | postfix
+//! postfix    = primary { "." name | "[" or "]" }
+//! primary    = number | text | "true" | "false" | "null" | "$"name | "(" or ")" | "[" list "]" | "{" name ":" or … "}"
+//!            | "exists" fact | function "(" list ")" | fact | state "." port | individual
+//! fact       = predicate "(" [ ("?" | or) { "," ("?" | or) } ] ")"
+//! effect     = ["set"] fact ["=" or] | ("delete" | "not") fact | ("increase" | "decrease") fact "by" or
+//! ```
+//!
+//! What a name stands for is asked of [`Names`]. Text, nesting and the height of the tree are bounded, so that neither
+//! parsing nor evaluating can exhaust the stack.
+
+use super::display::KEYWORDS;
+use super::token::{Token, tokens};
+use super::{BinaryOperator, EffectExpr, Expr, FactExpr, Function, UnaryOperator};
+use crate::value::Value;
+
+/// The longest text of an expression, in characters.
+pub const MAX_TEXT: usize = 10_000;
+/// How deep brackets and prefixes may nest.
+const MAX_NESTING: usize = 48;
+/// How high the tree may grow (a chain of n operators has height n).
+const MAX_HEIGHT: usize = 128;
+
+/// The rule of an error of syntax; names that are not found have rules of their own.
+pub const INVALID_EXPRESSION: &str = "invalid-expression";
+
+/// Why a text is no expression.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{message}")]
+pub struct ParseError {
+    /// Where, in characters from the start of the text.
+    pub offset: usize,
+    /// Which rule of `check` it breaks.
+    pub rule: &'static str,
+    /// What is wrong.
+    pub message: String,
+    /// What to do; empty where the message says it.
+    pub help: String,
+}
+
+/// Why a name stands for nothing here.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NameError {
+    /// Which rule of `check` it breaks.
+    pub rule: &'static str,
+    /// What is wrong.
+    pub message: String,
+    /// What to do.
+    pub help: String,
+}
+
+/// What the names in an expression stand for.
+pub trait Names {
+    /// `$name`
+    ///
+    /// # Errors
+    /// No such variable is visible here.
+    fn variable(&mut self, name: &str) -> Result<Expr, NameError>;
+    /// A bare word: an output of the state itself where that is allowed, else `None` for the individual of that name.
+    fn word(&mut self, word: &str) -> Option<Expr>;
+    /// `state.port`
+    ///
+    /// # Errors
+    /// No such port can be used here.
+    fn port(&mut self, state: &str, port: &str) -> Result<Expr, NameError>;
+}
+
+impl ParseError {
+    pub(crate) fn syntax(offset: usize, message: impl Into<String>) -> ParseError {
+        ParseError { offset, rule: INVALID_EXPRESSION, message: message.into(), help: String::new() }
+    }
+
+    fn name(offset: usize, error: NameError) -> ParseError {
+        ParseError { offset, rule: error.rule, message: error.message, help: error.help }
+    }
+}
+
+/// Parses an expression.
+///
+/// # Errors
+/// [`ParseError`] at the first place that does not fit.
+pub fn parse_expression(text: &str, names: &mut dyn Names) -> Result<Expr, ParseError> {
+    parse(text, names, |parser| Ok(parser.or()?.expr))
+}
+
+/// Parses `predicate(a, ?)`.
+///
+/// # Errors
+/// As [`parse_expression`].
+pub fn parse_fact(text: &str, names: &mut dyn Names) -> Result<FactExpr, ParseError> {
+    parse(text, names, |parser| Ok(parser.fact()?.0))
+}
+
+/// Parses an effect.
+///
+/// # Errors
+/// As [`parse_expression`].
+pub fn parse_effect(text: &str, names: &mut dyn Names) -> Result<EffectExpr, ParseError> {
+    parse(text, names, |parser| parser.effect())
+}
+
+fn parse<T>(
+    text: &str,
+    names: &mut dyn Names,
+    what: impl FnOnce(&mut Parser<'_>) -> Result<T, ParseError>,
+) -> Result<T, ParseError> {
+    if text.chars().nth(MAX_TEXT).is_some() {
+        return Err(ParseError::syntax(0, format!("an expression has at most {MAX_TEXT} characters")));
+    }
+    let mut parser = Parser { tokens: tokens(text)?, next: 0, nesting: 0, names };
+    let result = what(&mut parser)?;
+    match parser.peek() {
+        Token::End => Ok(result),
+        other => Err(parser.unexpected(&format!("expected an operator or the end, found {}", other.described()))),
+    }
+}
+
+/// A tree and its height.
+struct Tree {
+    expr: Expr,
+    height: usize,
+}
+
+struct Parser<'a> {
+    tokens: Vec<(usize, Token)>,
+    next: usize,
+    nesting: usize,
+    names: &'a mut dyn Names,
+}
+
+type Parsed = Result<Tree, ParseError>;
+
+impl Parser<'_> {
+    fn peek(&self) -> &Token {
+        self.tokens.get(self.next).map_or(&Token::End, |(_, token)| token)
+    }
+
+    fn peek_after(&self) -> &Token {
+        self.tokens.get(self.next + 1).map_or(&Token::End, |(_, token)| token)
+    }
+
+    fn offset(&self) -> usize {
+        self.tokens.get(self.next).or(self.tokens.last()).map_or(0, |(offset, _)| *offset)
+    }
+
+    fn advance(&mut self) -> Token {
+        let token = self.peek().clone();
+        self.next += 1;
+        token
+    }
+
+    fn takes(&mut self, symbol: &str) -> bool {
+        let found = matches!(self.peek(), Token::Symbol(s) if *s == symbol);
+        self.next += usize::from(found);
+        found
+    }
+
+    fn takes_word(&mut self, word: &str) -> bool {
+        let found = matches!(self.peek(), Token::Word(w) if w == word);
+        self.next += usize::from(found);
+        found
+    }
+
+    fn expects(&mut self, symbol: &str) -> Result<(), ParseError> {
+        if self.takes(symbol) {
+            return Ok(());
+        }
+        Err(self.unexpected(&format!("expected `{symbol}`, found {}", self.peek().described())))
+    }
+
+    fn unexpected(&self, message: &str) -> ParseError {
+        ParseError::syntax(self.offset(), message)
+    }
+
+    fn node(&self, expr: Expr, below: usize) -> Parsed {
+        if below >= MAX_HEIGHT {
+            return Err(self.unexpected("the expression is too large; split it"));
+        }
+        Ok(Tree { expr, height: below + 1 })
+    }
+
+    fn nested<T>(&mut self, what: impl FnOnce(&mut Self) -> Result<T, ParseError>) -> Result<T, ParseError> {
+        if self.nesting >= MAX_NESTING {
+            return Err(self.unexpected("brackets and prefixes nest too deep here"));
+        }
+        self.nesting += 1;
+        let result = what(self);
+        self.nesting -= 1;
+        result
+    }
+
+    fn binary(&mut self, operator: BinaryOperator, a: Tree, b: Tree) -> Parsed {
+        let below = a.height.max(b.height);
+        self.node(Expr::Binary(operator, Box::new(a.expr), Box::new(b.expr)), below)
+    }
+
+    fn or(&mut self) -> Parsed {
+        let mut tree = self.and()?;
+        while self.takes_word("or") {
+            let right = self.and()?;
+            tree = self.binary(BinaryOperator::Or, tree, right)?;
+        }
+        Ok(tree)
+    }
+
+    fn and(&mut self) -> Parsed {
+        let mut tree = self.not()?;
+        while self.takes_word("and") {
+            let right = self.not()?;
+            tree = self.binary(BinaryOperator::And, tree, right)?;
+        }
+        Ok(tree)
+    }
+
+    fn not(&mut self) -> Parsed {
+        if self.takes_word("not") {
+            let operand = self.nested(Parser::not)?;
+            return self.node(Expr::Unary(UnaryOperator::Not, Box::new(operand.expr)), operand.height);
+        }
+        let left = self.sum()?;
+        let Some(operator) = self.comparison() else { return Ok(left) };
+        let right = self.sum()?;
+        let tree = self.binary(operator, left, right)?;
+        let at = self.offset();
+        if self.comparison().is_some() {
+            return Err(ParseError::syntax(at, "comparisons do not chain; join two with `and`"));
+        }
+        Ok(tree)
+    }
+
+    fn comparison(&mut self) -> Option<BinaryOperator> {
+        let operator = match self.peek() {
+            Token::Symbol("=" | "==") => BinaryOperator::Equal,
+            Token::Symbol("!=") => BinaryOperator::NotEqual,
+            Token::Symbol("<") => BinaryOperator::Less,
+            Token::Symbol("<=") => BinaryOperator::LessOrEqual,
+            Token::Symbol(">") => BinaryOperator::Greater,
+            Token::Symbol(">=") => BinaryOperator::GreaterOrEqual,
+            Token::Word(word) if word == "in" => BinaryOperator::In,
+            _ => return None,
+        };
+        self.next += 1;
+        Some(operator)
+    }
+
+    fn sum(&mut self) -> Parsed {
+        let mut tree = self.product()?;
+        loop {
+            let operator = match self.peek() {
+                Token::Symbol("+") => BinaryOperator::Add,
+                Token::Symbol("-") => BinaryOperator::Subtract,
+                _ => return Ok(tree),
+            };
+            self.next += 1;
+            let right = self.product()?;
+            tree = self.binary(operator, tree, right)?;
+        }
+    }
+
+    fn product(&mut self) -> Parsed {
+        let mut tree = self.unary()?;
+        loop {
+            let operator = match self.peek() {
+                Token::Symbol("*") => BinaryOperator::Multiply,
+                Token::Symbol("/") => BinaryOperator::Divide,
+                _ => return Ok(tree),
+            };
+            self.next += 1;
+            let right = self.unary()?;
+            tree = self.binary(operator, tree, right)?;
+        }
+    }
+
+    fn unary(&mut self) -> Parsed {
+        if !self.takes("-") {
+            return self.postfix();
+        }
+        let operand = self.nested(Parser::unary)?;
+        match operand.expr {
+            Expr::Literal(Value::Int(i)) => self.node(Expr::Literal(Value::Int(-i)), 0),
+            Expr::Literal(Value::Float(x)) => self.node(Expr::Literal(Value::Float(-x)), 0),
+            expr => self.node(Expr::Unary(UnaryOperator::Negate, Box::new(expr)), operand.height),
+        }
+    }
+
+    fn postfix(&mut self) -> Parsed {
+        let mut tree = self.primary()?;
+        loop {
+            if self.takes(".") {
+                let name = self.name("a field's name after `.`")?;
+                tree = self.node(Expr::Field(Box::new(tree.expr), name), tree.height)?;
+            } else if self.takes("[") {
+                let index = self.nested(Parser::or)?;
+                self.expects("]")?;
+                let below = tree.height.max(index.height);
+                tree = self.node(Expr::Index(Box::new(tree.expr), Box::new(index.expr)), below)?;
+            } else {
+                return Ok(tree);
+            }
+        }
+    }
+
+    fn name(&mut self, what: &str) -> Result<String, ParseError> {
+        match self.peek() {
+            Token::Word(word) => {
+                let word = word.clone();
+                self.next += 1;
+                Ok(word)
+            }
+            other => Err(self.unexpected(&format!("expected {what}, found {}", other.described()))),
+        }
+    }
+
+    fn primary(&mut self) -> Parsed {
+        let at = self.offset();
+        match self.peek().clone() {
+            Token::Word(word) => self.word(at, &word),
+            Token::Int(i) => self.literal(Value::Int(i)),
+            Token::Float(x) => self.literal(Value::Float(x)),
+            Token::Text(text) => self.literal(Value::String(text)),
+            Token::Variable(name) => {
+                self.next += 1;
+                let expr = self.names.variable(&name).map_err(|e| ParseError::name(at, e))?;
+                self.node(expr, 0)
+            }
+            Token::Symbol("(") => {
+                self.next += 1;
+                let inner = self.nested(Parser::or)?;
+                self.expects(")")?;
+                Ok(inner)
+            }
+            Token::Symbol("[") => {
+                self.next += 1;
+                let (items, below) = self.list("]")?;
+                self.node(Expr::List(items), below)
+            }
+            Token::Symbol("{") => self.map(),
+            Token::Symbol("?") => Err(self.unexpected("`?` stands only for an argument of a fact")),
+            other => Err(self.unexpected(&format!("expected a value, found {}", other.described()))),
+        }
+    }
+
+    fn literal(&mut self, value: Value) -> Parsed {
+        self.next += 1;
+        self.node(Expr::Literal(value), 0)
+    }
+
+    fn word(&mut self, at: usize, word: &str) -> Parsed {
+        match word {
+            "true" => return self.literal(Value::Bool(true)),
+            "false" => return self.literal(Value::Bool(false)),
+            "null" => return self.literal(Value::Null),
+            "exists" => {
+                self.next += 1;
+                let (fact, below) = self.fact()?;
+                return self.node(Expr::Exists(fact), below);
+            }
+            _ if KEYWORDS.contains(&word) => {
+                return Err(self.unexpected(&format!("expected a value, found the keyword `{word}`")));
+            }
+            _ => {}
+        }
+        if matches!(self.peek_after(), Token::Symbol("(")) {
+            let Some(function) = Function::named(word) else {
+                let (fact, below) = self.fact()?;
+                return self.node(Expr::Fact(fact), below);
+            };
+            self.next += 2;
+            let (arguments, below) = self.list(")")?;
+            if !function.takes(arguments.len()) {
+                return Err(ParseError::syntax(at, format!("expected `{}`", function.usage())));
+            }
+            return self.node(Expr::Call(function, arguments), below);
+        }
+        self.next += 1;
+        if let Some(expr) = self.names.word(word) {
+            return self.node(expr, 0);
+        }
+        if self.takes(".") {
+            let port = self.name("a port's name after `.`")?;
+            let expr = self.names.port(word, &port).map_err(|e| ParseError::name(at, e))?;
+            return self.node(expr, 0);
+        }
+        self.node(Expr::Literal(Value::String(word.to_owned())), 0)
+    }
+
+    /// Expressions up to a closing bracket; the opening one is behind.
+    fn list(&mut self, close: &str) -> Result<(Vec<Expr>, usize), ParseError> {
+        let (mut items, mut below) = (Vec::new(), 0);
+        while !self.takes(close) {
+            if !items.is_empty() {
+                self.expects(",")?;
+            }
+            let item = self.nested(Parser::or)?;
+            below = below.max(item.height);
+            items.push(item.expr);
+        }
+        Ok((items, below))
+    }
+
+    fn map(&mut self) -> Parsed {
+        self.expects("{")?;
+        let (mut fields, mut below) = (Vec::<(String, Expr)>::new(), 0);
+        while !self.takes("}") {
+            if !fields.is_empty() {
+                self.expects(",")?;
+            }
+            let at = self.offset();
+            let name = match self.advance() {
+                Token::Word(name) | Token::Text(name) => name,
+                other => {
+                    return Err(ParseError::syntax(
+                        at,
+                        format!("expected a field's name, found {}", other.described()),
+                    ));
+                }
+            };
+            if fields.iter().any(|(other, _)| *other == name) {
+                return Err(ParseError::syntax(at, format!("the field `{name}` stands twice")));
+            }
+            self.expects(":")?;
+            let value = self.nested(Parser::or)?;
+            below = below.max(value.height);
+            fields.push((name, value.expr));
+        }
+        self.node(Expr::Map(fields), below)
+    }
+
+    fn fact(&mut self) -> Result<(FactExpr, usize), ParseError> {
+        let at = self.offset();
+        let predicate = self.name("a fact `predicate(argument, …)`")?;
+        if Function::named(&predicate).is_some() || KEYWORDS.contains(&predicate.as_str()) {
+            let message = format!("`{predicate}` is built in and cannot be a predicate");
+            return Err(ParseError::syntax(at, message));
+        }
+        self.expects("(")?;
+        let (mut arguments, mut below) = (Vec::new(), 0);
+        while !self.takes(")") {
+            if !arguments.is_empty() {
+                self.expects(",")?;
+            }
+            if self.takes("?") {
+                arguments.push(None);
+            } else {
+                let argument = self.nested(Parser::or)?;
+                below = below.max(argument.height);
+                arguments.push(Some(argument.expr));
+            }
+        }
+        Ok((FactExpr { predicate, arguments }, below))
+    }
+
+    fn effect(&mut self) -> Result<EffectExpr, ParseError> {
+        let verb = match (self.peek(), self.peek_after()) {
+            (Token::Word(verb), Token::Word(_)) => verb.clone(),
+            _ => String::new(),
+        };
+        self.next += usize::from(!verb.is_empty());
+        let at = self.offset();
+        let effect = match verb.as_str() {
+            "" | "set" => {
+                let (fact, _) = self.fact()?;
+                let value = if self.takes("=") { self.or()?.expr } else { Expr::Literal(Value::Bool(true)) };
+                EffectExpr::Set(fact, value)
+            }
+            "delete" | "not" => return Ok(EffectExpr::Delete(self.fact()?.0)),
+            "increase" | "decrease" => {
+                let (fact, _) = self.fact()?;
+                if !self.takes_word("by") {
+                    return Err(self.unexpected(&format!("expected `by`, found {}", self.peek().described())));
+                }
+                let amount = self.or()?.expr;
+                let by = match verb.as_str() {
+                    "increase" => amount,
+                    _ => Expr::Unary(UnaryOperator::Negate, Box::new(amount)),
+                };
+                EffectExpr::Increase(fact, by)
+            }
+            other => {
+                let message = format!("`{other}` is no effect: expected set, delete, increase or decrease");
+                return Err(ParseError::syntax(0, message));
+            }
+        };
+        let (EffectExpr::Set(fact, _) | EffectExpr::Increase(fact, _)) = &effect else { return Ok(effect) };
+        if fact.arguments.iter().any(Option::is_none) {
+            return Err(ParseError::syntax(at, "a fact that is written needs all its arguments; `?` is not one"));
+        }
+        Ok(effect)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::expression::scope::NothingKnown;
+    use crate::id::StateId;
+    use proptest::prelude::*;
+
+    /// Knows `$box`, the state `plan` with its port `end`, and the own output `width_m`.
+    struct OneState;
+
+    impl Names for OneState {
+        fn variable(&mut self, name: &str) -> Result<Expr, NameError> {
+            if name == "box" { Ok(Expr::Variable(name.to_owned())) } else { Err(unknown("unknown-variable", name)) }
+        }
+
+        fn word(&mut self, word: &str) -> Option<Expr> {
+            (word == "width_m").then(|| Expr::Output(word.to_owned()))
+        }
+
+        fn port(&mut self, state: &str, port: &str) -> Result<Expr, NameError> {
+            match (state, port) {
+                ("plan", "end") => Ok(Expr::Port { state: StateId(7), port: port.to_owned() }),
+                _ => Err(unknown("unknown-port", port)),
+            }
+        }
+    }
+
+    fn unknown(rule: &'static str, name: &str) -> NameError {
+        NameError { rule, message: format!("there is no `{name}`"), help: String::new() }
+    }
+
+    fn printed<T: std::fmt::Display>(result: Result<T, ParseError>) -> String {
+        match result {
+            Ok(parsed) => parsed.to_string(),
+            Err(error) => format!("{}: {} at {}", error.rule, error.message, error.offset),
+        }
+    }
+
+    fn check(text: &str, expect: &str) {
+        assert_eq!(printed(parse_expression(text, &mut OneState)), expect, "{text}");
+    }
+
+    #[test]
+    fn operators_bind_as_in_other_languages() {
+        check("1 + 2 * 3", "1 + 2 * 3");
+        check("(1 + 2) * 3", "(1 + 2) * 3");
+        check("1 - (2 - 3) - 4", "1 - (2 - 3) - 4");
+        check("not a = b and c or d", "not a = b and c or d");
+        check("not (a and b)", "not (a and b)");
+        check("a == b", "a = b");
+        check("-1.5e3 - -2", "-1500.0 - -2");
+        check("$box in [1, 'two', three]", "$box in [1, two, three]");
+        let sum = parse_expression("10 - 4 - 3", &mut OneState).map(|e| e.evaluate(&NothingKnown));
+        assert_eq!(sum, Ok(Ok(Value::Int(3))));
+    }
+
+    #[test]
+    fn names_are_what_the_state_sees() {
+        check("plan.end[0].x", "s7.end[0].x");
+        check("$box.pose", "$box.pose");
+        check("width_m * 2", "width_m * 2");
+        check("at($box.id, ?)", "at($box.id, ?)");
+        check("exists at(?) and hand_empty(gripper)", "exists at(?) and hand_empty(gripper)");
+        check("{id: $box, pose: pose(0, 0, 1)}", "{id: $box, pose: pose(0, 0, 1)}");
+    }
+
+    #[test]
+    fn an_error_says_where_and_what() {
+        check("1 +", "invalid-expression: expected a value, found the end at 3");
+        check("(1", "invalid-expression: expected `)`, found the end at 2");
+        check("1 2", "invalid-expression: expected an operator or the end, found `2` at 2");
+        check("a < b < c", "invalid-expression: comparisons do not chain; join two with `and` at 6");
+        check("pose(1)", "invalid-expression: expected `pose(x, y, z) or pose(x, y, z, roll, pitch, yaw)` at 0");
+        check("2 * plan.ende", "unknown-port: there is no `ende` at 4");
+        check("$bax", "unknown-variable: there is no `bax` at 0");
+        check("? = 1", "invalid-expression: `?` stands only for an argument of a fact at 0");
+        check("'open", "invalid-expression: this text has no closing quote at 0");
+        check("3rd", "invalid-expression: a name does not begin with a digit, and `3…` is no number at 0");
+        check("a § b", "invalid-expression: unexpected character `§` at 2");
+        check("99999999999999999999", "invalid-expression: 99999999999999999999 is too large for an int at 0");
+    }
+
+    #[test]
+    fn effects_read_as_sentences() {
+        let effect = |text: &str| printed(parse_effect(text, &mut OneState));
+        assert_eq!(effect("set at($box) = plan.end"), "set at($box) = s7.end");
+        assert_eq!(effect("at($box) = 1 + 1"), "set at($box) = 1 + 1");
+        assert_eq!(effect("hand_empty(gripper)"), "set hand_empty(gripper) = true");
+        assert_eq!(effect("delete at(?)"), "delete at(?)");
+        assert_eq!(effect("not hand_empty(gripper)"), "delete hand_empty(gripper)");
+        assert_eq!(effect("increase load(base) by 1"), "increase load(base) by 1");
+        assert_eq!(effect("decrease load(base) by 2 + 1"), "increase load(base) by -(2 + 1)");
+        assert_eq!(
+            effect("set at(?) = 1"),
+            "invalid-expression: a fact that is written needs all its arguments; `?` is not one at 4"
+        );
+        assert_eq!(
+            effect("remove at(x)"),
+            "invalid-expression: `remove` is no effect: expected set, delete, increase or decrease at 0"
+        );
+        assert_eq!(effect("set pose(x)"), "invalid-expression: `pose` is built in and cannot be a predicate at 4");
+    }
+
+    #[test]
+    fn size_is_bounded_before_the_stack_is() {
+        for text in ["(".repeat(9_000), "-".repeat(9_000), "not ".repeat(2_000), "[".repeat(9_000), "a(".repeat(4_000)]
+        {
+            assert!(parse_expression(&text, &mut OneState).is_err());
+        }
+        assert!(parse_expression(&"1 + ".repeat(2_000), &mut OneState).is_err());
+        assert!(parse_expression(&format!("x{}", "[0]".repeat(3_000)), &mut OneState).is_err());
+        assert!(parse_expression(&"1".repeat(MAX_TEXT + 1), &mut OneState).is_err());
+        let largest = vec!["1"; MAX_HEIGHT].join(" + ");
+        let sum = parse_expression(&largest, &mut OneState).map(|e| e.evaluate(&NothingKnown));
+        assert_eq!(sum, Ok(Ok(Value::Int(128))));
+    }
+
+    proptest! {
+        #[test]
+        fn no_text_panics(text in "\\PC{0,60}") {
+            let _ = parse_expression(&text, &mut OneState);
+            let _ = parse_effect(&text, &mut OneState);
+        }
+
+        #[test]
+        fn what_parses_prints_as_what_parses_to_the_same(
+            text in "(1|2\\.5|\\$box|plan\\.end|width_m|not |-|\\(|\\)|\\[|\\]| and | or | = | < | \\+ | \\* |at\\(|len\\(|, |\\.x){1,12}"
+        ) {
+            if let Ok(expr) = parse_expression(&text, &mut OneState) {
+                let printed = expr.to_string().replace("s7.", "plan.");
+                prop_assert_eq!(parse_expression(&printed, &mut OneState), Ok(expr));
+            }
+        }
+    }
+}

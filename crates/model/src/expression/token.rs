@@ -1,0 +1,158 @@
+//! Text → tokens, each with its place.
+
+use super::parse::ParseError;
+
+/// A token.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Token {
+    /// A name or a keyword.
+    Word(String),
+    /// `$name`
+    Variable(String),
+    /// A whole number.
+    Int(i64),
+    /// A number with a point or an exponent.
+    Float(f64),
+    /// Quoted text.
+    Text(String),
+    /// An operator or a bracket.
+    Symbol(&'static str),
+    /// Behind the last one.
+    End,
+}
+
+/// Longer ones first.
+const SYMBOLS: [&str; 22] =
+    ["==", "!=", "<=", ">=", "=", "<", ">", "+", "-", "*", "/", "(", ")", "[", "]", "{", "}", ",", ".", ":", "?", "|"];
+
+impl Token {
+    /// As it stands in a message.
+    pub(crate) fn described(&self) -> String {
+        match self {
+            Token::Word(word) => format!("`{word}`"),
+            Token::Variable(name) => format!("`${name}`"),
+            Token::Int(i) => format!("`{i}`"),
+            Token::Float(x) => format!("`{x}`"),
+            Token::Text(_) => "a text".to_owned(),
+            Token::Symbol(symbol) => format!("`{symbol}`"),
+            Token::End => "the end".to_owned(),
+        }
+    }
+}
+
+/// The tokens of a text with the offset of each in characters; the last is [`Token::End`].
+///
+/// # Errors
+/// [`ParseError`] at the first character that begins no token.
+pub(crate) fn tokens(text: &str) -> Result<Vec<(usize, Token)>, ParseError> {
+    let characters: Vec<char> = text.chars().collect();
+    let mut tokens = Vec::new();
+    let mut at = 0;
+    while at < characters.len() {
+        let c = characters[at];
+        if c.is_whitespace() {
+            at += 1;
+            continue;
+        }
+        let start = at;
+        let token = if c.is_ascii_alphabetic() || c == '_' {
+            Token::Word(word(&characters, &mut at))
+        } else if c.is_ascii_digit() {
+            number(&characters, &mut at)?
+        } else if c == '$' {
+            at += 1;
+            let name = word(&characters, &mut at);
+            if name.is_empty() {
+                return Err(ParseError::syntax(start, "expected a variable's name after `$`"));
+            }
+            Token::Variable(name)
+        } else if c == '"' || c == '\'' {
+            quoted(&characters, &mut at)?
+        } else {
+            let symbol =
+                SYMBOLS.iter().find(|s| s.chars().enumerate().all(|(i, c)| characters.get(at + i) == Some(&c)));
+            let Some(symbol) = symbol else {
+                return Err(ParseError::syntax(start, format!("unexpected character `{}`", c.escape_debug())));
+            };
+            at += symbol.len();
+            Token::Symbol(symbol)
+        };
+        tokens.push((start, token));
+    }
+    tokens.push((characters.len(), Token::End));
+    Ok(tokens)
+}
+
+fn word(characters: &[char], at: &mut usize) -> String {
+    let start = *at;
+    while characters.get(*at).is_some_and(|c| c.is_ascii_alphanumeric() || *c == '_') {
+        *at += 1;
+    }
+    characters[start..*at].iter().collect()
+}
+
+fn number(characters: &[char], at: &mut usize) -> Result<Token, ParseError> {
+    let start = *at;
+    let digits = |at: &mut usize| {
+        while characters.get(*at).is_some_and(char::is_ascii_digit) {
+            *at += 1;
+        }
+    };
+    let digit_at = |i: usize| characters.get(i).is_some_and(char::is_ascii_digit);
+    digits(at);
+    let mut whole = true;
+    if characters.get(*at) == Some(&'.') && digit_at(*at + 1) {
+        whole = false;
+        *at += 1;
+        digits(at);
+    }
+    if matches!(characters.get(*at), Some('e' | 'E')) {
+        let sign = usize::from(matches!(characters.get(*at + 1), Some('+' | '-')));
+        if digit_at(*at + 1 + sign) {
+            whole = false;
+            *at += 1 + sign;
+            digits(at);
+        }
+    }
+    let text: String = characters[start..*at].iter().collect();
+    if characters.get(*at).is_some_and(|c| c.is_alphanumeric() || *c == '_') {
+        return Err(ParseError::syntax(
+            start,
+            format!("a name does not begin with a digit, and `{text}…` is no number"),
+        ));
+    }
+    if whole {
+        let int = text.parse().map(Token::Int);
+        return int.map_err(|_| ParseError::syntax(start, format!("{text} is too large for an int")));
+    }
+    match text.parse::<f64>() {
+        Ok(x) if x.is_finite() => Ok(Token::Float(x)),
+        _ => Err(ParseError::syntax(start, format!("{text} is not a finite number"))),
+    }
+}
+
+fn quoted(characters: &[char], at: &mut usize) -> Result<Token, ParseError> {
+    let start = *at;
+    let quote = characters[start];
+    let mut text = String::new();
+    *at += 1;
+    loop {
+        match characters.get(*at) {
+            None => return Err(ParseError::syntax(start, "this text has no closing quote")),
+            Some(c) if *c == quote => break,
+            Some('\\') => {
+                *at += 1;
+                match characters.get(*at) {
+                    Some('n') => text.push('\n'),
+                    Some('t') => text.push('\t'),
+                    Some(c @ ('\\' | '"' | '\'')) => text.push(*c),
+                    _ => return Err(ParseError::syntax(*at, "expected one of n t \\ \" ' after `\\`")),
+                }
+            }
+            Some(c) => text.push(*c),
+        }
+        *at += 1;
+    }
+    *at += 1;
+    Ok(Token::Text(text))
+}
