@@ -1,1 +1,11 @@
 //! Robot kinematics, collision, path planning and time parameterisation.
+//!
+//! A pure library: no clock, no threads, no ambient randomness. The caller says through a callback when time is up, and
+//! hands in the seed.
+
+pub mod aimm;
+pub mod collision;
+mod frame;
+pub mod inverse;
+pub mod line;
+pub mod robot;

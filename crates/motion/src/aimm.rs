@@ -1,0 +1,196 @@
+//! Our cell in numbers: where the table, the places on the base and the boxes are, and the postures that tasks name.
+//!
+//! World frame: metres, floor at z = 0, the robot's base at the origin looking along x. The tests of this file show that
+//! every place below can be reached from above, with a straight approach of [`APPROACH_M`].
+
+use crate::robot::Joints;
+use ratn_model::pose::Pose;
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// Height of the base's top, which is its load deck, in metres.
+pub const DECK_HEIGHT_M: f64 = 0.60;
+
+/// Height of the table's top, in metres.
+pub const TABLE_HEIGHT_M: f64 = 0.70;
+
+/// The table's top slab: its centre.
+pub const TABLE_CENTRE: [f64; 3] = [0.80, 0.0, 0.675];
+
+/// The table's top slab: its edges.
+pub const TABLE_SIZE: [f64; 3] = [0.60, 1.20, 0.05];
+
+/// Where the centres of boxes may stand on the table: least and greatest x, least and greatest y. Any yaw.
+pub const BOX_REGION: [[f64; 2]; 2] = [[0.62, 0.84], [-0.38, 0.38]];
+
+/// Least edges of a box (longer horizontal, shorter horizontal, height) that the gripper can take.
+pub const BOX_LEAST: [f64; 3] = [0.06, 0.06, 0.08];
+
+/// Greatest edges of a box.
+pub const BOX_GREATEST: [f64; 3] = [0.16, 0.09, 0.12];
+
+/// How far above the grasp a straight approach begins, and how far a straight departure goes, in metres.
+pub const APPROACH_M: f64 = 0.10;
+
+/// How far below a box's top the tool frame is when it grasps, in metres; half of the box's height if that is less.
+pub const GRASP_DEPTH_M: f64 = 0.03;
+
+/// The widest that the fingers open, in metres.
+pub const GRIPPER_OPENING_M: f64 = 0.11;
+
+/// How many places for boxes the deck has.
+pub const SLOT_COUNT: usize = 9;
+
+/// Arm at rest in front of the base, tool downwards above the table.
+pub const HOME: Joints = [-FRAC_PI_2, -0.35, 0.0, 1.40, 0.0, -1.391_592_653_589_793, 0.0];
+
+/// Arm above the deck, out of the camera's view of the table.
+pub const OBSERVATION: Joints = [0.9, -1.2, 0.0, 0.9, 0.0, -0.6, 0.0];
+
+/// Arm folded within the base's outline, for driving.
+pub const STOWED: Joints = [FRAC_PI_2, 0.3, 0.0, 2.05, 0.0, -0.8, 0.0];
+
+/// The places `slot_1`..`slot_9` on the deck, seen from the base: on the deck's surface, x along a box's longer edge, which
+/// lies across the base. Three rows behind the arm, nearest first, each from right to left.
+pub fn slots() -> [Pose; SLOT_COUNT] {
+    std::array::from_fn(|i| {
+        let (row, column) = ((i / 3) as f64, (i % 3) as f64);
+        Pose::from_rpy([-0.22 - 0.15 * row, -0.20 + 0.20 * column, DECK_HEIGHT_M], 0.0, 0.0, FRAC_PI_2)
+    })
+}
+
+/// The two ways to grasp an upright box from above: tool z down, y along the shorter horizontal edge; half a turn apart.
+pub fn grasp_poses(pose: &Pose, size: [f64; 3]) -> [Pose; 2] {
+    let edge = pose.rotate(if size[0] <= size[1] { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] });
+    let yaw = edge[1].atan2(edge[0]) + FRAC_PI_2;
+    let top = pose.position[2] + size[2] / 2.0;
+    let position = [pose.position[0], pose.position[1], top - GRASP_DEPTH_M.min(size[2] / 2.0)];
+    [Pose::from_rpy(position, PI, 0.0, yaw), Pose::from_rpy(position, PI, 0.0, yaw + PI)]
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+    use super::*;
+    use crate::collision::{Checker, Contact, PADDING_M};
+    use crate::inverse::Solver;
+    use crate::line::line;
+    use crate::robot::{Configuration, Robot};
+    use parry3d::math::Vector;
+    use parry3d::query::Ray;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+
+    fn table() -> SceneObject {
+        let [x, y, z] = TABLE_CENTRE;
+        let shape = Shape::Box { size: TABLE_SIZE };
+        SceneObject { name: "table".into(), shape, placement: Placement::World(Pose::at(x, y, z)) }
+    }
+
+    fn standing(name: &str, floor: &Pose, size: [f64; 3]) -> SceneObject {
+        let placement = Placement::World(floor.compose(&Pose::at(0.0, 0.0, size[2] / 2.0)));
+        SceneObject { name: name.into(), shape: Shape::Box { size }, placement }
+    }
+
+    /// Some solution at the grasp from which the straight line up is free.
+    fn reachable(robot: &Robot, scene: &Scene, pose: &Pose, size: [f64; 3]) -> Result<(), String> {
+        let mut solver = Solver::new(robot, &scene.base);
+        let mut checker = Checker::new(robot, scene, PADDING_M);
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let mut reasons = Vec::new();
+        for grasp in grasp_poses(pose, size) {
+            for solution in solver.solutions(&grasp, &HOME, 12, 40, &mut random) {
+                match line(&mut solver, &solution, [0.0, 0.0, APPROACH_M]) {
+                    Err(error) => reasons.push(error.to_string()),
+                    Ok(postures) => {
+                        let contact = Contact::Gripper(crate::collision::CONTACT_TOLERANCE_M);
+                        match postures.iter().find_map(|p| checker.collision(p, contact)) {
+                            None => return Ok(()),
+                            Some(collision) => reasons.push(collision.to_string()),
+                        }
+                    }
+                }
+            }
+        }
+        Err(format!("{pose:?} {size:?}: {reasons:?}"))
+    }
+
+    #[test]
+    fn boxes_anywhere_in_the_region_can_be_grasped_from_above() {
+        let robot = Robot::aimm();
+        let mut failures = Vec::new();
+        for x in 0..3 {
+            for y in 0..5 {
+                for yaw in 0..4 {
+                    for size in [BOX_LEAST, BOX_GREATEST] {
+                        let at =
+                            |[low, high]: [f64; 2], i: i32, n: i32| low + (high - low) * f64::from(i) / f64::from(n);
+                        let position = [at(BOX_REGION[0], x, 2), at(BOX_REGION[1], y, 4), TABLE_HEIGHT_M];
+                        let floor = Pose::from_rpy(position, 0.0, 0.0, f64::from(yaw) * PI / 4.0);
+                        let standing = standing("box_1", &floor, size);
+                        let Placement::World(pose) = standing.placement else { unreachable!() };
+                        let scene = Scene { base: Pose::IDENTITY, objects: vec![standing, table()] };
+                        failures.extend(reachable(&robot, &scene, &pose, size).err());
+                    }
+                }
+            }
+        }
+        assert!(failures.is_empty(), "{} of 120: {failures:#?}", failures.len());
+    }
+
+    #[test]
+    fn every_slot_can_be_served_from_above_while_all_others_are_full() {
+        let robot = Robot::aimm();
+        let mut failures = Vec::new();
+        for size in [BOX_LEAST, BOX_GREATEST] {
+            for slot in slots() {
+                let objects = slots().into_iter().enumerate().map(|(i, s)| standing(&format!("box_{i}"), &s, size));
+                let scene = Scene { base: Pose::IDENTITY, objects: objects.chain([table()]).collect() };
+                let pose = slot.compose(&Pose::at(0.0, 0.0, size[2] / 2.0));
+                failures.extend(reachable(&robot, &scene, &pose, size).err());
+            }
+        }
+        assert!(failures.is_empty(), "{failures:#?}");
+    }
+
+    #[test]
+    fn the_named_postures_touch_nothing_above_a_full_table_and_a_full_deck() {
+        let robot = Robot::aimm();
+        let rows = [0.62, 0.84].into_iter().flat_map(|x| [-0.38, -0.19, 0.0, 0.19, 0.38].map(|y| (x, y)));
+        let on_table = rows.map(|(x, y)| Pose::from_rpy([x, y, TABLE_HEIGHT_M], 0.0, 0.0, FRAC_PI_2));
+        let objects = on_table.chain(slots()).enumerate().map(|(i, p)| standing(&format!("box_{i}"), &p, BOX_GREATEST));
+        let scene = Scene { base: Pose::IDENTITY, objects: objects.chain([table()]).collect() };
+        let mut checker = Checker::new(&robot, &scene, PADDING_M);
+        for (name, posture) in [("HOME", HOME), ("OBSERVATION", OBSERVATION), ("STOWED", STOWED)] {
+            let tool = Solver::new(&robot, &Pose::IDENTITY).tool(&posture);
+            assert_eq!(robot.clamp(&posture), posture, "{name} is within limits");
+            assert_eq!(checker.collision(&posture, Contact::None), None, "{name}, tool at {:?}", tool.position);
+        }
+    }
+
+    #[test]
+    fn in_the_observation_posture_the_camera_sees_every_box() {
+        let robot = Robot::aimm();
+        let (pan, tilt) = robot.look_at(&Pose::IDENTITY, TABLE_CENTRE);
+        let configuration = Configuration { arm: OBSERVATION, pan, tilt, finger: 0.055, ..Configuration::ZERO };
+        let eye = robot.camera_pose(&configuration).position;
+        let mut hidden = Vec::new();
+        for x in 0..=11 {
+            for y in 0..=22 {
+                let (x, y) = (0.57 + 0.03 * f64::from(x), -0.44 + 0.04 * f64::from(y));
+                for z in [TABLE_HEIGHT_M, TABLE_HEIGHT_M + 0.12] {
+                    let way = [x - eye[0], y - eye[1], z - eye[2]].map(|c| c as f32);
+                    let ray = Ray::new(Vector::from_array(eye.map(|c| c as f32)), Vector::from_array(way));
+                    for (link, pose, shape) in robot.shapes(&configuration) {
+                        let name = &robot.links[link].name;
+                        if name != "tilt" && shape.cast_ray(&pose, &ray, 1.0, true).is_some() {
+                            hidden.push(format!("({x:.2}, {y:.2}, {z:.2}) behind {name}"));
+                        }
+                    }
+                }
+            }
+        }
+        assert!(hidden.is_empty(), "eye {eye:?}: {} {hidden:#?}", hidden.len());
+    }
+}

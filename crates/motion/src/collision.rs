@@ -1,0 +1,403 @@
+//! Does the robot, in a posture of its arm, touch the scene or itself?
+//!
+//! A [`Checker`] is made once per scene: what stands still (objects, base, mast) becomes a flat array of obstacles, what the
+//! arm moves (links, hand, fingers, the held object) an array of moving shapes. Bounding spheres decide most pairs, parry3d
+//! decides the rest. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
+//! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is.
+
+use crate::frame::compose;
+use crate::robot::{Body, Configuration, Geometry, Joints, Robot, to_f32};
+use parry3d::math::{Pose as Pose32, Vector};
+use parry3d::query;
+use parry3d::shape::SharedShape;
+use ratn_model::pose::Pose;
+use ratn_world::scene::{Placement, Scene, Shape};
+use std::fmt;
+
+/// How much room the planner keeps around the moving shapes, in metres.
+pub const PADDING_M: f64 = 0.01;
+
+/// How deep the fingers and the held object may press into what they touch where contact is allowed, in metres: poses are
+/// measured, the arm is compliant.
+pub const CONTACT_TOLERANCE_M: f64 = 0.012;
+
+/// How far a point may move between two checked postures when there is no padding, in metres.
+const UNPADDED_STEP_M: f64 = 0.005;
+
+/// Checks postures against one scene.
+#[derive(Clone)]
+pub struct Checker<'a> {
+    robot: &'a Robot,
+    padding: f64,
+    finger: f64,
+    obstacles: Vec<Obstacle>,
+    moving: Vec<Moving>,
+    /// Pairs of moving shapes that can meet.
+    pairs: Vec<(usize, usize)>,
+    /// How far a point can be from the axis of each arm joint, in metres.
+    reach: Joints,
+    poses: Vec<Pose>,
+    placed: Vec<Pose32>,
+    centres: Vec<Vector>,
+}
+
+#[derive(Clone)]
+struct Obstacle {
+    name: String,
+    link: Option<usize>,
+    shape: SharedShape,
+    pose: Pose32,
+    centre: Vector,
+    radius: f32,
+}
+
+#[derive(Clone)]
+struct Moving {
+    name: String,
+    link: usize,
+    part: Part,
+    local: Pose,
+    /// Grown by the padding.
+    padded: SharedShape,
+    shape: SharedShape,
+    radius: f32,
+    /// Obstacles that it can meet.
+    obstacles: Vec<usize>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Part {
+    Arm,
+    Hand,
+    Finger,
+    Held,
+}
+
+/// What may touch what.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Contact {
+    /// Nothing touches anything.
+    None,
+    /// The fingers and the held object may touch anything, pressing in by this many metres at the most.
+    Gripper(f64),
+}
+
+/// Two things that meet.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Collision {
+    /// What moves: a link, or what is held.
+    pub moving: String,
+    /// What it meets: an object, or a link.
+    pub other: String,
+    /// How deep, in metres; negative: how far apart, where that is less than the padding.
+    pub depth_m: f64,
+}
+
+impl fmt::Display for Collision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let millimetres = self.depth_m.abs() * 1000.0;
+        if self.depth_m > 0.0 {
+            write!(f, "{} is {millimetres:.0} mm inside {}", self.moving, self.other)
+        } else {
+            write!(f, "{} is only {millimetres:.0} mm away from {}", self.moving, self.other)
+        }
+    }
+}
+
+impl<'a> Checker<'a> {
+    /// A checker of `robot` in `scene`, with the pan-tilt unit at rest. The fingers are taken to be around what is held, else
+    /// open.
+    pub fn new(robot: &'a Robot, scene: &Scene, padding: f64) -> Checker<'a> {
+        let finger = held_width(scene).map_or(robot.finger().upper, |w| (w / 2.0).min(robot.finger().upper));
+        Checker::with_finger(robot, scene, padding, finger)
+    }
+
+    /// As [`Checker::new`], with each finger at `finger` metres from the middle.
+    pub fn with_finger(robot: &'a Robot, scene: &Scene, padding: f64, finger: f64) -> Checker<'a> {
+        let configuration = Configuration { finger, ..Configuration::ZERO.with_base(&scene.base) };
+        let poses = robot.poses(&configuration);
+        let mut checker = Checker {
+            robot,
+            padding,
+            finger,
+            obstacles: Vec::new(),
+            moving: Vec::new(),
+            pairs: Vec::new(),
+            reach: [0.0; 7],
+            poses,
+            placed: Vec::new(),
+            centres: Vec::new(),
+        };
+        checker.add_robot();
+        checker.add_scene(scene);
+        checker.find_pairs();
+        checker.find_reach();
+        checker
+    }
+
+    fn add_robot(&mut self) {
+        let hand = self.robot.link("hand");
+        for (i, link) in self.robot.links.iter().enumerate() {
+            for body in &link.bodies {
+                if self.robot.arm_links.contains(&i) {
+                    let part = match () {
+                        () if Some(i) == hand => Part::Hand,
+                        () if link.parent == hand => Part::Finger,
+                        () => Part::Arm,
+                    };
+                    self.add_moving(format!("link {}", link.name), i, part, body);
+                } else {
+                    let pose = self.poses[i].compose(&body.pose);
+                    self.add_obstacle(format!("link {}", link.name), Some(i), pose, &body.geometry);
+                }
+            }
+        }
+    }
+
+    fn add_scene(&mut self, scene: &Scene) {
+        for object in &scene.objects {
+            let geometry = Geometry::from(&object.shape);
+            match &object.placement {
+                Placement::World(pose) => {
+                    let body = geometry.at(*pose);
+                    self.add_obstacle(object.name.clone(), None, body.pose, &geometry);
+                }
+                Placement::Gripper(pose) => {
+                    let body = geometry.at(*pose);
+                    self.add_moving(format!("held {}", object.name), self.robot.tool, Part::Held, &body);
+                }
+            }
+        }
+    }
+
+    fn add_moving(&mut self, name: String, link: usize, part: Part, body: &Body) {
+        self.moving.push(Moving {
+            name,
+            link,
+            part,
+            local: body.pose,
+            padded: body.geometry.shape(self.padding),
+            shape: body.geometry.shape(0.0),
+            // A padded box's corners move out by more than the padding.
+            radius: (body.geometry.radius() + self.padding * 3_f64.sqrt()) as f32,
+            obstacles: Vec::new(),
+        });
+        self.placed.push(Pose32::IDENTITY);
+        self.centres.push(Vector::ZERO);
+    }
+
+    fn add_obstacle(&mut self, name: String, link: Option<usize>, pose: Pose, geometry: &Geometry) {
+        let pose = to_f32(&pose);
+        self.obstacles.push(Obstacle {
+            name,
+            link,
+            shape: geometry.shape(0.0),
+            pose,
+            centre: pose.translation,
+            radius: geometry.radius() as f32,
+        });
+    }
+
+    /// Which pairs can meet at all: neighbours in the chain always touch, the hand and its fingers touch what they hold.
+    fn find_pairs(&mut self) {
+        for i in 0..self.moving.len() {
+            let a = &self.moving[i];
+            let obstacles = (0..self.obstacles.len())
+                .filter(|o| self.obstacles[*o].link.is_none_or(|link| !self.neighbours(a.link, link)))
+                .collect();
+            for j in i + 1..self.moving.len() {
+                let b = &self.moving[j];
+                let gripper = |m: &Moving| m.part != Part::Arm;
+                if !(gripper(a) && gripper(b)) && !self.neighbours(a.link, b.link) {
+                    self.pairs.push((i, j));
+                }
+            }
+            self.moving[i].obstacles = obstacles;
+        }
+    }
+
+    /// Whether two links are at most one link with a shape apart.
+    fn neighbours(&self, a: usize, b: usize) -> bool {
+        let solid_parent = |mut link: usize| {
+            while let Some(parent) = self.robot.links[link].parent {
+                if !self.robot.links[parent].bodies.is_empty() {
+                    return Some(parent);
+                }
+                link = parent;
+            }
+            None
+        };
+        // A short link between two long ones hides their contact: the wrist's ball, the flange.
+        let close = |child: usize, parent: usize| {
+            solid_parent(child) == Some(parent)
+                || solid_parent(child).is_some_and(|middle| {
+                    let small = self.robot.links[middle].bodies.iter().all(|body| body.geometry.radius() < 0.07);
+                    small && solid_parent(middle) == Some(parent)
+                })
+        };
+        a == b || close(a, b) || close(b, a)
+    }
+
+    fn find_reach(&mut self) {
+        let mut beyond = 0.0;
+        for joint in (0..7).rev() {
+            let link = self.robot.arm_joint_links[joint];
+            let mut reach: f64 = beyond;
+            for moving in self.moving.iter().filter(|m| self.nearest_joint(m.link) == joint) {
+                let offset = self.poses[link].inverse().compose(&self.poses[moving.link].compose(&moving.local));
+                reach = reach.max(offset.distance(&Pose::IDENTITY) + f64::from(moving.radius));
+            }
+            self.reach[joint] = reach;
+            beyond = reach + self.robot.links[link].origin.distance(&Pose::IDENTITY);
+        }
+    }
+
+    /// The last arm joint that moves a link.
+    fn nearest_joint(&self, mut link: usize) -> usize {
+        loop {
+            if let Some(joint) = self.robot.arm_joint_links.iter().position(|l| *l == link) {
+                return joint;
+            }
+            match self.robot.links[link].parent {
+                Some(parent) => link = parent,
+                None => return 0,
+            }
+        }
+    }
+
+    /// The robot that is checked.
+    pub fn robot(&self) -> &'a Robot {
+        self.robot
+    }
+
+    /// Into how many equal steps the straight line between two postures must be cut so that no point of the robot moves
+    /// further than twice the padding in one.
+    pub fn steps(&self, from: &Joints, to: &Joints) -> usize {
+        let moved: f64 = (0..7).map(|j| (to[j] - from[j]).abs() * self.reach[j]).sum();
+        let step = if self.padding > 0.0 { 2.0 * self.padding } else { UNPADDED_STEP_M };
+        ((moved / step).ceil() as usize).max(1)
+    }
+
+    /// Whether a posture touches nothing.
+    pub fn is_free(&mut self, arm: &Joints, contact: Contact) -> bool {
+        self.hit(arm, contact).is_none()
+    }
+
+    /// What a posture touches first, if anything.
+    pub fn collision(&mut self, arm: &Joints, contact: Contact) -> Option<Collision> {
+        let (i, other) = self.hit(arm, contact)?;
+        let depth = self.depth(i, other).unwrap_or(-self.padding);
+        let other = match other {
+            Other::Obstacle(o) => self.obstacles[o].name.clone(),
+            Other::Moving(j) => self.moving[j].name.clone(),
+        };
+        Some(Collision { moving: self.moving[i].name.clone(), other, depth_m: depth })
+    }
+
+    /// Whether the straight motion from one posture to another touches nothing; `from` itself is not checked.
+    pub fn edge_is_free(&mut self, from: &Joints, to: &Joints, contact: Contact) -> bool {
+        if !self.is_free(to, contact) {
+            return false;
+        }
+        // Halving: the middle of an edge is where it most likely touches something.
+        let steps = self.steps(from, to);
+        let mut stride = steps.next_power_of_two();
+        while stride > 1 {
+            for i in (stride / 2..steps).step_by(stride) {
+                if !self.is_free(&between(from, to, i as f64 / steps as f64), contact) {
+                    return false;
+                }
+            }
+            stride /= 2;
+        }
+        true
+    }
+
+    /// The first collision of the straight motion from one posture to another, both included.
+    pub fn edge_collision(&mut self, from: &Joints, to: &Joints, contact: Contact) -> Option<Collision> {
+        let steps = self.steps(from, to);
+        (0..=steps).find_map(|i| self.collision(&between(from, to, i as f64 / steps as f64), contact))
+    }
+
+    fn hit(&mut self, arm: &Joints, contact: Contact) -> Option<(usize, Other)> {
+        self.robot.update_arm(arm, self.finger, &mut self.poses);
+        for (i, moving) in self.moving.iter().enumerate() {
+            let pose = to_f32(&compose(&self.poses[moving.link], &moving.local));
+            self.centres[i] = pose.translation;
+            self.placed[i] = pose;
+        }
+        // The hand and what it holds are the likeliest to touch something.
+        for i in (0..self.moving.len()).rev() {
+            let moving = &self.moving[i];
+            for &o in &moving.obstacles {
+                let obstacle = &self.obstacles[o];
+                let reach = moving.radius + obstacle.radius;
+                if self.centres[i].distance_squared(obstacle.centre) < reach * reach
+                    && intersects(&self.placed[i], &moving.padded, &obstacle.pose, &obstacle.shape)
+                    && !self.allowed(i, Other::Obstacle(o), contact)
+                {
+                    return Some((i, Other::Obstacle(o)));
+                }
+            }
+        }
+        for &(i, j) in &self.pairs {
+            let reach = self.moving[i].radius + self.moving[j].radius;
+            if self.centres[i].distance_squared(self.centres[j]) < reach * reach
+                && intersects(&self.placed[i], &self.moving[i].padded, &self.placed[j], &self.moving[j].shape)
+            {
+                return Some((i, Other::Moving(j)));
+            }
+        }
+        None
+    }
+
+    fn allowed(&self, i: usize, other: Other, contact: Contact) -> bool {
+        let Contact::Gripper(tolerance) = contact else { return false };
+        matches!(self.moving[i].part, Part::Finger | Part::Held)
+            && self.depth(i, other).is_some_and(|depth| depth <= tolerance)
+    }
+
+    /// How deep the unpadded shapes are inside each other, in metres, in the posture checked last.
+    fn depth(&self, i: usize, other: Other) -> Option<f64> {
+        let (pose, shape) = match other {
+            Other::Obstacle(o) => (&self.obstacles[o].pose, &self.obstacles[o].shape),
+            Other::Moving(j) => (&self.placed[j], &self.moving[j].shape),
+        };
+        let prediction = 2.0 * self.padding as f32;
+        let contact = query::contact(&self.placed[i], &*self.moving[i].shape, pose, &**shape, prediction).ok()??;
+        Some(-f64::from(contact.dist))
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Other {
+    Obstacle(usize),
+    Moving(usize),
+}
+
+/// The posture a fraction of the way from one to another.
+pub fn between(from: &Joints, to: &Joints, fraction: f64) -> Joints {
+    std::array::from_fn(|j| from[j] + (to[j] - from[j]) * fraction)
+}
+
+/// The Euclidean distance of two postures, in radians.
+pub fn distance(a: &Joints, b: &Joints) -> f64 {
+    (0..7).map(|j| (a[j] - b[j]).powi(2)).sum::<f64>().sqrt()
+}
+
+/// Pairs that parry3d cannot decide count as touching; there are none among the primitives.
+fn intersects(pose_a: &Pose32, a: &SharedShape, pose_b: &Pose32, b: &SharedShape) -> bool {
+    query::intersection_test(pose_a, &**a, pose_b, &**b).is_ok_and(|r| r.intersecting)
+}
+
+/// The extent of what is held along the tool's y axis.
+fn held_width(scene: &Scene) -> Option<f64> {
+    scene.objects.iter().find_map(|object| match (&object.placement, &object.shape) {
+        (Placement::Gripper(pose), Shape::Box { size }) => {
+            let axis = pose.inverse().rotate([0.0, 1.0, 0.0]);
+            Some((0..3).map(|i| axis[i].abs() * size[i]).sum())
+        }
+        (Placement::Gripper(_), Shape::Cylinder { radius, .. }) => Some(2.0 * radius),
+        _ => None,
+    })
+}
