@@ -4,4 +4,10 @@
 //! commands (over gRPC in `ratn run`, in virtual time in `ratn-simulation`) and answers only with events, so the log of
 //! events and commands is the whole story of a run.
 
+mod analysis;
+mod binding;
+mod effects;
+pub mod executive;
+mod interpreter;
 pub mod protocol;
+mod window;

@@ -35,6 +35,12 @@ pub enum ChangeError {
 }
 
 impl World {
+    /// The world in which these facts hold, at a revision.
+    pub fn from_facts(facts: impl IntoIterator<Item = (FactKey, Value)>, revision: Revision) -> World {
+        let facts = facts.into_iter().map(|(key, value)| (key, Fact { value, revision })).collect();
+        World { facts, revision }
+    }
+
     /// The number of commits so far.
     pub fn revision(&self) -> Revision {
         self.revision

@@ -1,0 +1,197 @@
+//! What follows from the program alone, per state, before anything runs: what kind of node it is, what it asks of the
+//! resource manager, and which states its inputs flow from. Hierarchies and routines are resolved here.
+
+use ratn_model::expression::{EffectExpr, Expr, FactExpr};
+use ratn_model::id::StateId;
+use ratn_model::program::{Nature, Program, ResourceExpr, State, StateKind, WORLD_MODEL};
+use ratn_model::resource::ResourceOperation;
+use std::collections::BTreeSet;
+
+/// What a node does to the environment; a routine is the most committing of what it contains.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum NodeNature {
+    /// Works on a projection.
+    Computes,
+    /// Looks at the environment.
+    Senses,
+    /// A potentially irreversible action.
+    Irreversible,
+}
+
+/// One state's analysis.
+#[derive(Debug, Clone)]
+pub(crate) struct StateAnalysis {
+    /// What it is.
+    pub(crate) nature: NodeNature,
+    /// Blocks (its own and its hierarchies', merged by maximum), consumes and exists.
+    pub(crate) requirements: Vec<ResourceExpr>,
+    /// What it does to resources when it ends with success.
+    pub(crate) operations: Vec<ResourceExpr>,
+    /// The states whose outputs it needs before it starts; for a routine, those outside of it.
+    pub(crate) flows: Vec<StateId>,
+    /// What it senses, with that of what it contains.
+    pub(crate) senses: Vec<FactExpr>,
+    /// What it reads, with that of the hierarchies around it and of what it contains; `None` is everything.
+    pub(crate) reads: Option<Vec<FactExpr>>,
+    /// Whether it works on a projection of the world model.
+    pub(crate) needs_world: bool,
+}
+
+/// The analysis of a program, by state.
+#[derive(Debug, Clone)]
+pub(crate) struct Analysis {
+    states: Vec<StateAnalysis>,
+}
+
+impl Analysis {
+    /// Analyses every state of a loaded program.
+    pub(crate) fn of(program: &Program) -> Analysis {
+        Analysis { states: program.states.iter().map(|state| analyse(program, state)).collect() }
+    }
+
+    /// The analysis of one state.
+    pub(crate) fn state(&self, id: StateId) -> &StateAnalysis {
+        &self.states[id.0 as usize]
+    }
+}
+
+/// The children of a composite, of both branches of a condition.
+pub(crate) fn children(state: &State) -> Vec<StateId> {
+    match &state.kind {
+        StateKind::Action { .. } => Vec::new(),
+        StateKind::Sequence { children, .. } => children.clone(),
+        StateKind::ForEach { body, .. } => body.clone(),
+        StateKind::Condition { then, otherwise, .. } => then.iter().chain(otherwise).copied().collect(),
+    }
+}
+
+fn analyse(program: &Program, state: &State) -> StateAnalysis {
+    let mut subtree = BTreeSet::from([state.id]);
+    let mut open = vec![state.id];
+    while let Some(id) = open.pop() {
+        for child in children(program.state(id)) {
+            subtree.insert(child);
+            open.push(child);
+        }
+    }
+    let contained: Vec<&State> = subtree.iter().map(|id| program.state(*id)).collect();
+    let around = ancestors(program, state);
+    let requirements = requirements(&contained, &around);
+    let mut flows: BTreeSet<StateId> = contained.iter().flat_map(|s| start_flows(s)).collect();
+    if contained.len() > 1 {
+        // What its own effects are made of is needed to finish it, and it is one node.
+        flows.extend(contained.iter().flat_map(|s| effect_flows(s)));
+    }
+    flows.retain(|id| !subtree.contains(id));
+    StateAnalysis {
+        nature: contained.iter().map(|s| own_nature(s)).max().unwrap_or(NodeNature::Computes),
+        needs_world: requirements.iter().any(|r| r.kind == WORLD_MODEL),
+        operations: operations(state),
+        reads: reads(&contained, &around),
+        senses: contained
+            .iter()
+            .flat_map(|s| match &s.annotations.nature {
+                Nature::Senses(facts) => facts.clone(),
+                _ => Vec::new(),
+            })
+            .collect(),
+        requirements,
+        flows: flows.into_iter().collect(),
+    }
+}
+
+fn ancestors<'a>(program: &'a Program, state: &State) -> Vec<&'a State> {
+    std::iter::successors(state.parent, |id| program.state(*id).parent).map(|id| program.state(id)).collect()
+}
+
+fn own_nature(state: &State) -> NodeNature {
+    match (&state.kind, &state.annotations.nature) {
+        (StateKind::Action { .. }, Nature::Irreversible) => NodeNature::Irreversible,
+        (StateKind::Action { .. }, Nature::Senses(_)) => NodeNature::Senses,
+        _ => NodeNature::Computes,
+    }
+}
+
+/// Blocks merge by maximum; consumes and exists add up as they are, but only from within (a hierarchy's happen once).
+fn requirements(contained: &[&State], around: &[&State]) -> Vec<ResourceExpr> {
+    let mut merged: Vec<ResourceExpr> = Vec::new();
+    for (state, within) in contained.iter().map(|s| (s, true)).chain(around.iter().map(|s| (s, false))) {
+        for wanted in &state.annotations.resources {
+            match wanted.operation {
+                ResourceOperation::Block => {
+                    let same = merged.iter_mut().find(|m| {
+                        m.operation == ResourceOperation::Block
+                            && m.kind == wanted.kind
+                            && m.attributes == wanted.attributes
+                    });
+                    match same {
+                        Some(have) => have.count = have.count.max(wanted.count),
+                        None => merged.push(wanted.clone()),
+                    }
+                }
+                ResourceOperation::Consume | ResourceOperation::Exists if within => merged.push(wanted.clone()),
+                _ => {}
+            }
+        }
+    }
+    merged
+}
+
+/// A hierarchy consumes at its exit too; an action did so when it acquired.
+fn operations(state: &State) -> Vec<ResourceExpr> {
+    let at_end = |r: &&ResourceExpr| match r.operation {
+        ResourceOperation::Create | ResourceOperation::Delete => true,
+        ResourceOperation::Consume => !matches!(state.kind, StateKind::Action { .. }) && !state.annotations.routine,
+        ResourceOperation::Block | ResourceOperation::Exists => false,
+    };
+    state.annotations.resources.iter().filter(at_end).cloned().collect()
+}
+
+fn reads(contained: &[&State], around: &[&State]) -> Option<Vec<FactExpr>> {
+    let mut all = Vec::new();
+    for state in contained {
+        match (&state.kind, &state.annotations.reads) {
+            (_, Some(reads)) => all.extend(reads.iter().cloned()),
+            // A sensing node reads what it senses; anything else without the annotation reads everything.
+            (StateKind::Action { .. }, None) if !matches!(state.annotations.nature, Nature::Senses(_)) => return None,
+            _ => {}
+        }
+        if let StateKind::Condition { predicate: expression, .. } | StateKind::ForEach { collection: expression, .. } =
+            &state.kind
+        {
+            all.extend(expression.fact_expressions().into_iter().cloned());
+        }
+        all.extend(state.annotations.requires.iter().flat_map(Expr::fact_expressions).cloned());
+    }
+    for state in around {
+        all.extend(state.annotations.reads.iter().flatten().cloned());
+    }
+    Some(all)
+}
+
+/// The states whose outputs a state needs to start.
+fn start_flows(state: &State) -> Vec<StateId> {
+    let mut flows = Vec::new();
+    match &state.kind {
+        StateKind::Action { inputs, .. } => inputs.iter().for_each(|(_, e)| flows.extend(e.flows())),
+        StateKind::Sequence { outputs, .. } => outputs.iter().for_each(|o| flows.extend(o.value.flows())),
+        StateKind::ForEach { collection, .. } => flows.extend(collection.flows()),
+        StateKind::Condition { predicate, .. } => flows.extend(predicate.flows()),
+    }
+    state.annotations.requires.iter().for_each(|e| flows.extend(e.flows()));
+    for resource in &state.annotations.resources {
+        if !matches!(resource.operation, ResourceOperation::Create | ResourceOperation::Delete) {
+            resource.attributes.iter().for_each(|(_, e)| flows.extend(e.flows()));
+        }
+    }
+    flows
+}
+
+/// The states whose outputs a state's effects and resource operations are made of.
+pub(crate) fn effect_flows(state: &State) -> Vec<StateId> {
+    let mut flows: Vec<StateId> = state.annotations.effects.values().flat_map(|e| EffectExpr::flows(e)).collect();
+    for resource in &state.annotations.resources {
+        resource.attributes.iter().for_each(|(_, e)| flows.extend(e.flows()));
+    }
+    flows
+}

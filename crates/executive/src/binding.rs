@@ -1,0 +1,143 @@
+//! Evaluating a state's expressions in a scope: inputs, requirements, preconditions.
+
+use ratn_model::expression::{EvaluateError, Expr, Lookup, Scope};
+use ratn_model::fact::{FactPattern, Footprint};
+use ratn_model::id::StateId;
+use ratn_model::program::{ResourceExpr, State};
+use ratn_model::resource::Requirement;
+use ratn_model::value::Value;
+use ratn_world::world::World;
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+
+/// Output ports of one instance.
+pub(crate) type Outputs = BTreeMap<String, Value>;
+
+/// Where an instance's variables and other states' outputs are found.
+pub(crate) trait Names {
+    /// `$name`
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>>;
+    /// `state.port`
+    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>>;
+}
+
+/// The scope of one instance at its place in the program.
+pub(crate) struct Bindings<'a> {
+    /// Variables and ports.
+    pub(crate) names: &'a dyn Names,
+    /// The instance's own outputs, once finished.
+    pub(crate) outputs: Option<&'a Outputs>,
+    /// The world at its place.
+    pub(crate) world: &'a World,
+    /// The facts of that world that are not known yet.
+    pub(crate) unknown: &'a Footprint,
+}
+
+impl Scope for Bindings<'_> {
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.names.variable(name)
+    }
+
+    fn output(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outputs?.get(name).map(Cow::Borrowed)
+    }
+
+    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
+        self.names.port(state, port)
+    }
+
+    fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
+        if self.unknown.overlaps(&Footprint::Patterns(vec![pattern.clone()])) {
+            return Lookup::Unknown;
+        }
+        match self.world.matching(pattern).next() {
+            Some((_, fact)) => Lookup::Holds(Cow::Owned(fact.value.clone())),
+            None => Lookup::Absent,
+        }
+    }
+}
+
+/// Why an expression of a state has no value, with the part of the state it stands in.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{part} of {path}")]
+pub(crate) struct BindError {
+    part: String,
+    path: String,
+    /// The expression's own error.
+    #[source]
+    pub(crate) source: EvaluateError,
+}
+
+impl BindError {
+    /// Names the part of the state.
+    pub(crate) fn at(part: impl Into<String>, state: &State) -> impl FnOnce(EvaluateError) -> BindError {
+        let (part, path) = (part.into(), state.path.clone());
+        move |source| BindError { part, path, source }
+    }
+
+    /// The error and its cause on one line, as an outcome's reason.
+    pub(crate) fn reason(&self) -> String {
+        format!("{self}: {}", self.source)
+    }
+}
+
+/// The input ports of an action. An input that is null is left out: an optional port not given.
+pub(crate) fn inputs(state: &State, inputs: &[(String, Expr)], scope: &dyn Scope) -> Result<Outputs, BindError> {
+    let mut bound = BTreeMap::new();
+    for (port, expression) in inputs {
+        match expression.evaluate(scope).map_err(BindError::at(format!("input `{port}`"), state))? {
+            Value::Null => {}
+            value => {
+                bound.insert(port.clone(), value);
+            }
+        }
+    }
+    Ok(bound)
+}
+
+/// What a state asks for, evaluated.
+pub(crate) fn requirements(
+    state: &State,
+    wanted: &[ResourceExpr],
+    scope: &dyn Scope,
+) -> Result<Vec<Requirement>, BindError> {
+    wanted.iter().map(|r| r.bind(scope).map_err(BindError::at(format!("resource `{}`", r.kind), state))).collect()
+}
+
+/// Why a state may not start: the first of its preconditions that does not hold; `Ok(None)` when all hold.
+pub(crate) fn unmet(state: &State, scope: &dyn Scope) -> Result<Option<String>, BindError> {
+    for requirement in &state.annotations.requires {
+        if !requirement.holds(scope).map_err(BindError::at("`requires`", state))? {
+            return Ok(Some(format!("the precondition `{requirement}` of {} does not hold", state.path)));
+        }
+    }
+    Ok(None)
+}
+
+/// Checks what a provider returned against the declared output ports.
+pub(crate) fn missing_output(
+    declared: &BTreeMap<String, ratn_model::value::Type>,
+    outputs: &Outputs,
+) -> Option<String> {
+    declared.iter().find_map(|(port, ty)| match outputs.get(port) {
+        None => Some(format!("it did not write its output `{port}`")),
+        Some(value) if !ty.accepts(value) => {
+            Some(format!("its output `{port}` is of type {}, not {ty}", value.type_name()))
+        }
+        Some(_) => None,
+    })
+}
+
+/// A seed for one visit, the same in every mode and on every host (FNV-1a over the run's seed and the path).
+pub(crate) fn seed(run: u64, path: &str) -> u64 {
+    let mut hash = 0xcbf2_9ce4_8422_2325_u64;
+    for byte in run.to_le_bytes().into_iter().chain(path.bytes()) {
+        hash = (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
+    }
+    hash
+}
+
+/// The path of a child below its parent's.
+pub(crate) fn child_path(parent: &str, name: &str) -> String {
+    if parent.is_empty() { name.to_owned() } else { format!("{parent}/{name}") }
+}

@@ -1,0 +1,73 @@
+//! What a finished node changed: its declared effects with what was measured put in.
+
+use crate::analysis::NodeNature;
+use ratn_model::expression::{EffectExpr, EvaluateError, Scope};
+use ratn_model::fact::{Change, FactKey};
+use ratn_model::program::State;
+use ratn_model::value::Value;
+
+/// The declared effects of an outcome; `None` when the state may write everything then.
+pub(crate) fn declared<'a>(state: &'a State, nature: NodeNature, outcome: &str) -> Option<&'a [EffectExpr]> {
+    match state.annotations.effects.get(outcome) {
+        Some(effects) => Some(effects),
+        // A node that only computes or senses changes nothing unless it says so.
+        None if nature != NodeNature::Irreversible => Some(&[]),
+        None => None,
+    }
+}
+
+/// A finished node's changes that cannot be made.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub(crate) enum EffectError {
+    /// An effect's expression has no value even now.
+    #[error("an effect cannot be evaluated: {0}")]
+    Evaluate(#[from] EvaluateError),
+    /// A fact was measured that no effect of this outcome declares.
+    #[error(
+        "it measured {fact} = {value}, which none of its effects for outcome `{outcome}` declares; declare it, or drop the effects annotation"
+    )]
+    Undeclared {
+        /// Which fact.
+        fact: FactKey,
+        /// What was measured.
+        value: Value,
+        /// The outcome.
+        outcome: String,
+    },
+}
+
+/// Declared effects bound in `scope`, each measured value in the place of the predicted one.
+pub(crate) fn actual(
+    declared: Option<&[EffectExpr]>,
+    outcome: &str,
+    measured: &[(FactKey, Value)],
+    scope: &dyn Scope,
+) -> Result<Vec<Change>, EffectError> {
+    let mut changes = match declared {
+        Some(effects) => EffectExpr::bind(effects, scope)?,
+        None => Vec::new(),
+    };
+    for (key, value) in measured {
+        let mut predicted = false;
+        for change in &mut changes {
+            if let Change::Set { fact, value: old } = change
+                && fact == key
+            {
+                *old = value.clone();
+                predicted = true;
+            }
+        }
+        match (predicted, declared) {
+            (true, _) => {}
+            (false, None) => changes.push(Change::Set { fact: key.clone(), value: value.clone() }),
+            (false, Some(_)) => {
+                return Err(EffectError::Undeclared {
+                    fact: key.clone(),
+                    value: value.clone(),
+                    outcome: outcome.to_owned(),
+                });
+            }
+        }
+    }
+    Ok(changes)
+}

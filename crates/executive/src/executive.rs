@@ -1,0 +1,206 @@
+//! One run of one task, in either mode.
+
+use crate::analysis::Analysis;
+use crate::interpreter::{Context, Interpreter, Progress};
+use crate::protocol::{Command, Event, Mode};
+use crate::window::{End, Wait, Window};
+use ratn_model::expression::EffectExpr;
+use ratn_model::fact::Footprint;
+use ratn_model::id::InstanceId;
+use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS};
+use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
+use ratn_world::tolerance::Tolerance;
+use ratn_world::world::World;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// Executes one program once.
+///
+/// The first event is [`Event::Started`]; the first command then commits the program's declared initial world, as
+/// instance 0. The last command is [`Command::End`]; events after it are ignored.
+pub struct Executive {
+    program: Arc<Program>,
+    analysis: Analysis,
+    tolerance: Tolerance,
+    root: World,
+    last_instance: u64,
+    seed: u64,
+    state: State,
+}
+
+enum State {
+    Fresh,
+    Hsm(Box<Interpreter>),
+    Cdtn(Box<Window>),
+    Ended,
+}
+
+impl Executive {
+    /// For one run of a checked program.
+    pub fn new(program: Arc<Program>, tolerance: Tolerance) -> Executive {
+        let analysis = Analysis::of(&program);
+        Executive {
+            program,
+            analysis,
+            tolerance,
+            root: World::default(),
+            last_instance: 0,
+            seed: 0,
+            state: State::Fresh,
+        }
+    }
+
+    /// Takes an event; what the shell shall do now, in order.
+    pub fn handle(&mut self, _now: Timestamp, event: Event) -> Vec<Command> {
+        let mut commands = Vec::new();
+        match event {
+            Event::Started { mode, parameters, seed, world, revision, .. } => {
+                if matches!(self.state, State::Fresh) {
+                    self.root = World::from_facts(world, revision);
+                    self.seed = seed;
+                    self.start(mode, &parameters, &mut commands);
+                }
+            }
+            event => self.step(event, &mut commands),
+        }
+        commands
+    }
+
+    /// The mirror of the root world model.
+    pub fn root(&self) -> &World {
+        &self.root
+    }
+
+    /// Whether [`Command::End`] was given.
+    pub fn has_ended(&self) -> bool {
+        matches!(self.state, State::Ended)
+    }
+
+    /// What every instance that has not begun waits for, as sentences; empty in HSM mode.
+    pub fn explain(&self) -> Vec<String> {
+        let State::Cdtn(window) = &self.state else { return Vec::new() };
+        window.waits().map(|(path, wait)| format!("{path} {}", self.sentence(window, wait))).collect()
+    }
+
+    fn sentence(&self, window: &Window, wait: &Wait) -> String {
+        match wait {
+            Wait::Nothing => "has just been expanded".to_owned(),
+            Wait::Data(state) => format!("waits for an output of {}", self.program.state(*state).path),
+            Wait::World(Footprint::Everything) => {
+                "waits for an older state that may change everything (it declares no effects)".to_owned()
+            }
+            Wait::World(Footprint::Patterns(patterns)) => {
+                let facts: Vec<String> = patterns.iter().map(ToString::to_string).collect();
+                format!("waits for older states to know what they make of {}", facts.join(", "))
+            }
+            Wait::Environment => "waits for the environment to look as it does at its place in the program".to_owned(),
+            Wait::Order => "waits for every older state to have ended".to_owned(),
+            Wait::Sensing(id) => format!("waits for {} to have looked", window.path(*id)),
+            Wait::Writer(id) => format!("waits for {} to stop moving", window.path(*id)),
+            Wait::Precondition(reason) => format!("is held back: {reason}"),
+            Wait::TaskResource(kind) => format!("waits for older states that create, delete or consume {kind}"),
+            Wait::Resources => "waits for the resource manager".to_owned(),
+        }
+    }
+
+    fn start(&mut self, mode: Mode, parameters: &BTreeMap<String, Value>, commands: &mut Vec<Command>) {
+        let program = self.program.clone();
+        let mut context = Context {
+            program: &program,
+            analysis: &self.analysis,
+            root: &mut self.root,
+            last_instance: &mut self.last_instance,
+            seed: self.seed,
+            commands,
+        };
+        if let Err(reason) = commit_initial(&mut context, parameters) {
+            self.state = State::Ended;
+            let reason = format!("the task's initial world: {reason}");
+            commands.push(Command::End { outcome: ABORTED.to_owned(), outputs: BTreeMap::new(), reason });
+            return;
+        }
+        let end = match mode {
+            Mode::Hsm => {
+                let mut interpreter = Box::new(Interpreter::of_program(parameters));
+                let progress = interpreter.start(&mut context, Program::ROOT, "");
+                let end = end_of(&mut context, &interpreter, progress);
+                self.state = State::Hsm(interpreter);
+                end
+            }
+            Mode::Cdtn => {
+                let mut window = Box::new(Window::new(parameters, self.tolerance));
+                let end = window.start(&mut context);
+                self.state = State::Cdtn(window);
+                end
+            }
+        };
+        self.end(end, commands);
+    }
+
+    fn step(&mut self, event: Event, commands: &mut Vec<Command>) {
+        let program = self.program.clone();
+        let mut context = Context {
+            program: &program,
+            analysis: &self.analysis,
+            root: &mut self.root,
+            last_instance: &mut self.last_instance,
+            seed: self.seed,
+            commands,
+        };
+        let end = match &mut self.state {
+            State::Fresh | State::Ended => None,
+            State::Cdtn(window) => window.handle(&mut context, event),
+            State::Hsm(interpreter) => match event {
+                Event::AbortRequested { reason } => {
+                    interpreter.abort(&mut context);
+                    Some(End { outcome: PREEMPTED.to_owned(), outputs: BTreeMap::new(), reason })
+                }
+                Event::RetirementFailed { reason, .. } => {
+                    interpreter.abort(&mut context);
+                    let reason = format!("what had happened could not be recorded: {reason}");
+                    Some(End { outcome: ABORTED.to_owned(), outputs: BTreeMap::new(), reason })
+                }
+                event => {
+                    let progress = interpreter.handle(&mut context, event);
+                    end_of(&mut context, interpreter, progress)
+                }
+            },
+        };
+        self.end(end, commands);
+    }
+
+    fn end(&mut self, end: Option<End>, commands: &mut Vec<Command>) {
+        if let Some(End { outcome, outputs, reason }) = end {
+            self.state = State::Ended;
+            commands.push(Command::End { outcome, outputs, reason });
+        }
+    }
+}
+
+fn commit_initial(context: &mut Context<'_>, parameters: &BTreeMap<String, Value>) -> Result<(), String> {
+    let interpreter = Interpreter::of_program(parameters);
+    let changes = interpreter
+        .in_scope(context, |scope| EffectExpr::bind(&context.program.initial, scope))
+        .map_err(|e| e.to_string())?;
+    context.commit(InstanceId(0), changes)
+}
+
+fn end_of(context: &mut Context<'_>, interpreter: &Interpreter, progress: Progress) -> Option<End> {
+    let Progress::Ended { outcome, reason } = progress else { return None };
+    let mut outputs = BTreeMap::new();
+    if outcome == SUCCESS {
+        for output in &context.program.outputs {
+            match interpreter.in_scope(context, |scope| output.value.evaluate(scope)) {
+                Ok(value) => {
+                    outputs.insert(output.name.clone(), value);
+                }
+                Err(error) => {
+                    let reason = format!("output `{}`: {error}", output.name);
+                    return Some(End { outcome: ABORTED.to_owned(), outputs: BTreeMap::new(), reason });
+                }
+            }
+        }
+    }
+    Some(End { outcome, outputs, reason })
+}

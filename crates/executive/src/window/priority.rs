@@ -1,0 +1,72 @@
+//! Dispatch order: not speculative before speculative, then the longest remaining path, then program order.
+//!
+//! The remaining path of a node is its estimated duration plus the longest of what waits for it: the readers of its
+//! outputs, and the next PIA in program order, which may not begin before every older instance has ended.
+
+use crate::interpreter::Context;
+use crate::window::Window;
+use crate::window::instance::Role;
+use ratn_model::fact::Footprint;
+use ratn_model::id::InstanceId;
+use std::collections::BTreeMap;
+
+/// Priorities are milliseconds in this many bits, under the bit that says "not speculative".
+const REMAINING_BITS: u32 = 40;
+
+impl Window {
+    /// Estimates durations and remaining paths of everything in the window.
+    pub(crate) fn estimate(&mut self, context: &Context<'_>) {
+        let mut after: BTreeMap<InstanceId, f64> = BTreeMap::new();
+        let mut next_pia: BTreeMap<InstanceId, f64> = BTreeMap::new();
+        let ids: Vec<InstanceId> = self.instances.alive.keys().rev().copied().collect();
+        // A younger instance always has a larger id.
+        for id in ids {
+            let duration_s = self.duration_s(context, id);
+            let Some(instance) = self.instances.alive.get_mut(&id) else { continue };
+            let pia_s = instance.next.iter().filter_map(|next| next_pia.get(next)).fold(0.0, |a: f64, b| a.max(*b));
+            let readers_s = after.get(&id).copied().unwrap_or(0.0);
+            instance.duration_s = duration_s;
+            instance.remaining_s = duration_s + pia_s.max(readers_s);
+            let remaining_s = instance.remaining_s;
+            next_pia.insert(id, if instance.is_pia() { remaining_s } else { pia_s });
+            let analysis = context.analysis.state(instance.state);
+            if instance.role == Role::Node {
+                for state in &analysis.flows {
+                    if let Some(producer) = instance.environment.producers.get(state) {
+                        let longest = after.entry(*producer).or_default();
+                        *longest = longest.max(remaining_s);
+                    }
+                }
+            }
+        }
+    }
+
+    fn duration_s(&self, context: &Context<'_>, id: InstanceId) -> f64 {
+        let Some(instance) = self.instances.alive.get(&id) else { return 0.0 };
+        let estimate = context.program.state(instance.state).annotations.duration_s.as_ref();
+        if instance.role != Role::Node {
+            return 0.0;
+        }
+        let names =
+            crate::window::instance::PlaceNames { instances: &self.instances, environment: &instance.environment };
+        let scope = crate::binding::Bindings {
+            names: &names,
+            outputs: None,
+            world: context.root,
+            unknown: &Footprint::Everything,
+        };
+        estimate
+            .and_then(|e| e.evaluate(&scope).ok())
+            .and_then(|v| v.as_number())
+            .filter(|s| s.is_finite() && *s >= 0.0)
+            .unwrap_or(instance.duration_s)
+    }
+
+    /// The priority of an acquire: larger first.
+    pub(crate) fn priority(&self, id: InstanceId, speculative: bool) -> i64 {
+        let remaining_s = self.instances.alive.get(&id).map_or(0.0, |i| i.remaining_s);
+        let limit = (1_i64 << REMAINING_BITS) - 1;
+        let remaining = ((remaining_s * 1000.0) as i64).clamp(0, limit);
+        if speculative { remaining } else { remaining | (1 << REMAINING_BITS) }
+    }
+}
