@@ -1,1 +1,43 @@
-//! The resource pool as a state machine: operations, leases, wait queue.
+//! The resource pool as a state machine (the paper's Section V-B: create, consume, delete, block, release, exists), plus
+//! what concurrent clients need: all-or-nothing [`Pool::acquire`] with a queue, sessions, leases with fencing tokens,
+//! watch events and explanations.
+//!
+//! ```text
+//!   session ──keep alive──▶ session          waiter: queued ──▶ granted (a lease) ──▶ released | expired
+//!      │ no keep alive for its TTL                      └─────▶ refused (deadline, cancelled, session gone)
+//!      └▶ its resources vanish, its leases end, its waiters leave, its consumption returns
+//! ```
+//!
+//! Pure: time comes in as an argument, whatever happens besides the direct answer comes out of [`Pool::take_notices`].
+//! What is free is computed from the live leases of a resource; nothing is counted beside them. Grants are made in
+//! strict order of priority, then arrival: a waiter that cannot be served yet reserves every free unit it can use, so a
+//! later one never takes a unit that it waits for, and waiters for other kinds pass. It deliberately knows no socket,
+//! no clock and no process; who starts what a waiter lacks is the providers' business.
+
+mod assignment;
+mod error;
+mod event;
+mod expiry;
+mod explain;
+mod id;
+mod invariants;
+mod lease;
+mod limits;
+mod pool;
+mod queue;
+mod request;
+mod resource;
+mod schedule;
+mod session;
+
+pub use error::PoolError;
+pub use event::{Change, EndReason, Notice, Refusal, WatchEvent};
+pub use explain::{Explanation, Obstacle};
+pub use id::{SessionId, WaiterId};
+pub use lease::LeaseView;
+pub use limits::Limits;
+pub use pool::Pool;
+pub use queue::AcquireRequest;
+pub use request::{Reply, Request};
+pub use resource::{ENDPOINT_ATTRIBUTE, Holding, ResourceSpec, ResourceView};
+pub use session::SessionView;

@@ -1,0 +1,81 @@
+//! Why the pool does not do what a request asks.
+
+use crate::id::{SessionId, WaiterId};
+use ratn_model::id::LeaseId;
+
+/// A refused request; the pool is as it was before.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum PoolError {
+    /// The session was never opened, has expired or was closed.
+    #[error("{session} is unknown or has expired: send a keep-alive to open it anew")]
+    UnknownSession {
+        /// Which.
+        session: SessionId,
+    },
+    /// No such lease, or it has ended.
+    #[error("{lease} is unknown or has ended")]
+    UnknownLease {
+        /// Which.
+        lease: LeaseId,
+    },
+    /// No such waiter, or it has been answered.
+    #[error("{waiter} is not in the queue")]
+    UnknownWaiter {
+        /// Which.
+        waiter: WaiterId,
+    },
+    /// No such resource.
+    #[error("there is no resource `{id}`")]
+    UnknownResource {
+        /// Which.
+        id: String,
+    },
+    /// A resource of that id is there and belongs to another session.
+    #[error("resource `{id}` exists already and belongs to {owner}")]
+    ResourceTaken {
+        /// Which.
+        id: String,
+        /// Whose: a session, or nobody's.
+        owner: String,
+    },
+    /// The lease or session is not the caller's.
+    #[error("{what} belongs to {owner}, not to {caller}")]
+    NotYours {
+        /// What.
+        what: String,
+        /// Whose it is.
+        owner: SessionId,
+        /// Who asked.
+        caller: SessionId,
+    },
+    /// Fewer resources match than the operation takes.
+    #[error("{wanted} wanted, but {found} units of it exist")]
+    NotEnough {
+        /// What was asked.
+        wanted: String,
+        /// How much there is.
+        found: u64,
+    },
+    /// A request that no pool could perform.
+    #[error("{what}: {rule}")]
+    Malformed {
+        /// What is wrong, as written.
+        what: String,
+        /// The rule that it breaks.
+        rule: String,
+    },
+    /// A bound of [`crate::Limits`] is reached.
+    #[error("{what}: the limit of {limit} is reached, try again later")]
+    TooMany {
+        /// Of what.
+        what: &'static str,
+        /// The bound.
+        limit: usize,
+    },
+    /// A request id that was used for something else before.
+    #[error("request id `{id}` was used for another request before")]
+    RequestIdReused {
+        /// Which.
+        id: String,
+    },
+}

@@ -1,0 +1,139 @@
+//! What comes out of the pool besides direct answers: answers to waiters, and the events that watchers see.
+
+use crate::id::{SessionId, WaiterId};
+use crate::resource::ResourceView;
+use ratn_model::id::{FencingToken, LeaseId, Revision};
+use ratn_model::resource::Lease;
+use std::fmt;
+
+/// Something that happened while a request was handled or time went on.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Notice {
+    /// An acquire is granted, at once or after waiting.
+    Granted {
+        /// Which acquire.
+        waiter: WaiterId,
+        /// What it got.
+        lease: Lease,
+    },
+    /// An acquire will not be granted.
+    Refused {
+        /// Which acquire.
+        waiter: WaiterId,
+        /// Why.
+        refusal: Refusal,
+    },
+    /// A change that watchers see.
+    Event(WatchEvent),
+}
+
+/// Why a waiter left the queue without a lease.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Refusal {
+    /// Its deadline has passed; what it waited for until then.
+    Deadline {
+        /// In the words of [`crate::Explanation`].
+        waited_for: String,
+    },
+    /// Its client withdrew it.
+    Cancelled,
+    /// Its session has ended.
+    SessionEnded,
+}
+
+/// A change of the pool.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WatchEvent {
+    /// The pool's revision with this change; grows by one per event.
+    pub revision: Revision,
+    /// What changed.
+    pub change: Change,
+}
+
+/// What changed.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Change {
+    /// A resource is there.
+    ResourceCreated(ResourceView),
+    /// A resource has other attributes or another capacity.
+    ResourceUpdated(ResourceView),
+    /// A resource is gone.
+    ResourceDeleted {
+        /// As it was before.
+        resource: ResourceView,
+        /// Why.
+        reason: EndReason,
+    },
+    /// A resource vanished while somebody held it; the rest of the lease stays.
+    ResourceLost {
+        /// The holder's lease.
+        lease: LeaseId,
+        /// Its token.
+        token: FencingToken,
+        /// The holder.
+        session: SessionId,
+        /// What it lost, as it was before.
+        resource: ResourceView,
+    },
+    /// A lease began.
+    LeaseGranted {
+        /// Its id.
+        lease: LeaseId,
+        /// Its token.
+        token: FencingToken,
+        /// Whose.
+        session: SessionId,
+        /// Its resources, as they are with it.
+        resources: Vec<ResourceView>,
+    },
+    /// A lease ended; what it held is free.
+    LeaseEnded {
+        /// Its id.
+        lease: LeaseId,
+        /// Its token.
+        token: FencingToken,
+        /// Whose it was.
+        session: SessionId,
+        /// The resources that it held until now, as they are without it.
+        resources: Vec<ResourceView>,
+        /// Why.
+        reason: EndReason,
+    },
+}
+
+/// Why a lease or a resource ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EndReason {
+    /// Its holder released it, its owner deleted it.
+    Asked,
+    /// Its session's keep-alive stopped.
+    SessionExpired,
+    /// Its session was closed.
+    SessionClosed,
+    /// The lease's own time is over.
+    HeldTooLong,
+    /// All of it was deleted or consumed for good.
+    UsedUp,
+}
+
+impl fmt::Display for EndReason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            EndReason::Asked => "asked",
+            EndReason::SessionExpired => "session expired",
+            EndReason::SessionClosed => "session closed",
+            EndReason::HeldTooLong => "held too long",
+            EndReason::UsedUp => "used up",
+        })
+    }
+}
+
+impl fmt::Display for Refusal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Refusal::Deadline { waited_for } => write!(f, "deadline passed while waiting for {waited_for}"),
+            Refusal::Cancelled => f.write_str("cancelled"),
+            Refusal::SessionEnded => f.write_str("its session has ended"),
+        }
+    }
+}

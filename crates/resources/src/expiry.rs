@@ -1,0 +1,47 @@
+//! What time does to the pool: sessions expire, waiters reach their deadline, leases their end.
+//!
+//! Everything that is due is ended before anything is granted, so that a waiter whose session or deadline has passed is
+//! never handed a lease, however late the pool was called.
+
+use crate::event::{EndReason, Refusal};
+use crate::id::{SessionId, WaiterId};
+use crate::pool::Pool;
+use ratn_model::id::LeaseId;
+use ratn_model::time::Timestamp;
+
+/// What ends at a moment.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Timer {
+    Session(SessionId),
+    Waiter(WaiterId),
+    Lease(LeaseId),
+}
+
+impl Pool {
+    /// The next moment at which time alone changes something: call [`Pool::advance`] then.
+    pub fn next_deadline(&self) -> Option<Timestamp> {
+        self.timers.first().map(|(at, _)| *at).filter(|at| *at < Timestamp(u64::MAX))
+    }
+
+    /// Ends what has run out by `now`, then grants what became free. Every other method does this first.
+    pub fn advance(&mut self, now: Timestamp) {
+        // A clock that goes back is a clock that stands still.
+        self.now = self.now.max(now);
+        let mut ended = false;
+        while self.timers.first().is_some_and(|(at, _)| *at <= self.now) {
+            let Some((_, timer)) = self.timers.pop_first() else { break };
+            ended = true;
+            match timer {
+                Timer::Session(id) => self.end_session(&id, EndReason::SessionExpired),
+                Timer::Lease(id) => self.end_lease(id, EndReason::HeldTooLong),
+                Timer::Waiter(id) => {
+                    let waited_for = self.explain(id).map(|e| e.to_string()).unwrap_or_default();
+                    self.refuse(id, Refusal::Deadline { waited_for });
+                }
+            }
+        }
+        if ended {
+            self.schedule();
+        }
+    }
+}

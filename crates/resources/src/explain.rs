@@ -1,0 +1,152 @@
+//! What a waiter waits for, and whom.
+
+use crate::assignment::{Assignment, Available, Units};
+use crate::id::{SessionId, WaiterId};
+use crate::pool::Pool;
+use crate::queue::Waiter;
+use ratn_model::id::LeaseId;
+use ratn_model::resource::{Requirement, ResourceOperation};
+use std::fmt;
+
+/// How many holders and waiters ahead an obstacle names at the most.
+const MAX_NAMED: usize = 8;
+
+/// Why a waiter is still in the queue.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Explanation {
+    /// Who waits.
+    pub waiter: WaiterId,
+    /// How many are served before it.
+    pub ahead: usize,
+    /// What is in the way, in the order of its requirements.
+    pub obstacles: Vec<Obstacle>,
+}
+
+/// What is in the way of one requirement.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Obstacle {
+    /// No resource of that kind is there.
+    MissingKind {
+        /// The requirement.
+        requirement: String,
+        /// The kind.
+        kind: String,
+    },
+    /// Resources of the kind are there, but too few that fit.
+    TooFew {
+        /// The requirement.
+        requirement: String,
+        /// How many units fit.
+        exist: u64,
+    },
+    /// Enough is there, but others hold it.
+    Held {
+        /// The requirement.
+        requirement: String,
+        /// Who: lease, session, and what it is held for.
+        holders: Vec<(LeaseId, SessionId, String)>,
+    },
+    /// Enough is free, but waiters ahead need it.
+    Reserved {
+        /// The requirement.
+        requirement: String,
+        /// Waiters ahead that want the same kind.
+        waiters: Vec<WaiterId>,
+    },
+}
+
+impl Pool {
+    /// What a waiter waits for; `None` if it is not in the queue.
+    pub fn explain(&self, id: WaiterId) -> Option<Explanation> {
+        let waiter = self.queue.get(id)?;
+        let ahead = self.queue.iter().take_while(|(other, _)| *other != id).count();
+        let requirements = &waiter.request.requirements;
+        let free = Assignment::of(&self.resources, Available::Free(&self.reserved_before(id)), requirements);
+        let unreserved = Assignment::of(&self.resources, Available::Free(&Units::new()), requirements);
+        let obstacles = requirements
+            .iter()
+            .zip(free.missing.iter().zip(unreserved.missing))
+            .filter(|(_, (missing, _))| **missing > 0)
+            .map(|(requirement, (_, without_queue))| self.obstacle(id, requirement, without_queue > 0))
+            .collect();
+        Some(Explanation { waiter: id, ahead, obstacles })
+    }
+
+    fn obstacle(&self, id: WaiterId, requirement: &Requirement, held: bool) -> Obstacle {
+        let text = requirement.to_string();
+        let exist = self.resources.quantity(requirement);
+        if !self.resources.has_kind(&requirement.kind) {
+            Obstacle::MissingKind { requirement: text, kind: requirement.kind.clone() }
+        } else if exist < u64::from(requirement.count) {
+            Obstacle::TooFew { requirement: text, exist }
+        } else if held {
+            let holders = self
+                .resources
+                .fitting(requirement)
+                .flat_map(|(_, resource)| resource.holders.keys())
+                .filter_map(|lease| self.leases.get(lease).map(|r| (*lease, r.session.clone(), r.purpose.clone())))
+                .take(MAX_NAMED)
+                .collect();
+            Obstacle::Held { requirement: text, holders }
+        } else {
+            let wants = |waiter: &Waiter| {
+                waiter
+                    .request
+                    .requirements
+                    .iter()
+                    .any(|r| r.kind == requirement.kind && r.operation != ResourceOperation::Exists)
+            };
+            let waiters = self
+                .queue
+                .iter()
+                .take_while(|(other, _)| *other != id)
+                .filter(|(_, waiter)| wants(waiter))
+                .map(|(other, _)| other)
+                .take(MAX_NAMED)
+                .collect();
+            Obstacle::Reserved { requirement: text, waiters }
+        }
+    }
+}
+
+impl fmt::Display for Explanation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (i, obstacle) in self.obstacles.iter().enumerate() {
+            if i > 0 {
+                f.write_str("; ")?;
+            }
+            write!(f, "{obstacle}")?;
+        }
+        if self.obstacles.is_empty() {
+            write!(f, "{} requests before it", self.ahead)?;
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Display for Obstacle {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Obstacle::MissingKind { requirement, kind } => {
+                write!(f, "`{requirement}`: no resource of kind {kind} exists")
+            }
+            Obstacle::TooFew { requirement, exist } => write!(f, "`{requirement}`: only {exist} units that fit exist"),
+            Obstacle::Held { requirement, holders } => {
+                write!(f, "`{requirement}`: held by ")?;
+                for (i, (lease, session, purpose)) in holders.iter().enumerate() {
+                    let separator = if i == 0 { "" } else { ", " };
+                    let purpose = if purpose.is_empty() { String::new() } else { format!(" for {purpose}") };
+                    write!(f, "{separator}{lease} of {session}{purpose}")?;
+                }
+                Ok(())
+            }
+            Obstacle::Reserved { requirement, waiters } => {
+                write!(f, "`{requirement}`: reserved for ")?;
+                for (i, waiter) in waiters.iter().enumerate() {
+                    write!(f, "{}{waiter}", if i == 0 { "" } else { ", " })?;
+                }
+                Ok(())
+            }
+        }
+    }
+}

@@ -1,0 +1,82 @@
+//! What always holds between two calls; checked after every step of simulated runs and property tests.
+
+use crate::expiry::Timer;
+use crate::pool::Pool;
+use ratn_model::time::Timestamp;
+use std::collections::BTreeSet;
+
+impl Pool {
+    /// Says what is broken, if anything is.
+    ///
+    /// # Errors
+    /// The first invariant that does not hold, in words.
+    pub fn check_invariants(&self) -> Result<(), String> {
+        for (id, resource) in self.resources.iter() {
+            let held: u64 = resource.holders.values().map(|units| u64::from(*units)).sum();
+            let consumed = u64::from(resource.consumed());
+            // A provider may shrink a capacity below what is given out; then nothing more is free.
+            if resource.free() > 0 && held + consumed + u64::from(resource.free()) != u64::from(resource.spec.capacity)
+            {
+                return Err(format!("{id}: held {held} + consumed {consumed} + free is not its capacity"));
+            }
+            for lease in resource.holders.keys() {
+                let known = self.leases.get(lease).is_some_and(|record| record.resources.contains(id));
+                ensure(known, || format!("{id} is held by {lease}, which does not list it"))?;
+            }
+            for session in resource.consumers.keys() {
+                let known = self.sessions.get(session).is_some_and(|s| s.consumed.contains(id));
+                ensure(known, || format!("{id} is consumed by {session}, which does not know it"))?;
+            }
+            if let Some(owner) = &resource.owner {
+                let known = self.sessions.get(owner).is_some_and(|s| s.provides.contains(id));
+                ensure(known, || format!("{id} belongs to {owner}, which does not provide it"))?;
+            }
+        }
+        ensure(self.resources.index_agrees(), || "the index of kinds does not agree with the resources".to_owned())?;
+        let mut tokens = 0;
+        for (id, record) in &self.leases {
+            ensure(record.token.0 > tokens, || format!("{id}: tokens do not grow"))?;
+            tokens = record.token.0;
+            ensure(self.sessions.get(&record.session).is_some_and(|s| s.leases.contains(id)), || {
+                format!("{id} belongs to {}, which does not know it", record.session)
+            })?;
+            for resource in &record.resources {
+                let holds = self.resources.get(resource).is_some_and(|r| r.holders.contains_key(id));
+                ensure(holds, || format!("{id} lists {resource}, which it does not hold"))?;
+            }
+        }
+        ensure(tokens <= self.last_token, || "a token is ahead of the counter".to_owned())?;
+        ensure(self.queue.order_agrees(), || "the order of the queue does not agree with its waiters".to_owned())?;
+        for (id, waiter) in self.queue.iter() {
+            ensure(self.sessions.get(&waiter.request.session).is_some_and(|s| s.waiters.contains(&id)), || {
+                format!("{id} waits for {}, which does not know it", waiter.request.session)
+            })?;
+            ensure(waiter.request.deadline.is_none_or(|deadline| deadline > self.now), || {
+                format!("{id} waits beyond its deadline")
+            })?;
+            // No lost wake-up: whoever can be served has been.
+            let obstacles = self.explain(id).map_or(0, |explanation| explanation.obstacles.len());
+            ensure(obstacles > 0 || self.leases.len() >= self.limits.leases, || format!("{id} waits for nothing"))?;
+        }
+        let ids: usize = self.sessions.values().map(|s| s.waiters.len()).sum();
+        ensure(ids == self.queue.len(), || "a session knows a waiter that is not in the queue".to_owned())?;
+        let leases: usize = self.sessions.values().map(|s| s.leases.len()).sum();
+        ensure(leases == self.leases.len(), || "a session knows a lease that has ended".to_owned())?;
+        let provided: usize = self.sessions.values().map(|s| s.provides.len()).sum();
+        let owned = self.resources.iter().filter(|(_, resource)| resource.owner.is_some()).count();
+        ensure(provided == owned, || "a session provides a resource that is gone".to_owned())?;
+        ensure(self.timers == self.expected_timers(), || "the timers do not agree with what they are for".to_owned())?;
+        ensure(self.memory.len() <= self.limits.remembered_requests, || "the request memory is too long".to_owned())
+    }
+
+    fn expected_timers(&self) -> BTreeSet<(Timestamp, Timer)> {
+        let sessions = self.sessions.iter().map(|(id, session)| (session.expires, Timer::Session(id.clone())));
+        let waiters = self.queue.iter().filter_map(|(id, w)| Some((w.request.deadline?, Timer::Waiter(id))));
+        let leases = self.leases.iter().filter_map(|(id, lease)| Some((lease.expires?, Timer::Lease(*id))));
+        sessions.chain(waiters).chain(leases).collect()
+    }
+}
+
+fn ensure(holds: bool, broken: impl FnOnce() -> String) -> Result<(), String> {
+    if holds { Ok(()) } else { Err(broken()) }
+}

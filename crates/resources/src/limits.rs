@@ -1,0 +1,47 @@
+//! The bounds of everything that a client can make grow.
+
+use serde::{Deserialize, Serialize};
+
+/// Bounds of a pool; a request beyond one is refused with [`crate::PoolError::TooMany`] or
+/// [`crate::PoolError::Malformed`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Limits {
+    /// Resources in all.
+    pub resources: usize,
+    /// Sessions in all.
+    pub sessions: usize,
+    /// Queued acquires in all.
+    pub waiters: usize,
+    /// Queued acquires of one session.
+    pub waiters_per_session: usize,
+    /// Live leases in all.
+    pub leases: usize,
+    /// Requirements of one acquire, and operations of one operate.
+    pub requirements: usize,
+    /// Units that one requirement may ask for.
+    pub units: u32,
+    /// Characters of a name, a kind or a request id.
+    pub name_length: usize,
+    /// Attributes of a resource.
+    pub attributes: usize,
+    /// Answers remembered so that a repeated request id is not performed twice; the oldest is forgotten first.
+    pub remembered_requests: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Limits {
+            resources: 100_000,
+            sessions: 10_000,
+            waiters: 10_000,
+            waiters_per_session: 4_096,
+            leases: 100_000,
+            requirements: 32,
+            units: 100_000,
+            name_length: 128,
+            attributes: 32,
+            remembered_requests: 65_536,
+        }
+    }
+}

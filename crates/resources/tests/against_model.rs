@@ -1,0 +1,227 @@
+//! Random histories: the pool does what a tiny obvious model does, grant by grant, and keeps its invariants.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use proptest::prelude::*;
+use ratn_model::id::{FencingToken, LeaseId};
+use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+use ratn_model::time::Timestamp;
+use ratn_resources::{AcquireRequest, Limits, Notice, Pool, ResourceSpec, SessionId, WaiterId};
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+const KINDS: [&str; 3] = ["Arm", "Camera", "PathPlanner"];
+const SESSIONS: usize = 3;
+const TTL: u64 = 20;
+
+#[derive(Debug, Clone)]
+enum Step {
+    Wait(u64),
+    KeepAlive(usize),
+    Create(usize, u32),
+    DeleteUnit(usize),
+    Acquire { session: usize, units: [u32; 3], consume: bool, priority: i64, patience: Option<u64> },
+    Release(usize),
+    Cancel(usize),
+    EndTask(usize),
+}
+
+fn step() -> impl Strategy<Value = Step> {
+    let acquire =
+        (0..SESSIONS, [0..3u32, 0..2u32, 0..4u32], prop::bool::weighted(0.15), -2..3i64, prop::option::of(1..15u64))
+            .prop_map(|(session, units, consume, priority, patience)| Step::Acquire {
+                session,
+                units,
+                consume,
+                priority,
+                patience,
+            });
+    prop_oneof![
+        2 => (1..8u64).prop_map(Step::Wait),
+        2 => (0..SESSIONS).prop_map(Step::KeepAlive),
+        2 => (0..KINDS.len(), 1..3u32).prop_map(|(kind, capacity)| Step::Create(kind, capacity)),
+        1 => (0..KINDS.len()).prop_map(Step::DeleteUnit),
+        8 => acquire,
+        5 => (0..16usize).prop_map(Step::Release),
+        1 => (0..16usize).prop_map(Step::Cancel),
+        1 => (0..SESSIONS).prop_map(Step::EndTask),
+    ]
+}
+
+/// Units per kind.
+type Units = [u32; 3];
+
+#[derive(Debug)]
+struct ModelWaiter {
+    id: WaiterId,
+    session: usize,
+    units: Units,
+    consume: bool,
+    priority: i64,
+    deadline: Option<u64>,
+}
+
+/// What the pool should be: counts per kind, a list of holders, a sorted queue.
+#[derive(Debug, Default)]
+struct Model {
+    capacity: Units,
+    expires: [Option<u64>; SESSIONS],
+    leases: BTreeMap<LeaseId, (usize, Units)>,
+    consumed: [Units; SESSIONS],
+    queue: Vec<ModelWaiter>,
+}
+
+impl Model {
+    fn advance(&mut self, now: u64) {
+        self.queue.retain(|waiter| waiter.deadline.is_none_or(|deadline| deadline > now));
+        for session in 0..SESSIONS {
+            if self.expires[session].is_some_and(|at| at <= now) {
+                self.expires[session] = None;
+                self.consumed[session] = [0; 3];
+                self.leases.retain(|_, (owner, _)| *owner != session);
+                self.queue.retain(|waiter| waiter.session != session);
+            }
+        }
+    }
+
+    fn quantity(&self, kind: usize) -> u32 {
+        self.capacity[kind] - self.consumed.iter().map(|units| units[kind]).sum::<u32>()
+    }
+
+    fn free(&self, kind: usize) -> u32 {
+        self.quantity(kind) - self.leases.values().map(|(_, units)| units[kind]).sum::<u32>()
+    }
+
+    /// Who should be granted now, in order; `ids` are the lease ids that the pool gave them.
+    fn grant(&mut self, granted: &[(WaiterId, LeaseId)]) -> Vec<WaiterId> {
+        self.queue.sort_by_key(|waiter| (-waiter.priority, waiter.id));
+        let mut reserved = [0; 3];
+        let mut expected = Vec::new();
+        let mut left = Vec::new();
+        for waiter in std::mem::take(&mut self.queue) {
+            let free = |model: &Model, reserved: &Units, kind: usize| model.free(kind).saturating_sub(reserved[kind]);
+            if (0..3).all(|kind| waiter.units[kind] <= free(self, &reserved, kind)) {
+                expected.push(waiter.id);
+                let lease = granted.iter().find(|(id, _)| *id == waiter.id).map_or(LeaseId(0), |(_, lease)| *lease);
+                if waiter.consume {
+                    for kind in 0..3 {
+                        self.consumed[waiter.session][kind] += waiter.units[kind];
+                    }
+                }
+                let held = if waiter.consume { [0; 3] } else { waiter.units };
+                self.leases.insert(lease, (waiter.session, held));
+                continue;
+            }
+            if (0..3).all(|kind| waiter.units[kind] <= self.quantity(kind)) {
+                for kind in 0..3 {
+                    reserved[kind] += waiter.units[kind].min(free(self, &reserved, kind));
+                }
+            }
+            left.push(waiter);
+        }
+        self.queue = left;
+        expected
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 400, ..ProptestConfig::default() })]
+
+    #[test]
+    fn every_history_grants_what_the_obvious_model_grants(steps in prop::collection::vec(step(), 1..80)) {
+        let mut pool = Pool::new(Limits::default());
+        let mut model = Model::default();
+        let names: Vec<SessionId> = ["a", "b", "c"].map(SessionId::from).to_vec();
+        let (mut now, mut last_token) = (0, FencingToken(0));
+        for step in steps {
+            if let Step::Wait(seconds) = step {
+                now += seconds;
+            }
+            let at = Timestamp(now);
+            pool.advance(at);
+            model.advance(now);
+            // What became free while time went on is granted before the step.
+            compare(&mut pool, &mut model, &mut last_token)?;
+            match step {
+                Step::Wait(_) => {}
+                Step::KeepAlive(session) => {
+                    let created = pool.keep_alive(at, &names[session], "test", Duration::from_nanos(TTL)).unwrap();
+                    prop_assert_eq!(created, model.expires[session].is_none());
+                    model.expires[session] = Some(now + TTL);
+                }
+                Step::Create(kind, capacity) => {
+                    // Several resources of one kind count as their sum.
+                    let spec = ResourceSpec::new(ResourceClass::Module, KINDS[kind]).capacity(capacity);
+                    pool.create(at, None, spec).unwrap();
+                    model.capacity[kind] += capacity;
+                }
+                Step::DeleteUnit(kind) => {
+                    if model.expires[0].is_some() {
+                        let one = requirement(ResourceOperation::Delete, kind, 1);
+                        let deleted = pool.delete_units(at, &names[0], &one).is_ok();
+                        prop_assert_eq!(deleted, model.free(kind) > 0);
+                        model.capacity[kind] -= u32::from(deleted);
+                    }
+                }
+                Step::Acquire { session, units, consume, priority, patience } => {
+                    let operation = if consume { ResourceOperation::Consume } else { ResourceOperation::Block };
+                    let requirements: Vec<Requirement> = (0..3)
+                        .filter(|kind| units[*kind] > 0)
+                        .map(|kind| requirement(operation, kind, units[kind]))
+                        .collect();
+                    let mut request = AcquireRequest::new(names[session].clone(), requirements).priority(priority);
+                    request.deadline = patience.map(|seconds| Timestamp(now + seconds));
+                    let result = pool.acquire(at, request);
+                    prop_assert_eq!(result.is_ok(), model.expires[session].is_some());
+                    if let Ok(id) = result {
+                        let deadline = patience.map(|seconds| now + seconds);
+                        model.queue.push(ModelWaiter { id, session, units, consume, priority, deadline });
+                    }
+                }
+                Step::Release(index) => {
+                    if let Some(lease) = model.leases.keys().nth(index).copied() {
+                        pool.release(at, None, lease).unwrap();
+                        model.leases.remove(&lease);
+                    }
+                }
+                Step::Cancel(index) => {
+                    if index < model.queue.len() {
+                        pool.cancel(at, model.queue.remove(index).id).unwrap();
+                    }
+                }
+                Step::EndTask(session) => {
+                    let known = pool.end_task(at, &names[session]).is_ok();
+                    prop_assert_eq!(known, model.expires[session].is_some());
+                    model.consumed[session] = [0; 3];
+                }
+            }
+            compare(&mut pool, &mut model, &mut last_token)?;
+        }
+    }
+}
+
+fn requirement(operation: ResourceOperation, kind: usize, count: u32) -> Requirement {
+    Requirement { operation, kind: KINDS[kind].into(), class: None, attributes: BTreeMap::new(), count }
+}
+
+fn compare(pool: &mut Pool, model: &mut Model, last_token: &mut FencingToken) -> Result<(), TestCaseError> {
+    pool.check_invariants().map_err(TestCaseError::fail)?;
+    let mut granted = Vec::new();
+    for notice in pool.take_notices() {
+        if let Notice::Granted { waiter, lease } = notice {
+            prop_assert!(lease.token > *last_token, "tokens grow strictly");
+            *last_token = lease.token;
+            granted.push((waiter, lease.id));
+        }
+    }
+    let expected = model.grant(&granted);
+    prop_assert_eq!(granted.iter().map(|(waiter, _)| *waiter).collect::<Vec<_>>(), expected);
+    let mut free = [0; 3];
+    for resource in pool.list() {
+        let kind = KINDS.iter().position(|kind| *kind == resource.kind).unwrap();
+        free[kind] += resource.free;
+    }
+    prop_assert_eq!(free, [model.free(0), model.free(1), model.free(2)]);
+    prop_assert_eq!(pool.waiters().len(), model.queue.len());
+    prop_assert_eq!(pool.leases().len(), model.leases.len());
+    Ok(())
+}

@@ -1,0 +1,435 @@
+//! The pool, feature by feature.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_model::id::LeaseId;
+use ratn_model::resource::{Lease, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
+use ratn_resources::{
+    AcquireRequest, Change, EndReason, Limits, Notice, Obstacle, Pool, PoolError, Refusal, Reply, Request,
+    ResourceSpec, SessionId, WaiterId,
+};
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+/// A pool with a session `a` that provides and a session `b`, both with a TTL of 10 s, and a clock.
+struct Bench {
+    pool: Pool,
+    now: Timestamp,
+}
+
+impl Bench {
+    fn new() -> Bench {
+        let mut bench = Bench { pool: Pool::new(Limits::default()), now: Timestamp(0) };
+        for name in ["a", "b"] {
+            assert!(bench.pool.keep_alive(bench.now, &session(name), name, Duration::from_secs(10)).unwrap());
+        }
+        bench
+    }
+
+    fn with(resources: &[(&str, u32)]) -> Bench {
+        let mut bench = Bench::new();
+        for (kind, capacity) in resources {
+            bench.create("a", ResourceSpec::new(ResourceClass::Module, *kind).capacity(*capacity));
+        }
+        bench.pool.take_notices();
+        bench
+    }
+
+    fn create(&mut self, owner: &str, spec: ResourceSpec) -> String {
+        self.pool.create(self.now, Some(&session(owner)), spec).unwrap().id
+    }
+
+    fn at(&mut self, seconds: f64) -> Vec<Notice> {
+        self.now = Timestamp::from_seconds(seconds);
+        self.pool.advance(self.now);
+        self.notices()
+    }
+
+    fn acquire(&mut self, owner: &str, requirements: &[Requirement]) -> WaiterId {
+        self.acquire_as(AcquireRequest::new(session(owner), requirements.to_vec()))
+    }
+
+    fn acquire_as(&mut self, request: AcquireRequest) -> WaiterId {
+        let waiter = self.pool.acquire(self.now, request).unwrap();
+        self.pool.check_invariants().unwrap();
+        waiter
+    }
+
+    fn granted(&mut self, owner: &str, requirements: &[Requirement]) -> Lease {
+        let waiter = self.acquire(owner, requirements);
+        let notices = self.notices();
+        grants(&notices).into_iter().find(|(id, _)| *id == waiter).expect("granted at once").1
+    }
+
+    fn release(&mut self, lease: LeaseId) -> Vec<WaiterId> {
+        self.pool.release(self.now, None, lease).unwrap();
+        grants(&self.notices()).into_iter().map(|(waiter, _)| waiter).collect()
+    }
+
+    fn notices(&mut self) -> Vec<Notice> {
+        self.pool.check_invariants().unwrap();
+        self.pool.take_notices()
+    }
+}
+
+fn session(name: &str) -> SessionId {
+    SessionId::from(name)
+}
+
+fn requirement(operation: ResourceOperation, kind: &str, count: u32) -> Requirement {
+    Requirement { operation, kind: kind.into(), class: None, attributes: BTreeMap::new(), count }
+}
+
+fn block(kind: &str) -> Requirement {
+    requirement(ResourceOperation::Block, kind, 1)
+}
+
+fn grants(notices: &[Notice]) -> Vec<(WaiterId, Lease)> {
+    notices
+        .iter()
+        .filter_map(|notice| match notice {
+            Notice::Granted { waiter, lease } => Some((*waiter, lease.clone())),
+            _ => None,
+        })
+        .collect()
+}
+
+fn changes(notices: &[Notice]) -> Vec<&Change> {
+    notices
+        .iter()
+        .filter_map(|notice| match notice {
+            Notice::Event(event) => Some(&event.change),
+            _ => None,
+        })
+        .collect()
+}
+
+#[test]
+fn a_free_resource_is_granted_at_once_with_its_endpoint() {
+    let mut bench = Bench::new();
+    let spec = ResourceSpec::new(ResourceClass::Process, "PathPlanner")
+        .id("planner-1@compute")
+        .attribute("endpoint", Value::String("unix:/p1".into()));
+    bench.create("a", spec);
+    let lease = bench.granted("b", &[block("PathPlanner")]);
+    let resource = lease.resource("PathPlanner").unwrap();
+    assert_eq!((resource.id.as_str(), resource.endpoint.as_str()), ("planner-1@compute", "unix:/p1"));
+}
+
+#[test]
+fn a_held_resource_goes_to_the_next_waiter_with_a_larger_token() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    let first = bench.granted("a", &[block("Arm")]);
+    let waiter = bench.acquire("b", &[block("Arm")]);
+    assert!(grants(&bench.notices()).is_empty());
+    bench.pool.release(bench.now, None, first.id).unwrap();
+    let granted = grants(&bench.notices());
+    assert_eq!(granted[0].0, waiter);
+    assert!(granted[0].1.token > first.token);
+}
+
+#[test]
+fn larger_priority_goes_first_and_equals_in_the_order_of_arrival() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    let mut held = bench.granted("a", &[block("Arm")]).id;
+    let asks = [0, 5, 0, 5];
+    let waiters: Vec<WaiterId> = asks
+        .map(|priority| bench.acquire_as(AcquireRequest::new(session("b"), vec![block("Arm")]).priority(priority)))
+        .to_vec();
+    let mut order = Vec::new();
+    for _ in asks {
+        bench.pool.release(bench.now, None, held).unwrap();
+        let granted = grants(&bench.notices());
+        order.push(granted[0].0);
+        held = granted[0].1.id;
+    }
+    assert_eq!(order, [waiters[1], waiters[3], waiters[0], waiters[2]]);
+}
+
+#[test]
+fn an_acquire_takes_all_or_nothing() {
+    let mut bench = Bench::with(&[("Arm", 1), ("Gripper", 1)]);
+    let arm = bench.granted("a", &[block("Arm")]);
+    let both = bench.acquire("b", &[block("Arm"), block("Gripper")]);
+    assert_eq!(bench.pool.get("Gripper-2").unwrap().free, 1, "nothing is held while waiting");
+    assert_eq!(bench.release(arm.id), [both]);
+    assert_eq!(bench.pool.get("Gripper-2").unwrap().free, 0);
+}
+
+#[test]
+fn a_large_request_is_not_overtaken_for_what_it_waits_for_but_other_kinds_pass() {
+    let mut bench = Bench::with(&[("PathPlanner", 2), ("Detector", 1)]);
+    let one = bench.granted("a", &[block("PathPlanner")]);
+    let large = bench.acquire("b", &[requirement(ResourceOperation::Block, "PathPlanner", 2)]);
+    let small = bench.acquire("b", &[block("PathPlanner")]);
+    let other = bench.acquire("b", &[block("Detector")]);
+    let granted = grants(&bench.notices());
+    assert_eq!(granted.iter().map(|(waiter, _)| *waiter).collect::<Vec<_>>(), [other]);
+    assert!(matches!(&bench.pool.explain(small).unwrap().obstacles[..],
+        [Obstacle::Reserved { waiters, .. }] if waiters[..] == [large]));
+    assert_eq!(bench.release(one.id), [large]);
+}
+
+#[test]
+fn a_request_for_a_missing_kind_holds_nobody_up_and_is_granted_when_the_kind_appears() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    let missing = bench.acquire("b", &[block("Arm"), block("Detector")]);
+    assert!(matches!(&bench.pool.explain(missing).unwrap().obstacles[..],
+        [Obstacle::MissingKind { kind, .. }] if kind == "Detector"));
+    let arm = bench.granted("a", &[block("Arm")]);
+    bench.pool.release(bench.now, None, arm.id).unwrap();
+    bench.notices();
+    bench.create("a", ResourceSpec::new(ResourceClass::Process, "Detector"));
+    assert_eq!(grants(&bench.notices())[0].0, missing);
+}
+
+#[test]
+fn a_capacity_of_eight_has_eight_concurrent_holders() {
+    let mut bench = Bench::with(&[("WorldModel", 8)]);
+    let leases: Vec<Lease> = (0..8).map(|_| bench.granted("b", &[block("WorldModel")])).collect();
+    let ninth = bench.acquire("b", &[block("WorldModel")]);
+    assert!(grants(&bench.notices()).is_empty());
+    assert_eq!(bench.release(leases[3].id), [ninth]);
+}
+
+#[test]
+fn units_are_moved_between_requirements_so_that_what_can_be_served_is() {
+    let mut bench = Bench::new();
+    for host in ["a", "b"] {
+        let spec = ResourceSpec::new(ResourceClass::Process, "PathPlanner").id(format!("planner@{host}"));
+        bench.create("a", spec.attribute("host", Value::String(host.into())));
+    }
+    let on_a = Requirement {
+        attributes: [("host".to_owned(), Value::String("a".into()))].into(),
+        ..requirement(ResourceOperation::Block, "PathPlanner", 1)
+    };
+    let lease = bench.granted("b", &[block("PathPlanner"), on_a]);
+    let ids: Vec<&str> = lease.resources.iter().map(|r| r.id.as_str()).collect();
+    assert_eq!(ids, ["planner@b", "planner@a"], "in the order of the requirements");
+}
+
+#[test]
+fn a_session_without_keep_alive_loses_resources_leases_and_place_in_the_queue() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    bench.create("b", ResourceSpec::new(ResourceClass::Module, "Gripper").id("gripper"));
+    let held = bench.granted("a", &[block("Gripper")]);
+    let waiting = bench.acquire("b", &[block("Gripper")]);
+    bench.at(9.0);
+    bench.pool.keep_alive(bench.now, &session("a"), "a", Duration::from_secs(10)).unwrap();
+    assert_eq!(bench.pool.next_deadline(), Some(Timestamp::from_seconds(10.0)));
+    let notices = bench.at(10.0);
+    assert!(notices.contains(&Notice::Refused { waiter: waiting, refusal: Refusal::SessionEnded }));
+    let changes = changes(&notices);
+    assert!(matches!(&changes[..], [
+        Change::ResourceLost { lease, resource: lost, .. },
+        Change::ResourceDeleted { resource, reason: EndReason::SessionExpired },
+    ] if *lease == held.id && lost.id == "gripper" && resource.id == "gripper"));
+    assert!(bench.pool.get("gripper").is_none());
+}
+
+#[test]
+fn a_waiter_whose_session_expired_is_not_granted_however_late_the_pool_is_called() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    let held = bench.granted("a", &[block("Arm")]);
+    let waiting = bench.acquire("b", &[block("Arm")]);
+    bench.pool.keep_alive(Timestamp::from_seconds(5.0), &session("a"), "a", Duration::from_secs(60)).unwrap();
+    // No timer fired in between: the release itself comes after b's time.
+    bench.now = Timestamp::from_seconds(12.0);
+    bench.pool.release(bench.now, Some(&session("a")), held.id).unwrap();
+    let notices = bench.notices();
+    assert!(grants(&notices).is_empty());
+    assert!(notices.contains(&Notice::Refused { waiter: waiting, refusal: Refusal::SessionEnded }));
+    assert_eq!(bench.pool.get("Arm-1").unwrap().free, 1);
+}
+
+#[test]
+fn a_waiter_past_its_deadline_is_told_what_it_waited_for() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    bench
+        .acquire_as(AcquireRequest { purpose: "move".into(), ..AcquireRequest::new(session("a"), vec![block("Arm")]) });
+    bench.notices();
+    let request = AcquireRequest::new(session("b"), vec![block("Arm")]).deadline(Timestamp::from_seconds(2.0));
+    let waiter = bench.acquire_as(request);
+    assert_eq!(bench.pool.next_deadline(), Some(Timestamp::from_seconds(2.0)));
+    let notices = bench.at(2.0);
+    let [Notice::Refused { waiter: refused, refusal: Refusal::Deadline { waited_for } }] = &notices[..] else {
+        panic!("{notices:?}")
+    };
+    assert_eq!(*refused, waiter);
+    assert_eq!(waited_for, "`block Arm`: held by lease-1 of session a for move");
+}
+
+#[test]
+fn a_lease_ends_when_its_own_time_is_over() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    let request = AcquireRequest::new(session("a"), vec![block("Arm")]);
+    bench.acquire_as(AcquireRequest { hold_for: Some(Duration::from_secs(3)), ..request });
+    let waiter = bench.acquire("b", &[block("Arm")]);
+    bench.notices();
+    let notices = bench.at(3.0);
+    assert!(matches!(changes(&notices)[0], Change::LeaseEnded { reason: EndReason::HeldTooLong, .. }));
+    assert_eq!(grants(&notices)[0].0, waiter);
+}
+
+#[test]
+fn a_cancelled_waiter_is_not_granted() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    let held = bench.granted("a", &[block("Arm")]);
+    let waiter = bench.acquire("b", &[block("Arm")]);
+    bench.pool.cancel(bench.now, waiter).unwrap();
+    assert_eq!(bench.notices(), [Notice::Refused { waiter, refusal: Refusal::Cancelled }]);
+    assert_eq!(bench.release(held.id), []);
+    assert_eq!(bench.pool.cancel(bench.now, waiter), Err(PoolError::UnknownWaiter { waiter }));
+}
+
+#[test]
+fn what_is_consumed_returns_when_the_task_ends() {
+    let mut bench = Bench::with(&[("Slot", 3)]);
+    let consume = requirement(ResourceOperation::Consume, "Slot", 2);
+    let lease = bench.granted("b", std::slice::from_ref(&consume));
+    assert!(lease.resources.is_empty(), "what is consumed is not held");
+    bench.pool.release(bench.now, None, lease.id).unwrap();
+    assert_eq!(bench.pool.get("Slot-1").unwrap().free, 1);
+    let refused = bench.pool.consume(bench.now, &session("b"), &consume);
+    assert_eq!(refused, Err(PoolError::NotEnough { wanted: "consume Slot × 2".into(), found: 1 }));
+    bench.pool.end_task(bench.now, &session("b")).unwrap();
+    assert_eq!(bench.pool.get("Slot-1").unwrap().free, 3);
+}
+
+#[test]
+fn what_is_consumed_of_something_not_renewable_is_gone() {
+    let mut bench = Bench::new();
+    let spec = ResourceSpec { renewable: false, ..ResourceSpec::new(ResourceClass::System, "Battery").capacity(100) };
+    let id = bench.create("a", spec);
+    bench.granted("b", &[requirement(ResourceOperation::Consume, "Battery", 30)]);
+    bench.at(11.0);
+    assert!(bench.pool.get(&id).is_none(), "it went with its provider's session");
+    let mut bench = Bench::new();
+    let spec = ResourceSpec { renewable: false, ..ResourceSpec::new(ResourceClass::System, "Battery").capacity(100) };
+    let id = bench.pool.create(bench.now, None, spec).unwrap().id;
+    bench.granted("b", &[requirement(ResourceOperation::Consume, "Battery", 30)]);
+    bench.at(11.0);
+    assert_eq!(bench.pool.get(&id).unwrap().free, 70);
+}
+
+#[test]
+fn exists_waits_for_the_resource_but_does_not_hold_it() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    let level = Requirement {
+        attributes: [("charged".to_owned(), Value::Bool(true))].into(),
+        ..requirement(ResourceOperation::Exists, "Battery", 1)
+    };
+    let waiter = bench.acquire("b", &[block("Arm"), level.clone()]);
+    let battery = |charged| {
+        let spec = ResourceSpec::new(ResourceClass::System, "Battery").id("battery");
+        spec.attribute("charged", Value::Bool(charged))
+    };
+    bench.create("a", battery(false));
+    assert!(grants(&bench.notices()).is_empty());
+    bench.create("a", battery(true));
+    let granted = grants(&bench.notices());
+    assert_eq!(granted[0].0, waiter);
+    assert_eq!(granted[0].1.resources.len(), 1);
+    assert_eq!(bench.pool.exists(&level), 1);
+}
+
+#[test]
+fn a_deleted_resource_is_lost_to_its_holder_and_the_rest_of_the_lease_stays() {
+    let mut bench = Bench::with(&[("Arm", 1), ("Gripper", 1)]);
+    let lease = bench.granted("b", &[block("Arm"), block("Gripper")]);
+    bench.pool.delete(bench.now, Some(&session("a")), "Arm-1").unwrap();
+    let notices = bench.notices();
+    assert!(matches!(changes(&notices)[0], Change::ResourceLost { lease: l, .. } if *l == lease.id));
+    assert_eq!(bench.pool.leases()[0].resources, ["Gripper-2"]);
+    assert_eq!(
+        bench.pool.delete(bench.now, Some(&session("b")), "Gripper-2").unwrap_err(),
+        PoolError::NotYours { what: "resource `Gripper-2`".into(), owner: session("a"), caller: session("b") }
+    );
+}
+
+#[test]
+fn creates_and_deletes_of_a_state_happen_together_or_not_at_all() {
+    let mut bench = Bench::new();
+    let create = requirement(ResourceOperation::Create, "box_delivered", 3);
+    let delete = |count| requirement(ResourceOperation::Delete, "box_delivered", count);
+    assert_eq!(bench.pool.operate(bench.now, &session("b"), &[create.clone(), delete(1)]).unwrap().len(), 1);
+    assert_eq!(bench.pool.exists(&requirement(ResourceOperation::Exists, "box_delivered", 1)), 2);
+    bench.notices();
+    let refused = bench.pool.operate(bench.now, &session("b"), &[create, delete(6)]);
+    assert_eq!(refused, Err(PoolError::NotEnough { wanted: "delete box_delivered × 6".into(), found: 5 }));
+    assert!(bench.notices().is_empty(), "no trace of it");
+    assert_eq!(bench.pool.delete_units(bench.now, &session("b"), &delete(2)).unwrap(), ["box_delivered-1"]);
+    assert!(bench.pool.list().is_empty(), "a resource without units is gone");
+}
+
+#[test]
+fn a_request_id_used_again_is_performed_once() {
+    let mut bench = Bench::new();
+    let create = Request::Create { session: Some(session("a")), spec: ResourceSpec::new(ResourceClass::Module, "Arm") };
+    let first = bench.pool.handle(bench.now, "c1", create.clone()).unwrap();
+    assert_eq!(bench.pool.handle(bench.now, "c1", create.clone()).unwrap(), first);
+    assert_eq!(bench.pool.list().len(), 1);
+    let acquire = Request::Acquire(AcquireRequest::new(session("b"), vec![block("Arm")]));
+    assert!(matches!(bench.pool.handle(bench.now, "q1", acquire.clone()), Ok(Reply::Queued(_))));
+    let granted = grants(&bench.notices()).remove(0).1;
+    assert_eq!(bench.pool.handle(bench.now, "q1", acquire.clone()), Ok(Reply::Granted(granted.clone())));
+    assert!(grants(&bench.notices()).is_empty());
+    let reused = bench.pool.handle(bench.now, "q1", create);
+    assert_eq!(reused, Err(PoolError::RequestIdReused { id: "q1".into() }));
+    bench.pool.handle(bench.now, "r1", Request::Release { session: None, lease: granted.id }).unwrap();
+    bench.pool.handle(bench.now, "r1", Request::Release { session: None, lease: granted.id }).unwrap();
+    assert_eq!(bench.pool.handle(bench.now, "q1", acquire), Err(PoolError::UnknownLease { lease: granted.id }));
+}
+
+#[test]
+fn a_cancelled_acquire_may_be_asked_again_with_its_request_id() {
+    let mut bench = Bench::new();
+    let acquire = Request::Acquire(AcquireRequest::new(session("b"), vec![block("Arm")]));
+    let Ok(Reply::Queued(first)) = bench.pool.handle(bench.now, "q", acquire.clone()) else { panic!() };
+    assert_eq!(
+        bench.pool.handle(bench.now, "q", acquire.clone()),
+        Ok(Reply::Queued(first)),
+        "it joins the one waiting"
+    );
+    bench.pool.cancel(bench.now, first).unwrap();
+    let Ok(Reply::Queued(second)) = bench.pool.handle(bench.now, "q", acquire) else { panic!() };
+    assert_ne!(first, second);
+}
+
+#[test]
+fn the_id_of_another_sessions_resource_is_refused() {
+    let mut bench = Bench::new();
+    let spec = ResourceSpec::new(ResourceClass::Module, "Arm").id("arm");
+    bench.create("a", spec.clone());
+    let refused = bench.pool.create(bench.now, Some(&session("b")), spec).unwrap_err();
+    assert_eq!(refused.to_string(), "resource `arm` exists already and belongs to session a");
+}
+
+#[test]
+fn requests_beyond_a_bound_are_refused() {
+    let mut pool = Pool::new(Limits { waiters: 1, name_length: 8, ..Limits::default() });
+    let now = Timestamp(0);
+    pool.keep_alive(now, &session("a"), "a", Duration::from_secs(1)).unwrap();
+    let ask = |kind: &str| AcquireRequest::new(session("a"), vec![block(kind)]);
+    pool.acquire(now, ask("Arm")).unwrap();
+    assert_eq!(pool.acquire(now, ask("Arm")), Err(PoolError::TooMany { what: "waiters", limit: 1 }));
+    let spec = ResourceSpec::new(ResourceClass::Module, "Line\nfeed");
+    let refused = pool.create(now, None, spec).unwrap_err().to_string();
+    assert_eq!(refused, "kind `Line\\nfee`: 1 to 8 characters, none of them a control character");
+    assert!(matches!(
+        pool.acquire(now, AcquireRequest::new(session("x"), vec![])),
+        Err(PoolError::UnknownSession { .. })
+    ));
+    let odd = AcquireRequest::new(session("a"), vec![requirement(ResourceOperation::Create, "Arm", 1)]);
+    assert!(matches!(pool.acquire(now, odd), Err(PoolError::TooMany { .. } | PoolError::Malformed { .. })));
+}
+
+#[test]
+fn tokens_of_a_restarted_pool_are_above_those_of_the_old_one() {
+    let mut pool = Pool::starting_above(Limits::default(), 1_000);
+    let now = Timestamp(0);
+    pool.keep_alive(now, &session("a"), "a", Duration::from_secs(1)).unwrap();
+    pool.acquire(now, AcquireRequest::new(session("a"), vec![])).unwrap();
+    assert!(grants(&pool.take_notices())[0].1.token.0 > 1_000);
+}
