@@ -73,8 +73,8 @@ pub enum ImageError {
 pub const MAX_SIDE: usize = 4096;
 
 impl Intrinsics {
-    /// 320 × 240 pixels and 57° × 44°: modest, so that a frame costs milliseconds, and wide enough for the table.
-    pub const DEFAULT: Intrinsics = Intrinsics { width: 320, height: 240, fx: 296.0, fy: 296.0, cx: 159.5, cy: 119.5 };
+    /// 320 × 240 pixels and 52° × 40°: modest, so that a frame costs milliseconds, and wide enough for the table.
+    pub const DEFAULT: Intrinsics = Intrinsics { width: 320, height: 240, fx: 330.0, fy: 330.0, cx: 159.5, cy: 119.5 };
 
     /// The direction of a pixel's ray in the optical frame, with z = 1: times the depth it is the point.
     pub fn ray(&self, column: usize, row: usize) -> [f64; 3] {

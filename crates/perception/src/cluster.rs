@@ -74,7 +74,7 @@ mod tests {
         let points: Vec<Option<Vector>> = [1.0, 1.0, 1.0, 1.0, 1.1, 0.0, 1.1, 1.1]
             .iter()
             .enumerate()
-            .map(|(i, z)| (*z > 0.0).then(|| [i as f64 * 0.005, 0.0, *z]))
+            .map(|(i, z)| (*z > 0.0).then_some([i as f64 * 0.005, 0.0, *z]))
             .collect();
         let (found, labels) = clusters(8, 1, &points, 2);
         assert_eq!(found, vec![vec![0, 1, 2, 3], vec![4, 6, 7]]);

@@ -61,6 +61,22 @@ pub fn observe(clean: &DepthImage, noise: &Noise, seed: u64, first_frame: u64, f
     DepthImage { width: clean.width, height: clean.height, depth }
 }
 
+/// The average of pictures that are themselves averages of so many frames; a pixel counts where it returned. The camera
+/// stood still, the scene need not have.
+pub fn average(width: usize, height: usize, pictures: impl Iterator<Item = (DepthImage, u32)>) -> DepthImage {
+    let mut sums = vec![(0.0_f64, 0.0_f64); width * height];
+    for (picture, frames) in pictures {
+        for (sum, depth) in sums.iter_mut().zip(&picture.depth) {
+            if *depth > 0.0 {
+                sum.0 += f64::from(*depth) * f64::from(frames);
+                sum.1 += f64::from(frames);
+            }
+        }
+    }
+    let depth = sums.into_iter().map(|(sum, n)| if n > 0.0 { (sum / n) as f32 } else { 0.0 }).collect();
+    DepthImage { width, height, depth }
+}
+
 fn edges(image: &DepthImage) -> Vec<bool> {
     let (width, height) = (image.width, image.height);
     let mut edges = vec![false; image.depth.len()];
@@ -121,6 +137,13 @@ mod tests {
         assert_eq!(one, observe(&wall(1.0), &Noise::DEFAULT, 7, 3, 2));
         assert_ne!(one, observe(&wall(1.0), &Noise::DEFAULT, 8, 3, 2));
         assert_ne!(one, observe(&wall(1.0), &Noise::DEFAULT, 7, 4, 2));
+    }
+
+    #[test]
+    fn an_average_weighs_by_frames_and_skips_what_did_not_return() {
+        let picture = |depth: [f32; 2], frames| (DepthImage { width: 2, height: 1, depth: depth.to_vec() }, frames);
+        let all = average(2, 1, [picture([1.0, 0.0], 3), picture([2.0, 2.0], 1)].into_iter());
+        assert_eq!(all.depth, vec![1.25, 2.0]);
     }
 
     #[test]

@@ -141,7 +141,7 @@ mod tests {
         for bodies in [[far.clone(), near.clone()], [near, far]] {
             let image = render(&looking_forward(), &bodies);
             assert!((image.at(160, 120).unwrap() - 1.0).abs() < 1e-3);
-            assert!((image.at(160, 152).unwrap() - 2.0).abs() < 1e-3);
+            assert!((image.at(160, 160).unwrap() - 2.0).abs() < 1e-3);
             assert_eq!(image.at(0, 0), None);
         }
     }

@@ -13,10 +13,10 @@ use ratn_world::scene::Shape;
 
 const TABLE: [f64; 3] = [0.80, 0.0, 0.70];
 
-/// A camera at (-0.5, 0, 1.55) that looks at the table's middle.
+/// A camera where the robot's mast holds it, that looks at the table's middle.
 fn camera() -> Camera {
-    let (eye, target) = ([-0.5, 0.0, 1.55], TABLE);
-    let pitch = ((eye[2] - target[2]) as f64).atan2(target[0] - eye[0]);
+    let (eye, target) = ([-0.62, 0.0, 1.88], TABLE);
+    let pitch = f64::atan2(eye[2] - target[2], target[0] - eye[0]);
     // Optical axis = x of the pitched head; x right = -y of it.
     let head = Pose::from_rpy(eye, 0.0, pitch, 0.0);
     let optical = Pose { position: [0.0; 3], quaternion_xyzw: [-0.5, 0.5, -0.5, 0.5] };
