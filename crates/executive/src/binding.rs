@@ -128,6 +128,12 @@ pub(crate) fn missing_output(
     })
 }
 
+/// The declared estimate of a state's duration, in seconds; `None` where it says none or it is not known here.
+pub(crate) fn expected_s(state: &State, scope: &dyn Scope) -> Option<f64> {
+    let seconds = state.annotations.duration_s.as_ref()?.evaluate(scope).ok()?.as_number()?;
+    (seconds.is_finite() && seconds >= 0.0).then_some(seconds)
+}
+
 /// A seed for one visit, the same in every mode and on every host (FNV-1a over the run's seed and the path).
 pub(crate) fn seed(run: u64, path: &str) -> u64 {
     let mut hash = 0xcbf2_9ce4_8422_2325_u64;

@@ -28,9 +28,9 @@ pub(crate) enum EffectError {
     )]
     Undeclared {
         /// Which fact.
-        fact: FactKey,
+        fact: String,
         /// What was measured.
-        value: Value,
+        value: String,
         /// The outcome.
         outcome: String,
     },
@@ -62,8 +62,8 @@ pub(crate) fn actual(
             (false, None) => changes.push(Change::Set { fact: key.clone(), value: value.clone() }),
             (false, Some(_)) => {
                 return Err(EffectError::Undeclared {
-                    fact: key.clone(),
-                    value: value.clone(),
+                    fact: key.to_string(),
+                    value: value.to_string(),
                     outcome: outcome.to_owned(),
                 });
             }

@@ -410,6 +410,7 @@ impl Interpreter {
             Ok(inputs) => inputs,
             Err(error) => return self.leave(context, ABORTED, error.reason()),
         };
+        let expected_s = self.with_scope(context, None, |scope| binding::expected_s(state, scope));
         let Some(current) = self.current.as_mut() else { return Progress::Busy };
         current.phase = Phase::Running;
         let (instance, attempt) = (current.instance, current.attempt);
@@ -420,6 +421,7 @@ impl Interpreter {
             seed: binding::seed(context.seed, &current.path),
             lease: current.lease.clone(),
             projection: current.projection,
+            expected_s,
         };
         context.note(Note::Running { instance, attempt });
         context.commands.push(Command::Start { instance, attempt, goal });

@@ -257,6 +257,8 @@ pub struct Goal {
     pub lease: Option<Lease>,
     /// The world it works on; `None` for a node that reads no world model.
     pub projection: Option<ProjectionId>,
+    /// How long it is expected to take, in seconds of the robot's time, where the task says so.
+    pub expected_s: Option<f64>,
 }
 
 /// One line of an event log.

@@ -43,7 +43,6 @@ impl Window {
 
     fn duration_s(&self, context: &Context<'_>, id: InstanceId) -> f64 {
         let Some(instance) = self.instances.alive.get(&id) else { return 0.0 };
-        let estimate = context.program.state(instance.state).annotations.duration_s.as_ref();
         if instance.role != Role::Node {
             return 0.0;
         }
@@ -55,11 +54,7 @@ impl Window {
             world: context.root,
             unknown: &Footprint::Everything,
         };
-        estimate
-            .and_then(|e| e.evaluate(&scope).ok())
-            .and_then(|v| v.as_number())
-            .filter(|s| s.is_finite() && *s >= 0.0)
-            .unwrap_or(instance.duration_s)
+        crate::binding::expected_s(context.program.state(instance.state), &scope).unwrap_or(instance.duration_s)
     }
 
     /// The priority of an acquire: larger first.

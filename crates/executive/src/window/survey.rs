@@ -347,6 +347,9 @@ impl Window {
                     seed: binding::seed(context.seed, &instance.path),
                     lease: instance.lease.clone(),
                     projection: instance.projection,
+                    expected_s: place
+                        .with_scope(&self.instances, id, None, |scope| binding::expected_s(state, scope))
+                        .flatten(),
                 };
                 context.commands.push(Command::Start { instance: id, attempt, goal });
             }
