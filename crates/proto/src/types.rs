@@ -200,6 +200,10 @@ pub struct WorkerStatus {
     pub endpoint: String,
     /// Why it exited, else empty.
     pub reason: String,
+    /// Resident memory, in bytes; only where pools are listed.
+    pub resident_bytes: u64,
+    /// Processor use since the last listing, in thousandths of a core; only where pools are listed.
+    pub cpu_millicores: u32,
 }
 
 /// A pool of workers of one template.
@@ -215,6 +219,8 @@ pub struct PoolStatus {
     pub max: u32,
     /// In the order of ids.
     pub workers: Vec<WorkerStatus>,
+    /// Why no more workers are started; empty while all is well.
+    pub failure: String,
 }
 
 /// A goal as a provider gets it.
@@ -249,4 +255,45 @@ pub struct GoalOutcome {
     pub measured: Vec<(FactKey, Value)>,
     /// Why, when the outcome is not success; else empty.
     pub reason: String,
+}
+
+impl GoalOutcome {
+    /// It did what it should.
+    pub fn success() -> GoalOutcome {
+        GoalOutcome::named(ratn_model::program::SUCCESS)
+    }
+
+    /// It failed.
+    pub fn aborted(reason: impl Into<String>) -> GoalOutcome {
+        GoalOutcome { reason: reason.into(), ..GoalOutcome::named(ratn_model::program::ABORTED) }
+    }
+
+    /// It was told to stop.
+    pub fn preempted(reason: impl Into<String>) -> GoalOutcome {
+        GoalOutcome { reason: reason.into(), ..GoalOutcome::named(ratn_model::program::PREEMPTED) }
+    }
+
+    /// An outcome of the action's own.
+    pub fn named(outcome: &str) -> GoalOutcome {
+        GoalOutcome { outcome: outcome.to_owned(), ..GoalOutcome::default() }
+    }
+
+    /// With an output port.
+    #[must_use]
+    pub fn with_output(mut self, port: &str, value: Value) -> GoalOutcome {
+        self.outputs.insert(port.to_owned(), value);
+        self
+    }
+
+    /// With a fact as measured.
+    #[must_use]
+    pub fn with_measured(mut self, fact: FactKey, value: Value) -> GoalOutcome {
+        self.measured.push((fact, value));
+        self
+    }
+
+    /// Whether it did what it should.
+    pub fn is_success(&self) -> bool {
+        self.outcome == ratn_model::program::SUCCESS
+    }
 }

@@ -1,1 +1,35 @@
-//! The worker SDK: serve the action protocol, fence by lease token, cancel.
+//! The worker SDK: what a process links that takes part in a ratn system. Light: no planner, no store, no clap.
+//!
+//! # Serving
+//! - [`endpoint::Endpoint`]: `http://host:port`, `host:port` or `unix:/path`; parse, print, [`endpoint::connect`].
+//! - [`runtime_directory::RuntimeDirectory`]: `create`, `publish(role, &endpoint) -> Published` (a guard), `find(role)`,
+//!   `wait_for(role, deadline)`.
+//! - [`server`]: `bind(&endpoint) -> Bound` (port 0 and Unix sockets too), `Services::new().with(service)`,
+//!   `bound.serve(services, shutdown_token)`: adds gRPC health and reflection, drains with a hard deadline.
+//! - [`shutdown`]: `on_signals(&token)`, `exit_with_parent(&token)`.
+//!
+//! # Performing actions
+//! - [`action::Action`]: the trait; [`action::GoalContext`]: inputs by type (`goal.input_joints("start")?`), `seed`, `lease`,
+//!   `cancelled`, `progress("…")`, `world(&patterns)`, `call("Camera", "capture", inputs)`.
+//! - [`action::ActionServer`]: fencing, idempotent goals, one at a time where asked, cancel, bounded results; for leases that
+//!   end: `end_lease(id, reason)`.
+//! - [`worker::Worker`]: all of it in one builder, for `ratn worker …`.
+//!
+//! # Asking others
+//! - [`client::Channels`] keeps one channel per endpoint; [`client::ActionClient`], [`client::ResourceClient`],
+//!   [`client::WorldClient`], [`client::ProcessClient`] speak the cores' types; [`client::CallError`] tells a refusal from a
+//!   crash; [`client::wait_until_serving`] asks gRPC health.
+//! - [`session::Session`] keeps a session with the resource manager alive and tells when it was lost;
+//!   [`provider::Provider`] offers resources under it, again after the manager came back.
+//!
+//! What it deliberately does not do: decide anything. No retries of goals, no choice of resources.
+
+pub mod action;
+pub mod client;
+pub mod endpoint;
+pub mod provider;
+pub mod runtime_directory;
+pub mod server;
+pub mod session;
+pub mod shutdown;
+pub mod worker;

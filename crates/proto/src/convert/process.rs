@@ -18,6 +18,8 @@ impl From<WorkerStatus> for v1::WorkerStatus {
             pid: worker.pid,
             endpoint: worker.endpoint,
             reason: worker.reason,
+            resident_bytes: worker.resident_bytes,
+            cpu_millicores: worker.cpu_millicores,
         }
     }
 }
@@ -43,13 +45,22 @@ impl TryFrom<v1::WorkerStatus> for WorkerStatus {
             pid: worker.pid,
             endpoint: worker.endpoint,
             reason: worker.reason,
+            resident_bytes: worker.resident_bytes,
+            cpu_millicores: worker.cpu_millicores,
         })
     }
 }
 
 impl From<PoolStatus> for v1::Pool {
     fn from(pool: PoolStatus) -> v1::Pool {
-        v1::Pool { template: pool.template, kind: pool.kind, min: pool.min, max: pool.max, workers: all(pool.workers) }
+        v1::Pool {
+            template: pool.template,
+            kind: pool.kind,
+            min: pool.min,
+            max: pool.max,
+            workers: all(pool.workers),
+            failure: pool.failure,
+        }
     }
 }
 
@@ -65,6 +76,7 @@ impl TryFrom<v1::Pool> for PoolStatus {
             min: pool.min,
             max: pool.max,
             workers: each(pool.workers, "workers")?,
+            failure: pool.failure,
         })
     }
 }

@@ -1,0 +1,289 @@
+//! What an action gets: its goal, and what it may do with it.
+
+use super::goal::GoalEntry;
+use super::{ActionFailure, InputError, Port};
+use crate::client::{ActionClient, CallError, Channels, WorldClient};
+use crate::endpoint::{Endpoint, EndpointError};
+use ratn_model::fact::{Change, FactPattern};
+use ratn_model::id::ProjectionId;
+use ratn_model::pose::Pose;
+use ratn_model::resource::Lease;
+use ratn_model::value::{Trajectory, Value};
+use ratn_proto::convert::wire_ports;
+use ratn_proto::types::{FactRecord, Goal, GoalOutcome};
+use ratn_proto::v1;
+use ratn_world::world::{ChangeError, World};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use tokio_util::sync::CancellationToken;
+
+/// A goal under way.
+#[derive(Debug)]
+pub struct GoalContext {
+    /// Unique to the attempt.
+    pub id: String,
+    /// The action's name.
+    pub action: String,
+    /// The input ports.
+    pub inputs: BTreeMap<String, Value>,
+    /// What every random choice is derived from.
+    pub seed: u64,
+    /// What the action may use.
+    pub lease: Option<Lease>,
+    /// The world that it works on.
+    pub projection: Option<ProjectionId>,
+    /// Fires when the goal shall stop; [`GoalContext::stopped`] then says with what outcome.
+    pub cancelled: CancellationToken,
+    world_pool: String,
+    channels: Channels,
+    entry: Arc<GoalEntry>,
+    calls: AtomicU32,
+}
+
+/// The world cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum WorldFailure {
+    /// The goal says nothing of a world pool.
+    #[error("the goal names no world pool")]
+    NoWorldPool,
+    /// What it says is no endpoint.
+    #[error("the goal's world pool")]
+    Endpoint(#[from] EndpointError),
+    /// The world pool did not answer as it should.
+    #[error("the world pool")]
+    Call(#[from] CallError),
+    /// The facts make no world.
+    #[error("the projection's facts")]
+    Facts(#[from] ChangeError),
+}
+
+/// Another provider's action did not come to an outcome.
+#[derive(Debug, thiserror::Error)]
+pub enum CallFailure {
+    /// The goal's lease holds no such resource.
+    #[error("the goal's lease holds no {kind}: the state has to block one")]
+    NotLeased {
+        /// Its kind.
+        kind: String,
+    },
+    /// The resource says nothing of where its action service is.
+    #[error("the endpoint of {resource}")]
+    Endpoint {
+        /// Which resource.
+        resource: String,
+        /// What is wrong with it.
+        #[source]
+        source: EndpointError,
+    },
+    /// The provider refused the goal, or crashed.
+    #[error("{action}")]
+    Call {
+        /// What it should do.
+        action: String,
+        /// What came of it.
+        #[source]
+        source: CallError,
+    },
+    /// The action ended otherwise than with success.
+    #[error("{action} was {outcome}: {reason}")]
+    Outcome {
+        /// What it should do.
+        action: String,
+        /// How it ended.
+        outcome: String,
+        /// Why.
+        reason: String,
+    },
+    /// This goal was told to stop meanwhile.
+    #[error("{action} was given up: the goal shall stop")]
+    Cancelled {
+        /// What it should do.
+        action: String,
+    },
+}
+
+impl GoalContext {
+    pub(crate) fn new(goal: Goal, entry: Arc<GoalEntry>, channels: Channels) -> GoalContext {
+        GoalContext {
+            id: goal.id,
+            action: goal.action,
+            inputs: goal.inputs,
+            seed: goal.seed,
+            lease: goal.lease,
+            projection: goal.projection,
+            cancelled: entry.cancelled.clone(),
+            world_pool: goal.world_pool,
+            channels,
+            entry,
+            calls: AtomicU32::new(0),
+        }
+    }
+
+    /// The input `name`, there or not: `goal.port("region").field("pose").pose()?`.
+    pub fn port(&self, name: &str) -> Port<'_> {
+        Port::new(name, self.inputs.get(name))
+    }
+
+    /// An input that must be joint positions.
+    ///
+    /// # Errors
+    /// [`InputError`].
+    pub fn input_joints(&self, name: &str) -> Result<&[f64], InputError> {
+        self.port(name).joints()
+    }
+
+    /// An input that must be a pose.
+    ///
+    /// # Errors
+    /// [`InputError`].
+    pub fn input_pose(&self, name: &str) -> Result<Pose, InputError> {
+        self.port(name).pose()
+    }
+
+    /// An input that must be a trajectory.
+    ///
+    /// # Errors
+    /// [`InputError`].
+    pub fn input_trajectory(&self, name: &str) -> Result<&Trajectory, InputError> {
+        self.port(name).trajectory()
+    }
+
+    /// An input that must be text.
+    ///
+    /// # Errors
+    /// [`InputError`].
+    pub fn input_string(&self, name: &str) -> Result<&str, InputError> {
+        self.port(name).string()
+    }
+
+    /// An input that must be a number.
+    ///
+    /// # Errors
+    /// [`InputError`].
+    pub fn input_float(&self, name: &str) -> Result<f64, InputError> {
+        self.port(name).float()
+    }
+
+    /// An input that is a number if it is there.
+    ///
+    /// # Errors
+    /// [`InputError`].
+    pub fn optional_float(&self, name: &str) -> Result<Option<f64>, InputError> {
+        self.port(name).optional().map(|port| port.float()).transpose()
+    }
+
+    /// An input that is a whole number if it is there.
+    ///
+    /// # Errors
+    /// [`InputError`].
+    pub fn optional_int(&self, name: &str) -> Result<Option<i64>, InputError> {
+        self.port(name).optional().map(|port| port.int()).transpose()
+    }
+
+    /// Says how far it is, to whoever listens and to the event log. Never blocks.
+    pub fn progress(&self, message: impl Into<String>) {
+        self.progress_with(message, BTreeMap::new());
+    }
+
+    /// As [`GoalContext::progress`], with figures.
+    pub fn progress_with(&self, message: impl Into<String>, values: BTreeMap<String, Value>) {
+        let progress = v1::GoalProgress { message: message.into(), values: wire_ports(values) };
+        // Nobody may be listening.
+        let _ = self.entry.progress.send(progress);
+    }
+
+    /// Goes on unless the goal shall stop.
+    ///
+    /// # Errors
+    /// [`GoalContext::stopped`].
+    pub fn checkpoint(&self) -> Result<(), ActionFailure> {
+        if self.cancelled.is_cancelled() { Err(self.stopped()) } else { Ok(()) }
+    }
+
+    /// What a goal that was told to stop comes to: `preempted`, or `aborted` where its lease ended.
+    pub fn stopped(&self) -> ActionFailure {
+        self.entry.stopped()
+    }
+
+    /// Waits for `work`, unless the goal shall stop: then `work` is dropped.
+    ///
+    /// # Errors
+    /// [`GoalContext::stopped`].
+    pub async fn unless_cancelled<T>(&self, work: impl Future<Output = T>) -> Result<T, ActionFailure> {
+        tokio::select! {
+            biased;
+            () = self.cancelled.cancelled() => Err(self.stopped()),
+            done = work => Ok(done),
+        }
+    }
+
+    /// The facts of the goal's projection (of the root, where it has none) that match any of the patterns.
+    ///
+    /// # Errors
+    /// [`WorldFailure`].
+    pub async fn facts(&self, patterns: &[FactPattern]) -> Result<Vec<FactRecord>, WorldFailure> {
+        if self.world_pool.is_empty() {
+            return Err(WorldFailure::NoWorldPool);
+        }
+        let world_pool: Endpoint = self.world_pool.parse()?;
+        let client = WorldClient::new(&self.channels, &world_pool)?;
+        Ok(client.query(self.projection, patterns).await?)
+    }
+
+    /// As [`GoalContext::facts`], as a world: `Scene::of(&goal.world(&patterns).await?)`.
+    ///
+    /// # Errors
+    /// [`WorldFailure`].
+    pub async fn world(&self, patterns: &[FactPattern]) -> Result<World, WorldFailure> {
+        let facts = self.facts(patterns).await?;
+        let changes: Vec<Change> =
+            facts.into_iter().map(|record| Change::Set { fact: record.key, value: record.value }).collect();
+        let mut world = World::default();
+        world.apply(&changes)?;
+        Ok(world)
+    }
+
+    /// Has another provider of this goal's lease perform an action under the same lease; its outputs.
+    ///
+    /// # Errors
+    /// [`CallFailure`] also where its outcome is not success.
+    pub async fn call(
+        &self,
+        kind: &str,
+        action: &str,
+        inputs: BTreeMap<String, Value>,
+    ) -> Result<BTreeMap<String, Value>, CallFailure> {
+        let resource = self.lease.as_ref().and_then(|lease| lease.resource(kind));
+        let resource = resource.ok_or_else(|| CallFailure::NotLeased { kind: kind.to_owned() })?;
+        let endpoint: Endpoint = resource
+            .endpoint
+            .parse()
+            .map_err(|source| CallFailure::Endpoint { resource: resource.id.clone(), source })?;
+        let name = format!("{kind}/{action}");
+        let number = self.calls.fetch_add(1, Ordering::Relaxed) + 1;
+        let goal = Goal {
+            id: format!("{}/{action}-{number}", self.id),
+            action: action.to_owned(),
+            inputs,
+            seed: self.seed,
+            lease: self.lease.clone(),
+            projection: self.projection,
+            world_pool: self.world_pool.clone(),
+            deadline_ms: 0,
+        };
+        let client = ActionClient::new(self.channels.clone());
+        let performed = client.execute(&endpoint, goal, |_, _| {});
+        let outcome: Result<GoalOutcome, CallError> = tokio::select! {
+            biased;
+            () = self.cancelled.cancelled() => return Err(CallFailure::Cancelled { action: name }),
+            outcome = performed => outcome,
+        };
+        let outcome = outcome.map_err(|source| CallFailure::Call { action: name.clone(), source })?;
+        if outcome.is_success() {
+            Ok(outcome.outputs)
+        } else {
+            Err(CallFailure::Outcome { action: name, outcome: outcome.outcome, reason: outcome.reason })
+        }
+    }
+}

@@ -1,0 +1,116 @@
+//! One goal as the server keeps it: who listens, whether it was told to stop, how it ended.
+
+use super::ActionFailure;
+use ratn_model::id::{FencingToken, LeaseId};
+use ratn_proto::types::{Goal, GoalOutcome};
+use ratn_proto::v1;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use tokio::sync::{broadcast, watch};
+use tokio_util::sync::CancellationToken;
+
+/// A listener that falls further behind misses the oldest progress messages.
+const PROGRESS_KEPT: usize = 256;
+
+/// Why a goal was told to stop.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum StopCause {
+    /// Its client asked for it.
+    Cancelled,
+    /// Nobody listens to it any more.
+    Abandoned,
+    /// Its time is over.
+    Deadline,
+    /// Somebody with a newer lease wants the resource.
+    Fenced(FencingToken),
+    /// Its lease has ended.
+    LeaseEnded(String),
+}
+
+impl StopCause {
+    /// What the goal comes to: who asked for the stop gets `preempted`, who lost the right to go on `aborted`.
+    pub(crate) fn failure(&self) -> ActionFailure {
+        match self {
+            StopCause::Cancelled => ActionFailure::Preempted("cancelled".to_owned()),
+            StopCause::Abandoned => ActionFailure::Preempted("nobody listened to the goal any more".to_owned()),
+            StopCause::Deadline => ActionFailure::Preempted("the goal's deadline was over".to_owned()),
+            StopCause::Fenced(token) => {
+                ActionFailure::Aborted(format!("a newer lease ({token}) took the resource over"))
+            }
+            StopCause::LeaseEnded(reason) => ActionFailure::Aborted(format!("the lease ended: {reason}")),
+        }
+    }
+}
+
+/// A goal under way, or ended and remembered.
+#[derive(Debug)]
+pub(crate) struct GoalEntry {
+    pub(crate) id: String,
+    /// The resource that it has to itself where the server takes one goal at a time.
+    pub(crate) resource: String,
+    pub(crate) lease: Option<LeaseId>,
+    pub(crate) token: FencingToken,
+    pub(crate) cancelled: CancellationToken,
+    pub(crate) progress: broadcast::Sender<v1::GoalProgress>,
+    pub(crate) result: watch::Sender<Option<GoalOutcome>>,
+    stop_when_abandoned: bool,
+    cause: Mutex<Option<StopCause>>,
+    listeners: AtomicUsize,
+}
+
+/// Somebody who waits for a goal's result.
+#[derive(Debug)]
+pub(crate) struct Listener(Arc<GoalEntry>);
+
+impl GoalEntry {
+    pub(crate) fn new(goal: &Goal, resource: String, stop_when_abandoned: bool) -> Arc<GoalEntry> {
+        Arc::new(GoalEntry {
+            id: goal.id.clone(),
+            resource,
+            lease: goal.lease.as_ref().map(|lease| lease.id),
+            token: goal.lease.as_ref().map_or(FencingToken(0), |lease| lease.token),
+            cancelled: CancellationToken::new(),
+            progress: broadcast::channel(PROGRESS_KEPT).0,
+            result: watch::channel(None).0,
+            stop_when_abandoned,
+            cause: Mutex::new(None),
+            listeners: AtomicUsize::new(0),
+        })
+    }
+
+    pub(crate) fn listen(self: &Arc<GoalEntry>) -> Listener {
+        self.listeners.fetch_add(1, Ordering::AcqRel);
+        Listener(Arc::clone(self))
+    }
+
+    /// Tells it to stop; the first cause counts.
+    pub(crate) fn stop(&self, cause: StopCause) {
+        self.cause.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(cause);
+        self.cancelled.cancel();
+    }
+
+    pub(crate) fn is_over(&self) -> bool {
+        self.result.borrow().is_some()
+    }
+
+    /// Returns once it has ended.
+    pub(crate) async fn over(&self) {
+        // The sender is in `self`, so the channel is open.
+        let _ = self.result.subscribe().wait_for(Option::is_some).await;
+    }
+
+    /// What being told to stop makes of the goal.
+    pub(crate) fn stopped(&self) -> ActionFailure {
+        let cause = self.cause.lock().unwrap_or_else(PoisonError::into_inner);
+        cause.as_ref().unwrap_or(&StopCause::Cancelled).failure()
+    }
+}
+
+impl Drop for Listener {
+    fn drop(&mut self) {
+        let last = self.0.listeners.fetch_sub(1, Ordering::AcqRel) == 1;
+        if last && self.0.stop_when_abandoned && !self.0.is_over() {
+            self.0.stop(StopCause::Abandoned);
+        }
+    }
+}

@@ -1,0 +1,84 @@
+//! Performing actions: what a driver or a worker implements, and the service around it.
+//!
+//! ```text
+//! execute ─ unknown action, stale token, busy ──────────────→ refused (a gRPC status)
+//!    └→ accepted → progress* → result: success | the action's own | aborted | preempted
+//!                      └─ cancel, deadline, lease over, nobody listens: `cancelled` fires, the action ends itself
+//! ```
+//!
+//! An [`Action`] gets a [`GoalContext`] and returns an outcome; `?` on anything that is an error makes it `aborted` with
+//! that error as reason. The [`ActionServer`] owns what is common to all: fencing, idempotence, exclusion, panics.
+
+mod context;
+mod fence;
+mod goal;
+mod port;
+mod server;
+mod service;
+
+pub use context::{CallFailure, GoalContext, WorldFailure};
+pub use port::{InputError, Port};
+pub use ratn_proto::types::{Goal, GoalOutcome};
+pub use server::{ActionServer, ActionServerBuilder};
+
+use crate::client::chain;
+
+/// Something that can be done.
+#[tonic::async_trait]
+pub trait Action: Send + Sync + 'static {
+    /// Its name, the part after the slash of `path_planner/plan`.
+    fn name(&self) -> &str;
+
+    /// What it does, for people.
+    fn description(&self) -> &str {
+        ""
+    }
+
+    /// The resource whose lease a goal needs, where it is another than the server's own.
+    fn resource(&self) -> Option<&str> {
+        None
+    }
+
+    /// Whether a goal is stopped when the last client that listens to it has gone.
+    fn cancel_when_abandoned(&self) -> bool {
+        true
+    }
+
+    /// Does it. Has to look at `goal.cancelled` (or `goal.checkpoint()?`) and to end soon once that fired. What blocks for
+    /// longer than a millisecond belongs into `tokio::task::spawn_blocking`.
+    async fn execute(&self, goal: GoalContext) -> ActionResult;
+}
+
+/// How a goal ends.
+pub type ActionResult = Result<GoalOutcome, ActionFailure>;
+
+/// A goal that did not come to an outcome of its own. Made from any error by `?`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum ActionFailure {
+    /// It failed: the outcome is `aborted`.
+    Aborted(String),
+    /// It was told to stop: the outcome is `preempted`.
+    Preempted(String),
+}
+
+impl ActionFailure {
+    /// It failed, and why.
+    pub fn aborted(reason: impl Into<String>) -> ActionFailure {
+        ActionFailure::Aborted(reason.into())
+    }
+}
+
+impl<E: std::error::Error> From<E> for ActionFailure {
+    fn from(error: E) -> ActionFailure {
+        ActionFailure::Aborted(chain(&error))
+    }
+}
+
+impl From<ActionFailure> for GoalOutcome {
+    fn from(failure: ActionFailure) -> GoalOutcome {
+        match failure {
+            ActionFailure::Aborted(reason) => GoalOutcome::aborted(reason),
+            ActionFailure::Preempted(reason) => GoalOutcome::preempted(reason),
+        }
+    }
+}

@@ -1,0 +1,308 @@
+//! The goals of one server: who may start, what runs, what is remembered.
+
+use super::fence::Fence;
+use super::goal::{GoalEntry, StopCause};
+use super::service::Messages;
+use super::{Action, ActionFailure, ActionResult, GoalContext};
+use crate::client::Channels;
+use ratn_model::id::{FencingToken, LeaseId};
+use ratn_proto::types::{Goal, GoalOutcome};
+use std::collections::{BTreeMap, VecDeque};
+use std::convert::Infallible;
+use std::fmt;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+use tokio::task::JoinError;
+use tonic::Status;
+
+/// So many results are remembered unless said otherwise.
+const RESULTS_KEPT: usize = 64;
+/// At most so many goals run at once.
+const MAX_RUNNING: usize = 64;
+/// A goal that was told to stop and does not is ended hard after this long.
+const STOP_GRACE: Duration = Duration::from_secs(3);
+
+/// Performs goals. A handle: clones share everything.
+#[derive(Debug, Clone)]
+pub struct ActionServer {
+    pub(super) inner: Arc<Inner>,
+}
+
+/// What an [`ActionServer`] shall be.
+#[derive(Default)]
+pub struct ActionServerBuilder {
+    resource: String,
+    actions: BTreeMap<String, Arc<dyn Action>>,
+    one_at_a_time: bool,
+    results_kept: Option<usize>,
+    channels: Channels,
+}
+
+pub(super) struct Inner {
+    pub(super) resource: String,
+    pub(super) actions: BTreeMap<String, Arc<dyn Action>>,
+    one_at_a_time: bool,
+    results_kept: usize,
+    channels: Channels,
+    state: Mutex<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    fence: Fence,
+    /// Running and remembered, by id.
+    goals: BTreeMap<String, Arc<GoalEntry>>,
+    running: Vec<Arc<GoalEntry>>,
+    /// The remembered ones, oldest first.
+    ended: VecDeque<String>,
+}
+
+/// What became of a request for a goal.
+pub(super) enum Admission {
+    /// It starts.
+    New(Arc<GoalEntry>, Arc<dyn Action>),
+    /// It was known.
+    Joined(Arc<GoalEntry>),
+    /// It has to wait until this one, told to stop, has ended.
+    After(Arc<GoalEntry>),
+}
+
+impl ActionServerBuilder {
+    /// With an action. A second one of the same name replaces the first.
+    #[must_use]
+    pub fn action(mut self, action: impl Action) -> ActionServerBuilder {
+        self.actions.insert(action.name().to_owned(), Arc::new(action));
+        self
+    }
+
+    /// A resource performs one goal at a time: a further one is refused, unless the one before was told to stop.
+    #[must_use]
+    pub fn one_at_a_time(mut self) -> ActionServerBuilder {
+        self.one_at_a_time = true;
+        self
+    }
+
+    /// Remembers this many results.
+    #[must_use]
+    pub fn results_kept(mut self, results: usize) -> ActionServerBuilder {
+        self.results_kept = Some(results);
+        self
+    }
+
+    /// Over channels that others use too.
+    #[must_use]
+    pub fn channels(mut self, channels: Channels) -> ActionServerBuilder {
+        self.channels = channels;
+        self
+    }
+
+    /// The server.
+    pub fn build(self) -> ActionServer {
+        ActionServer {
+            inner: Arc::new(Inner {
+                resource: self.resource,
+                actions: self.actions,
+                one_at_a_time: self.one_at_a_time,
+                results_kept: self.results_kept.unwrap_or(RESULTS_KEPT),
+                channels: self.channels,
+                state: Mutex::default(),
+            }),
+        }
+    }
+}
+
+impl ActionServer {
+    /// A server that is `resource`: a goal needs a lease of it. With an empty name no lease is asked for, except by actions
+    /// that name a resource of their own.
+    pub fn builder(resource: impl Into<String>) -> ActionServerBuilder {
+        ActionServerBuilder { resource: resource.into(), ..ActionServerBuilder::default() }
+    }
+
+    /// Stops every goal that runs under a lease: it ends `aborted` with the reason. How many there were.
+    pub fn end_lease(&self, lease: LeaseId, reason: &str) -> usize {
+        self.stop_where(|goal| goal.lease == Some(lease), &StopCause::LeaseEnded(reason.to_owned()))
+    }
+
+    /// Tells every goal to stop, and returns when all have ended.
+    pub async fn stop_all(&self) {
+        self.stop_where(|_| true, &StopCause::Cancelled);
+        let running = self.inner.state().running.clone();
+        for goal in running {
+            goal.over().await;
+        }
+    }
+
+    /// Tells a goal to stop; whether it was under way.
+    pub fn cancel(&self, goal: &str) -> bool {
+        self.stop_where(|entry| entry.id == goal, &StopCause::Cancelled) > 0
+    }
+
+    /// How many goals run.
+    pub fn running(&self) -> usize {
+        self.inner.state().running.len()
+    }
+
+    fn stop_where(&self, which: impl Fn(&GoalEntry) -> bool, cause: &StopCause) -> usize {
+        let state = self.inner.state();
+        state.running.iter().filter(|goal| which(goal)).map(|goal| goal.stop(cause.clone())).count()
+    }
+
+    /// Starts a goal, or finds the one of the same id; what is to be heard of it.
+    ///
+    /// # Errors
+    /// A status that says why not.
+    pub(super) async fn admit(&self, goal: Goal) -> Result<Messages, Status> {
+        loop {
+            let admission = self.inner.state().admit(&self.inner, &goal)?;
+            match admission {
+                Admission::Joined(entry) => return Ok(Messages::of(&entry, true)),
+                Admission::New(entry, action) => {
+                    // Listens before the action can say anything.
+                    let messages = Messages::of(&entry, false);
+                    let deadline_ms = goal.deadline_ms;
+                    let context = GoalContext::new(goal, Arc::clone(&entry), self.inner.channels.clone());
+                    tokio::spawn(run(Arc::clone(&self.inner), entry, action, context, deadline_ms));
+                    return Ok(messages);
+                }
+                // Ends within the grace: the runner sees to it.
+                Admission::After(entry) => entry.over().await,
+            }
+        }
+    }
+}
+
+impl Inner {
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn admit(&mut self, server: &Inner, goal: &Goal) -> Result<Admission, Status> {
+        let Some(action) = server.actions.get(&goal.action) else {
+            let known: Vec<&str> = server.actions.keys().map(String::as_str).collect();
+            let message = format!("no action `{}`: there are {}", goal.action, known.join(", "));
+            return Err(Status::invalid_argument(message));
+        };
+        if let Some(entry) = self.goals.get(&goal.id) {
+            return Ok(Admission::Joined(Arc::clone(entry)));
+        }
+        let resource = action.resource().unwrap_or(&server.resource);
+        if !resource.is_empty() {
+            self.fence(goal, resource)?;
+        }
+        if server.one_at_a_time
+            && let Some(other) = self.running.iter().find(|other| other.resource == resource)
+        {
+            if other.cancelled.is_cancelled() {
+                return Ok(Admission::After(Arc::clone(other)));
+            }
+            let message = format!("busy with goal {}: one goal at a time", other.id);
+            return Err(Status::resource_exhausted(message));
+        }
+        if self.running.len() >= MAX_RUNNING {
+            let message = format!("{MAX_RUNNING} goals are under way: no more at once");
+            return Err(Status::resource_exhausted(message));
+        }
+        let entry = GoalEntry::new(goal, resource.to_owned(), action.cancel_when_abandoned());
+        self.goals.insert(goal.id.clone(), Arc::clone(&entry));
+        self.running.push(Arc::clone(&entry));
+        Ok(Admission::New(entry, Arc::clone(action)))
+    }
+
+    /// Refuses a goal without a current lease of `resource`; stops goals of older leases.
+    fn fence(&mut self, goal: &Goal, resource: &str) -> Result<(), Status> {
+        let lease = goal.lease.as_ref().filter(|lease| lease.resources.iter().any(|r| r.id == resource));
+        let Some(lease) = lease else {
+            let message = format!("the goal has no lease of {resource}: acquire it and send the lease along");
+            return Err(Status::failed_precondition(message));
+        };
+        self.fence.admit(resource, lease.token).map_err(|highest: FencingToken| {
+            let (id, token) = (lease.id, lease.token);
+            let message = format!("{id} ({token}) of {resource} is over: {highest} was seen since; acquire it anew");
+            Status::failed_precondition(message)
+        })?;
+        for other in self.running.iter().filter(|other| other.resource == resource && other.token < lease.token) {
+            other.stop(StopCause::Fenced(lease.token));
+        }
+        Ok(())
+    }
+
+    fn end(&mut self, entry: &GoalEntry, results_kept: usize) {
+        self.running.retain(|other| other.id != entry.id);
+        self.ended.push_back(entry.id.clone());
+        while self.ended.len() > results_kept {
+            if let Some(forgotten) = self.ended.pop_front() {
+                self.goals.remove(&forgotten);
+            }
+        }
+    }
+}
+
+/// Runs a goal to its end, whatever its action does.
+async fn run(
+    server: Arc<Inner>,
+    entry: Arc<GoalEntry>,
+    action: Arc<dyn Action>,
+    context: GoalContext,
+    deadline_ms: u64,
+) {
+    let mut performing = tokio::spawn(async move { action.execute(context).await });
+    let deadline = async {
+        if deadline_ms > 0 {
+            tokio::time::sleep(Duration::from_millis(deadline_ms)).await;
+            entry.stop(StopCause::Deadline);
+        }
+        // It only tells the goal to stop; the goal ends by itself, or is overdue.
+        std::future::pending::<Infallible>().await
+    };
+    let overdue = async {
+        entry.cancelled.cancelled().await;
+        tokio::time::sleep(STOP_GRACE).await;
+    };
+    let outcome = tokio::select! {
+        biased;
+        performed = &mut performing => outcome_of(performed),
+        () = overdue => {
+            performing.abort();
+            let (ActionFailure::Aborted(cause) | ActionFailure::Preempted(cause)) = entry.stopped();
+            GoalOutcome::aborted(format!("{cause}; it did not stop within {} s", STOP_GRACE.as_secs()))
+        }
+        never = deadline => match never {},
+    };
+    // No longer running before anybody hears of its end: the next goal must find its place free.
+    server.state().end(&entry, server.results_kept);
+    entry.result.send_replace(Some(outcome));
+}
+
+fn outcome_of(performed: Result<ActionResult, JoinError>) -> GoalOutcome {
+    match performed {
+        Ok(Ok(outcome)) => outcome,
+        Ok(Err(failure)) => failure.into(),
+        Err(error) => GoalOutcome::aborted(match error.try_into_panic() {
+            Ok(panic) => format!("the action panicked: {}", panic_message(&*panic)),
+            Err(error) => format!("the action was torn down: {error}"),
+        }),
+    }
+}
+
+fn panic_message(panic: &(dyn std::any::Any + Send)) -> &str {
+    match (panic.downcast_ref::<&str>(), panic.downcast_ref::<String>()) {
+        (Some(text), _) => text,
+        (_, Some(text)) => text,
+        _ => "no message",
+    }
+}
+
+impl fmt::Debug for Inner {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ActionServer").field("resource", &self.resource).field("state", &self.state).finish()
+    }
+}
+
+impl fmt::Debug for ActionServerBuilder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let actions: Vec<&String> = self.actions.keys().collect();
+        f.debug_struct("ActionServerBuilder").field("resource", &self.resource).field("actions", &actions).finish()
+    }
+}

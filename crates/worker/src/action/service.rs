@@ -1,0 +1,109 @@
+//! The gRPC adapter of [`ActionServer`].
+
+use super::ActionServer;
+use super::goal::{GoalEntry, Listener};
+use futures::stream::{BoxStream, StreamExt, unfold};
+use ratn_proto::MAX_MESSAGE_BYTES;
+use ratn_proto::convert::required;
+use ratn_proto::types::{Goal, GoalOutcome};
+use ratn_proto::v1;
+use ratn_proto::v1::action_service_server::{ActionService, ActionServiceServer};
+use ratn_proto::v1::execute_response::Kind;
+use std::sync::Arc;
+use tokio::sync::broadcast::error::RecvError;
+use tokio::sync::{broadcast, watch};
+use tonic::{Request, Response, Status};
+
+impl ActionServer {
+    /// For [`crate::server::Services::with`].
+    pub fn into_service(self) -> ActionServiceServer<ActionServer> {
+        ActionServiceServer::new(self)
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES)
+    }
+}
+
+#[tonic::async_trait]
+impl ActionService for ActionServer {
+    type ExecuteStream = BoxStream<'static, Result<v1::ExecuteResponse, Status>>;
+
+    async fn execute(&self, request: Request<v1::ExecuteRequest>) -> Result<Response<Self::ExecuteStream>, Status> {
+        let goal: Goal = required(request.into_inner().goal, "goal")?;
+        Ok(Response::new(self.admit(goal).await?.into_stream()))
+    }
+
+    async fn cancel(&self, request: Request<v1::CancelRequest>) -> Result<Response<v1::CancelResponse>, Status> {
+        let under_way = ActionServer::cancel(self, &request.into_inner().goal_id);
+        Ok(Response::new(v1::CancelResponse { under_way }))
+    }
+
+    async fn describe(&self, _: Request<v1::DescribeRequest>) -> Result<Response<v1::DescribeResponse>, Status> {
+        let description = |action: &Arc<dyn super::Action>| v1::ActionDescription {
+            name: action.name().to_owned(),
+            description: action.description().to_owned(),
+            cancel_when_abandoned: action.cancel_when_abandoned(),
+        };
+        Ok(Response::new(v1::DescribeResponse {
+            resource_id: self.inner.resource.clone(),
+            actions: self.inner.actions.values().map(description).collect(),
+        }))
+    }
+}
+
+/// What one client hears of a goal. Dropping it is how a client leaves.
+pub(super) struct Messages {
+    accepted: Option<bool>,
+    over: bool,
+    progress: broadcast::Receiver<v1::GoalProgress>,
+    result: watch::Receiver<Option<GoalOutcome>>,
+    _listener: Listener,
+}
+
+impl Messages {
+    pub(super) fn of(entry: &Arc<GoalEntry>, joined: bool) -> Messages {
+        Messages {
+            accepted: Some(joined),
+            over: false,
+            progress: entry.progress.subscribe(),
+            result: entry.result.subscribe(),
+            _listener: entry.listen(),
+        }
+    }
+
+    fn into_stream(self) -> BoxStream<'static, Result<v1::ExecuteResponse, Status>> {
+        let step = async |mut messages: Messages| {
+            let kind = messages.next().await?;
+            Some((Ok(v1::ExecuteResponse { kind: Some(kind) }), messages))
+        };
+        unfold(self, step).boxed()
+    }
+
+    async fn next(&mut self) -> Option<Kind> {
+        if let Some(joined) = self.accepted.take() {
+            return Some(Kind::Accepted(v1::GoalAccepted { joined }));
+        }
+        if self.over {
+            return None;
+        }
+        loop {
+            let outcome = tokio::select! {
+                biased;
+                progress = self.progress.recv() => match progress {
+                    Ok(progress) => return Some(Kind::Progress(progress)),
+                    Err(RecvError::Lagged(_)) => continue,
+                    Err(RecvError::Closed) => return None,
+                },
+                outcome = self.result.wait_for(Option::is_some) => match outcome {
+                    Ok(outcome) => outcome.clone()?,
+                    Err(_) => return None,
+                },
+            };
+            // A last word may have come between the two looks.
+            if let Ok(progress) = self.progress.try_recv() {
+                return Some(Kind::Progress(progress));
+            }
+            self.over = true;
+            return Some(Kind::Result(outcome.into()));
+        }
+    }
+}

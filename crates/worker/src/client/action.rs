@@ -1,0 +1,111 @@
+//! The client of action services: workers, and the modules of the robot.
+
+use super::{CallError, Channels};
+use crate::endpoint::Endpoint;
+use ratn_model::value::Value;
+use ratn_proto::MAX_MESSAGE_BYTES;
+use ratn_proto::convert::{Malformed, ports};
+use ratn_proto::types::{Goal, GoalOutcome};
+use ratn_proto::v1;
+use ratn_proto::v1::action_service_client::ActionServiceClient;
+use ratn_proto::v1::execute_response::Kind;
+use std::collections::BTreeMap;
+use tonic::transport::Channel;
+
+/// Gives goals to providers.
+#[derive(Debug, Clone, Default)]
+pub struct ActionClient {
+    channels: Channels,
+}
+
+/// What a provider performs.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ProviderInfo {
+    /// The resource that it is; empty for none.
+    pub resource: String,
+    /// In the order of names.
+    pub actions: Vec<ActionInfo>,
+}
+
+/// An action of a provider.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ActionInfo {
+    /// Its name.
+    pub name: String,
+    /// What it does, for people.
+    pub description: String,
+    /// A goal ends when nobody listens to it any more.
+    pub cancel_when_abandoned: bool,
+}
+
+impl ActionClient {
+    /// Over shared channels.
+    pub fn new(channels: Channels) -> ActionClient {
+        ActionClient { channels }
+    }
+
+    /// The channels.
+    pub fn channels(&self) -> &Channels {
+        &self.channels
+    }
+
+    /// Has a goal performed. Dropping the future drops the stream: what that means to the goal is the action's to say.
+    ///
+    /// # Errors
+    /// [`CallError::Refused`] when the provider did not take the goal; otherwise what became of the goal is not known.
+    pub async fn execute(
+        &self,
+        endpoint: &Endpoint,
+        goal: Goal,
+        mut on_progress: impl FnMut(String, BTreeMap<String, Value>),
+    ) -> Result<GoalOutcome, CallError> {
+        let failed = |status: tonic::Status| CallError::from_status(endpoint, &status);
+        let malformed = |m: Malformed| CallError::malformed(endpoint, m);
+        let mut client = self.client(endpoint)?;
+        let question = v1::ExecuteRequest { goal: Some(goal.into()) };
+        let mut stream = client.execute(question).await.map_err(failed)?.into_inner();
+        while let Some(message) = stream.message().await.map_err(failed)? {
+            match message.kind {
+                Some(Kind::Accepted(_)) => {}
+                Some(Kind::Progress(progress)) => {
+                    on_progress(progress.message, ports(progress.values, "progress.values").map_err(malformed)?);
+                }
+                Some(Kind::Result(result)) => return result.try_into().map_err(malformed),
+                None => return Err(malformed(Malformed::new("kind", "is not set"))),
+            }
+        }
+        let reason = "the stream of the goal ended without a result".to_owned();
+        Err(CallError::Broken { endpoint: endpoint.clone(), reason })
+    }
+
+    /// Tells a goal to stop; whether it was under way. Its outcome comes over its execute.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn cancel(&self, endpoint: &Endpoint, goal: &str) -> Result<bool, CallError> {
+        let question = v1::CancelRequest { goal_id: goal.to_owned() };
+        let answer = self.client(endpoint)?.cancel(question).await;
+        Ok(answer.map_err(|status| CallError::from_status(endpoint, &status))?.into_inner().under_way)
+    }
+
+    /// What a provider performs.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn describe(&self, endpoint: &Endpoint) -> Result<ProviderInfo, CallError> {
+        let answer = self.client(endpoint)?.describe(v1::DescribeRequest {}).await;
+        let answer = answer.map_err(|status| CallError::from_status(endpoint, &status))?.into_inner();
+        let info = |a: v1::ActionDescription| ActionInfo {
+            name: a.name,
+            description: a.description,
+            cancel_when_abandoned: a.cancel_when_abandoned,
+        };
+        Ok(ProviderInfo { resource: answer.resource_id, actions: answer.actions.into_iter().map(info).collect() })
+    }
+
+    fn client(&self, endpoint: &Endpoint) -> Result<ActionServiceClient<Channel>, CallError> {
+        Ok(ActionServiceClient::new(self.channels.get(endpoint)?)
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES))
+    }
+}

@@ -1,0 +1,77 @@
+//! How a call fails: refused by the one who was asked, or broken on the way.
+
+use super::chain;
+use crate::endpoint::Endpoint;
+use ratn_proto::convert::Malformed;
+use std::error::Error;
+use tonic::{Code, Status};
+
+/// A call without an answer.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum CallError {
+    /// Nobody answered: the process died, the connection broke, or nothing listens there.
+    #[error("{endpoint} does not answer: {reason}")]
+    Broken {
+        /// Who was asked.
+        endpoint: Endpoint,
+        /// What is known of it.
+        reason: String,
+    },
+    /// The one who was asked said no.
+    #[error("{message}")]
+    Refused {
+        /// Who was asked.
+        endpoint: Endpoint,
+        /// In which of gRPC's ways.
+        code: Code,
+        /// Why, in its own words.
+        message: String,
+    },
+    /// The answer means nothing.
+    #[error("{endpoint} answered nonsense")]
+    Malformed {
+        /// Who was asked.
+        endpoint: Endpoint,
+        /// What is wrong with the answer.
+        #[source]
+        source: Malformed,
+    },
+}
+
+impl CallError {
+    /// Whether the one who was asked did not get to decide: a crash, not a refusal.
+    pub fn is_crash(&self) -> bool {
+        !matches!(self, CallError::Refused { .. })
+    }
+
+    /// The code of a refusal.
+    pub fn code(&self) -> Option<Code> {
+        match self {
+            CallError::Refused { code, .. } => Some(*code),
+            _ => None,
+        }
+    }
+
+    /// What a status that `endpoint` answered (or that stands for its silence) means.
+    pub fn from_status(endpoint: &Endpoint, status: &Status) -> CallError {
+        let endpoint = endpoint.clone();
+        let refused = match status.code() {
+            // The servers of this system use none of these to say no: they come from the connection.
+            Code::Unavailable | Code::Unknown | Code::Internal | Code::Cancelled | Code::DataLoss => false,
+            // With a source, the status was made on this side.
+            _ => status.source().is_none(),
+        };
+        if refused {
+            return CallError::Refused { endpoint, code: status.code(), message: status.message().to_owned() };
+        }
+        let reason = match status.source() {
+            Some(source) => chain(source),
+            None => format!("{} ({:?})", status.message(), status.code()),
+        };
+        CallError::Broken { endpoint, reason }
+    }
+
+    pub(crate) fn malformed(endpoint: &Endpoint, source: Malformed) -> CallError {
+        CallError::Malformed { endpoint: endpoint.clone(), source }
+    }
+}

@@ -1,0 +1,83 @@
+//! Asking others, in the cores' types: one client per service, one channel per endpoint.
+
+mod action;
+mod error;
+mod health;
+mod process;
+mod resource;
+mod world;
+
+pub use action::{ActionClient, ActionInfo, ProviderInfo};
+pub use error::CallError;
+pub use health::wait_until_serving;
+pub use process::{ProcessClient, WorkerWatch};
+pub use resource::{AcquireOptions, ResourceClient, ResourceWatch};
+pub use world::{Projection, WorldClient};
+
+use crate::endpoint::{Endpoint, connect_lazily};
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{SystemTime, UNIX_EPOCH};
+use tonic::transport::Channel;
+
+/// So many channels are kept; beyond it all are forgotten and made anew as they are needed.
+const MAX_CHANNELS: usize = 256;
+
+/// One channel per endpoint, shared by all clients of a process. A channel connects by itself, again if it broke.
+#[derive(Debug, Clone, Default)]
+pub struct Channels {
+    kept: Arc<Mutex<BTreeMap<Endpoint, Channel>>>,
+}
+
+impl Channels {
+    /// None yet.
+    pub fn new() -> Channels {
+        Channels::default()
+    }
+
+    /// The channel to `endpoint`. Needs a tokio runtime.
+    ///
+    /// # Errors
+    /// [`CallError::Broken`] when the endpoint makes no URI.
+    pub fn get(&self, endpoint: &Endpoint) -> Result<Channel, CallError> {
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(channel) = kept.get(endpoint) {
+            return Ok(channel.clone());
+        }
+        if kept.len() >= MAX_CHANNELS {
+            kept.clear();
+        }
+        let channel = connect_lazily(endpoint)
+            .map_err(|error| CallError::Broken { endpoint: endpoint.clone(), reason: chain(&error) })?;
+        kept.insert(endpoint.clone(), channel.clone());
+        Ok(channel)
+    }
+
+    /// Forgets the channel to an endpoint that is gone for good.
+    pub fn forget(&self, endpoint: &Endpoint) {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner).remove(endpoint);
+    }
+}
+
+/// An id that nobody else has: for requests, sessions and goals.
+pub fn fresh_id(prefix: &str) -> String {
+    static COUNTER: AtomicU64 = AtomicU64::new(0);
+    let started = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
+    let number = COUNTER.fetch_add(1, Ordering::Relaxed);
+    format!("{prefix}-{:x}-{started:x}-{number:x}", std::process::id())
+}
+
+/// An error and its sources in one line.
+pub(crate) fn chain(error: &dyn std::error::Error) -> String {
+    let mut line = error.to_string();
+    let mut source = error.source();
+    while let Some(error) = source {
+        let text = error.to_string();
+        if !line.ends_with(&text) {
+            line = format!("{line}: {text}");
+        }
+        source = error.source();
+    }
+    line
+}

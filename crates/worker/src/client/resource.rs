@@ -1,0 +1,230 @@
+//! The client of the resource manager.
+
+use super::{CallError, Channels, fresh_id};
+use crate::endpoint::Endpoint;
+use ratn_model::id::LeaseId;
+use ratn_model::resource::{Lease, Requirement};
+use ratn_proto::MAX_MESSAGE_BYTES;
+use ratn_proto::convert::{Malformed, all, each, required};
+use ratn_proto::types::{Resource, ResourceUpdate};
+use ratn_proto::v1;
+use ratn_proto::v1::resource_service_client::ResourceServiceClient;
+use std::time::Duration;
+use tonic::Streaming;
+use tonic::transport::Channel;
+
+/// Asks one resource manager, in the name of one session. Every mutation gets a fresh request id.
+#[derive(Debug, Clone)]
+pub struct ResourceClient {
+    endpoint: Endpoint,
+    session: String,
+    client: ResourceServiceClient<Channel>,
+}
+
+/// How an acquire waits.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AcquireOptions {
+    /// Makes it idempotent, `run/instance/attempt`; a fresh one when empty.
+    pub request: String,
+    /// Larger first; among equals first come, first served.
+    pub priority: i64,
+    /// How long to wait at the most.
+    pub deadline: Duration,
+    /// What the holder is, for people.
+    pub holder: String,
+}
+
+impl Default for AcquireOptions {
+    fn default() -> AcquireOptions {
+        AcquireOptions {
+            request: String::new(),
+            priority: 0,
+            deadline: Duration::from_secs(600),
+            holder: String::new(),
+        }
+    }
+}
+
+/// The resources as they are, then every change.
+#[derive(Debug)]
+pub struct ResourceWatch {
+    endpoint: Endpoint,
+    stream: Streaming<v1::ResourceServiceWatchResponse>,
+}
+
+impl ResourceClient {
+    /// The client of the resource manager at `endpoint`. `session` is that of a [`crate::session::Session`]; who only
+    /// lists and watches needs none.
+    ///
+    /// # Errors
+    /// As [`Channels::get`].
+    pub fn new(channels: &Channels, endpoint: &Endpoint, session: &str) -> Result<ResourceClient, CallError> {
+        let client = ResourceServiceClient::new(channels.get(endpoint)?)
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES);
+        Ok(ResourceClient { endpoint: endpoint.clone(), session: session.to_owned(), client })
+    }
+
+    /// Where the resource manager is.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.endpoint
+    }
+
+    /// Adds a resource, or updates one that this session added; as the manager knows it now.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn create(&self, resource: Resource) -> Result<Resource, CallError> {
+        let (request_id, session_id) = self.mutation();
+        let question = v1::CreateRequest { request_id, session_id, resource: Some(resource.into()) };
+        let answer = self.client.clone().create(question).await.map_err(|status| self.failed(&status))?;
+        self.field(answer.into_inner().resource, "resource")
+    }
+
+    /// Uses capacity up; the ids of what was used.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn consume(&self, requirement: Requirement) -> Result<Vec<String>, CallError> {
+        let (request_id, session_id) = self.mutation();
+        let question = v1::ConsumeRequest { request_id, session_id, requirement: Some(requirement.into()) };
+        let answer = self.client.clone().consume(question).await.map_err(|status| self.failed(&status))?;
+        Ok(answer.into_inner().resource_ids)
+    }
+
+    /// Removes one resource by its id.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn delete(&self, resource: &str) -> Result<(), CallError> {
+        self.delete_target(v1::delete_request::Target::ResourceId(resource.to_owned())).await.map(|_| ())
+    }
+
+    /// Removes as many resources as the requirement says; their ids.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn delete_matching(&self, requirement: Requirement) -> Result<Vec<String>, CallError> {
+        self.delete_target(v1::delete_request::Target::Requirement(requirement.into())).await
+    }
+
+    async fn delete_target(&self, target: v1::delete_request::Target) -> Result<Vec<String>, CallError> {
+        let (request_id, session_id) = self.mutation();
+        let question = v1::DeleteRequest { request_id, session_id, target: Some(target) };
+        let answer = self.client.clone().delete(question).await.map_err(|status| self.failed(&status))?;
+        Ok(answer.into_inner().resource_ids)
+    }
+
+    /// Waits for resources of one kind and blocks them.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn block(&self, requirement: Requirement, options: AcquireOptions) -> Result<Lease, CallError> {
+        let (fresh, session_id) = self.mutation();
+        let question = v1::BlockRequest {
+            request_id: if options.request.is_empty() { fresh } else { options.request },
+            session_id,
+            requirement: Some(requirement.into()),
+            priority: options.priority,
+            deadline_ms: milliseconds(options.deadline),
+            holder: options.holder,
+        };
+        let answer = self.client.clone().block(question).await.map_err(|status| self.failed(&status))?;
+        self.field(answer.into_inner().lease, "lease")
+    }
+
+    /// Waits until all requirements can be met at once and takes them under one lease. Dropping the future withdraws.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn acquire(&self, requirements: Vec<Requirement>, options: AcquireOptions) -> Result<Lease, CallError> {
+        let (fresh, session_id) = self.mutation();
+        let question = v1::AcquireRequest {
+            request_id: if options.request.is_empty() { fresh } else { options.request },
+            session_id,
+            requirements: all(requirements),
+            priority: options.priority,
+            deadline_ms: milliseconds(options.deadline),
+            holder: options.holder,
+        };
+        let answer = self.client.clone().acquire(question).await.map_err(|status| self.failed(&status))?;
+        self.field(answer.into_inner().lease, "lease")
+    }
+
+    /// Gives a lease back; false when it had ended before.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn release(&self, lease: LeaseId) -> Result<bool, CallError> {
+        let (request_id, session_id) = self.mutation();
+        let question = v1::ResourceServiceReleaseRequest { request_id, session_id, lease_id: lease.0 };
+        let answer = self.client.clone().release(question).await.map_err(|status| self.failed(&status))?;
+        Ok(answer.into_inner().released)
+    }
+
+    /// Whether what is required is there, blocked or not.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn exists(&self, requirement: Requirement) -> Result<bool, CallError> {
+        let question = v1::ExistsRequest { requirement: Some(requirement.into()) };
+        let answer = self.client.clone().exists(question).await.map_err(|status| self.failed(&status))?;
+        Ok(answer.into_inner().exists)
+    }
+
+    /// The resources of these kinds (of every kind, when none is named), in the order of ids.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn list(&self, kinds: &[&str]) -> Result<Vec<Resource>, CallError> {
+        let question = v1::ListRequest { kinds: owned(kinds) };
+        let answer = self.client.clone().list(question).await.map_err(|status| self.failed(&status))?;
+        each(answer.into_inner().resources, "resources").map_err(|m| self.malformed(m))
+    }
+
+    /// Tells of the resources of these kinds (of every kind, when none is named) and of every change.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn watch(&self, kinds: &[&str]) -> Result<ResourceWatch, CallError> {
+        let question = v1::ResourceServiceWatchRequest { kinds: owned(kinds) };
+        let answer = self.client.clone().watch(question).await.map_err(|status| self.failed(&status))?;
+        Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
+    }
+
+    fn mutation(&self) -> (String, String) {
+        (fresh_id("request"), self.session.clone())
+    }
+
+    fn field<W, T: TryFrom<W, Error = Malformed>>(&self, message: Option<W>, field: &str) -> Result<T, CallError> {
+        required(message, field).map_err(|m| self.malformed(m))
+    }
+
+    fn malformed(&self, malformed: Malformed) -> CallError {
+        CallError::malformed(&self.endpoint, malformed)
+    }
+
+    fn failed(&self, status: &tonic::Status) -> CallError {
+        CallError::from_status(&self.endpoint, status)
+    }
+}
+
+impl ResourceWatch {
+    /// The snapshot, then every change; `None` when the manager ends the watch.
+    ///
+    /// # Errors
+    /// [`CallError`] when it broke.
+    pub async fn next(&mut self) -> Result<Option<ResourceUpdate>, CallError> {
+        let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
+        let update = message.map(ResourceUpdate::try_from).transpose();
+        update.map_err(|m| CallError::malformed(&self.endpoint, m))
+    }
+}
+
+fn owned(kinds: &[&str]) -> Vec<String> {
+    kinds.iter().map(|&kind| kind.to_owned()).collect()
+}
+
+fn milliseconds(duration: Duration) -> u64 {
+    u64::try_from(duration.as_millis()).unwrap_or(u64::MAX).max(1)
+}

@@ -1,0 +1,172 @@
+//! Where a server is: a TCP address or a Unix socket. Written `http://host:port`, `host:port` or `unix:/path`.
+
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::path::PathBuf;
+use std::str::FromStr;
+use std::time::Duration;
+use tonic::transport::Channel;
+
+/// A connection attempt that takes longer has failed.
+pub const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
+/// Both sides ping a connection this often, idle or not …
+pub const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(5);
+/// … and give it up when a ping stays unanswered for this long.
+pub const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// A socket path has to fit into `sockaddr_un`, with its final zero.
+const MAX_SOCKET_PATH_BYTES: usize = 107;
+
+/// Where a server listens, or is to be reached.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(into = "String", try_from = "String")]
+pub enum Endpoint {
+    /// Over TCP.
+    Tcp {
+        /// A name or an address, an IPv6 one without its brackets.
+        host: String,
+        /// The port; 0 lets the system choose, for listening only.
+        port: u16,
+    },
+    /// At a path of the file system.
+    Unix(PathBuf),
+}
+
+/// Text that is no endpoint.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{text}` is not an endpoint: {problem}; expected http://host:port, host:port or unix:/path")]
+pub struct EndpointError {
+    /// What was written.
+    pub text: String,
+    /// What is wrong with it.
+    pub problem: String,
+}
+
+/// A server that cannot be reached.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot connect to {endpoint}")]
+pub struct ConnectError {
+    /// Which.
+    pub endpoint: Endpoint,
+    /// Why.
+    #[source]
+    pub source: tonic::transport::Error,
+}
+
+impl Endpoint {
+    /// A port of this machine's loopback that the system chooses.
+    pub fn loopback() -> Endpoint {
+        Endpoint::Tcp { host: "127.0.0.1".to_owned(), port: 0 }
+    }
+}
+
+impl fmt::Display for Endpoint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Endpoint::Tcp { host, port } if host.contains(':') => write!(f, "http://[{host}]:{port}"),
+            Endpoint::Tcp { host, port } => write!(f, "http://{host}:{port}"),
+            Endpoint::Unix(path) => write!(f, "unix:{}", path.display()),
+        }
+    }
+}
+
+impl FromStr for Endpoint {
+    type Err = EndpointError;
+
+    fn from_str(text: &str) -> Result<Endpoint, EndpointError> {
+        let refuse = |problem: String| EndpointError { text: text.to_owned(), problem };
+        if let Some(path) = text.strip_prefix("unix:") {
+            let path = path.strip_prefix("//").unwrap_or(path);
+            if !path.starts_with('/') {
+                return Err(refuse("the path is not absolute".to_owned()));
+            }
+            if path.len() > MAX_SOCKET_PATH_BYTES {
+                let problem = format!("the path has {} bytes, a socket's at most {MAX_SOCKET_PATH_BYTES}", path.len());
+                return Err(refuse(problem));
+            }
+            return Ok(Endpoint::Unix(PathBuf::from(path)));
+        }
+        let address = text.strip_prefix("http://").unwrap_or(text);
+        let address = address.strip_suffix('/').unwrap_or(address);
+        let (host, port) = address.rsplit_once(':').ok_or_else(|| refuse("no port is given".to_owned()))?;
+        let port = port.parse().map_err(|_| refuse(format!("`{port}` is no port")))?;
+        let host = host.strip_prefix('[').and_then(|h| h.strip_suffix(']')).unwrap_or(host);
+        if host.is_empty() || host.contains(['/', '@', ' ']) {
+            return Err(refuse(format!("`{host}` is no host")));
+        }
+        Ok(Endpoint::Tcp { host: host.to_owned(), port })
+    }
+}
+
+impl From<Endpoint> for String {
+    fn from(endpoint: Endpoint) -> String {
+        endpoint.to_string()
+    }
+}
+
+impl TryFrom<String> for Endpoint {
+    type Error = EndpointError;
+
+    fn try_from(text: String) -> Result<Endpoint, EndpointError> {
+        text.parse()
+    }
+}
+
+/// A channel that connects with its first call, and again whenever the connection broke. Needs a tokio runtime.
+///
+/// # Errors
+/// [`ConnectError`] when the endpoint makes no URI.
+pub fn connect_lazily(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
+    Ok(configured(endpoint)?.connect_lazy())
+}
+
+/// A channel that is connected.
+///
+/// # Errors
+/// [`ConnectError`] when nobody answers there within [`CONNECT_TIMEOUT`].
+pub async fn connect(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
+    let connected = configured(endpoint)?.connect().await;
+    connected.map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
+}
+
+fn configured(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, ConnectError> {
+    let configured = tonic::transport::Endpoint::from_shared(endpoint.to_string())
+        .map_err(|source| ConnectError { endpoint: endpoint.clone(), source })?;
+    Ok(configured
+        .connect_timeout(CONNECT_TIMEOUT)
+        .tcp_nodelay(true)
+        .http2_keep_alive_interval(KEEPALIVE_INTERVAL)
+        .keep_alive_timeout(KEEPALIVE_TIMEOUT)
+        .keep_alive_while_idle(true))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn an_endpoint_reads_back_as_printed() {
+        for (text, printed) in [
+            ("127.0.0.1:0", "http://127.0.0.1:0"),
+            ("http://compute:4000", "http://compute:4000"),
+            ("http://[::1]:4000/", "http://[::1]:4000"),
+            ("unix:/run/ratn/x.sock", "unix:/run/ratn/x.sock"),
+            ("unix:///run/ratn/x.sock", "unix:/run/ratn/x.sock"),
+        ] {
+            let endpoint: Endpoint = text.parse().unwrap();
+            assert_eq!(endpoint.to_string(), printed);
+            assert_eq!(printed.parse::<Endpoint>().unwrap(), endpoint);
+        }
+    }
+
+    #[test]
+    fn what_is_no_endpoint_is_refused_with_the_reason() {
+        for text in ["", "compute", "compute:port", ":80", "unix:relative", "http://a/b:80"] {
+            let error = text.parse::<Endpoint>().unwrap_err().to_string();
+            assert!(error.contains("expected http://host:port"), "{error}");
+        }
+        let long = format!("unix:/{}", "x".repeat(200));
+        assert!(long.parse::<Endpoint>().unwrap_err().to_string().contains("at most 107"));
+    }
+}

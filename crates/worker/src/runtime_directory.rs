@@ -1,0 +1,230 @@
+//! How the parts of a system on one machine find each other: a directory with one file per role, `<role>.endpoint`, which
+//! holds where that role is served. A file is there exactly while its role is ready.
+
+use crate::endpoint::{Endpoint, EndpointError};
+use std::fs;
+use std::io::{self, Write};
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// How often [`RuntimeDirectory::wait_for`] looks.
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
+
+/// The runtime directory of one system.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RuntimeDirectory {
+    path: PathBuf,
+}
+
+/// A role that cannot be found.
+#[derive(Debug, thiserror::Error)]
+pub enum FindError {
+    /// Nobody serves it.
+    #[error("no {role} is running: {} is not there; start one with `ratn up` or `ratn {role}`", file.display())]
+    NotPublished {
+        /// The role.
+        role: String,
+        /// The file that it would have.
+        file: PathBuf,
+    },
+    /// Nobody served it in time.
+    #[error("no {role} was ready within {waited_s:.1} s: {} is not there", file.display())]
+    NotInTime {
+        /// The role.
+        role: String,
+        /// The file that it would have.
+        file: PathBuf,
+        /// How long was waited, in seconds.
+        waited_s: f64,
+    },
+    /// The file holds something else than an endpoint.
+    #[error("{} does not say where the {role} is", file.display())]
+    Malformed {
+        /// The role.
+        role: String,
+        /// Its file.
+        file: PathBuf,
+        /// What is wrong with it.
+        #[source]
+        source: EndpointError,
+    },
+    /// The file cannot be read.
+    #[error("cannot read {}", file.display())]
+    Unreadable {
+        /// The file.
+        file: PathBuf,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+}
+
+/// A role that others can find as long as this lives.
+#[derive(Debug)]
+#[must_use = "the endpoint is withdrawn when this is dropped"]
+pub struct Published {
+    file: PathBuf,
+    content: String,
+}
+
+impl RuntimeDirectory {
+    /// The directory at `path`, made if need be, for this user only.
+    ///
+    /// # Errors
+    /// Where it cannot be made, or is no directory.
+    pub fn create(path: impl Into<PathBuf>) -> io::Result<RuntimeDirectory> {
+        let path = path.into();
+        fs::DirBuilder::new().recursive(true).mode(0o700).create(&path)?;
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o700))?;
+        Ok(RuntimeDirectory { path: path.canonicalize()? })
+    }
+
+    /// The directory at `path`, whether it is there or not: for those who only look.
+    pub fn at(path: impl Into<PathBuf>) -> RuntimeDirectory {
+        RuntimeDirectory { path: path.into() }
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The file that says where `role` is.
+    pub fn endpoint_file(&self, role: &str) -> PathBuf {
+        self.path.join(format!("{role}.endpoint"))
+    }
+
+    /// A Unix socket in it, `<name>.sock`; its directory is made with the first bind.
+    pub fn socket(&self, name: &str) -> Endpoint {
+        Endpoint::Unix(self.path.join(format!("{name}.sock")))
+    }
+
+    /// Lets others find `role` at `endpoint` until the guard is dropped.
+    ///
+    /// # Errors
+    /// Where the file cannot be written.
+    pub fn publish(&self, role: &str, endpoint: &Endpoint) -> io::Result<Published> {
+        publish_file(&self.endpoint_file(role), endpoint)
+    }
+
+    /// Where `role` is.
+    ///
+    /// # Errors
+    /// [`FindError`] says what is missing.
+    pub fn find(&self, role: &str) -> Result<Endpoint, FindError> {
+        let file = self.endpoint_file(role);
+        match read_endpoint_file(&file, role) {
+            Ok(Some(endpoint)) => Ok(endpoint),
+            Ok(None) => Err(FindError::NotPublished { role: role.to_owned(), file }),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Where `role` is, as soon as it is there.
+    ///
+    /// # Errors
+    /// [`FindError`] after `deadline`, or at once where the file is there and holds nonsense.
+    pub async fn wait_for(&self, role: &str, deadline: Duration) -> Result<Endpoint, FindError> {
+        wait_for_file(&self.endpoint_file(role), role, deadline).await
+    }
+}
+
+/// Writes `endpoint` to `file`, so that nobody ever reads half of it; removed when the guard is dropped.
+///
+/// # Errors
+/// Where the file cannot be written.
+pub fn publish_file(file: &Path, endpoint: &Endpoint) -> io::Result<Published> {
+    let content = format!("{endpoint}\n");
+    let mut name = file.file_name().unwrap_or_default().to_owned();
+    name.push(format!(".{}.tmp", std::process::id()));
+    let temporary = file.with_file_name(name);
+    let mut writer = fs::File::create(&temporary)?;
+    writer.write_all(content.as_bytes())?;
+    drop(writer);
+    fs::rename(&temporary, file)?;
+    Ok(Published { file: file.to_owned(), content })
+}
+
+/// The endpoint that `file` (of `role`, for the message) comes to hold.
+///
+/// # Errors
+/// [`FindError`] after `deadline`, or at once where the file is there and holds nonsense.
+pub async fn wait_for_file(file: &Path, role: &str, deadline: Duration) -> Result<Endpoint, FindError> {
+    let look = async {
+        loop {
+            if let Some(endpoint) = read_endpoint_file(file, role)? {
+                return Ok(endpoint);
+            }
+            tokio::time::sleep(POLL_INTERVAL).await;
+        }
+    };
+    let late = |_| {
+        let (role, file) = (role.to_owned(), file.to_owned());
+        FindError::NotInTime { role, file, waited_s: deadline.as_secs_f64() }
+    };
+    tokio::time::timeout(deadline, look).await.map_err(late)?
+}
+
+fn read_endpoint_file(file: &Path, role: &str) -> Result<Option<Endpoint>, FindError> {
+    let text = match fs::read_to_string(file) {
+        Ok(text) => text,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(source) => return Err(FindError::Unreadable { file: file.to_owned(), source }),
+    };
+    let malformed = |source| FindError::Malformed { role: role.to_owned(), file: file.to_owned(), source };
+    text.trim().parse().map(Some).map_err(malformed)
+}
+
+impl Drop for Published {
+    fn drop(&mut self) {
+        // A successor may have published itself in the meantime: then the file is its own.
+        if fs::read_to_string(&self.file).is_ok_and(|content| content == self.content) {
+            let _ = fs::remove_file(&self.file);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    fn endpoint(port: u16) -> Endpoint {
+        Endpoint::Tcp { host: "127.0.0.1".to_owned(), port }
+    }
+
+    #[tokio::test]
+    async fn a_role_is_found_while_it_is_published() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
+        assert_eq!(fs::metadata(directory.path()).unwrap().permissions().mode() & 0o777, 0o700);
+        assert!(directory.find("cell").unwrap_err().to_string().contains("no cell is running"));
+
+        let waiting = directory.wait_for("cell", Duration::from_secs(10));
+        let publishing = async { directory.publish("cell", &endpoint(4000)).unwrap() };
+        let (found, published) = tokio::join!(waiting, publishing);
+        assert_eq!(found.unwrap(), endpoint(4000));
+        drop(published);
+        assert!(matches!(directory.find("cell"), Err(FindError::NotPublished { .. })));
+        assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_late_guard_leaves_its_successors_file_alone() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::at(parent.path());
+        let first = directory.publish("cell", &endpoint(1)).unwrap();
+        let _second = directory.publish("cell", &endpoint(2)).unwrap();
+        drop(first);
+        assert_eq!(directory.find("cell").unwrap(), endpoint(2));
+    }
+
+    #[tokio::test]
+    async fn waiting_ends_at_its_deadline_and_names_the_file() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::at(parent.path());
+        let error = directory.wait_for("cell", Duration::from_millis(1)).await.unwrap_err().to_string();
+        assert!(error.contains("no cell was ready") && error.contains("cell.endpoint"), "{error}");
+    }
+}

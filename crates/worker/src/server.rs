@@ -1,0 +1,194 @@
+//! One way to serve: bind, add health and reflection, serve until a token is cancelled, drain with a hard deadline.
+
+use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
+use std::convert::Infallible;
+use std::io;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::PathBuf;
+use std::time::Duration;
+use tokio::net::{TcpListener, UnixListener, UnixStream};
+use tokio_stream::wrappers::UnixListenerStream;
+use tokio_util::sync::CancellationToken;
+use tonic::body::Body;
+use tonic::codegen::{Service, http};
+use tonic::server::NamedService;
+use tonic::service::Routes;
+use tonic::transport::server::TcpIncoming;
+use tonic_health::ServingStatus;
+
+/// Calls that have not ended this long after the shutdown began are dropped.
+pub const DRAIN_DEADLINE: Duration = Duration::from_millis(500);
+
+/// A listener that nobody is served on yet.
+#[derive(Debug)]
+pub struct Bound {
+    listener: Listener,
+    endpoint: Endpoint,
+}
+
+#[derive(Debug)]
+enum Listener {
+    Tcp(TcpListener),
+    Unix(UnixListener, SocketFile),
+}
+
+/// Removes the socket's file in the end.
+#[derive(Debug)]
+struct SocketFile(PathBuf);
+
+/// An address that cannot be listened on.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot listen on {endpoint}")]
+pub struct BindError {
+    /// Which.
+    pub endpoint: Endpoint,
+    /// Why.
+    #[source]
+    pub source: io::Error,
+}
+
+/// Serving ended before its time.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// The transport failed.
+    #[error("serving on {endpoint} failed")]
+    Transport {
+        /// Where.
+        endpoint: Endpoint,
+        /// Why.
+        #[source]
+        source: tonic::transport::Error,
+    },
+    /// The descriptors do not make a reflection service.
+    #[error("no reflection for the services")]
+    Reflection(#[source] tonic_reflection::server::Error),
+}
+
+/// What is served. A service sets its own message limits (`max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)`).
+#[derive(Debug, Clone, Default)]
+pub struct Services {
+    routes: Routes,
+    names: Vec<&'static str>,
+}
+
+impl Services {
+    /// Nothing yet.
+    pub fn new() -> Services {
+        Services::default()
+    }
+
+    /// With one more service, as tonic generates them.
+    #[must_use]
+    pub fn with<S>(mut self, service: S) -> Services
+    where
+        S: Service<http::Request<Body>, Response = http::Response<Body>, Error = Infallible>
+            + NamedService
+            + Clone
+            + Send
+            + Sync
+            + 'static,
+        S::Future: Send + 'static,
+    {
+        self.routes = self.routes.add_service(service);
+        self.names.push(S::NAME);
+        self
+    }
+}
+
+/// Binds `listen`; what is bound has the real port. A Unix socket that nobody listens on any more is replaced.
+///
+/// # Errors
+/// [`BindError`] where the address cannot be had.
+pub async fn bind(listen: &Endpoint) -> Result<Bound, BindError> {
+    let failed = |source| BindError { endpoint: listen.clone(), source };
+    match listen {
+        Endpoint::Tcp { host, port } => {
+            let listener = TcpListener::bind((host.as_str(), *port)).await.map_err(failed)?;
+            let port = listener.local_addr().map_err(failed)?.port();
+            let endpoint = Endpoint::Tcp { host: host.clone(), port };
+            Ok(Bound { listener: Listener::Tcp(listener), endpoint })
+        }
+        Endpoint::Unix(path) => {
+            if let Some(parent) = path.parent() {
+                std::fs::DirBuilder::new().recursive(true).mode(0o700).create(parent).map_err(failed)?;
+            }
+            if path.exists() {
+                if UnixStream::connect(path).await.is_ok() {
+                    return Err(failed(io::Error::from(io::ErrorKind::AddrInUse)));
+                }
+                std::fs::remove_file(path).map_err(failed)?;
+            }
+            let listener = UnixListener::bind(path).map_err(failed)?;
+            let listener = Listener::Unix(listener, SocketFile(path.clone()));
+            Ok(Bound { listener, endpoint: listen.clone() })
+        }
+    }
+}
+
+impl Bound {
+    /// Where it is to be reached.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.endpoint
+    }
+
+    /// Serves until `shutdown` is cancelled, then lets calls under way end within [`DRAIN_DEADLINE`]. Health is SERVING
+    /// from the first answer on, for the server (the empty name) and for each service, and NOT_SERVING once it drains.
+    /// Services with endless streams must end them on the same token.
+    ///
+    /// # Errors
+    /// [`ServeError`] where the transport fails.
+    pub async fn serve(self, services: Services, shutdown: CancellationToken) -> Result<(), ServeError> {
+        let (health, health_service) = tonic_health::server::health_reporter();
+        for name in services.names.iter().chain(&[""]) {
+            health.set_service_status(name, ServingStatus::Serving).await;
+        }
+        let reflection = tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(ratn_proto::FILE_DESCRIPTOR_SET)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+            .build_v1()
+            .map_err(ServeError::Reflection)?;
+        let router = tonic::transport::Server::builder()
+            .http2_keepalive_interval(Some(KEEPALIVE_INTERVAL))
+            .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
+            .add_routes(services.routes.add_service(health_service).add_service(reflection));
+
+        let serving = {
+            let stop = shutdown.clone().cancelled_owned();
+            async move {
+                match self.listener {
+                    Listener::Tcp(listener) => {
+                        let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+                        router.serve_with_incoming_shutdown(incoming, stop).await
+                    }
+                    Listener::Unix(listener, file) => {
+                        let incoming = UnixListenerStream::new(listener);
+                        let served = router.serve_with_incoming_shutdown(incoming, stop).await;
+                        drop(file);
+                        served
+                    }
+                }
+            }
+        };
+        let drained = async {
+            shutdown.cancelled().await;
+            for name in services.names.iter().chain(&[""]) {
+                health.set_service_status(name, ServingStatus::NotServing).await;
+            }
+            tokio::time::sleep(DRAIN_DEADLINE).await;
+        };
+        let endpoint = self.endpoint;
+        tokio::select! {
+            served = serving => served.map_err(|source| ServeError::Transport { endpoint, source }),
+            () = drained => {
+                tracing::debug!(%endpoint, "calls were still under way at the end of the drain");
+                Ok(())
+            }
+        }
+    }
+}
+
+impl Drop for SocketFile {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.0);
+    }
+}

@@ -1,0 +1,219 @@
+//! A session with the resource manager: kept alive in the background, continued after a broken connection, opened again
+//! when the manager has forgotten it. What it owned is then gone; [`SessionState::generation`] tells.
+//!
+//! ```text
+//! open ─→ not alive ─ ping answered ─→ alive ─ no answer for a TTL ─→ not alive
+//!                                      └─ answer says `created` ─→ alive, next generation
+//! ```
+
+use crate::client::{Channels, fresh_id};
+use crate::endpoint::Endpoint;
+use ratn_proto::v1;
+use ratn_proto::v1::resource_service_client::ResourceServiceClient;
+use std::time::Duration;
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinHandle;
+use tokio::time::{Instant, timeout};
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Channel;
+
+/// How long a session lives without a ping unless said otherwise.
+pub const DEFAULT_TTL: Duration = Duration::from_secs(3);
+
+/// A session is pinged this many times per time to live.
+const PINGS_PER_TTL: u32 = 4;
+/// The pause before a reconnect; grows from the first to the second.
+const BACKOFF: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
+/// The last ping, which ends the session, is given this long.
+const FAREWELL: Duration = Duration::from_millis(200);
+
+/// A session that is kept alive until this is closed or dropped.
+#[derive(Debug)]
+pub struct Session {
+    id: String,
+    endpoint: Endpoint,
+    state: watch::Receiver<SessionState>,
+    end: CancellationToken,
+    task: Option<JoinHandle<()>>,
+}
+
+/// How a session is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct SessionState {
+    /// It was pinged within its time to live.
+    pub alive: bool,
+    /// How often the manager made it; when it grows beyond 1, what the session owned and held is gone.
+    pub generation: u64,
+}
+
+/// No session within the deadline.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("the resource manager at {endpoint} opened no session within {waited_s:.1} s; is it running?")]
+pub struct SessionError {
+    /// Where it was asked for.
+    pub endpoint: Endpoint,
+    /// How long was waited, in seconds.
+    pub waited_s: f64,
+}
+
+impl Session {
+    /// Begins to keep a session alive with the resource manager at `endpoint`. `client` says who this is, for people.
+    pub fn open(channels: &Channels, endpoint: &Endpoint, client: &str, ttl: Duration) -> Session {
+        let id = fresh_id(client);
+        let end = CancellationToken::new();
+        let (tell, state) = watch::channel(SessionState::default());
+        let keeper = Keeper {
+            channels: channels.clone(),
+            endpoint: endpoint.clone(),
+            id: id.clone(),
+            client: client.to_owned(),
+            ttl,
+            expires: Instant::now(),
+            tell,
+            end: end.clone(),
+        };
+        let task = Some(tokio::spawn(keeper.keep()));
+        Session { id, endpoint: endpoint.clone(), state, end, task }
+    }
+
+    /// Its id.
+    pub fn id(&self) -> &str {
+        &self.id
+    }
+
+    /// How it is, and every change of it.
+    pub fn state(&self) -> watch::Receiver<SessionState> {
+        self.state.clone()
+    }
+
+    /// Returns once it is alive.
+    ///
+    /// # Errors
+    /// [`SessionError`] when it is not within `deadline`.
+    pub async fn alive(&self, deadline: Duration) -> Result<(), SessionError> {
+        let mut state = self.state.clone();
+        let alive = timeout(deadline, state.wait_for(|state| state.alive)).await;
+        if matches!(alive, Ok(Ok(_))) {
+            return Ok(());
+        }
+        Err(SessionError { endpoint: self.endpoint.clone(), waited_s: deadline.as_secs_f64() })
+    }
+
+    /// Returns once what the session owned or held is gone: it was not answered for its time to live, or the manager made
+    /// it anew. Counts from the call on; a session that is not alive yet is waited for first.
+    pub async fn lost(&self) {
+        let mut state = self.state.clone();
+        let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { return };
+        let _ = state.wait_for(|s| !s.alive || s.generation != generation).await;
+    }
+
+    /// Ends it with the manager, so that what it holds is free at once.
+    pub async fn close(mut self) {
+        self.end.cancel();
+        if let Some(task) = self.task.take() {
+            let _ = task.await;
+        }
+    }
+}
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        // The task says farewell, if the runtime still lets it.
+        self.end.cancel();
+    }
+}
+
+struct Keeper {
+    channels: Channels,
+    endpoint: Endpoint,
+    id: String,
+    client: String,
+    ttl: Duration,
+    expires: Instant,
+    tell: watch::Sender<SessionState>,
+    end: CancellationToken,
+}
+
+impl Keeper {
+    async fn keep(mut self) {
+        let mut backoff = BACKOFF.0;
+        loop {
+            let before = self.tell.borrow().generation;
+            let end = self.end.clone();
+            tokio::select! {
+                biased;
+                () = end.cancelled() => break,
+                () = self.stream() => {}
+            }
+            if self.tell.borrow().generation != before || Instant::now() < self.expires {
+                backoff = BACKOFF.0;
+            }
+            if Instant::now() >= self.expires {
+                self.tell.send_if_modified(|state| std::mem::take(&mut state.alive));
+            }
+            tokio::select! {
+                biased;
+                () = end.cancelled() => break,
+                () = tokio::time::sleep(backoff) => {}
+            }
+            backoff = (backoff * 2).min(BACKOFF.1);
+        }
+        // The stream with its pings is gone; a last one says that the session shall end now.
+        let _ = timeout(FAREWELL, self.farewell()).await;
+        self.tell.send_if_modified(|state| std::mem::take(&mut state.alive));
+    }
+
+    /// Pings over one stream until it breaks.
+    async fn stream(&mut self) {
+        let Some(mut client) = self.connect() else { return };
+        let (pings, outgoing) = mpsc::channel(1);
+        if pings.send(self.ping(self.ttl)).await.is_err() {
+            return;
+        }
+        let opening = timeout(self.patience(), client.keep_alive(ReceiverStream::new(outgoing))).await;
+        let mut answers = match opening {
+            Ok(Ok(answer)) => answer.into_inner(),
+            Ok(Err(status)) => return tracing::debug!(endpoint = %self.endpoint, %status, "no session yet"),
+            Err(_) => return,
+        };
+        loop {
+            let Ok(Ok(Some(answer))) = timeout(self.patience(), answers.message()).await else { return };
+            let ttl = Duration::from_millis(answer.ttl_ms);
+            self.expires = Instant::now() + ttl;
+            self.tell.send_if_modified(|state| {
+                let before = *state;
+                state.alive = true;
+                state.generation += u64::from(answer.created);
+                *state != before
+            });
+            tokio::time::sleep(ttl.min(self.ttl) / PINGS_PER_TTL).await;
+            if pings.send(self.ping(self.ttl)).await.is_err() {
+                return;
+            }
+        }
+    }
+
+    async fn farewell(&self) {
+        let Some(mut client) = self.connect() else { return };
+        let ping = tokio_stream::once(self.ping(Duration::ZERO));
+        if let Ok(answer) = client.keep_alive(ping).await {
+            let _ = answer.into_inner().message().await;
+        }
+    }
+
+    fn connect(&self) -> Option<ResourceServiceClient<Channel>> {
+        self.channels.get(&self.endpoint).ok().map(ResourceServiceClient::new)
+    }
+
+    fn ping(&self, ttl: Duration) -> v1::KeepAliveRequest {
+        let ttl_ms = u64::try_from(ttl.as_millis()).unwrap_or(u64::MAX);
+        v1::KeepAliveRequest { session_id: self.id.clone(), ttl_ms, client: self.client.clone() }
+    }
+
+    /// How long an answer may take: until the session is over, once it is, a time to live.
+    fn patience(&self) -> Duration {
+        let left = self.expires.saturating_duration_since(Instant::now());
+        if left.is_zero() { self.ttl } else { left }
+    }
+}

@@ -1,0 +1,57 @@
+//! When a process ends: a signal, or the end of its parent. Both only cancel a token; the server drains by it. What does
+//! not drain in time is ended hard, so that nothing outlives its parent.
+
+use std::io::{self, Read};
+use std::time::Duration;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+
+/// After its parent's end a process lives at most this much longer.
+pub const EXIT_GRACE: Duration = Duration::from_millis(900);
+/// The exit code of a process that outlived its parent and did not drain.
+const EXIT_CODE_ORPHAN: i32 = 3;
+/// The exit code after a second signal: 128 + SIGINT.
+const EXIT_CODE_INTERRUPTED: i32 = 130;
+
+/// Cancels `token` at SIGTERM or SIGINT; a second one ends the process at once. Needs a tokio runtime.
+///
+/// # Errors
+/// Where the signals cannot be caught.
+pub fn on_signals(token: &CancellationToken) -> io::Result<()> {
+    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    let token = token.clone();
+    tokio::spawn(async move {
+        let mut next = async || tokio::select! { _ = terminate.recv() => {}, _ = interrupt.recv() => {} };
+        next().await;
+        token.cancel();
+        next().await;
+        std::process::exit(EXIT_CODE_INTERRUPTED);
+    });
+    Ok(())
+}
+
+/// Watches standard input, a pipe that the parent holds open, in a thread of its own (a busy runtime cannot starve it);
+/// when it ends, cancels `token` and, [`EXIT_GRACE`] later, the process.
+///
+/// # Errors
+/// Where the thread cannot be started.
+pub fn exit_with_parent(token: &CancellationToken) -> io::Result<()> {
+    let token = token.clone();
+    let watch = move || {
+        let mut ignored = [0_u8; 256];
+        let mut input = io::stdin().lock();
+        loop {
+            match input.read(&mut ignored) {
+                Ok(0) => break,
+                Ok(_) => {}
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(_) => break,
+            }
+        }
+        token.cancel();
+        std::thread::sleep(EXIT_GRACE);
+        std::process::exit(EXIT_CODE_ORPHAN);
+    };
+    std::thread::Builder::new().name("exit-with-parent".to_owned()).spawn(watch)?;
+    Ok(())
+}

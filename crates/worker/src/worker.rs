@@ -1,0 +1,174 @@
+//! A worker process in one builder: what `ratn worker path-planner` and the like are.
+//!
+//! A pooled worker only serves: its process manager makes its resource once gRPC health says SERVING, and knows where it
+//! is by the socket that it named (`listen unix:…`) or by the endpoint file that the worker writes. A worker that stands
+//! alone is given the resource manager and offers its resource itself.
+
+use crate::action::{Action, ActionServer, ActionServerBuilder};
+use crate::client::{CallError, Channels};
+use crate::endpoint::Endpoint;
+use crate::provider::Provider;
+use crate::runtime_directory::publish_file;
+use crate::server::{BindError, ServeError, Services, bind};
+use crate::session::{DEFAULT_TTL, Session};
+use crate::shutdown;
+use ratn_model::resource::ResourceClass;
+use ratn_proto::types::Resource;
+use std::io;
+use std::path::PathBuf;
+use tokio_util::sync::CancellationToken;
+
+/// What a worker is told by whoever starts it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WorkerOptions {
+    /// Its resource's id, by which leases are checked; empty asks for no lease.
+    pub id: String,
+    /// Its resource's kind, `PathPlanner`.
+    pub kind: String,
+    /// Where it listens.
+    pub listen: Endpoint,
+    /// Where it writes its endpoint once it serves.
+    pub endpoint_file: Option<PathBuf>,
+    /// Ends when its standard input does.
+    pub exit_with_parent: bool,
+    /// Offers its resource there by itself. Not for pooled workers.
+    pub resource_manager: Option<Endpoint>,
+    /// The host that it says it is on, when it offers its resource.
+    pub host: String,
+}
+
+impl Default for WorkerOptions {
+    fn default() -> WorkerOptions {
+        WorkerOptions {
+            id: String::new(),
+            kind: String::new(),
+            listen: Endpoint::loopback(),
+            endpoint_file: None,
+            exit_with_parent: false,
+            resource_manager: None,
+            host: String::new(),
+        }
+    }
+}
+
+/// A worker that failed to start or to go on.
+#[derive(Debug, thiserror::Error)]
+pub enum WorkerError {
+    /// It cannot listen.
+    #[error("the worker cannot start")]
+    Bind(#[from] BindError),
+    /// It cannot serve.
+    #[error("the worker cannot serve")]
+    Serve(#[from] ServeError),
+    /// The resource manager does not want it.
+    #[error("the worker's resource is refused")]
+    Resource(#[from] CallError),
+    /// Something of the operating system failed.
+    #[error("the worker cannot {what}")]
+    System {
+        /// What it wanted to do.
+        what: String,
+        /// Why it cannot.
+        #[source]
+        source: io::Error,
+    },
+}
+
+/// A worker that does not run yet.
+#[derive(Debug)]
+pub struct Worker {
+    options: WorkerOptions,
+    actions: ActionServerBuilder,
+    shutdown: CancellationToken,
+}
+
+impl Worker {
+    /// A worker without actions that takes one goal at a time.
+    pub fn new(options: WorkerOptions) -> Worker {
+        let actions = ActionServer::builder(options.id.clone()).one_at_a_time();
+        Worker { options, actions, shutdown: CancellationToken::new() }
+    }
+
+    /// With an action.
+    #[must_use]
+    pub fn action(mut self, action: impl Action) -> Worker {
+        self.actions = self.actions.action(action);
+        self
+    }
+
+    /// Ends when `shutdown` is cancelled, too.
+    #[must_use]
+    pub fn shutdown(mut self, shutdown: CancellationToken) -> Worker {
+        self.shutdown = shutdown;
+        self
+    }
+
+    /// Serves until a signal, the parent's end or the shutdown token says otherwise. Goals under way are told to stop.
+    ///
+    /// # Errors
+    /// [`WorkerError`].
+    pub async fn run(self) -> Result<(), WorkerError> {
+        let Worker { options, actions, shutdown } = self;
+        let system = |what: &str| {
+            let what = what.to_owned();
+            move |source| WorkerError::System { what, source }
+        };
+        shutdown::on_signals(&shutdown).map_err(system("catch signals"))?;
+        if options.exit_with_parent {
+            shutdown::exit_with_parent(&shutdown).map_err(system("watch its parent"))?;
+        }
+        let channels = Channels::new();
+        let server = actions.channels(channels.clone()).build();
+        let bound = bind(&options.listen).await?;
+        let endpoint = bound.endpoint().clone();
+        let services = Services::new().with(server.clone().into_service());
+        let ends = shutdown.clone();
+        let serving = tokio::spawn(async move {
+            let served = bound.serve(services, ends.clone()).await;
+            ends.cancel();
+            served
+        });
+        // Connections are accepted from the bind on: whoever reads the file is answered.
+        let published = match &options.endpoint_file {
+            Some(file) => Some(
+                publish_file(file, &endpoint).map_err(system(&format!("write its endpoint to {}", file.display())))?,
+            ),
+            None => None,
+        };
+        let offered = match &options.resource_manager {
+            Some(manager) => Some(offer(&channels, manager, &options, &endpoint).await?),
+            None => None,
+        };
+        tracing::info!(id = %options.id, %endpoint, "serving");
+
+        shutdown.cancelled().await;
+        drop(published);
+        if let Some((session, provider)) = offered {
+            drop(provider);
+            session.close().await;
+        }
+        let stopping = server.stop_all();
+        let (served, ()) = tokio::join!(serving, async {
+            let _ = tokio::time::timeout(crate::server::DRAIN_DEADLINE, stopping).await;
+        });
+        match served {
+            Ok(served) => Ok(served?),
+            Err(error) => Err(WorkerError::System { what: "serve".to_owned(), source: io::Error::other(error) }),
+        }
+    }
+}
+
+async fn offer(
+    channels: &Channels,
+    manager: &Endpoint,
+    options: &WorkerOptions,
+    endpoint: &Endpoint,
+) -> Result<(Session, Provider), CallError> {
+    let session = Session::open(channels, manager, &options.id, DEFAULT_TTL);
+    let provider = Provider::start(channels, manager, &session)?;
+    let resource = Resource::new(&options.id, ResourceClass::Process, &options.kind)
+        .with_endpoint(endpoint)
+        .on_host(&options.host);
+    provider.offer(resource).await?;
+    Ok((session, provider))
+}
