@@ -18,6 +18,40 @@ pub struct Catalogue {
     pub resources: BTreeMap<String, ResourceOffer>,
 }
 
+/// The catalogue of the bundled system, as text.
+const STANDARD: &str = include_str!("../../../deploy/catalogue.toml");
+
+/// A text that is no catalogue.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("not a catalogue: {0}")]
+pub struct InvalidCatalogue(String);
+
+impl Catalogue {
+    /// Reads the TOML form, as in `deploy/catalogue.toml`.
+    ///
+    /// # Errors
+    /// [`InvalidCatalogue`] with line and column of the first thing that does not fit.
+    pub fn from_toml(text: &str) -> Result<Catalogue, InvalidCatalogue> {
+        toml::from_str(text).map_err(|error| InvalidCatalogue(error.to_string().trim_end().to_owned()))
+    }
+
+    /// The catalogue of the bundled system (`deploy/catalogue.toml`).
+    ///
+    /// # Panics
+    /// Never: the text is part of the program, and a test reads it.
+    pub fn standard() -> Catalogue {
+        match Catalogue::from_toml(STANDARD) {
+            Ok(catalogue) => catalogue,
+            Err(error) => unreachable!("the embedded catalogue is {error}"),
+        }
+    }
+
+    /// The signature of `provider/action`.
+    pub fn action(&self, provider: &str, action: &str) -> Option<&ActionSignature> {
+        self.providers.get(provider)?.actions.get(action)
+    }
+}
+
 /// Something that performs actions: a worker, or a module of the robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -57,4 +91,22 @@ pub struct ResourceOffer {
     /// Blocking it can change the environment: a state that computes or senses may not.
     #[serde(default)]
     pub actuates: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_standard_catalogue_reads_and_its_providers_are_offered() {
+        let catalogue = Catalogue::standard();
+        assert!(catalogue.providers.values().all(|p| catalogue.resources.contains_key(&p.resource)));
+        assert!(catalogue.action("path_planner", "plan").is_some_and(|plan| plan.outputs.contains_key("end_pose")));
+    }
+
+    #[test]
+    fn an_unknown_key_in_a_catalogue_is_refused_with_its_line() {
+        let error = Catalogue::from_toml("[resources.Arm]\nclass = \"module\"\ncount = 1\nactuate = true\n");
+        assert!(error.is_err_and(|e| e.to_string().contains("line 4") && e.to_string().contains("actuate")));
+    }
 }

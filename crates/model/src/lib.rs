@@ -5,9 +5,13 @@
 //! It deliberately knows no clock, no socket, no process and no world: facts are named here, kept in `ratn-world`.
 
 pub mod catalogue;
+pub(crate) mod check;
+pub mod diagnostic;
 pub mod expression;
 pub mod fact;
 pub mod id;
+pub mod load;
+pub mod parameters;
 pub mod pose;
 pub mod program;
 pub mod resource;

@@ -1,0 +1,108 @@
+//! Preconditions that nothing establishes: no older state's effects and not the initial world.
+//!
+//! Without a declared `world` the facts at the start are whatever the system holds, so this is a warning then.
+
+use super::{Subject, branches};
+use crate::diagnostic::Findings;
+use crate::expression::scope::NothingKnown;
+use crate::expression::{BinaryOperator, EffectExpr, Expr, FactExpr, UnaryOperator};
+use crate::fact::{FactPattern, Footprint};
+use crate::id::StateId;
+use crate::program::{Program, State, StateKind};
+use crate::value::Value;
+
+pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
+    let mut established = Established::default();
+    established.add(writes(&subject.program.initial));
+    walk(subject, Program::ROOT, &mut established, findings);
+}
+
+/// The facts that may hold by now.
+#[derive(Default)]
+struct Established {
+    everything: bool,
+    patterns: Vec<FactPattern>,
+}
+
+impl Established {
+    fn add(&mut self, patterns: Vec<FactPattern>) {
+        for pattern in patterns {
+            if !self.patterns.contains(&pattern) {
+                self.patterns.push(pattern);
+            }
+        }
+    }
+
+    fn may_hold(&self, fact: &FactExpr) -> bool {
+        let pattern = fact.pattern(&NothingKnown);
+        self.everything || self.patterns.iter().any(|other| other.overlaps(&pattern))
+    }
+}
+
+/// In program order; what any branch or visit may have written counts.
+fn walk(subject: &Subject<'_>, id: StateId, established: &mut Established, findings: &mut Findings) {
+    let state = subject.program.state(id);
+    if let StateKind::ForEach { body, .. } = &state.kind {
+        // A later visit of the loop sees what its body wrote before.
+        body.iter().for_each(|child| establish_all(subject, *child, established));
+    }
+    for (i, required) in state.annotations.requires.iter().enumerate() {
+        if let Some(missing) = missing(required, established) {
+            let at = subject.place(state, &format!("requires.{i}"));
+            let message = format!("`{required}` is required, and nothing before establishes `{missing}`");
+            let rule = "unestablished-precondition";
+            if subject.declares_world {
+                let help = "add it to the `world` of the task, or to the effects of an older state";
+                findings.error(rule, at, &state.path, message, help);
+            } else {
+                findings.warning(rule, at, &state.path, message, "say in the task's `world` what holds at the start");
+            }
+        }
+    }
+    branches(state).into_iter().flatten().for_each(|child| walk(subject, *child, established, findings));
+    establish(state, established);
+}
+
+fn establish_all(subject: &Subject<'_>, id: StateId, established: &mut Established) {
+    let state = subject.program.state(id);
+    branches(state).into_iter().flatten().for_each(|child| establish_all(subject, *child, established));
+    establish(state, established);
+}
+
+fn establish(state: &State, established: &mut Established) {
+    match state.annotations.effects.get(crate::program::SUCCESS) {
+        None => established.everything = true,
+        Some(_) => state.annotations.effects.values().for_each(|effects| established.add(writes(effects))),
+    }
+}
+
+/// What effects may make true; deletions establish nothing.
+fn writes(effects: &[EffectExpr]) -> Vec<FactPattern> {
+    let mut patterns = Vec::new();
+    for effect in effects {
+        match effect {
+            EffectExpr::Delete(_) => {}
+            EffectExpr::Set(_, Expr::Literal(Value::Null)) => {}
+            EffectExpr::ForEach { effects, .. } => patterns.extend(writes(effects)),
+            one => {
+                if let Footprint::Patterns(some) = EffectExpr::footprint(std::slice::from_ref(one), &NothingKnown) {
+                    patterns.extend(some);
+                }
+            }
+        }
+    }
+    patterns
+}
+
+/// A fact without which the expression cannot be true, and which nothing establishes.
+fn missing<'e>(required: &'e Expr, established: &Established) -> Option<&'e FactExpr> {
+    match required {
+        Expr::Unary(UnaryOperator::Not, _) => None,
+        Expr::Binary(BinaryOperator::And, a, b) => missing(a, established).or_else(|| missing(b, established)),
+        Expr::Binary(BinaryOperator::Or, a, b) => missing(a, established).and_then(|_| missing(b, established)),
+        // Absence can be what is asked for.
+        Expr::Binary(BinaryOperator::NotEqual, ..) => None,
+        Expr::Binary(_, a, b) if [a, b].into_iter().any(|e| **e == Expr::Literal(Value::Null)) => None,
+        other => other.fact_expressions().into_iter().find(|fact| !established.may_hold(fact)),
+    }
+}

@@ -1,0 +1,125 @@
+//! Resources: that the system can have them, that an action's provider is blocked, and that what claims to compute or to
+//! look cannot act.
+
+use super::Subject;
+use crate::diagnostic::Findings;
+use crate::load::suggestion;
+use crate::program::{Nature, ResourceExpr, State, StateKind};
+use crate::resource::{ResourceClass, ResourceOperation};
+use std::collections::{BTreeMap, BTreeSet};
+
+pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
+    let created: BTreeSet<&str> = subject
+        .program
+        .states
+        .iter()
+        .flat_map(|state| &state.annotations.resources)
+        .filter(|r| r.operation == ResourceOperation::Create)
+        .map(|r| r.kind.as_str())
+        .collect();
+    for state in &subject.program.states {
+        for (i, resource) in state.annotations.resources.iter().enumerate() {
+            offered(subject, state, i, resource, &created, findings);
+        }
+        too_many(subject, state, findings);
+        if let StateKind::Action { provider, .. } = &state.kind {
+            provider_blocked(subject, state, provider, findings);
+            only_looks(subject, state, findings);
+        }
+    }
+}
+
+fn is_task_class(resource: &ResourceExpr) -> bool {
+    resource.class == Some(ResourceClass::Task)
+}
+
+fn offered(
+    subject: &Subject<'_>,
+    state: &State,
+    i: usize,
+    resource: &ResourceExpr,
+    created: &BTreeSet<&str>,
+    findings: &mut Findings,
+) {
+    let at = subject.place(state, &format!("resources.{i}"));
+    let offer = subject.catalogue.resources.get(&resource.kind);
+    let by_the_task = resource.operation == ResourceOperation::Create || created.contains(resource.kind.as_str());
+    if offer.is_none() && !by_the_task {
+        let known = subject.catalogue.resources.keys().map(String::as_str).chain(created.iter().copied());
+        let message = format!("no template or module of the system provides `{}`", resource.kind);
+        let help = suggestion(&resource.kind, known, "", "offer it in the catalogue, or create it in an older state");
+        findings.error("unknown-resource", at, &state.path, message, help);
+    }
+    if let (Some(offer), Some(class)) = (offer, resource.class)
+        && offer.class != class
+    {
+        let message = format!("`{}` is a {} resource, not a {class} one", resource.kind, offer.class);
+        findings.error("unknown-resource", at, &state.path, message, "leave the class out");
+    }
+    if resource.operation == ResourceOperation::Create && !is_task_class(resource) {
+        let message =
+            format!("a task creates task resources only, and `{}` does not say that it is one", resource.kind);
+        findings.error("unknown-resource", at, &state.path, message, "add `class: task`");
+    }
+}
+
+/// What one node blocks at once: its own lines by kind and attributes, merged with those around it by maximum.
+fn too_many(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
+    let mut own = BTreeMap::<&str, (u32, usize)>::new();
+    for (i, resource) in state.annotations.resources.iter().enumerate() {
+        if matches!(resource.operation, ResourceOperation::Block | ResourceOperation::Exists) {
+            let (count, _) = own.entry(&resource.kind).or_insert((0, i));
+            *count = match resource.operation {
+                ResourceOperation::Block => count.saturating_add(resource.count),
+                _ => (*count).max(resource.count),
+            };
+        }
+    }
+    for (kind, (count, i)) in own {
+        let Some(offer) = subject.catalogue.resources.get(kind) else { continue };
+        if count > offer.count {
+            let message = format!("this asks for {count} of `{kind}` at once; the system can have {}", offer.count);
+            let at = subject.place(state, &format!("resources.{i}"));
+            findings.error("too-many-resources", at, &state.path, message, "ask for fewer, or offer more");
+        }
+    }
+}
+
+fn blocked<'a>(subject: &Subject<'a>, state: &State) -> BTreeSet<&'a str> {
+    let lines = subject.around(state.id).flat_map(|state| &state.annotations.resources);
+    lines.filter(|r| r.operation == ResourceOperation::Block).map(|r| r.kind.as_str()).collect()
+}
+
+fn provider_blocked(subject: &Subject<'_>, state: &State, provider: &str, findings: &mut Findings) {
+    let Some(offered) = subject.catalogue.providers.get(provider) else { return };
+    if !blocked(subject, state).contains(offered.resource.as_str()) {
+        let message = format!("`{provider}` is a `{0}`, and this state blocks none", offered.resource);
+        let help = format!("add `resources: [{{block: {}}}]`", offered.resource);
+        findings.error("provider-not-blocked", subject.place(state, "action"), &state.path, message, help);
+    }
+}
+
+fn only_looks(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
+    let claim = match state.annotations.nature {
+        Nature::Irreversible => return,
+        Nature::Computes => "computes",
+        Nature::Senses(_) => "senses",
+    };
+    let help = "make it a PIA (`pia: true`), or leave the resource out";
+    let at = |part: &str| subject.place(state, part);
+    for kind in blocked(subject, state) {
+        if subject.catalogue.resources.get(kind).is_some_and(|offer| offer.actuates) {
+            let i = state.annotations.resources.iter().position(|r| r.kind == kind);
+            let at = i.map_or(state.location, |i| at(&format!("resources.{i}")));
+            let message = format!("a state that {claim} cannot block `{kind}`, which moves the robot");
+            findings.error("computes-actuates", at, &state.path, message, help);
+        }
+    }
+    for (i, resource) in state.annotations.resources.iter().enumerate() {
+        use ResourceOperation::{Consume, Create, Delete};
+        if matches!(resource.operation, Consume | Create | Delete) {
+            let message = format!("a state that {claim} cannot {} `{}`", resource.operation, resource.kind);
+            findings.error("computes-actuates", at(&format!("resources.{i}")), &state.path, message, help);
+        }
+    }
+}

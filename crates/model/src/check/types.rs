@@ -1,0 +1,357 @@
+//! The types of expressions, as far as they are known before anything runs; `any` fits everywhere and is checked then.
+
+use super::{Subject, Variables, expressions};
+use crate::diagnostic::Findings;
+use crate::expression::{BinaryOperator, EffectExpr, Expr, Function, UnaryOperator};
+use crate::program::{Program, State, StateKind, TaskOutput};
+use crate::value::{Type, Value};
+use std::collections::BTreeMap;
+
+/// How deep outputs of hierarchies may be made of outputs of hierarchies.
+const MAX_INDIRECTION: usize = 32;
+
+pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
+    let program = subject.program;
+    for state in &program.states {
+        let types = Types { program, state, variables: variables(subject, state), indirection: 0 };
+        let quantified = quantified(state);
+        for (part, expr) in expressions(program, state) {
+            // Quantified effects bind variables of their own; their elements are checked at run time.
+            let bound = expr.variables().iter().any(|name| quantified.contains(name));
+            if bound && part.starts_with("effects.") {
+                continue;
+            }
+            let at = subject.place(state, &part);
+            match types.of(expr) {
+                Err(message) => findings.error("type-mismatch", at, &state.path, message, ""),
+                Ok(found) => {
+                    if let Some(wanted) = wanted(subject, state, &part)
+                        && !fits(&wanted, &found, expr)
+                    {
+                        let message = format!("`{}` is {wanted}; `{}` is {found}", what(&part), named(program, expr));
+                        findings.error("type-mismatch", at, &state.path, message, "");
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The type of a value.
+pub(crate) fn of_value(value: &Value) -> Type {
+    match value {
+        Value::Null => Type::Any,
+        Value::Bool(_) => Type::Bool,
+        Value::Int(_) => Type::Int,
+        Value::Float(_) => Type::Float,
+        Value::String(_) => Type::String,
+        Value::Pose(_) => Type::Pose,
+        Value::Joints(_) => Type::Joints,
+        Value::Trajectory(_) => Type::Trajectory,
+        Value::Bytes(_) => Type::Bytes,
+        Value::List(items) => Type::List(Box::new(common(items.iter().map(of_value)))),
+        Value::Map(fields) => Type::Record(fields.iter().map(|(name, v)| (name.clone(), of_value(v))).collect()),
+    }
+}
+
+/// The type that all fit into: one of them, or `any`.
+fn common(types: impl Iterator<Item = Type>) -> Type {
+    types
+        .reduce(|a, b| {
+            if a.accepts_type(&b) && a != Type::Any {
+                a
+            } else if b.accepts_type(&a) && b != Type::Any {
+                b
+            } else {
+                Type::Any
+            }
+        })
+        .unwrap_or(Type::Any)
+}
+
+/// A literal null may stand for an input that is left out.
+fn fits(wanted: &Type, found: &Type, expr: &Expr) -> bool {
+    wanted.accepts_type(found) || *expr == Expr::Literal(Value::Null)
+}
+
+fn what(part: &str) -> &str {
+    match part.split_once('.') {
+        Some(("in" | "outputs", name)) => name,
+        Some((part, _)) => part,
+        None => part,
+    }
+}
+
+fn wanted(subject: &Subject<'_>, state: &State, part: &str) -> Option<Type> {
+    match (part.split_once('.'), &state.kind) {
+        (Some(("in", port)), StateKind::Action { provider, action, .. }) => {
+            let signature = subject.catalogue.action(provider, action)?;
+            signature.inputs.get(port).or_else(|| signature.optional.get(port)).cloned()
+        }
+        (Some(("outputs", name)), StateKind::Sequence { outputs, .. }) => {
+            let own = if state.id == Program::ROOT { &subject.program.outputs } else { outputs };
+            own.iter().find(|output| output.name == name).map(|output| output.ty.clone())
+        }
+        (Some(("requires", _)), _) => Some(Type::Bool),
+        (None, _) => match part {
+            "for" => Some(Type::List(Box::new(Type::Any))),
+            "condition" => Some(Type::Bool),
+            "duration" => Some(Type::Float),
+            _ => None,
+        },
+        _ => None,
+    }
+}
+
+fn quantified(state: &State) -> Vec<&str> {
+    fn collect<'a>(effect: &'a EffectExpr, names: &mut Vec<&'a str>) {
+        if let EffectExpr::ForEach { variable, effects, .. } = effect {
+            names.push(variable);
+            effects.iter().for_each(|inner| collect(inner, names));
+        }
+    }
+    let mut names = Vec::new();
+    state.annotations.effects.values().flatten().for_each(|effect| collect(effect, &mut names));
+    names
+}
+
+/// The variables that a state sees: parameters, and those of the loops around it.
+fn variables(subject: &Subject<'_>, state: &State) -> Variables {
+    let program = subject.program;
+    let mut variables: Variables = program.parameters.iter().map(|p| (p.name.clone(), p.ty.clone())).collect();
+    let mut around: Vec<&State> = subject.around(state.id).skip(1).collect();
+    around.reverse();
+    for outer in around {
+        if let StateKind::ForEach { variable, index, collection, .. } = &outer.kind {
+            let types = Types { program, state: outer, variables: variables.clone(), indirection: 0 };
+            let element = match types.of(collection) {
+                Ok(Type::List(element)) => *element,
+                _ => Type::Any,
+            };
+            variables.insert(variable.clone(), element);
+            variables.extend(index.iter().map(|name| (name.clone(), Type::Int)));
+        }
+    }
+    variables
+}
+
+/// An expression with the names of states instead of their ids.
+fn named(program: &Program, expr: &Expr) -> String {
+    let mut text = expr.to_string();
+    for id in expr.flows() {
+        text = text.replace(&format!("{id}."), &format!("{}.", program.state(id).name));
+    }
+    text
+}
+
+struct Types<'a> {
+    program: &'a Program,
+    state: &'a State,
+    variables: Variables,
+    indirection: usize,
+}
+
+type Found = Result<Type, String>;
+
+impl Types<'_> {
+    fn of(&self, expr: &Expr) -> Found {
+        let wrong = |message: String| Err(format!("`{}`: {message}", named(self.program, expr)));
+        Ok(match expr {
+            Expr::Literal(value) => of_value(value),
+            Expr::Variable(name) => self.variables.get(name).cloned().unwrap_or(Type::Any),
+            Expr::Output(name) => self.port(self.state, name),
+            Expr::Port { state, port } => self.port(self.program.state(*state), port),
+            Expr::Field(of, name) => match (self.of(of)?, name.as_str()) {
+                (Type::Record(fields), _) => match fields.get(name) {
+                    Some(ty) => ty.clone(),
+                    None => {
+                        let known = fields.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
+                        return wrong(format!("there is no field `{name}`, only {known}"));
+                    }
+                },
+                (Type::Map(element), _) => *element,
+                (Type::Pose, "x" | "y" | "z") | (Type::Trajectory, "duration_s") => Type::Float,
+                (Type::Any, _) => Type::Any,
+                (other, _) => return wrong(format!("{other} has no field `{name}`")),
+            },
+            Expr::Index(of, index) => {
+                let index = self.of(index)?;
+                let wanted = |ty: Type| if ty.accepts_type(&index) { Ok(()) } else { Err(ty) };
+                let (element, fits) = match self.of(of)? {
+                    Type::List(element) => (*element, wanted(Type::Int)),
+                    Type::Joints => (Type::Float, wanted(Type::Int)),
+                    Type::Map(element) => (*element, wanted(Type::String)),
+                    Type::Any | Type::Record(_) => (Type::Any, Ok(())),
+                    other => return wrong(format!("{other} has no elements")),
+                };
+                match fits {
+                    Ok(()) => element,
+                    Err(ty) => return wrong(format!("expected {ty} as index, found {index}")),
+                }
+            }
+            Expr::List(items) => {
+                let types = items.iter().map(|item| self.of(item)).collect::<Result<Vec<_>, _>>()?;
+                Type::List(Box::new(common(types.into_iter())))
+            }
+            Expr::Map(fields) => {
+                let typed = fields.iter().map(|(name, value)| Ok((name.clone(), self.of(value)?)));
+                Type::Record(typed.collect::<Result<BTreeMap<_, _>, String>>()?)
+            }
+            Expr::Call(function, arguments) => {
+                let types = arguments.iter().map(|a| self.of(a)).collect::<Result<Vec<_>, _>>()?;
+                match call(*function, arguments, &types) {
+                    Ok(ty) => ty,
+                    Err(message) => return wrong(message),
+                }
+            }
+            Expr::Fact(fact) | Expr::Exists(fact) => {
+                fact.arguments.iter().flatten().try_for_each(|a| self.of(a).map(drop))?;
+                if matches!(expr, Expr::Exists(_)) { Type::Bool } else { Type::Any }
+            }
+            Expr::Unary(operator, operand) => {
+                let found = self.of(operand)?;
+                let wanted = match operator {
+                    UnaryOperator::Not => Type::Bool,
+                    UnaryOperator::Negate => Type::Float,
+                };
+                if !wanted.accepts_type(&found) {
+                    return wrong(format!("expected {wanted}, found {found}"));
+                }
+                if wanted == Type::Bool { Type::Bool } else { found }
+            }
+            Expr::Binary(operator, a, b) => match binary(*operator, self.of(a)?, self.of(b)?) {
+                Ok(ty) => ty,
+                Err(message) => return wrong(message),
+            },
+        })
+    }
+
+    fn port(&self, state: &State, port: &str) -> Type {
+        match &state.kind {
+            StateKind::Action { outputs, .. } => outputs.get(port).cloned().unwrap_or(Type::Any),
+            StateKind::Sequence { outputs, .. } => {
+                let output = outputs.iter().find(|output| output.name == port);
+                output.map_or(Type::Any, |output| self.output(state, output))
+            }
+            _ => Type::Any,
+        }
+    }
+
+    /// The declared type of a hierarchy's output, else that of its expression.
+    fn output(&self, state: &State, output: &TaskOutput) -> Type {
+        if output.ty != Type::Any || self.indirection >= MAX_INDIRECTION {
+            return output.ty.clone();
+        }
+        let (program, variables, indirection) = (self.program, self.variables.clone(), self.indirection + 1);
+        Types { program, state, variables, indirection }.of(&output.value).unwrap_or(Type::Any)
+    }
+}
+
+fn call(function: Function, arguments: &[Expr], types: &[Type]) -> Found {
+    let expect = |i: usize, wanted: Type| match types.get(i) {
+        Some(found) if !wanted.accepts_type(found) => Err(format!("argument {} is {wanted}, found {found}", i + 1)),
+        _ => Ok(()),
+    };
+    let all = |wanted: Type| (0..types.len()).try_for_each(|i| expect(i, wanted.clone()));
+    Ok(match function {
+        Function::Len => {
+            if !matches!(
+                types,
+                [Type::Any | Type::List(_) | Type::Map(_) | Type::Record(_) | Type::String | Type::Joints]
+            ) {
+                return Err(format!("expected `{}`", function.usage()));
+            }
+            Type::Int
+        }
+        Function::Range => {
+            all(Type::Int)?;
+            Type::List(Box::new(Type::Int))
+        }
+        Function::Min | Function::Max => match types {
+            [Type::List(element)] => element.as_ref().clone(),
+            _ => common(types.iter().cloned()),
+        },
+        Function::Abs => {
+            expect(0, Type::Float)?;
+            types[0].clone()
+        }
+        Function::If => {
+            expect(0, Type::Bool)?;
+            let null = |e: &Expr| *e == Expr::Literal(Value::Null);
+            match (null(&arguments[1]), null(&arguments[2])) {
+                (true, _) => types[2].clone(),
+                (_, true) => types[1].clone(),
+                _ => common(types[1..].iter().cloned()),
+            }
+        }
+        Function::Pose => {
+            all(Type::Float)?;
+            Type::Pose
+        }
+        Function::Joints => {
+            all(Type::Float)?;
+            Type::Joints
+        }
+        Function::Compose | Function::Between | Function::Inverse => {
+            all(Type::Pose)?;
+            Type::Pose
+        }
+        Function::GraspPose => {
+            let size = Type::List(Box::new(Type::Float));
+            expect(0, Type::Record([("pose".to_owned(), Type::Pose), ("size".to_owned(), size)].into()))?;
+            Type::List(Box::new(Type::Pose))
+        }
+        Function::PlacePose => {
+            all(Type::Pose)?;
+            Type::List(Box::new(Type::Pose))
+        }
+        Function::Concat => {
+            let text = |ty: &&Type| !matches!(ty, Type::String | Type::Int | Type::Any);
+            if let Some(found) = types.iter().find(text) {
+                return Err(format!("expected strings and ints, found {found}"));
+            }
+            Type::String
+        }
+        Function::Repeat => {
+            expect(1, Type::Int)?;
+            Type::List(Box::new(types[0].clone()))
+        }
+    })
+}
+
+fn binary(operator: BinaryOperator, a: Type, b: Type) -> Found {
+    use BinaryOperator as Op;
+    let both = |wanted: Type| match [&a, &b].into_iter().find(|found| !wanted.accepts_type(found)) {
+        Some(found) => Err(format!("expected {wanted}, found {found}")),
+        None => Ok(()),
+    };
+    let numeric = || {
+        both(Type::Float)?;
+        Ok(match (&a, &b) {
+            (Type::Int, Type::Int) => Type::Int,
+            (Type::Any, _) | (_, Type::Any) => Type::Any,
+            _ => Type::Float,
+        })
+    };
+    match operator {
+        Op::Or | Op::And => both(Type::Bool).map(|()| Type::Bool),
+        Op::Equal | Op::NotEqual => Ok(Type::Bool),
+        Op::Less | Op::LessOrEqual | Op::Greater | Op::GreaterOrEqual => match (&a, &b) {
+            (Type::String, Type::String | Type::Any) | (Type::Any, Type::String) => Ok(Type::Bool),
+            _ => both(Type::Float).map(|()| Type::Bool),
+        },
+        Op::In => match b {
+            Type::List(_) | Type::Map(_) | Type::Record(_) | Type::Any => Ok(Type::Bool),
+            other => Err(format!("expected a list after `in`, found {other}")),
+        },
+        Op::Add => match (&a, &b) {
+            (Type::List(x), Type::List(y)) => {
+                Ok(Type::List(Box::new(common([(**x).clone(), (**y).clone()].into_iter()))))
+            }
+            (Type::List(_), Type::Any) | (Type::Any, Type::List(_)) => Ok(Type::List(Box::new(Type::Any))),
+            _ => numeric(),
+        },
+        Op::Subtract | Op::Multiply => numeric(),
+        Op::Divide => both(Type::Float).map(|()| Type::Float),
+    }
+}

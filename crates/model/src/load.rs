@@ -1,0 +1,287 @@
+//! Task file → [`Program`].
+//!
+//! In three passes: the outline (which states there are, and their order), the expressions (with every name resolved), and
+//! the rules of [`crate::check`]. Everything that is wrong is collected, each with its place; a program comes out only if
+//! nothing is. What the format will have and does not have yet is refused by name, never ignored.
+//!
+//! ```yaml
+//! task: name
+//! horizon: 120
+//! parameters: {boxes: {type: int, default: 3}}
+//! world: ["hand_empty(gripper)"]
+//! outputs: {delivered: "len(look.boxes)"}
+//! states:
+//!   - look: { action: detector/segment, in: {region: {...}}, out: {boxes}, senses: ["at(table)"], resources: [...] }
+//!   - for: box in look.boxes
+//!     do: [...]
+//! ```
+
+mod effects;
+mod fields;
+mod names;
+mod outline;
+mod resources;
+mod state;
+mod yaml;
+
+pub(crate) use fields::Places;
+pub(crate) use names::suggestion;
+
+use crate::catalogue::Catalogue;
+use crate::check;
+use crate::diagnostic::{Diagnostic, Findings};
+use crate::expression::EffectExpr;
+use crate::expression::scope::NothingKnown;
+use crate::program::{Parameter, Program, StateKind, TaskOutput};
+use crate::value::{Type, Value};
+use fields::{Fields, Output};
+use names::{Ports, Task, View};
+use outline::{Form, Outline};
+use yaml::{Content, Node};
+
+/// The horizon of a task that names none.
+pub const DEFAULT_HORIZON: usize = 120;
+
+const TASK_KEYS: [&str; 7] = ["task", "description", "horizon", "parameters", "world", "outputs", "states"];
+const LATER_TASK_KEYS: [&str; 7] =
+    ["ontology", "exceptions", "variables", "deadline", "imports", "tolerance", "speculation_width"];
+
+/// A program and what was noticed about it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Loaded {
+    /// The program.
+    pub program: Program,
+    /// Findings that do not refuse it.
+    pub warnings: Vec<Diagnostic>,
+}
+
+/// Loads and checks a task file; `file` is its name in messages.
+///
+/// # Errors
+/// Every finding, at least one of them an error, in the order of the file.
+pub fn load(source: &str, file: &str, catalogue: &Catalogue) -> Result<Loaded, Vec<Diagnostic>> {
+    let mut out = Output::default();
+    let program = read(source, catalogue, &mut out);
+    if let Some(program) = &program
+        && !out.findings.has_errors()
+    {
+        check::check(program, catalogue, out.declares_world, &out.places, &mut out.findings);
+    }
+    let refused = out.findings.has_errors();
+    let findings = out.findings.in_file(file);
+    match program {
+        Some(program) if !refused => Ok(Loaded { program, warnings: findings }),
+        _ => Err(findings),
+    }
+}
+
+fn read(source: &str, catalogue: &Catalogue, out: &mut Output) -> Option<Program> {
+    let root = match yaml::read(source) {
+        Ok(root) => root,
+        Err(error) => {
+            out.findings.error("invalid-yaml", error.at, "", error.message, "");
+            return None;
+        }
+    };
+    if !matches!(root.content, Content::Map(_)) {
+        let message = format!("a task file is a mapping, found {}", root.described());
+        out.findings.error("invalid-yaml", root.at, "", message, "begin it with `task: name`");
+        return None;
+    }
+    let name = match root.get("task").map(|node| &node.content) {
+        Some(Content::Text(name)) => name.clone(),
+        _ => {
+            out.findings.error(
+                "invalid-state",
+                root.at,
+                "",
+                "the task has no name",
+                "begin the file with `task: name`",
+            );
+            String::new()
+        }
+    };
+    let outline = outline::outline(&name, &root, &mut out.findings);
+    let ports = ports(&outline, catalogue, &mut out.findings);
+    let parameters = root.get("parameters").map(Node::entries).unwrap_or_default();
+    let parameters = parameters.iter().map(|entry| entry.key.clone()).collect();
+    let task = Task { source, catalogue, outline, ports, parameters };
+    let mut fields = Fields { task: &task, view: View::default(), path: String::new(), out };
+    fields.keys(&root, &TASK_KEYS, &LATER_TASK_KEYS);
+    let horizon = match root.get("horizon") {
+        Some(node) => horizon(&mut fields, node),
+        None => DEFAULT_HORIZON,
+    };
+    let parameters = read_parameters(&mut fields, &root);
+    let initial = root.get("world").map(|node| world(&mut fields, node)).unwrap_or_default();
+    out.declares_world = root.get("world").is_some();
+    let ids = (0..task.outline.steps.len()).map(|i| crate::id::StateId(i as u64));
+    let mut states: Vec<_> = ids.map(|id| state::state(&task, id, out)).collect();
+    // The task's outputs are the root's.
+    let outputs: Vec<TaskOutput> = match &mut states[0].kind {
+        StateKind::Sequence { outputs, .. } => std::mem::take(outputs),
+        _ => Vec::new(),
+    };
+    let digest = blake3::hash(source.as_bytes()).to_hex().to_string();
+    Some(Program { name, horizon, parameters, outputs, initial, states, digest })
+}
+
+fn horizon(fields: &mut Fields<'_, '_>, node: &Node) -> usize {
+    match node.content {
+        Content::Int(n) if n > 0 => usize::try_from(n).unwrap_or(DEFAULT_HORIZON),
+        Content::Int(n) => {
+            let message = format!("a horizon of {n} leaves no room for a single state");
+            fields.error("horizon-too-small", node.at, message, format!("leave it out for {DEFAULT_HORIZON}"));
+            DEFAULT_HORIZON
+        }
+        _ => {
+            fields.error("type-mismatch", node.at, "`horizon` is a whole number of states", "");
+            DEFAULT_HORIZON
+        }
+    }
+}
+
+fn world(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<EffectExpr> {
+    let mut initial = Vec::new();
+    for item in node.items() {
+        let effects = effects::list(fields, item);
+        if !EffectExpr::fact_expressions(&effects).is_empty() {
+            let message = "the initial world cannot look up facts";
+            fields.error("invalid-expression", item.at, message, "use constants and parameters");
+        }
+        initial.extend(effects);
+    }
+    initial
+}
+
+/// `name: {type: int, default: 3}`, or `name: 3` with the value's own type.
+fn read_parameters(fields: &mut Fields<'_, '_>, root: &Node) -> Vec<Parameter> {
+    let mut parameters = Vec::new();
+    for entry in root.get("parameters").map(Node::entries).unwrap_or_default() {
+        let long = entry.value.get("type").is_some() || entry.value.get("default").is_some();
+        let default = if long {
+            fields.keys(&entry.value, &["type", "default", "description"], &[]);
+            entry.value.get("default")
+        } else {
+            Some(&entry.value)
+        };
+        let declared = entry.value.get("type").filter(|_| long).map(|node| declared_type(fields, node));
+        let default = default.and_then(|node| constant(fields, node).map(|value| (node.at, value)));
+        let ty = declared.flatten().or_else(|| default.as_ref().map(|(_, value)| check::types::of_value(value)));
+        let ty = ty.unwrap_or(Type::Any);
+        if let Some((at, value)) = &default
+            && !ty.accepts(value)
+        {
+            let message = format!("the default of `{}` is {}, not {ty}", entry.key, value.type_name());
+            fields.error("type-mismatch", *at, message, "");
+        }
+        parameters.push(Parameter { name: entry.key.clone(), ty, default: default.map(|(_, value)| value) });
+    }
+    parameters
+}
+
+fn constant(fields: &mut Fields<'_, '_>, node: &Node) -> Option<Value> {
+    match fields.expression(node)?.evaluate(&NothingKnown) {
+        Ok(value) => Some(value),
+        Err(error) => {
+            fields.error("invalid-expression", node.at, error.to_string(), "a default is a constant");
+            None
+        }
+    }
+}
+
+fn declared_type(fields: &mut Fields<'_, '_>, node: &Node) -> Option<Type> {
+    match type_of(node) {
+        Ok(ty) => Some(ty),
+        Err(message) => {
+            fields.error("type-mismatch", node.at, message, "");
+            None
+        }
+    }
+}
+
+/// A type as text, or a mapping of fields to types.
+fn type_of(node: &Node) -> Result<Type, String> {
+    match &node.content {
+        Content::Text(text) => text.parse::<Type>().map_err(|error| error.to_string()),
+        Content::Map(entries) => {
+            let fields = entries.iter().map(|entry| Ok((entry.key.clone(), type_of(&entry.value)?)));
+            Ok(Type::Record(fields.collect::<Result<_, String>>()?))
+        }
+        _ => Err(format!("expected a type, found {}", node.described())),
+    }
+}
+
+/// The output ports of every state: those of its action, narrowed by `out` where it is given.
+fn ports(outline: &Outline<'_>, catalogue: &Catalogue, findings: &mut Findings) -> Vec<Ports> {
+    let of_step = |step: &outline::Step<'_>| match &step.form {
+        Form::Action { action } => {
+            let signature = state::action_name(action).and_then(|(p, a)| catalogue.action(&p, &a));
+            let Some(node) = step.body.get("out") else {
+                let types = signature.map(|s| s.outputs.clone()).unwrap_or_default();
+                return Ports { types, open: signature.is_none() };
+            };
+            let mut ports = Ports { open: signature.is_none(), ..Ports::default() };
+            for (name, at, ty) in declared_ports(node, &step.path, findings) {
+                let offered = signature.and_then(|s| s.outputs.get(&name));
+                if let (Some(signature), None) = (signature, offered) {
+                    let message = format!("the action has no output port `{name}`");
+                    let help = suggestion(&name, signature.outputs.keys().map(String::as_str), "", "it has no outputs");
+                    findings.error("unknown-port", at, &step.path, message, help);
+                    continue;
+                }
+                let fits = |ty: &Type| offered.is_none_or(|offered| ty.accepts_type(offered));
+                if let Some(ty) = ty.as_ref().filter(|ty| !fits(ty)) {
+                    let offered = offered.map(ToString::to_string).unwrap_or_default();
+                    let message = format!("the action's output `{name}` is {offered}, not {ty}");
+                    findings.error("type-mismatch", at, &step.path, message, "leave the type out");
+                }
+                let ty = ty.filter(|ty| *ty != Type::Any).or(offered.cloned()).unwrap_or(Type::Any);
+                ports.types.insert(name, ty);
+            }
+            ports
+        }
+        Form::Sequence { .. } => {
+            let declared = step.body.get("outputs").map(Node::entries).unwrap_or_default();
+            let typed = |entry: &yaml::Entry| entry.value.get("type").and_then(|node| type_of(node).ok());
+            let types = declared.iter().map(|entry| (entry.key.clone(), typed(entry).unwrap_or(Type::Any)));
+            Ports { types: types.collect(), open: false }
+        }
+        Form::ForEach { .. } | Form::Condition { .. } => Ports::default(),
+    };
+    outline.steps.iter().map(of_step).collect()
+}
+
+/// `[a, b]`, `{a, b}`, `{a: type}` or `a`.
+fn declared_ports(
+    node: &Node,
+    path: &str,
+    findings: &mut Findings,
+) -> Vec<(String, crate::program::Location, Option<Type>)> {
+    let mut ports = Vec::new();
+    for item in node.items() {
+        match &item.content {
+            Content::Text(name) => ports.push((name.clone(), item.at, None)),
+            Content::Map(entries) => {
+                for entry in entries {
+                    let ty = match &entry.value.content {
+                        Content::Null => None,
+                        _ => match type_of(&entry.value) {
+                            Ok(ty) => Some(ty),
+                            Err(message) => {
+                                findings.error("type-mismatch", entry.value.at, path, message, "");
+                                None
+                            }
+                        },
+                    };
+                    ports.push((entry.key.clone(), entry.at, ty));
+                }
+            }
+            _ => {
+                let message = format!("expected output ports, found {}", item.described());
+                findings.error("invalid-state", item.at, path, message, "write `out: {port}` or `out: {port: type}`");
+            }
+        }
+    }
+    ports
+}

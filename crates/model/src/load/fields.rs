@@ -1,0 +1,166 @@
+//! Reading the fields of a mapping: expressions with their places, plain numbers and flags, unknown keys.
+
+use super::names::{NamesFrom, Task, View, suggestion};
+use super::yaml::{Content, Node};
+use crate::diagnostic::Findings;
+use crate::expression::parse::{Names, ParseError, parse_effect, parse_expression, parse_fact};
+use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::id::StateId;
+use crate::program::Location;
+use crate::value::Value;
+use std::collections::BTreeMap;
+
+/// Where the parts of states stand in the file: `(state, "in.goal")`, `(state, "requires.0")`.
+#[derive(Debug, Default)]
+pub(crate) struct Places {
+    places: BTreeMap<(StateId, String), Location>,
+}
+
+impl Places {
+    pub(crate) fn note(&mut self, state: StateId, part: impl Into<String>, at: Location) {
+        self.places.insert((state, part.into()), at);
+    }
+
+    /// The place of a part; of the state where the part's is not known.
+    pub(crate) fn of(&self, state: StateId, part: &str, fallback: Location) -> Location {
+        self.places.get(&(state, part.to_owned())).copied().unwrap_or(fallback)
+    }
+}
+
+/// What loading adds to as it goes.
+#[derive(Debug, Default)]
+pub(crate) struct Output {
+    pub(crate) findings: Findings,
+    pub(crate) places: Places,
+    /// The task says what holds at the start.
+    pub(crate) declares_world: bool,
+}
+
+/// Reads fields on behalf of one state.
+pub(crate) struct Fields<'t, 'a> {
+    pub(crate) task: &'t Task<'a>,
+    pub(crate) view: View,
+    pub(crate) path: String,
+    pub(crate) out: &'t mut Output,
+}
+
+impl<'t, 'a> Fields<'t, 'a> {
+    pub(crate) fn error(&mut self, rule: &str, at: Location, message: impl Into<String>, help: impl Into<String>) {
+        self.out.findings.error(rule, at, &self.path, message, help);
+    }
+
+    /// Complains of keys that are neither known nor planned.
+    pub(crate) fn keys(&mut self, node: &Node, known: &[&str], later: &[&str]) {
+        for entry in node.entries() {
+            let key = entry.key.as_str();
+            if known.contains(&key) {
+                continue;
+            }
+            if later.contains(&key) {
+                let message = format!("`{key}` is not supported yet");
+                self.error("not-supported-yet", entry.at, message, "leave it out");
+            } else {
+                let help = suggestion(key, known.iter().copied(), "", "leave it out");
+                self.error("unknown-key", entry.at, format!("there is no key `{key}` here"), help);
+            }
+        }
+    }
+
+    /// Notes where a part of the state stands.
+    pub(crate) fn note(&mut self, part: impl Into<String>, at: Location) {
+        if let Some(state) = self.view.state {
+            self.out.places.note(state, part, at);
+        }
+    }
+
+    /// A YAML value as an expression: text is parsed, the rest is what it is.
+    pub(crate) fn expression(&mut self, node: &Node) -> Option<Expr> {
+        match &node.content {
+            Content::Null => Some(Expr::Literal(Value::Null)),
+            Content::Bool(b) => Some(Expr::Literal(Value::Bool(*b))),
+            Content::Int(i) => Some(Expr::Literal(Value::Int(*i))),
+            Content::Float(x) => Some(Expr::Literal(Value::Float(*x))),
+            Content::Text(text) => self.parsed(node, text, 0, parse_expression),
+            Content::List(items) => {
+                let parsed: Vec<Option<Expr>> = items.iter().map(|item| self.expression(item)).collect();
+                Some(Expr::List(parsed.into_iter().collect::<Option<_>>()?))
+            }
+            Content::Map(entries) => {
+                let parsed: Vec<_> =
+                    entries.iter().map(|e| Some((e.key.clone(), self.expression(&e.value)?))).collect();
+                Some(Expr::Map(parsed.into_iter().collect::<Option<_>>()?))
+            }
+        }
+    }
+
+    /// Parses `text`, which stands in `node` from character `offset` on.
+    pub(crate) fn parsed<T>(
+        &mut self,
+        node: &Node,
+        text: &str,
+        offset: usize,
+        parse: impl FnOnce(&str, &mut dyn Names) -> Result<T, ParseError>,
+    ) -> Option<T> {
+        let parsed = parse(text, &mut NamesFrom { task: self.task, view: &self.view });
+        match parsed {
+            Ok(parsed) => Some(parsed),
+            Err(error) => {
+                let at = node.place_in_text(self.task.source, offset + error.offset);
+                self.error(error.rule, at, error.message, error.help);
+                None
+            }
+        }
+    }
+
+    fn text<'n>(&mut self, node: &'n Node, what: &str, example: &str) -> Option<&'n str> {
+        if let Content::Text(text) = &node.content {
+            return Some(text);
+        }
+        let message = format!("expected {what}, found {}", node.described());
+        self.error("invalid-expression", node.at, message, format!("write it as text, {example}"));
+        None
+    }
+
+    pub(crate) fn fact(&mut self, node: &Node) -> Option<FactExpr> {
+        let text = self.text(node, "a fact", "\"at(box, ?)\" (quoted, because of the comma)")?;
+        self.parsed(node, text, 0, parse_fact)
+    }
+
+    pub(crate) fn effect(&mut self, node: &Node) -> Option<EffectExpr> {
+        let text = self.text(node, "an effect", "\"set at(box) = x\"")?;
+        self.parsed(node, text, 0, parse_effect)
+    }
+
+    pub(crate) fn flag(&mut self, node: &Node) -> bool {
+        match node.content {
+            Content::Bool(b) => b,
+            _ => {
+                self.error("type-mismatch", node.at, format!("expected true or false, found {}", node.described()), "");
+                false
+            }
+        }
+    }
+
+    /// A whole number of at least `least`.
+    pub(crate) fn count(&mut self, node: &Node, what: &str, least: u32) -> Option<u32> {
+        let count = match node.content {
+            Content::Int(i) => u32::try_from(i).ok().filter(|n| *n >= least),
+            _ => None,
+        };
+        if count.is_none() {
+            let message = format!("`{what}` is a whole number of at least {least}");
+            self.error("type-mismatch", node.at, message, "");
+        }
+        count
+    }
+
+    pub(crate) fn word<'n>(&mut self, node: &'n Node, what: &str) -> Option<&'n str> {
+        match &node.content {
+            Content::Text(text) if crate::expression::display::is_word(text) => Some(text),
+            _ => {
+                self.error("invalid-name", node.at, format!("expected {what}, a name, found {}", node.described()), "");
+                None
+            }
+        }
+    }
+}

@@ -1,0 +1,321 @@
+//! The tree of steps of a task file: what kinds of states there are, their names and their order, before any expression is
+//! read. So an expression may name states that stand further down, and the rules can say that they do.
+
+use super::yaml::{Content, Entry, Node};
+use crate::diagnostic::Findings;
+use crate::expression::Function;
+use crate::expression::display::is_word;
+use crate::id::StateId;
+use crate::program::Location;
+
+/// The most states of a task.
+const MAX_STATES: usize = 10_000;
+/// How deep states may nest.
+const MAX_DEPTH: usize = 32;
+
+/// Keys that say what a step is.
+const FORMS: [&str; 4] = ["action", "for", "condition", "states"];
+/// Keys of kinds of states that are not there yet.
+const LATER_FORMS: [&str; 9] =
+    ["while", "do_while", "until", "concurrency", "parallel", "regions", "preemptive", "library", "barrier"];
+
+/// Every step, by [`StateId`]; the root is the task.
+#[derive(Debug)]
+pub(crate) struct Outline<'a> {
+    pub(crate) steps: Vec<Step<'a>>,
+}
+
+/// A step of the file: a state to be.
+#[derive(Debug)]
+pub(crate) struct Step<'a> {
+    pub(crate) name: String,
+    pub(crate) path: String,
+    pub(crate) parent: Option<StateId>,
+    /// Its siblings are the steps of the same parent and branch.
+    pub(crate) branch: Branch,
+    pub(crate) form: Form<'a>,
+    /// Its mapping.
+    pub(crate) body: &'a Node,
+    pub(crate) at: Location,
+}
+
+/// Which of its parent's lists a step stands in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Branch {
+    /// The only one, or `then`.
+    First,
+    /// `else`
+    Otherwise,
+}
+
+/// What a step is.
+#[derive(Debug)]
+pub(crate) enum Form<'a> {
+    Action { action: &'a Node },
+    Sequence { children: Vec<StateId> },
+    ForEach { variable: String, collection: Header<'a>, index: Option<String>, body: Vec<StateId> },
+    Condition { predicate: &'a Node, then: Vec<StateId>, otherwise: Vec<StateId> },
+}
+
+/// `variable in collection`
+#[derive(Debug, Clone)]
+pub(crate) struct Header<'a> {
+    /// The whole text.
+    pub(crate) node: &'a Node,
+    /// The part behind `in`.
+    pub(crate) collection: String,
+    /// Where that part begins in the text, in characters.
+    pub(crate) offset: usize,
+}
+
+impl Outline<'_> {
+    pub(crate) fn step(&self, id: StateId) -> &Step<'_> {
+        &self.steps[id.0 as usize]
+    }
+
+    /// The siblings of a step, itself included, in program order.
+    pub(crate) fn siblings(&self, id: StateId) -> &[StateId] {
+        let step = self.step(id);
+        match (step.parent.map(|parent| &self.step(parent).form), step.branch) {
+            (Some(Form::Condition { otherwise, .. }), Branch::Otherwise) => otherwise,
+            (Some(form), _) => form.first_branch(),
+            (None, _) => &[],
+        }
+    }
+
+    /// The step and those around it, innermost first.
+    pub(crate) fn around(&self, id: StateId) -> impl Iterator<Item = StateId> + '_ {
+        std::iter::successors(Some(id), |id| self.step(*id).parent)
+    }
+}
+
+impl Form<'_> {
+    /// The children, or those of `then`.
+    pub(crate) fn first_branch(&self) -> &[StateId] {
+        match self {
+            Form::Action { .. } => &[],
+            Form::Sequence { children } => children,
+            Form::ForEach { body, .. } => body,
+            Form::Condition { then, .. } => then,
+        }
+    }
+}
+
+/// Splits `variable in collection`.
+pub(crate) fn header<'a>(node: &'a Node, path: &str, findings: &mut Findings) -> Option<(String, Header<'a>)> {
+    let expected = "write `for: variable in collection`";
+    let Content::Text(text) = &node.content else {
+        let message = format!("expected `variable in collection`, found {}", node.described());
+        findings.error("invalid-state", node.at, path, message, expected);
+        return None;
+    };
+    let split = text.find(" in ").map(|at| (text[..at].trim(), at + " in ".len()));
+    let Some((variable, begin)) = split.filter(|(variable, _)| is_word(variable)) else {
+        findings.error("invalid-state", node.at, path, format!("`{text}` is not `variable in collection`"), expected);
+        return None;
+    };
+    let offset = text[..begin].chars().count();
+    Some((variable.to_owned(), Header { node, collection: text[begin..].to_owned(), offset }))
+}
+
+/// Reads the outline of a whole file.
+pub(crate) fn outline<'a>(name: &str, root: &'a Node, findings: &mut Findings) -> Outline<'a> {
+    let mut builder = Builder { steps: Vec::new(), findings };
+    builder.steps.push(Step {
+        name: name.to_owned(),
+        path: String::new(),
+        parent: None,
+        branch: Branch::First,
+        form: Form::Sequence { children: Vec::new() },
+        body: root,
+        at: root.at,
+    });
+    let children = match root.get("states") {
+        Some(list) => builder.list(list, StateId(0), Branch::First, 0),
+        None => {
+            builder.findings.error("invalid-state", root.at, "", "the task has no `states`", "list its states there");
+            Vec::new()
+        }
+    };
+    builder.steps[0].form = Form::Sequence { children };
+    Outline { steps: builder.steps }
+}
+
+struct Builder<'a, 'f> {
+    steps: Vec<Step<'a>>,
+    findings: &'f mut Findings,
+}
+
+impl<'a> Builder<'a, '_> {
+    fn list(&mut self, list: &'a Node, parent: StateId, branch: Branch, depth: usize) -> Vec<StateId> {
+        let path = self.steps[parent.0 as usize].path.clone();
+        let Content::List(items) = &list.content else {
+            let message = format!("expected a list of states, found {}", list.described());
+            self.findings.error("invalid-state", list.at, &path, message, "write each state as `- name: {…}`");
+            return Vec::new();
+        };
+        if depth >= MAX_DEPTH || self.steps.len() + items.len() > MAX_STATES {
+            let message = format!("a task has at most {MAX_STATES} states, nested at most {MAX_DEPTH} deep");
+            self.findings.error("invalid-state", list.at, &path, message, "");
+            return Vec::new();
+        }
+        let mut ids: Vec<StateId> = Vec::new();
+        for item in items {
+            let Some((name, at, body)) = self.named(item, &path) else { continue };
+            let siblings = || ids.iter().map(|id| self.steps[id.0 as usize].name.as_str());
+            let name = match name {
+                Some(name) => name,
+                None => unused(&default_name(body), siblings()),
+            };
+            let path = if path.is_empty() { name.clone() } else { format!("{path}/{name}") };
+            if siblings().any(|other| other == name) {
+                let message = format!("there are two states `{name}` side by side");
+                self.findings.error("duplicate-name", at, &path, message, "rename one of them");
+            }
+            if let Some(id) = self.step(name, path, at, body, parent, branch, depth) {
+                ids.push(id);
+            }
+        }
+        ids
+    }
+
+    /// The name of a step, if it has one, and its mapping.
+    fn named(&mut self, item: &'a Node, path: &str) -> Option<(Option<String>, Location, &'a Node)> {
+        let entries = item.entries();
+        let is_form = |entry: &Entry| FORMS.contains(&entry.key.as_str()) || LATER_FORMS.contains(&entry.key.as_str());
+        if let Some(form) = entries.iter().find(|e| is_form(e)) {
+            if form.key == "action" {
+                let message = "this state has no name";
+                self.findings.error("invalid-state", item.at, path, message, "write `- name: { action: … }`");
+                return None;
+            }
+            return Some((None, item.at, item));
+        }
+        let [entry] = entries else {
+            let message = format!("expected `name: {{…}}`, found {}", item.described());
+            let help = "each state is one list item `- name: {…}`; mind the indentation of what belongs to it";
+            self.findings.error("invalid-state", item.at, path, message, help);
+            return None;
+        };
+        if !is_word(&entry.key) || Function::named(&entry.key).is_some() {
+            let message = format!("`{}` cannot be a state's name", entry.key);
+            let help = "use letters, digits and _, beginning with a letter, and no word that is built in";
+            self.findings.error("invalid-name", entry.at, path, message, help);
+            return None;
+        }
+        if !matches!(entry.value.content, Content::Map(_)) {
+            let message = format!("expected a mapping, found {}", entry.value.described());
+            self.findings.error(
+                "invalid-state",
+                entry.at,
+                path,
+                message,
+                "write `- name: { action: provider/action }`",
+            );
+            return None;
+        }
+        Some((Some(entry.key.clone()), entry.at, &entry.value))
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "all of it is the place of one step")]
+    fn step(
+        &mut self,
+        name: String,
+        path: String,
+        at: Location,
+        body: &'a Node,
+        parent: StateId,
+        branch: Branch,
+        depth: usize,
+    ) -> Option<StateId> {
+        if let Some(later) = body.entries().iter().find(|e| LATER_FORMS.contains(&e.key.as_str())) {
+            let message = format!("`{}` is not supported yet", later.key);
+            self.findings.error(
+                "not-supported-yet",
+                later.at,
+                &path,
+                message,
+                "states are action, for, condition or states",
+            );
+            return None;
+        }
+        let forms: Vec<&Entry> = body.entries().iter().filter(|e| FORMS.contains(&e.key.as_str())).collect();
+        let [form] = forms.as_slice() else {
+            let message = match forms.as_slice() {
+                [] => "this is no kind of state".to_owned(),
+                [a, b, ..] => format!("a state is `{}` or `{}`, not both", a.key, b.key),
+                [_] => String::new(),
+            };
+            self.findings.error("invalid-state", at, &path, message, "give it one of action, for, condition or states");
+            return None;
+        };
+        let (variable, collection) = match form.key.as_str() {
+            "for" => header(&form.value, &path, self.findings)?,
+            _ => (String::new(), Header { node: body, collection: String::new(), offset: 0 }),
+        };
+        let id = StateId(self.steps.len() as u64);
+        let placeholder = Form::Sequence { children: Vec::new() };
+        self.steps.push(Step { name, path: path.clone(), parent: Some(parent), branch, form: placeholder, body, at });
+        let form = match form.key.as_str() {
+            "action" => Form::Action { action: &form.value },
+            "states" => Form::Sequence { children: self.list(&form.value, id, Branch::First, depth + 1) },
+            "for" => {
+                let index = body.get("index").and_then(|node| self.index(node, &path));
+                let body = self.branch(body, "do", id, Branch::First, depth, at);
+                Form::ForEach { variable, collection, index, body }
+            }
+            _ => {
+                let then = self.branch(body, "then", id, Branch::First, depth, at);
+                let otherwise = match body.get("else") {
+                    Some(list) => self.list(list, id, Branch::Otherwise, depth + 1),
+                    None => Vec::new(),
+                };
+                Form::Condition { predicate: &form.value, then, otherwise }
+            }
+        };
+        self.steps[id.0 as usize].form = form;
+        Some(id)
+    }
+
+    fn branch(
+        &mut self,
+        body: &'a Node,
+        key: &str,
+        id: StateId,
+        branch: Branch,
+        depth: usize,
+        at: Location,
+    ) -> Vec<StateId> {
+        if let Some(list) = body.get(key) {
+            return self.list(list, id, branch, depth + 1);
+        }
+        let path = self.steps[id.0 as usize].path.clone();
+        self.findings.error("invalid-state", at, &path, format!("there is no `{key}`"), "list its states there");
+        Vec::new()
+    }
+
+    fn index(&mut self, node: &Node, path: &str) -> Option<String> {
+        match &node.content {
+            Content::Text(name) if is_word(name) => Some(name.clone()),
+            _ => {
+                self.findings.error("invalid-state", node.at, path, "`index` is the name of a variable", "index: i");
+                None
+            }
+        }
+    }
+}
+
+/// The name of a loop or a condition that was given none.
+fn default_name(body: &Node) -> String {
+    match body.get("for").map(|node| &node.content) {
+        Some(Content::Text(text)) => format!("for_{}", text.split_whitespace().next().unwrap_or("each")),
+        _ if body.get("condition").is_some() => "condition".to_owned(),
+        _ => "states".to_owned(),
+    }
+}
+
+fn unused<'s>(name: &str, taken: impl Iterator<Item = &'s str>) -> String {
+    let taken: Vec<&str> = taken.collect();
+    let numbered = (2..).map(|n| format!("{name}_{n}"));
+    std::iter::once(name.to_owned()).chain(numbered).find(|n| !taken.contains(&n.as_str())).unwrap_or_default()
+}

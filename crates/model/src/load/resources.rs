@@ -1,0 +1,78 @@
+//! `resources` of a state: `{block: Arm}`, `{create: BoxDelivered, class: task, with: {box: $box.id}}`, `world_model`.
+
+use super::fields::Fields;
+use super::yaml::{Content, Entry, Node};
+use crate::expression::Expr;
+use crate::program::{ResourceExpr, WORLD_MODEL};
+use crate::resource::{ResourceClass, ResourceOperation};
+
+const OPERATIONS: [(&str, ResourceOperation); 5] = [
+    ("block", ResourceOperation::Block),
+    ("consume", ResourceOperation::Consume),
+    ("create", ResourceOperation::Create),
+    ("delete", ResourceOperation::Delete),
+    ("exists", ResourceOperation::Exists),
+];
+
+const CLASSES: [(&str, ResourceClass); 5] = [
+    ("system", ResourceClass::System),
+    ("process", ResourceClass::Process),
+    ("module", ResourceClass::Module),
+    ("world", ResourceClass::World),
+    ("task", ResourceClass::Task),
+];
+
+/// The lines of `resources`; what does not read is left out (and was complained of).
+pub(crate) fn list(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<ResourceExpr> {
+    let mut resources = Vec::new();
+    for item in node.items() {
+        if let Some(resource) = resource(fields, item) {
+            fields.note(format!("resources.{}", resources.len()), item.at);
+            resources.push(resource);
+        }
+    }
+    resources
+}
+
+fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
+    if matches!(item.content, Content::Text(_)) {
+        let word = fields.word(item, "a kind of resource")?;
+        let kind = if word == "world_model" { WORLD_MODEL } else { word }.to_owned();
+        let operation = ResourceOperation::Block;
+        return Some(ResourceExpr { operation, kind, class: None, attributes: Vec::new(), count: 1 });
+    }
+    let expected = "write `{block: Arm}` with one of block, consume, create, delete, exists";
+    let operations: Vec<(&Entry, ResourceOperation)> = item
+        .entries()
+        .iter()
+        .filter_map(|entry| OPERATIONS.iter().find(|(name, _)| *name == entry.key).map(|(_, op)| (entry, *op)))
+        .collect();
+    let [(entry, operation)] = operations.as_slice() else {
+        fields.error("invalid-state", item.at, "a resource has exactly one operation", expected);
+        return None;
+    };
+    fields.keys(
+        item,
+        &["block", "consume", "create", "delete", "exists", "class", "count", "where", "with"],
+        &["hold"],
+    );
+    let kind = fields.word(&entry.value, "a kind of resource")?.to_owned();
+    let count = item.get("count").map_or(Some(1), |node| fields.count(node, "count", 1))?;
+    let class = match item.get("class") {
+        None => None,
+        Some(node) => {
+            let name = fields.word(node, "a class")?;
+            let class = CLASSES.iter().find(|(known, _)| *known == name).map(|(_, class)| *class);
+            if class.is_none() {
+                let message = format!("there is no resource class `{name}`");
+                fields.error("unknown-resource", node.at, message, "system, process, module, world or task");
+            }
+            class
+        }
+    };
+    let attributes = item.get("where").into_iter().chain(item.get("with")).flat_map(Node::entries);
+    let attributes: Vec<(String, Option<Expr>)> =
+        attributes.map(|attribute| (attribute.key.clone(), fields.expression(&attribute.value))).collect();
+    let attributes = attributes.into_iter().filter_map(|(name, value)| Some((name, value?))).collect();
+    Some(ResourceExpr { operation: *operation, kind, class, attributes, count })
+}

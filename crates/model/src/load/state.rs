@@ -1,0 +1,295 @@
+//! A step of the outline → a state: its kind with every expression read, and its annotations.
+
+use super::fields::{Fields, Output};
+use super::names::{Task, View};
+use super::outline::{Form, Step};
+use super::yaml::{Content, Node};
+use super::{effects, resources};
+use crate::expression::parse::parse_expression;
+use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::fact::SCENE_PREDICATES;
+use crate::id::StateId;
+use crate::program::{ABORTED, Annotations, Nature, PREEMPTED, SUCCESS, State, StateKind, TaskOutput};
+use crate::value::{Type, Value};
+
+const ACTION_KEYS: [&str; 3] = ["action", "in", "out"];
+const SEQUENCE_KEYS: [&str; 2] = ["states", "outputs"];
+const LOOP_KEYS: [&str; 3] = ["for", "index", "do"];
+const CONDITION_KEYS: [&str; 3] = ["condition", "then", "else"];
+const NODE_KEYS: [&str; 5] = ["reads", "routine", "duration", "resources", "description"];
+const BOUNDARY_KEYS: [&str; 2] = ["requires", "effects"];
+const NATURE_KEYS: [&str; 4] = ["computes", "senses", "pia", "attempts"];
+const LATER_KEYS: [&str; 20] = [
+    "transitions",
+    "retry",
+    "on",
+    "outcomes",
+    "exceptional",
+    "exceptions",
+    "hold",
+    "deterministic",
+    "unordered",
+    "timeout",
+    "timeout_s",
+    "variables",
+    "scoped",
+    "shared",
+    "defaults",
+    "cancellable",
+    "priority",
+    "ports",
+    "next",
+    "backoff",
+];
+
+/// Reads one step.
+pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
+    let step = task.outline.step(id);
+    let view = View { state: Some(id), ..View::default() };
+    let mut fields = Fields { task, view, path: step.path.clone(), out };
+    if id.0 > 0 {
+        let own: &[&str] = match step.form {
+            Form::Action { .. } => &ACTION_KEYS,
+            Form::Sequence { .. } => &SEQUENCE_KEYS,
+            Form::ForEach { .. } => &LOOP_KEYS,
+            Form::Condition { .. } => &CONDITION_KEYS,
+        };
+        let mut known = [own, &NODE_KEYS].concat();
+        if matches!(step.form, Form::Action { .. } | Form::Sequence { .. }) {
+            known.extend(BOUNDARY_KEYS);
+        }
+        if matches!(step.form, Form::Action { .. }) {
+            known.extend(NATURE_KEYS);
+        }
+        fields.keys(step.body, &known, &LATER_KEYS);
+    }
+    let kind = kind(&mut fields, step);
+    let annotations = if id.0 > 0 { annotations(&mut fields, step, &kind) } else { boundary(Vec::new()) };
+    State {
+        id,
+        name: step.name.clone(),
+        path: step.path.clone(),
+        parent: step.parent,
+        kind,
+        annotations,
+        location: step.at,
+    }
+}
+
+fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
+    let nothing = || Expr::Literal(Value::Null);
+    match &step.form {
+        Form::Action { action } => {
+            fields.note("action", action.at);
+            let (provider, name) = action_name(action).unwrap_or_default();
+            if provider.is_empty() {
+                fields.error("unknown-action", action.at, "expected `action: provider/action`", "");
+            }
+            StateKind::Action { provider, action: name, inputs: inputs(fields, step.body), outputs: outputs(fields) }
+        }
+        Form::Sequence { children } => {
+            let children = children.clone();
+            fields.view.inside = true;
+            let node = step.body.get("outputs");
+            let outputs = node.map(|node| task_outputs(fields, node)).unwrap_or_default();
+            fields.view.inside = false;
+            StateKind::Sequence { children, outputs }
+        }
+        Form::ForEach { variable, collection, index, body } => {
+            for name in std::iter::once(variable).chain(index) {
+                let outer = fields.view.state.into_iter().flat_map(|id| fields.task.loop_variables(id));
+                if outer.chain(fields.task.parameters.iter().map(String::as_str)).any(|other| other == name) {
+                    let message = format!("the variable `${name}` exists already around this loop");
+                    fields.error(
+                        "duplicate-name",
+                        collection.node.at,
+                        message,
+                        "give the loop's variable another name",
+                    );
+                }
+            }
+            if index.as_ref() == Some(variable) {
+                fields.error("duplicate-name", collection.node.at, "element and index have the same name", "");
+            }
+            fields.note("for", collection.node.at);
+            let list = fields.parsed(collection.node, &collection.collection, collection.offset, parse_expression);
+            StateKind::ForEach {
+                variable: variable.clone(),
+                index: index.clone(),
+                collection: list.unwrap_or_else(nothing),
+                body: body.clone(),
+            }
+        }
+        Form::Condition { predicate, then, otherwise } => {
+            fields.note("condition", predicate.at);
+            let predicate = fields.expression(predicate).unwrap_or_else(nothing);
+            StateKind::Condition { predicate, then: then.clone(), otherwise: otherwise.clone() }
+        }
+    }
+}
+
+/// `provider/action`
+pub(crate) fn action_name(node: &Node) -> Option<(String, String)> {
+    let Content::Text(text) = &node.content else { return None };
+    let (provider, action) = text.split_once('/')?;
+    (!provider.is_empty() && !action.is_empty()).then(|| (provider.to_owned(), action.to_owned()))
+}
+
+fn inputs(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String, Expr)> {
+    let Some(node) = body.get("in") else { return Vec::new() };
+    if !matches!(node.content, Content::Map(_) | Content::Null) {
+        let message = format!("expected input ports with values, found {}", node.described());
+        fields.error("invalid-state", node.at, message, "write `in: {port: value}`");
+    }
+    let mut inputs = Vec::new();
+    for entry in node.entries() {
+        fields.note(format!("in.{}", entry.key), entry.at);
+        if let Some(value) = fields.expression(&entry.value) {
+            inputs.push((entry.key.clone(), value));
+        }
+    }
+    inputs
+}
+
+fn outputs(fields: &Fields<'_, '_>) -> std::collections::BTreeMap<String, Type> {
+    let own = fields.view.state.map(|id| fields.task.ports[id.0 as usize].types.clone());
+    own.unwrap_or_default()
+}
+
+/// `outputs: {name: expression}` or `{name: {type: int, value: expression}}`.
+pub(crate) fn task_outputs(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<TaskOutput> {
+    let mut outputs = Vec::new();
+    for entry in node.entries() {
+        fields.note(format!("outputs.{}", entry.key), entry.at);
+        let long = entry.value.get("value").is_some();
+        let ty = match entry.value.get("type") {
+            Some(node) if long => super::declared_type(fields, node),
+            _ => None,
+        };
+        if long {
+            fields.keys(&entry.value, &["type", "value", "description"], &[]);
+        }
+        let value = if long { entry.value.get("value").unwrap_or(&entry.value) } else { &entry.value };
+        if let Some(value) = fields.expression(value) {
+            outputs.push(TaskOutput { name: entry.key.clone(), ty: ty.unwrap_or(Type::Any), value });
+        }
+    }
+    outputs
+}
+
+/// Of a state that contains others: it reads and changes nothing beside what they do, and what its own keys say.
+fn boundary(reads: Vec<FactExpr>) -> Annotations {
+    let effects = [(SUCCESS.to_owned(), Vec::new())].into();
+    Annotations { reads: Some(reads), effects, ..Annotations::default() }
+}
+
+fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -> Annotations {
+    let body = step.body;
+    let is_action = matches!(kind, StateKind::Action { .. });
+    let mut annotations = if is_action { Annotations::default() } else { boundary(Vec::new()) };
+    annotations.nature = nature(fields, body);
+    if let Some(node) = body.get("reads") {
+        fields.note("reads", node.at);
+        annotations.reads = Some(node.items().into_iter().flat_map(|item| reads(fields, item)).collect());
+    } else if matches!(annotations.nature, Nature::Senses(_)) {
+        // What a sensing state reads is what it senses.
+        annotations.reads = Some(Vec::new());
+    }
+    for (i, node) in body.get("requires").into_iter().flat_map(Node::items).enumerate() {
+        fields.note(format!("requires.{i}"), node.at);
+        annotations.requires.extend(fields.expression(node));
+    }
+    // States that cannot change the environment change nothing when they fail, and computing alone changes nothing at all.
+    if annotations.nature != Nature::Irreversible {
+        for outcome in [ABORTED, PREEMPTED] {
+            annotations.effects.insert(outcome.to_owned(), Vec::new());
+        }
+    }
+    if annotations.nature == Nature::Computes {
+        annotations.effects.insert(SUCCESS.to_owned(), Vec::new());
+        if let StateKind::Action { provider, action, .. } = kind {
+            let custom = fields.task.catalogue.action(provider, action).into_iter().flat_map(|a| &a.outcomes);
+            annotations.effects.extend(custom.map(|outcome| (outcome.clone(), Vec::new())));
+        }
+    }
+    if let Some(node) = body.get("effects") {
+        fields.view.own_outputs = true;
+        annotations.effects.extend(effects::by_outcome(fields, node));
+        fields.view.own_outputs = false;
+    }
+    if let Some(node) = body.get("resources") {
+        // What is created may be named by what the state put out; blocks are checked against that.
+        fields.view.own_outputs = true;
+        annotations.resources = resources::list(fields, node);
+        fields.view.own_outputs = false;
+    }
+    annotations.routine = body.get("routine").is_some_and(|node| fields.flag(node));
+    if let Some(node) = body.get("duration") {
+        fields.note("duration", node.at);
+        annotations.duration_s = fields.expression(node);
+        if annotations.duration_s.as_ref().is_some_and(|d| !d.fact_expressions().is_empty()) {
+            fields.error(
+                "invalid-expression",
+                node.at,
+                "an estimated duration cannot look up facts",
+                "use a parameter",
+            );
+        }
+    }
+    annotations.attempts = body.get("attempts").and_then(|node| fields.count(node, "attempts", 1));
+    if let Some(reads) = &mut annotations.reads {
+        add_used_facts(reads, kind, &annotations.effects);
+    }
+    annotations
+}
+
+fn nature(fields: &mut Fields<'_, '_>, body: &Node) -> Nature {
+    let computes = body.get("computes").is_some_and(|node| fields.flag(node));
+    let pia = body.get("pia").is_some_and(|node| fields.flag(node));
+    let senses = body.get("senses");
+    if usize::from(computes) + usize::from(pia) + usize::from(senses.is_some()) > 1 {
+        let message = "a state computes, senses or is a PIA; this one says two of them";
+        let help =
+            "keep `pia: true` if it may change the environment, `senses` if it looks at it, else `computes: true`";
+        fields.error("conflicting-annotations", body.at, message, help);
+    }
+    match senses {
+        Some(node) => {
+            fields.note("senses", node.at);
+            Nature::Senses(node.items().into_iter().filter_map(|item| fields.fact(item)).collect())
+        }
+        None if computes => Nature::Computes,
+        None => Nature::Irreversible,
+    }
+}
+
+/// `scene` stands for the facts that geometry is derived from.
+fn reads(fields: &mut Fields<'_, '_>, item: &Node) -> Vec<FactExpr> {
+    match &item.content {
+        Content::Text(text) if text == "scene" => SCENE_PREDICATES
+            .iter()
+            .map(|(predicate, arity)| FactExpr { predicate: (*predicate).to_owned(), arguments: vec![None; *arity] })
+            .collect(),
+        _ => fields.fact(item).into_iter().collect(),
+    }
+}
+
+/// Declared reads include the facts that the state's own expressions look up.
+fn add_used_facts(
+    reads: &mut Vec<FactExpr>,
+    kind: &StateKind,
+    effects: &std::collections::BTreeMap<String, Vec<EffectExpr>>,
+) {
+    let mut used: Vec<&FactExpr> = match kind {
+        StateKind::Action { inputs, .. } => inputs.iter().flat_map(|(_, value)| value.fact_expressions()).collect(),
+        StateKind::Sequence { .. } => Vec::new(),
+        StateKind::ForEach { collection, .. } => collection.fact_expressions(),
+        StateKind::Condition { predicate, .. } => predicate.fact_expressions(),
+    };
+    used.extend(effects.values().flat_map(|effects| EffectExpr::fact_expressions(effects)));
+    for fact in used {
+        if !reads.contains(fact) {
+            reads.push(fact.clone());
+        }
+    }
+}

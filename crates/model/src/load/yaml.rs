@@ -1,0 +1,226 @@
+//! YAML text → a tree of nodes that know where they stand. The only place that knows the YAML library.
+//!
+//! Booleans are `true` and `false` only: a state may be called `no`. Duplicate keys, several documents and files beyond
+//! [`MAX_SOURCE`] are refused; the library bounds depth and aliases.
+
+use crate::program::Location;
+use serde::de::{Deserialize, Deserializer, MapAccess, SeqAccess, Visitor};
+use serde_saphyr::Spanned;
+use std::fmt;
+
+/// The largest task file, in bytes.
+pub(crate) const MAX_SOURCE: usize = 1 << 20;
+
+/// A YAML node.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Node {
+    /// Where it begins.
+    pub(crate) at: Location,
+    /// Byte offset of its beginning in the source.
+    pub(crate) offset: Option<usize>,
+    /// What it is.
+    pub(crate) content: Content,
+}
+
+/// What a node is.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Content {
+    Null,
+    Bool(bool),
+    Int(i64),
+    Float(f64),
+    Text(String),
+    List(Vec<Node>),
+    Map(Vec<Entry>),
+}
+
+/// A key and its value.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Entry {
+    pub(crate) key: String,
+    pub(crate) at: Location,
+    pub(crate) value: Node,
+}
+
+/// Text that is no YAML.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct InvalidYaml {
+    pub(crate) at: Location,
+    pub(crate) message: String,
+}
+
+/// Reads a document.
+pub(crate) fn read(source: &str) -> Result<Node, InvalidYaml> {
+    let start = Location { line: 1, column: 1 };
+    if source.len() > MAX_SOURCE {
+        return Err(InvalidYaml { at: start, message: format!("a task file has at most {MAX_SOURCE} bytes") });
+    }
+    let mut options = serde_saphyr::Options::default();
+    options.strict_booleans = true;
+    options.with_snippet = false;
+    match serde_saphyr::from_str_with_options::<Spanned<Content>>(source, options) {
+        Ok(spanned) => Ok(node(spanned)),
+        Err(error) => {
+            let at = error.location().map_or(start, location);
+            let text = error.without_snippet().to_string();
+            let message = text.lines().next().unwrap_or("unreadable").to_owned();
+            Err(InvalidYaml { at: if at.line == 0 { start } else { at }, message })
+        }
+    }
+}
+
+impl Node {
+    /// What kind of node it is, for messages.
+    pub(crate) fn described(&self) -> &'static str {
+        match self.content {
+            Content::Null => "nothing",
+            Content::Bool(_) => "a boolean",
+            Content::Int(_) | Content::Float(_) => "a number",
+            Content::Text(_) => "text",
+            Content::List(_) => "a list",
+            Content::Map(_) => "a mapping",
+        }
+    }
+
+    /// The value of a key of a mapping.
+    pub(crate) fn get(&self, key: &str) -> Option<&Node> {
+        self.entries().iter().find(|entry| entry.key == key).map(|entry| &entry.value)
+    }
+
+    /// The entries of a mapping; none for anything else.
+    pub(crate) fn entries(&self) -> &[Entry] {
+        match &self.content {
+            Content::Map(entries) => entries,
+            _ => &[],
+        }
+    }
+
+    /// The items of a list; a single value counts as a list of itself, nothing as the empty list.
+    pub(crate) fn items(&self) -> Vec<&Node> {
+        match &self.content {
+            Content::List(items) => items.iter().collect(),
+            Content::Null => Vec::new(),
+            _ => vec![self],
+        }
+    }
+
+    /// Where the character `offset` of a text stands in the file: exactly if the text stands there as it reads (plain, or
+    /// quoted without escapes, on one line), else where the node begins.
+    pub(crate) fn place_in_text(&self, source: &str, offset: usize) -> Location {
+        let (Content::Text(text), Some(begin)) = (&self.content, self.offset) else { return self.at };
+        let Some(raw) = source.get(begin..) else { return self.at };
+        let quotes = usize::from(raw.starts_with(['"', '\'']));
+        let as_written = raw.get(quotes..).is_some_and(|raw| raw.starts_with(text.as_str()));
+        if !as_written || text.contains('\n') {
+            return self.at;
+        }
+        let shift = u32::try_from(quotes + offset.min(text.chars().count())).unwrap_or(0);
+        Location { line: self.at.line, column: self.at.column + shift }
+    }
+}
+
+fn location(at: serde_saphyr::Location) -> Location {
+    let clipped = |n: u64| u32::try_from(n).unwrap_or(u32::MAX);
+    Location { line: clipped(at.line()), column: clipped(at.column()) }
+}
+
+fn node(spanned: Spanned<Content>) -> Node {
+    let offset = spanned.defined.span().byte_offset().and_then(|offset| usize::try_from(offset).ok());
+    Node { at: location(spanned.defined), offset, content: spanned.value }
+}
+
+impl<'de> Deserialize<'de> for Content {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Content, D::Error> {
+        deserializer.deserialize_any(ContentVisitor)
+    }
+}
+
+struct ContentVisitor;
+
+impl<'de> Visitor<'de> for ContentVisitor {
+    type Value = Content;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a value, a list or a mapping")
+    }
+
+    fn visit_bool<E>(self, value: bool) -> Result<Content, E> {
+        Ok(Content::Bool(value))
+    }
+
+    fn visit_i64<E>(self, value: i64) -> Result<Content, E> {
+        Ok(Content::Int(value))
+    }
+
+    fn visit_u64<E: serde::de::Error>(self, value: u64) -> Result<Content, E> {
+        i64::try_from(value).map(Content::Int).map_err(|_| E::custom(format!("{value} is too large for an int")))
+    }
+
+    fn visit_f64<E>(self, value: f64) -> Result<Content, E> {
+        Ok(Content::Float(value))
+    }
+
+    fn visit_str<E>(self, value: &str) -> Result<Content, E> {
+        Ok(Content::Text(value.to_owned()))
+    }
+
+    fn visit_unit<E>(self) -> Result<Content, E> {
+        Ok(Content::Null)
+    }
+
+    fn visit_none<E>(self) -> Result<Content, E> {
+        Ok(Content::Null)
+    }
+
+    fn visit_some<D: Deserializer<'de>>(self, deserializer: D) -> Result<Content, D::Error> {
+        Content::deserialize(deserializer)
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut access: A) -> Result<Content, A::Error> {
+        let mut items = Vec::new();
+        while let Some(item) = access.next_element::<Spanned<Content>>()? {
+            items.push(node(item));
+        }
+        Ok(Content::List(items))
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut access: A) -> Result<Content, A::Error> {
+        let mut entries = Vec::new();
+        while let Some(key) = access.next_key::<Spanned<String>>()? {
+            let value = node(access.next_value::<Spanned<Content>>()?);
+            entries.push(Entry { at: location(key.defined), key: key.value, value });
+        }
+        Ok(Content::Map(entries))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+    use super::*;
+
+    #[test]
+    fn every_node_knows_where_it_stands() {
+        let root = read("task: demo\nstates:\n  - plan: { in: {goal: \"at(§x)\"}, no: yes }\n").unwrap();
+        let Content::List(steps) = &root.get("states").unwrap().content else { panic!("a list") };
+        let entry = &steps[0].entries()[0];
+        assert_eq!((entry.key.as_str(), entry.at), ("plan", Location { line: 3, column: 5 }));
+        let goal = entry.value.get("in").unwrap().get("goal").unwrap();
+        assert_eq!(goal.at, Location { line: 3, column: 24 });
+        assert_eq!(goal.place_in_text("", 3), goal.at);
+        let source = "task: demo\nstates:\n  - plan: { in: {goal: \"at(§x)\"}, no: yes }\n";
+        assert_eq!(goal.place_in_text(source, 4), Location { line: 3, column: 29 });
+        assert_eq!(entry.value.get("no").unwrap().content, Content::Text("yes".into()));
+    }
+
+    #[test]
+    fn what_is_no_yaml_is_refused_with_its_place() {
+        for source in ["task: [1, 2", "a: 1\na: 2\n", "a: b: c\n", "a: 1\n---\nb: 2\n", "x: *nothing"] {
+            let error = read(source).unwrap_err();
+            assert!(error.at.line >= 1 && !error.message.is_empty(), "{source}: {error:?}");
+        }
+        let deep = "[".repeat(5_000);
+        assert!(read(&deep).is_err());
+    }
+}
