@@ -299,6 +299,30 @@ impl Pool {
         Ok(())
     }
 
+    /// Undoes an acquire by its request id: takes it out of the queue, or ends the lease that it was granted. False when
+    /// there is nothing to undo.
+    ///
+    /// # Errors
+    /// An acquire of another session.
+    pub fn withdraw(&mut self, now: Timestamp, caller: &SessionId, request_id: &str) -> Result<bool, PoolError> {
+        self.advance(now);
+        match self.memory.reply(request_id) {
+            Some(Reply::Queued(id)) => {
+                let Some(waiter) = self.queue.get(id) else { return Ok(false) };
+                check_owner(|| id.to_string(), &waiter.request.session, caller)?;
+                self.refuse(id, Refusal::Cancelled);
+            }
+            Some(Reply::Granted(lease)) => {
+                let Some(record) = self.leases.get(&lease.id) else { return Ok(false) };
+                check_owner(|| lease.id.to_string(), &record.session, caller)?;
+                self.end_lease(lease.id, EndReason::Asked);
+            }
+            _ => return Ok(false),
+        }
+        self.schedule();
+        Ok(true)
+    }
+
     /// Ends a lease. `None` as session may release anything.
     ///
     /// # Errors
@@ -329,6 +353,11 @@ impl Pool {
     /// How many units of what fits exist and are not consumed, held or not (the paper's `exists`).
     pub fn exists(&self, requirement: &Requirement) -> u64 {
         self.resources.quantity(requirement)
+    }
+
+    /// The ids of what fits a requirement, in order.
+    pub fn fitting(&self, requirement: &Requirement) -> Vec<String> {
+        self.resources.fitting(requirement).map(|(id, _)| id.to_owned()).collect()
     }
 
     /// One resource.

@@ -387,6 +387,8 @@ fn a_cancelled_acquire_may_be_asked_again_with_its_request_id() {
     let mut bench = Bench::new();
     let acquire = Request::Acquire(AcquireRequest::new(session("b"), vec![block("Arm")]));
     let Ok(Reply::Queued(first)) = bench.pool.handle(bench.now, "q", acquire.clone()) else { panic!() };
+    let later = AcquireRequest::new(session("b"), vec![block("Arm")]).deadline(Timestamp(1));
+    assert_eq!(bench.pool.handle(bench.now, "q", Request::Acquire(later)), Ok(Reply::Queued(first)));
     assert_eq!(
         bench.pool.handle(bench.now, "q", acquire.clone()),
         Ok(Reply::Queued(first)),
@@ -395,6 +397,22 @@ fn a_cancelled_acquire_may_be_asked_again_with_its_request_id() {
     bench.pool.cancel(bench.now, first).unwrap();
     let Ok(Reply::Queued(second)) = bench.pool.handle(bench.now, "q", acquire) else { panic!() };
     assert_ne!(first, second);
+}
+
+#[test]
+fn a_withdrawn_acquire_leaves_the_queue_or_gives_back_what_it_got() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    let acquire = Request::Acquire(AcquireRequest::new(session("b"), vec![block("Arm")]));
+    for id in ["first", "second"] {
+        bench.pool.handle(bench.now, id, acquire.clone()).unwrap();
+    }
+    let stranger = bench.pool.withdraw(bench.now, &session("a"), "first");
+    assert!(matches!(stranger, Err(PoolError::NotYours { .. })));
+    assert_eq!(bench.pool.withdraw(bench.now, &session("b"), "second"), Ok(true));
+    assert_eq!(bench.pool.withdraw(bench.now, &session("b"), "first"), Ok(true));
+    assert_eq!(bench.pool.get("Arm-1").unwrap().free, 1);
+    assert_eq!(bench.pool.withdraw(bench.now, &session("b"), "first"), Ok(false));
+    assert_eq!(bench.pool.withdraw(bench.now, &session("b"), "never asked"), Ok(false));
 }
 
 #[test]
