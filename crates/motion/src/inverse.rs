@@ -4,17 +4,17 @@
 //! iterations the step is also drawn towards a preferred posture within the null space. Restarts from random postures give
 //! further solutions. Deterministic: the randomness comes from the caller.
 
-use crate::collision::distance;
+use crate::collision::{between, distance};
 use crate::frame::{compose, cross, difference, norm, rotate};
 use crate::robot::{Configuration, Joints, Motion, Robot};
 use rand::{Rng, RngExt};
 use ratn_model::pose::Pose;
 
 /// A solution is at most this far off, in metres.
-pub const POSITION_TOLERANCE_M: f64 = 1e-5;
+pub const POSITION_TOLERANCE_M: f64 = 1e-6;
 
 /// A solution is turned at most by this much, in radians.
-pub const ROTATION_TOLERANCE_RAD: f64 = 1e-4;
+pub const ROTATION_TOLERANCE_RAD: f64 = 1e-6;
 
 /// Iterations of one descent.
 const MAX_ITERATIONS: usize = 80;
@@ -88,6 +88,15 @@ impl<'a> Solver<'a> {
     pub fn random(&self, random: &mut impl Rng) -> Joints {
         let joints = self.robot.arm_joints();
         std::array::from_fn(|j| random.random_range(joints[j].lower..joints[j].upper))
+    }
+
+    /// A random posture within limits and within `room` radians per joint of the point `along` (0 to 1) of a straight line.
+    pub(crate) fn near_line(&self, from: &Joints, to: &Joints, along: f64, room: f64, random: &mut impl Rng) -> Joints {
+        let mut posture = between(from, to, along);
+        for q in &mut posture {
+            *q += room * random.random_range(-1.0..=1.0);
+        }
+        self.robot.clamp(&posture)
     }
 
     /// Up to `wanted` different postures for one pose from at most `attempts` descents, nearest to `near` first.

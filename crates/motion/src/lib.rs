@@ -6,6 +6,14 @@
 pub mod aimm;
 pub mod collision;
 mod frame;
+mod improve;
 pub mod inverse;
 pub mod line;
+pub mod pace;
+pub mod plan;
 pub mod robot;
+mod search;
+pub mod shorten;
+pub mod timing;
+pub mod trajectory;
+pub mod validate;

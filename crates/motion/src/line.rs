@@ -4,10 +4,10 @@ use crate::inverse::Solver;
 use crate::robot::Joints;
 
 /// The tool's way between two solved postures, in metres.
-const STEP_M: f64 = 0.01;
+const STEP_M: f64 = 0.0025;
 
 /// A joint that turns more than this between two of them has left the straight line, in radians.
-const MAX_JUMP_RAD: f64 = 0.25;
+const MAX_JUMP_RAD: f64 = 0.1;
 
 /// A straight line that the arm cannot follow to its end.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

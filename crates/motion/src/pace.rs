@@ -1,0 +1,60 @@
+//! The caller's hand on the planner: asked often whether to go on, told when there is a first path.
+
+/// What the planner reports when it asks whether to go on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Progress {
+    /// Nothing new.
+    Working,
+    /// The first path was found; said once.
+    FirstPath {
+        /// Its length in joint space.
+        length_rad: f64,
+    },
+}
+
+/// The caller's answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Control {
+    /// Go on.
+    Continue,
+    /// Finish with the best path so far.
+    TimeUp,
+    /// Give up.
+    Cancelled,
+}
+
+/// Why the planner stopped before it was done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Stop {
+    TimeUp,
+    Cancelled,
+}
+
+pub(crate) struct Pace<'c> {
+    control: &'c mut dyn FnMut(Progress) -> Control,
+    /// Iterations of search and improvement so far.
+    pub(crate) iterations: usize,
+}
+
+impl<'c> Pace<'c> {
+    pub(crate) fn new(control: &'c mut dyn FnMut(Progress) -> Control) -> Pace<'c> {
+        Pace { control, iterations: 0 }
+    }
+
+    pub(crate) fn report(&mut self, progress: Progress) -> Result<(), Stop> {
+        match (self.control)(progress) {
+            Control::Continue => Ok(()),
+            Control::TimeUp => Err(Stop::TimeUp),
+            Control::Cancelled => Err(Stop::Cancelled),
+        }
+    }
+
+    pub(crate) fn poll(&mut self) -> Result<(), Stop> {
+        self.report(Progress::Working)
+    }
+
+    pub(crate) fn iteration(&mut self) -> Result<(), Stop> {
+        self.iterations += 1;
+        self.poll()
+    }
+}

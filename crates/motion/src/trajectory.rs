@@ -1,0 +1,169 @@
+//! A trajectory of the arm as a curve: cubic Hermite interpolation between its points.
+
+use crate::robot::{Joints, Robot};
+use ratn_model::value::{Trajectory, TrajectoryPoint};
+
+/// The most points that a trajectory may have.
+pub const MAX_POINTS: usize = 100_000;
+
+/// A well-formed trajectory of the seven arm joints.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ArmTrajectory {
+    knots: Vec<Knot>,
+}
+
+/// Where the arm is, and how fast, at one moment.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Knot {
+    /// Seconds since the start.
+    pub time_s: f64,
+    /// Radians.
+    pub positions: Joints,
+    /// Radians per second.
+    pub velocities: Joints,
+}
+
+/// A trajectory that is not one of this arm.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum TrajectoryError {
+    /// Other joints.
+    #[error("the trajectory moves [{joints}], the arm's joints are [{expected}]")]
+    OtherJoints {
+        /// What it moves.
+        joints: String,
+        /// What it should.
+        expected: String,
+    },
+    /// None, or too many.
+    #[error("the trajectory has {points} points: expected 1 to {MAX_POINTS}")]
+    Points {
+        /// How many.
+        points: usize,
+    },
+    /// A point of the wrong form.
+    #[error("point {index} of the trajectory: {reason}")]
+    Point {
+        /// Which one, from 0.
+        index: usize,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+impl ArmTrajectory {
+    /// From knots whose times grow from 0.
+    pub(crate) fn new(knots: Vec<Knot>) -> ArmTrajectory {
+        ArmTrajectory { knots }
+    }
+
+    /// Reads a trajectory of the task model.
+    ///
+    /// # Errors
+    /// [`TrajectoryError`] where it is not one of this arm, or its times do not grow strictly from 0.
+    pub fn read(robot: &Robot, trajectory: &Trajectory) -> Result<ArmTrajectory, TrajectoryError> {
+        let names: Vec<&str> = robot.arm_joints().iter().map(|j| j.name.as_str()).collect();
+        if trajectory.joints != names {
+            let joints = trajectory.joints.join(", ");
+            return Err(TrajectoryError::OtherJoints { joints, expected: names.join(", ") });
+        }
+        if trajectory.points.is_empty() || trajectory.points.len() > MAX_POINTS {
+            return Err(TrajectoryError::Points { points: trajectory.points.len() });
+        }
+        let mut knots: Vec<Knot> = Vec::with_capacity(trajectory.points.len());
+        for (index, point) in trajectory.points.iter().enumerate() {
+            let wrong = |reason: String| TrajectoryError::Point { index, reason };
+            let seven = |values: &[f64], what: &str| -> Result<Joints, TrajectoryError> {
+                let joints: Joints =
+                    values.try_into().map_err(|_| wrong(format!("{} {what}, expected 7", values.len())))?;
+                if joints.iter().all(|v| v.is_finite()) { Ok(joints) } else { Err(wrong(format!("{what} not finite"))) }
+            };
+            let after = knots.last().map_or(0.0, |k| k.time_s);
+            let grows = if index == 0 { point.time_s == 0.0 } else { point.time_s > after && point.time_s.is_finite() };
+            if !grows {
+                return Err(wrong(format!("time {} s does not grow strictly from 0", point.time_s)));
+            }
+            let velocities = seven(&point.velocities, "velocities")?;
+            knots.push(Knot { time_s: point.time_s, positions: seven(&point.positions, "positions")?, velocities });
+        }
+        Ok(ArmTrajectory { knots })
+    }
+
+    /// As a trajectory of the task model.
+    pub fn to_model(&self, robot: &Robot) -> Trajectory {
+        let point = |knot: &Knot| TrajectoryPoint {
+            time_s: knot.time_s,
+            positions: knot.positions.to_vec(),
+            velocities: knot.velocities.to_vec(),
+        };
+        Trajectory {
+            joints: robot.arm_joints().iter().map(|j| j.name.clone()).collect(),
+            points: self.knots.iter().map(point).collect(),
+        }
+    }
+
+    /// The points.
+    pub fn knots(&self) -> &[Knot] {
+        &self.knots
+    }
+
+    /// Seconds from start to end.
+    pub fn duration_s(&self) -> f64 {
+        self.knots.last().map_or(0.0, |k| k.time_s)
+    }
+
+    /// Where the trajectory ends.
+    pub fn end(&self) -> Joints {
+        self.knots.last().map_or([0.0; 7], |k| k.positions)
+    }
+
+    /// Where the arm is at a moment; before the start and after the end it stands.
+    pub fn sample(&self, time_s: f64) -> Knot {
+        let next = self.knots.partition_point(|k| k.time_s <= time_s);
+        if next == 0 || next == self.knots.len() {
+            let knot = if next == 0 { &self.knots[0] } else { &self.knots[next - 1] };
+            return Knot { time_s, positions: knot.positions, velocities: [0.0; 7] };
+        }
+        hermite(&self.knots[next - 1], &self.knots[next], time_s)
+    }
+
+    /// Per segment the greatest absolute velocities and accelerations of each joint.
+    pub(crate) fn extremes(&self) -> impl Iterator<Item = (Joints, Joints)> {
+        self.knots.windows(2).map(|pair| {
+            let (a, b) = (&pair[0], &pair[1]);
+            let h = b.time_s - a.time_s;
+            let (mut velocities, mut accelerations) = ([0.0; 7], [0.0; 7]);
+            for j in 0..7 {
+                let mean = (b.positions[j] - a.positions[j]) / h;
+                let (v0, v1) = (a.velocities[j], b.velocities[j]);
+                let (a0, a1) = ((6.0 * mean - 4.0 * v0 - 2.0 * v1) / h, (2.0 * v0 + 4.0 * v1 - 6.0 * mean) / h);
+                let mut fastest = v0.abs().max(v1.abs());
+                // The velocity's extreme lies where the acceleration, which is linear, is zero.
+                if a0 * a1 < 0.0 {
+                    let t = h * a0 / (a0 - a1);
+                    fastest = fastest.max((v0 + a0 * t / 2.0).abs());
+                }
+                velocities[j] = fastest;
+                accelerations[j] = a0.abs().max(a1.abs());
+            }
+            (velocities, accelerations)
+        })
+    }
+}
+
+fn hermite(a: &Knot, b: &Knot, time_s: f64) -> Knot {
+    let h = b.time_s - a.time_s;
+    let t = (time_s - a.time_s) / h;
+    let (t2, t3) = (t * t, t * t * t);
+    let positions = std::array::from_fn(|j| {
+        (2.0 * t3 - 3.0 * t2 + 1.0) * a.positions[j]
+            + (t3 - 2.0 * t2 + t) * h * a.velocities[j]
+            + (3.0 * t2 - 2.0 * t3) * b.positions[j]
+            + (t3 - t2) * h * b.velocities[j]
+    });
+    let velocities = std::array::from_fn(|j| {
+        6.0 * (t2 - t) / h * (a.positions[j] - b.positions[j])
+            + (3.0 * t2 - 4.0 * t + 1.0) * a.velocities[j]
+            + (3.0 * t2 - 2.0 * t) * b.velocities[j]
+    });
+    Knot { time_s, positions, velocities }
+}

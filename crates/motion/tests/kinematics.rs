@@ -1,0 +1,105 @@
+//! The kinematics against what is published of the arm, and inverse against forward kinematics.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use proptest::prelude::*;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_motion::aimm;
+use ratn_motion::inverse::Solver;
+use ratn_motion::line::line;
+use ratn_motion::robot::{Configuration, DEGREES_OF_FREEDOM, Joints, Robot};
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// The LWR 4+ by its Denavit-Hartenberg parameters (a = 0): flange as seen from the foot.
+fn by_denavit_hartenberg(arm: &Joints) -> Pose {
+    let lengths = [0.3105, 0.0, 0.40, 0.0, 0.39, 0.0, 0.078];
+    let twists = [FRAC_PI_2, -FRAC_PI_2, -FRAC_PI_2, FRAC_PI_2, FRAC_PI_2, -FRAC_PI_2, 0.0];
+    (0..7).fold(Pose::IDENTITY, |pose, i| {
+        let turned = pose.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, arm[i]));
+        turned.compose(&Pose::from_rpy([0.0, 0.0, lengths[i]], twists[i], 0.0, 0.0))
+    })
+}
+
+fn postures() -> impl Strategy<Value = Joints> {
+    let robot = Robot::aimm();
+    let limits = robot.arm_joints().iter().map(|j| j.lower..j.upper).collect::<Vec<_>>();
+    limits.prop_map(|v| v.try_into().unwrap())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn the_chain_is_that_of_the_published_parameters(arm in postures(), x in -2.0..2.0, yaw in -3.0..3.0) {
+        let robot = Robot::aimm();
+        let base = Pose::from_rpy([x, 0.5, 0.0], 0.0, 0.0, yaw);
+        let configuration = Configuration { arm, ..Configuration::ZERO.with_base(&base) };
+        let flange = robot.pose(&configuration, robot.link("arm_7").unwrap());
+        let foot = robot.pose(&configuration, robot.arm_foot);
+        let expected = foot.compose(&by_denavit_hartenberg(&arm));
+        prop_assert!(flange.distance(&expected) < 1e-9 && flange.angle(&expected) < 1e-6);
+    }
+
+    #[test]
+    fn solutions_reach_the_pose_within_limits(arm in postures(), seed in 0_u64..1000) {
+        let robot = Robot::aimm();
+        let mut solver = Solver::new(&robot, &Pose::at(0.3, -0.2, 0.0));
+        let target = solver.tool(&arm);
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let solutions = solver.solutions(&target, &aimm::HOME, 4, 60, &mut random);
+        prop_assert!(!solutions.is_empty(), "a pose taken from a posture can be reached");
+        for solution in solutions {
+            let tool = solver.tool(&solution);
+            prop_assert!(tool.distance(&target) < 1e-5 && tool.angle(&target) < 1e-5);
+            prop_assert_eq!(robot.clamp(&solution), solution);
+        }
+    }
+
+    #[test]
+    fn a_straight_line_is_straight(dx in -0.05..0.05, dz in 0.0..0.1) {
+        let robot = Robot::aimm();
+        let mut solver = Solver::new(&robot, &Pose::IDENTITY);
+        let start = solver.tool(&aimm::HOME);
+        let postures = line(&mut solver, &aimm::HOME, [dx, 0.0, dz]).unwrap();
+        for pair in postures.windows(2) {
+            let middle = ratn_motion::collision::between(&pair[0], &pair[1], 0.5);
+            let tool = solver.tool(&middle);
+            let [x, y, z] = [0, 1, 2].map(|i| tool.position[i] - start.position[i]);
+            prop_assert!(y.abs() < 1e-4 && (x * dz - z * dx).abs() < 1e-4 && tool.angle(&start) < 1e-3);
+        }
+    }
+}
+
+#[test]
+fn the_robot_has_the_thirteen_degrees_of_freedom_of_the_paper() {
+    let robot = Robot::aimm();
+    assert_eq!(robot.joints.len(), DEGREES_OF_FREEDOM);
+    let degrees = |x: f64| (x * 180.0 / PI).round();
+    let limits: Vec<f64> = robot.arm_joints().iter().map(|j| degrees(j.upper)).collect();
+    let speeds: Vec<f64> = robot.arm_joints().iter().map(|j| degrees(j.velocity)).collect();
+    assert_eq!(limits, [170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 170.0]);
+    assert_eq!(speeds, [110.0, 110.0, 128.0, 128.0, 204.0, 184.0, 184.0]);
+    assert_eq!(robot.finger().upper * 2.0, aimm::GRIPPER_OPENING_M);
+}
+
+#[test]
+fn looking_at_a_point_puts_it_on_the_optical_axis() {
+    let robot = Robot::aimm();
+    let base = Pose::from_rpy([0.2, -0.1, 0.0], 0.0, 0.0, 0.4);
+    let target = base.transform(aimm::TABLE_CENTRE);
+    let (pan, tilt) = robot.look_at(&base, target);
+    let camera = robot.camera_pose(&Configuration { pan, tilt, ..Configuration::ZERO.with_base(&base) });
+    let seen = camera.inverse().transform(target);
+    assert!(seen[0].abs() < 1e-6 && seen[1].abs() < 1e-6 && seen[2] > 1.0, "{seen:?}");
+    // The image is upright: what is higher in the world is further up, which is -y.
+    let above = camera.inverse().transform([target[0], target[1], target[2] + 0.1]);
+    assert!(above[1] < -0.05 && above[0].abs() < 0.01, "{above:?}");
+}
+
+#[test]
+fn a_description_without_a_joint_is_refused_by_name() {
+    let error = Robot::from_urdf(r#"<robot name="r"><link name="world"/></robot>"#).unwrap_err();
+    assert_eq!(error.to_string(), "the robot description has no joint `base_x`");
+}

@@ -1,0 +1,215 @@
+//! Whole motions in the cell: approach, transfer with the box, retract.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod common;
+
+use common::{Cell, request};
+use proptest::prelude::*;
+use ratn_model::pose::Pose;
+use ratn_motion::aimm;
+use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact};
+use ratn_motion::pace::{Control, Progress};
+use ratn_motion::plan::{Goal, Plan, PlanError, plan};
+use ratn_motion::robot::Robot;
+use ratn_motion::trajectory::ArmTrajectory;
+use ratn_motion::validate::{Violation, validate_trajectory};
+use ratn_world::scene::{Placement, SceneObject, Shape};
+
+/// The whole trajectory touches nothing but with the gripper, checked exactly and four times as densely as it was planned.
+fn assert_valid(cell: &Cell, plan: &Plan, speed: f64) {
+    let contact = Contact::Gripper(CONTACT_TOLERANCE_M);
+    let valid = validate_trajectory(&cell.robot, &cell.scene, &cell.arm, None, &plan.trajectory, contact);
+    let trajectory = valid.unwrap_or_else(|violation| panic!("{violation}"));
+    let mut exact = Checker::new(&cell.robot, &cell.scene, 0.0);
+    for pair in trajectory.knots().windows(2) {
+        let samples = exact.steps(&pair[0].positions, &pair[1].positions);
+        for i in 0..samples {
+            let time = pair[0].time_s + (pair[1].time_s - pair[0].time_s) * i as f64 / samples as f64;
+            let collision = exact.collision(&trajectory.sample(time).positions, contact);
+            assert_eq!(collision, None, "at {time:.3} s");
+        }
+    }
+    for knot in trajectory.knots() {
+        for (j, joint) in cell.robot.arm_joints().iter().enumerate() {
+            assert!(knot.velocities[j].abs() <= joint.velocity * speed * 1.001, "{} at {}", joint.name, knot.time_s);
+            assert!((joint.lower..=joint.upper).contains(&knot.positions[j]), "{} at {}", joint.name, knot.time_s);
+        }
+    }
+    assert_eq!(trajectory.end(), plan.end);
+}
+
+fn carry(cell: &mut Cell, name: &str, slot: usize) {
+    let context = |what: &str, e: PlanError| panic!("{what} {name} → slot {slot}: {e}");
+    let plan = cell.plan(&cell.approach(name)).unwrap_or_else(|e| context("approach", e));
+    assert_valid(cell, &plan, 0.3);
+    cell.follow(&plan);
+    cell.grasp(name);
+    let plan = cell.plan(&cell.transfer(name, slot)).unwrap_or_else(|e| context("transfer", e));
+    assert_valid(cell, &plan, 0.3);
+    cell.follow(&plan);
+    cell.release(name);
+    let plan = cell.plan(&cell.retract()).unwrap_or_else(|e| context("retract", e));
+    assert_valid(cell, &plan, 0.3);
+    cell.follow(&plan);
+}
+
+#[test]
+fn one_box_is_carried_to_every_slot() {
+    for slot in 0..aimm::SLOT_COUNT {
+        let mut cell = Cell::with_boxes(1, slot as u64);
+        carry(&mut cell, "box_1", slot);
+    }
+}
+
+#[test]
+fn three_boxes_are_carried_to_any_three_slots() {
+    for first in 0..3 {
+        let mut cell = Cell::with_boxes(3, 10 + first as u64);
+        for i in 0..3 {
+            carry(&mut cell, &format!("box_{}", i + 1), first + 3 * i);
+        }
+    }
+}
+
+#[test]
+fn nine_boxes_are_carried_until_the_deck_is_full() {
+    for seed in 20..22 {
+        let mut cell = Cell::with_boxes(9, seed);
+        for i in 0..9 {
+            carry(&mut cell, &format!("box_{}", i + 1), i);
+        }
+    }
+}
+
+#[test]
+fn the_same_seed_and_iterations_give_the_same_plan() {
+    let mut cell = Cell::with_boxes(3, 1);
+    cell.improvement_iterations = 300;
+    let request = cell.approach("box_2");
+    assert_eq!(cell.plan(&request).unwrap(), cell.plan(&request).unwrap());
+}
+
+#[test]
+fn more_iterations_never_make_the_path_longer() {
+    let mut cell = Cell::with_boxes(3, 2);
+    let lengths = [0, 100, 400, 1600].map(|iterations| {
+        cell.improvement_iterations = iterations;
+        let plan = cell.plan(&cell.approach("box_1")).unwrap();
+        assert!(plan.length_rad <= plan.first_length_rad + 1e-9);
+        plan.length_rad
+    });
+    assert!(lengths.is_sorted_by(|a, b| b <= a), "{lengths:?}");
+}
+
+#[test]
+fn when_time_is_up_the_best_path_so_far_is_the_answer() {
+    let cell = Cell::with_boxes(3, 3);
+    let mut request = cell.approach("box_1");
+    request.improvement_iterations = usize::MAX;
+    let mut found = false;
+    let mut asked = 0;
+    let plan = plan(&cell.robot, &cell.scene, &request, &mut |progress| {
+        found |= matches!(progress, Progress::FirstPath { .. });
+        asked += usize::from(found);
+        if asked > 500 { Control::TimeUp } else { Control::Continue }
+    });
+    assert_valid(&cell, &plan.unwrap(), 0.3);
+}
+
+#[test]
+fn a_cancelled_planning_ends_at_once() {
+    let cell = Cell::with_boxes(3, 3);
+    let mut asked = 0;
+    let outcome = plan(&cell.robot, &cell.scene, &cell.approach("box_1"), &mut |_| {
+        asked += 1;
+        if asked == 5 { Control::Cancelled } else { Control::Continue }
+    });
+    assert_eq!((outcome, asked), (Err(PlanError::Cancelled), 5));
+}
+
+#[test]
+fn a_walled_in_goal_is_refused_with_what_is_in_the_way() {
+    let mut cell = Cell::with_boxes(1, 4);
+    let Placement::World(pose) = cell.object("box_1").placement else { panic!() };
+    let lid = Pose::at(pose.position[0], pose.position[1], 0.95);
+    let shape = Shape::Box { size: [0.4, 0.4, 0.02] };
+    cell.scene.objects.push(SceneObject { name: "lid".into(), shape, placement: Placement::World(lid) });
+    let error = cell.plan(&cell.approach("box_1")).unwrap_err().to_string();
+    assert!(error.contains("none of the 2 goals can be reached") && error.contains("lid"), "{error}");
+}
+
+#[test]
+fn a_pose_out_of_reach_is_refused_as_such() {
+    let cell = Cell::with_boxes(1, 5);
+    let error = cell.plan(&request(cell.arm, vec![Goal::Pose(Pose::at(3.0, 0.0, 1.0))])).unwrap_err();
+    assert_eq!(error.to_string(), "none of the 1 goals can be reached: the arm does not reach (3.000, 0.000, 1.000)");
+}
+
+#[test]
+fn a_start_inside_the_table_is_refused() {
+    let mut cell = Cell::with_boxes(0, 0);
+    cell.arm = [-1.5707, -1.7, 0.0, 0.3, 0.0, 0.0, 0.0];
+    let error = cell.plan(&request(cell.arm, vec![Goal::Joints(aimm::HOME)])).unwrap_err().to_string();
+    assert!(error.starts_with("at the start ") && error.contains("inside table"), "{error}");
+}
+
+#[test]
+fn a_trajectory_that_meets_something_or_starts_elsewhere_is_refused() {
+    let cell = Cell::with_boxes(1, 6);
+    let plan = cell.plan(&cell.approach("box_1")).unwrap();
+    let check = |scene, start| validate_trajectory(&cell.robot, scene, start, None, &plan.trajectory, Contact::None);
+    assert!(matches!(check(&cell.scene, &aimm::HOME), Err(Violation::Start { .. })));
+    let mut blocked = cell.scene.clone();
+    let Placement::World(pose) = cell.object("box_1").placement else { panic!() };
+    let placement = Placement::World(Pose::at(pose.position[0], pose.position[1], 0.9));
+    blocked.objects.push(SceneObject {
+        name: "lamp".into(),
+        shape: Shape::Cylinder { radius: 0.1, length: 0.1 },
+        placement,
+    });
+    let violation = check(&blocked, &cell.arm).unwrap_err();
+    assert!(matches!(&violation, Violation::Collision { collision, .. } if collision.other == "lamp"), "{violation}");
+    let mut hasty = plan.trajectory.clone();
+    for point in &mut hasty.points {
+        point.time_s /= 5.0;
+        point.velocities.iter_mut().for_each(|v| *v *= 5.0);
+    }
+    let outcome = validate_trajectory(&cell.robot, &cell.scene, &cell.arm, None, &hasty, Contact::Gripper(0.012));
+    assert!(matches!(outcome, Err(Violation::Limit { .. })), "{outcome:?}");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 24, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn every_plan_is_valid_at_four_times_its_resolution(seed in 0_u64..10_000, boxes in 1_usize..10, speed in 0.1..1.0) {
+        let mut cell = Cell::with_boxes(boxes, seed);
+        cell.improvement_iterations = 60;
+        let mut request = cell.approach("box_1");
+        request.seed = seed;
+        request.speed = speed;
+        let plan = cell.plan(&request).unwrap();
+        assert_valid(&cell, &plan, speed);
+    }
+
+    #[test]
+    fn accelerations_keep_within_their_limits(seed in 0_u64..10_000, speed in 0.1..1.0) {
+        let cell = Cell::with_boxes(3, seed);
+        let mut request = cell.approach("box_3");
+        request.speed = speed;
+        let plan = cell.plan(&request).unwrap();
+        let trajectory = ArmTrajectory::read(&Robot::aimm(), &plan.trajectory).unwrap();
+        let at = |t: f64| trajectory.sample(t).velocities;
+        for pair in trajectory.knots().windows(2) {
+            let (t, h) = (pair[0].time_s, (pair[1].time_s - pair[0].time_s) / 8.0);
+            for i in 0..8 {
+                let (a, b) = (at(t + h * f64::from(i)), at(t + h * (f64::from(i) + 0.999_999)));
+                for (j, joint) in cell.robot.arm_joints().iter().enumerate() {
+                    let acceleration = (b[j] - a[j]).abs() / h;
+                    prop_assert!(acceleration <= joint.acceleration * speed * 1.01, "{} {acceleration}", joint.name);
+                }
+            }
+        }
+    }
+}
