@@ -128,6 +128,8 @@ pub enum Function {
     Concat,
     /// `repeat(value, n)` → list of n times the value
     Repeat,
+    /// `take(list, n)` → the first n elements, or all if there are fewer
+    Take,
 }
 
 /// Operators of one operand.

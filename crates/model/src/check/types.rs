@@ -312,6 +312,11 @@ fn call(function: Function, arguments: &[Expr], types: &[Type]) -> Found {
             }
             Type::String
         }
+        Function::Take => {
+            expect(0, Type::List(Box::new(Type::Any)))?;
+            expect(1, Type::Int)?;
+            types[0].clone()
+        }
         Function::Repeat => {
             expect(1, Type::Int)?;
             Type::List(Box::new(types[0].clone()))

@@ -16,7 +16,7 @@ pub const GRASP_DEPTH_M: f64 = 0.03;
 
 impl Function {
     /// Every function.
-    pub const ALL: [Function; 15] = [
+    pub const ALL: [Function; 16] = [
         Function::Len,
         Function::Range,
         Function::Min,
@@ -32,6 +32,7 @@ impl Function {
         Function::PlacePose,
         Function::Concat,
         Function::Repeat,
+        Function::Take,
     ];
 
     /// Its name in an expression.
@@ -52,6 +53,7 @@ impl Function {
             Function::PlacePose => "place_pose",
             Function::Concat => "concat",
             Function::Repeat => "repeat",
+            Function::Take => "take",
         }
     }
 
@@ -78,6 +80,7 @@ impl Function {
             Function::PlacePose => "place_pose(target, in_gripper)",
             Function::Concat => "concat(a, b, …)",
             Function::Repeat => "repeat(value, n)",
+            Function::Take => "take(list, n)",
         }
     }
 
@@ -86,7 +89,9 @@ impl Function {
         match self {
             Function::Len | Function::Abs | Function::Inverse | Function::GraspPose => arguments == 1,
             Function::Range => matches!(arguments, 1 | 2),
-            Function::Compose | Function::Between | Function::PlacePose | Function::Repeat => arguments == 2,
+            Function::Compose | Function::Between | Function::PlacePose | Function::Repeat | Function::Take => {
+                arguments == 2
+            }
             Function::If => arguments == 3,
             Function::Pose => matches!(arguments, 3 | 6),
             Function::Min | Function::Max | Function::Joints | Function::Concat => arguments >= 1,
@@ -137,6 +142,10 @@ pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, Str
                 return Err(format!("the list is longer than {MAX_LIST}"));
             }
             Ok(Value::List(vec![value.clone(); times]))
+        }
+        (Function::Take, [Value::List(items), count]) => {
+            let count = usize::try_from(int(count)?).map_err(|_| "cannot take a negative number".to_owned())?;
+            Ok(Value::List(items.iter().take(count).cloned().collect()))
         }
         _ => Err(format!("expected `{}`", function.usage())),
     }
