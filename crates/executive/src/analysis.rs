@@ -3,11 +3,11 @@
 
 use ratn_model::expression::{EffectExpr, Expr, FactExpr};
 use ratn_model::id::StateId;
-use ratn_model::program::{Nature, Program, ResourceExpr, State, StateKind, WORLD_MODEL};
+use ratn_model::program::{Nature, Program, ResourceExpr, SUCCESS, State, StateKind, WORLD_MODEL};
 use ratn_model::resource::ResourceOperation;
 use std::collections::BTreeSet;
 
-/// What a node does to the environment; a routine is the most committing of what it contains.
+/// What a node does to the environment. A routine computes if all of it does, else it is irreversible.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum NodeNature {
     /// Works on a projection.
@@ -33,6 +33,8 @@ pub(crate) struct StateAnalysis {
     pub(crate) senses: Vec<FactExpr>,
     /// What it reads, with that of the hierarchies around it and of what it contains; `None` is everything.
     pub(crate) reads: Option<Vec<FactExpr>>,
+    /// What it may write, with that of what it contains, whatever the outcome; `None` is everything.
+    pub(crate) writes: Option<Vec<EffectExpr>>,
     /// Whether it works on a projection of the world model.
     pub(crate) needs_world: bool,
 }
@@ -84,9 +86,14 @@ fn analyse(program: &Program, state: &State) -> StateAnalysis {
     }
     flows.retain(|id| !subtree.contains(id));
     StateAnalysis {
-        nature: contained.iter().map(|s| own_nature(s)).max().unwrap_or(NodeNature::Computes),
+        nature: match contained.iter().map(|s| own_nature(s)).max() {
+            // What it senses may depend on what it changed just before: it runs at its place in the program.
+            Some(NodeNature::Senses) if contained.len() > 1 => NodeNature::Irreversible,
+            nature => nature.unwrap_or(NodeNature::Computes),
+        },
         needs_world: requirements.iter().any(|r| r.kind == WORLD_MODEL),
         operations: operations(state),
+        writes: contained.iter().map(|s| own_writes(s)).collect::<Option<Vec<_>>>().map(|all| all.concat()),
         reads: reads(&contained, &around),
         senses: contained
             .iter()
@@ -110,6 +117,15 @@ fn own_nature(state: &State) -> NodeNature {
         (StateKind::Action { .. }, Nature::Senses(_)) => NodeNature::Senses,
         _ => NodeNature::Computes,
     }
+}
+
+/// The effects of every outcome. An irreversible action that does not say what success changes may change everything.
+fn own_writes(state: &State) -> Option<Vec<EffectExpr>> {
+    let effects = &state.annotations.effects;
+    if own_nature(state) == NodeNature::Irreversible && !effects.contains_key(SUCCESS) {
+        return None;
+    }
+    Some(effects.values().flatten().cloned().collect())
 }
 
 /// Blocks merge by maximum; consumes and exists add up as they are, but only from within (a hierarchy's happen once).

@@ -16,7 +16,7 @@ use crate::protocol::{Command, Event, Goal, Note};
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, Revision, StateId};
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind, WORLD_MODEL};
-use ratn_model::resource::Lease;
+use ratn_model::resource::{Lease, Requirement};
 use ratn_model::value::Value;
 use ratn_world::world::World;
 use std::borrow::Cow;
@@ -68,8 +68,10 @@ pub(crate) enum Target {
     Projection {
         /// The root's revision below it.
         base: Revision,
-        /// What was changed since, in order.
+        /// What was changed since, in order: first what older instances will have changed, then what this one has.
         changes: Vec<Change>,
+        /// How many of them are the older instances'.
+        before: usize,
         /// The result.
         world: World,
     },
@@ -118,9 +120,16 @@ pub(crate) struct Interpreter {
     variables: Vec<(String, Value)>,
     outputs: BTreeMap<StateId, Outputs>,
     current: Option<Current>,
-    held: Option<Lease>,
-    routine: bool,
+    routine: Option<Routine>,
     target: Target,
+}
+
+/// What a routine holds for everything it contains.
+pub(crate) struct Routine {
+    /// What it asks for.
+    pub(crate) requirements: Vec<Requirement>,
+    /// What it was granted; `None` while it asks again because a worker of it died.
+    pub(crate) lease: Option<Lease>,
 }
 
 struct Scoped<'a> {
@@ -146,8 +155,7 @@ impl Interpreter {
             variables: parameters.iter().map(|(n, v)| (n.clone(), v.clone())).collect(),
             outputs: BTreeMap::new(),
             current: None,
-            held: None,
-            routine: false,
+            routine: None,
             target: Target::Actual,
         }
     }
@@ -156,10 +164,15 @@ impl Interpreter {
     pub(crate) fn of_routine(
         variables: Vec<(String, Value)>,
         outputs: BTreeMap<StateId, Outputs>,
-        lease: Option<Lease>,
+        routine: Routine,
         target: Target,
     ) -> Interpreter {
-        Interpreter { frames: Vec::new(), variables, outputs, current: None, held: lease, routine: true, target }
+        Interpreter { frames: Vec::new(), variables, outputs, current: None, routine: Some(routine), target }
+    }
+
+    /// What a routine holds now.
+    pub(crate) fn lease(&self) -> Option<&Lease> {
+        self.routine.as_ref()?.lease.as_ref()
     }
 
     /// Begins with `state`.
@@ -180,6 +193,14 @@ impl Interpreter {
         &self.outputs
     }
 
+    /// The changes it has made to its projection; none in the actual world, where they are real already.
+    pub(crate) fn into_changes(self) -> Vec<Change> {
+        match self.target {
+            Target::Actual => Vec::new(),
+            Target::Projection { changes, before, .. } => changes[before..].to_vec(),
+        }
+    }
+
     /// Uses the scope of the outermost state: its parameters, and the outputs of what it has executed.
     pub(crate) fn in_scope<T>(
         &self,
@@ -194,7 +215,10 @@ impl Interpreter {
         let Some(current) = self.current.as_mut() else { return Progress::Busy };
         match event {
             Event::Granted { instance, lease } if instance == current.instance => {
-                current.lease = Some(lease);
+                match &mut self.routine {
+                    Some(routine) => routine.lease = Some(lease),
+                    None => current.lease = Some(lease),
+                }
                 self.project_or_run(context)
             }
             Event::Refused { instance, reason } if instance == current.instance => {
@@ -365,10 +389,7 @@ impl Interpreter {
             projection: None,
         });
         let wanted = &analysis.state(id).requirements;
-        if self.routine || wanted.is_empty() {
-            if let Some(current) = self.current.as_mut() {
-                current.lease = self.held.clone();
-            }
+        if self.routine.is_some() || wanted.is_empty() {
             return match self.project_or_run(context) {
                 Progress::Busy => Ok(()),
                 Progress::Ended { reason, .. } => Err(reason),
@@ -419,7 +440,7 @@ impl Interpreter {
             action: action.clone(),
             inputs,
             seed: binding::seed(context.seed, &current.path),
-            lease: current.lease.clone(),
+            lease: self.routine.as_ref().map_or(&current.lease, |routine| &routine.lease).clone(),
             projection: current.projection,
             expected_s,
         };
@@ -433,8 +454,7 @@ impl Interpreter {
         let state = context.program.state(current.state);
         self.give_back(context, &current);
         let again = context.analysis.state(current.state).nature != crate::analysis::NodeNature::Irreversible
-            && current.attempt < state.annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS)
-            && !self.routine;
+            && current.attempt < state.annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
         if !again {
             let (path, attempt) = (current.path.clone(), current.attempt);
             current.lease = None;
@@ -443,9 +463,19 @@ impl Interpreter {
             return self.leave(context, ABORTED, format!("{path} crashed in attempt {attempt}: {reason}"));
         }
         let (instance, id) = (current.instance, current.state);
-        let requirements = self.with_scope(context, None, |scope| {
-            binding::requirements(state, &context.analysis.state(id).requirements, scope)
-        });
+        let requirements = match &mut self.routine {
+            // Nothing of it moves between two nodes: it gives everything back and asks for all of it again.
+            Some(routine) => {
+                let lease = routine.lease.take().map(|l| l.id);
+                if lease.is_some() {
+                    context.commands.push(Command::Release { instance, lease, projection: None });
+                }
+                Ok(routine.requirements.clone())
+            }
+            None => self.with_scope(context, None, |scope| {
+                binding::requirements(state, &context.analysis.state(id).requirements, scope)
+            }),
+        };
         let requirements = match requirements {
             Ok(requirements) => requirements,
             Err(error) => return self.leave(context, ABORTED, error.reason()),
@@ -495,7 +525,9 @@ impl Interpreter {
             (outcome, reason) = (ABORTED.to_owned(), problem);
         }
         self.give_back(context, &current);
-        context.note(Note::Retired { instance });
+        if matches!(self.target, Target::Actual) {
+            context.note(Note::Retired { instance });
+        }
         if outcome == SUCCESS {
             return self.advance(context);
         }
@@ -556,7 +588,7 @@ impl Interpreter {
     }
 
     fn give_back(&self, context: &mut Context<'_>, current: &Current) {
-        let lease = if self.routine { None } else { current.lease.as_ref().map(|l| l.id) };
+        let lease = current.lease.as_ref().map(|l| l.id);
         if lease.is_some() || current.projection.is_some() {
             context.commands.push(Command::Release {
                 instance: current.instance,

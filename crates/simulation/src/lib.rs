@@ -1,1 +1,10 @@
-//! All cores together in virtual time: the paper's tables.
+//! All cores together in virtual time: the executive, the resource pool and the world, with providers that answer after as
+//! many virtual seconds as an [`run::Oracle`] says.
+//!
+//! Nothing here waits, opens a socket or reads a clock: the same program, oracle and seed give the same run to the last
+//! event. [`tables`] replays the paper's tables this way; the property tests compare the two modes.
+
+pub mod random;
+pub mod run;
+pub mod tables;
+pub mod timed;

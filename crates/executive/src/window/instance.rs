@@ -4,9 +4,9 @@ use crate::analysis::{NodeNature, StateAnalysis};
 use crate::binding::{Names, Outputs};
 use crate::interpreter::Interpreter;
 use imbl::OrdMap;
-use ratn_model::fact::{FactKey, Footprint};
+use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, StateId};
-use ratn_model::program::SUCCESS;
+use ratn_model::program::{ABORTED, SUCCESS};
 use ratn_model::resource::Lease;
 use ratn_model::value::Value;
 use std::borrow::Cow;
@@ -81,21 +81,37 @@ pub(crate) enum Wait {
 pub(crate) struct Ended {
     pub(crate) outcome: String,
     pub(crate) outputs: Outputs,
-    pub(crate) measured: Vec<(FactKey, Value)>,
     pub(crate) reason: String,
+    pub(crate) changes: Changed,
+}
+
+/// What an ended instance changes when it retires.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Changed {
+    /// What it declares for its outcome, with what was measured.
+    Declared(Vec<(FactKey, Value)>),
+    /// Exactly this: a routine on a projection (or nothing: a routine in the actual world has made its changes already,
+    /// and what was never executed has none).
+    Exactly(Vec<Change>),
 }
 
 impl Ended {
     pub(crate) fn success(outputs: Outputs) -> Ended {
-        Ended { outcome: SUCCESS.to_owned(), outputs, measured: Vec::new(), reason: String::new() }
+        let changes = Changed::Declared(Vec::new());
+        Ended { outcome: SUCCESS.to_owned(), outputs, reason: String::new(), changes }
     }
 
+    /// It was never executed, or nobody knows how far: it changes nothing.
     pub(crate) fn aborted(reason: String) -> Ended {
-        Ended {
-            outcome: ratn_model::program::ABORTED.to_owned(),
-            outputs: Outputs::new(),
-            measured: Vec::new(),
-            reason,
+        let changes = Changed::Exactly(Vec::new());
+        Ended { outcome: ABORTED.to_owned(), outputs: Outputs::new(), reason, changes }
+    }
+
+    /// Facts as measured.
+    pub(crate) fn measured(&self) -> &[(FactKey, Value)] {
+        match &self.changes {
+            Changed::Declared(measured) => measured,
+            Changed::Exactly(_) => &[],
         }
     }
 }

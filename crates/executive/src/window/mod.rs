@@ -19,7 +19,7 @@ use crate::binding;
 use crate::interpreter::{Context, DEFAULT_ATTEMPTS, Progress};
 use crate::protocol::{Command, Event, Note};
 use expand::Cursor;
-use instance::{Ended, Instance, Instances, Status};
+use instance::{Changed, Ended, Instance, Instances, Status};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, StateKind};
 use ratn_model::value::Value;
@@ -100,7 +100,8 @@ impl Window {
             Event::Finished { instance, attempt, outcome, outputs, measured, reason } => {
                 match self.with_status(instance, Status::Running) {
                     Some(running) if running.attempt == attempt && running.routine.is_none() => {
-                        self.finish(context, instance, Ended { outcome, outputs, measured, reason });
+                        let changes = Changed::Declared(measured);
+                        self.finish(context, instance, Ended { outcome, outputs, reason, changes });
                     }
                     _ => {
                         let event = Event::Finished { instance, attempt, outcome, outputs, measured, reason };
@@ -177,12 +178,11 @@ impl Window {
     fn routine_progressed(&mut self, context: &mut Context<'_>, id: InstanceId, progress: Progress) {
         let Progress::Ended { outcome, reason } = progress else { return };
         let Some(instance) = self.instances.alive.get_mut(&id) else { return };
-        let outputs = instance
-            .routine
-            .take()
-            .and_then(|routine| routine.outputs().get(&instance.state).cloned())
-            .unwrap_or_default();
-        self.finish(context, id, Ended { outcome, outputs, measured: Vec::new(), reason });
+        let Some(routine) = instance.routine.take() else { return };
+        instance.lease = routine.lease().cloned();
+        let outputs = routine.outputs().get(&instance.state).cloned().unwrap_or_default();
+        let changes = Changed::Exactly(routine.into_changes());
+        self.finish(context, id, Ended { outcome, outputs, reason, changes });
     }
 
     /// A node's result is known: it gives back what it held.
@@ -192,7 +192,7 @@ impl Window {
             && ended.outcome == SUCCESS
             && let Some(problem) = binding::missing_output(outputs, &ended.outputs)
         {
-            ended = Ended::aborted(problem);
+            ended = Ended { changes: ended.changes, ..Ended::aborted(problem) };
         }
         context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
         instance.status = Status::Finished;

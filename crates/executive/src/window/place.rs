@@ -1,13 +1,13 @@
 //! A place in the program: what holds there, as far as the older instances have made it known.
 
-use crate::analysis::NodeNature;
+use crate::analysis::{Analysis, StateAnalysis};
 use crate::binding::{Bindings, Outputs};
 use crate::effects;
-use crate::window::instance::{Instances, PlaceNames, Role};
+use crate::window::instance::{Changed, Ended, Instances, PlaceNames, Role};
 use ratn_model::expression::{EffectExpr, Scope};
 use ratn_model::fact::{Change, FactPattern, Footprint};
 use ratn_model::id::InstanceId;
-use ratn_model::program::{Program, SUCCESS};
+use ratn_model::program::{Program, SUCCESS, StateKind};
 use ratn_world::world::World;
 use std::collections::BTreeSet;
 
@@ -58,7 +58,7 @@ impl Place {
     }
 
     /// Moves on past an instance: its effects, known or not, hold from here.
-    pub(crate) fn pass(&mut self, program: &Program, instances: &Instances, id: InstanceId) {
+    pub(crate) fn pass(&mut self, program: &Program, analysis: &Analysis, instances: &Instances, id: InstanceId) {
         let Some(instance) = instances.alive.get(&id) else { return };
         self.oldest = false;
         self.speculative |= instance.is_undecided();
@@ -73,6 +73,20 @@ impl Place {
             }
         }
         let ended = instance.ended.as_ref();
+        if let Some(Changed::Exactly(changes)) = ended.map(|e| &e.changes) {
+            let footprint = Footprint::Patterns(changes.iter().map(Change::pattern).collect());
+            self.written = std::mem::replace(&mut self.written, Footprint::NOTHING).union(footprint.clone());
+            self.change(changes.clone(), footprint);
+            return;
+        }
+        if instance.role == Role::Node && !matches!(state.kind, StateKind::Action { .. }) {
+            // A routine's effects are unknown until it ends.
+            let writes = self.with_scope(instances, id, None, |scope| may_write(analysis.state(state.id), scope));
+            let writes = writes.unwrap_or(Footprint::Everything);
+            self.written = std::mem::replace(&mut self.written, Footprint::NOTHING).union(writes.clone());
+            self.forget(writes);
+            return;
+        }
         let outcome = ended.map_or(SUCCESS, |e| e.outcome.as_str());
         let declared = match instance.role {
             Role::Exit => state.annotations.effects.get(outcome).map_or(Some(&[][..]), |e| Some(e)),
@@ -93,7 +107,7 @@ impl Place {
             self.written = std::mem::replace(&mut self.written, Footprint::NOTHING).union(footprint.clone());
             match changes {
                 Ok(mut changes) => {
-                    put_measured(&mut changes, ended.map_or(&[], |e| &e.measured));
+                    put_measured(&mut changes, ended.map_or(&[], Ended::measured));
                     self.change(changes, footprint);
                 }
                 Err(_) => self.forget(footprint),
@@ -132,10 +146,11 @@ impl Place {
 }
 
 /// What a node may write if it ends with success or with any outcome whose effects are declared.
-pub(crate) fn may_write(state: &ratn_model::program::State, nature: NodeNature, scope: &dyn Scope) -> Footprint {
-    let Some(success) = effects::declared(state, nature, SUCCESS) else { return Footprint::Everything };
-    let others = state.annotations.effects.iter().filter(|(outcome, _)| *outcome != SUCCESS);
-    others.fold(EffectExpr::footprint(success, scope), |all, (_, e)| all.union(EffectExpr::footprint(e, scope)))
+pub(crate) fn may_write(analysis: &StateAnalysis, scope: &dyn Scope) -> Footprint {
+    match &analysis.writes {
+        Some(effects) => EffectExpr::footprint(effects, scope),
+        None => Footprint::Everything,
+    }
 }
 
 fn put_measured(changes: &mut [Change], measured: &[(ratn_model::fact::FactKey, ratn_model::value::Value)]) {

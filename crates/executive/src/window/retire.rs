@@ -5,12 +5,12 @@ use crate::binding;
 use crate::effects;
 use crate::interpreter::Context;
 use crate::protocol::{Command, Note};
-use crate::window::instance::{Ended, Role, Status};
+use crate::window::instance::{Changed, Ended, Role, Status};
 use crate::window::place::Place;
 use crate::window::{End, SWEEP_INTERVAL, Window, give_back};
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::InstanceId;
-use ratn_model::program::{ABORTED, SUCCESS};
+use ratn_model::program::{ABORTED, SUCCESS, StateKind};
 use std::collections::BTreeSet;
 
 impl Window {
@@ -59,18 +59,23 @@ impl Window {
             _ => Some(&[][..]),
         };
         let outputs = Some(&ended.outputs);
-        let changes = place.with_scope(&self.instances, id, outputs, |scope| {
-            effects::actual(declared, &ended.outcome, &ended.measured, scope)
-        });
-        if let Some(changes) = changes {
-            let changes = changes.map_err(|e| aborted(e.to_string()))?;
-            context.commit(id, changes).map_err(aborted)?;
-        }
+        let changes = match &ended.changes {
+            Changed::Exactly(changes) => changes.clone(),
+            Changed::Declared(measured) => place
+                .with_scope(&self.instances, id, outputs, |scope| {
+                    effects::actual(declared, &ended.outcome, measured, scope)
+                })
+                .unwrap_or_else(|| Ok(Vec::new()))
+                .map_err(|e| aborted(e.to_string()))?,
+        };
+        context.commit(id, changes).map_err(aborted)?;
         if ended.outcome != SUCCESS {
             return Err((ended.outcome.clone(), named(ended.reason)));
         }
         let wanted = &analysis.state(instance.state).operations;
-        if matches!(instance.role, Role::Node | Role::Exit) && !wanted.is_empty() {
+        // A routine has performed its own.
+        let is_routine = instance.role == Role::Node && !matches!(state.kind, StateKind::Action { .. });
+        if matches!(instance.role, Role::Node | Role::Exit) && !is_routine && !wanted.is_empty() {
             let operations = place
                 .with_scope(&self.instances, id, outputs, |scope| binding::requirements(state, wanted, scope))
                 .unwrap_or_else(|| Ok(Vec::new()))
@@ -199,7 +204,10 @@ impl Window {
                 context.commands.push(Command::Cancel { instance: id, attempt: instance.attempt });
             }
             Status::Running => match instance.routine.take() {
-                Some(mut routine) => routine.abort(context),
+                Some(mut routine) => {
+                    routine.abort(context);
+                    instance.lease = routine.lease().cloned();
+                }
                 None => context.commands.push(Command::Cancel { instance: id, attempt: instance.attempt }),
             },
             Status::Expanded | Status::Granted | Status::Finished => {}
@@ -223,7 +231,7 @@ impl Window {
     /// already built on the prediction: its result would be wrong, and it cannot be taken back yet.
     pub(crate) fn compare_with_prediction(&mut self, context: &Context<'_>, id: InstanceId) {
         let Some(instance) = self.instances.alive.get(&id) else { return };
-        let Some(ended) = instance.ended.as_ref().filter(|e| e.outcome == SUCCESS && !e.measured.is_empty()) else {
+        let Some(ended) = instance.ended.as_ref().filter(|e| e.outcome == SUCCESS && !e.measured().is_empty()) else {
             return;
         };
         let state = context.program.state(instance.state);
@@ -238,7 +246,7 @@ impl Window {
             let Some(Ok(predicted)) = predicted else { continue };
             for change in &predicted {
                 let Change::Set { fact, value } = change else { continue };
-                let Some((_, actual)) = ended.measured.iter().find(|(key, _)| key == fact) else { continue };
+                let Some((_, actual)) = ended.measured().iter().find(|(key, _)| key == fact) else { continue };
                 let written = Footprint::Patterns(vec![change.pattern()]);
                 let used = |younger: &crate::window::instance::Instance| {
                     younger.id > id
@@ -257,8 +265,8 @@ impl Window {
             }
         }
         if let (Some(reason), Some(instance)) = (deviation, self.instances.alive.get_mut(&id)) {
-            let measured = instance.ended.as_ref().map(|e| e.measured.clone()).unwrap_or_default();
-            instance.ended = Some(Ended { measured, ..Ended::aborted(reason) });
+            let measured = instance.ended.as_ref().map(|e| e.measured().to_vec()).unwrap_or_default();
+            instance.ended = Some(Ended { changes: Changed::Declared(measured), ..Ended::aborted(reason) });
         }
     }
 }

@@ -3,11 +3,11 @@
 
 use crate::analysis::NodeNature;
 use crate::binding::{self, Outputs};
-use crate::interpreter::{Context, Interpreter, Target};
+use crate::interpreter::{Context, Interpreter, Routine, Target};
 use crate::protocol::{Command, Goal, Note};
 use crate::window::instance::{Ended, Role, Status, Wait};
 use crate::window::place::{Place, may_write};
-use crate::window::{End, Window};
+use crate::window::{End, Window, give_back};
 use ratn_model::expression::FactExpr;
 use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
@@ -39,7 +39,7 @@ impl Window {
                 return true;
             }
             self.settle_result(context, id, &place);
-            place.pass(context.program, &self.instances, id);
+            place.pass(context.program, context.analysis, &self.instances, id);
             let next = self.instances.alive.get(&id).map(|i| i.next.clone()).unwrap_or_default();
             // The first branch is visited first.
             for younger in next.into_iter().rev() {
@@ -188,7 +188,7 @@ impl Window {
                 Some(facts) => FactExpr::footprint(facts, scope),
                 None => Footprint::Everything,
             };
-            (reads, FactExpr::footprint(&analysis.senses, scope), may_write(state, nature, scope))
+            (reads, FactExpr::footprint(&analysis.senses, scope), may_write(analysis, scope))
         });
         let Some((reads, senses, writes)) = bound else { return Readiness::Waits(Wait::Nothing) };
         if reads.overlaps(&place.unknown) || senses.overlaps(&place.unknown) {
@@ -317,6 +317,13 @@ impl Window {
     fn proceed(&mut self, context: &mut Context<'_>, id: InstanceId, place: &Place) -> bool {
         let Some(instance) = self.instances.alive.get_mut(&id) else { return false };
         let state = context.program.state(instance.state);
+        // While it waited for its resources an older instance may have changed what it would look at.
+        if instance.nature == NodeNature::Senses && !same_facts(&instance.senses, &place.world, context.root) {
+            instance.status = Status::Expanded;
+            instance.wait = Wait::Environment;
+            give_back(context, instance);
+            return true;
+        }
         let is_routine = !matches!(state.kind, StateKind::Action { .. });
         if context.analysis.state(instance.state).needs_world && instance.projection.is_none() && !is_routine {
             instance.status = Status::Projecting;
@@ -372,11 +379,17 @@ impl Window {
             _ => Target::Projection {
                 base: context.root.revision(),
                 changes: place.changes.clone(),
+                before: place.changes.len(),
                 world: place.world.clone(),
             },
         };
-        let mut interpreter =
-            Box::new(Interpreter::of_routine(variables, outputs.collect(), instance.lease.clone(), target));
+        let state = context.program.state(instance.state);
+        let wanted = &context.analysis.state(instance.state).requirements;
+        let requirements =
+            place.with_scope(&self.instances, id, None, |scope| binding::requirements(state, wanted, scope));
+        let Some(Ok(requirements)) = requirements else { return false };
+        let routine = Routine { requirements, lease: instance.lease.clone() };
+        let mut interpreter = Box::new(Interpreter::of_routine(variables, outputs.collect(), routine, target));
         let (state, path) = (instance.state, instance.path.clone());
         let progress = interpreter.start(context, state, &path);
         if let Some(instance) = self.instances.alive.get_mut(&id) {
