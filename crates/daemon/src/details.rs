@@ -1,0 +1,26 @@
+//! Statuses with `google.rpc` details: a machine-readable reason, and when to try again.
+
+use std::time::Duration;
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
+
+/// The domain of every reason.
+const DOMAIN: &str = "ratn";
+
+/// A status that says why in one word for programs and in a sentence for people.
+pub(crate) fn status(code: Code, reason: &str, message: impl Into<String>) -> Status {
+    let details = ErrorDetails::with_error_info(reason, DOMAIN, []);
+    Status::with_error_details(code, message, details)
+}
+
+/// A status of something that may go better after a while.
+pub(crate) fn retry_later(code: Code, reason: &str, message: impl Into<String>, after: Duration) -> Status {
+    let mut details = ErrorDetails::with_error_info(reason, DOMAIN, []);
+    details.set_retry_info(Some(after));
+    Status::with_error_details(code, message, details)
+}
+
+/// The daemon is ending.
+pub(crate) fn ending() -> Status {
+    retry_later(Code::Unavailable, "ENDING", "the daemon is ending", Duration::from_millis(500))
+}

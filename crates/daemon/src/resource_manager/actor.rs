@@ -1,0 +1,305 @@
+//! The one task that owns the pool: takes messages in order, ends what time has ended, hands out grants and events.
+//!
+//! A grant that nobody takes any more (the call was dropped in the same moment) is released at once; a watcher that does
+//! not keep up is cut off rather than waited for.
+
+use super::wire;
+use super::{Granted, ResourceManagerConfig, status};
+use crate::details::{retry_later, status as status_with};
+use ratn_model::id::{LeaseId, Revision};
+use ratn_model::resource::Requirement;
+use ratn_model::time::Timestamp;
+use ratn_proto::types::{ResourceEvent, ResourceUpdate};
+use ratn_resources::{AcquireRequest, Notice, Pool, PoolError, Reply, Request, ResourceView, SessionId, WaiterId};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
+use tonic::{Code, Status};
+
+/// Messages that wait for the actor; more make their senders wait.
+const INBOX: usize = 1_024;
+/// Updates that wait for a watcher; one that has more to catch up with is cut off.
+const WATCH_BUFFER: usize = 4_096;
+/// A session lives at least this long.
+const MIN_SESSION_TTL: Duration = Duration::from_millis(50);
+
+/// What a keep-alive came to.
+#[derive(Debug)]
+pub(super) struct KeptAlive {
+    pub(super) ttl: Duration,
+    pub(super) created: bool,
+    pub(super) revision: Revision,
+}
+
+/// What the service asks of the actor.
+#[derive(Debug)]
+pub(super) enum Message {
+    KeepAlive {
+        session: SessionId,
+        client: String,
+        ttl: Duration,
+        answer: Answer<KeptAlive>,
+    },
+    Perform {
+        request_id: String,
+        request: Request,
+        answer: Answer<(Reply, Revision)>,
+    },
+    Acquire {
+        ticket: u64,
+        request_id: String,
+        request: AcquireRequest,
+        wait: Duration,
+        answer: oneshot::Sender<Granted>,
+    },
+    /// The call with this ticket was dropped before its answer.
+    Abandon {
+        ticket: u64,
+    },
+    Withdraw {
+        session: SessionId,
+        request_id: String,
+        answer: Answer<bool>,
+    },
+    /// The call was dropped after its answer and before it was read.
+    Return {
+        lease: LeaseId,
+    },
+    Find {
+        requirement: Requirement,
+        answer: oneshot::Sender<(u64, Vec<String>)>,
+    },
+    List {
+        answer: oneshot::Sender<(Vec<ResourceView>, Revision)>,
+    },
+    Watch {
+        answer: Answer<mpsc::Receiver<Arc<ResourceUpdate>>>,
+    },
+}
+
+pub(super) type Answer<T> = oneshot::Sender<Result<T, Status>>;
+
+/// Sends messages to the actor.
+#[derive(Debug, Clone)]
+pub(super) struct Handle {
+    inbox: mpsc::Sender<Message>,
+}
+
+#[derive(Debug)]
+struct Actor {
+    config: ResourceManagerConfig,
+    pool: Pool,
+    start: Instant,
+    /// Who waits for the answer of which waiter; a repeated request joins.
+    calls: BTreeMap<WaiterId, Vec<(u64, oneshot::Sender<Granted>)>>,
+    tickets: BTreeMap<u64, WaiterId>,
+    watchers: Vec<mpsc::Sender<Arc<ResourceUpdate>>>,
+}
+
+/// Starts the actor; it ends with the token.
+pub(super) fn start(config: ResourceManagerConfig, shutdown: CancellationToken) -> Handle {
+    let (inbox, messages) = mpsc::channel(INBOX);
+    // Nothing is kept over a restart: tokens have to be above those of before all the same.
+    let milliseconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis());
+    let floor = u64::try_from(milliseconds).unwrap_or(0);
+    let actor = Actor {
+        pool: Pool::starting_above(config.limits.clone(), floor),
+        config,
+        start: Instant::now(),
+        calls: BTreeMap::new(),
+        tickets: BTreeMap::new(),
+        watchers: Vec::new(),
+    };
+    tokio::spawn(actor.run(messages, shutdown));
+    Handle { inbox }
+}
+
+impl Handle {
+    /// Sends a message and waits for the answer that it is to be given.
+    pub(super) async fn ask<T>(&self, message: impl FnOnce(oneshot::Sender<T>) -> Message) -> Result<T, Status> {
+        let (answer, answered) = oneshot::channel();
+        self.send(message(answer)).await?;
+        answered.await.map_err(|_| crate::details::ending())
+    }
+
+    pub(super) async fn send(&self, message: Message) -> Result<(), Status> {
+        self.inbox.send(message).await.map_err(|_| crate::details::ending())
+    }
+
+    /// Sends a message from where nothing can be waited for.
+    pub(super) fn send_later(&self, message: Message) {
+        if let Err(mpsc::error::TrySendError::Full(message)) = self.inbox.try_send(message) {
+            let inbox = self.inbox.clone();
+            tokio::spawn(async move { inbox.send(message).await });
+        }
+    }
+}
+
+impl Actor {
+    async fn run(mut self, mut messages: mpsc::Receiver<Message>, shutdown: CancellationToken) {
+        loop {
+            let deadline = self.pool.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
+            tokio::select! {
+                message = messages.recv() => match message {
+                    Some(message) => self.receive(message),
+                    None => return,
+                },
+                () = sleep_until(deadline) => self.pool.advance(self.now()),
+                () = shutdown.cancelled() => return,
+            }
+            self.deliver();
+        }
+    }
+
+    fn now(&self) -> Timestamp {
+        Timestamp(u64::try_from(self.start.elapsed().as_nanos()).unwrap_or(u64::MAX))
+    }
+
+    fn receive(&mut self, message: Message) {
+        let now = self.now();
+        match message {
+            Message::KeepAlive { session, client, ttl, answer } => {
+                let kept = self.keep_alive(&session, &client, ttl).map_err(|error| status::of_error(&error));
+                let _ = answer.send(kept);
+            }
+            Message::Perform { request_id, request, answer } => {
+                let reply = self.pool.handle(now, &request_id, request);
+                let revision = self.pool.revision();
+                let _ = answer.send(reply.map(|reply| (reply, revision)).map_err(|error| status::of_error(&error)));
+            }
+            Message::Acquire { ticket, request_id, mut request, wait, answer } => {
+                request.deadline = Some(now + wait.min(self.config.max_wait()));
+                match self.pool.handle(now, &request_id, Request::Acquire(request)) {
+                    Ok(Reply::Queued(waiter)) => {
+                        self.tickets.insert(ticket, waiter);
+                        self.calls.entry(waiter).or_default().push((ticket, answer));
+                    }
+                    // Repeated after the grant: whoever asks again has it already, so a dropped call keeps it.
+                    Ok(Reply::Granted(lease)) => drop(answer.send(Ok(lease))),
+                    Ok(reply) => debug_assert!(false, "an acquire is queued or granted, not {reply:?}"),
+                    Err(error) => drop(answer.send(Err(status::of_error(&error)))),
+                }
+            }
+            Message::Abandon { ticket } => self.abandon(ticket),
+            Message::Withdraw { session, request_id, answer } => {
+                let withdrawn = self.pool.withdraw(now, &session, &request_id);
+                let _ = answer.send(withdrawn.map_err(|error| status::of_error(&error)));
+            }
+            Message::Return { lease } => self.give_back(lease),
+            Message::Find { requirement, answer } => {
+                let fitting = self.pool.fitting(&requirement);
+                let _ = answer.send((self.pool.exists(&requirement), fitting));
+            }
+            Message::List { answer } => drop(answer.send((self.pool.list(), self.pool.revision()))),
+            Message::Watch { answer } => drop(answer.send(self.watch())),
+        }
+    }
+
+    fn keep_alive(&mut self, session: &SessionId, client: &str, ttl: Duration) -> Result<KeptAlive, PoolError> {
+        let now = self.now();
+        let ttl = ttl.min(self.config.max_session_ttl());
+        let created = if ttl.is_zero() {
+            match self.pool.close_session(now, session) {
+                Err(PoolError::UnknownSession { .. }) | Ok(()) => false,
+                Err(error) => return Err(error),
+            }
+        } else {
+            self.pool.keep_alive(now, session, client, ttl.max(MIN_SESSION_TTL))?
+        };
+        if created {
+            tracing::info!(%session, client, ttl_ms = ttl.as_millis(), "session opened");
+        }
+        Ok(KeptAlive { ttl, created, revision: self.pool.revision() })
+    }
+
+    fn abandon(&mut self, ticket: u64) {
+        let Some(waiter) = self.tickets.remove(&ticket) else { return };
+        let Some(calls) = self.calls.get_mut(&waiter) else { return };
+        calls.retain(|(other, _)| *other != ticket);
+        if calls.is_empty() {
+            self.calls.remove(&waiter);
+            // Unknown when it was answered in this moment: then the answer could not be delivered and was undone.
+            let _ = self.pool.cancel(self.now(), waiter);
+        }
+    }
+
+    fn give_back(&mut self, lease: LeaseId) {
+        tracing::debug!(%lease, "granted to a call that was dropped: released");
+        let _ = self.pool.release(self.now(), None, lease);
+    }
+
+    fn watch(&mut self) -> Result<mpsc::Receiver<Arc<ResourceUpdate>>, Status> {
+        self.watchers.retain(|watcher| !watcher.is_closed());
+        if self.watchers.len() >= self.config.max_watchers {
+            let message = format!("{} clients watch already", self.watchers.len());
+            return Err(retry_later(Code::ResourceExhausted, "TOO_MANY", message, Duration::from_secs(1)));
+        }
+        let (sender, updates) = mpsc::channel(WATCH_BUFFER);
+        let resources = self.pool.list().into_iter().map(wire::resource).collect();
+        let snapshot = ResourceUpdate::Snapshot { revision: self.pool.revision(), resources };
+        sender
+            .try_send(Arc::new(snapshot))
+            .map_err(|_| status_with(Code::Internal, "BROKEN", "a new watch took no snapshot"))?;
+        self.watchers.push(sender);
+        Ok(updates)
+    }
+
+    /// Hands out what the pool has to say, including what that in turn leads to.
+    fn deliver(&mut self) {
+        loop {
+            let notices = self.pool.take_notices();
+            if notices.is_empty() {
+                return;
+            }
+            for notice in notices {
+                match notice {
+                    Notice::Event(event) => wire::events(event).into_iter().for_each(|event| self.publish(event)),
+                    Notice::Granted { waiter, lease } => {
+                        let id = lease.id;
+                        if !self.answer(waiter, Ok(lease)) {
+                            self.give_back(id);
+                        }
+                    }
+                    Notice::Refused { waiter, refusal } => {
+                        self.answer(waiter, Err(status::of_refusal(&refusal)));
+                    }
+                }
+            }
+        }
+    }
+
+    /// Whether anybody took it.
+    fn answer(&mut self, waiter: WaiterId, granted: Granted) -> bool {
+        let mut taken = false;
+        for (ticket, call) in self.calls.remove(&waiter).unwrap_or_default() {
+            self.tickets.remove(&ticket);
+            taken |= call.send(granted.clone()).is_ok();
+        }
+        taken
+    }
+
+    fn publish(&mut self, event: ResourceEvent) {
+        if self.watchers.is_empty() {
+            return;
+        }
+        tracing::trace!(revision = event.revision.0, kind = ?event.kind, resource = event.resource.id, "event");
+        let update = Arc::new(ResourceUpdate::Event(event));
+        self.watchers.retain(|watcher| match watcher.try_send(update.clone()) {
+            Ok(()) => true,
+            Err(mpsc::error::TrySendError::Closed(_)) => false,
+            Err(mpsc::error::TrySendError::Full(_)) => {
+                tracing::warn!("a watcher did not keep up and was cut off");
+                false
+            }
+        });
+    }
+}
+
+async fn sleep_until(deadline: Option<Instant>) {
+    match deadline {
+        Some(deadline) => tokio::time::sleep_until(deadline.into()).await,
+        None => std::future::pending().await,
+    }
+}

@@ -1,0 +1,53 @@
+//! The resource manager's config.
+
+use crate::config::{Check, ConfigError, rule};
+use ratn_resources::Limits;
+use ratn_worker::endpoint::Endpoint;
+use serde::{Deserialize, Serialize};
+use std::time::Duration;
+
+/// All keys are optional.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ResourceManagerConfig {
+    /// Where to listen.
+    pub listen: Endpoint,
+    /// A session may ask for at most so long without a keep-alive, in milliseconds; more is shortened to this.
+    pub max_session_ttl_ms: u64,
+    /// An acquire may wait for at most so long, in milliseconds; more is shortened to this.
+    pub max_wait_ms: u64,
+    /// Clients that watch at the same time.
+    pub max_watchers: usize,
+    /// Bounds of everything that a client can make grow.
+    pub limits: Limits,
+}
+
+impl Default for ResourceManagerConfig {
+    fn default() -> Self {
+        ResourceManagerConfig {
+            listen: Endpoint::loopback(),
+            max_session_ttl_ms: 60_000,
+            max_wait_ms: 24 * 3_600_000,
+            max_watchers: 1_024,
+            limits: Limits::default(),
+        }
+    }
+}
+
+impl ResourceManagerConfig {
+    pub(crate) fn max_session_ttl(&self) -> Duration {
+        Duration::from_millis(self.max_session_ttl_ms)
+    }
+
+    pub(crate) fn max_wait(&self) -> Duration {
+        Duration::from_millis(self.max_wait_ms)
+    }
+}
+
+impl Check for ResourceManagerConfig {
+    fn check(&self) -> Result<(), ConfigError> {
+        rule("max_session_ttl_ms", self.max_session_ttl_ms >= 100, "at least 100 ms")?;
+        rule("max_wait_ms", self.max_wait_ms >= 1, "at least 1 ms")?;
+        rule("max_watchers", self.max_watchers >= 1, "at least 1")
+    }
+}

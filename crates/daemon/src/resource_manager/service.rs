@@ -1,0 +1,297 @@
+//! gRPC in front of the actor: checks what the schema cannot say, and undoes what a dropped call was about to get.
+
+use super::actor::{Handle, KeptAlive, Message};
+use super::{Granted, wire};
+use crate::details::{ending, retry_later, status};
+use futures::{Stream, StreamExt};
+use ratn_model::id::LeaseId;
+use ratn_model::resource::{Lease, Requirement, ResourceOperation};
+use ratn_proto::convert::{all, each, label, name, required};
+use ratn_proto::types::{Resource, ResourceUpdate};
+use ratn_proto::v1;
+use ratn_resources::{AcquireRequest, Reply, Request as PoolRequest, ResourceSpec, SessionId};
+use std::collections::BTreeSet;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
+use tonic::{Code, Request, Response, Status, Streaming};
+
+/// Answers that wait for a slow reader of a keep-alive stream.
+const KEEP_ALIVE_BUFFER: usize = 16;
+/// What the pool's own answer at a deadline is given to arrive.
+const GRACE: Duration = Duration::from_millis(20);
+/// When a watcher that was cut off may come back.
+const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
+
+/// The service; clones share the actor.
+#[derive(Debug, Clone)]
+pub(super) struct Service {
+    actor: Handle,
+    shutdown: CancellationToken,
+    next_ticket: Arc<AtomicU64>,
+}
+
+type Streamed<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+impl Service {
+    pub(super) fn new(actor: Handle, shutdown: CancellationToken) -> Service {
+        Service { actor, shutdown, next_ticket: Arc::default() }
+    }
+
+    async fn perform(&self, request_id: String, request: PoolRequest) -> Result<(Reply, u64), Status> {
+        label(&request_id, "request_id")?;
+        let performed = self.actor.ask(|answer| Message::Perform { request_id, request, answer }).await??;
+        Ok((performed.0, performed.1.0))
+    }
+
+    async fn wait_for_grant(&self, request_id: String, request: AcquireRequest, wait_ms: u64) -> Result<Lease, Status> {
+        label(&request_id, "request_id")?;
+        label(&request.purpose, "holder")?;
+        if wait_ms == 0 {
+            return Err(status(Code::InvalidArgument, "MALFORMED", "deadline_ms: is 0: it must be at least 1"));
+        }
+        let ticket = self.next_ticket.fetch_add(1, Ordering::Relaxed);
+        let (answer, answered) = oneshot::channel();
+        let wait = Duration::from_millis(wait_ms);
+        self.actor.send(Message::Acquire { ticket, request_id, request, wait, answer }).await?;
+        let mut call = WaitingCall { actor: self.actor.clone(), ticket, answered: Some(answered) };
+        let Some(answered) = &mut call.answered else { return Err(ending()) };
+        // The pool answers at the deadline, and says what was waited for; a call that joined another of its request id has
+        // a deadline of its own, and leaves by being dropped.
+        let Ok(granted) = tokio::time::timeout(wait + GRACE, answered).await else {
+            return Err(status(Code::DeadlineExceeded, "NOT_GRANTED_IN_TIME", "not granted: the deadline has passed"));
+        };
+        call.answered = None;
+        granted.map_err(|_| ending())?
+    }
+}
+
+/// An acquire that waits. Dropped before its answer, it leaves the queue, or gives back what it was granted meanwhile.
+struct WaitingCall {
+    actor: Handle,
+    ticket: u64,
+    answered: Option<oneshot::Receiver<Granted>>,
+}
+
+impl Drop for WaitingCall {
+    fn drop(&mut self) {
+        let Some(mut answered) = self.answered.take() else { return };
+        answered.close();
+        match answered.try_recv() {
+            Ok(Ok(lease)) => self.actor.send_later(Message::Return { lease: lease.id }),
+            Ok(Err(_)) => {}
+            Err(_) => self.actor.send_later(Message::Abandon { ticket: self.ticket }),
+        }
+    }
+}
+
+#[tonic::async_trait]
+impl v1::resource_service_server::ResourceService for Service {
+    type WatchStream = Streamed<v1::ResourceServiceWatchResponse>;
+    type KeepAliveStream = Streamed<v1::KeepAliveResponse>;
+
+    async fn create(&self, request: Request<v1::CreateRequest>) -> Result<Response<v1::CreateResponse>, Status> {
+        let request = request.into_inner();
+        let resource: Resource = required(request.resource, "resource")?;
+        let spec = ResourceSpec {
+            id: Some(resource.id).filter(|id| !id.is_empty()),
+            class: resource.class,
+            kind: resource.kind,
+            attributes: resource.attributes,
+            capacity: resource.capacity,
+            renewable: true,
+            host: resource.host,
+        };
+        let session = optional_session(&request.session_id)?;
+        let (reply, _) = self.perform(request.request_id, PoolRequest::Create { session, spec }).await?;
+        let Reply::Created(view) = reply else { return Err(odd_reply(&reply)) };
+        Ok(Response::new(v1::CreateResponse { resource: Some(wire::resource(view).into()) }))
+    }
+
+    async fn consume(&self, request: Request<v1::ConsumeRequest>) -> Result<Response<v1::ConsumeResponse>, Status> {
+        let request = request.into_inner();
+        let requirement: Requirement = required(request.requirement, "requirement")?;
+        let session = session(&request.session_id)?;
+        let (reply, revision) = self.perform(request.request_id, PoolRequest::Consume { session, requirement }).await?;
+        let Reply::Touched(resource_ids) = reply else { return Err(odd_reply(&reply)) };
+        Ok(Response::new(v1::ConsumeResponse { resource_ids, revision }))
+    }
+
+    async fn delete(&self, request: Request<v1::DeleteRequest>) -> Result<Response<v1::DeleteResponse>, Status> {
+        use v1::delete_request::Target;
+        let request = request.into_inner();
+        let target = request.target.ok_or_else(|| {
+            status(Code::InvalidArgument, "MALFORMED", "target: resource_id or requirement is missing")
+        })?;
+        let (resource_ids, revision) = match target {
+            Target::ResourceId(id) => {
+                name(&id, "resource_id")?;
+                let session = optional_session(&request.session_id)?;
+                let delete = PoolRequest::Delete { session, id: id.clone() };
+                let (_, revision) = self.perform(request.request_id, delete).await?;
+                (vec![id], revision)
+            }
+            Target::Requirement(requirement) => {
+                let requirement = Requirement::try_from(requirement).map_err(|m| m.within("requirement"))?;
+                let delete = PoolRequest::DeleteUnits { session: session(&request.session_id)?, requirement };
+                let (reply, revision) = self.perform(request.request_id, delete).await?;
+                let Reply::Touched(ids) = reply else { return Err(odd_reply(&reply)) };
+                (ids, revision)
+            }
+        };
+        Ok(Response::new(v1::DeleteResponse { resource_ids, revision }))
+    }
+
+    async fn block(&self, request: Request<v1::BlockRequest>) -> Result<Response<v1::BlockResponse>, Status> {
+        let request = request.into_inner();
+        let requirement: Requirement = required(request.requirement, "requirement")?;
+        if requirement.operation != ResourceOperation::Block {
+            let message = format!("requirement.operation: is {}, not block", requirement.operation);
+            return Err(status(Code::InvalidArgument, "MALFORMED", message));
+        }
+        let acquire = AcquireRequest {
+            priority: request.priority,
+            purpose: request.holder,
+            ..AcquireRequest::new(session(&request.session_id)?, vec![requirement])
+        };
+        let lease = self.wait_for_grant(request.request_id, acquire, request.deadline_ms).await?;
+        Ok(Response::new(v1::BlockResponse { lease: Some(lease.into()) }))
+    }
+
+    async fn acquire(&self, request: Request<v1::AcquireRequest>) -> Result<Response<v1::AcquireResponse>, Status> {
+        let request = request.into_inner();
+        let requirements = each(request.requirements, "requirements")?;
+        let acquire = AcquireRequest {
+            priority: request.priority,
+            purpose: request.holder,
+            ..AcquireRequest::new(session(&request.session_id)?, requirements)
+        };
+        let lease = self.wait_for_grant(request.request_id, acquire, request.deadline_ms).await?;
+        Ok(Response::new(v1::AcquireResponse { lease: Some(lease.into()) }))
+    }
+
+    async fn withdraw(&self, request: Request<v1::WithdrawRequest>) -> Result<Response<v1::WithdrawResponse>, Status> {
+        let v1::WithdrawRequest { request_id, session_id } = request.into_inner();
+        name(&request_id, "request_id")?;
+        let session = session(&session_id)?;
+        let withdrawn = self.actor.ask(|answer| Message::Withdraw { session, request_id, answer }).await??;
+        Ok(Response::new(v1::WithdrawResponse { withdrawn }))
+    }
+
+    async fn release(
+        &self,
+        request: Request<v1::ResourceServiceReleaseRequest>,
+    ) -> Result<Response<v1::ResourceServiceReleaseResponse>, Status> {
+        let request = request.into_inner();
+        let session = optional_session(&request.session_id)?;
+        let release = PoolRequest::Release { session, lease: LeaseId(request.lease_id) };
+        let (released, revision) = match self.perform(request.request_id, release).await {
+            Ok((_, revision)) => (true, revision),
+            Err(status) if status.code() == Code::NotFound => {
+                let (_, revision) = self.actor.ask(|answer| Message::List { answer }).await?;
+                (false, revision.0)
+            }
+            Err(status) => return Err(status),
+        };
+        Ok(Response::new(v1::ResourceServiceReleaseResponse { released, revision }))
+    }
+
+    async fn exists(&self, request: Request<v1::ExistsRequest>) -> Result<Response<v1::ExistsResponse>, Status> {
+        let requirement: Requirement = required(request.into_inner().requirement, "requirement")?;
+        let wanted = u64::from(requirement.count);
+        let (units, resource_ids) = self.actor.ask(|answer| Message::Find { requirement, answer }).await?;
+        Ok(Response::new(v1::ExistsResponse { exists: units >= wanted, resource_ids }))
+    }
+
+    async fn list(&self, request: Request<v1::ListRequest>) -> Result<Response<v1::ListResponse>, Status> {
+        let kinds: BTreeSet<String> = request.into_inner().kinds.into_iter().collect();
+        let (views, revision) = self.actor.ask(|answer| Message::List { answer }).await?;
+        let wanted = views.into_iter().filter(|view| kinds.is_empty() || kinds.contains(&view.kind));
+        let resources = all(wanted.map(wire::resource));
+        Ok(Response::new(v1::ListResponse { resources, revision: revision.0 }))
+    }
+
+    async fn watch(
+        &self,
+        request: Request<v1::ResourceServiceWatchRequest>,
+    ) -> Result<Response<Self::WatchStream>, Status> {
+        let kinds: BTreeSet<String> = request.into_inner().kinds.into_iter().collect();
+        let updates = self.actor.ask(|answer| Message::Watch { answer }).await??;
+        let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
+            .filter_map(move |update| futures::future::ready(filtered(&update, &kinds)))
+            .map(|update| Ok(update.into()));
+        let last = futures::stream::once(async {
+            let message = "the watch has ended (too slow, or the resource manager ends): watch again";
+            Err(retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER))
+        });
+        let stream = updates.chain(last).take_until(self.shutdown.clone().cancelled_owned());
+        Ok(Response::new(Box::pin(stream)))
+    }
+
+    async fn keep_alive(
+        &self,
+        request: Request<Streaming<v1::KeepAliveRequest>>,
+    ) -> Result<Response<Self::KeepAliveStream>, Status> {
+        let mut pings = request.into_inner();
+        let (sender, answers) = mpsc::channel(KEEP_ALIVE_BUFFER);
+        let actor = self.actor.clone();
+        let shutdown = self.shutdown.clone();
+        tokio::spawn(async move {
+            loop {
+                let ping = tokio::select! {
+                    ping = pings.message() => ping,
+                    () = shutdown.cancelled() => return,
+                };
+                let Ok(Some(ping)) = ping else { return };
+                let answer = kept_alive(&actor, ping).await;
+                let failed = answer.is_err();
+                if sender.send(answer).await.is_err() || failed {
+                    return;
+                }
+            }
+        });
+        Ok(Response::new(Box::pin(tokio_stream::wrappers::ReceiverStream::new(answers))))
+    }
+}
+
+async fn kept_alive(actor: &Handle, ping: v1::KeepAliveRequest) -> Result<v1::KeepAliveResponse, Status> {
+    let session = session(&ping.session_id)?;
+    label(&ping.client, "client")?;
+    let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };
+    let ttl = Duration::from_millis(ping.ttl_ms);
+    let kept: KeptAlive = actor.ask(|answer| Message::KeepAlive { session, client, ttl, answer }).await??;
+    Ok(v1::KeepAliveResponse {
+        session_id: ping.session_id,
+        ttl_ms: u64::try_from(kept.ttl.as_millis()).unwrap_or(u64::MAX),
+        created: kept.created,
+        revision: kept.revision.0,
+    })
+}
+
+fn filtered(update: &ResourceUpdate, kinds: &BTreeSet<String>) -> Option<ResourceUpdate> {
+    match update {
+        _ if kinds.is_empty() => Some(update.clone()),
+        ResourceUpdate::Event(event) => kinds.contains(&event.resource.kind).then(|| update.clone()),
+        ResourceUpdate::Snapshot { revision, resources } => Some(ResourceUpdate::Snapshot {
+            revision: *revision,
+            resources: resources.iter().filter(|resource| kinds.contains(&resource.kind)).cloned().collect(),
+        }),
+    }
+}
+
+fn session(id: &str) -> Result<SessionId, Status> {
+    name(id, "session_id")?;
+    Ok(SessionId::from(id))
+}
+
+/// Without a session a call speaks for the operator.
+fn optional_session(id: &str) -> Result<Option<SessionId>, Status> {
+    if id.is_empty() { Ok(None) } else { session(id).map(Some) }
+}
+
+fn odd_reply(reply: &Reply) -> Status {
+    status(Code::Internal, "BROKEN", format!("the pool answered with {reply:?}"))
+}

@@ -1,0 +1,36 @@
+//! The pool's errors as gRPC statuses.
+
+use crate::details::{retry_later, status};
+use ratn_resources::{PoolError, Refusal};
+use std::time::Duration;
+use tonic::{Code, Status};
+
+/// When to try again after a bound was reached.
+const RETRY_DELAY: Duration = Duration::from_millis(100);
+
+pub(super) fn of_error(error: &PoolError) -> Status {
+    let (code, reason) = match error {
+        PoolError::UnknownSession { .. } => (Code::FailedPrecondition, "SESSION_UNKNOWN"),
+        PoolError::UnknownLease { .. } => (Code::NotFound, "LEASE_UNKNOWN"),
+        PoolError::UnknownWaiter { .. } => (Code::NotFound, "WAITER_UNKNOWN"),
+        PoolError::UnknownResource { .. } => (Code::NotFound, "RESOURCE_UNKNOWN"),
+        PoolError::ResourceTaken { .. } => (Code::AlreadyExists, "RESOURCE_TAKEN"),
+        PoolError::NotYours { .. } => (Code::PermissionDenied, "NOT_YOURS"),
+        PoolError::NotEnough { .. } => (Code::FailedPrecondition, "NOT_ENOUGH"),
+        PoolError::Malformed { .. } => (Code::InvalidArgument, "MALFORMED"),
+        PoolError::RequestIdReused { .. } => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
+        PoolError::TooMany { .. } => {
+            return retry_later(Code::ResourceExhausted, "TOO_MANY", error.to_string(), RETRY_DELAY);
+        }
+    };
+    status(code, reason, error.to_string())
+}
+
+pub(super) fn of_refusal(refusal: &Refusal) -> Status {
+    let (code, reason) = match refusal {
+        Refusal::Deadline { .. } => (Code::DeadlineExceeded, "NOT_GRANTED_IN_TIME"),
+        Refusal::Cancelled => (Code::Cancelled, "WITHDRAWN"),
+        Refusal::SessionEnded => (Code::FailedPrecondition, "SESSION_UNKNOWN"),
+    };
+    status(code, reason, format!("not granted: {refusal}"))
+}

@@ -1,0 +1,61 @@
+//! The world pool's config.
+
+use crate::config::{Check, ConfigError, rule};
+use ratn_worker::endpoint::Endpoint;
+use serde::{Deserialize, Serialize};
+
+/// All keys are optional.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct WorldPoolConfig {
+    /// Where to listen.
+    pub listen: Endpoint,
+    /// The name of this host: the end of its resource's id, `world-model@compute`.
+    pub host: String,
+    /// Where the resource manager is; without it, where the runtime directory says.
+    pub resource_manager: Option<Endpoint>,
+    /// The session lives this long without an answer from the resource manager, in milliseconds.
+    pub session_ttl_ms: u64,
+    /// The kind of its resource.
+    pub kind: String,
+    /// Units of its resource: so many projections can be held by leases at once.
+    pub capacity: u32,
+    /// So many revisions of the root are kept to project from.
+    pub revisions_kept: usize,
+    /// Projections at once in all, those without a lease included.
+    pub max_projections: usize,
+    /// A projection whose lease holds no resource ends after this long, in seconds.
+    pub unbound_ttl_s: f64,
+    /// Commits and projections remembered so that a repeated id is not performed twice.
+    pub remembered_requests: usize,
+}
+
+impl Default for WorldPoolConfig {
+    fn default() -> Self {
+        WorldPoolConfig {
+            listen: Endpoint::loopback(),
+            host: "localhost".to_owned(),
+            resource_manager: None,
+            session_ttl_ms: 3_000,
+            kind: "WorldModel".to_owned(),
+            capacity: 64,
+            revisions_kept: 4_096,
+            max_projections: 4_096,
+            unbound_ttl_s: 600.0,
+            remembered_requests: 65_536,
+        }
+    }
+}
+
+impl Check for WorldPoolConfig {
+    fn check(&self) -> Result<(), ConfigError> {
+        rule("host", !self.host.is_empty(), "is not empty")?;
+        rule("kind", !self.kind.is_empty(), "is not empty")?;
+        rule("session_ttl_ms", self.session_ttl_ms >= 100, "at least 100 ms")?;
+        rule("capacity", self.capacity >= 1, "at least 1")?;
+        rule("revisions_kept", self.revisions_kept >= 1, "at least 1")?;
+        rule("max_projections", self.max_projections >= 1, "at least 1")?;
+        rule("unbound_ttl_s", (1.0..=86_400.0).contains(&self.unbound_ttl_s), "from 1 s to a day")?;
+        rule("remembered_requests", self.remembered_requests >= 1, "at least 1")
+    }
+}
