@@ -1,0 +1,62 @@
+//! Every file of `tests/bad-tasks` is refused for the rule that its first line names, with the line where it is broken.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_model::catalogue::Catalogue;
+use ratn_model::diagnostic::Severity;
+use ratn_model::load::load;
+use std::collections::BTreeSet;
+use std::path::Path;
+
+/// Rules that the folder must have a task for.
+const RULES: [&str; 24] = [
+    "branch-may-not-have-written",
+    "computes-actuates",
+    "conflicting-annotations",
+    "duplicate-name",
+    "horizon-too-small",
+    "invalid-expression",
+    "invalid-name",
+    "invalid-state",
+    "invalid-yaml",
+    "missing-input",
+    "not-supported-yet",
+    "provider-not-blocked",
+    "too-many-resources",
+    "type-mismatch",
+    "unestablished-precondition",
+    "unknown-action",
+    "unknown-key",
+    "unknown-outcome",
+    "unknown-port",
+    "unknown-provider",
+    "unknown-resource",
+    "unknown-state",
+    "unknown-variable",
+    "unservable-flow",
+];
+
+#[test]
+fn every_bad_task_is_refused_for_its_rule_with_a_line() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/bad-tasks");
+    let catalogue = Catalogue::standard();
+    let mut seen = BTreeSet::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_string_lossy().into_owned();
+        let source = std::fs::read_to_string(&path).unwrap();
+        let rule =
+            source.lines().next().unwrap().strip_prefix("# rule: ").expect("the first line names the rule").trim();
+        assert!(name.starts_with(rule), "{name} is named after its rule, {rule}");
+        let findings = load(&source, &name, &catalogue).map(|loaded| loaded.warnings).unwrap_err();
+        let printed: Vec<String> = findings.iter().map(ToString::to_string).collect();
+        let errors: Vec<_> = findings.iter().filter(|finding| finding.severity == Severity::Error).collect();
+        assert!(!errors.is_empty() && errors.iter().all(|error| error.rule == rule), "{name}: {printed:#?}");
+        assert!(
+            errors.iter().all(|error| error.location.line > 1 && error.location.column > 0),
+            "{name}: {printed:#?}"
+        );
+        seen.insert(rule.to_owned());
+    }
+    assert_eq!(seen.iter().map(String::as_str).collect::<Vec<_>>(), RULES);
+}

@@ -1,0 +1,210 @@
+//! What the findings of a task file say, and that no text makes the loader panic.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use insta::assert_snapshot;
+use proptest::prelude::*;
+use ratn_model::catalogue::Catalogue;
+use ratn_model::load::load;
+use ratn_model::program::{Nature, Program, StateKind};
+
+const FETCH: &str = include_str!("../../../examples/fetch_boxes.yaml");
+
+/// Everything that is found in a task file, one line each; `fine` for nothing.
+fn check(source: &str) -> String {
+    let findings = match load(source, "task.yaml", &Catalogue::standard()) {
+        Ok(loaded) => loaded.warnings,
+        Err(findings) => findings,
+    };
+    if findings.is_empty() {
+        return "fine".to_owned();
+    }
+    findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n")
+}
+
+fn program(source: &str) -> Program {
+    match load(source, "task.yaml", &Catalogue::standard()) {
+        Ok(loaded) => loaded.program,
+        Err(findings) => panic!("{}", findings[0]),
+    }
+}
+
+/// A task of these states, each line indented as it is.
+fn task(states: &str) -> String {
+    format!("task: t\nstates:\n{states}")
+}
+
+const PLAN: &str = "  - plan: { action: path_planner/plan, in: { start: 'joints(0,0,0,0,0,0,0)', goal: 'pose(1,0,1)' }, computes: true, resources: [{block: PathPlanner}, world_model] }\n";
+
+#[test]
+fn a_misspelt_port_is_found_where_it_stands() {
+    let follow = "  - go: { action: arm/follow, in: { trajectory: plan.trajektory }, resources: [{block: Arm}] }\n";
+    assert_snapshot!(check(&task(&format!("{PLAN}{follow}"))), @"");
+}
+
+#[test]
+fn an_error_inside_a_quoted_expression_has_its_own_column() {
+    let look = "  - look: { action: pan_tilt/look_at, in: { target: \"pose(1, 2, $heigth)\" }, resources: [{block: PanTilt}] }\n";
+    let source = format!("task: t\nparameters: {{height: 1.0}}\nstates:\n{look}");
+    assert_snapshot!(check(&source), @"");
+}
+
+#[test]
+fn a_cycle_of_flows_is_told_from_a_wrong_order() {
+    assert_snapshot!(check(include_str!("../../../tests/bad-tasks/unservable-flow.yaml")), @"");
+    assert_snapshot!(check(include_str!("../../../tests/bad-tasks/unservable-flow-cycle.yaml")), @"");
+}
+
+#[test]
+fn several_findings_come_in_the_order_of_the_file() {
+    let source = "
+task: t
+colour: blue
+parameters: { n: { type: int, default: three } }
+states:
+  - plan: { action: path_planner/plam, resources: [{ block: PathPlaner }] }
+  - while: true
+  - release: { action: gripper/release, attempts: 0, duration: -, resources: [{ block: Gripper, count: x }] }
+  - 3
+";
+    assert_snapshot!(check(source), @"");
+}
+
+#[test]
+fn rules_of_a_program_that_reads_are_applied_together() {
+    let source = "
+task: t
+world: []
+states:
+  - plan: { action: path_planner/plam, resources: [{ block: PathPlaner }] }
+  - look:
+      action: pan_tilt/look_at
+      in: { goal: 3, target: 1 + 1 }
+      senses: [at(cup)]
+      requires: [lit(room), 1 + 1]
+      effects: { done: [] }
+      resources: [{ block: PanTilt, count: 2 }, { consume: Battery }]
+  - far:
+      condition: 3
+      then: []
+      else: []
+";
+    assert_snapshot!(check(source), @"");
+}
+
+#[test]
+fn a_precondition_that_nothing_establishes_is_a_warning_when_the_world_is_not_declared() {
+    let release = "  - release: { action: gripper/release, requires: [hand_full(gripper)], effects: [], resources: [{block: Gripper}] }\n";
+    assert_snapshot!(check(&task(release)), @"");
+    // An older state without declared effects may have established anything.
+    let first = "  - first: { action: gripper/release, resources: [{block: Gripper}] }\n";
+    assert_eq!(check(&task(&format!("{first}{release}"))), "fine");
+}
+
+#[test]
+fn what_is_no_yaml_is_said_with_its_place() {
+    assert_snapshot!(check("task: t\nstates: [\n"), @"");
+    assert_snapshot!(check("task: t\ntask: u\n"), @"");
+    assert_snapshot!(check("- task\n"), @"");
+    assert_snapshot!(check(""), @"");
+}
+
+#[test]
+fn hierarchies_loops_and_conditions_see_what_they_should() {
+    let source = "
+task: t
+states:
+  - look:
+      action: detector/segment
+      in: { region: { pose: 'pose(1, 0, 1)', size: [1, 1] } }
+      out: { boxes }
+      senses: ['at(?)']
+      effects: [{ for: b in boxes, set: 'at($b.id) = $b.pose' }]
+      resources: [{ block: Detector }, { block: Camera }]
+  - each:
+      for: box in look.boxes
+      index: i
+      do:
+        - think:
+            outputs: { way: plan.trajectory }
+            resources: [{ block: PathPlanner }]
+            states:
+              - plan:
+                  action: path_planner/plan
+                  in: { start: arm_at(arm), goal: grasp_pose($box), budget_s: null }
+                  computes: true
+                  reads: [scene]
+                  resources: [world_model]
+        - near:
+            condition: $i < 2 and not exists in_gripper(?)
+            then:
+              - go: { action: arm/follow, in: { trajectory: think.way }, resources: [{ block: Arm }] }
+            else: []
+";
+    assert_eq!(check(source), "fine");
+    let program = program(source);
+    let paths: Vec<&str> = program.states.iter().map(|s| s.path.as_str()).collect();
+    assert_eq!(paths, ["", "look", "each", "each/think", "each/think/plan", "each/near", "each/near/go"]);
+    let state = |path: &str| program.states.iter().find(|s| s.path == path).unwrap();
+    let reads = |path: &str| {
+        let reads = state(path).annotations.reads.as_ref();
+        reads.map(|facts| facts.iter().map(ToString::to_string).collect::<Vec<_>>().join(" "))
+    };
+    assert_eq!(reads("each/think/plan").as_deref(), Some("at(?) shape(?) in_gripper(?) arm_at(arm)"));
+    assert_eq!(reads("each/near").as_deref(), Some("in_gripper(?)"));
+    assert_eq!(reads("each/near/go"), None);
+    assert_eq!(
+        state("look").annotations.nature,
+        Nature::Senses(vec![ratn_model::expression::FactExpr { predicate: "at".into(), arguments: vec![None] }])
+    );
+    assert!(state("each/near/go").annotations.effects.is_empty());
+    assert_eq!(state("each/think/plan").annotations.effects.values().flatten().count(), 0);
+    let StateKind::Action { inputs, .. } = &state("each/near/go").kind else { panic!("an action") };
+    assert_eq!(inputs[0].1.flows().into_iter().collect::<Vec<_>>(), [state("each/think").id]);
+}
+
+#[test]
+fn a_program_survives_json() {
+    let program = program(FETCH);
+    let json = serde_json::to_string(&program).unwrap();
+    assert_eq!(serde_json::from_str::<Program>(&json).unwrap(), program);
+}
+
+#[test]
+fn parameters_are_read_by_their_type() {
+    let program = program(
+        "task: t\nparameters: {n: 3, far: 1.5, slow: false, who: {type: string}, goal: {type: pose, default: 'pose(0,0,1)'}}\nstates: []\n",
+    );
+    let bind = |set: &[(&str, &str)]| {
+        let set: Vec<_> = set.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect();
+        match program.bind_parameters(&set) {
+            Ok(values) => values.iter().map(|(n, v)| format!("{n}={v}")).collect::<Vec<_>>().join(" "),
+            Err(error) => error.to_string(),
+        }
+    };
+    assert_snapshot!(bind(&[("who", "a b"), ("n", "-2"), ("far", "2")]), @"");
+    assert_snapshot!(bind(&[]), @"");
+    assert_snapshot!(bind(&[("who", "x"), ("n", "2.5")]), @"");
+    assert_snapshot!(bind(&[("who", "x"), ("m", "1")]), @"");
+    assert_snapshot!(bind(&[("who", "x"), ("who", "y")]), @"");
+    assert_snapshot!(bind(&[("who", "x"), ("goal", "pose(1)")]), @"");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(256))]
+
+    #[test]
+    fn no_text_makes_the_loader_panic(text in "(task|states|do|for|in|x|: |- |\n|\n  |\n    |\\{|\\}|\\[|\\]|, |\"|'|\\$|#|&a |\\*a|\\?|PathPlanner|[a-z]{1,3}|[0-9]){0,60}") {
+        let _ = check(&text);
+    }
+
+    #[test]
+    fn no_damage_to_a_real_task_makes_the_loader_panic(
+        at in 0..FETCH.len(), length in 0..200_usize, inserted in "\\PC{0,8}|[ \\n\\[\\]{}:,?*&'\"$()-]{0,6}"
+    ) {
+        let clip = |mut i: usize| { while !FETCH.is_char_boundary(i) { i -= 1; } i };
+        let (from, to) = (clip(at), clip((at + length).min(FETCH.len())));
+        let damaged = format!("{}{inserted}{}", &FETCH[..from], &FETCH[to..]);
+        let _ = check(&damaged);
+    }
+}
