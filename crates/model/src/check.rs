@@ -108,6 +108,15 @@ fn effect_expressions<'a>(effect: &'a EffectExpr, part: &str, all: &mut Vec<(Str
     all.extend(value.map(|e| (part.to_owned(), e)));
 }
 
+/// An expression with the names of states instead of their ids.
+pub(crate) fn named(program: &Program, expr: &Expr) -> String {
+    let mut text = expr.to_string();
+    for id in expr.flows() {
+        text = text.replace(&format!("{id}."), &format!("{}.", program.state(id).name));
+    }
+    text
+}
+
 /// The children of a state by branch.
 pub(crate) fn branches(state: &State) -> [&[StateId]; 2] {
     match &state.kind {

@@ -39,20 +39,20 @@ const PLAN: &str = "  - plan: { action: path_planner/plan, in: { start: 'joints(
 #[test]
 fn a_misspelt_port_is_found_where_it_stands() {
     let follow = "  - go: { action: arm/follow, in: { trajectory: plan.trajektory }, resources: [{block: Arm}] }\n";
-    assert_snapshot!(check(&task(&format!("{PLAN}{follow}"))), @"");
+    assert_snapshot!(check(&task(&format!("{PLAN}{follow}"))), @"task.yaml:4:49: error[unknown-port] in go: state `plan` has no output port `trajektory`. help: did you mean `trajectory`?");
 }
 
 #[test]
 fn an_error_inside_a_quoted_expression_has_its_own_column() {
     let look = "  - look: { action: pan_tilt/look_at, in: { target: \"pose(1, 2, $heigth)\" }, resources: [{block: PanTilt}] }\n";
     let source = format!("task: t\nparameters: {{height: 1.0}}\nstates:\n{look}");
-    assert_snapshot!(check(&source), @"");
+    assert_snapshot!(check(&source), @"task.yaml:4:65: error[unknown-variable] in look: there is no variable `$heigth` here. help: did you mean `$height`?");
 }
 
 #[test]
 fn a_cycle_of_flows_is_told_from_a_wrong_order() {
-    assert_snapshot!(check(include_str!("../../../tests/bad-tasks/unservable-flow.yaml")), @"");
-    assert_snapshot!(check(include_str!("../../../tests/bad-tasks/unservable-flow-cycle.yaml")), @"");
+    assert_snapshot!(check(include_str!("../../../tests/bad-tasks/unservable-flow.yaml")), @"task.yaml:5:39: error[unservable-flow] in move: `plan.trajectory` is written by `plan`, which comes later. help: move `plan` before `move`");
+    assert_snapshot!(check(include_str!("../../../tests/bad-tasks/unservable-flow-cycle.yaml")), @"task.yaml:7:13: error[unservable-flow] in there: `back.end` is written by `back`, which comes later. help: each waits for the next: there → back → there; break the cycle");
 }
 
 #[test]
@@ -64,10 +64,18 @@ parameters: { n: { type: int, default: three } }
 states:
   - plan: { action: path_planner/plam, resources: [{ block: PathPlaner }] }
   - while: true
-  - release: { action: gripper/release, attempts: 0, duration: -, resources: [{ block: Gripper, count: x }] }
+  - release: { action: gripper/release, attempts: 0, duration: at(x), resources: [{ block: Gripper, count: x }] }
   - 3
 ";
-    assert_snapshot!(check(source), @"");
+    assert_snapshot!(check(source), @r#"
+    task.yaml:3:1: error[unknown-key]: there is no key `colour` here. help: there is `description`, `horizon`, `outputs`, `parameters`, `states`, `task`, `world`
+    task.yaml:4:40: error[type-mismatch]: the default of `n` is string, not int
+    task.yaml:7:5: error[not-supported-yet] in while: `while` is not supported yet. help: states are action, for, condition or states
+    task.yaml:8:51: error[type-mismatch] in release: `attempts` is a whole number of at least 1
+    task.yaml:8:64: error[invalid-expression] in release: an estimated duration cannot look up facts. help: use a parameter
+    task.yaml:8:108: error[type-mismatch] in release: `count` is a whole number of at least 1
+    task.yaml:9:5: error[invalid-state]: expected `name: {…}`, found a number. help: each state is one list item `- name: {…}`; mind the indentation of what belongs to it
+    "#);
 }
 
 #[test]
@@ -89,13 +97,25 @@ states:
       then: []
       else: []
 ";
-    assert_snapshot!(check(source), @"");
+    assert_snapshot!(check(source), @r#"
+    task.yaml:5:21: error[unknown-action] in plan: `path_planner` has no action `plam`. help: did you mean `plan`?
+    task.yaml:5:21: error[provider-not-blocked] in plan: `path_planner` is a `PathPlanner`, and this state blocks none. help: add `resources: [{block: PathPlanner}]`
+    task.yaml:5:52: error[unknown-resource] in plan: no template or module of the system provides `PathPlaner`. help: did you mean `PathPlanner`?
+    task.yaml:8:13: error[unknown-port] in look: `pan_tilt/look_at` has no input port `goal`. help: there is `target`
+    task.yaml:8:22: error[type-mismatch] in look: `target` is pose; `1 + 1` is int
+    task.yaml:10:29: error[type-mismatch] in look: `requires` is bool; `1 + 1` is int
+    task.yaml:11:18: error[unknown-outcome] in look: this state has no outcome `done`. help: there is `aborted`, `preempted`, `success`
+    task.yaml:12:19: error[too-many-resources] in look: this asks for 2 of `PanTilt` at once; the system can have 1. help: ask for fewer, or offer more
+    task.yaml:12:19: error[computes-actuates] in look: a state that senses cannot block `PanTilt`, which moves the robot. help: make it a PIA (`pia: true`), or leave the resource out
+    task.yaml:12:49: error[computes-actuates] in look: a state that senses cannot consume `Battery`. help: make it a PIA (`pia: true`), or leave the resource out
+    task.yaml:14:18: error[type-mismatch] in far: `condition` is bool; `3` is int
+    "#);
 }
 
 #[test]
 fn a_precondition_that_nothing_establishes_is_a_warning_when_the_world_is_not_declared() {
     let release = "  - release: { action: gripper/release, requires: [hand_full(gripper)], effects: [], resources: [{block: Gripper}] }\n";
-    assert_snapshot!(check(&task(release)), @"");
+    assert_snapshot!(check(&task(release)), @"task.yaml:3:52: warning[unestablished-precondition] in release: `hand_full(gripper)` is required, and nothing before establishes `hand_full(gripper)`. help: say in the task's `world` what holds at the start");
     // An older state without declared effects may have established anything.
     let first = "  - first: { action: gripper/release, resources: [{block: Gripper}] }\n";
     assert_eq!(check(&task(&format!("{first}{release}"))), "fine");
@@ -103,10 +123,10 @@ fn a_precondition_that_nothing_establishes_is_a_warning_when_the_world_is_not_de
 
 #[test]
 fn what_is_no_yaml_is_said_with_its_place() {
-    assert_snapshot!(check("task: t\nstates: [\n"), @"");
-    assert_snapshot!(check("task: t\ntask: u\n"), @"");
-    assert_snapshot!(check("- task\n"), @"");
-    assert_snapshot!(check(""), @"");
+    assert_snapshot!(check("task: t\nstates: [\n"), @"task.yaml:2:9: error[invalid-yaml]: unclosed bracket '['");
+    assert_snapshot!(check("task: t\ntask: u\n"), @"task.yaml:2:1: error[invalid-yaml]: duplicate mapping key: task");
+    assert_snapshot!(check("- task\n"), @"task.yaml:1:1: error[invalid-yaml]: a task file is a mapping, found a list. help: begin it with `task: name`");
+    assert_snapshot!(check(""), @"task.yaml:1:1: error[invalid-yaml]: a task file is a mapping, found nothing. help: begin it with `task: name`");
 }
 
 #[test]
@@ -182,12 +202,12 @@ fn parameters_are_read_by_their_type() {
             Err(error) => error.to_string(),
         }
     };
-    assert_snapshot!(bind(&[("who", "a b"), ("n", "-2"), ("far", "2")]), @"");
-    assert_snapshot!(bind(&[]), @"");
-    assert_snapshot!(bind(&[("who", "x"), ("n", "2.5")]), @"");
-    assert_snapshot!(bind(&[("who", "x"), ("m", "1")]), @"");
-    assert_snapshot!(bind(&[("who", "x"), ("who", "y")]), @"");
-    assert_snapshot!(bind(&[("who", "x"), ("goal", "pose(1)")]), @"");
+    assert_snapshot!(bind(&[("who", "a b"), ("n", "-2"), ("far", "2")]), @"far=2 goal=pose(0.000, 0.000, 1.000; 0.000, 0.000, 0.000, 1.000) n=-2 slow=false who=a b");
+    assert_snapshot!(bind(&[]), @"task `t` needs parameter `who` (string): set it with `--set who=…`");
+    assert_snapshot!(bind(&[("who", "x"), ("n", "2.5")]), @"parameter `n` is int; `2.5` is none");
+    assert_snapshot!(bind(&[("who", "x"), ("m", "1")]), @"task `t` has no parameter `m`: did you mean `n`?");
+    assert_snapshot!(bind(&[("who", "x"), ("who", "y")]), @"parameter `who` is set twice");
+    assert_snapshot!(bind(&[("who", "x"), ("goal", "pose(1)")]), @"parameter `goal` is pose; `pose(1)` is none");
 }
 
 proptest! {

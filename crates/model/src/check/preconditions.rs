@@ -2,7 +2,7 @@
 //!
 //! Without a declared `world` the facts at the start are whatever the system holds, so this is a warning then.
 
-use super::{Subject, branches};
+use super::{Subject, branches, named};
 use crate::diagnostic::Findings;
 use crate::expression::scope::NothingKnown;
 use crate::expression::{BinaryOperator, EffectExpr, Expr, FactExpr, UnaryOperator};
@@ -49,6 +49,7 @@ fn walk(subject: &Subject<'_>, id: StateId, established: &mut Established, findi
     for (i, required) in state.annotations.requires.iter().enumerate() {
         if let Some(missing) = missing(required, established) {
             let at = subject.place(state, &format!("requires.{i}"));
+            let required = named(subject.program, required);
             let message = format!("`{required}` is required, and nothing before establishes `{missing}`");
             let rule = "unestablished-precondition";
             if subject.declares_world {

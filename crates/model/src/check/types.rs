@@ -1,6 +1,6 @@
 //! The types of expressions, as far as they are known before anything runs; `any` fits everywhere and is checked then.
 
-use super::{Subject, Variables, expressions};
+use super::{Subject, Variables, expressions, named};
 use crate::diagnostic::Findings;
 use crate::expression::{BinaryOperator, EffectExpr, Expr, Function, UnaryOperator};
 use crate::program::{Program, State, StateKind, TaskOutput};
@@ -133,15 +133,6 @@ fn variables(subject: &Subject<'_>, state: &State) -> Variables {
         }
     }
     variables
-}
-
-/// An expression with the names of states instead of their ids.
-fn named(program: &Program, expr: &Expr) -> String {
-    let mut text = expr.to_string();
-    for id in expr.flows() {
-        text = text.replace(&format!("{id}."), &format!("{}.", program.state(id).name));
-    }
-    text
 }
 
 struct Types<'a> {

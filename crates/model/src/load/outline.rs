@@ -309,8 +309,14 @@ impl<'a> Builder<'a, '_> {
 fn default_name(body: &Node) -> String {
     match body.get("for").map(|node| &node.content) {
         Some(Content::Text(text)) => format!("for_{}", text.split_whitespace().next().unwrap_or("each")),
-        _ if body.get("condition").is_some() => "condition".to_owned(),
-        _ => "states".to_owned(),
+        _ => {
+            let form = body
+                .entries()
+                .iter()
+                .map(|e| e.key.as_str())
+                .find(|key| FORMS.contains(key) || LATER_FORMS.contains(key));
+            form.unwrap_or("state").to_owned()
+        }
     }
 }
 

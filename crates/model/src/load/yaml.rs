@@ -63,10 +63,16 @@ pub(crate) fn read(source: &str) -> Result<Node, InvalidYaml> {
         Err(error) => {
             let at = error.location().map_or(start, location);
             let text = error.without_snippet().to_string();
-            let message = text.lines().next().unwrap_or("unreadable").to_owned();
-            Err(InvalidYaml { at: if at.line == 0 { start } else { at }, message })
+            Err(InvalidYaml { at: if at.line == 0 { start } else { at }, message: message(&text) })
         }
     }
+}
+
+/// The library's message without the place, which is said before it, and without advice to programmers.
+fn message(text: &str) -> String {
+    let line = text.lines().next().unwrap_or("unreadable");
+    let line = line.rsplit_once(" at line ").map_or(line, |(message, _)| message);
+    line.split_once(", set DuplicateKeyPolicy").map_or(line, |(message, _)| message).to_owned()
 }
 
 impl Node {
