@@ -158,3 +158,6 @@ fn all_finite(numbers: &[f64], field: &str) -> Result<(), Malformed> {
 fn missing_choice(choices: &str) -> Malformed {
     Malformed::new("kind", format!("is not set: one of {choices} is needed"))
 }
+
+#[cfg(test)]
+mod tests;

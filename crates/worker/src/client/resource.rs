@@ -133,7 +133,8 @@ impl ResourceClient {
         self.field(answer.into_inner().lease, "lease")
     }
 
-    /// Waits until all requirements can be met at once and takes them under one lease. Dropping the future withdraws.
+    /// Waits until all requirements can be met at once and takes them under one lease. Dropping the future leaves the queue;
+    /// a grant that crosses with that is undone by [`ResourceClient::withdraw`].
     ///
     /// # Errors
     /// [`CallError`].
@@ -149,6 +150,17 @@ impl ResourceClient {
         };
         let answer = self.client.clone().acquire(question).await.map_err(|status| self.failed(&status))?;
         self.field(answer.into_inner().lease, "lease")
+    }
+
+    /// Undoes an acquire or a block by its request id, where the call was dropped and a grant may have crossed with that:
+    /// it leaves the queue, or gives back what it got. False when there was nothing to undo.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn withdraw(&self, request: &str) -> Result<bool, CallError> {
+        let question = v1::WithdrawRequest { request_id: request.to_owned(), session_id: self.session.clone() };
+        let answer = self.client.clone().withdraw(question).await.map_err(|status| self.failed(&status))?;
+        Ok(answer.into_inner().withdrawn)
     }
 
     /// Gives a lease back; false when it had ended before.

@@ -1,0 +1,290 @@
+//! What goes onto the wire comes back the same, through the bytes; what means nothing is refused with its path.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use super::*;
+use crate::types::*;
+use proptest::collection::{btree_map, vec};
+use proptest::prelude::*;
+use prost::Message;
+use ratn_model::fact::{Change, FactPattern, Footprint, Term};
+use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
+use ratn_model::pose::Pose;
+use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::value::{Trajectory, TrajectoryPoint};
+use std::fmt::Debug;
+
+/// Over the wire and back.
+fn check<T, W>(original: &T) -> Result<(), TestCaseError>
+where
+    T: Clone + PartialEq + Debug + TryFrom<W, Error = Malformed>,
+    W: From<T> + Message + Default,
+{
+    let bytes = W::from(original.clone()).encode_to_vec();
+    let back = T::try_from(W::decode(bytes.as_slice()).unwrap());
+    prop_assert_eq!(back.as_ref(), Ok(original));
+    Ok(())
+}
+
+fn number() -> impl Strategy<Value = f64> {
+    prop_oneof![Just(0.0), -1e3..1e3, prop::num::f64::NORMAL]
+}
+
+fn a_name() -> impl Strategy<Value = String> {
+    "[a-z][a-z_0-9@.-]{0,8}"
+}
+
+fn pose() -> impl Strategy<Value = Pose> {
+    ([-9.0..9.0, -9.0..9.0, -9.0..9.0], -4.0..4.0, -2.0..2.0, -4.0..4.0)
+        .prop_map(|(p, r, q, y)| Pose::from_rpy(p, r, q, y))
+}
+
+fn trajectory() -> impl Strategy<Value = Trajectory> {
+    let points = vec((0.001..2.0, any::<bool>()), 1..5);
+    (vec(a_name(), 0..4), points, number()).prop_map(|(joints, steps, x)| {
+        let (mut time_s, count) = (0.0, joints.len());
+        let point = |(step, velocities): (f64, bool)| {
+            time_s += step;
+            let velocities = if velocities { vec![x; count] } else { Vec::new() };
+            TrajectoryPoint { time_s, positions: vec![x; count], velocities }
+        };
+        Trajectory { points: steps.into_iter().map(point).collect(), joints }
+    })
+}
+
+fn value() -> impl Strategy<Value = Value> {
+    let leaf = prop_oneof![
+        Just(Value::Null),
+        any::<bool>().prop_map(Value::Bool),
+        any::<i64>().prop_map(Value::Int),
+        number().prop_map(Value::Float),
+        ".{0,6}".prop_map(Value::String),
+        pose().prop_map(Value::Pose),
+        vec(number(), 0..8).prop_map(Value::Joints),
+        trajectory().prop_map(Value::Trajectory),
+        vec(any::<u8>(), 0..9).prop_map(Value::Bytes),
+    ];
+    leaf.prop_recursive(4, 24, 4, |inner| {
+        prop_oneof![
+            vec(inner.clone(), 0..4).prop_map(Value::List),
+            btree_map(a_name(), inner, 0..4).prop_map(Value::Map),
+        ]
+    })
+}
+
+fn term() -> impl Strategy<Value = Term> {
+    prop_oneof![any::<i64>().prop_map(Term::Int), a_name().prop_map(Term::Name)]
+}
+
+fn key() -> impl Strategy<Value = FactKey> {
+    (a_name(), vec(term(), 0..3)).prop_map(|(predicate, arguments)| FactKey { predicate, arguments })
+}
+
+fn pattern() -> impl Strategy<Value = FactPattern> {
+    (a_name(), vec(prop::option::of(term()), 0..3))
+        .prop_map(|(predicate, arguments)| FactPattern { predicate, arguments })
+}
+
+fn footprint() -> impl Strategy<Value = Footprint> {
+    prop_oneof![Just(Footprint::Everything), vec(pattern(), 0..3).prop_map(Footprint::Patterns)]
+}
+
+fn change() -> impl Strategy<Value = Change> {
+    prop_oneof![
+        (key(), value()).prop_map(|(fact, value)| Change::Set { fact, value }),
+        pattern().prop_map(|pattern| Change::Delete { pattern }),
+        (key(), number()).prop_map(|(fact, by)| Change::Increase { fact, by }),
+    ]
+}
+
+fn class() -> impl Strategy<Value = ResourceClass> {
+    use ResourceClass::*;
+    prop::sample::select(vec![System, Process, Module, World, Task])
+}
+
+fn requirement() -> impl Strategy<Value = Requirement> {
+    use ResourceOperation::*;
+    let operation = prop::sample::select(vec![Block, Consume, Create, Delete, Exists]);
+    let attributes = btree_map(a_name(), value(), 0..3);
+    (operation, a_name(), prop::option::of(class()), attributes, 1..9_u32).prop_map(
+        |(operation, kind, class, attributes, count)| Requirement { operation, kind, class, attributes, count },
+    )
+}
+
+fn lease() -> impl Strategy<Value = Lease> {
+    let resource = (a_name(), a_name(), prop_oneof![Just(String::new()), Just("unix:/a.sock".to_owned())])
+        .prop_map(|(id, kind, endpoint)| LeasedResource { id, kind, endpoint });
+    (any::<u64>(), any::<u64>(), vec(resource, 0..3)).prop_map(|(id, token, resources)| Lease {
+        id: LeaseId(id),
+        token: FencingToken(token),
+        resources,
+    })
+}
+
+fn resource() -> impl Strategy<Value = Resource> {
+    let state = prop::sample::select(vec![ResourceState::Free, ResourceState::Leased, ResourceState::Exhausted]);
+    let holding = (any::<u64>(), any::<u64>(), 1..3_u32, a_name()).prop_map(|(lease, token, units, session)| Holding {
+        lease: LeaseId(lease),
+        token: FencingToken(token),
+        units,
+        holder: format!("{session}/a"),
+        session,
+    });
+    (a_name(), class(), a_name(), btree_map(a_name(), value(), 0..3), 1..9_u32, state, vec(holding, 0..3)).prop_map(
+        |(id, class, kind, attributes, capacity, state, holdings)| Resource {
+            attributes,
+            capacity,
+            state,
+            holdings,
+            session: "s".to_owned(),
+            revision: Revision(u64::from(capacity)),
+            ..Resource::new(id, class, kind).on_host("here")
+        },
+    )
+}
+
+fn update() -> impl Strategy<Value = ResourceUpdate> {
+    use ResourceEventKind::*;
+    let kind = prop::sample::select(vec![Created, Updated, Deleted, Leased, Released]);
+    let event = (any::<u64>(), kind, resource(), any::<u64>()).prop_map(|(revision, kind, resource, lease)| {
+        ResourceUpdate::Event(ResourceEvent {
+            revision: Revision(revision),
+            kind,
+            resource,
+            lease: matches!(kind, Leased | Released).then_some((LeaseId(lease), FencingToken(lease))),
+            reason: "because".to_owned(),
+        })
+    });
+    let snapshot = (any::<u64>(), vec(resource(), 0..3))
+        .prop_map(|(revision, resources)| ResourceUpdate::Snapshot { revision: Revision(revision), resources });
+    prop_oneof![event, snapshot]
+}
+
+fn goal() -> impl Strategy<Value = Goal> {
+    let inputs = btree_map(a_name(), value(), 0..3);
+    (a_name(), a_name(), inputs, any::<u64>(), prop::option::of(lease()), prop::option::of(any::<u64>())).prop_map(
+        |(id, action, inputs, seed, lease, projection)| Goal {
+            id,
+            action,
+            inputs,
+            seed,
+            lease,
+            projection: projection.map(ProjectionId),
+            world_pool: "unix:/world.sock".to_owned(),
+            deadline_ms: seed / 2,
+        },
+    )
+}
+
+fn outcome() -> impl Strategy<Value = GoalOutcome> {
+    (a_name(), btree_map(a_name(), value(), 0..3), vec((key(), value()), 0..3), ".{0,9}")
+        .prop_map(|(outcome, outputs, measured, reason)| GoalOutcome { outcome, outputs, measured, reason })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn what_goes_onto_the_wire_comes_back_the_same(
+        value in value(), key in key(), footprint in footprint(), change in change(), requirement in requirement(),
+        lease in lease(), update in update(), goal in goal(), outcome in outcome(),
+    ) {
+        check::<_, v1::Fact>(&FactRecord { key: key.clone(), value: value.clone(), revision: Revision(7) })?;
+        check::<_, v1::Value>(&value)?;
+        check::<_, v1::FactKey>(&key)?;
+        check::<_, v1::Footprint>(&footprint)?;
+        check::<_, v1::Change>(&change)?;
+        check::<_, v1::Requirement>(&requirement)?;
+        check::<_, v1::Lease>(&lease)?;
+        check::<_, v1::ResourceServiceWatchResponse>(&update)?;
+        check::<_, v1::Goal>(&goal)?;
+        check::<_, v1::GoalResult>(&outcome)?;
+    }
+
+    #[test]
+    fn no_bytes_make_a_conversion_panic(bytes in vec(any::<u8>(), 0..200)) {
+        if let Ok(goal) = v1::Goal::decode(bytes.as_slice()) {
+            let _ = Goal::try_from(goal);
+        }
+        if let Ok(change) = v1::Change::decode(bytes.as_slice()) {
+            let _ = Change::try_from(change);
+        }
+    }
+}
+
+#[test]
+fn workers_and_pools_come_back_the_same() {
+    for state in [WorkerState::Starting, WorkerState::Ready, WorkerState::Exited] {
+        let worker = WorkerStatus {
+            id: "path-planner-1@compute".to_owned(),
+            template: "path-planner".to_owned(),
+            state,
+            pid: 42,
+            endpoint: "unix:/a.sock".to_owned(),
+            reason: "killed by signal 9".to_owned(),
+            resident_bytes: 1 << 20,
+            cpu_millicores: 1500,
+        };
+        let pool = PoolStatus {
+            template: worker.template.clone(),
+            kind: "PathPlanner".to_owned(),
+            min: 1,
+            max: 4,
+            workers: vec![worker],
+            failure: "crashes in a loop".to_owned(),
+        };
+        assert_eq!(PoolStatus::try_from(v1::Pool::from(pool.clone())), Ok(pool));
+    }
+}
+
+fn refused<T, W>(message: W, expected: &str)
+where
+    T: TryFrom<W, Error = Malformed> + Debug,
+{
+    let error = T::try_from(message).unwrap_err().to_string();
+    assert!(error.contains(expected), "`{error}` does not say `{expected}`");
+}
+
+#[test]
+fn what_means_nothing_is_refused_with_its_path() {
+    refused::<Value, _>(v1::Value { kind: None }, "kind: is not set: one of null, boolean");
+    refused::<Value, _>(v1::Value::from(Value::Float(f64::NAN)), "number: is NaN");
+    refused::<Value, _>(v1::Value::from(Value::Joints(vec![0.0, f64::INFINITY])), "joints[1]: is inf");
+    let nested = Value::map([("a", Value::List(vec![Value::Null, Value::Float(f64::NAN)]))]);
+    refused::<Value, _>(v1::Value::from(nested.clone()), "[a][1].number: is NaN");
+    let goal = Goal {
+        id: "g".to_owned(),
+        action: "plan".to_owned(),
+        inputs: [("start".to_owned(), nested)].into(),
+        ..Goal::default()
+    };
+    refused::<Goal, _>(v1::Goal::from(goal.clone()), "inputs[start][a][1].number: is NaN");
+    refused::<Goal, _>(v1::Goal::from(Goal { action: String::new(), ..goal.clone() }), "action: is empty");
+    refused::<Goal, _>(
+        v1::Goal::from(Goal { action: "a\u{7}".to_owned(), ..goal }),
+        "action: holds control characters",
+    );
+    refused::<Pose, _>(v1::Pose { position_m: vec![0.0; 2], quaternion_xyzw: vec![0.0, 0.0, 0.0, 1.0] }, "exactly 3");
+    refused::<Pose, _>(v1::Pose { position_m: vec![0.0; 3], quaternion_xyzw: vec![0.0; 4] }, "has length 0");
+    let point = |time_s| TrajectoryPoint { time_s, positions: vec![0.0], velocities: vec![] };
+    let back = Trajectory { joints: vec!["a".to_owned()], points: vec![point(1.0), point(0.5)] };
+    refused::<Trajectory, _>(v1::Trajectory::from(back), "points[1].time_s: is 0.5: times start at 0 and grow");
+    let short = Trajectory { joints: vec![], points: vec![point(1.0)] };
+    refused::<Trajectory, _>(v1::Trajectory::from(short), "points[0].positions: has 1 numbers for 0 joints");
+    refused::<FactKey, _>(v1::FactKey { predicate: "x".repeat(2000), arguments: vec![] }, "at most 1024");
+    refused::<Change, _>(v1::Change { kind: None }, "one of set, delete, increase");
+    refused::<Requirement, _>(
+        v1::Requirement { kind: "Arm".to_owned(), count: 1, operation: 99, ..Default::default() },
+        "operation: 99",
+    );
+}
+
+#[test]
+fn nesting_and_size_have_an_end() {
+    let nested = |depth: usize| (0..depth).fold(Value::Null, |inner, _| Value::List(vec![inner]));
+    assert!(Value::try_from(v1::Value::from(nested(MAX_DEPTH))).is_ok());
+    refused::<Value, _>(v1::Value::from(nested(MAX_DEPTH + 1)), "nest deeper than 16");
+    refused::<Value, _>(v1::Value::from(Value::List(vec![Value::Null; MAX_ELEMENTS + 1])), "more than 200000 elements");
+    // The deepest value that is allowed also survives the decoder's own limit.
+    let bytes = v1::Value::from(nested(MAX_DEPTH)).encode_to_vec();
+    assert!(v1::Value::decode(bytes.as_slice()).is_ok());
+}

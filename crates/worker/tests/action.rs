@@ -1,0 +1,200 @@
+//! The action protocol over real sockets.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod common;
+
+use common::{Provider, RESOURCE, begin, goal, lease, provider};
+use ratn_model::id::LeaseId;
+use ratn_model::value::Value;
+use ratn_proto::types::{Goal, GoalOutcome};
+use ratn_worker::client::CallError;
+use ratn_worker::endpoint::Endpoint;
+use std::sync::atomic::Ordering;
+use tonic::Code;
+
+async fn run(provider: &Provider, goal: Goal) -> Result<GoalOutcome, CallError> {
+    provider.client.execute(&provider.endpoint, goal, |_, _| {}).await
+}
+
+#[tokio::test]
+async fn a_goal_is_accepted_tells_its_progress_and_ends_with_its_result() {
+    for listen in [None, Some(Endpoint::loopback())] {
+        let provider = provider(listen).await;
+        let mut heard = Vec::new();
+        let outcome = provider
+            .client
+            .execute(&provider.endpoint, goal("a", "double", 1), |message, _| heard.push(message))
+            .await
+            .unwrap();
+        assert_eq!(outcome, GoalOutcome::success().with_output("y", Value::Float(42.0)));
+        assert_eq!(heard, ["run 1"]);
+    }
+}
+
+#[tokio::test]
+async fn a_cancelled_goal_ends_preempted() {
+    let provider = provider(None).await;
+    let waiting = begin(&provider, goal("a", "wait", 1)).await;
+    assert!(provider.client.cancel(&provider.endpoint, "a").await.unwrap());
+    assert_eq!(waiting.await.unwrap().unwrap().outcome, "preempted");
+    assert!(!provider.client.cancel(&provider.endpoint, "a").await.unwrap());
+}
+
+#[tokio::test]
+async fn a_goal_beyond_its_deadline_ends_preempted() {
+    let provider = provider(None).await;
+    let outcome = run(&provider, Goal { deadline_ms: 1, ..goal("a", "wait", 1) }).await.unwrap();
+    assert_eq!(outcome, GoalOutcome::preempted("the goal's deadline was over"));
+}
+
+#[tokio::test]
+async fn an_older_token_than_one_seen_is_refused() {
+    let provider = provider(None).await;
+    run(&provider, goal("a", "double", 7)).await.unwrap();
+    let error = run(&provider, goal("b", "double", 6)).await.unwrap_err();
+    assert_eq!(error.code(), Some(Code::FailedPrecondition));
+    assert!(error.to_string().contains("token-7 was seen since"), "{error}");
+    assert_eq!(provider.runs.load(Ordering::SeqCst), 1);
+}
+
+#[tokio::test]
+async fn a_goal_without_a_lease_of_the_provider_is_refused() {
+    let provider = provider(None).await;
+    for lease in [None, Some(lease(1, &[("somebody-else", "Tester", "")]))] {
+        let error = run(&provider, Goal { lease, ..goal("a", "double", 1) }).await.unwrap_err();
+        assert_eq!(error.code(), Some(Code::FailedPrecondition));
+        assert!(error.to_string().contains(RESOURCE), "{error}");
+    }
+}
+
+#[tokio::test]
+async fn a_newer_lease_takes_over_and_the_older_goal_ends_aborted() {
+    let provider = provider(None).await;
+    let older = begin(&provider, goal("a", "wait", 1)).await;
+    let newer = run(&provider, goal("b", "double", 2)).await.unwrap();
+    assert!(newer.is_success());
+    let older = older.await.unwrap().unwrap();
+    assert_eq!((older.outcome.as_str(), older.reason.contains("newer lease")), ("aborted", true));
+}
+
+#[tokio::test]
+async fn a_lease_that_ends_aborts_the_goal_under_way() {
+    let provider = provider(None).await;
+    let waiting = begin(&provider, goal("a", "wait", 3)).await;
+    assert_eq!(provider.server.end_lease(LeaseId(4), "expired"), 0);
+    assert_eq!(provider.server.end_lease(LeaseId(3), "expired"), 1);
+    assert_eq!(waiting.await.unwrap().unwrap(), GoalOutcome::aborted("the lease ended: expired"));
+}
+
+#[tokio::test]
+async fn the_same_goal_twice_runs_once() {
+    let provider = provider(None).await;
+    let first = run(&provider, goal("a", "double", 1)).await.unwrap();
+    let again = run(&provider, goal("a", "double", 1)).await.unwrap();
+    assert_eq!(first, again);
+    assert_eq!(provider.runs.load(Ordering::SeqCst), 1);
+
+    let one = begin(&provider, goal("b", "wait", 1)).await;
+    let client = (provider.client.clone(), provider.endpoint.clone());
+    let other = tokio::spawn(async move { client.0.execute(&client.1, goal("b", "wait", 1), |_, _| {}).await });
+    tokio::task::yield_now().await;
+    assert!(provider.server.cancel("b"));
+    assert_eq!(one.await.unwrap().unwrap(), other.await.unwrap().unwrap());
+    assert_eq!(provider.server.running(), 0);
+}
+
+#[tokio::test]
+async fn a_result_is_forgotten_when_enough_newer_ones_are_kept() {
+    let provider = provider(None).await;
+    for id in ["a", "b", "c", "a"] {
+        run(&provider, goal(id, "double", 1)).await.unwrap();
+    }
+    assert_eq!(provider.runs.load(Ordering::SeqCst), 4);
+    run(&provider, goal("c", "double", 1)).await.unwrap();
+    assert_eq!(provider.runs.load(Ordering::SeqCst), 4);
+}
+
+#[tokio::test]
+async fn a_second_goal_of_a_busy_provider_is_refused() {
+    let provider = provider(None).await;
+    let _waiting = begin(&provider, goal("a", "wait", 1)).await;
+    let error = run(&provider, goal("b", "double", 1)).await.unwrap_err();
+    assert_eq!(error.code(), Some(Code::ResourceExhausted));
+    assert!(error.to_string().contains("busy with goal a"), "{error}");
+}
+
+#[tokio::test]
+async fn a_goal_whose_client_leaves_is_stopped_where_the_action_says_so() {
+    let provider = provider(None).await;
+    let waiting = begin(&provider, goal("a", "wait", 1)).await;
+    waiting.abort();
+    provider.ended.notified().await;
+
+    let staying = begin(&provider, goal("b", "stay", 2)).await;
+    staying.abort();
+    assert!(staying.await.unwrap_err().is_cancelled());
+    // The goal still runs: whoever gives it again joins it.
+    let joined = begin_silent(&provider, goal("b", "stay", 2));
+    assert!(provider.client.cancel(&provider.endpoint, "b").await.unwrap());
+    assert_eq!(joined.await.unwrap().unwrap().outcome, "preempted");
+}
+
+fn begin_silent(provider: &Provider, goal: Goal) -> tokio::task::JoinHandle<Result<GoalOutcome, CallError>> {
+    let (client, endpoint) = (provider.client.clone(), provider.endpoint.clone());
+    tokio::spawn(async move { client.execute(&endpoint, goal, |_, _| {}).await })
+}
+
+#[tokio::test]
+async fn an_unknown_action_is_refused_with_those_that_there_are() {
+    let provider = provider(None).await;
+    let error = run(&provider, goal("a", "fly", 1)).await.unwrap_err();
+    assert_eq!(error.code(), Some(Code::InvalidArgument));
+    assert!(error.to_string().contains("no action `fly`: there are double, panic, relay, stay, wait"), "{error}");
+    assert!(!error.is_crash());
+}
+
+#[tokio::test]
+async fn a_wrong_input_and_a_panic_end_the_goal_aborted_with_the_reason() {
+    let provider = provider(None).await;
+    let inputs = [("x".to_owned(), Value::String("many".to_owned()))].into();
+    let outcome = run(&provider, Goal { inputs, ..goal("a", "double", 1) }).await.unwrap();
+    assert_eq!(outcome, GoalOutcome::aborted("input `x` is a string: expected a number"));
+    let outcome = run(&provider, goal("b", "panic", 1)).await.unwrap();
+    assert_eq!(outcome, GoalOutcome::aborted("the action panicked: on purpose"));
+}
+
+#[tokio::test]
+async fn an_action_has_another_provider_of_its_lease_help() {
+    let (helper, provider) = (provider(None).await, provider(None).await);
+    let at = helper.endpoint.to_string();
+    // The helper is the same resource, here of kind Doubler.
+    let lease = lease(1, &[(RESOURCE, "Doubler", &at)]);
+    let outcome = run(&provider, Goal { lease: Some(lease), ..goal("a", "relay", 1) }).await.unwrap();
+    assert_eq!(outcome.outputs["y"], Value::Float(42.0));
+    let outcome = run(&provider, goal("b", "relay", 1)).await.unwrap();
+    assert!(outcome.reason.contains("holds no Doubler"), "{}", outcome.reason);
+}
+
+#[tokio::test]
+async fn a_provider_that_goes_away_is_a_crash_and_not_an_outcome() {
+    let provider = provider(None).await;
+    let staying = begin(&provider, goal("a", "stay", 1)).await;
+    provider.shutdown.cancel();
+    provider.serving.await.unwrap();
+    // Its process would be gone now: here the goal's own end stands for it.
+    provider.server.stop_all().await;
+    let _ = staying.await.unwrap();
+    let error = provider.client.execute(&provider.endpoint, goal("b", "double", 1), |_, _| {}).await.unwrap_err();
+    assert!(error.is_crash() && error.code().is_none(), "{error}");
+}
+
+#[tokio::test]
+async fn a_provider_describes_what_it_performs() {
+    let provider = provider(None).await;
+    let info = provider.client.describe(&provider.endpoint).await.unwrap();
+    assert_eq!(info.resource, RESOURCE);
+    let double = info.actions.iter().find(|action| action.name == "double").unwrap();
+    assert_eq!(double.description, "twice as much");
+    assert!(double.cancel_when_abandoned);
+    assert!(!info.actions.iter().find(|action| action.name == "stay").unwrap().cancel_when_abandoned);
+}

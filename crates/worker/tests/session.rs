@@ -1,0 +1,220 @@
+//! Sessions and providers against a resource manager reduced to what they need of it: sessions that die with their time
+//! to live, and resources that die with their session.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use futures::stream::{BoxStream, StreamExt};
+use ratn_model::resource::ResourceClass;
+use ratn_model::value::Value;
+use ratn_proto::types::Resource;
+use ratn_proto::v1::resource_service_server::{ResourceService, ResourceServiceServer};
+use ratn_proto::v1::*;
+use ratn_worker::client::Channels;
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::provider::Provider;
+use ratn_worker::server::{Services, bind};
+use ratn_worker::session::Session;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+use tonic::{Request, Response, Status, Streaming};
+
+const LONG: Duration = Duration::from_secs(20);
+const TTL: Duration = Duration::from_millis(200);
+
+#[derive(Default)]
+struct Pool {
+    sessions: BTreeSet<String>,
+    resources: BTreeMap<String, ratn_proto::v1::Resource>,
+}
+
+#[derive(Clone)]
+struct Manager {
+    pool: Arc<Mutex<Pool>>,
+    changed: watch::Sender<()>,
+}
+
+#[tonic::async_trait]
+impl ResourceService for Manager {
+    async fn create(&self, request: Request<CreateRequest>) -> Result<Response<CreateResponse>, Status> {
+        let request = request.into_inner();
+        let mut pool = self.pool.lock().unwrap();
+        if !pool.sessions.contains(&request.session_id) {
+            return Err(Status::failed_precondition("no such session"));
+        }
+        let resource = request.resource.unwrap();
+        if resource.kind == "Forbidden" {
+            return Err(Status::permission_denied("not here"));
+        }
+        pool.resources.insert(resource.id.clone(), resource.clone());
+        drop(pool);
+        self.changed.send_replace(());
+        Ok(Response::new(CreateResponse { resource: Some(resource) }))
+    }
+
+    async fn delete(&self, request: Request<DeleteRequest>) -> Result<Response<DeleteResponse>, Status> {
+        let Some(delete_request::Target::ResourceId(id)) = request.into_inner().target else { unreachable!() };
+        self.pool.lock().unwrap().resources.remove(&id).ok_or_else(|| Status::not_found(id.clone()))?;
+        self.changed.send_replace(());
+        Ok(Response::new(DeleteResponse { resource_ids: vec![id], revision: 1 }))
+    }
+
+    type KeepAliveStream = BoxStream<'static, Result<KeepAliveResponse, Status>>;
+
+    async fn keep_alive(
+        &self,
+        request: Request<Streaming<KeepAliveRequest>>,
+    ) -> Result<Response<Self::KeepAliveStream>, Status> {
+        let manager = self.clone();
+        let answers = request.into_inner().map(move |ping| {
+            let ping = ping?;
+            let mut pool = manager.pool.lock().unwrap();
+            let created = if ping.ttl_ms == 0 {
+                pool.sessions.remove(&ping.session_id);
+                false
+            } else {
+                pool.sessions.insert(ping.session_id.clone())
+            };
+            drop(pool);
+            manager.changed.send_replace(());
+            Ok(KeepAliveResponse { session_id: ping.session_id, ttl_ms: ping.ttl_ms, created, revision: 1 })
+        });
+        Ok(Response::new(answers.boxed()))
+    }
+
+    async fn consume(&self, _: Request<ConsumeRequest>) -> Result<Response<ConsumeResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    async fn block(&self, _: Request<BlockRequest>) -> Result<Response<BlockResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    async fn release(
+        &self,
+        _: Request<ResourceServiceReleaseRequest>,
+    ) -> Result<Response<ResourceServiceReleaseResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    async fn withdraw(&self, _: Request<WithdrawRequest>) -> Result<Response<WithdrawResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    async fn exists(&self, _: Request<ExistsRequest>) -> Result<Response<ExistsResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    async fn acquire(&self, _: Request<AcquireRequest>) -> Result<Response<AcquireResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    async fn list(&self, _: Request<ListRequest>) -> Result<Response<ListResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    type WatchStream = BoxStream<'static, Result<ResourceServiceWatchResponse, Status>>;
+
+    async fn watch(&self, _: Request<ResourceServiceWatchRequest>) -> Result<Response<Self::WatchStream>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+}
+
+impl Manager {
+    fn new() -> Manager {
+        Manager { pool: Arc::default(), changed: watch::channel(()).0 }
+    }
+
+    async fn serve(&self, endpoint: &Endpoint) -> (CancellationToken, tokio::task::JoinHandle<()>) {
+        let bound = bind(endpoint).await.unwrap();
+        let stop = CancellationToken::new();
+        let serving = bound.serve(Services::new().with(ResourceServiceServer::new(self.clone())), stop.clone());
+        (stop, tokio::spawn(async move { serving.await.unwrap() }))
+    }
+
+    /// Waits until the pool is as `wanted` says.
+    async fn until(&self, wanted: impl Fn(&Pool) -> bool) {
+        let mut changes = self.changed.subscribe();
+        let seen = changes.wait_for(|()| wanted(&self.pool.lock().unwrap()));
+        tokio::time::timeout(LONG, seen).await.expect("the pool never became so").unwrap();
+    }
+
+    fn forget_everything(&self) {
+        *self.pool.lock().unwrap() = Pool::default();
+    }
+}
+
+fn arm() -> Resource {
+    Resource::new("arm@sim", ResourceClass::Module, "Arm").with_endpoint("unix:/cell.sock")
+}
+
+#[tokio::test]
+async fn a_session_lives_until_it_is_closed() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let session = Session::open(&Channels::new(), &endpoint, "test", TTL);
+    session.alive(LONG).await.unwrap();
+    let id = session.id().to_owned();
+    manager.until(|pool| pool.sessions.contains(&id)).await;
+    session.close().await;
+    manager.until(|pool| pool.sessions.is_empty()).await;
+}
+
+#[tokio::test]
+async fn a_session_without_its_manager_is_not_alive() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let session = Session::open(&Channels::new(), &endpoint, "test", TTL);
+    let error = session.alive(Duration::from_millis(1)).await.unwrap_err().to_string();
+    assert!(error.contains("rm.sock") && error.contains("is it running?"), "{error}");
+}
+
+#[tokio::test]
+async fn a_lost_session_says_so_and_comes_back_with_its_resources() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    let (stop, serving) = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open(&channels, &endpoint, "cell", TTL);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    assert!(provider.offer(arm()).await.unwrap());
+    let lost = session.lost();
+
+    stop.cancel();
+    serving.await.unwrap();
+    // A manager without a memory comes back at the same place.
+    manager.forget_everything();
+    tokio::time::timeout(LONG, lost).await.expect("nobody said that the session was lost");
+    let _serving = manager.serve(&endpoint).await;
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    assert_eq!(session.state().borrow().generation, 2);
+}
+
+#[tokio::test]
+async fn resources_are_offered_updated_and_withdrawn() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    let channels = Channels::new();
+    let session = Session::open(&channels, &endpoint, "cell", TTL);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    // Before there is a manager: later, by itself.
+    assert!(!provider.offer(arm()).await.unwrap());
+    let _serving = manager.serve(&endpoint).await;
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    session.alive(LONG).await.unwrap();
+
+    assert!(provider.offer(arm().with_attribute("level", Value::Float(0.5))).await.unwrap());
+    assert!(manager.pool.lock().unwrap().resources["arm@sim"].attributes.contains_key("level"));
+    let refused = provider.offer(Resource::new("x", ResourceClass::Module, "Forbidden")).await.unwrap_err();
+    assert_eq!(refused.to_string(), "not here");
+    assert_eq!(provider.offered().await.len(), 1);
+    provider.withdraw("arm@sim").await.unwrap();
+    provider.withdraw("arm@sim").await.unwrap();
+    assert!(manager.pool.lock().unwrap().resources.is_empty());
+}
