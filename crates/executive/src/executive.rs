@@ -64,7 +64,7 @@ impl Executive {
             }
             event => self.step(event, &mut commands),
         }
-        commands
+        releases_last(commands)
     }
 
     /// The mirror of the root world model.
@@ -176,6 +176,18 @@ impl Executive {
             commands.push(Command::End { outcome, outputs, reason });
         }
     }
+}
+
+/// What is given back goes to whom it serves most: those who ask because of the same event must be in the queue by then.
+fn releases_last(commands: Vec<Command>) -> Vec<Command> {
+    let rank = |command: &Command| match command {
+        Command::Release { .. } => 1,
+        Command::End { .. } => 2,
+        _ => 0,
+    };
+    let mut ordered = commands;
+    ordered.sort_by_key(rank);
+    ordered
 }
 
 fn commit_initial(context: &mut Context<'_>, parameters: &BTreeMap<String, Value>) -> Result<(), String> {

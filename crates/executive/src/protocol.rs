@@ -109,7 +109,8 @@ pub enum Event {
     },
 }
 
-/// What the shell shall do. Performed in order; commits and projections reach the world pool in this order.
+/// What the shell shall do. Performed in order: commits and projections reach the world pool, acquires and releases the
+/// resource manager, in this order. The releases of one event come last, so that what is given back goes to the most urgent.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "command", rename_all = "snake_case")]
 pub enum Command {

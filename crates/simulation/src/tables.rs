@@ -5,6 +5,7 @@ use crate::timed::TimedProviders;
 use ratn_executive::protocol::Mode;
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
+use ratn_model::parameters::ParameterError;
 use ratn_model::program::Program;
 use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
@@ -52,6 +53,9 @@ pub enum TableError {
     /// An example task does not load.
     #[error("the example task is refused: {}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("; "))]
     Refused(Vec<Diagnostic>),
+    /// A parameter does not fit.
+    #[error("{0}")]
+    Parameter(#[from] ParameterError),
     /// A run broke.
     #[error("{0}")]
     Run(#[from] RunError),
@@ -150,8 +154,7 @@ impl Scenario {
 }
 
 fn setup(program: Program, parameters: &[(String, String)], mode: Mode, planners: u32) -> Result<Setup, TableError> {
-    let parameters: BTreeMap<String, Value> =
-        program.bind_parameters(parameters).map_err(|diagnostic| TableError::Refused(vec![diagnostic]))?;
+    let parameters: BTreeMap<String, Value> = program.bind_parameters(parameters)?;
     let mut resources: Vec<(String, ResourceClass, u32)> = Catalogue::standard()
         .resources
         .iter()
