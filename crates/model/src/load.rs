@@ -1,7 +1,7 @@
 //! Task file → [`Program`].
 //!
 //! In three passes: the outline (which states there are, and their order), the expressions (with every name resolved), and
-//! the rules of [`crate::check`]. Everything that is wrong is collected, each with its place; a program comes out only if
+//! the rules of `check`. Everything that is wrong is collected, each with its place; a program comes out only if
 //! nothing is. What the format will have and does not have yet is refused by name, never ignored.
 //!
 //! ```yaml
