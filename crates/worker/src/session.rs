@@ -187,7 +187,11 @@ impl Keeper {
                 state.generation += u64::from(answer.created);
                 *state != before
             });
-            tokio::time::sleep(ttl.min(self.ttl) / PINGS_PER_TTL).await;
+            tokio::select! {
+                () = tokio::time::sleep(ttl.min(self.ttl) / PINGS_PER_TTL) => {}
+                // Nothing is due: the stream broke, or the manager ended it.
+                _ = answers.message() => return,
+            }
             if pings.send(self.ping(self.ttl)).await.is_err() {
                 return;
             }

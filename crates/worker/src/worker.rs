@@ -147,7 +147,7 @@ impl Worker {
             drop(provider);
             session.close().await;
         }
-        let stopping = server.stop_all();
+        let stopping = server.shut_down();
         let (served, ()) = tokio::join!(serving, async {
             let _ = tokio::time::timeout(crate::server::DRAIN_DEADLINE, stopping).await;
         });

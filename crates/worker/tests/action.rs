@@ -176,15 +176,16 @@ async fn an_action_has_another_provider_of_its_lease_help() {
 }
 
 #[tokio::test]
-async fn a_provider_that_goes_away_is_a_crash_and_not_an_outcome() {
-    let provider = provider(None).await;
+async fn a_provider_that_shuts_down_is_a_crash_and_not_an_outcome() {
+    let mut provider = provider(None).await;
     let staying = begin(&provider, goal("a", "stay", 1)).await;
+    provider.server.shut_down().await;
+    let error = staying.await.unwrap().unwrap_err();
+    assert!(error.is_crash() && error.to_string().contains("shuts down"), "{error}");
+
     provider.shutdown.cancel();
-    provider.serving.await.unwrap();
-    // Its process would be gone now: here the goal's own end stands for it.
-    provider.server.stop_all().await;
-    let _ = staying.await.unwrap();
-    let error = provider.client.execute(&provider.endpoint, goal("b", "double", 1), |_, _| {}).await.unwrap_err();
+    (&mut provider.serving).await.unwrap();
+    let error = run(&provider, goal("b", "double", 1)).await.unwrap_err();
     assert!(error.is_crash() && error.code().is_none(), "{error}");
 }
 

@@ -25,6 +25,17 @@ pub(crate) enum StopCause {
     Fenced(FencingToken),
     /// Its lease has ended.
     LeaseEnded(String),
+    /// The provider ends.
+    ShuttingDown,
+}
+
+/// How a goal ended.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Ending {
+    /// With an outcome.
+    Outcome(GoalOutcome),
+    /// Without one, as if the process had been killed: the provider ends, which is not the goal's doing.
+    Gone,
 }
 
 impl StopCause {
@@ -38,6 +49,7 @@ impl StopCause {
                 ActionFailure::Aborted(format!("a newer lease ({token}) took the resource over"))
             }
             StopCause::LeaseEnded(reason) => ActionFailure::Aborted(format!("the lease ended: {reason}")),
+            StopCause::ShuttingDown => ActionFailure::Aborted("the provider shuts down".to_owned()),
         }
     }
 }
@@ -52,7 +64,7 @@ pub(crate) struct GoalEntry {
     pub(crate) token: FencingToken,
     pub(crate) cancelled: CancellationToken,
     pub(crate) progress: broadcast::Sender<v1::GoalProgress>,
-    pub(crate) result: watch::Sender<Option<GoalOutcome>>,
+    pub(crate) result: watch::Sender<Option<Ending>>,
     stop_when_abandoned: bool,
     cause: Mutex<Option<StopCause>>,
     listeners: AtomicUsize,
@@ -99,10 +111,14 @@ impl GoalEntry {
         let _ = self.result.subscribe().wait_for(Option::is_some).await;
     }
 
+    /// Why it was told to stop.
+    pub(crate) fn cause(&self) -> Option<StopCause> {
+        self.cause.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
     /// What being told to stop makes of the goal.
     pub(crate) fn stopped(&self) -> ActionFailure {
-        let cause = self.cause.lock().unwrap_or_else(PoisonError::into_inner);
-        cause.as_ref().unwrap_or(&StopCause::Cancelled).failure()
+        self.cause().unwrap_or(StopCause::Cancelled).failure()
     }
 }
 

@@ -1,7 +1,7 @@
 //! The goals of one server: who may start, what runs, what is remembered.
 
 use super::fence::Fence;
-use super::goal::{GoalEntry, StopCause};
+use super::goal::{Ending, GoalEntry, StopCause};
 use super::service::Messages;
 use super::{Action, ActionFailure, ActionResult, GoalContext};
 use crate::client::Channels;
@@ -123,9 +123,10 @@ impl ActionServer {
         self.stop_where(|goal| goal.lease == Some(lease), &StopCause::LeaseEnded(reason.to_owned()))
     }
 
-    /// Tells every goal to stop, and returns when all have ended.
-    pub async fn stop_all(&self) {
-        self.stop_where(|_| true, &StopCause::Cancelled);
+    /// Ends with the process: tells every goal to stop, and returns when all have ended. Their clients hear what they would
+    /// hear if the process had been killed, unless a goal made it in time: a crash of the attempt, not an outcome.
+    pub async fn shut_down(&self) {
+        self.stop_where(|_| true, &StopCause::ShuttingDown);
         let running = self.inner.state().running.clone();
         for goal in running {
             goal.over().await;
@@ -272,7 +273,11 @@ async fn run(
     };
     // No longer running before anybody hears of its end: the next goal must find its place free.
     server.state().end(&entry, server.results_kept);
-    entry.result.send_replace(Some(outcome));
+    let ending = match entry.cause() {
+        Some(StopCause::ShuttingDown) if !outcome.is_success() => Ending::Gone,
+        _ => Ending::Outcome(outcome),
+    };
+    entry.result.send_replace(Some(ending));
 }
 
 fn outcome_of(performed: Result<ActionResult, JoinError>) -> GoalOutcome {

@@ -1,11 +1,11 @@
 //! The gRPC adapter of [`ActionServer`].
 
 use super::ActionServer;
-use super::goal::{GoalEntry, Listener};
+use super::goal::{Ending, GoalEntry, Listener};
 use futures::stream::{BoxStream, StreamExt, unfold};
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::required;
-use ratn_proto::types::{Goal, GoalOutcome};
+use ratn_proto::types::Goal;
 use ratn_proto::v1;
 use ratn_proto::v1::action_service_server::{ActionService, ActionServiceServer};
 use ratn_proto::v1::execute_response::Kind;
@@ -55,7 +55,7 @@ pub(super) struct Messages {
     accepted: Option<bool>,
     over: bool,
     progress: broadcast::Receiver<v1::GoalProgress>,
-    result: watch::Receiver<Option<GoalOutcome>>,
+    result: watch::Receiver<Option<Ending>>,
     _listener: Listener,
 }
 
@@ -72,38 +72,41 @@ impl Messages {
 
     fn into_stream(self) -> BoxStream<'static, Result<v1::ExecuteResponse, Status>> {
         let step = async |mut messages: Messages| {
-            let kind = messages.next().await?;
-            Some((Ok(v1::ExecuteResponse { kind: Some(kind) }), messages))
+            let message = messages.next().await?;
+            Some((message.map(|kind| v1::ExecuteResponse { kind: Some(kind) }), messages))
         };
         unfold(self, step).boxed()
     }
 
-    async fn next(&mut self) -> Option<Kind> {
+    async fn next(&mut self) -> Option<Result<Kind, Status>> {
         if let Some(joined) = self.accepted.take() {
-            return Some(Kind::Accepted(v1::GoalAccepted { joined }));
+            return Some(Ok(Kind::Accepted(v1::GoalAccepted { joined })));
         }
         if self.over {
             return None;
         }
         loop {
-            let outcome = tokio::select! {
+            let ending = tokio::select! {
                 biased;
                 progress = self.progress.recv() => match progress {
-                    Ok(progress) => return Some(Kind::Progress(progress)),
+                    Ok(progress) => return Some(Ok(Kind::Progress(progress))),
                     Err(RecvError::Lagged(_)) => continue,
                     Err(RecvError::Closed) => return None,
                 },
-                outcome = self.result.wait_for(Option::is_some) => match outcome {
-                    Ok(outcome) => outcome.clone()?,
+                ending = self.result.wait_for(Option::is_some) => match ending {
+                    Ok(ending) => ending.clone()?,
                     Err(_) => return None,
                 },
             };
             // A last word may have come between the two looks.
             if let Ok(progress) = self.progress.try_recv() {
-                return Some(Kind::Progress(progress));
+                return Some(Ok(Kind::Progress(progress)));
             }
             self.over = true;
-            return Some(Kind::Result(outcome.into()));
+            return Some(match ending {
+                Ending::Outcome(outcome) => Ok(Kind::Result(outcome.into())),
+                Ending::Gone => Err(Status::unavailable("the provider shuts down")),
+            });
         }
     }
 }

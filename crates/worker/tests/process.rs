@@ -1,0 +1,87 @@
+//! A worker as a process of its own: this test's own executable, run again in the role of the worker.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod common;
+
+use common::{Wait, goal};
+use ratn_worker::client::{ActionClient, Channels, wait_until_serving};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::shutdown::{EXIT_GRACE, exit_with_parent};
+use ratn_worker::worker::{Worker, WorkerOptions};
+use std::path::Path;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
+
+const LONG: Duration = Duration::from_secs(20);
+const SOCKET: &str = "RATN_TEST_SOCKET";
+
+/// The role of the worker; as a test it does nothing.
+#[test]
+fn child() {
+    let Some(socket) = std::env::var_os(SOCKET) else { return };
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    if socket.is_empty() {
+        // One that never drains.
+        exit_with_parent(&CancellationToken::new()).unwrap();
+        runtime.block_on(std::future::pending::<()>());
+    }
+    let options = WorkerOptions {
+        id: common::RESOURCE.to_owned(),
+        listen: Endpoint::Unix(socket.into()),
+        exit_with_parent: true,
+        ..WorkerOptions::default()
+    };
+    let wait = Wait { name: "wait", abandon: true, ended: Notify::new().into() };
+    runtime.block_on(Worker::new(options).action(wait).run()).unwrap();
+}
+
+fn spawn(socket: &Path) -> Child {
+    Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "child", "--nocapture"])
+        .env(SOCKET, socket)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap()
+}
+
+async fn exit_of(mut child: Child) -> ExitStatus {
+    let exited = tokio::task::spawn_blocking(move || child.wait().unwrap());
+    tokio::time::timeout(LONG, exited).await.expect("the worker does not end").unwrap()
+}
+
+#[tokio::test]
+async fn a_worker_ends_with_its_parent_and_removes_its_socket() {
+    let directory = tempfile::tempdir().unwrap();
+    let socket = directory.path().join("workers/one.sock");
+    let mut child = spawn(&socket);
+    wait_until_serving(&Endpoint::Unix(socket.clone()), LONG).await.unwrap();
+    drop(child.stdin.take());
+    assert!(exit_of(child).await.success());
+    assert!(!socket.exists());
+}
+
+#[tokio::test]
+async fn a_process_that_does_not_drain_ends_all_the_same() {
+    let mut child = spawn(Path::new(""));
+    let ended = Instant::now();
+    drop(child.stdin.take());
+    assert_eq!(exit_of(child).await.code(), Some(3));
+    assert!(ended.elapsed() >= EXIT_GRACE);
+}
+
+#[tokio::test]
+async fn a_killed_worker_is_a_crash_of_its_goal() {
+    let directory = tempfile::tempdir().unwrap();
+    let socket = directory.path().join("one.sock");
+    let mut child = spawn(&socket);
+    let endpoint = Endpoint::Unix(socket);
+    wait_until_serving(&endpoint, LONG).await.unwrap();
+    let client = ActionClient::new(Channels::new());
+    // It is killed as soon as its goal is under way.
+    let killed = client.execute(&endpoint, goal("a", "wait", 1), |_, _| child.kill().unwrap()).await.unwrap_err();
+    assert!(killed.is_crash(), "{killed}");
+    assert!(!exit_of(child).await.success());
+}
