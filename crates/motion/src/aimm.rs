@@ -46,7 +46,7 @@ pub const HOME: Joints = [-FRAC_PI_2, -0.35, 0.0, 1.40, 0.0, -1.391_592_653_589_
 /// Arm above the deck, out of the camera's view of the table.
 pub const OBSERVATION: Joints = [0.9, -1.2, 0.0, 0.9, 0.0, -0.6, 0.0];
 
-/// Arm folded within the base's outline, for driving.
+/// Arm folded within the base's outline, for driving; the camera sees the whole deck.
 pub const STOWED: Joints = [FRAC_PI_2, 0.3, 0.0, 2.05, 0.0, -0.8, 0.0];
 
 /// The places `slot_1`..`slot_9` on the deck, seen from the base: on the deck's surface, x along a box's longer edge, which
@@ -169,28 +169,41 @@ mod tests {
         }
     }
 
-    #[test]
-    fn in_the_observation_posture_the_camera_sees_every_box() {
+    /// Which points of a patch of floor, or up to a box's height above it, the robot hides from the camera looking at `target`.
+    fn hidden(arm: Joints, target: [f64; 3], [x_low, x_high]: [f64; 2], [y_low, y_high]: [f64; 2]) -> Vec<String> {
         let robot = Robot::aimm();
-        let (pan, tilt) = robot.look_at(&Pose::IDENTITY, TABLE_CENTRE);
-        let configuration = Configuration { arm: OBSERVATION, pan, tilt, finger: 0.055, ..Configuration::ZERO };
+        let (pan, tilt) = robot.look_at(&Pose::IDENTITY, target);
+        let configuration = Configuration { arm, pan, tilt, finger: GRIPPER_OPENING_M / 2.0, ..Configuration::ZERO };
         let eye = robot.camera_pose(&configuration).position;
+        // The base carries the deck: looking at it, its surface is no obstacle.
+        let body = robot.link("base").unwrap();
+        let shapes: Vec<_> = robot.shapes(&configuration).into_iter().filter(|(link, ..)| *link != body).collect();
         let mut hidden = Vec::new();
-        for x in 0..=11 {
-            for y in 0..=22 {
-                let (x, y) = (0.57 + 0.03 * f64::from(x), -0.44 + 0.04 * f64::from(y));
-                for z in [TABLE_HEIGHT_M, TABLE_HEIGHT_M + 0.12] {
-                    let way = [x - eye[0], y - eye[1], z - eye[2]].map(|c| c as f32);
-                    let ray = Ray::new(Vector::from_array(eye.map(|c| c as f32)), Vector::from_array(way));
-                    for (link, pose, shape) in robot.shapes(&configuration) {
-                        let name = &robot.links[link].name;
-                        if name != "tilt" && shape.cast_ray(&pose, &ray, 1.0, true).is_some() {
-                            hidden.push(format!("({x:.2}, {y:.2}, {z:.2}) behind {name}"));
-                        }
-                    }
+        for (x, y) in (0..=12).flat_map(|x| (0..=20).map(move |y| (f64::from(x) / 12.0, f64::from(y) / 20.0))) {
+            let (x, y) = (x_low + (x_high - x_low) * x, y_low + (y_high - y_low) * y);
+            for z in [target[2], target[2] + BOX_GREATEST[2]] {
+                let way = [x - eye[0], y - eye[1], z - eye[2]].map(|c| c as f32);
+                let ray = Ray::new(Vector::from_array(eye.map(|c| c as f32)), Vector::from_array(way));
+                let meets = shapes.iter().filter(|(_, pose, shape)| shape.cast_ray(pose, &ray, 1.0, true).is_some());
+                for (link, ..) in meets.filter(|(link, ..)| robot.links[*link].name != "tilt") {
+                    hidden.push(format!("({x:.2}, {y:.2}, {z:.2}) behind {}", robot.links[*link].name));
                 }
             }
         }
-        assert!(hidden.is_empty(), "eye {eye:?}: {} {hidden:#?}", hidden.len());
+        hidden
+    }
+
+    #[test]
+    fn in_the_observation_posture_the_camera_sees_every_box_on_the_table() {
+        let target = [TABLE_CENTRE[0], TABLE_CENTRE[1], TABLE_HEIGHT_M];
+        let [x, y] = BOX_REGION.map(|[low, high]| [low - 0.08, high + 0.08]);
+        assert_eq!(hidden(OBSERVATION, target, x, y), Vec::<String>::new());
+        assert!(!hidden(HOME, target, x, y).is_empty(), "at home the arm stands in the way");
+    }
+
+    #[test]
+    fn in_the_stowed_posture_the_camera_sees_the_whole_deck_behind_the_arm() {
+        let target = [-0.37, 0.0, DECK_HEIGHT_M];
+        assert_eq!(hidden(STOWED, target, [-0.58, -0.16], [-0.28, 0.28]), Vec::<String>::new());
     }
 }

@@ -110,10 +110,8 @@ impl<'a> Solver<'a> {
     ) -> Vec<Joints> {
         let mut found: Vec<Joints> = Vec::new();
         for attempt in 0..attempts {
-            let seed = if attempt == 0 { *near } else { self.random(random) };
-            let solution = self.descend(target, &seed, Some(near)).or_else(|| self.descend(target, &seed, None));
-            if let Some(solution) = solution
-                && found.iter().all(|other| distance(other, &solution) > SAME_RAD)
+            if let Some(solution) = self.attempt(target, near, attempt, random)
+                && found.iter().all(|other| !is_same(other, &solution))
             {
                 found.push(solution);
                 if found.len() == wanted {
@@ -123,6 +121,12 @@ impl<'a> Solver<'a> {
         }
         found.sort_by(|a, b| distance(a, near).total_cmp(&distance(b, near)));
         found
+    }
+
+    /// One attempt at a pose: the first from `near`, further ones from random postures, all drawn to `near`.
+    pub fn attempt(&mut self, target: &Pose, near: &Joints, attempt: usize, random: &mut impl Rng) -> Option<Joints> {
+        let seed = if attempt == 0 { *near } else { self.random(random) };
+        self.descend(target, &seed, Some(near)).or_else(|| self.descend(target, &seed, None))
     }
 
     /// Rows: the tool's velocity and angular velocity per joint.
@@ -139,6 +143,11 @@ impl<'a> Solver<'a> {
         }
         rows
     }
+}
+
+/// Whether two solutions are the same one.
+pub(crate) fn is_same(a: &Joints, b: &Joints) -> bool {
+    distance(a, b) < SAME_RAD
 }
 
 /// Position and rotation vector from `have` to `want`, in the world frame.

@@ -10,7 +10,7 @@
 
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M, distance};
 use crate::improve::improve;
-use crate::inverse::Solver;
+use crate::inverse::{Solver, is_same};
 use crate::line::{LineError, line};
 use crate::pace::{Control, Pace, Progress, Stop};
 use crate::robot::{Configuration, Joints, Robot};
@@ -273,8 +273,7 @@ impl Planning<'_> {
                 let postures = match goal {
                     Goal::Joints(posture) => vec![posture],
                     Goal::Pose(pose) => {
-                        pace.poll()?;
-                        let found = self.solver.solutions(&pose, near, wanted, attempts, &mut self.random);
+                        let found = self.postures(&pose, near, wanted, attempts, pace)?;
                         if found.is_empty() {
                             let [x, y, z] = pose.position;
                             reasons.push(format!("the arm does not reach ({x:.3}, {y:.3}, {z:.3})"));
@@ -299,6 +298,30 @@ impl Planning<'_> {
         reasons.sort();
         reasons.dedup();
         Err(PlanError::NoGoal { goals: self.goals.len(), reasons: reasons.into_iter().take(MAX_REASONS).collect() })
+    }
+
+    /// As [`Solver::solutions`], asking between the attempts whether to go on.
+    fn postures(
+        &mut self,
+        pose: &Pose,
+        near: &Joints,
+        wanted: usize,
+        attempts: usize,
+        pace: &mut Pace<'_>,
+    ) -> Result<Vec<Joints>, Stop> {
+        let mut found: Vec<Joints> = Vec::new();
+        for attempt in 0..attempts {
+            pace.poll()?;
+            if let Some(posture) = self.solver.attempt(pose, near, attempt, &mut self.random)
+                && found.iter().all(|other| !is_same(other, &posture))
+            {
+                found.push(posture);
+                if found.len() == wanted {
+                    break;
+                }
+            }
+        }
+        Ok(found)
     }
 
     /// The goal posture with its approach, or why it is none.
