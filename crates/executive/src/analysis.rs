@@ -119,10 +119,10 @@ fn own_nature(state: &State) -> NodeNature {
     }
 }
 
-/// The effects of every outcome. An irreversible action that does not say what success changes may change everything.
+/// The effects of every outcome. A node that does not say what success changes may change everything, unless it computes.
 fn own_writes(state: &State) -> Option<Vec<EffectExpr>> {
     let effects = &state.annotations.effects;
-    if own_nature(state) == NodeNature::Irreversible && !effects.contains_key(SUCCESS) {
+    if own_nature(state) != NodeNature::Computes && !effects.contains_key(SUCCESS) {
         return None;
     }
     Some(effects.values().flatten().cloned().collect())

@@ -3,15 +3,16 @@
 use crate::analysis::NodeNature;
 use ratn_model::expression::{EffectExpr, EvaluateError, Scope};
 use ratn_model::fact::{Change, FactKey};
-use ratn_model::program::State;
+use ratn_model::program::{SUCCESS, State};
 use ratn_model::value::Value;
 
 /// The declared effects of an outcome; `None` when the state may write everything then.
 pub(crate) fn declared<'a>(state: &'a State, nature: NodeNature, outcome: &str) -> Option<&'a [EffectExpr]> {
     match state.annotations.effects.get(outcome) {
         Some(effects) => Some(effects),
-        // A node that only computes or senses changes nothing unless it says so.
-        None if nature != NodeNature::Irreversible => Some(&[]),
+        // A node that only computes changes nothing, and one that failed to sense has learned nothing, unless it says so.
+        None if nature == NodeNature::Computes => Some(&[]),
+        None if nature == NodeNature::Senses && outcome != SUCCESS => Some(&[]),
         None => None,
     }
 }

@@ -251,8 +251,9 @@ impl Maker {
             5 | 6 => {
                 annotations.nature = Nature::Senses(facts(self, 2));
                 annotations.resources = vec![block("Eye")];
-                if self.dice.percent(60) {
-                    annotations.effects.insert(SUCCESS.to_owned(), vec![self.effect(visible, true)]);
+                if self.dice.percent(85) {
+                    let effects = if self.dice.percent(60) { vec![self.effect(visible, true)] } else { Vec::new() };
+                    annotations.effects.insert(SUCCESS.to_owned(), effects);
                 }
             }
             _ => {

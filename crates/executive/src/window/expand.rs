@@ -191,7 +191,7 @@ impl Window {
     /// A composite state is left with success: what it still does at its end.
     fn exit(&mut self, context: &mut Context<'_>, index: usize, state: &State, path: String) {
         let outputs = matches!(&state.kind, StateKind::Sequence { outputs, .. } if !outputs.is_empty());
-        let effects = !state.annotations.effects.is_empty();
+        let effects = state.annotations.effects.values().any(|effects| !effects.is_empty());
         if outputs || effects || !context.analysis.state(state.id).operations.is_empty() {
             let id = self.append(context, index, state, Role::Exit, path.clone());
             self.cursors[index].environment.producers.insert(state.id, id);

@@ -1,0 +1,474 @@
+//! One scenario per rule of how instances go from expanded to retired. A transcript is what the environment and the workers
+//! see: `seconds  start|end|squash  path`.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
+
+use ratn_executive::protocol::{Command, Event, Goal, LogEntry, Mode, Note};
+use ratn_model::catalogue::Catalogue;
+use ratn_model::fact::{FactKey, Term};
+use ratn_model::id::InstanceId;
+use ratn_model::pose::Pose;
+use ratn_model::resource::ResourceClass;
+use ratn_model::value::Value;
+use ratn_simulation::run::{Answer, Oracle, Performance, Run, Setup, run};
+use ratn_world::tolerance::Tolerance;
+use ratn_world::world::World;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+const CATALOGUE: &str = r#"
+[resources]
+Brain = { class = "process", count = 2 }
+Eye = { class = "process", count = 1 }
+Arm = { class = "module", count = 1, actuates = true }
+Head = { class = "module", count = 1, actuates = true }
+WorldModel = { class = "world", count = 8 }
+
+[providers.brain]
+resource = "Brain"
+actions.think = { optional = { a = "any", b = "any" }, outputs = { x = "any" } }
+
+[providers.eye]
+resource = "Eye"
+actions.look = { optional = { a = "any" }, outputs = { x = "any", list = "list<any>" } }
+
+[providers.arm]
+resource = "Arm"
+actions.move = { optional = { a = "any", b = "any" }, outputs = { x = "any" } }
+
+[providers.head]
+resource = "Head"
+actions.turn = { optional = { a = "any" }, outputs = { x = "any" } }
+"#;
+
+/// Providers that do as they are told, by path; else success after the declared duration with `x = 1`.
+#[derive(Default)]
+struct Script {
+    outputs: BTreeMap<&'static str, Vec<(&'static str, Value)>>,
+    outcomes: BTreeMap<&'static str, &'static str>,
+    measured: BTreeMap<&'static str, (FactKey, Value)>,
+    crashes: BTreeMap<&'static str, u32>,
+    worlds: BTreeMap<String, Vec<String>>,
+}
+
+impl Oracle for Script {
+    fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, world: &World) -> Performance {
+        let facts = world.iter().map(|(key, fact)| format!("{key} = {}", fact.value)).collect();
+        self.worlds.insert(path.to_owned(), facts);
+        let duration_s = goal.expected_s.unwrap_or(1.0);
+        if attempt <= self.crashes.get(path).copied().unwrap_or(0) {
+            return Performance { duration_s, answer: Answer::Crashed };
+        }
+        let mut outputs = BTreeMap::from([("x".to_owned(), Value::Int(1)), ("list".to_owned(), Value::List(vec![]))]);
+        for (name, value) in self.outputs.get(path).into_iter().flatten() {
+            outputs.insert((*name).to_owned(), value.clone());
+        }
+        let outcome = self.outcomes.get(path).copied().unwrap_or("success").to_owned();
+        let measured = self.measured.get(path).cloned().into_iter().collect();
+        Performance { duration_s, answer: Answer::Finished { outcome, outputs, measured } }
+    }
+}
+
+fn simulate(task: &str, mode: Mode, script: &mut Script) -> Run {
+    let catalogue = Catalogue::from_toml(CATALOGUE).unwrap();
+    let loaded = ratn_model::load::load(task, "task.yaml", &catalogue).unwrap_or_else(|problems| {
+        panic!("{}", problems.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))
+    });
+    let parameters = loaded.program.bind_parameters(&[]).unwrap();
+    let units = |class: ResourceClass, count: u32| if class == ResourceClass::System { 0 } else { count };
+    let setup = Setup {
+        program: Arc::new(loaded.program),
+        mode,
+        parameters,
+        seed: 7,
+        resources: catalogue.resources.iter().map(|(k, o)| (k.clone(), o.class, units(o.class, o.count))).collect(),
+        world: Vec::new(),
+        tolerance: Tolerance::ROBOT,
+    };
+    run(setup, script).unwrap()
+}
+
+/// `seconds verb path`, in the order of events.
+fn transcript(run: &Run) -> Vec<String> {
+    let mut paths: BTreeMap<InstanceId, String> = BTreeMap::new();
+    let mut lines = Vec::new();
+    for line in &run.log {
+        let at = line.at.seconds();
+        match &line.entry {
+            LogEntry::Command(Command::Note(Note::Expanded { instance, path, .. })) => {
+                paths.insert(*instance, path.clone());
+            }
+            LogEntry::Command(Command::Start { instance, .. }) => lines.push(format!("{at} start {}", paths[instance])),
+            LogEntry::Command(Command::Note(Note::Squashed { instance })) => {
+                lines.push(format!("{at} squash {}", paths[instance]));
+            }
+            LogEntry::Event(Event::Finished { instance, .. }) => lines.push(format!("{at} end {}", paths[instance])),
+            _ => {}
+        }
+    }
+    lines
+}
+
+fn at(run: &Run, what: &str) -> f64 {
+    transcript(run)
+        .iter()
+        .find_map(|line| line.split_once(' ').filter(|(_, rest)| *rest == what).map(|(at, _)| at.parse().unwrap()))
+        .unwrap_or_else(|| panic!("no `{what}` in {:#?}", transcript(run)))
+}
+
+fn never(run: &Run, what: &str) {
+    assert!(!transcript(run).iter().any(|line| line.ends_with(what)), "`{what}` in {:#?}", transcript(run));
+}
+
+#[test]
+fn a_machine_without_annotations_runs_as_its_hsm() {
+    let task = "
+task: bare
+states:
+  - a: { action: brain/think, resources: [{ block: Brain }], duration: 2 }
+  - b: { action: eye/look, resources: [{ block: Eye }], duration: 3 }
+  - c: { action: arm/move, in: { a: b.x }, resources: [{ block: Arm }], duration: 4 }
+";
+    let (hsm, cdtn) =
+        (simulate(task, Mode::Hsm, &mut Script::default()), simulate(task, Mode::Cdtn, &mut Script::default()));
+    assert_eq!(transcript(&hsm), transcript(&cdtn));
+    assert_eq!(hsm.end_s, 9.0);
+}
+
+#[test]
+fn a_computing_node_runs_ahead_in_the_world_that_older_effects_will_make() {
+    let task = "
+task: ahead
+world: ['at(box) = table']
+states:
+  - carry: { action: arm/move, pia: true, effects: ['at(box) = shelf'], resources: [{ block: Arm }], duration: 10 }
+  - plan: { action: brain/think, computes: true, reads: ['at(?)'], resources: [{ block: Brain }, world_model], duration: 5 }
+  - go: { action: arm/move, in: { a: plan.x }, pia: true, reads: [], effects: [], resources: [{ block: Arm }], duration: 1 }
+";
+    let mut script = Script::default();
+    let run = simulate(task, Mode::Cdtn, &mut script);
+    assert_eq!(
+        transcript(&run),
+        ["0 start carry", "0 start plan", "5 end plan", "10 end carry", "10 start go", "11 end go"]
+    );
+    assert_eq!(script.worlds["plan"], ["at(box) = shelf"]);
+    assert_eq!(script.worlds["carry"], ["at(box) = table"]);
+}
+
+#[test]
+fn an_effect_that_is_not_known_yet_holds_back_only_what_reads_it() {
+    let task = "
+task: partly
+states:
+  - look: { action: eye/look, senses: ['light()'], effects: ['at(box) = x'], resources: [{ block: Eye }], duration: 4 }
+  - reader: { action: brain/think, computes: true, reads: ['at(box)'], resources: [{ block: Brain }], duration: 1 }
+  - other: { action: brain/think, computes: true, reads: ['at(cup)'], resources: [{ block: Brain }], duration: 1 }
+";
+    let run = simulate(task, Mode::Cdtn, &mut Script::default());
+    assert_eq!((at(&run, "start reader"), at(&run, "start other")), (4.0, 0.0));
+}
+
+#[test]
+fn an_effect_that_is_overwritten_later_holds_nobody_back() {
+    let task = "
+task: overwritten
+states:
+  - plan: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 9 }
+  - carry: { action: arm/move, pia: true, reads: [], effects: ['in_gripper(box) = plan.x'], resources: [{ block: Arm }] }
+  - put: { action: arm/move, pia: true, reads: [], effects: ['delete in_gripper(box)'], resources: [{ block: Arm }] }
+  - next: { action: brain/think, computes: true, reads: ['in_gripper(?)'], resources: [{ block: Brain }], duration: 1 }
+";
+    assert_eq!(at(&simulate(task, Mode::Cdtn, &mut Script::default()), "start next"), 0.0);
+}
+
+#[test]
+fn both_branches_are_computed_ahead_but_only_the_taken_one_acts() {
+    let task = "
+task: branches
+states:
+  - look: { action: eye/look, senses: ['light()'], effects: [], resources: [{ block: Eye }], duration: 5 }
+  - found:
+      condition: look.x = 1
+      then:
+        - plan_carry: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 3 }
+        - carry: { action: arm/move, in: { a: plan_carry.x }, pia: true, effects: [], resources: [{ block: Arm }], duration: 2 }
+      else:
+        - plan_search: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 3 }
+        - search: { action: head/turn, in: { a: plan_search.x }, pia: true, effects: [], resources: [{ block: Head }], duration: 2 }
+";
+    let run = simulate(task, Mode::Cdtn, &mut Script::default());
+    assert_eq!(
+        transcript(&run),
+        [
+            "0 start look",
+            "0 start found/plan_carry",
+            "0 start found/plan_search",
+            "3 end found/plan_carry",
+            "3 end found/plan_search",
+            "5 end look",
+            "5 squash found/plan_search",
+            "5 squash found/search",
+            "5 start found/carry",
+            "7 end found/carry"
+        ]
+    );
+}
+
+#[test]
+fn a_running_node_of_the_branch_not_taken_is_cancelled_and_gives_back_what_it_holds() {
+    let task = "
+task: squashed
+states:
+  - look: { action: eye/look, senses: ['light()'], effects: [], resources: [{ block: Eye }], duration: 1 }
+  - found:
+      condition: look.x = 2
+      then:
+        - think: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain, count: 2 }], duration: 100 }
+      else:
+        - other: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain, count: 2 }], duration: 1 }
+";
+    let run = simulate(task, Mode::Cdtn, &mut Script::default());
+    assert_eq!((at(&run, "squash found/think"), at(&run, "start found/other"), run.end_s), (1.0, 1.0, 2.0));
+    never(&run, "end found/think");
+}
+
+#[test]
+fn a_sensing_node_looks_before_the_motion_that_would_change_what_it_sees() {
+    let task = "
+task: look_first
+world: ['at(arm) = home']
+states:
+  - slow: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 3 }
+  - move: { action: arm/move, in: { a: slow.x }, pia: true, effects: ['at(arm) = away'], resources: [{ block: Arm }], duration: 4 }
+  - back: { action: arm/move, pia: true, effects: ['at(arm) = home'], resources: [{ block: Arm }], duration: 4 }
+  - look: { action: eye/look, senses: ['at(arm)'], effects: [], resources: [{ block: Eye }], duration: 5 }
+";
+    let run = simulate(task, Mode::Cdtn, &mut Script::default());
+    // At its place in the program the arm is home again; it is home at the start as well. The motion waits for it.
+    assert_eq!((at(&run, "start look"), at(&run, "start move")), (0.0, 5.0));
+}
+
+#[test]
+fn a_sensing_node_waits_until_the_environment_looks_as_at_its_place_in_the_program() {
+    let task = "
+task: look_after
+world: ['at(arm) = home']
+states:
+  - move: { action: arm/move, pia: true, effects: ['at(arm) = away'], resources: [{ block: Arm }], duration: 4 }
+  - look: { action: eye/look, senses: ['at(arm)'], effects: [], resources: [{ block: Eye }], duration: 5 }
+";
+    assert_eq!(at(&simulate(task, Mode::Cdtn, &mut Script::default()), "start look"), 4.0);
+}
+
+#[test]
+fn after_a_failure_nothing_younger_has_acted() {
+    let task = "
+task: precise
+states:
+  - first: { action: arm/move, pia: true, effects: ['done(first)'], resources: [{ block: Arm }], duration: 2 }
+  - second: { action: head/turn, pia: true, effects: ['done(second)'], resources: [{ block: Head }], duration: 2 }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let mut script = Script { outcomes: BTreeMap::from([("first", "aborted")]), ..Script::default() };
+        let run = simulate(task, mode, &mut script);
+        assert_eq!(run.outcome, "aborted");
+        assert!(run.reason.starts_with("first: "), "{}", run.reason);
+        never(&run, "start second");
+        assert!(run.world.is_empty());
+    }
+}
+
+#[test]
+fn a_computed_failure_counts_only_when_its_turn_comes() {
+    let task = "
+task: turn
+states:
+  - act: { action: arm/move, pia: true, effects: ['done(act)'], resources: [{ block: Arm }], duration: 9 }
+  - plan: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 1 }
+";
+    let mut script = Script { outcomes: BTreeMap::from([("plan", "aborted")]), ..Script::default() };
+    let run = simulate(task, Mode::Cdtn, &mut script);
+    assert_eq!((run.outcome.as_str(), run.end_s, run.world.len()), ("aborted", 9.0, 1));
+}
+
+#[test]
+fn a_precondition_that_does_not_hold_ends_the_task_and_says_which() {
+    let task = "
+task: requires
+states:
+  - grasp: { action: arm/move, pia: true, effects: [], requires: ['hand_empty(gripper)'], resources: [{ block: Arm }] }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let run = simulate(task, mode, &mut Script::default());
+        assert_eq!(run.outcome, "aborted");
+        assert!(run.reason.contains("the precondition `hand_empty(gripper)` of grasp does not hold"), "{}", run.reason);
+        never(&run, "start grasp");
+    }
+}
+
+#[test]
+fn a_precondition_that_an_older_motion_will_establish_only_holds_back() {
+    let task = "
+task: established
+states:
+  - open: { action: arm/move, pia: true, effects: ['hand_empty(gripper)'], resources: [{ block: Arm }], duration: 3 }
+  - grasp: { action: arm/move, pia: true, effects: [], requires: ['hand_empty(gripper)'], resources: [{ block: Arm }] }
+";
+    assert_eq!(at(&simulate(task, Mode::Cdtn, &mut Script::default()), "start grasp"), 3.0);
+}
+
+#[test]
+fn a_worker_that_dies_costs_an_attempt_not_the_task() {
+    let task = "
+task: crash
+states:
+  - plan: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 2 }
+  - move: { action: arm/move, in: { a: plan.x }, pia: true, effects: [], resources: [{ block: Arm }], duration: 1 }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let twice = simulate(task, mode, &mut Script { crashes: BTreeMap::from([("plan", 2)]), ..Script::default() });
+        assert_eq!((twice.outcome.as_str(), twice.end_s), ("success", 7.0));
+        let always = simulate(task, mode, &mut Script { crashes: BTreeMap::from([("plan", 9)]), ..Script::default() });
+        assert_eq!(always.outcome, "aborted");
+        assert!(always.reason.contains("crashed in attempt 3"), "{}", always.reason);
+        let moved = simulate(task, mode, &mut Script { crashes: BTreeMap::from([("move", 1)]), ..Script::default() });
+        assert_eq!(moved.outcome, "aborted", "what became of the motion is unknown: it is not started again");
+    }
+}
+
+#[test]
+fn a_routine_holds_what_it_contains_and_runs_it_in_order() {
+    let task = "
+task: routine
+states:
+  - both:
+      routine: true
+      states:
+        - turn: { action: head/turn, pia: true, effects: [], resources: [{ block: Head }], duration: 2 }
+        - move: { action: arm/move, pia: true, effects: [], resources: [{ block: Arm }], duration: 2 }
+  - after: { action: arm/move, pia: true, effects: [], resources: [{ block: Arm }], duration: 1 }
+";
+    let run = simulate(task, Mode::Cdtn, &mut Script::default());
+    let acquired: Vec<usize> = run
+        .log
+        .iter()
+        .filter_map(|line| match &line.entry {
+            LogEntry::Command(Command::Acquire { requirements, .. }) => Some(requirements.len()),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(acquired, [2, 1]);
+    assert_eq!((at(&run, "start both/move"), run.end_s), (2.0, 5.0));
+}
+
+#[test]
+fn a_hierarchy_s_effects_and_resources_happen_once_at_its_exit() {
+    let task = "
+task: hierarchy
+world: ['count() = 0']
+states:
+  - group:
+      requires: ['count() = 0']
+      effects: ['increase count() by 1']
+      resources: [{ create: Done, class: task }]
+      states:
+        - a: { action: arm/move, pia: true, effects: [], resources: [{ block: Arm }], duration: 1 }
+        - b: { action: arm/move, pia: true, effects: [], resources: [{ block: Arm }], duration: 1 }
+  - last: { action: arm/move, pia: true, effects: [], requires: ['count() = 1'], resources: [{ block: Arm }], duration: 1 }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let run = simulate(task, mode, &mut Script::default());
+        assert_eq!((run.outcome.as_str(), run.end_s), ("success", 3.0), "{}", run.reason);
+        let operations =
+            run.log.iter().filter(|l| matches!(l.entry, LogEntry::Command(Command::Operate { .. }))).count();
+        assert_eq!(operations, 1);
+    }
+}
+
+fn grasp_pose(x: f64) -> (FactKey, Value) {
+    let key = FactKey { predicate: "held".to_owned(), arguments: vec![Term::Name("box".to_owned())] };
+    (key, Value::Pose(Pose::at(x, 0.0, 0.0)))
+}
+
+const MEASURED: &str = "
+task: measured
+states:
+  - grasp: { action: arm/move, pia: true, effects: ['held(box) = pose(0.1, 0, 0)'], resources: [{ block: Arm }], duration: 5 }
+  - plan: { action: brain/think, computes: true, reads: ['held(?)'], resources: [{ block: Brain }, world_model], duration: 1 }
+";
+
+#[test]
+fn a_measured_value_within_tolerance_becomes_the_fact() {
+    let mut script = Script { measured: BTreeMap::from([("grasp", grasp_pose(0.105))]), ..Script::default() };
+    let run = simulate(MEASURED, Mode::Cdtn, &mut script);
+    assert_eq!((run.outcome.as_str(), run.end_s), ("success", 5.0));
+    let (key, value) = grasp_pose(0.105);
+    assert_eq!(run.world.get(&key), Some(&value));
+}
+
+#[test]
+fn a_measured_value_beyond_tolerance_that_was_built_upon_ends_the_task() {
+    let mut script = Script { measured: BTreeMap::from([("grasp", grasp_pose(0.3))]), ..Script::default() };
+    let run = simulate(MEASURED, Mode::Cdtn, &mut script);
+    assert_eq!(run.outcome, "aborted");
+    assert!(run.reason.contains("plan was already computed from that"), "{}", run.reason);
+    let mut script = Script { measured: BTreeMap::from([("grasp", grasp_pose(0.3))]), ..Script::default() };
+    assert_eq!(simulate(MEASURED, Mode::Hsm, &mut script).outcome, "success");
+}
+
+#[test]
+fn a_measured_fact_that_no_effect_declares_is_an_error() {
+    let (mut key, value) = grasp_pose(0.1);
+    key.predicate = "elsewhere".to_owned();
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let measured = BTreeMap::from([("grasp", (key.clone(), value.clone()))]);
+        let run = simulate(MEASURED, mode, &mut Script { measured, ..Script::default() });
+        assert_eq!(run.outcome, "aborted");
+        assert!(run.reason.contains("none of its effects"), "{}", run.reason);
+    }
+}
+
+#[test]
+fn a_loop_is_unrolled_once_its_list_is_known_and_no_further_than_the_horizon() {
+    let task = "
+task: unroll
+horizon: 4
+states:
+  - look: { action: eye/look, senses: ['light()'], effects: [], resources: [{ block: Eye }], duration: 1 }
+  - for: item in look.list
+    do:
+      - think: { action: brain/think, in: { a: $item }, computes: true, reads: [], resources: [{ block: Brain }], duration: 1 }
+      - move: { action: arm/move, in: { a: think.x }, pia: true, effects: [], resources: [{ block: Arm }], duration: 1 }
+";
+    let list = Value::List((0..50).map(Value::Int).collect());
+    let mut script = Script { outputs: BTreeMap::from([("look", vec![("list", list)])]), ..Script::default() };
+    let run = simulate(task, Mode::Cdtn, &mut script);
+    assert_eq!(run.outcome, "success");
+    let (mut alive, mut most) = (0_i64, 0);
+    for line in &run.log {
+        match &line.entry {
+            LogEntry::Command(Command::Note(Note::Expanded { .. })) => alive += 1,
+            LogEntry::Command(Command::Note(Note::Retired { .. })) => alive -= 1,
+            _ => {}
+        }
+        most = most.max(alive);
+    }
+    assert_eq!((most, at(&run, "start for_item[0]/think"), run.end_s), (4, 1.0, 52.0));
+}
+
+#[test]
+fn the_outputs_of_the_task_are_those_of_both_modes() {
+    let task = "
+task: outputs
+outputs: { answer: { type: any, value: group.best } }
+states:
+  - group:
+      outputs: { best: think.x }
+      states:
+        - think: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 1 }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let run = simulate(task, mode, &mut Script::default());
+        assert_eq!(run.outputs, BTreeMap::from([("answer".to_owned(), Value::Int(1))]));
+    }
+}
