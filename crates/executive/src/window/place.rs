@@ -98,12 +98,15 @@ impl Place {
             return;
         };
         let outputs = ended.map(|e| &e.outputs);
-        for effect in declared {
-            let one = std::slice::from_ref(effect);
-            let bound = self.with_scope(instances, id, outputs, |scope| {
+        // None of a node's effects sees another's: all are evaluated before any is applied.
+        let bound = self.with_scope(instances, id, outputs, |scope| {
+            let one = |effect| {
+                let one = std::slice::from_ref(effect);
                 (effects::actual(Some(one), outcome, &[], scope), EffectExpr::footprint(one, scope))
-            });
-            let Some((changes, footprint)) = bound else { continue };
+            };
+            declared.iter().map(one).collect::<Vec<_>>()
+        });
+        for (changes, footprint) in bound.unwrap_or_default() {
             self.written = std::mem::replace(&mut self.written, Footprint::NOTHING).union(footprint.clone());
             match changes {
                 Ok(mut changes) => {
