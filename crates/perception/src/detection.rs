@@ -113,17 +113,20 @@ fn boxes_on(image: &DepthImage, camera: &Camera, region: &Region) -> Result<Vec<
     let above: Vec<Option<Vector>> =
         points.iter().map(|p| p.filter(|p| (CLEAR_OF_PLANE..TALLEST).contains(&plane.above(*p)))).collect();
     let (clusters, labels) = cluster::clusters(width, height, &above, MIN_PIXELS);
-    let mut boxes = Vec::new();
-    for (label, pixels) in clusters.iter().enumerate() {
+    // Large clusters first: a steep side face can come apart from its top, and must not make a second box in the same place.
+    let mut largest_first: Vec<(usize, &Vec<usize>)> = clusters.iter().enumerate().collect();
+    largest_first.sort_by_key(|(label, pixels)| (std::cmp::Reverse(pixels.len()), *label));
+    let mut fits: Vec<Fit> = Vec::new();
+    for (label, pixels) in largest_first {
         let cloud: Vec<Vector> = pixels.iter().filter_map(|i| above[*i]).collect();
         let Some(start) = Fit::of_top_face(&cloud, &plane) else { continue };
         let fit = start.refined(view.eye, &plane, &view.window(pixels, label as u32, &labels));
         let own: Vec<Sight> = pixels.iter().filter_map(|i| view.sight(*i)).collect();
-        if fit.explains(view.eye, &own) >= MIN_EXPLAINED {
-            boxes.push(estimate(&fit, region));
+        if fit.explains(view.eye, &own) >= MIN_EXPLAINED && !fits.iter().any(|other| other.covers(fit.centre)) {
+            fits.push(fit);
         }
     }
-    Ok(boxes)
+    Ok(fits.iter().map(|fit| estimate(fit, region)).collect())
 }
 
 /// The image as seen from the region's frame.

@@ -86,6 +86,13 @@ impl Fit {
         best
     }
 
+    /// Whether a place is below the box.
+    pub(crate) fn covers(&self, place: [f64; 2]) -> bool {
+        let (sin, cos) = self.yaw.sin_cos();
+        let [dx, dy] = [place[0] - self.centre[0], place[1] - self.centre[1]];
+        (cos * dx + sin * dy).abs() < self.size[0] / 2.0 && (cos * dy - sin * dx).abs() < self.size[1] / 2.0
+    }
+
     /// How much of what was measured the box explains: the fraction of these pixels whose depth it shows.
     pub(crate) fn explains(&self, eye: Vector, pixels: &[Sight]) -> f64 {
         let (sin, cos) = self.yaw.sin_cos();

@@ -1,0 +1,221 @@
+//! What a cell is made of, from TOML. Every key has a default; an unknown one is an error.
+
+use ratn_perception::camera::Intrinsics;
+use ratn_perception::noise::Noise;
+use serde::{Deserialize, Serialize};
+
+/// The most boxes that a cell can have: as many as there are places on the base.
+pub const MAX_BOXES: usize = 9;
+
+/// A cell's configuration.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CellConfig {
+    /// Where to listen: `127.0.0.1:0` or `unix:/path`.
+    pub listen: String,
+    /// The host that the resources say they are on.
+    pub host: String,
+    /// How many boxes stand on the table, 1 to 9.
+    pub boxes: usize,
+    /// What the boxes' sizes and places and the camera's noise are derived from.
+    pub seed: u64,
+    /// The robot's seconds per second of wall time.
+    pub speed: f64,
+    /// How long the session with the resource manager outlives the last keep-alive, in milliseconds.
+    pub session_ttl_ms: u64,
+    /// The gripper.
+    pub gripper: GripperConfig,
+    /// The pan-tilt unit.
+    pub pan_tilt: PanTiltConfig,
+    /// The camera.
+    pub camera: CameraConfig,
+    /// The battery.
+    pub battery: BatteryConfig,
+}
+
+/// The gripper.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GripperConfig {
+    /// How far it opens, in metres; at most what its fingers can.
+    pub opening_m: f64,
+    /// How long it takes to close, in the robot's seconds.
+    pub close_s: f64,
+    /// How long it takes to open, in the robot's seconds.
+    pub open_s: f64,
+}
+
+/// The pan-tilt unit.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PanTiltConfig {
+    /// How much of its greatest speed it uses, above 0 and at most 1.
+    pub speed: f64,
+    /// How long it takes to come to rest, in the robot's seconds.
+    pub settle_s: f64,
+}
+
+/// The camera.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CameraConfig {
+    /// Frames per second of the robot.
+    pub frames_per_s: f64,
+    /// Its optics.
+    pub intrinsics: Intrinsics,
+    /// Its noise.
+    pub noise: Noise,
+}
+
+/// The battery.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BatteryConfig {
+    /// How full it is at the start, 0 to 1.
+    pub level: f64,
+    /// How much an hour of standing uses up.
+    pub idle_per_hour: f64,
+    /// How much more an hour of moving the arm uses up.
+    pub motion_per_hour: f64,
+}
+
+/// A value that no cell can have.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("`{key}` of the cell is {value}: it must be {rule}")]
+pub struct ConfigError {
+    /// Which.
+    pub key: &'static str,
+    /// What it is.
+    pub value: String,
+    /// What it must be.
+    pub rule: &'static str,
+}
+
+impl CellConfig {
+    /// Checks what the types cannot say.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the first value that no cell can have.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        let rules = [
+            ("boxes", self.boxes as f64, (1..=MAX_BOXES).contains(&self.boxes), "1 to 9"),
+            ("speed", self.speed, self.speed > 0.0 && self.speed <= 1000.0, "above 0 and at most 1000"),
+            (
+                "session_ttl_ms",
+                self.session_ttl_ms as f64,
+                (500..=600_000).contains(&self.session_ttl_ms),
+                "500 to 600000",
+            ),
+            (
+                "gripper.opening_m",
+                self.gripper.opening_m,
+                (0.02..=0.11).contains(&self.gripper.opening_m),
+                "0.02 to 0.11",
+            ),
+            ("gripper.close_s", self.gripper.close_s, (0.0..=60.0).contains(&self.gripper.close_s), "0 to 60"),
+            ("gripper.open_s", self.gripper.open_s, (0.0..=60.0).contains(&self.gripper.open_s), "0 to 60"),
+            (
+                "pan_tilt.speed",
+                self.pan_tilt.speed,
+                self.pan_tilt.speed > 0.0 && self.pan_tilt.speed <= 1.0,
+                "above 0 and at most 1",
+            ),
+            ("pan_tilt.settle_s", self.pan_tilt.settle_s, (0.0..=60.0).contains(&self.pan_tilt.settle_s), "0 to 60"),
+            (
+                "camera.frames_per_s",
+                self.camera.frames_per_s,
+                (0.1..=1000.0).contains(&self.camera.frames_per_s),
+                "0.1 to 1000",
+            ),
+            (
+                "camera.intrinsics.width",
+                self.camera.intrinsics.width as f64,
+                (16..=1024).contains(&self.camera.intrinsics.width),
+                "16 to 1024",
+            ),
+            (
+                "camera.intrinsics.height",
+                self.camera.intrinsics.height as f64,
+                (16..=1024).contains(&self.camera.intrinsics.height),
+                "16 to 1024",
+            ),
+            ("camera.intrinsics.fx", self.camera.intrinsics.fx, self.camera.intrinsics.fx > 0.0, "above 0"),
+            ("camera.intrinsics.fy", self.camera.intrinsics.fy, self.camera.intrinsics.fy > 0.0, "above 0"),
+            (
+                "camera.noise.sigma_at_1m",
+                self.camera.noise.sigma_at_1m,
+                (0.0..0.1).contains(&self.camera.noise.sigma_at_1m),
+                "0 to 0.1",
+            ),
+            ("battery.level", self.battery.level, (0.0..=1.0).contains(&self.battery.level), "0 to 1"),
+            ("battery.idle_per_hour", self.battery.idle_per_hour, self.battery.idle_per_hour >= 0.0, "0 or more"),
+            ("battery.motion_per_hour", self.battery.motion_per_hour, self.battery.motion_per_hour >= 0.0, "0 or more"),
+        ];
+        match rules.into_iter().find(|(_, _, holds, _)| !holds) {
+            Some((key, value, _, rule)) => Err(ConfigError { key, value: value.to_string(), rule }),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Default for CellConfig {
+    fn default() -> CellConfig {
+        CellConfig {
+            listen: "127.0.0.1:0".to_owned(),
+            host: "sim".to_owned(),
+            boxes: 3,
+            seed: 1,
+            speed: 1.0,
+            session_ttl_ms: 3000,
+            gripper: GripperConfig::default(),
+            pan_tilt: PanTiltConfig::default(),
+            camera: CameraConfig::default(),
+            battery: BatteryConfig::default(),
+        }
+    }
+}
+
+impl Default for GripperConfig {
+    fn default() -> GripperConfig {
+        GripperConfig { opening_m: 0.11, close_s: 1.1, open_s: 0.8 }
+    }
+}
+
+impl Default for PanTiltConfig {
+    fn default() -> PanTiltConfig {
+        PanTiltConfig { speed: 0.15, settle_s: 0.5 }
+    }
+}
+
+impl Default for CameraConfig {
+    fn default() -> CameraConfig {
+        CameraConfig { frames_per_s: 10.0, intrinsics: Intrinsics::DEFAULT, noise: Noise::DEFAULT }
+    }
+}
+
+impl Default for BatteryConfig {
+    fn default() -> BatteryConfig {
+        BatteryConfig { level: 1.0, idle_per_hour: 0.1, motion_per_hour: 0.4 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn an_empty_file_is_the_default_and_the_default_is_valid() {
+        let config: CellConfig = toml::from_str("").unwrap();
+        assert_eq!(config, CellConfig::default());
+        config.check().unwrap();
+    }
+
+    #[test]
+    fn an_unknown_key_and_an_impossible_value_are_refused() {
+        assert!(toml::from_str::<CellConfig>("boxs = 3").is_err());
+        assert!(toml::from_str::<CellConfig>("[gripper]\nopen = 1").is_err());
+        let config: CellConfig = toml::from_str("boxes = 10").unwrap();
+        assert_eq!(config.check().unwrap_err().to_string(), "`boxes` of the cell is 10: it must be 1 to 9");
+    }
+}

@@ -1,0 +1,107 @@
+//! What a module is doing, and where that has brought it at a moment.
+
+use super::picture::Exposure;
+use ratn_model::id::LeaseId;
+use ratn_model::pose::Pose;
+use ratn_model::time::Timestamp;
+use ratn_motion::robot::Joints;
+use ratn_motion::trajectory::ArmTrajectory;
+use ratn_perception::camera::Camera;
+use std::time::Duration;
+
+/// A goal under way, as its giver named it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Ticket(pub u64);
+
+/// A module of the robot. Each does one thing at a time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Module {
+    /// The seven joints.
+    Arm,
+    /// The two fingers.
+    Gripper,
+    /// The camera's head.
+    PanTilt,
+    /// The camera.
+    Camera,
+}
+
+#[derive(Debug, Clone)]
+pub(crate) struct Activity {
+    pub(crate) ticket: Ticket,
+    pub(crate) lease: Option<LeaseId>,
+    pub(crate) started: Timestamp,
+    pub(crate) ends: Timestamp,
+    pub(crate) kind: Kind,
+}
+
+#[derive(Debug, Clone)]
+pub(crate) enum Kind {
+    Follow { trajectory: ArmTrajectory },
+    Close { from: f64, object: String, expected: Option<Pose> },
+    Open { from: f64, to: f64 },
+    Look { from: [f64; 2], to: [f64; 2] },
+    Capture { camera: Camera, frames: u32, taken: u32, next: Timestamp, exposures: Vec<Exposure> },
+}
+
+impl Module {
+    /// All of them.
+    pub const ALL: [Module; 4] = [Module::Arm, Module::Gripper, Module::PanTilt, Module::Camera];
+
+    /// The kind of the resource that it is.
+    pub fn kind(self) -> &'static str {
+        match self {
+            Module::Arm => "Arm",
+            Module::Gripper => "Gripper",
+            Module::PanTilt => "PanTilt",
+            Module::Camera => "Camera",
+        }
+    }
+}
+
+impl Activity {
+    /// The time since it started.
+    fn elapsed_s(&self, now: Timestamp) -> f64 {
+        now.since(self.started).as_secs_f64()
+    }
+
+    /// How much of its time has passed, 0 to 1.
+    fn fraction(&self, now: Timestamp) -> f64 {
+        let whole = self.ends.since(self.started).as_secs_f64();
+        if whole > 0.0 { (self.elapsed_s(now) / whole).clamp(0.0, 1.0) } else { 1.0 }
+    }
+
+    /// Where the arm is, if it moves the arm.
+    pub(crate) fn arm(&self, now: Timestamp) -> Option<Joints> {
+        match &self.kind {
+            Kind::Follow { trajectory } => Some(trajectory.sample(self.elapsed_s(now)).positions),
+            _ => None,
+        }
+    }
+
+    /// How far each finger is from the middle, if it moves the fingers.
+    pub(crate) fn finger(&self, now: Timestamp) -> Option<f64> {
+        let fraction = self.fraction(now);
+        match &self.kind {
+            Kind::Close { from, .. } => Some(from * (1.0 - fraction)),
+            Kind::Open { from, to } => Some(from + (to - from) * fraction),
+            _ => None,
+        }
+    }
+
+    /// Pan and tilt, if it moves the head.
+    pub(crate) fn head(&self, now: Timestamp) -> Option<[f64; 2]> {
+        let fraction = self.fraction(now);
+        // A smooth start and stop.
+        let eased = fraction * fraction * (3.0 - 2.0 * fraction);
+        match &self.kind {
+            Kind::Look { from, to } => Some([0, 1].map(|i| from[i] + (to[i] - from[i]) * eased)),
+            _ => None,
+        }
+    }
+}
+
+/// Seconds of the robot as a duration; negative and NaN count as none.
+pub(crate) fn seconds(s: f64) -> Duration {
+    Duration::try_from_secs_f64(s.max(0.0)).unwrap_or(Duration::ZERO)
+}

@@ -1,0 +1,42 @@
+//! A battery that drains with time, and faster while the arm moves.
+
+use crate::config::BatteryConfig;
+use std::time::Duration;
+
+#[derive(Debug, Clone)]
+pub(crate) struct Battery {
+    config: BatteryConfig,
+    level: f64,
+}
+
+impl Battery {
+    pub(crate) fn new(config: BatteryConfig) -> Battery {
+        Battery { config, level: config.level }
+    }
+
+    /// How full it is, 0 to 1.
+    pub(crate) fn level(&self) -> f64 {
+        self.level
+    }
+
+    pub(crate) fn drain(&mut self, time: Duration, moving: bool) {
+        let hours = time.as_secs_f64() / 3600.0;
+        let rate = self.config.idle_per_hour + if moving { self.config.motion_per_hour } else { 0.0 };
+        self.level = (self.level - rate * hours).max(0.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_hour_of_motion_drains_more_than_an_hour_of_rest_and_never_below_empty() {
+        let (mut rest, mut motion) = (Battery::new(BatteryConfig::default()), Battery::new(BatteryConfig::default()));
+        rest.drain(Duration::from_secs(3600), false);
+        motion.drain(Duration::from_secs(3600), true);
+        assert!((rest.level() - 0.9).abs() < 1e-9 && (motion.level() - 0.5).abs() < 1e-9);
+        motion.drain(Duration::from_secs(36_000), true);
+        assert_eq!(motion.level(), 0.0);
+    }
+}

@@ -1,0 +1,234 @@
+//! What is between the fingers, really.
+//!
+//! The pads of the two fingers sweep a cuboid of the tool frame when they close (along y). A box is grasped when two of its
+//! opposite faces are roughly across that direction, all of it that the pads would meet is between them, and the pads meet
+//! enough of it. Closing then turns and shifts the box until its faces are flush with the pads: compliant boxes and rigid
+//! fingers do that, so a pose that was off by millimetres ends exactly in the middle.
+
+use ratn_model::pose::Pose;
+use ratn_motion::robot::{Geometry, Robot};
+
+/// The fingers' pads, in the tool frame, in metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pads {
+    /// They reach from -x to x.
+    pub x: f64,
+    /// From here along z (the palm's side)
+    pub z_from: f64,
+    /// to here (the tips).
+    pub z_to: f64,
+}
+
+/// A grasp.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Grip {
+    /// Which box of those asked about.
+    pub index: usize,
+    /// The opening at which the fingers stopped, in metres.
+    pub width: f64,
+    /// The box's centre in the tool frame, once the fingers have closed.
+    pub in_tool: Pose,
+}
+
+/// Why closing the fingers holds nothing.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum NotGrasped {
+    /// No box is there.
+    #[error("nothing is between the fingers")]
+    Nothing,
+    /// It would not lie flush.
+    #[error("{id} stands {degrees:.0}° askew between the fingers; at most {MAX_ASKEW_DEGREES}° is taken")]
+    Askew {
+        /// Which box.
+        id: String,
+        /// How much.
+        degrees: f64,
+    },
+    /// A finger is in it or on the wrong side of it.
+    #[error("{id} is not between the fingers: it reaches {beyond_mm:.0} mm beyond one of them")]
+    Beyond {
+        /// Which box.
+        id: String,
+        /// How far.
+        beyond_mm: f64,
+    },
+    /// Only an edge of it is there.
+    #[error("the fingers hold only an edge of {id}: {held_mm:.0} mm of it, at least {:.0} mm are needed", MIN_HOLD_M * 1e3)]
+    Edge {
+        /// Which box.
+        id: String,
+        /// How much.
+        held_mm: f64,
+    },
+    /// More than one.
+    #[error("{first} and {second} are both between the fingers")]
+    Several {
+        /// One.
+        first: String,
+        /// The other.
+        second: String,
+    },
+}
+
+/// How far a box may be turned away from the closing direction.
+pub const MAX_ASKEW_DEGREES: f64 = 15.0;
+/// How much of a box the pads must hold, along x and along z.
+pub const MIN_HOLD_M: f64 = 0.008;
+/// What the pads give way, in metres.
+const PAD_GIVE_M: f64 = 0.002;
+
+impl Pads {
+    /// The pads of a robot's gripper: the inner faces of its fingers.
+    pub fn of(robot: &Robot) -> Option<Pads> {
+        let finger = &robot.links[robot.link("finger_left")?];
+        let body = finger.bodies.first()?;
+        let Geometry::Box { half } = body.geometry else { return None };
+        let tool = &robot.links[robot.tool];
+        let middle = finger.origin.position[2] + body.pose.position[2] - tool.origin.position[2];
+        Some(Pads { x: half[0], z_from: middle - half[2], z_to: middle + half[2] })
+    }
+
+    /// What the fingers hold when they close from `finger` metres on each side of the middle.
+    ///
+    /// # Errors
+    /// [`NotGrasped`] says why they hold nothing.
+    pub fn close(&self, tool: &Pose, finger: f64, boxes: &[(String, Pose, [f64; 3])]) -> Result<Grip, NotGrasped> {
+        let mut grip: Option<Grip> = None;
+        for (index, (id, pose, size)) in boxes.iter().enumerate() {
+            let in_tool = tool.inverse().compose(pose);
+            if !self.meets(finger, &in_tool, size) {
+                continue;
+            }
+            let new = self.grip(index, id, &in_tool, size, finger)?;
+            if let Some(other) = grip {
+                return Err(NotGrasped::Several { first: boxes[other.index].0.clone(), second: id.clone() });
+            }
+            grip = Some(new);
+        }
+        grip.ok_or(NotGrasped::Nothing)
+    }
+
+    /// Whether a box is in the cuboid that the pads sweep: whether no axis of either separates the two.
+    fn meets(&self, finger: f64, in_tool: &Pose, size: &[f64; 3]) -> bool {
+        let half = [self.x, finger, (self.z_to - self.z_from) / 2.0];
+        let offset = [in_tool.position[0], in_tool.position[1], in_tool.position[2] - (self.z_to + self.z_from) / 2.0];
+        let axes = axes(in_tool);
+        let along_tool = |i: usize| {
+            let reach: f64 = (0..3).map(|k| axes[k][i].abs() * size[k] / 2.0).sum();
+            offset[i].abs() < half[i] + reach
+        };
+        let along_box = |k: usize| {
+            let reach: f64 = (0..3).map(|i| axes[k][i].abs() * half[i]).sum();
+            let distance: f64 = (0..3).map(|i| axes[k][i] * offset[i]).sum();
+            distance.abs() < size[k] / 2.0 + reach
+        };
+        (0..3).all(along_tool) && (0..3).all(along_box)
+    }
+
+    fn grip(&self, index: usize, id: &str, in_tool: &Pose, size: &[f64; 3], finger: f64) -> Result<Grip, NotGrasped> {
+        let id = || id.to_owned();
+        let axes = axes(in_tool);
+        let across = (0..3).max_by(|a, b| axes[*a][1].abs().total_cmp(&axes[*b][1].abs())).unwrap_or(1);
+        let askew = axes[across][1].abs().min(1.0).acos().to_degrees();
+        if askew > MAX_ASKEW_DEGREES {
+            return Err(NotGrasped::Askew { id: id(), degrees: askew });
+        }
+        let width = size[across];
+        let beyond = in_tool.position[1].abs() + width / 2.0 - finger;
+        if beyond > PAD_GIVE_M {
+            return Err(NotGrasped::Beyond { id: id(), beyond_mm: beyond * 1e3 });
+        }
+        let held = |axis: usize, from: f64, to: f64| {
+            let reach: f64 = (0..3).filter(|k| *k != across).map(|k| axes[k][axis].abs() * size[k] / 2.0).sum();
+            (in_tool.position[axis] + reach).min(to) - (in_tool.position[axis] - reach).max(from)
+        };
+        let held = held(0, -self.x, self.x).min(held(2, self.z_from, self.z_to));
+        if held < MIN_HOLD_M {
+            return Err(NotGrasped::Edge { id: id(), held_mm: held.max(0.0) * 1e3 });
+        }
+        Ok(Grip { index, width, in_tool: flush(in_tool, axes[across]) })
+    }
+}
+
+/// The pose after closing: the axis that lay roughly along ±y lies exactly so, and the box is in the middle.
+fn flush(in_tool: &Pose, axis: [f64; 3]) -> Pose {
+    let side = axis[1].signum();
+    // The rotation that takes `axis` to ±y: about their cross product, by the angle between them.
+    let turn = [-axis[2] * side, 0.0, axis[0] * side];
+    let sine = (turn[0] * turn[0] + turn[2] * turn[2]).sqrt();
+    let mut pose = *in_tool;
+    if sine > 1e-12 {
+        let half = sine.atan2(axis[1].abs()) / 2.0;
+        let scale = half.sin() / sine;
+        let rotation =
+            Pose { position: [0.0; 3], quaternion_xyzw: [turn[0] * scale, 0.0, turn[2] * scale, half.cos()] };
+        pose.quaternion_xyzw = rotation.compose(&Pose { position: [0.0; 3], ..*in_tool }).quaternion_xyzw;
+    }
+    pose.position[1] = 0.0;
+    pose
+}
+
+fn axes(pose: &Pose) -> [[f64; 3]; 3] {
+    [pose.rotate([1.0, 0.0, 0.0]), pose.rotate([0.0, 1.0, 0.0]), pose.rotate([0.0, 0.0, 1.0])]
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use std::f64::consts::PI;
+
+    const PADS: Pads = Pads { x: 0.0125, z_from: -0.055, z_to: 0.015 };
+    const SIZE: [f64; 3] = [0.12, 0.07, 0.10];
+
+    /// The tool looks down from 3 cm below the top of a box at the origin.
+    fn tool() -> Pose {
+        Pose::from_rpy([0.0, 0.0, 0.02], PI, 0.0, 0.0)
+    }
+
+    fn close(pose: Pose) -> Result<Grip, NotGrasped> {
+        PADS.close(&tool(), 0.055, &[("slc_1".to_owned(), pose, SIZE)])
+    }
+
+    #[test]
+    fn a_box_between_the_fingers_is_held_and_ends_flush_in_the_middle() {
+        let grip = close(Pose::from_rpy([0.02, 0.012, 0.003], 0.0, 0.0, 0.1)).unwrap();
+        assert_eq!(grip.width, 0.07);
+        assert!(grip.in_tool.position[1].abs() < 1e-12);
+        assert!((grip.in_tool.position[0] - 0.02).abs() < 1e-9);
+        assert!(grip.in_tool.rotate([0.0, 1.0, 0.0])[1].abs() > 1.0 - 1e-12);
+        assert!(grip.in_tool.rotate([0.0, 0.0, 1.0])[2] < -1.0 + 1e-12, "still upright");
+    }
+
+    #[test]
+    fn a_box_beside_the_fingers_is_not_held() {
+        assert_eq!(close(Pose::at(0.3, 0.0, 0.0)), Err(NotGrasped::Nothing));
+        assert_eq!(close(Pose::at(0.0, 0.0, -0.12)), Err(NotGrasped::Nothing));
+        assert!(matches!(close(Pose::at(0.0, 0.03, 0.0)), Err(NotGrasped::Beyond { .. })));
+    }
+
+    #[test]
+    fn a_box_wider_than_the_opening_is_not_held() {
+        let turned = Pose::from_rpy([0.0; 3], 0.0, 0.0, PI / 2.0);
+        assert!(matches!(close(turned), Err(NotGrasped::Beyond { beyond_mm, .. }) if beyond_mm > 4.0));
+    }
+
+    #[test]
+    fn a_box_that_stands_askew_is_not_held() {
+        assert!(matches!(close(Pose::from_rpy([0.0; 3], 0.0, 0.0, 0.5)), Err(NotGrasped::Askew { .. })));
+    }
+
+    #[test]
+    fn an_edge_is_not_enough() {
+        assert!(matches!(close(Pose::at(0.07, 0.0, 0.0)), Err(NotGrasped::Edge { .. })));
+    }
+
+    #[test]
+    fn of_two_boxes_none_is_held() {
+        let boxes = [
+            ("slc_1".to_owned(), Pose::at(0.0, -0.02, 0.0), [0.1, 0.03, 0.1]),
+            ("slc_2".to_owned(), Pose::at(0.0, 0.02, 0.0), [0.1, 0.03, 0.1]),
+        ];
+        assert!(matches!(PADS.close(&tool(), 0.055, &boxes), Err(NotGrasped::Several { .. })));
+    }
+}

@@ -1,0 +1,12 @@
+//! The cell as a pure machine: events in, commands out, time as an argument.
+
+pub mod boxes;
+pub mod cell;
+pub mod grasping;
+pub mod picture;
+pub mod placement;
+pub mod settling;
+
+mod activity;
+mod battery;
+mod trajectory;

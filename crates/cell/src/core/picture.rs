@@ -1,0 +1,53 @@
+//! What the camera looks at: the true scene at one moment, robot included, and the frames taken of it.
+
+use ratn_model::pose::Pose;
+use ratn_motion::aimm;
+use ratn_motion::robot::{Configuration, Robot};
+use ratn_perception::camera::{Camera, DepthImage};
+use ratn_perception::noise::{Noise, average, observe};
+use ratn_perception::render::{Body, render};
+use ratn_world::scene::Shape;
+
+/// The true scene at one moment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scenery {
+    /// Where the robot's joints are.
+    pub configuration: Configuration,
+    /// Sizes and poses of the boxes, in the world frame.
+    pub boxes: Vec<([f64; 3], Pose)>,
+}
+
+/// Frames of a scene that stood still.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Exposure {
+    /// What was there.
+    pub scenery: Scenery,
+    /// The number of the first frame since the cell began.
+    pub first_frame: u64,
+    /// How many frames.
+    pub frames: u32,
+}
+
+/// The floor around the robot, in metres; its top is at z = 0.
+const FLOOR_SIZE: [f64; 3] = [12.0, 12.0, 0.1];
+
+impl Scenery {
+    /// Every body that the camera could see.
+    pub fn bodies(&self, robot: &Robot) -> Vec<Body> {
+        let links = robot.shapes(&self.configuration).into_iter().map(|(_, pose, shape)| Body { shape, pose });
+        let [x, y, z] = aimm::TABLE_CENTRE;
+        let table = Body::new(&Shape::Box { size: aimm::TABLE_SIZE }, &Pose::at(x, y, z));
+        let floor = Body::new(&Shape::Box { size: FLOOR_SIZE }, &Pose::at(0.0, 0.0, -FLOOR_SIZE[2] / 2.0));
+        let boxes = self.boxes.iter().map(|(size, pose)| Body::new(&Shape::Box { size: *size }, pose));
+        links.chain([table, floor]).chain(boxes).collect()
+    }
+}
+
+/// The average of all frames. Takes milliseconds per exposure.
+pub fn develop(robot: &Robot, camera: &Camera, noise: &Noise, seed: u64, exposures: &[Exposure]) -> DepthImage {
+    let pictures = exposures.iter().map(|exposure| {
+        let clean = render(camera, &exposure.scenery.bodies(robot));
+        (observe(&clean, noise, seed, exposure.first_frame, exposure.frames), exposure.frames)
+    });
+    average(camera.intrinsics.width, camera.intrinsics.height, pictures)
+}

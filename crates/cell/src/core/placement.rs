@@ -1,0 +1,193 @@
+//! Boxes on the table at random, but so that the task can be done: apart from each other, within reach, and each of them
+//! graspable from above while all others still stand there. The same seed gives the same table.
+
+use super::boxes::{Place, SimulatedBox};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_motion::aimm;
+use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
+use ratn_motion::inverse::Solver;
+use ratn_motion::line::line;
+use ratn_motion::robot::Robot;
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use std::f64::consts::FRAC_PI_2;
+
+/// No table was found on which the task could be done.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("no feasible table with {count} boxes was found from seed {seed} in {MAX_TABLES} tries; try another seed")]
+pub struct PlacementError {
+    /// How many boxes.
+    pub count: usize,
+    /// From which seed.
+    pub seed: u64,
+}
+
+/// Tables tried.
+const MAX_TABLES: usize = 3000;
+/// Places tried for one box.
+const MAX_PLACES: usize = 60;
+/// Free space between two boxes, in metres: what the detector needs to tell them apart.
+const GAP_M: f64 = 0.045;
+/// What the fingers need across a box, from its middle, and along it: with room for what the detector gets wrong.
+const FINGER_REACH_M: f64 = aimm::GRIPPER_OPENING_M / 2.0 + 0.034;
+const FINGER_HALF_WIDTH_M: f64 = 0.033;
+/// The table's name.
+pub const TABLE: &str = "table";
+
+/// The boxes of a new table.
+///
+/// # Errors
+/// [`PlacementError`] when there seems to be no feasible one.
+pub fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<SimulatedBox>, PlacementError> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    for table in 0..MAX_TABLES {
+        // Long boxes get rarer as the table gets fuller, and the more tries have failed.
+        let crowding = (count as f64 / 9.0).powi(2) * 0.6 + 0.4 * table as f64 / MAX_TABLES as f64;
+        let footprints = footprints(&mut random, count, crowding.min(1.0));
+        if let Some(footprints) = footprints
+            && all_graspable(robot, &footprints)
+        {
+            return Ok(footprints.iter().enumerate().map(|(i, f)| f.as_box(i)).collect());
+        }
+    }
+    Err(PlacementError { count, seed })
+}
+
+/// The table as an object of the scene.
+pub fn table() -> SceneObject {
+    let [x, y, z] = aimm::TABLE_CENTRE;
+    SceneObject {
+        name: TABLE.to_owned(),
+        shape: Shape::Box { size: aimm::TABLE_SIZE },
+        placement: Placement::World(Pose::at(x, y, z)),
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Footprint {
+    centre: [f64; 2],
+    yaw: f64,
+    size: [f64; 3],
+}
+
+/// A rectangle in the plane.
+#[derive(Debug, Clone, Copy)]
+struct Rectangle {
+    centre: [f64; 2],
+    yaw: f64,
+    half: [f64; 2],
+}
+
+fn footprints(random: &mut ChaCha8Rng, count: usize, crowding: f64) -> Option<Vec<Footprint>> {
+    let mut placed: Vec<Footprint> = Vec::with_capacity(count);
+    for _ in 0..count {
+        let new = (0..MAX_PLACES).find_map(|_| {
+            let [longest, widest, highest] = aimm::BOX_GREATEST;
+            let longest = longest + (widest - longest) * crowding;
+            let width = random.random_range(aimm::BOX_LEAST[1]..=widest);
+            let length = random.random_range(width..=longest.max(width));
+            let height = random.random_range(aimm::BOX_LEAST[2]..=highest);
+            let [[x_low, x_high], [y_low, y_high]] = aimm::BOX_REGION;
+            let new = Footprint {
+                centre: [random.random_range(x_low..=x_high), random.random_range(y_low..=y_high)],
+                yaw: random.random_range(-FRAC_PI_2..FRAC_PI_2),
+                size: [length, width, height],
+            };
+            placed.iter().all(|other| new.clear_of(other) && other.clear_of(&new)).then_some(new)
+        })?;
+        placed.push(new);
+    }
+    Some(placed)
+}
+
+impl Footprint {
+    fn base(&self) -> Rectangle {
+        Rectangle { centre: self.centre, yaw: self.yaw, half: [self.size[0] / 2.0, self.size[1] / 2.0] }
+    }
+
+    /// Whether this box keeps its distance from the other and can be grasped beside it.
+    fn clear_of(&self, other: &Footprint) -> bool {
+        let grown = Rectangle { half: self.base().half.map(|h| h + GAP_M), ..self.base() };
+        let fingers = Rectangle { half: [FINGER_HALF_WIDTH_M, FINGER_REACH_M], ..self.base() };
+        !grown.overlaps(&other.base()) && !fingers.overlaps(&other.base())
+    }
+
+    fn pose(&self) -> Pose {
+        let [x, y] = self.centre;
+        Pose::from_rpy([x, y, aimm::TABLE_HEIGHT_M + self.size[2] / 2.0], 0.0, 0.0, self.yaw)
+    }
+
+    fn as_box(&self, index: usize) -> SimulatedBox {
+        SimulatedBox {
+            id: format!("slc_{}", index + 1),
+            size: self.size,
+            place: Place::At { pose: self.pose(), on: TABLE.to_owned(), standing: true },
+        }
+    }
+}
+
+impl Rectangle {
+    /// Whether no axis of either separates the two.
+    fn overlaps(&self, other: &Rectangle) -> bool {
+        let separated = |a: &Rectangle, b: &Rectangle| {
+            let (sin, cos) = a.yaw.sin_cos();
+            [[cos, sin], [-sin, cos]].iter().zip(a.half).any(|(axis, half)| {
+                let distance: f64 = (0..2).map(|i| axis[i] * (b.centre[i] - a.centre[i])).sum();
+                let (sin, cos) = b.yaw.sin_cos();
+                let reach = (axis[0] * cos + axis[1] * sin).abs() * b.half[0]
+                    + (axis[1] * cos - axis[0] * sin).abs() * b.half[1];
+                distance.abs() > half + reach
+            })
+        };
+        !separated(self, other) && !separated(other, self)
+    }
+}
+
+/// Whether each box can be taken from above while all of them stand there.
+fn all_graspable(robot: &Robot, footprints: &[Footprint]) -> bool {
+    let objects = footprints.iter().enumerate().map(|(i, f)| SceneObject {
+        name: format!("slc_{}", i + 1),
+        shape: Shape::Box { size: f.size },
+        placement: Placement::World(f.pose()),
+    });
+    let scene = Scene { base: Pose::IDENTITY, objects: objects.chain([table()]).collect() };
+    let mut checker = Checker::new(robot, &scene, PADDING_M);
+    let mut solver = Solver::new(robot, &scene.base);
+    let mut random = ChaCha8Rng::seed_from_u64(0);
+    footprints.iter().all(|f| {
+        aimm::grasp_poses(&f.pose(), f.size).iter().any(|grasp| {
+            solver.solutions(grasp, &aimm::HOME, 6, 20, &mut random).iter().any(|posture| {
+                line(&mut solver, posture, [0.0, 0.0, aimm::APPROACH_M]).is_ok_and(|postures| {
+                    postures.iter().all(|p| checker.is_free(p, Contact::Gripper(CONTACT_TOLERANCE_M)))
+                })
+            })
+        })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn every_number_of_boxes_finds_room_and_the_same_seed_gives_the_same_table() {
+        let robot = Robot::aimm();
+        for count in 1..=9 {
+            for seed in 0..3 {
+                let table = boxes(&robot, count, seed).unwrap();
+                assert_eq!(table.len(), count);
+                assert_eq!(table, boxes(&robot, count, seed).unwrap());
+            }
+            assert_ne!(boxes(&robot, count, 1).unwrap(), boxes(&robot, count, 2).unwrap());
+        }
+    }
+
+    #[test]
+    fn rectangles_overlap_unless_an_axis_separates_them() {
+        let one = Rectangle { centre: [0.0, 0.0], yaw: 0.0, half: [0.1, 0.05] };
+        assert!(one.overlaps(&Rectangle { centre: [0.12, 0.08], yaw: 0.8, half: [0.1, 0.05] }));
+        assert!(!one.overlaps(&Rectangle { centre: [0.18, 0.12], yaw: -0.8, half: [0.1, 0.05] }));
+    }
+}

@@ -1,0 +1,46 @@
+//! Which motions the arm follows: those that ratn-motion finds nothing wrong with in the *true* scene.
+
+use ratn_model::value::Trajectory;
+use ratn_motion::collision::{Checker, Contact};
+use ratn_motion::robot::{Configuration, Joints, Robot};
+use ratn_motion::timing::{Part, parameterise};
+use ratn_motion::trajectory::ArmTrajectory;
+use ratn_motion::validate::validate_trajectory;
+use ratn_world::scene::Scene;
+
+/// How deep the fingers and what they hold may press into something, in metres: what the planner takes for certain was
+/// measured, and rubber and cardboard give way. Arm links may not.
+const COMPLIANCE_M: f64 = 0.015;
+
+/// The trajectory, ready to be followed from `here`.
+///
+/// # Errors
+/// Why it may not be followed.
+pub(crate) fn check(
+    robot: &Robot,
+    scene: &Scene,
+    here: &Configuration,
+    trajectory: &Trajectory,
+) -> Result<ArmTrajectory, String> {
+    let contact = Contact::Gripper(COMPLIANCE_M);
+    validate_trajectory(robot, scene, &here.arm, Some(here.finger), trajectory, contact)
+        .map_err(|violation| format!("the trajectory is refused: {violation}"))
+}
+
+/// The straight line of joint space to a posture.
+///
+/// # Errors
+/// When the speed is none.
+pub(crate) fn straight(
+    robot: &Robot,
+    scene: &Scene,
+    from: &Joints,
+    to: &Joints,
+    speed: f64,
+) -> Result<Trajectory, String> {
+    if !(speed > 0.0 && speed <= 1.0) {
+        return Err(format!("a speed of {speed} is none: it is a fraction of the limits, above 0 and at most 1"));
+    }
+    let mut checker = Checker::new(robot, scene, 0.0);
+    Ok(parameterise(&mut checker, &[Part::Free(vec![*from, *to])], speed))
+}

@@ -1,0 +1,344 @@
+//! The core of the cell, driven in virtual time: what it refuses, what it holds, where boxes end, and the whole job.
+
+#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic and print")]
+
+use ratn_cell::config::CellConfig;
+use ratn_cell::core::cell::{Cell, Command, Ending, Event, Module, Product, Request, Ticket};
+use ratn_cell::core::picture::develop;
+use ratn_model::id::LeaseId;
+use ratn_model::pose::Pose;
+use ratn_model::time::Timestamp;
+use ratn_model::value::Trajectory;
+use ratn_motion::aimm;
+use ratn_motion::collision::{PADDING_M, distance};
+use ratn_motion::pace::Control;
+use ratn_motion::plan::{Goal, Request as PlanRequest, plan};
+use ratn_motion::robot::Joints;
+use ratn_perception::camera::Camera;
+use ratn_perception::detection::{BoxEstimate, Region, locate, segment};
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use std::f64::consts::PI;
+use std::time::Duration;
+
+/// A cell with a clock that only goes on when nothing else is left to do.
+struct Bench {
+    cell: Cell,
+    now: Timestamp,
+    tickets: u64,
+}
+
+impl Bench {
+    fn new(boxes: usize, seed: u64) -> Bench {
+        let cell = Cell::new(CellConfig { boxes, seed, ..CellConfig::default() }).unwrap();
+        Bench { cell, now: Timestamp::default(), tickets: 0 }
+    }
+
+    fn start(&mut self, lease: Option<LeaseId>, request: Request) -> (Ticket, Vec<Command>) {
+        self.tickets += 1;
+        let ticket = Ticket(self.tickets);
+        (ticket, self.cell.handle(self.now, Event::Start { ticket, lease, request }))
+    }
+
+    fn pass(&mut self, seconds: f64) -> Vec<Command> {
+        self.now = self.now + Duration::from_secs_f64(seconds);
+        self.cell.handle(self.now, Event::Tick)
+    }
+
+    /// Performs a request to its end.
+    fn perform(&mut self, request: Request) -> Ending {
+        let (ticket, mut commands) = self.start(None, request);
+        while commands.is_empty() {
+            self.now = self.cell.next_wake().expect("the goal is under way");
+            commands = self.cell.handle(self.now, Event::Tick);
+        }
+        let [Command::Ended { ticket: ended, ending }] = &commands[..] else { panic!("{commands:?}") };
+        assert_eq!(*ended, ticket);
+        ending.clone()
+    }
+
+    fn done(&mut self, request: Request) -> Product {
+        match self.perform(request) {
+            Ending::Done(product) => product,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn arm(&self) -> Joints {
+        self.cell.configuration().arm
+    }
+
+    fn plan(&self, scene: &Scene, goals: Vec<Goal>, depart_m: f64, approach_m: f64) -> Trajectory {
+        let request = PlanRequest {
+            start: self.arm(),
+            goals,
+            depart_m,
+            approach_m,
+            speed: 0.5,
+            seed: 3,
+            improvement_iterations: 50,
+        };
+        plan(self.cell.robot(), scene, &request, &mut |_| Control::Continue).unwrap().trajectory
+    }
+
+    /// Moves the arm by a plan in the true scene.
+    fn go(&mut self, goals: Vec<Goal>, depart_m: f64, approach_m: f64) {
+        let trajectory = self.plan(&self.cell.scene(), goals, depart_m, approach_m);
+        self.done(Request::Follow { trajectory });
+    }
+
+    /// Stands with the fingers around the box.
+    fn reach_for(&mut self, index: usize) {
+        let truth = self.cell.ground_truth()[index].clone();
+        let goals = aimm::grasp_poses(&truth.pose, truth.size).map(Goal::Pose).to_vec();
+        self.go(goals, 0.0, 0.10);
+    }
+}
+
+fn grasp() -> Request {
+    Request::Grasp { object: "box_1".to_owned(), expected: None }
+}
+
+#[test]
+fn a_box_is_held_only_when_the_fingers_are_around_it() {
+    let mut bench = Bench::new(2, 4);
+    assert!(
+        matches!(bench.perform(grasp()), Ending::Aborted(reason) if reason.contains("nothing is between the fingers"))
+    );
+    bench.done(Request::Release);
+    bench.reach_for(0);
+    let Product::Grasped { width, in_gripper, .. } = bench.done(grasp()) else { panic!() };
+    let truth = bench.cell.ground_truth();
+    assert!((width - truth[0].size[1]).abs() < 1e-9);
+    assert_eq!(in_gripper, None, "nobody said what to expect");
+    assert!(truth[0].held && !truth[1].held);
+    assert!(matches!(bench.perform(grasp()), Ending::Aborted(reason) if reason.contains("already")));
+}
+
+#[test]
+fn a_held_box_is_reported_the_way_round_it_was_expected() {
+    for half_turn in [0.0, PI] {
+        let mut bench = Bench::new(1, 4);
+        bench.reach_for(0);
+        let truth = bench.cell.ground_truth()[0].clone();
+        let tool = bench.cell.robot().tool_pose(&bench.cell.configuration());
+        let believed = truth.pose.compose(&Pose::from_rpy([0.003, 0.002, 0.001], 0.0, 0.0, half_turn + 0.02));
+        let expected = tool.inverse().compose(&believed);
+        let request = Request::Grasp { object: "box_1".to_owned(), expected: Some(expected) };
+        let Product::Grasped { in_gripper: Some(measured), .. } = bench.done(request) else { panic!() };
+        assert!(measured.distance(&expected) < 0.006 && measured.angle(&expected) < 0.03);
+    }
+}
+
+#[test]
+fn a_held_box_moves_with_the_tool_and_stands_where_it_is_let_go_on_the_deck() {
+    let mut bench = Bench::new(1, 7);
+    bench.reach_for(0);
+    bench.done(grasp());
+    let held = bench.cell.ground_truth()[0].clone();
+    let tool = bench.cell.robot().tool_pose(&bench.cell.configuration());
+    let in_tool = tool.inverse().compose(&held.pose);
+    let slot = aimm::slots()[4].compose(&Pose::at(0.0, 0.0, held.size[2] / 2.0 + 0.003));
+    bench.go(vec![Goal::Pose(slot.compose(&in_tool.inverse()))], 0.10, 0.10);
+    assert!(bench.cell.ground_truth()[0].pose.distance(&slot) < 1e-3);
+    bench.done(Request::Release);
+    let delivered = bench.cell.ground_truth()[0].clone();
+    assert!(delivered.on_base && !delivered.held && delivered.on == "base");
+    assert!((delivered.pose.position[2] - aimm::DECK_HEIGHT_M - held.size[2] / 2.0).abs() < 1e-6);
+}
+
+#[test]
+fn a_box_let_go_in_the_air_is_not_delivered() {
+    let mut bench = Bench::new(1, 7);
+    bench.reach_for(0);
+    bench.done(grasp());
+    bench.go(vec![Goal::Joints(aimm::OBSERVATION)], 0.10, 0.0);
+    bench.done(Request::Release);
+    let truth = bench.cell.ground_truth()[0].clone();
+    assert!(!truth.on_base && !truth.held, "{truth:?}");
+}
+
+#[test]
+fn a_trajectory_that_collides_or_starts_elsewhere_is_refused_with_the_reason() {
+    let mut bench = Bench::new(1, 7);
+    let table = Pose::from_rpy([0.62, -0.45, 0.66], PI, 0.0, 0.0);
+    let empty = Scene { base: Pose::IDENTITY, objects: vec![] };
+    let through_the_table = bench.plan(&empty, vec![Goal::Pose(table)], 0.0, 0.0);
+    let refused = bench.perform(Request::Follow { trajectory: through_the_table });
+    assert!(matches!(&refused, Ending::Aborted(reason) if reason.contains("table")), "{refused:?}");
+
+    let from_home = bench.plan(&bench.cell.scene(), vec![Goal::Joints(aimm::OBSERVATION)], 0.0, 0.0);
+    let mut too_fast = from_home.clone();
+    for point in &mut too_fast.points {
+        point.time_s /= 5.0;
+        point.velocities.iter_mut().for_each(|v| *v *= 5.0);
+    }
+    let refused = bench.perform(Request::Follow { trajectory: too_fast });
+    assert!(matches!(&refused, Ending::Aborted(reason) if reason.contains("limit")), "{refused:?}");
+
+    bench.done(Request::Follow { trajectory: from_home.clone() });
+    let refused = bench.perform(Request::Follow { trajectory: from_home });
+    assert!(matches!(&refused, Ending::Aborted(reason) if reason.contains("starts at")), "{refused:?}");
+    assert!(distance(&bench.arm(), &aimm::OBSERVATION) < 1e-6, "a refused trajectory moves nothing");
+}
+
+#[test]
+fn an_arm_whose_lease_ends_in_mid_motion_is_held_where_it_was() {
+    let mut bench = Bench::new(1, 7);
+    let (ticket, none) = bench.start(Some(LeaseId(5)), Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+    assert_eq!(none, vec![]);
+    assert_eq!(bench.pass(1.5), vec![]);
+    let other = Event::LeaseEnded { lease: LeaseId(4), reason: "released".to_owned() };
+    assert_eq!(bench.cell.handle(bench.now, other), vec![]);
+    let ended = Event::LeaseEnded { lease: LeaseId(5), reason: "session expired".to_owned() };
+    let commands = bench.cell.handle(bench.now, ended);
+    assert!(
+        matches!(&commands[..], [Command::Ended { ticket: t, ending: Ending::Aborted(reason) }]
+            if *t == ticket && reason.contains("session expired")),
+        "{commands:?}"
+    );
+    let held = bench.arm();
+    assert!(distance(&held, &aimm::HOME) > 0.1 && distance(&held, &aimm::OBSERVATION) > 0.1);
+    assert_eq!(bench.pass(60.0), vec![]);
+    assert_eq!(bench.arm(), held);
+    assert!(!bench.cell.is_active(Module::Arm));
+    bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+}
+
+#[test]
+fn a_stopped_motion_is_preempted_and_a_second_goal_for_a_busy_module_refused() {
+    let mut bench = Bench::new(1, 7);
+    let (ticket, _) = bench.start(None, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+    bench.pass(1.0);
+    let (second, refused) = bench.start(None, Request::MoveTo { joints: aimm::HOME, speed: 0.3 });
+    assert!(matches!(&refused[..], [Command::Ended { ticket, ending: Ending::Aborted(_) }] if *ticket == second));
+    let (_, refused) = bench.start(None, grasp());
+    assert!(matches!(&refused[..], [Command::Ended { ending: Ending::Aborted(r), .. }] if r.contains("Arm")));
+    let stopped = bench.cell.handle(bench.now, Event::Stop { ticket, reason: "cancelled".to_owned() });
+    assert_eq!(stopped, vec![Command::Ended { ticket, ending: Ending::Preempted("cancelled".to_owned()) }]);
+}
+
+#[test]
+fn the_same_seed_makes_the_same_world_and_a_reset_makes_it_again() {
+    let (one, other) = (Bench::new(5, 11), Bench::new(5, 12));
+    assert_eq!(one.cell.ground_truth(), Bench::new(5, 11).cell.ground_truth());
+    assert_ne!(one.cell.ground_truth(), other.cell.ground_truth());
+    let mut bench = Bench::new(5, 12);
+    bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+    bench.cell.handle(bench.now, Event::Reset { seed: 11, boxes: 5 });
+    assert_eq!(bench.cell.ground_truth(), one.cell.ground_truth());
+    assert_eq!(bench.arm(), aimm::HOME);
+}
+
+#[test]
+fn the_camera_is_turned_only_where_it_can_look() {
+    let mut bench = Bench::new(1, 1);
+    let Product::Looking { tilt, .. } = bench.done(Request::LookAt { target: aimm::TABLE_CENTRE }) else { panic!() };
+    assert!((0.4..1.0).contains(&tilt));
+    assert!(matches!(
+        bench.perform(Request::LookAt { target: [-0.63, 0.0, 9.0] }),
+        Ending::Aborted(reason) if reason.contains("limits")
+    ));
+}
+
+#[test]
+fn a_picture_takes_its_time_and_one_of_a_moving_arm_has_several_exposures() {
+    let mut bench = Bench::new(1, 1);
+    let before = bench.now;
+    let Product::Captured { exposures, .. } = bench.done(Request::Capture { frames: 30 }) else { panic!() };
+    assert!((bench.now.since(before).as_secs_f64() - 3.0).abs() < 1e-6);
+    assert_eq!(exposures.iter().map(|e| e.frames).collect::<Vec<_>>(), vec![30]);
+
+    bench.start(None, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+    let (_, none) = bench.start(None, Request::Capture { frames: 5 });
+    assert_eq!(none, vec![]);
+    let commands = bench.pass(0.5);
+    let [Command::Ended { ending: Ending::Done(Product::Captured { exposures, .. }), .. }] = &commands[..] else {
+        panic!("{commands:?}")
+    };
+    assert_eq!(exposures.len(), 5);
+}
+
+#[test]
+fn the_battery_drains_with_time_and_more_with_motion() {
+    let mut bench = Bench::new(1, 1);
+    bench.pass(10.0);
+    let idle = 1.0 - bench.cell.battery();
+    let start = bench.now;
+    bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+    let moving = (1.0 - bench.cell.battery() - idle) / bench.now.since(start).as_secs_f64();
+    assert!(idle > 0.0 && moving > 4.0 * idle / 10.0);
+}
+
+/// What the detector sees from where the robot stands.
+fn look<T>(bench: &mut Bench, frames: u32, detect: impl Fn(&ratn_perception::camera::DepthImage, &Camera) -> T) -> T {
+    let Product::Captured { camera, exposures } = bench.done(Request::Capture { frames }) else { panic!() };
+    let config = bench.cell.config();
+    let image = develop(bench.cell.robot(), &camera, &config.camera.noise, bench.cell.seed(), &exposures);
+    detect(&image, &camera)
+}
+
+/// The whole job by belief only: look, then for each box locate, plan in the believed scene, grasp, place, retreat.
+#[test]
+fn believing_only_what_the_camera_sees_the_robot_delivers_every_box() {
+    let mut worst: f64 = 0.0;
+    for (boxes, seed) in [(1, 1), (2, 2), (3, 3), (3, 1), (5, 5), (9, 1), (9, 9)] {
+        let mut bench = Bench::new(boxes, seed);
+        bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+        bench.done(Request::LookAt { target: [0.80, 0.0, 0.70] });
+        let table = Region { pose: Pose::at(0.80, 0.0, 0.70), size: [0.60, 1.20] };
+        let found = look(&mut bench, 60, |image, camera| segment(image, camera, &table)).unwrap();
+        assert_eq!(found.len(), boxes, "seed {seed}");
+        let [x, y, z] = aimm::TABLE_CENTRE;
+        let object = |name: String, size, pose| SceneObject {
+            name,
+            shape: Shape::Box { size },
+            placement: Placement::World(pose),
+        };
+        let mut believed =
+            Scene { base: Pose::IDENTITY, objects: vec![object("table".into(), aimm::TABLE_SIZE, Pose::at(x, y, z))] };
+        for (i, b) in found.iter().enumerate() {
+            believed.objects.push(object(format!("box_{}", i + 1), b.size, b.pose));
+        }
+        for (i, seen) in found.iter().enumerate() {
+            let b: BoxEstimate = look(&mut bench, 8, |image, camera| locate(image, camera, seen)).unwrap().unwrap();
+            let truths = bench.cell.ground_truth();
+            let error = truths.iter().map(|t| t.pose.distance(&b.pose)).fold(f64::INFINITY, f64::min);
+            worst = worst.max(error);
+            let goals = aimm::grasp_poses(&b.pose, b.size).map(Goal::Pose).to_vec();
+            let approach = bench.plan(&believed, goals, 0.0, 0.10);
+            bench.done(Request::Follow { trajectory: approach });
+            let tool = bench.cell.robot().tool_pose(&bench.cell.configuration());
+            let in_tool = tool.inverse().compose(&b.pose);
+            let Product::Grasped { in_gripper: Some(measured), .. } =
+                bench.done(Request::Grasp { object: format!("box_{}", i + 1), expected: Some(in_tool) })
+            else {
+                panic!()
+            };
+            assert!(measured.distance(&in_tool) < 0.015 && measured.angle(&in_tool) < 0.09, "seed {seed} box {i}");
+            believed.objects[i + 1].placement = Placement::Gripper(in_tool);
+            let slot = aimm::slots()[i].compose(&Pose::at(0.0, 0.0, b.size[2] / 2.0 + 0.003));
+            let half_turn = slot.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, PI));
+            let goals = [slot, half_turn].map(|s| Goal::Pose(s.compose(&in_tool.inverse()))).to_vec();
+            let transfer = bench.plan(&believed, goals, 0.10, 0.10);
+            bench.done(Request::Follow { trajectory: transfer });
+            bench.done(Request::Release);
+            believed.objects[i + 1].placement = Placement::World(slot);
+            let retract = bench.plan(&believed, vec![Goal::Joints(aimm::OBSERVATION)], 0.10, 0.0);
+            bench.done(Request::Follow { trajectory: retract });
+        }
+        let truth = bench.cell.ground_truth();
+        assert!(truth.iter().all(|b| b.on_base), "seed {seed}: {truth:#?}");
+        let stow = bench.plan(&believed, vec![Goal::Joints(aimm::STOWED)], 0.0, 0.0);
+        bench.done(Request::Follow { trajectory: stow });
+        bench.done(Request::LookAt { target: [-0.37, 0.0, 0.60] });
+        let deck = Region { pose: Pose::at(-0.37, 0.0, 0.60), size: [0.44, 0.58] };
+        let on_deck = look(&mut bench, 60, |image, camera| segment(image, camera, &deck)).unwrap();
+        println!("{boxes} boxes, seed {seed}: {:.0} s, {} seen on the deck", bench.now.seconds(), on_deck.len());
+        assert_eq!(on_deck.len(), boxes, "seed {seed}: {on_deck:#?}");
+    }
+    println!(
+        "worst position error of a located box: {:.1} mm (the planner keeps {:.0} mm)",
+        worst * 1e3,
+        PADDING_M * 1e3
+    );
+}
