@@ -8,7 +8,8 @@
 
 pub mod config;
 mod details;
-//pub mod process_manager;
+mod link;
+pub mod process_manager;
 pub mod resource_manager;
 pub mod telemetry;
-//pub mod world_pool;
+pub mod world_pool;

@@ -1,0 +1,128 @@
+//! The link of a provider to the resource manager: finds it, keeps a session, and keeps the resources there equal to those
+//! wanted, also after the manager came back, on another port if need be.
+
+use crate::resource_manager;
+use ratn_proto::types::Resource;
+use ratn_worker::client::{CallError, Channels};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::provider::Provider;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::session::Session;
+use std::collections::BTreeMap;
+use std::time::Duration;
+use tokio::sync::{mpsc, watch};
+use tokio_util::sync::CancellationToken;
+
+/// How long is waited for a manager before that is said in the log (and waited on).
+const PATIENCE: Duration = Duration::from_secs(10);
+/// How often is looked whether the manager has moved, and whether something is still to be offered.
+const LOOK_INTERVAL: Duration = Duration::from_millis(250);
+
+/// The resources wanted, by id.
+pub(crate) type Wanted = BTreeMap<String, Resource>;
+
+/// Where the resource manager is.
+#[derive(Debug, Clone)]
+pub(crate) struct Manager {
+    pub(crate) configured: Option<Endpoint>,
+    pub(crate) directory: RuntimeDirectory,
+}
+
+/// A provider's link.
+pub(crate) struct Link {
+    pub(crate) manager: Manager,
+    /// Who this is, for people.
+    pub(crate) client: String,
+    pub(crate) ttl: Duration,
+    pub(crate) wanted: watch::Receiver<Wanted>,
+    /// Hears the id of each resource once it is there.
+    pub(crate) there: Option<mpsc::Sender<String>>,
+}
+
+impl Manager {
+    /// Where it is, as soon as it is there.
+    pub(crate) async fn find(&self) -> Endpoint {
+        loop {
+            if let Some(endpoint) = &self.configured {
+                return endpoint.clone();
+            }
+            match self.directory.wait_for(resource_manager::ROLE, PATIENCE).await {
+                Ok(endpoint) => return endpoint,
+                Err(error) => {
+                    tracing::warn!("still waiting for the resource manager: {error}");
+                    tokio::time::sleep(LOOK_INTERVAL).await;
+                }
+            }
+        }
+    }
+
+    /// Whether it is somewhere else now.
+    pub(crate) fn has_moved_from(&self, endpoint: &Endpoint) -> bool {
+        self.configured.is_none() && self.directory.find(resource_manager::ROLE).is_ok_and(|found| found != *endpoint)
+    }
+}
+
+impl Link {
+    /// Keeps it up until `shutdown`; then the session is closed, and with it every resource is gone.
+    pub(crate) async fn keep(mut self, shutdown: CancellationToken) {
+        let channels = Channels::new();
+        loop {
+            let endpoint = tokio::select! {
+                endpoint = self.manager.find() => endpoint,
+                () = shutdown.cancelled() => return,
+            };
+            let session = Session::open(&channels, &endpoint, &self.client, self.ttl);
+            tokio::select! {
+                kept = self.keep_at(&channels, &endpoint, &session) => if let Err(error) = kept {
+                    tracing::error!(%endpoint, "no link to the resource manager: {error}");
+                    tokio::time::sleep(LOOK_INTERVAL).await;
+                },
+                () = shutdown.cancelled() => {
+                    session.close().await;
+                    return;
+                }
+            }
+        }
+    }
+
+    /// Returns when the manager is somewhere else.
+    async fn keep_at(&mut self, channels: &Channels, endpoint: &Endpoint, session: &Session) -> Result<(), CallError> {
+        let provider = Provider::start(channels, endpoint, session)?;
+        let mut offered = Wanted::new();
+        let mut refused = Wanted::new();
+        loop {
+            let wanted = self.wanted.borrow_and_update().clone();
+            for id in offered.keys().filter(|id| !wanted.contains_key(*id)).cloned().collect::<Vec<_>>() {
+                offered.remove(&id);
+                if let Err(error) = provider.withdraw(&id).await {
+                    // Not offered again; at the latest it vanishes with the session.
+                    tracing::warn!(id, %error, "a resource could not be withdrawn");
+                }
+            }
+            refused.retain(|id, resource| wanted.get(id) == Some(resource));
+            for (id, resource) in wanted {
+                if offered.get(&id) == Some(&resource) || refused.contains_key(&id) {
+                    continue;
+                }
+                match provider.offer(resource.clone()).await {
+                    Ok(true) => {
+                        offered.insert(id.clone(), resource);
+                        if let Some(there) = &self.there {
+                            let _ = there.send(id).await;
+                        }
+                    }
+                    // The provider offers it by itself as soon as it can; asked again only to learn that it has.
+                    Ok(false) => {}
+                    Err(error) => {
+                        tracing::error!(id, %error, "the resource manager does not take the resource");
+                        refused.insert(id, resource);
+                    }
+                }
+            }
+            tokio::select! {
+                changed = self.wanted.changed() => if changed.is_err() { return Ok(()) },
+                () = tokio::time::sleep(LOOK_INTERVAL) => if self.manager.has_moved_from(endpoint) { return Ok(()) },
+            }
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! The output of a worker: into a bounded file, with its end kept at hand for whoever asks why it died.
+
+use std::collections::VecDeque;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use tokio::io::{AsyncRead, AsyncReadExt};
+
+/// How much of the end is kept.
+const LAST_WORDS_BYTES: usize = 400;
+/// How much is read at once.
+const CHUNK_BYTES: usize = 4_096;
+
+/// A worker's log; clones write to the same.
+#[derive(Debug, Clone)]
+pub(super) struct Log {
+    inner: Arc<Mutex<Inner>>,
+}
+
+#[derive(Debug)]
+struct Inner {
+    path: PathBuf,
+    file: File,
+    written: u64,
+    max_bytes: u64,
+    tail: VecDeque<u8>,
+}
+
+impl Log {
+    /// Begins a log file.
+    pub(super) fn create(path: &Path, max_bytes: u64) -> io::Result<Log> {
+        if let Some(parent) = path.parent() {
+            fs::create_dir_all(parent)?;
+        }
+        let file = File::create(path)?;
+        let inner = Inner { path: path.to_owned(), file, written: 0, max_bytes, tail: VecDeque::new() };
+        Ok(Log { inner: Arc::new(Mutex::new(inner)) })
+    }
+
+    /// Copies until the other side ends.
+    pub(super) async fn capture(self, mut from: impl AsyncRead + Unpin) {
+        let mut chunk = vec![0; CHUNK_BYTES];
+        while let Ok(length @ 1..) = from.read(&mut chunk).await {
+            let mut inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Err(error) = inner.write(&chunk[..length]) {
+                // The worker goes on; a full disk costs its log only.
+                tracing::warn!(file = %inner.path.display(), %error, "a worker's log is not written");
+            }
+        }
+    }
+
+    /// The last lines, in one.
+    pub(super) fn last_words(&self) -> String {
+        let inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
+        let (front, back) = inner.tail.as_slices();
+        let text = String::from_utf8_lossy(&[front, back].concat()).into_owned();
+        text.lines().map(str::trim).filter(|line| !line.is_empty()).collect::<Vec<_>>().join(" | ")
+    }
+}
+
+impl Inner {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.tail.extend(bytes);
+        let surplus = self.tail.len().saturating_sub(LAST_WORDS_BYTES);
+        self.tail.drain(..surplus);
+        if self.written + bytes.len() as u64 > self.max_bytes {
+            fs::rename(&self.path, self.path.with_extension("log.1"))?;
+            self.file = File::create(&self.path)?;
+            self.written = 0;
+        }
+        self.written += bytes.len() as u64;
+        self.file.write_all(bytes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[tokio::test]
+    async fn a_log_is_bounded_and_its_end_is_at_hand() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("logs/planner-1@compute.log");
+        let log = Log::create(&path, 10_000).unwrap();
+        let lines: String = (0..2_000).map(|i| format!("line {i}\n")).collect();
+        log.clone().capture(lines.as_bytes()).await;
+        assert!(fs::metadata(&path).unwrap().len() <= 10_000);
+        assert!(fs::metadata(path.with_extension("log.1")).unwrap().len() <= 10_000);
+        assert!(log.last_words().ends_with("line 1998 | line 1999"));
+        assert!(log.last_words().len() < 600);
+    }
+}

@@ -1,0 +1,68 @@
+//! The process manager of one host (the paper's process pools, Section V-C): starts worker processes from the templates
+//! of its config, offers each to the resource manager once it serves, and replaces those that die.
+//!
+//! ```text
+//!   gRPC call ──▶ service.rs ──message──▶ actor.rs ──command──▶ spawner.rs (one thread) ──▶ worker processes
+//!                                          │ ▲ pool.rs (what there should be)                  │ exit, health
+//!                  resource manager ◀──link┘ └─────────────────────────────────────────────────┘
+//! ```
+//! What the workers do, and who uses them, it does not know.
+
+mod actor;
+mod config;
+mod log;
+pub mod pool;
+mod service;
+mod spawner;
+mod status;
+mod usage;
+
+pub use config::{ProcessManagerConfig, Template};
+
+use crate::link::{Link, Manager, Wanted};
+use anyhow::Context;
+use ratn_proto::v1::process_service_server::ProcessServiceServer;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::server::{Services, bind};
+use std::time::Duration;
+use tokio::sync::{mpsc, watch};
+use tokio_util::sync::CancellationToken;
+
+/// The role's name: of its endpoint file, its command and its section of a config.
+pub const ROLE: &str = "process-manager";
+/// Resources that are there which the actor was not told of yet.
+const THERE: usize = 1_024;
+
+/// Serves until `shutdown` is cancelled, and returns once every worker is gone.
+///
+/// # Errors
+/// Where it cannot listen, publish its endpoint or start its thread, or where serving fails.
+pub async fn run(
+    config: ProcessManagerConfig,
+    directory: RuntimeDirectory,
+    shutdown: CancellationToken,
+) -> anyhow::Result<()> {
+    let bound = bind(&config.listen).await?;
+    let endpoint = bound.endpoint().clone();
+    let (wanted, to_offer) = watch::channel(Wanted::new());
+    let (offered, there) = mpsc::channel(THERE);
+    let link = Link {
+        manager: Manager { configured: config.resource_manager.clone(), directory: directory.clone() },
+        client: format!("{ROLE}@{}", config.host),
+        ttl: Duration::from_millis(config.session_ttl_ms),
+        wanted: to_offer,
+        there: Some(offered),
+    };
+    let linked = tokio::spawn(link.keep(shutdown.clone()));
+    let host = config.host.clone();
+    let parts = actor::Parts { config, directory: directory.clone(), wanted, there };
+    let (actor, ended) = actor::start(parts, shutdown.clone()).context("cannot start workers")?;
+    let service = ProcessServiceServer::new(service::Service { actor, host, shutdown: shutdown.clone() });
+    let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
+    tracing::info!(%endpoint, "{ROLE} is ready");
+    let served = bound.serve(Services::new().with(service), shutdown.clone()).await;
+    drop(published);
+    shutdown.cancel();
+    let _ = tokio::join!(linked, ended);
+    Ok(served?)
+}

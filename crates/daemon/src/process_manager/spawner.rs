@@ -1,0 +1,123 @@
+//! Starts processes, all from one thread that lives as long as the process manager, and watches each until its end.
+//!
+//! Each worker leads a process group of its own, so that it can be ended with all that it started. Its standard input is a
+//! pipe that nobody writes to: it ends with the process manager, however that ends. Nothing runs in the child before exec.
+
+use super::log::Log;
+use nix::errno::Errno;
+use nix::sys::signal::{Signal, killpg};
+use nix::unistd::Pid;
+use std::collections::BTreeMap;
+use std::io;
+use std::os::unix::process::ExitStatusExt;
+use std::path::PathBuf;
+use std::process::{ExitStatus, Stdio};
+use std::time::Duration;
+use tokio::process::{Child, Command};
+use tokio::runtime::Handle;
+use tokio::sync::mpsc;
+
+/// Processes that wait to be started.
+const QUEUE: usize = 1_024;
+/// How long the end of a dead worker's output is waited for: something that it started may hold the pipe open.
+const LAST_WORDS_PATIENCE: Duration = Duration::from_millis(20);
+
+/// A process to be started.
+#[derive(Debug)]
+pub(super) struct Job {
+    pub(super) id: String,
+    pub(super) program: PathBuf,
+    pub(super) args: Vec<String>,
+    pub(super) env: BTreeMap<String, String>,
+    pub(super) log: PathBuf,
+    pub(super) max_log_bytes: u64,
+}
+
+/// What becomes of a job, in this order.
+#[derive(Debug)]
+pub(super) enum Outcome {
+    /// The process is there.
+    Spawned { id: String, pid: u32 },
+    /// It is gone, or never was.
+    Exited { id: String, reason: String, last_words: String },
+}
+
+/// Starts the thread; it ends when the sender is dropped. Needs a tokio runtime.
+pub(super) fn start(outcomes: mpsc::Sender<Outcome>) -> io::Result<mpsc::Sender<Job>> {
+    let (sender, mut jobs) = mpsc::channel::<Job>(QUEUE);
+    let runtime = Handle::current();
+    std::thread::Builder::new().name("spawner".to_owned()).spawn(move || {
+        let _entered = runtime.enter();
+        while let Some(job) = jobs.blocking_recv() {
+            let id = job.id.clone();
+            match spawn(&job) {
+                Ok((child, log)) => {
+                    let pid = child.id().unwrap_or(0);
+                    if outcomes.blocking_send(Outcome::Spawned { id: id.clone(), pid }).is_err() {
+                        return;
+                    }
+                    runtime.spawn(watch(id, pid, child, log, outcomes.clone()));
+                }
+                Err(error) => {
+                    let reason = format!("cannot start {}: {error}", job.program.display());
+                    let exited = Outcome::Exited { id, reason, last_words: String::new() };
+                    if outcomes.blocking_send(exited).is_err() {
+                        return;
+                    }
+                }
+            }
+        }
+    })?;
+    Ok(sender)
+}
+
+/// Signals a worker and all that it started.
+pub(super) fn signal(pid: u32, signal: Signal) {
+    let Some(group) = i32::try_from(pid).ok().filter(|pid| *pid > 1) else { return };
+    match killpg(Pid::from_raw(group), signal) {
+        Ok(()) | Err(Errno::ESRCH) => {}
+        Err(error) => tracing::warn!(pid, %signal, %error, "a worker could not be signalled"),
+    }
+}
+
+fn spawn(job: &Job) -> io::Result<(Child, Log)> {
+    let log = Log::create(&job.log, job.max_log_bytes)?;
+    let child = Command::new(&job.program)
+        .args(&job.args)
+        .envs(&job.env)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .process_group(0)
+        .kill_on_drop(true)
+        .spawn()?;
+    Ok((child, log))
+}
+
+async fn watch(id: String, pid: u32, mut child: Child, log: Log, outcomes: mpsc::Sender<Outcome>) {
+    let out = child.stdout.take().map(|out| tokio::spawn(log.clone().capture(out)));
+    let err = child.stderr.take().map(|err| tokio::spawn(log.clone().capture(err)));
+    // `wait` would close the pipe that tells the worker that its parent lives.
+    let parent_lives = child.stdin.take();
+    let reason = match child.wait().await {
+        Ok(status) => describe(status),
+        Err(error) => format!("cannot be waited for: {error}"),
+    };
+    drop(parent_lives);
+    signal(pid, Signal::SIGKILL);
+    let captured = async {
+        for capture in [out, err].into_iter().flatten() {
+            let _ = capture.await;
+        }
+    };
+    let _ = tokio::time::timeout(LAST_WORDS_PATIENCE, captured).await;
+    let _ = outcomes.send(Outcome::Exited { id, reason, last_words: log.last_words() }).await;
+}
+
+fn describe(status: ExitStatus) -> String {
+    match (status.code(), status.signal()) {
+        (Some(code), _) => format!("exited with status {code}"),
+        (None, Some(signal)) => format!("killed by signal {signal}"),
+        (None, None) => status.to_string(),
+    }
+}

@@ -1,0 +1,32 @@
+//! What workers use of the machine: resident memory, and processor time between two listings.
+
+use ratn_proto::types::PoolStatus;
+use sysinfo::{Pid, ProcessRefreshKind, ProcessesToUpdate, System};
+
+/// Remembers the last look, from which processor use is counted.
+pub(super) struct Usage {
+    /// None where the system does not say.
+    system: Option<System>,
+}
+
+impl Usage {
+    pub(super) fn new() -> Usage {
+        Usage { system: System::new().ok() }
+    }
+
+    pub(super) fn fill_in(&mut self, pools: &mut [PoolStatus]) {
+        let Some(system) = &mut self.system else { return };
+        let workers = || pools.iter().flat_map(|pool| &pool.workers).filter(|worker| worker.pid != 0);
+        let pids: Vec<Pid> = workers().map(|worker| Pid::from_u32(worker.pid)).collect();
+        let what = ProcessRefreshKind::nothing().with_memory().with_cpu();
+        // What is not known stays at 0.
+        let _ = system.refresh_processes_specifics(ProcessesToUpdate::Some(&pids), true, what);
+        for worker in pools.iter_mut().flat_map(|pool| &mut pool.workers) {
+            if let Some(process) = system.process(Pid::from_u32(worker.pid)) {
+                worker.resident_bytes = process.memory();
+                // Percent of one core, as tenths of a percent.
+                worker.cpu_millicores = (process.cpu_usage() * 10.0).round() as u32;
+            }
+        }
+    }
+}

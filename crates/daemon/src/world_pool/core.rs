@@ -1,0 +1,378 @@
+//! The root world, the revisions that can be projected from, and the projections: a pure state machine.
+//!
+//! A projection is a clone of a kept revision with its changes applied, so it costs its effects, whatever the size of the
+//! world. It shows its declared reads and nothing else, and it ends with its lease.
+
+use super::WorldPoolConfig;
+use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
+use ratn_model::id::{LeaseId, ProjectionId, Revision};
+use ratn_model::time::Timestamp;
+use ratn_world::world::{ChangeError, Fact, World};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::time::Duration;
+
+/// The pool's whole state.
+#[derive(Debug)]
+pub(super) struct WorldPool {
+    config: WorldPoolConfig,
+    /// The last of them is the root.
+    revisions: VecDeque<World>,
+    commits: Memory<Revision>,
+    projections: BTreeMap<ProjectionId, Projection>,
+    projected: Memory<ProjectionId>,
+    by_lease: BTreeMap<LeaseId, BTreeSet<ProjectionId>>,
+    last_projection: u64,
+}
+
+#[derive(Debug)]
+struct Projection {
+    world: World,
+    base: Revision,
+    reads: Footprint,
+    held_by: HeldBy,
+    request_id: String,
+}
+
+/// What a projection lives as long as.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum HeldBy {
+    /// A live lease of the resource manager.
+    Lease(LeaseId),
+    /// Nothing but time.
+    Until(Timestamp),
+}
+
+/// A projection to be made.
+#[derive(Debug)]
+pub(super) struct ProjectRequest {
+    pub(super) request_id: String,
+    pub(super) base: Revision,
+    pub(super) changes: Vec<Change>,
+    pub(super) reads: Footprint,
+    pub(super) held_by: HeldBy,
+}
+
+/// A commit that was not made; the root is as it was.
+#[derive(Debug, PartialEq, thiserror::Error)]
+pub(super) enum CommitError {
+    #[error("the root is at revision {root}: a commit makes {next}, not {expected}; read the root again")]
+    Revision { root: u64, next: u64, expected: u64 },
+    #[error(transparent)]
+    Change(#[from] ChangeError),
+}
+
+/// A projection that was not made.
+#[derive(Debug, PartialEq, thiserror::Error)]
+pub(super) enum ProjectError {
+    #[error("the root is at revision {root}: there is no revision {base} yet")]
+    Future { root: u64, base: u64 },
+    #[error("revision {base} is no longer kept, the oldest is {oldest}; project from a later one")]
+    Forgotten { base: u64, oldest: u64 },
+    #[error(transparent)]
+    Change(#[from] ChangeError),
+    #[error("{limit} projections exist: release some")]
+    TooMany { limit: usize },
+    #[error("the projection of request `{request_id}` has ended; ask with another request id")]
+    Ended { request_id: String },
+}
+
+/// A question without an answer.
+#[derive(Debug, PartialEq, thiserror::Error)]
+pub(super) enum QueryError {
+    #[error("{id} is unknown or has ended (its lease ended, or it was released)")]
+    Unknown { id: ProjectionId },
+    #[error("{id} does not show {pattern}: it is not among the reads declared for it; declare it (reads: […])")]
+    Hidden { id: ProjectionId, pattern: FactPattern },
+}
+
+impl WorldPool {
+    pub(super) fn new(config: WorldPoolConfig) -> WorldPool {
+        WorldPool {
+            revisions: VecDeque::from([World::default()]),
+            commits: Memory::new(config.remembered_requests),
+            projections: BTreeMap::new(),
+            projected: Memory::new(config.remembered_requests),
+            by_lease: BTreeMap::new(),
+            last_projection: 0,
+            config,
+        }
+    }
+
+    pub(super) fn root(&self) -> &World {
+        // One revision is always kept.
+        &self.revisions[self.revisions.len() - 1]
+    }
+
+    /// All changes as the next revision, or none. An id committed before gets its answer again.
+    pub(super) fn commit(
+        &mut self,
+        id: &str,
+        changes: &[Change],
+        expected: Option<Revision>,
+    ) -> Result<Revision, CommitError> {
+        if let Some(revision) = self.commits.get(id) {
+            return Ok(*revision);
+        }
+        let (root, next) = (self.root().revision().0, self.root().revision().0 + 1);
+        if let Some(expected) = expected.filter(|expected| expected.0 != next) {
+            return Err(CommitError::Revision { root, next, expected: expected.0 });
+        }
+        let world = self.root().project(changes)?;
+        let revision = world.revision();
+        self.revisions.push_back(world);
+        while self.revisions.len() > self.config.revisions_kept {
+            self.revisions.pop_front();
+        }
+        self.commits.insert(id, revision);
+        Ok(revision)
+    }
+
+    /// The world at a revision with changes applied. A request made before gets its answer again, as long as it lives.
+    pub(super) fn project(&mut self, request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
+        if let Some(id) = self.projected.get(&request.request_id) {
+            let ended = || ProjectError::Ended { request_id: request.request_id.clone() };
+            return self.projections.contains_key(id).then_some(*id).ok_or_else(ended);
+        }
+        if self.projections.len() >= self.config.max_projections {
+            return Err(ProjectError::TooMany { limit: self.config.max_projections });
+        }
+        let (root, oldest) = (self.root().revision().0, self.revisions[0].revision().0);
+        let base = request.base.0;
+        if base > root {
+            return Err(ProjectError::Future { root, base });
+        }
+        let below = base
+            .checked_sub(oldest)
+            .and_then(|index| self.revisions.get(usize::try_from(index).ok()?))
+            .ok_or(ProjectError::Forgotten { base, oldest })?;
+        let world = below.project(&request.changes)?;
+        self.last_projection += 1;
+        let id = ProjectionId(self.last_projection);
+        if let HeldBy::Lease(lease) = request.held_by {
+            self.by_lease.entry(lease).or_default().insert(id);
+        }
+        self.projected.insert(&request.request_id, id);
+        let projection = Projection {
+            world,
+            base: request.base,
+            reads: request.reads,
+            held_by: request.held_by,
+            request_id: request.request_id,
+        };
+        self.projections.insert(id, projection);
+        Ok(id)
+    }
+
+    /// What matches any of the patterns, in the order of keys, of the root or of a projection.
+    pub(super) fn query(
+        &self,
+        id: Option<ProjectionId>,
+        patterns: &[FactPattern],
+    ) -> Result<(Vec<(FactKey, Fact)>, Revision), QueryError> {
+        let (world, revision) = match id {
+            None => (self.root(), self.root().revision()),
+            Some(id) => {
+                let projection = self.projections.get(&id).ok_or(QueryError::Unknown { id })?;
+                let shown = |pattern: &FactPattern| match &projection.reads {
+                    Footprint::Everything => true,
+                    Footprint::Patterns(reads) => reads.iter().any(|read| read.covers(pattern)),
+                };
+                if let Some(pattern) = patterns.iter().find(|pattern| !shown(pattern)) {
+                    return Err(QueryError::Hidden { id, pattern: pattern.clone() });
+                }
+                (&projection.world, projection.base)
+            }
+        };
+        let facts: BTreeMap<FactKey, Fact> = patterns
+            .iter()
+            .flat_map(|pattern| world.matching(pattern))
+            .map(|(key, fact)| (key.clone(), fact.clone()))
+            .collect();
+        Ok((facts.into_iter().collect(), revision))
+    }
+
+    /// Ends a projection; false when it had ended before.
+    pub(super) fn release(&mut self, id: ProjectionId) -> bool {
+        let Some(projection) = self.projections.remove(&id) else { return false };
+        tracing::trace!(%id, request = projection.request_id, "projection ended");
+        if let HeldBy::Lease(lease) = projection.held_by
+            && let Some(ids) = self.by_lease.get_mut(&lease)
+        {
+            ids.remove(&id);
+            if ids.is_empty() {
+                self.by_lease.remove(&lease);
+            }
+        }
+        true
+    }
+
+    /// Ends what the lease held; how many projections that were.
+    pub(super) fn end_lease(&mut self, lease: LeaseId) -> usize {
+        let ids = self.by_lease.get(&lease).cloned().unwrap_or_default();
+        ids.into_iter().filter(|id| self.release(*id)).count()
+    }
+
+    /// Ends what leases held that live no more.
+    pub(super) fn keep_leases(&mut self, live: impl Fn(LeaseId) -> bool) -> usize {
+        let ended: Vec<LeaseId> = self.by_lease.keys().copied().filter(|lease| !live(*lease)).collect();
+        ended.into_iter().map(|lease| self.end_lease(lease)).sum()
+    }
+
+    /// Ends what is held by nothing but time that has passed.
+    pub(super) fn expire(&mut self, now: Timestamp) {
+        let over = |projection: &Projection| matches!(projection.held_by, HeldBy::Until(end) if end <= now);
+        let ids: Vec<ProjectionId> = self.projections.iter().filter(|(_, p)| over(p)).map(|(id, _)| *id).collect();
+        for id in ids {
+            self.release(id);
+        }
+    }
+
+    pub(super) fn unbound_ttl(&self) -> Duration {
+        Duration::from_secs_f64(self.config.unbound_ttl_s)
+    }
+
+    pub(super) fn projections(&self) -> usize {
+        self.projections.len()
+    }
+}
+
+/// The answers given, by id; bounded, the oldest forgotten first.
+#[derive(Debug)]
+struct Memory<T> {
+    answers: BTreeMap<String, T>,
+    order: VecDeque<String>,
+    limit: usize,
+}
+
+impl<T> Memory<T> {
+    fn new(limit: usize) -> Memory<T> {
+        Memory { answers: BTreeMap::new(), order: VecDeque::new(), limit }
+    }
+
+    fn get(&self, id: &str) -> Option<&T> {
+        if id.is_empty() { None } else { self.answers.get(id) }
+    }
+
+    fn insert(&mut self, id: &str, answer: T) {
+        if id.is_empty() || self.answers.insert(id.to_owned(), answer).is_some() {
+            return;
+        }
+        self.order.push_back(id.to_owned());
+        if self.order.len() > self.limit
+            && let Some(oldest) = self.order.pop_front()
+        {
+            self.answers.remove(&oldest);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_model::fact::Term;
+    use ratn_model::value::Value;
+
+    fn key(name: &str) -> FactKey {
+        FactKey { predicate: "at".to_owned(), arguments: vec![Term::Name(name.to_owned())] }
+    }
+
+    fn set(name: &str, value: i64) -> Change {
+        Change::Set { fact: key(name), value: Value::Int(value) }
+    }
+
+    fn pool() -> WorldPool {
+        WorldPool::new(WorldPoolConfig { revisions_kept: 3, max_projections: 2, ..WorldPoolConfig::default() })
+    }
+
+    fn project(pool: &mut WorldPool, request: &str, base: u64, lease: u64) -> Result<ProjectionId, ProjectError> {
+        pool.project(ProjectRequest {
+            request_id: request.to_owned(),
+            base: Revision(base),
+            changes: vec![set("box", 7)],
+            reads: Footprint::Patterns(vec![FactPattern::of(&key("box"))]),
+            held_by: HeldBy::Lease(LeaseId(lease)),
+        })
+    }
+
+    fn value(pool: &WorldPool, id: Option<ProjectionId>, name: &str) -> Result<Option<Value>, QueryError> {
+        let (facts, _) = pool.query(id, &[FactPattern::of(&key(name))])?;
+        Ok(facts.into_iter().next().map(|(_, fact)| fact.value))
+    }
+
+    #[test]
+    fn a_commit_is_made_once_and_only_as_the_revision_expected() {
+        let mut pool = pool();
+        assert_eq!(pool.commit("a", &[set("box", 1)], Some(Revision(1))), Ok(Revision(1)));
+        assert_eq!(pool.commit("a", &[set("box", 1)], Some(Revision(1))), Ok(Revision(1)));
+        let wrong = pool.commit("b", &[set("box", 2)], Some(Revision(3)));
+        assert_eq!(wrong, Err(CommitError::Revision { root: 1, next: 2, expected: 3 }));
+        assert_eq!(value(&pool, None, "box"), Ok(Some(Value::Int(1))));
+        assert_eq!(pool.commit("b", &[set("box", 2)], None), Ok(Revision(2)));
+    }
+
+    #[test]
+    fn a_projection_is_of_its_base_whatever_was_committed_since() {
+        let mut pool = pool();
+        pool.commit("a", &[set("box", 1), set("cup", 1)], None).unwrap();
+        pool.commit("b", &[set("box", 2), set("cup", 2)], None).unwrap();
+        let all = Footprint::Everything;
+        let request = ProjectRequest {
+            request_id: "p".to_owned(),
+            base: Revision(1),
+            changes: vec![set("box", 7)],
+            reads: all,
+            held_by: HeldBy::Until(Timestamp(5)),
+        };
+        let id = pool.project(request).unwrap();
+        assert_eq!(value(&pool, Some(id), "box"), Ok(Some(Value::Int(7))));
+        assert_eq!(value(&pool, Some(id), "cup"), Ok(Some(Value::Int(1))));
+        assert_eq!(value(&pool, None, "box"), Ok(Some(Value::Int(2))), "the root is as it was");
+        pool.expire(Timestamp(4));
+        assert_eq!(pool.projections(), 1);
+        pool.expire(Timestamp(5));
+        assert_eq!(pool.projections(), 0);
+    }
+
+    #[test]
+    fn a_projection_shows_its_declared_reads_and_nothing_else() {
+        let mut pool = pool();
+        pool.commit("a", &[set("cup", 1)], None).unwrap();
+        let id = project(&mut pool, "p", 1, 1).unwrap();
+        assert_eq!(value(&pool, Some(id), "box"), Ok(Some(Value::Int(7))));
+        let hidden = value(&pool, Some(id), "cup").unwrap_err();
+        assert_eq!(
+            hidden.to_string(),
+            "projection-1 does not show at(cup): it is not among the reads declared for it; declare it (reads: […])"
+        );
+        let wider = FactPattern { predicate: "at".to_owned(), arguments: vec![None] };
+        assert!(matches!(pool.query(Some(id), &[wider]), Err(QueryError::Hidden { .. })));
+    }
+
+    #[test]
+    fn revisions_outside_those_kept_are_refused() {
+        let mut pool = pool();
+        for i in 1..=4 {
+            pool.commit(&i.to_string(), &[set("box", i)], None).unwrap();
+        }
+        assert_eq!(project(&mut pool, "p", 1, 1), Err(ProjectError::Forgotten { base: 1, oldest: 2 }));
+        assert_eq!(project(&mut pool, "p", 5, 1), Err(ProjectError::Future { root: 4, base: 5 }));
+        assert!(project(&mut pool, "p", 2, 1).is_ok(), "a refused request can be asked again");
+    }
+
+    #[test]
+    fn projections_end_with_their_lease_and_are_bounded() {
+        let mut pool = pool();
+        let first = project(&mut pool, "p", 0, 1).unwrap();
+        assert_eq!(project(&mut pool, "p", 0, 1), Ok(first), "asked twice, made once");
+        project(&mut pool, "q", 0, 2).unwrap();
+        assert_eq!(project(&mut pool, "r", 0, 2), Err(ProjectError::TooMany { limit: 2 }));
+        assert_eq!(pool.end_lease(LeaseId(1)), 1);
+        assert_eq!(value(&pool, Some(first), "box"), Err(QueryError::Unknown { id: first }));
+        assert_eq!(project(&mut pool, "p", 0, 1), Err(ProjectError::Ended { request_id: "p".to_owned() }));
+        assert_eq!(pool.keep_leases(|lease| lease == LeaseId(2)), 0);
+        assert_eq!(pool.keep_leases(|_| false), 1);
+        assert_eq!(pool.projections(), 0);
+        assert!(pool.by_lease.is_empty());
+    }
+}

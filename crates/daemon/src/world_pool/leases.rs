@@ -1,0 +1,140 @@
+//! Which leases live, as the resource manager's watch tells: what projections live as long as.
+
+use crate::link::Manager;
+use ratn_model::id::LeaseId;
+use ratn_proto::types::{Resource, ResourceEventKind, ResourceUpdate};
+use ratn_worker::client::{CallError, Channels, ResourceClient};
+use ratn_worker::endpoint::Endpoint;
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+use tokio::sync::watch;
+
+/// The pause before the manager is watched again.
+const RETRY_INTERVAL: Duration = Duration::from_millis(50);
+
+/// The live leases, by what they hold.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct LiveLeases {
+    held: BTreeMap<LeaseId, BTreeSet<String>>,
+    /// The youngest that was ever seen: ids grow, so an older one that does not live has ended.
+    youngest: LeaseId,
+    /// Counts snapshots: each tells anew what lives.
+    pub(super) snapshots: u64,
+}
+
+/// What is known of a lease.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Known {
+    Lives,
+    Ended,
+    /// Too young: the watch has not told of it yet.
+    NotYet,
+}
+
+impl LiveLeases {
+    pub(super) fn known(&self, lease: LeaseId) -> Known {
+        if self.held.contains_key(&lease) {
+            Known::Lives
+        } else if lease <= self.youngest {
+            Known::Ended
+        } else {
+            Known::NotYet
+        }
+    }
+
+    fn snapshot(&mut self, resources: &[Resource]) {
+        self.held.clear();
+        self.snapshots += 1;
+        for resource in resources {
+            for holding in &resource.holdings {
+                self.hold(holding.lease, &resource.id);
+            }
+        }
+    }
+
+    fn hold(&mut self, lease: LeaseId, resource: &str) {
+        self.held.entry(lease).or_default().insert(resource.to_owned());
+        self.youngest = self.youngest.max(lease);
+    }
+
+    /// Whether anything is known that was not before.
+    fn update(&mut self, update: &ResourceUpdate) -> bool {
+        let event = match update {
+            ResourceUpdate::Snapshot { resources, .. } => {
+                self.snapshot(resources);
+                return true;
+            }
+            ResourceUpdate::Event(event) => event,
+        };
+        let Some((lease, _)) = event.lease else { return false };
+        match event.kind {
+            ResourceEventKind::Leased => self.hold(lease, &event.resource.id),
+            ResourceEventKind::Released => {
+                if let Some(held) = self.held.get_mut(&lease) {
+                    held.remove(&event.resource.id);
+                    if held.is_empty() {
+                        self.held.remove(&lease);
+                    }
+                }
+            }
+            _ => return false,
+        }
+        true
+    }
+}
+
+/// Keeps `live` up to date for ever.
+pub(super) async fn follow(manager: Manager, live: watch::Sender<LiveLeases>) {
+    let channels = Channels::new();
+    loop {
+        let endpoint = manager.find().await;
+        if let Err(error) = follow_at(&channels, &endpoint, &live).await {
+            tracing::debug!(%endpoint, "the watch of leases ended: {error}");
+        }
+        tokio::time::sleep(RETRY_INTERVAL).await;
+    }
+}
+
+async fn follow_at(
+    channels: &Channels,
+    endpoint: &Endpoint,
+    live: &watch::Sender<LiveLeases>,
+) -> Result<(), CallError> {
+    let mut updates = ResourceClient::new(channels, endpoint, "")?.watch(&[]).await?;
+    while let Some(update) = updates.next().await? {
+        live.send_if_modified(|leases| leases.update(&update));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_model::id::{FencingToken, Revision};
+    use ratn_model::resource::ResourceClass;
+    use ratn_proto::types::ResourceEvent;
+
+    fn event(kind: ResourceEventKind, resource: &str, lease: u64) -> ResourceUpdate {
+        ResourceUpdate::Event(ResourceEvent {
+            revision: Revision(1),
+            kind,
+            resource: Resource::new(resource, ResourceClass::World, "WorldModel"),
+            lease: Some((LeaseId(lease), FencingToken(lease))),
+            reason: String::new(),
+        })
+    }
+
+    #[test]
+    fn a_lease_lives_from_its_first_resource_to_its_last_and_is_not_known_before() {
+        let mut leases = LiveLeases::default();
+        assert_eq!(leases.known(LeaseId(3)), Known::NotYet);
+        leases.update(&event(ResourceEventKind::Leased, "world", 3));
+        leases.update(&event(ResourceEventKind::Leased, "planner", 3));
+        assert_eq!(leases.known(LeaseId(2)), Known::Ended, "ids grow");
+        leases.update(&event(ResourceEventKind::Released, "planner", 3));
+        assert_eq!(leases.known(LeaseId(3)), Known::Lives);
+        leases.update(&event(ResourceEventKind::Released, "world", 3));
+        assert_eq!(leases.known(LeaseId(3)), Known::Ended);
+    }
+}

@@ -1,0 +1,69 @@
+//! The world pool: holds the root world model and its projections (the paper's Section V-A), and offers the room for
+//! projections to the resource manager as a world resource.
+//!
+//! ```text
+//!   gRPC call ──▶ service.rs ──message──▶ actor.rs (core.rs) ◀──leases that live── leases.rs ◀──watch── resource manager
+//! ```
+//! Which effects are projected, and when they become real, is task control's business.
+
+mod actor;
+mod config;
+mod core;
+mod leases;
+mod service;
+mod status;
+
+pub use config::WorldPoolConfig;
+
+use crate::link::{Link, Manager};
+use anyhow::Context;
+use ratn_model::resource::ResourceClass;
+use ratn_proto::types::Resource;
+use ratn_proto::v1::world_pool_service_server::WorldPoolServiceServer;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::server::{Services, bind};
+use std::time::Duration;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+/// The role's name: of its endpoint file, its command and its section of a config.
+pub const ROLE: &str = "world-pool";
+
+/// Serves until `shutdown` is cancelled.
+///
+/// # Errors
+/// Where it cannot listen or publish its endpoint, or where serving fails.
+pub async fn run(
+    config: WorldPoolConfig,
+    directory: RuntimeDirectory,
+    shutdown: CancellationToken,
+) -> anyhow::Result<()> {
+    let bound = bind(&config.listen).await?;
+    let endpoint = bound.endpoint().clone();
+    let manager = Manager { configured: config.resource_manager.clone(), directory: directory.clone() };
+    let room = Resource::new(format!("world-model@{}", config.host), ResourceClass::World, &config.kind)
+        .with_capacity(config.capacity)
+        .on_host(&config.host);
+    let (_wanted, wanted) = watch::channel([(room.id.clone(), room)].into());
+    let link = Link {
+        manager: manager.clone(),
+        client: format!("{ROLE}@{}", config.host),
+        ttl: Duration::from_millis(config.session_ttl_ms),
+        wanted,
+        there: None,
+    };
+    let linked = tokio::spawn(link.keep(shutdown.clone()));
+    let (live, leases) = watch::channel(leases::LiveLeases::default());
+    tokio::spawn(shutdown.clone().run_until_cancelled_owned(leases::follow(manager, live)));
+    let actor = actor::start(config, leases.clone(), shutdown.clone());
+    let service = WorldPoolServiceServer::new(service::Service { actor, leases })
+        .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
+        .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
+    let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
+    tracing::info!(%endpoint, "{ROLE} is ready");
+    let served = bound.serve(Services::new().with(service), shutdown.clone()).await;
+    drop(published);
+    shutdown.cancel();
+    let _ = linked.await;
+    Ok(served?)
+}
