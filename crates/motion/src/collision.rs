@@ -208,7 +208,8 @@ impl<'a> Checker<'a> {
             for j in i + 1..self.moving.len() {
                 let b = &self.moving[j];
                 let gripper = |m: &Moving| m.part != Part::Arm;
-                if !(gripper(a) && gripper(b)) && !self.neighbours(a.link, b.link) {
+                let touching = self.neighbours(a.link, b.link) || gripper(a) && gripper(b);
+                if !touching {
                     self.pairs.push((i, j));
                 }
             }

@@ -5,7 +5,7 @@
 //! Gammell et al., 2014). The best path is never lost.
 
 use crate::collision::{Contact, distance};
-use crate::pace::{Pace, Stop};
+use crate::pace::{Pace, Progress, Stop};
 use crate::plan::{Candidate, Goal, Planning, Way};
 use crate::robot::Joints;
 use crate::search::search;
@@ -24,13 +24,18 @@ const MAX_DRAWS: usize = 50;
 /// Shortcuts tried on a path that a new search found.
 const SHORTCUTS_AFTER_SEARCH: usize = 60;
 
-/// Improves `best` for at most so many iterations.
+/// A path must have become this much shorter to be worth a word, in radians.
+const LEAST_REPORT_RAD: f64 = 1e-3;
+
+/// Improves `best` for at most so many iterations; `departed_rad` is the length of what lies before it.
 pub(crate) fn improve(
     planning: &mut Planning<'_>,
     best: &mut Way,
+    departed_rad: f64,
     iterations: usize,
     pace: &mut Pace<'_>,
 ) -> Result<(), Stop> {
+    let mut reported = total(planning, best);
     for _ in 0..iterations {
         pace.iteration()?;
         match planning.random.random_range(0..100) {
@@ -42,6 +47,11 @@ pub(crate) fn improve(
             }
             80..97 => turn_to_another_goal(planning, best),
             _ => search_again(planning, best, pace)?,
+        }
+        let now = total(planning, best);
+        if now < reported - LEAST_REPORT_RAD {
+            reported = now;
+            pace.report(Progress::Shorter { length_rad: departed_rad + now })?;
         }
     }
     Ok(())

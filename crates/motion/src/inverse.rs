@@ -185,8 +185,9 @@ fn solve(system: &mut [[f64; 7]; 6]) -> Option<Vector6> {
         }
         for row in column + 1..6 {
             let factor = system[row][column] / system[column][column];
-            for k in column..7 {
-                system[row][k] -= factor * system[column][k];
+            let above = system[column];
+            for (value, other) in system[row].iter_mut().zip(above).skip(column) {
+                *value -= factor * other;
             }
         }
     }

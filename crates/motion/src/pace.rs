@@ -10,6 +10,11 @@ pub enum Progress {
         /// Its length in joint space.
         length_rad: f64,
     },
+    /// The path became shorter.
+    Shorter {
+        /// Its length now.
+        length_rad: f64,
+    },
 }
 
 /// The caller's answer.

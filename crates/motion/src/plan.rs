@@ -214,7 +214,8 @@ pub fn plan(
         Ok(()) => planning.shorten_first(&mut best, &mut pace),
         stopped => stopped,
     };
-    let improved = improved.and_then(|()| improve(&mut planning, &mut best, request.improvement_iterations, &mut pace));
+    let improved = improved
+        .and_then(|()| improve(&mut planning, &mut best, length(&depart), request.improvement_iterations, &mut pace));
     if let Err(Stop::Cancelled) = improved {
         return Err(PlanError::Cancelled);
     }

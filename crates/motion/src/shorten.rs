@@ -47,7 +47,7 @@ pub(crate) fn shortcut(path: &mut Vec<Joints>, checker: &mut Checker<'_>, random
 }
 
 /// Tries to move a random corner towards the straight line past it; whether it did.
-pub(crate) fn move_corner(path: &mut Vec<Joints>, checker: &mut Checker<'_>, random: &mut impl Rng) -> bool {
+pub(crate) fn move_corner(path: &mut [Joints], checker: &mut Checker<'_>, random: &mut impl Rng) -> bool {
     if path.len() < 3 {
         return false;
     }

@@ -1,1 +1,96 @@
-//! The path planner worker (being written).
+//! The path planner worker: one action, `plan`.
+//!
+//! It reads the facts of the goal's projection that make the scene, plans on a thread of its own and answers with a timed
+//! trajectory. All durations in its goals and answers are in the robot's seconds; [`clock`] knows how many of them pass in
+//! one of ours. Where `budget_s` is given, planning takes exactly that long and gets a shorter path for it.
+
+mod clock;
+mod goal;
+
+use clock::{Clock, Figures};
+use ratn_model::fact::{FactPattern, SCENE_PREDICATES};
+use ratn_model::value::Value;
+use ratn_motion::plan::{Plan, PlanError, plan};
+use ratn_motion::robot::Robot;
+use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome};
+use ratn_worker::worker::{Worker, WorkerOptions};
+use ratn_world::scene::Scene;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// `path_planner/plan`.
+#[derive(Debug)]
+pub struct PlanAction {
+    robot: Arc<Robot>,
+    speed: f64,
+}
+
+/// Runs the worker until it is told to stop; `speed` is how many of the robot's seconds pass in one of ours.
+///
+/// # Errors
+/// Where it cannot serve.
+pub async fn run(options: WorkerOptions, speed: f64) -> anyhow::Result<()> {
+    Ok(Worker::new(options).action(PlanAction::new(speed)).run().await?)
+}
+
+impl PlanAction {
+    /// For our robot.
+    pub fn new(speed: f64) -> PlanAction {
+        PlanAction { robot: Arc::new(Robot::aimm()), speed }
+    }
+}
+
+#[tonic::async_trait]
+impl Action for PlanAction {
+    fn name(&self) -> &str {
+        "plan"
+    }
+
+    fn description(&self) -> &str {
+        "A collision-free motion of the arm from joints to joints or to a pose of the tool, timed."
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        let begin = Instant::now();
+        let (request, budget_s) = goal::request(&goal)?;
+        let patterns = SCENE_PREDICATES.map(|(predicate, arguments)| FactPattern {
+            predicate: predicate.to_owned(),
+            arguments: vec![None; arguments],
+        });
+        let world = goal.unless_cancelled(goal.world(&patterns)).await??;
+        let scene = Scene::of(&world)?;
+
+        let (robot, goal) = (Arc::clone(&self.robot), Arc::new(goal));
+        let mut clock = Clock::new(begin, self.speed, budget_s, Arc::clone(&goal));
+        let planning = tokio::task::spawn_blocking(move || {
+            let outcome = plan(&robot, &scene, &request, &mut |progress| clock.control(progress));
+            (outcome, clock.figures())
+        });
+        match planning.await? {
+            (Ok(plan), figures) => Ok(outcome(plan, &figures)),
+            (Err(PlanError::Cancelled), _) => Err(goal.stopped()),
+            (Err(PlanError::TimeUp), figures) => {
+                let reason = format!("{} ({:.1} s)", PlanError::TimeUp, figures.planning_s);
+                Err(ActionFailure::aborted(reason))
+            }
+            (Err(error), _) => Err(error.into()),
+        }
+    }
+}
+
+fn outcome(plan: Plan, figures: &Figures) -> GoalOutcome {
+    let outputs: BTreeMap<String, Value> = [
+        ("trajectory", Value::Trajectory(plan.trajectory)),
+        ("end", Value::Joints(plan.end.to_vec())),
+        ("end_pose", Value::Pose(plan.end_pose)),
+        ("first_path_s", Value::Float(figures.first_path_s)),
+        ("first_length_rad", Value::Float(plan.first_length_rad)),
+        ("length_rad", Value::Float(plan.length_rad)),
+        ("planning_s", Value::Float(figures.planning_s)),
+        ("iterations", Value::Int(i64::try_from(plan.iterations).unwrap_or(i64::MAX))),
+    ]
+    .map(|(port, value)| (port.to_owned(), value))
+    .into();
+    GoalOutcome { outputs, ..GoalOutcome::success() }
+}

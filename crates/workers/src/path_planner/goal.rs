@@ -1,0 +1,56 @@
+//! A goal of the path planner, read from its input ports.
+
+use ratn_model::value::Value;
+use ratn_motion::plan::{Goal, Request};
+use ratn_motion::robot::Joints;
+use ratn_worker::action::{ActionFailure, GoalContext};
+
+/// The fraction of the joints' limits where the goal says none.
+const DEFAULT_SPEED: f64 = 0.3;
+
+/// The request, and the budget in the robot's seconds.
+pub(super) fn request(goal: &GoalContext) -> Result<(Request, Option<f64>), ActionFailure> {
+    let budget_s = goal.optional_float("budget_s")?;
+    if budget_s.is_some_and(|s| !s.is_finite() || s < 0.0) {
+        return Err(ActionFailure::aborted(format!(
+            "input `budget_s` is {budget_s:?}: expected seconds, not negative"
+        )));
+    }
+    let request = Request {
+        start: joints("start", goal.input_joints("start")?)?,
+        goals: goals(goal.port("goal").any()?)?,
+        depart_m: goal.optional_float("depart_m")?.unwrap_or(0.0),
+        approach_m: goal.optional_float("approach_m")?.unwrap_or(0.0),
+        speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
+        seed: goal.seed,
+        // Improvement goes on until the budget ends.
+        improvement_iterations: if budget_s.is_some() { usize::MAX } else { 0 },
+    };
+    Ok((request, budget_s))
+}
+
+fn goals(value: &Value) -> Result<Vec<Goal>, ActionFailure> {
+    match value {
+        Value::Joints(values) => Ok(vec![Goal::Joints(joints("goal", values)?)]),
+        Value::Pose(pose) => Ok(vec![Goal::Pose(*pose)]),
+        Value::List(alternatives) => {
+            let one = |value: &Value| match value {
+                Value::List(_) => Err(not_a_goal(value)),
+                _ => goals(value),
+            };
+            let goals: Result<Vec<Vec<Goal>>, ActionFailure> = alternatives.iter().map(one).collect();
+            Ok(goals?.concat())
+        }
+        other => Err(not_a_goal(other)),
+    }
+}
+
+fn not_a_goal(value: &Value) -> ActionFailure {
+    let found = value.type_name();
+    ActionFailure::aborted(format!("input `goal` has a {found}: expected joints, a pose, or a list of these"))
+}
+
+fn joints(port: &str, values: &[f64]) -> Result<Joints, ActionFailure> {
+    let wrong = |_| ActionFailure::aborted(format!("input `{port}` has {} joints: expected 7", values.len()));
+    values.try_into().map_err(wrong)
+}
