@@ -1,7 +1,8 @@
 //! One run of one task, in either mode.
 
 use crate::analysis::Analysis;
-use crate::interpreter::{Context, Interpreter, Progress};
+use crate::context::Context;
+use crate::interpreter::{Interpreter, Progress};
 use crate::protocol::{Command, Event, Mode};
 use crate::window::{End, Wait, Window};
 use ratn_model::expression::EffectExpr;

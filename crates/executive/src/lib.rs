@@ -6,6 +6,7 @@
 
 mod analysis;
 mod binding;
+mod context;
 mod effects;
 pub mod executive;
 mod interpreter;

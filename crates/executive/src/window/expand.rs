@@ -5,7 +5,7 @@
 
 use crate::analysis::NodeNature;
 use crate::binding::child_path;
-use crate::interpreter::Context;
+use crate::context::Context;
 use crate::protocol::Note;
 use crate::window::Window;
 use crate::window::instance::{Environment, Instance, Role, Status, Wait};

@@ -8,6 +8,8 @@
 //! Three moments of a result: *finished* feeds data flows and projections; *settled* cannot change any more (its path is
 //! decided, its inputs are settled, nobody older will write what it read) and decides conditions and loops; *retired* is real.
 
+mod begin;
+mod decide;
 mod expand;
 mod instance;
 mod place;
@@ -16,7 +18,8 @@ mod retire;
 mod survey;
 
 use crate::binding;
-use crate::interpreter::{Context, DEFAULT_ATTEMPTS, Progress};
+use crate::context::Context;
+use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
 use crate::protocol::{Command, Event, Note};
 use expand::Cursor;
 use instance::{Changed, Ended, Instance, Instances, Status};

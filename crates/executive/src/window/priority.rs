@@ -3,7 +3,7 @@
 //! The remaining path of a node is its estimated duration plus the longest of what waits for it: the readers of its
 //! outputs, and the next PIA in program order, which may not begin before every older instance has ended.
 
-use crate::interpreter::Context;
+use crate::context::Context;
 use crate::window::Window;
 use crate::window::instance::Role;
 use ratn_model::fact::Footprint;

@@ -2,8 +2,8 @@
 
 use crate::analysis::NodeNature;
 use crate::binding;
+use crate::context::Context;
 use crate::effects;
-use crate::interpreter::Context;
 use crate::protocol::{Command, Note};
 use crate::window::instance::{Changed, Ended, Role, Status};
 use crate::window::place::Place;

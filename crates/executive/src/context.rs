@@ -1,0 +1,43 @@
+//! What every part of the executive works with while it handles one event.
+
+use crate::analysis::Analysis;
+use crate::protocol::{Command, Note};
+use ratn_model::fact::Change;
+use ratn_model::id::InstanceId;
+use ratn_model::program::Program;
+use ratn_world::world::World;
+
+/// What every part of the executive works with.
+pub(crate) struct Context<'a> {
+    pub(crate) program: &'a Program,
+    pub(crate) analysis: &'a Analysis,
+    /// The mirror of the root world model.
+    pub(crate) root: &'a mut World,
+    /// The last instance id given.
+    pub(crate) last_instance: &'a mut u64,
+    /// The run's seed.
+    pub(crate) seed: u64,
+    /// What the shell shall do.
+    pub(crate) commands: &'a mut Vec<Command>,
+}
+
+impl Context<'_> {
+    pub(crate) fn new_instance(&mut self) -> InstanceId {
+        *self.last_instance += 1;
+        InstanceId(*self.last_instance)
+    }
+
+    pub(crate) fn note(&mut self, note: Note) {
+        self.commands.push(Command::Note(note));
+    }
+
+    /// Makes changes real: in the mirror now, in the world pool by command.
+    pub(crate) fn commit(&mut self, instance: InstanceId, changes: Vec<Change>) -> Result<(), String> {
+        if changes.is_empty() {
+            return Ok(());
+        }
+        let revision = self.root.apply(&changes).map_err(|e| e.to_string())?;
+        self.commands.push(Command::Commit { instance, changes, revision });
+        Ok(())
+    }
+}
