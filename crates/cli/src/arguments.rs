@@ -1,6 +1,7 @@
 //! The command line.
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use ratn_worker::endpoint::Endpoint;
 use std::path::PathBuf;
 
 /// Runs robot tasks, written as sequential state machines, as fast as their real dependencies allow.
@@ -30,9 +31,9 @@ pub(crate) enum Command {
     /// Hold the root world model and its projections (host compute)
     WorldPool(RoleArguments),
     /// Spawn and watch this host's worker processes
-    ProcessManager(ProcessManagerArguments),
+    ProcessManager(RoleArguments),
     /// Be the simulated cell: robot, table, boxes, sensors, controllers (host sim)
-    Cell(CellArguments),
+    Cell(RoleArguments),
     /// Be a worker process; the process manager starts these
     Worker(WorkerArguments),
 }
@@ -51,13 +52,10 @@ pub(crate) struct RoleArguments {
     pub(crate) runtime_dir: Option<PathBuf>,
     /// Where to listen: `127.0.0.1:0`, `unix:/path`; the config's unless given
     #[arg(long, value_name = "ADDRESS")]
-    pub(crate) listen: Option<String>,
+    pub(crate) listen: Option<Endpoint>,
     /// End when standard input ends: whoever started this is gone
     #[arg(long)]
     pub(crate) exit_with_parent: bool,
-    /// Robot's seconds per second; the config's unless given
-    #[arg(long, value_name = "X")]
-    pub(crate) speed: Option<f64>,
 }
 
 /// How tasks are executed, on the command line.
@@ -70,36 +68,34 @@ pub(crate) enum ModeArgument {
 }
 
 #[derive(Debug, Clone, Args)]
-pub(crate) struct ProcessManagerArguments {
-    #[command(flatten)]
-    pub(crate) role: RoleArguments,
-    /// Keep this many workers of a template, `path-planner=2`; may be repeated
-    #[arg(long = "pool", value_name = "TEMPLATE=N", value_parser = pool_size)]
-    pub(crate) pools: Vec<(String, u32)>,
-}
-
-#[derive(Debug, Clone, Args)]
-pub(crate) struct CellArguments {
-    #[command(flatten)]
-    pub(crate) role: RoleArguments,
-    /// Boxes on the table
-    #[arg(long, value_name = "N")]
-    pub(crate) boxes: Option<usize>,
-    /// What the boxes' places and the sensors' noise are derived from
-    #[arg(long, value_name = "N")]
-    pub(crate) seed: Option<u64>,
-}
-
-#[derive(Debug, Clone, Args)]
 pub(crate) struct WorkerArguments {
     /// What it does
     #[arg(value_enum)]
-    pub(crate) kind: WorkerKind,
-    /// Its resource's id, `path-planner-1@compute`
+    pub(crate) worker: WorkerKind,
+    /// Its resource's id, `path-planner-1@compute`, by which leases are checked; without it no lease is asked for
     #[arg(long, value_name = "ID", default_value = "")]
     pub(crate) id: String,
-    #[command(flatten)]
-    pub(crate) role: RoleArguments,
+    /// Its resource's kind
+    #[arg(long, value_name = "KIND", default_value = "")]
+    pub(crate) kind: String,
+    /// The host that it is on
+    #[arg(long, value_name = "NAME", default_value = "")]
+    pub(crate) host: String,
+    /// Where to listen: `127.0.0.1:0`, `unix:/path`
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:0")]
+    pub(crate) listen: Endpoint,
+    /// Write where it serves to this file once it is ready
+    #[arg(long, value_name = "FILE")]
+    pub(crate) endpoint_file: Option<PathBuf>,
+    /// Offer the resource to this resource manager by itself; not for workers of a process manager
+    #[arg(long, value_name = "ADDRESS")]
+    pub(crate) resource_manager: Option<Endpoint>,
+    /// End when standard input ends: whoever started this is gone
+    #[arg(long)]
+    pub(crate) exit_with_parent: bool,
+    /// Robot's seconds per second
+    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
+    pub(crate) speed: f64,
 }
 
 /// The bundled workers.
@@ -153,8 +149,8 @@ pub(crate) struct RunArguments {
     #[arg(long, value_enum, default_value = "cdtn")]
     pub(crate) mode: ModeArgument,
     /// Give a parameter of the task a value, `boxes=3`; may be repeated
-    #[arg(long = "set", value_name = "NAME=VALUE")]
-    pub(crate) set: Vec<String>,
+    #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
+    pub(crate) set: Vec<(String, String)>,
     /// Write the event log here
     #[arg(long, value_name = "FILE")]
     pub(crate) log: Option<PathBuf>,
@@ -256,9 +252,9 @@ fn speed(text: &str) -> Result<f64, String> {
     }
 }
 
-fn pool_size(text: &str) -> Result<(String, u32), String> {
-    let pair = text.split_once('=').and_then(|(template, n)| Some((template.to_owned(), n.parse().ok()?)));
-    pair.ok_or_else(|| "expected TEMPLATE=N".to_owned())
+fn setting(text: &str) -> Result<(String, String), String> {
+    let pair = text.split_once('=').map(|(name, value)| (name.to_owned(), value.to_owned()));
+    pair.ok_or_else(|| "expected NAME=VALUE".to_owned())
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@
 mod arguments;
 mod command;
 mod failure;
+mod interrupt;
 mod report;
 mod system;
 mod task_control;

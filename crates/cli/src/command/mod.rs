@@ -1,14 +1,46 @@
 //! One file per command of the user; `roles.rs` holds the daemons and workers.
 
+mod check;
+mod demo;
 mod report;
+mod roles;
+mod run;
+mod tables;
+mod up;
 
 use crate::arguments::Command;
 use crate::failure::Failure;
+use anyhow::Context;
+use std::time::Duration;
+
+/// At the end of a process, for computations under way.
+const LAST_WORK: Duration = Duration::from_millis(200);
 
 /// Runs one command to its end.
 pub(crate) fn run(command: Command) -> Result<(), Failure> {
     match command {
+        Command::Demo(arguments) => demo::run(&arguments),
+        Command::Up(arguments) => up::run(&arguments),
+        Command::Run(arguments) => run::run(&arguments),
+        Command::Check(arguments) => check::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
-        _ => Err(Failure::Refused("not there yet".into())),
+        Command::Tables(arguments) => tables::run(&arguments),
+        Command::ResourceManager(arguments) => roles::resource_manager(&arguments),
+        Command::WorldPool(arguments) => roles::world_pool(&arguments),
+        Command::ProcessManager(arguments) => roles::process_manager(&arguments),
+        Command::Cell(arguments) => roles::cell(&arguments),
+        Command::Worker(arguments) => roles::worker(&arguments),
     }
+}
+
+/// Runs a future on a runtime of its own.
+fn blocking(future: impl Future<Output = Result<(), Failure>>) -> Result<(), Failure> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .context("cannot start the asynchronous runtime")?;
+    let done = runtime.block_on(future);
+    // A computation that does not hear that it is over is not waited for.
+    runtime.shutdown_timeout(LAST_WORK);
+    done
 }

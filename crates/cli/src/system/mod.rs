@@ -1,1 +1,143 @@
 //! A whole system on this machine: its config, its processes, its endpoint files.
+
+pub(crate) mod config;
+mod launch;
+
+use crate::task_control::Endpoints;
+use anyhow::Context;
+use config::SystemConfig;
+use launch::Processes;
+use ratn_worker::client::{Channels, ResourceClient};
+use ratn_worker::endpoint;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The environment variable that says where endpoint files are.
+const DIRECTORY_VARIABLE: &str = "RATN_RUNTIME_DIR";
+/// In a runtime directory: the config of the system that runs there.
+const CONFIG_FILE: &str = "system.toml";
+const CELL: &str = "cell";
+/// The roles of a system on one machine, in the order in which they are started.
+const ROLES: [&str; 4] = ["resource-manager", "world-pool", CELL, "process-manager"];
+
+/// A running system.
+#[derive(Debug)]
+pub(crate) struct System {
+    pub(crate) config: SystemConfig,
+    pub(crate) endpoints: Endpoints,
+    directory: RuntimeDirectory,
+    processes: Processes,
+    /// Removed with it.
+    _private: Option<tempfile::TempDir>,
+}
+
+impl System {
+    /// Starts one in a directory of its own, which goes with it.
+    pub(crate) async fn start_private(config: SystemConfig) -> anyhow::Result<System> {
+        let private = tempfile::Builder::new().prefix("ratn-").tempdir().context("cannot make a runtime directory")?;
+        let path = private.path().to_owned();
+        System::start(config, &path, Some(private)).await
+    }
+
+    /// Starts one that others find in `directory`.
+    pub(crate) async fn start_public(config: SystemConfig, directory: &Path) -> anyhow::Result<System> {
+        System::start(config, directory, None).await
+    }
+
+    async fn start(
+        config: SystemConfig,
+        directory: &Path,
+        private: Option<tempfile::TempDir>,
+    ) -> anyhow::Result<System> {
+        let directory = RuntimeDirectory::create(directory)
+            .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
+        let file = directory.path().join(CONFIG_FILE);
+        std::fs::write(&file, config.to_toml()?).with_context(|| format!("cannot write {}", file.display()))?;
+        let mut processes = Processes::start(&ROLES, &file, directory.path())?;
+        match ready(&mut processes, &directory, &config).await {
+            Ok(endpoints) => Ok(System { config, endpoints, directory, processes, _private: private }),
+            Err(error) => {
+                processes.stop().await;
+                Err(error)
+            }
+        }
+    }
+
+    /// The one that runs in `directory`, if one does.
+    pub(crate) async fn find(directory: &Path) -> anyhow::Result<Option<System>> {
+        let directory = RuntimeDirectory::at(directory);
+        let (Ok(resource_manager), Ok(world_pool)) = (directory.find(ROLES[0]), directory.find(ROLES[1])) else {
+            return Ok(None);
+        };
+        // A file of a system that was killed is there, too.
+        if endpoint::connect(&resource_manager).await.is_err() || endpoint::connect(&world_pool).await.is_err() {
+            return Ok(None);
+        }
+        let file = directory.path().join(CONFIG_FILE);
+        let config = SystemConfig::read(&file).with_context(|| {
+            format!("a system runs in {}, and its config cannot be read", directory.path().display())
+        })?;
+        let endpoints = Endpoints { resource_manager, world_pool };
+        Ok(Some(System { config, endpoints, directory, processes: Processes::default(), _private: None }))
+    }
+
+    /// Where its endpoint files and logs are.
+    pub(crate) fn directory(&self) -> &RuntimeDirectory {
+        &self.directory
+    }
+
+    /// Resolves when one of the processes that were started for it ends, with what is known of it.
+    pub(crate) async fn one_ended(&mut self) -> anyhow::Error {
+        self.processes.one_ended().await
+    }
+
+    /// How many boxes are really on the base, as only the cell knows.
+    pub(crate) async fn delivered_boxes(&self) -> anyhow::Result<usize> {
+        let cell = self.directory.find(CELL)?;
+        anyhow::bail!("{cell}: not there yet")
+    }
+
+    /// Ends what was started for it.
+    pub(crate) async fn stop(self) {
+        self.processes.stop().await;
+    }
+}
+
+/// Waits until every role is there and every resource that the config promises.
+async fn ready(
+    processes: &mut Processes,
+    directory: &RuntimeDirectory,
+    config: &SystemConfig,
+) -> anyhow::Result<Endpoints> {
+    let wanted = config.promised_resources();
+    let channels = Channels::new();
+    let missing = async || {
+        let roles = ROLES.iter().filter(|role| directory.find(role).is_err());
+        let roles: Vec<String> = roles.map(|&role| role.to_owned()).collect();
+        if !roles.is_empty() {
+            return Ok(roles);
+        }
+        let client = ResourceClient::new(&channels, &directory.find(ROLES[0])?, "")?;
+        // A manager that does not answer yet is asked again.
+        let Ok(resources) = client.list(&[]).await else { return Ok(vec!["an answer of the resource manager".into()]) };
+        let mut there: BTreeMap<String, u32> = BTreeMap::new();
+        for resource in resources {
+            *there.entry(resource.kind).or_default() += resource.capacity;
+        }
+        Ok(launch::missing(&wanted, &there))
+    };
+    processes.wait_until(missing).await?;
+    Ok(Endpoints { resource_manager: directory.find(ROLES[0])?, world_pool: directory.find(ROLES[1])? })
+}
+
+/// Where endpoint files are unless said otherwise: as the environment says, else a directory of this user.
+pub(crate) fn public_directory(given: Option<&Path>) -> PathBuf {
+    if let Some(path) = given {
+        return path.to_owned();
+    }
+    let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    variable(DIRECTORY_VARIABLE).or_else(|| variable("XDG_RUNTIME_DIR").map(|dir| dir.join("ratn"))).unwrap_or_else(
+        || std::env::temp_dir().join(format!("ratn-{}", nix::unistd::getuid())),
+    )
+}

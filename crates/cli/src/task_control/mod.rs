@@ -1,3 +1,18 @@
 //! Task control: the shell around the executive. Performs its commands over gRPC and brings the answers back as events.
 
+pub(crate) mod clock;
 pub(crate) mod log;
+mod performer;
+mod progress;
+mod record;
+mod retry;
+pub(crate) mod shell;
+
+use ratn_worker::endpoint::Endpoint;
+
+/// Where the daemons are that task control speaks with; everyone else is found by leases.
+#[derive(Debug, Clone)]
+pub(crate) struct Endpoints {
+    pub(crate) resource_manager: Endpoint,
+    pub(crate) world_pool: Endpoint,
+}

@@ -1,0 +1,142 @@
+//! `ratn demo`: the main job. The same task three times on real processes, each time in the same cell.
+//!
+//! Every run gets a system of its own, started fresh from the same seed, so that nothing of one run helps or hinders the next.
+
+mod result;
+
+use super::run::{on_system, starting};
+use super::{blocking, check};
+use crate::arguments::{Budget, DemoArguments, SystemArguments};
+use crate::failure::Failure;
+use crate::interrupt::Interrupt;
+use crate::report::gantt;
+use crate::report::timeline::Timeline;
+use crate::system::System;
+use crate::system::config::SystemConfig;
+use crate::task_control::log;
+use crate::task_control::shell::Run;
+use anyhow::{Context, anyhow, bail};
+use ratn_executive::protocol::Mode;
+use ratn_model::program::{Program, SUCCESS};
+use result::{Demonstration, Outcome, Plan};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// The task, so that the demo works from anywhere.
+const TASK: &str = include_str!("../../../../examples/fetch_boxes.yaml");
+const TASK_FILE: &str = "examples/fetch_boxes.yaml";
+
+/// Runs the task in every way and compares.
+pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
+    let config = SystemConfig::load(arguments.config.as_deref())?;
+    let program = Arc::new(check::load_text(TASK, TASK_FILE, &config.catalogue)?);
+    let directory = out_directory(arguments)?;
+    let mut demonstration = Demonstration::new(arguments);
+    let outcome: Result<(), Failure> = blocking(async {
+        let interrupt = Interrupt::listen()?;
+        for plan in plans(arguments) {
+            eprintln!("\n{}", plan.announcement(arguments));
+            let outcome = one_run(&plan, arguments, &config, &program, &directory, &interrupt).await;
+            let outcome = outcome.with_context(|| plan.name())?;
+            let (end, delivered) = (outcome.end.clone(), outcome.delivered);
+            demonstration.outcomes.push(outcome);
+            if interrupt.asked() {
+                return Err(anyhow!("interrupted").into());
+            }
+            if delivered != arguments.boxes as usize {
+                let boxes = arguments.boxes;
+                return Err(anyhow!("{}: {delivered} of {boxes} boxes are on the base; {end}", plan.name()).into());
+            }
+        }
+        Ok(())
+    });
+    // Whatever was run is shown, also when not all was.
+    draw(&mut demonstration)?;
+    eprintln!("\n{demonstration}");
+    if arguments.json {
+        println!("{}", serde_json::to_string_pretty(&demonstration.to_json())?);
+    }
+    outcome
+}
+
+/// The runs in the order of the table's columns.
+fn plans(arguments: &DemoArguments) -> Vec<Plan> {
+    let plan = |mode, planners, budget| Plan { mode, planners, budget };
+    let mut plans = Vec::new();
+    if arguments.budget != Budget::None {
+        plans.push(plan(Mode::Hsm, arguments.planners, true));
+        plans.push(plan(Mode::Cdtn, 1, true));
+        plans.push(plan(Mode::Cdtn, arguments.planners, true));
+    }
+    if arguments.budget != Budget::Task {
+        plans.push(plan(Mode::Hsm, arguments.planners, false));
+        if arguments.budget == Budget::None {
+            plans.push(plan(Mode::Cdtn, 1, false));
+        }
+        plans.push(plan(Mode::Cdtn, arguments.planners, false));
+    }
+    plans
+}
+
+async fn one_run(
+    plan: &Plan,
+    arguments: &DemoArguments,
+    config: &SystemConfig,
+    program: &Arc<Program>,
+    directory: &Path,
+    interrupt: &Interrupt,
+) -> anyhow::Result<Outcome> {
+    let mut config = config.clone();
+    config.apply(&SystemArguments {
+        boxes: Some(arguments.boxes),
+        planners: Some(plan.planners),
+        speed: Some(arguments.speed),
+        seed: Some(arguments.seed),
+    });
+    let set = [("boxes".to_owned(), arguments.boxes.to_string()), ("budget".to_owned(), plan.budget.to_string())];
+    let log_file = directory.join(format!("{}.jsonl", plan.file_stem()));
+    let run = Run {
+        program: program.clone(),
+        catalogue: Arc::new(config.catalogue.clone()),
+        parameters: program.bind_parameters(&set)?,
+        mode: plan.mode,
+        seed: arguments.seed,
+        speed: arguments.speed,
+        log: log_file.clone(),
+        quiet: false,
+    };
+    let system = starting(System::start_private(config), interrupt).await?;
+    let (ended, delivered) = on_system(run, system, interrupt, async |system| system.delivered_boxes().await).await?;
+    let timeline = Timeline::of(&log::read(&log_file)?);
+    if timeline.outcome.as_deref() != Some(ended.outcome.as_str()) {
+        bail!("the event log {} does not end as the run did", log_file.display());
+    }
+    let end = if ended.outcome == SUCCESS {
+        "the task ended with success".to_owned()
+    } else {
+        format!("the task ended with {}: {}", ended.outcome, ended.reason)
+    };
+    let chart = directory.join(format!("{}.html", plan.file_stem()));
+    Ok(Outcome { plan: *plan, timeline, delivered, end, log: log_file, chart })
+}
+
+fn out_directory(arguments: &DemoArguments) -> anyhow::Result<PathBuf> {
+    match &arguments.out {
+        Some(directory) => {
+            std::fs::create_dir_all(directory).with_context(|| format!("cannot make {}", directory.display()))?;
+            Ok(directory.canonicalize()?)
+        }
+        None => Ok(tempfile::Builder::new().prefix("ratn-demo-").tempdir()?.keep()),
+    }
+}
+
+/// One chart per run, all of one budget with the time axis of the longest.
+fn draw(demonstration: &mut Demonstration) -> anyhow::Result<()> {
+    for outcome in &demonstration.outcomes {
+        let same = demonstration.outcomes.iter().filter(|other| other.plan.budget == outcome.plan.budget);
+        let scale_s = same.map(|other| other.timeline.end_s).fold(0.0, f64::max);
+        gantt::write(&outcome.chart, &outcome.timeline, Some(scale_s))
+            .with_context(|| format!("cannot write {}", outcome.chart.display()))?;
+    }
+    Ok(())
+}

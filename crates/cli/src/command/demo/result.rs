@@ -1,0 +1,242 @@
+//! What a demonstration has to show: the paper's Table I with this machine's figures, and where the time went.
+
+use crate::arguments::DemoArguments;
+use crate::command::tables::improvement;
+use crate::report::statistics::{self, Statistics, mode_name};
+use crate::report::timeline::Timeline;
+use ratn_executive::protocol::Mode;
+use serde_json::{Value, json};
+use std::fmt;
+use std::path::PathBuf;
+
+/// Table I of the paper: boxes, HSM, CDTN 1 MP, CDTN 2 MP.
+const PAPER: [(u32, f64, f64, f64); 3] =
+    [(1, 81.3, 73.5, 72.3), (2, 123.7, 107.3, 97.3), (3, 164.2, 141.5, 116.5)];
+
+/// One run to be made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Plan {
+    pub(super) mode: Mode,
+    pub(super) planners: u32,
+    /// Planners use the time that the task gives them; else as long as a path takes.
+    pub(super) budget: bool,
+}
+
+/// One run that was made.
+#[derive(Debug)]
+pub(super) struct Outcome {
+    pub(super) plan: Plan,
+    pub(super) timeline: Timeline,
+    /// Boxes on the base in the cell's ground truth.
+    pub(super) delivered: usize,
+    /// How the task ended, as a sentence.
+    pub(super) end: String,
+    pub(super) log: PathBuf,
+    pub(super) chart: PathBuf,
+}
+
+/// All runs.
+#[derive(Debug)]
+pub(super) struct Demonstration {
+    boxes: u32,
+    planners: u32,
+    speed: f64,
+    seed: u64,
+    pub(super) outcomes: Vec<Outcome>,
+}
+
+impl Plan {
+    /// For people.
+    pub(super) fn name(&self) -> String {
+        let planners = match self.mode {
+            Mode::Hsm => String::new(),
+            Mode::Cdtn => format!(" {} MP", self.planners),
+        };
+        format!("{}{planners}{}", mode_name(self.mode), if self.budget { "" } else { ", no budget" })
+    }
+
+    /// For files.
+    pub(super) fn file_stem(&self) -> String {
+        let mode = match self.mode {
+            Mode::Hsm => "hsm".to_owned(),
+            Mode::Cdtn => format!("cdtn-{}mp", self.planners),
+        };
+        format!("{mode}{}", if self.budget { "" } else { "-no-budget" })
+    }
+
+    /// Before it begins.
+    pub(super) fn announcement(&self, arguments: &DemoArguments) -> String {
+        let how = match self.mode {
+            Mode::Hsm => "as its state machine is written".to_owned(),
+            Mode::Cdtn if self.planners == 1 => "as a dataflow network, one motion planner".to_owned(),
+            Mode::Cdtn => format!("as a dataflow network, {} motion planners", self.planners),
+        };
+        let budget = if self.budget { "" } else { "; planning takes what it takes" };
+        format!("== {}: {} boxes {how}{budget} ==", self.name(), arguments.boxes)
+    }
+}
+
+impl Demonstration {
+    pub(super) fn new(arguments: &DemoArguments) -> Demonstration {
+        let DemoArguments { boxes, planners, speed, seed, .. } = *arguments;
+        Demonstration { boxes, planners, speed, seed, outcomes: Vec::new() }
+    }
+
+    fn makespan_s(&self, mode: Mode, planners: u32, budget: bool) -> Option<f64> {
+        let mut fitting = self.outcomes.iter().filter(|o| o.plan.mode == mode && o.plan.budget == budget);
+        fitting.find(|o| mode == Mode::Hsm || o.plan.planners == planners).map(|o| o.timeline.end_s)
+    }
+
+    fn row(&self, budget: bool) -> Row {
+        Row {
+            hsm_s: self.makespan_s(Mode::Hsm, 0, budget),
+            cdtn_1mp_s: self.makespan_s(Mode::Cdtn, 1, budget),
+            cdtn_nmp_s: self.makespan_s(Mode::Cdtn, self.planners, budget),
+        }
+    }
+
+    /// With the task's budget unless only the other was asked for.
+    fn main_budget(&self) -> bool {
+        self.outcomes.iter().any(|o| o.plan.budget) || self.outcomes.is_empty()
+    }
+
+    /// The document of `--json`.
+    pub(super) fn to_json(&self) -> Value {
+        let main = self.row(self.main_budget());
+        let none = self.row(false);
+        let delivered: Vec<usize> = self.outcomes.iter().map(|o| o.delivered).collect();
+        json!({
+            "boxes": self.boxes,
+            "planners": self.planners,
+            "speed": self.speed,
+            "seed": self.seed,
+            "hsm_s": main.hsm_s,
+            "cdtn_1mp_s": main.cdtn_1mp_s,
+            "cdtn_2mp_s": main.cdtn_nmp_s,
+            "improvement_2mp_percent": main.improvement(),
+            // What every run delivered, at the least.
+            "delivered": delivered.iter().min().copied().unwrap_or(0),
+            "delivered_per_run": delivered,
+            "logs": self.outcomes.iter().map(|o| &o.log).collect::<Vec<_>>(),
+            "charts": self.outcomes.iter().map(|o| &o.chart).collect::<Vec<_>>(),
+            "budget_none": {
+                "hsm_s": none.hsm_s, "cdtn_2mp_s": none.cdtn_nmp_s, "improvement_2mp_percent": none.improvement(),
+            },
+            "runs": self.outcomes.iter().map(|o| json!({
+                "name": o.plan.name(),
+                "planners": o.plan.planners,
+                "budget": if o.plan.budget { "task" } else { "none" },
+                "delivered": o.delivered,
+                "log": o.log,
+                "chart": o.chart,
+                "statistics": Statistics::of(&o.timeline),
+            })).collect::<Vec<_>>(),
+        })
+    }
+}
+
+/// A row of Table I.
+#[derive(Debug, Clone, Copy)]
+struct Row {
+    hsm_s: Option<f64>,
+    cdtn_1mp_s: Option<f64>,
+    cdtn_nmp_s: Option<f64>,
+}
+
+impl Row {
+    fn improvement(&self) -> Option<f64> {
+        Some(improvement(self.hsm_s?, self.cdtn_nmp_s?))
+    }
+
+    fn write(&self, f: &mut fmt::Formatter<'_>, name: &str) -> fmt::Result {
+        let seconds = |s: Option<f64>| s.map_or_else(|| "-".to_owned(), |s| format!("{s:.1}"));
+        let improvement = self.improvement().map_or_else(|| "-".to_owned(), |p| format!("{p:.1} %"));
+        writeln!(
+            f,
+            "  {name:<26} {:>8} {:>11} {:>11} {improvement:>13}",
+            seconds(self.hsm_s),
+            seconds(self.cdtn_1mp_s),
+            seconds(self.cdtn_nmp_s),
+        )
+    }
+}
+
+impl fmt::Display for Demonstration {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (boxes, planners) = (self.boxes, self.planners);
+        let plural = if boxes == 1 { "box" } else { "boxes" };
+        writeln!(
+            f,
+            "Fetching {boxes} {plural}: seconds of the robot's time (wall time × {}); MP: motion planner processes\n",
+            self.speed
+        )?;
+        let columns = (format!("CDTN {planners} MP"), format!("{planners} MP over HSM"));
+        writeln!(f, "  {:<26} {:>8} {:>11} {:>11} {:>13}", "", "HSM", "CDTN 1 MP", columns.0, columns.1)?;
+        if self.outcomes.iter().any(|o| o.plan.budget) {
+            self.row(true).write(f, "this run")?;
+        }
+        if self.outcomes.iter().any(|o| !o.plan.budget) {
+            self.row(false).write(f, "planning without a budget")?;
+        }
+        if let Some((_, hsm, one, two)) = PAPER.into_iter().find(|row| row.0 == boxes) {
+            let paper = Row { hsm_s: Some(hsm), cdtn_1mp_s: Some(one), cdtn_nmp_s: (planners == 2).then_some(two) };
+            paper.write(f, "the paper")?;
+        }
+        self.write_where_the_time_went(f)?;
+        self.write_plans(f)?;
+        writeln!(f, "\nfiles")?;
+        for outcome in &self.outcomes {
+            writeln!(f, "  {:<26} {}", outcome.plan.name(), outcome.log.display())?;
+            writeln!(f, "  {:<26} {}", "", outcome.chart.display())?;
+        }
+        Ok(())
+    }
+}
+
+impl Demonstration {
+    fn write_where_the_time_went(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "\n  {:<26} {:>8} {:>11} {:>11} {:>8} {:>12} {:>10}",
+            "where the time went, s", "motion", "detection", "planning", "idle", "in parallel", "delivered"
+        )?;
+        for outcome in &self.outcomes {
+            let s = Statistics::of(&outcome.timeline);
+            writeln!(
+                f,
+                "  {:<26} {:>8.1} {:>11.1} {:>11.1} {:>8.1} {:>12.1} {:>10}",
+                outcome.plan.name(),
+                s.time.motion_s,
+                s.time.detection_s,
+                s.time.planning_waited_for_s,
+                s.time.idle_s,
+                s.overlap_s,
+                format!("{} of {}", outcome.delivered, self.boxes)
+            )?;
+        }
+        writeln!(f, "  (planning: while nothing moved and nothing was looked at)")
+    }
+
+    fn write_plans(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let budget = self.main_budget();
+        let fitting = |o: &&Outcome| o.plan.mode == Mode::Cdtn && o.plan.budget == budget;
+        let Some(outcome) = self.outcomes.iter().rfind(fitting) else { return Ok(()) };
+        let plans = Statistics::of(&outcome.timeline).plans;
+        writeln!(f, "\nwhat the planners did with their time in {}", outcome.plan.name())?;
+        f.write_str(statistics::plan_table(&plans).trim_start_matches('\n'))?;
+        if let Some(first) = median(plans.iter().map(|p| p.first_path_s)) {
+            let shortened = median(plans.iter().map(|p| p.shortened_percent)).unwrap_or_default();
+            writeln!(
+                f,
+                "  medians: the first path after {first:.2} s, the rest of the budget made it {shortened:.1} % shorter"
+            )?;
+        }
+        Ok(())
+    }
+}
+
+fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}

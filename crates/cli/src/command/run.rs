@@ -1,0 +1,139 @@
+//! `ratn run TASK`: on the system that runs here, or on one started for it.
+
+use super::{blocking, check};
+use crate::arguments::{ModeArgument, RunArguments, SystemArguments};
+use crate::failure::Failure;
+use crate::interrupt::Interrupt;
+use crate::report::gantt;
+use crate::report::statistics::Statistics;
+use crate::report::timeline::Timeline;
+use crate::system::config::SystemConfig;
+use crate::system::{System, public_directory};
+use crate::task_control::log;
+use crate::task_control::shell::{self, Ended, Run};
+use anyhow::{Context, anyhow, bail};
+use ratn_executive::protocol::Mode;
+use ratn_model::program::SUCCESS;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+impl From<ModeArgument> for Mode {
+    fn from(mode: ModeArgument) -> Mode {
+        match mode {
+            ModeArgument::Hsm => Mode::Hsm,
+            ModeArgument::Cdtn => Mode::Cdtn,
+        }
+    }
+}
+
+/// Runs a task once.
+pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
+    blocking(async {
+        let interrupt = Interrupt::listen()?;
+        let directory = public_directory(arguments.runtime_dir.as_deref());
+        let found = System::find(&directory).await?;
+        // The system that runs knows best what it offers.
+        let mut config = match &found {
+            Some(system) if arguments.config.is_none() => system.config.clone(),
+            _ => SystemConfig::load(arguments.config.as_deref())?,
+        };
+        config.apply(&SystemArguments { speed: arguments.speed, ..SystemArguments::default() });
+
+        // Everything that can be refused is refused before anything is started.
+        let program = check::load(&arguments.task, &config.catalogue)?;
+        let parameters = program.bind_parameters(&arguments.set).map_err(|error| {
+            Failure::Refused(format!("{}: error[invalid-parameter]: {error}", arguments.task.display()))
+        })?;
+        if found.is_some() && arguments.speed.is_some() {
+            let message = format!("ratn: a system runs in {}: its speed is its own", directory.display());
+            return Err(Failure::Refused(message));
+        }
+        let log = arguments.log.clone().map_or_else(|| log_file(&program.name), Ok)?;
+
+        let system = match found {
+            Some(system) => {
+                eprintln!("on the system in {}", directory.display());
+                system
+            }
+            None => {
+                eprintln!("no system runs in {}: starting one for this run", directory.display());
+                starting(System::start_private(config.clone()), &interrupt).await?
+            }
+        };
+        let run = Run {
+            program: Arc::new(program),
+            catalogue: Arc::new(config.catalogue.clone()),
+            parameters,
+            mode: arguments.mode.into(),
+            seed: arguments.seed,
+            speed: system.config.speed,
+            log: log.clone(),
+            quiet: false,
+        };
+        let ended = on_system(run, system, &interrupt, async |_| Ok(())).await;
+        eprintln!("event log: {}", log.display());
+        let (ended, ()) = ended?;
+        say(&ended, &log, arguments)?;
+        if ended.outcome == SUCCESS { Ok(()) } else { Err(anyhow!("the task ended with {}", ended.outcome).into()) }
+    })
+}
+
+/// Starts something, unless the user has enough of it first.
+pub(super) async fn starting<T>(
+    start: impl Future<Output = anyhow::Result<T>>,
+    interrupt: &Interrupt,
+) -> anyhow::Result<T> {
+    tokio::select! {
+        started = start => started,
+        () = interrupt.asked_times(1) => bail!("interrupted before the run began"),
+    }
+}
+
+/// Runs a task, asks `afterwards` what has become of the system, and ends the system if it was started for this.
+pub(super) async fn on_system<T>(
+    run: Run,
+    mut system: System,
+    interrupt: &Interrupt,
+    afterwards: impl AsyncFnOnce(&System) -> anyhow::Result<T>,
+) -> anyhow::Result<(Ended, T)> {
+    let endpoints = system.endpoints.clone();
+    let ended = tokio::select! {
+        ended = shell::run(run, &endpoints, interrupt) => ended,
+        error = system.one_ended() => Err(error.context("a part of the system ended during the run")),
+    };
+    let answer = match ended {
+        Ok(ended) => afterwards(&system).await.map(|answer| (ended, answer)),
+        Err(error) => Err(error),
+    };
+    system.stop().await;
+    answer
+}
+
+fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()> {
+    let timeline = Timeline::of(&log::read(log)?);
+    if let Some(path) = &arguments.gantt {
+        gantt::write(path, &timeline, None).with_context(|| format!("cannot write {}", path.display()))?;
+        eprintln!("chart: {}", path.display());
+    }
+    let statistics = Statistics::of(&timeline);
+    if arguments.json {
+        let outputs = serde_json::to_value(&ended.outputs)?;
+        let document = serde_json::json!({
+            "outcome": ended.outcome, "reason": ended.reason, "outputs": outputs,
+            "makespan_s": ended.makespan_s, "log": log, "statistics": statistics,
+        });
+        println!("{}", serde_json::to_string_pretty(&document)?);
+        return Ok(());
+    }
+    println!("{statistics}");
+    for (name, value) in &ended.outputs {
+        println!("{name} = {value}");
+    }
+    Ok(())
+}
+
+fn log_file(task: &str) -> anyhow::Result<PathBuf> {
+    let name = format!("ratn-{task}-");
+    let file = tempfile::Builder::new().prefix(&name).suffix(".jsonl").tempfile().context("cannot make an event log")?;
+    Ok(file.into_temp_path().keep()?)
+}

@@ -1,0 +1,29 @@
+//! `ratn up`: a whole system in the foreground.
+
+use super::{blocking, run::starting};
+use crate::arguments::UpArguments;
+use crate::failure::Failure;
+use crate::interrupt::Interrupt;
+use crate::system::config::SystemConfig;
+use crate::system::{System, public_directory};
+
+/// Starts it and keeps it running until the user or one of its processes ends it.
+pub(crate) fn run(arguments: &UpArguments) -> Result<(), Failure> {
+    let mut config = SystemConfig::load(arguments.config.as_deref())?;
+    config.apply(&arguments.system);
+    blocking(async {
+        let interrupt = Interrupt::listen()?;
+        let directory = public_directory(arguments.runtime_dir.as_deref());
+        if System::find(&directory).await?.is_some() {
+            return Err(Failure::Refused(format!("ratn: a system runs in {} already", directory.display())));
+        }
+        let mut system = starting(System::start_public(config, &directory), &interrupt).await?;
+        eprintln!("the system is ready in {}; Ctrl-C ends it", system.directory().path().display());
+        let ended = tokio::select! {
+            () = interrupt.asked_times(1) => Ok(()),
+            error = system.one_ended() => Err(error.into()),
+        };
+        system.stop().await;
+        ended
+    })
+}

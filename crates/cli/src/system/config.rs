@@ -1,0 +1,175 @@
+//! The config of a whole system: one TOML file, of which every role takes its own section.
+
+use crate::arguments::SystemArguments;
+use crate::failure::Failure;
+use anyhow::Context;
+use ratn_cell::config::CellConfig;
+use ratn_daemon::config::Check;
+use ratn_daemon::process_manager::ProcessManagerConfig;
+use ratn_daemon::resource_manager::ResourceManagerConfig;
+use ratn_daemon::world_pool::WorldPoolConfig;
+use ratn_model::catalogue::Catalogue;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// What is used without `--config`.
+const DEFAULT: &str = include_str!("../../../../deploy/ratn.toml");
+const DEFAULT_NAME: &str = "the built-in config";
+/// In the arguments of a template: the system's speed.
+const SPEED_PLACEHOLDER: &str = "{speed}";
+/// The kind whose pool `--planners` sizes.
+const PATH_PLANNER: &str = "PathPlanner";
+/// What a cell provides, one of each.
+const CELL_RESOURCES: [&str; 5] = ["Arm", "Gripper", "PanTilt", "Camera", "Battery"];
+const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=1000.0;
+
+/// All keys are optional.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, rename_all = "kebab-case")]
+pub(crate) struct SystemConfig {
+    /// Robot's seconds per second, for all roles.
+    pub(crate) speed: f64,
+    pub(crate) resource_manager: ResourceManagerConfig,
+    pub(crate) world_pool: WorldPoolConfig,
+    pub(crate) process_manager: ProcessManagerConfig,
+    pub(crate) cell: CellConfig,
+    /// What tasks are checked against.
+    pub(crate) catalogue: Catalogue,
+}
+
+impl Default for SystemConfig {
+    fn default() -> Self {
+        SystemConfig {
+            speed: 1.0,
+            resource_manager: ResourceManagerConfig::default(),
+            world_pool: WorldPoolConfig::default(),
+            process_manager: ProcessManagerConfig::default(),
+            cell: CellConfig::default(),
+            catalogue: Catalogue::standard(),
+        }
+    }
+}
+
+impl SystemConfig {
+    /// Reads and checks a config, or the built-in one; a bad one is refused.
+    pub(crate) fn load(file: Option<&Path>) -> Result<SystemConfig, Failure> {
+        let parsed = match file {
+            None => SystemConfig::parse(DEFAULT, DEFAULT_NAME),
+            Some(file) => SystemConfig::read(file),
+        };
+        parsed.map_err(|error| Failure::Refused(format!("ratn: {error:#}")))
+    }
+
+    /// Reads and checks a config.
+    pub(crate) fn read(file: &Path) -> anyhow::Result<SystemConfig> {
+        let name = file.display().to_string();
+        let text = std::fs::read_to_string(file).with_context(|| format!("cannot read the config {name}"))?;
+        SystemConfig::parse(&text, &name)
+    }
+
+    fn parse(text: &str, name: &str) -> anyhow::Result<SystemConfig> {
+        let mut config: SystemConfig =
+            toml::from_str(text).map_err(|error| anyhow::anyhow!("{name}: {}", error.to_string().trim_end()))?;
+        config.check().with_context(|| name.to_owned())?;
+        config.settle();
+        Ok(config)
+    }
+
+    fn check(&self) -> anyhow::Result<()> {
+        anyhow::ensure!(SPEEDS.contains(&self.speed), "`speed` is {}: it must be 0.01 to 1000", self.speed);
+        let of_its_own = CellConfig::default().speed;
+        anyhow::ensure!(
+            self.cell.speed == of_its_own || self.cell.speed == self.speed,
+            "`cell.speed` is {} and `speed` is {}: a system has one speed, give it at the top",
+            self.cell.speed,
+            self.speed
+        );
+        self.resource_manager.check().context("[resource-manager]")?;
+        self.world_pool.check().context("[world-pool]")?;
+        self.process_manager.check().context("[process-manager]")?;
+        self.cell.check().context("[cell]")
+    }
+
+    /// What follows from the rest: one speed for all, and as many workers in the catalogue as the templates can provide.
+    fn settle(&mut self) {
+        self.cell.speed = self.speed;
+        for (kind, offer) in &mut self.catalogue.resources {
+            let templates = self.process_manager.templates.iter().filter(|t| t.kind == *kind);
+            let provided: u32 = templates.map(|t| t.max_workers()).sum();
+            if provided > 0 {
+                offer.count = provided;
+            }
+        }
+    }
+
+    /// With what the command line says.
+    pub(crate) fn apply(&mut self, arguments: &SystemArguments) {
+        self.speed = arguments.speed.unwrap_or(self.speed);
+        self.cell.boxes = arguments.boxes.map_or(self.cell.boxes, |n| n as usize);
+        self.cell.seed = arguments.seed.unwrap_or(self.cell.seed);
+        if let Some(planners) = arguments.planners {
+            for template in self.process_manager.templates.iter_mut().filter(|t| t.kind == PATH_PLANNER) {
+                template.min = planners;
+                template.max = Some(planners);
+            }
+        }
+        self.settle();
+    }
+
+    /// The process manager's section with the speed filled in.
+    pub(crate) fn process_manager_config(&self) -> ProcessManagerConfig {
+        let mut config = self.process_manager.clone();
+        for argument in config.templates.iter_mut().flat_map(|t| &mut t.args) {
+            *argument = argument.replace(SPEED_PLACEHOLDER, &self.speed.to_string());
+        }
+        config
+    }
+
+    /// Units by kind that are there once the system is ready.
+    pub(crate) fn promised_resources(&self) -> BTreeMap<String, u32> {
+        let mut promised: BTreeMap<String, u32> = CELL_RESOURCES.iter().map(|&kind| (kind.to_owned(), 1)).collect();
+        promised.insert(self.world_pool.kind.clone(), self.world_pool.capacity);
+        for template in &self.process_manager.templates {
+            *promised.entry(template.kind.clone()).or_default() += template.min;
+        }
+        promised
+    }
+
+    /// The same config as a file.
+    pub(crate) fn to_toml(&self) -> anyhow::Result<String> {
+        toml::to_string(self).context("cannot write the config")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn the_built_in_config_reads_back_as_written() {
+        let config = SystemConfig::load(None).unwrap();
+        assert_eq!(SystemConfig::parse(&config.to_toml().unwrap(), "again").unwrap(), config);
+        assert_eq!(config.catalogue.resources[PATH_PLANNER].count, 4);
+        assert_eq!(config.promised_resources()[PATH_PLANNER], 2);
+    }
+
+    #[test]
+    fn the_command_line_overrides_it() {
+        let mut config = SystemConfig::load(None).unwrap();
+        config.apply(&SystemArguments { boxes: Some(5), planners: Some(1), speed: Some(8.0), seed: Some(7) });
+        assert_eq!((config.cell.boxes, config.cell.seed, config.cell.speed), (5, 7, 8.0));
+        assert_eq!(config.promised_resources()[PATH_PLANNER], 1);
+        assert!(config.process_manager_config().templates[0].args.contains(&"8".to_owned()));
+    }
+
+    #[test]
+    fn a_bad_config_is_refused_with_its_place() {
+        let refusal = |text| SystemConfig::parse(text, "x.toml").unwrap_err();
+        assert!(format!("{:#}", refusal("sped = 2")).starts_with("x.toml: TOML parse error at line 1"));
+        assert!(format!("{:#}", refusal("speed = 0")).contains("`speed` is 0: it must be 0.01 to 1000"));
+        assert!(format!("{:#}", refusal("[cell]\nboxes = 10")).contains("x.toml: [cell]: `boxes`"));
+        assert!(format!("{:#}", refusal("[world-pool]\ncapacity = 0")).contains("[world-pool]: `capacity`"));
+    }
+}

@@ -1,0 +1,165 @@
+//! Starting a whole system on this machine as children of this process, and ending it again whatever happens.
+//!
+//! Every child is this very binary in one of its roles, in a process group of its own (Ctrl-C reaches only this process, which
+//! then ends them in order), with a pipe as standard input whose end tells it that this process is gone, and with its output in
+//! a log file of the runtime directory. A system is ready when every role has published its endpoint and every resource that
+//! the config promises is there.
+
+use anyhow::{Context, bail};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::{Duration, Instant};
+use tokio::process::{Child, Command};
+
+/// From the start of the processes to the last resource.
+const READY_DEADLINE: Duration = Duration::from_secs(30);
+const POLL: Duration = Duration::from_millis(10);
+/// From SIGTERM to SIGKILL, for all roles together.
+const STOP_DEADLINE: Duration = Duration::from_secs(3);
+/// How much of a dead child's log is shown.
+const LAST_WORDS_BYTES: u64 = 2000;
+
+/// One role as a child process.
+#[derive(Debug)]
+pub(crate) struct RoleProcess {
+    role: &'static str,
+    child: Child,
+    log: PathBuf,
+}
+
+impl RoleProcess {
+    /// Starts `ratn <role> --config … --runtime-dir … --exit-with-parent`.
+    pub(crate) fn start(role: &'static str, config: &Path, directory: &Path) -> anyhow::Result<RoleProcess> {
+        let log = directory.join(format!("{role}.log"));
+        let output = File::create(&log).with_context(|| format!("cannot create {}", log.display()))?;
+        let binary = std::env::current_exe().context("cannot find this program's own file")?;
+        let child = Command::new(&binary)
+            .arg(role)
+            .arg("--config")
+            .arg(config)
+            .arg("--runtime-dir")
+            .arg(directory)
+            .arg("--exit-with-parent")
+            .stdin(Stdio::piped())
+            .stdout(output.try_clone()?)
+            .stderr(output)
+            .process_group(0)
+            .kill_on_drop(true)
+            .spawn()
+            .with_context(|| format!("cannot start {} {role}", binary.display()))?;
+        Ok(RoleProcess { role, child, log })
+    }
+
+    /// An error with its last words when it has ended.
+    pub(crate) fn check_running(&mut self) -> anyhow::Result<()> {
+        if let Some(status) = self.child.try_wait()? {
+            bail!("{} ended ({status}); the end of {}:\n{}", self.role, self.log.display(), last_words(&self.log));
+        }
+        Ok(())
+    }
+
+    fn signal(&self, signal: nix::sys::signal::Signal) {
+        if let Some(pid) = self.child.id().and_then(|pid| i32::try_from(pid).ok()) {
+            let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), signal);
+        }
+    }
+}
+
+/// The roles of one system.
+#[derive(Debug, Default)]
+pub(crate) struct Processes {
+    roles: Vec<RoleProcess>,
+}
+
+impl Processes {
+    /// Starts them, all at once: each waits for those that it needs.
+    pub(crate) fn start(roles: &[&'static str], config: &Path, directory: &Path) -> anyhow::Result<Processes> {
+        let roles = roles.iter().map(|role| RoleProcess::start(role, config, directory)).collect::<Result<_, _>>()?;
+        Ok(Processes { roles })
+    }
+
+    /// Waits until `ready` says so. `missing` of it is what is not there yet, for people.
+    ///
+    /// # Errors
+    /// When a process ends, or after [`READY_DEADLINE`]; with the last words of the log.
+    pub(crate) async fn wait_until<F>(&mut self, mut missing: F) -> anyhow::Result<()>
+    where
+        F: AsyncFnMut() -> anyhow::Result<Vec<String>>,
+    {
+        let start = Instant::now();
+        loop {
+            self.check_running()?;
+            let missing = missing().await?;
+            if missing.is_empty() {
+                return Ok(());
+            }
+            if start.elapsed() > READY_DEADLINE {
+                let mut text = format!(
+                    "the system is not ready after {} s: still missing {}",
+                    READY_DEADLINE.as_secs(),
+                    missing.join(", ")
+                );
+                for role in &self.roles {
+                    text += &format!("\nthe end of {}:\n{}", role.log.display(), last_words(&role.log));
+                }
+                bail!(text);
+            }
+            tokio::time::sleep(POLL).await;
+        }
+    }
+
+    /// An error when one of them has ended.
+    pub(crate) fn check_running(&mut self) -> anyhow::Result<()> {
+        self.roles.iter_mut().try_for_each(RoleProcess::check_running)
+    }
+
+    /// Resolves when one of them ends, with what is known of it.
+    pub(crate) async fn one_ended(&mut self) -> anyhow::Error {
+        loop {
+            if let Err(error) = self.check_running() {
+                return error;
+            }
+            tokio::time::sleep(POLL * 10).await;
+        }
+    }
+
+    /// Ends them: those started last first, hard where they do not end by themselves.
+    pub(crate) async fn stop(mut self) {
+        let start = Instant::now();
+        for process in self.roles.iter_mut().rev() {
+            drop(process.child.stdin.take());
+            process.signal(nix::sys::signal::Signal::SIGTERM);
+        }
+        for process in self.roles.iter_mut().rev() {
+            let left = STOP_DEADLINE.saturating_sub(start.elapsed());
+            if tokio::time::timeout(left, process.child.wait()).await.is_err() {
+                eprintln!("{} did not end in time and is killed", process.role);
+                let _ = process.child.kill().await;
+            }
+        }
+    }
+}
+
+fn last_words(log: &Path) -> String {
+    let read = || -> std::io::Result<String> {
+        let mut file = File::open(log)?;
+        let length = file.metadata()?.len();
+        file.seek(SeekFrom::Start(length.saturating_sub(LAST_WORDS_BYTES)))?;
+        let mut bytes = Vec::new();
+        file.read_to_end(&mut bytes)?;
+        Ok(String::from_utf8_lossy(&bytes).trim_end().to_owned())
+    };
+    read().map_or_else(|error| format!("(unreadable: {error})"), |text| if text.is_empty() { "(empty)".into() } else { text })
+}
+
+/// What of `wanted` (resources by kind) is not among `there`.
+pub(crate) fn missing(wanted: &BTreeMap<String, u32>, there: &BTreeMap<String, u32>) -> Vec<String> {
+    let short = wanted.iter().filter_map(|(kind, n)| {
+        let have = there.get(kind).copied().unwrap_or(0);
+        (have < *n).then(|| format!("{kind} ({have} of {n})"))
+    });
+    short.collect()
+}

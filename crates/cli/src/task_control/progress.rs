@@ -1,0 +1,84 @@
+//! What a run is doing, one line per node that starts or ends, on standard error.
+
+use ratn_executive::protocol::{Command, Event, Note};
+use ratn_model::id::InstanceId;
+use ratn_model::program::{SUCCESS, WORLD_MODEL};
+use ratn_model::time::Timestamp;
+use std::collections::BTreeMap;
+
+/// Follows events and commands and prints.
+#[derive(Debug, Default)]
+pub(crate) struct Progress {
+    paths: BTreeMap<InstanceId, String>,
+    started: BTreeMap<InstanceId, Timestamp>,
+    quiet: bool,
+}
+
+impl Progress {
+    /// One that prints, or not.
+    pub(crate) fn new(quiet: bool) -> Progress {
+        Progress { quiet, ..Progress::default() }
+    }
+
+    /// Prints what there is to say of one step.
+    pub(crate) fn follow(&mut self, at: Timestamp, event: &Event, commands: &[Command]) {
+        if self.quiet {
+            return;
+        }
+        match event {
+            Event::Finished { instance, outcome, reason, .. } => {
+                let path = self.path(*instance);
+                let took = self.started.remove(instance).map_or(0.0, |s| at.since(s).as_secs_f64());
+                if outcome == SUCCESS {
+                    say(at, &format!("done   {path}  {took:.1} s"));
+                } else {
+                    say(at, &format!("{outcome} {path}  {took:.1} s: {reason}"));
+                }
+            }
+            Event::Crashed { instance, reason, .. } => {
+                let path = self.path(*instance);
+                say(at, &format!("crash  {path}: {reason}"));
+            }
+            Event::Refused { instance, reason } => say(at, &format!("refuse {}: {reason}", self.path(*instance))),
+            Event::RetirementFailed { instance, reason } => {
+                say(at, &format!("failed to make {} real: {reason}", self.path(*instance)));
+            }
+            Event::AbortRequested { reason } => say(at, &format!("abort: {reason}")),
+            Event::Started { .. } | Event::Granted { .. } | Event::Projected { .. } | Event::Progressed { .. } => {}
+        }
+        for command in commands {
+            match command {
+                Command::Note(Note::Expanded { instance, path, .. }) => {
+                    self.paths.insert(*instance, path.clone());
+                }
+                Command::Note(Note::Decided { instance, decision }) => {
+                    say(at, &format!("decide {}: {decision}", self.path(*instance)));
+                }
+                Command::Note(Note::Squashed { instance }) if self.started.remove(instance).is_some() => {
+                    say(at, &format!("squash {}", self.path(*instance)));
+                }
+                Command::Start { instance, attempt, goal } => {
+                    self.started.insert(*instance, at);
+                    let with: Vec<&str> = goal
+                        .lease
+                        .iter()
+                        .flat_map(|lease| &lease.resources)
+                        .filter(|r| r.kind != WORLD_MODEL)
+                        .map(|r| r.id.as_str())
+                        .collect();
+                    let again = if *attempt > 1 { format!(", attempt {attempt}") } else { String::new() };
+                    say(at, &format!("start  {}  ({}{again})", self.path(*instance), with.join(", ")));
+                }
+                _ => {}
+            }
+        }
+    }
+
+    fn path(&self, instance: InstanceId) -> String {
+        self.paths.get(&instance).cloned().unwrap_or_else(|| instance.to_string())
+    }
+}
+
+fn say(at: Timestamp, what: &str) {
+    eprintln!("{:>8.1} s  {what}", at.seconds());
+}

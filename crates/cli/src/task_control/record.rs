@@ -1,0 +1,129 @@
+//! What must reach the world pool and the resource manager in the order in which it was decided: projections, commits,
+//! creation and deletion of task resources. One task, one request at a time.
+
+use super::retry::{Attempts, patiently};
+use ratn_executive::protocol::Event;
+use ratn_model::fact::{Change, Footprint};
+use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
+use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+use ratn_proto::types::Resource;
+use ratn_worker::client::{CallError, Projection, ResourceClient, WorldClient};
+use std::collections::BTreeSet;
+use std::sync::{Arc, Mutex, PoisonError};
+use tokio::sync::{mpsc, oneshot};
+
+/// How far the world pool may be behind before the run is given up.
+pub(super) const MAX_PENDING_RECORDS: usize = 65_536;
+
+/// One thing to do, in order.
+#[derive(Debug)]
+pub(super) enum Record {
+    Project {
+        instance: InstanceId,
+        attempt: u32,
+        base: Revision,
+        changes: Vec<Change>,
+        reads: Footprint,
+        lease: Option<(LeaseId, FencingToken)>,
+    },
+    Commit { instance: InstanceId, changes: Vec<Change>, revision: Revision },
+    Operate { instance: InstanceId, operations: Vec<Requirement> },
+    /// Answers once everything before it is done.
+    Flush(oneshot::Sender<()>),
+}
+
+/// Attempts whose projection nobody waits for any more.
+pub(super) type Cancelled = Arc<Mutex<BTreeSet<(InstanceId, u32)>>>;
+
+/// The task that does it.
+pub(super) struct Recorder {
+    pub(super) run: String,
+    pub(super) world: WorldClient,
+    pub(super) resources: ResourceClient,
+    pub(super) cancelled: Cancelled,
+    pub(super) events: mpsc::Sender<Event>,
+}
+
+impl Recorder {
+    /// Until nobody can ask any more.
+    pub(super) async fn work(self, mut records: mpsc::Receiver<Record>) {
+        while let Some(record) = records.recv().await {
+            let event = match record {
+                Record::Project { instance, attempt, base, changes, reads, lease } => {
+                    let request = format!("{}/{instance}/{attempt}", self.run);
+                    self.project(instance, attempt, Projection { request, base, changes, reads, lease }).await
+                }
+                Record::Commit { instance, changes, revision } => self.commit(instance, changes, revision).await,
+                Record::Operate { instance, operations } => self.operate(instance, operations).await,
+                Record::Flush(done) => {
+                    let _ = done.send(());
+                    None
+                }
+            };
+            if let Some(event) = event
+                && self.events.send(event).await.is_err()
+            {
+                return;
+            }
+        }
+    }
+
+    async fn project(&self, instance: InstanceId, attempt: u32, wanted: Projection) -> Option<Event> {
+        let cancelled = || self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).remove(&(instance, attempt));
+        if cancelled() {
+            return None;
+        }
+        let made = patiently(Attempts::IDEMPOTENT, || self.world.project(wanted.clone())).await;
+        match made {
+            Ok(projection) if cancelled() => {
+                let _ = self.world.release(projection).await;
+                None
+            }
+            Ok(projection) => Some(Event::Projected { instance, attempt, projection }),
+            Err(error) => {
+                Some(Event::Crashed { instance, attempt, reason: format!("no projection: {}", said(&error)) })
+            }
+        }
+    }
+
+    async fn commit(&self, instance: InstanceId, changes: Vec<Change>, revision: Revision) -> Option<Event> {
+        // One instance may commit more than once (the parts of a routine); the revision tells its commits apart.
+        let commit = format!("{}/{instance}/{revision}", self.run);
+        let done = patiently(Attempts::IDEMPOTENT, || {
+            self.world.commit(&commit, changes.clone(), Some(revision))
+        });
+        match done.await {
+            Ok(_) => None,
+            Err(error) => Some(Event::RetirementFailed {
+                instance,
+                reason: format!("the world pool did not take its effects: {}", said(&error)),
+            }),
+        }
+    }
+
+    async fn operate(&self, instance: InstanceId, operations: Vec<Requirement>) -> Option<Event> {
+        for operation in operations {
+            let done = match operation.operation {
+                ResourceOperation::Create => {
+                    let class = operation.class.unwrap_or(ResourceClass::Task);
+                    let mut resource = Resource::new("", class, operation.kind.clone()).with_capacity(operation.count);
+                    resource.attributes = operation.attributes.clone();
+                    self.resources.create(resource).await.map(|_| ())
+                }
+                ResourceOperation::Delete => self.resources.delete_matching(operation.clone()).await.map(|_| ()),
+                // The executive gives these to an acquire.
+                ResourceOperation::Block | ResourceOperation::Consume | ResourceOperation::Exists => Ok(()),
+            };
+            if let Err(error) = done {
+                let reason = format!("`{operation}` was not done: {}", said(&error));
+                return Some(Event::RetirementFailed { instance, reason });
+            }
+        }
+        None
+    }
+}
+
+/// An error with its sources in one line.
+pub(super) fn said(error: &CallError) -> String {
+    format!("{:#}", anyhow::Error::new(error.clone()))
+}
