@@ -4,7 +4,7 @@ use prost::Message;
 use std::error::Error;
 use std::path::PathBuf;
 
-const FILES: [&str; 5] = ["value", "resources", "world", "processes", "action"];
+const FILES: [&str; 6] = ["value", "resources", "world", "processes", "action", "cell"];
 
 fn main() -> Result<(), Box<dyn Error>> {
     let root = PathBuf::from(std::env::var("CARGO_MANIFEST_DIR")?).join("../../proto");
