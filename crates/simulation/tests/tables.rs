@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "a test may panic and print")]
 
-use ratn_executive::protocol::Mode;
+use ratn_executive::protocol::{LogLine, Mode};
 use ratn_simulation::tables::{Row, scenarios, tables};
 
 /// Seconds of the sums in the paper's notes, per row.
@@ -33,6 +33,14 @@ fn a_replay_is_the_same_every_time() {
     let scenario = &scenarios()[2];
     let (a, b) = (scenario.replay(Mode::Cdtn, 2).unwrap(), scenario.replay(Mode::Cdtn, 2).unwrap());
     assert_eq!(a.log, b.log);
+}
+
+#[test]
+fn every_line_of_an_event_log_reads_back_as_it_was_written() {
+    for line in scenarios()[1].replay(Mode::Cdtn, 2).unwrap().log {
+        let text = serde_json::to_string(&line).unwrap();
+        assert_eq!(serde_json::from_str::<LogLine>(&text).unwrap(), line, "{text}");
+    }
 }
 
 /// How the planning of a row could be scheduled: chains of three planning nodes per object, each ready when its object is

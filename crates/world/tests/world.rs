@@ -1,0 +1,96 @@
+//! The world against the obvious model: a plain map, scanned.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use proptest::prelude::*;
+use ratn_model::fact::{Change, FactKey, FactPattern, Term};
+use ratn_model::value::Value;
+use ratn_world::world::{ChangeError, World};
+use std::collections::BTreeMap;
+
+fn term() -> impl Strategy<Value = Term> {
+    prop_oneof![(0_i64..3).prop_map(Term::Int), "[ab]{1,2}".prop_map(Term::Name)]
+}
+
+fn key() -> impl Strategy<Value = FactKey> {
+    ("[pq]{1,2}", prop::collection::vec(term(), 0..3))
+        .prop_map(|(predicate, arguments)| FactKey { predicate, arguments })
+}
+
+fn pattern() -> impl Strategy<Value = FactPattern> {
+    ("[pq]{1,2}", prop::collection::vec(prop::option::of(term()), 0..3))
+        .prop_map(|(predicate, arguments)| FactPattern { predicate, arguments })
+}
+
+fn change() -> impl Strategy<Value = Change> {
+    prop_oneof![
+        4 => (key(), -5_i64..5).prop_map(|(fact, i)| Change::Set { fact, value: Value::Int(i) }),
+        1 => pattern().prop_map(|pattern| Change::Delete { pattern }),
+        1 => (key(), -3_i64..3).prop_map(|(fact, by)| Change::Increase { fact, by: by as f64 }),
+    ]
+}
+
+fn apply(model: &mut BTreeMap<FactKey, Value>, change: &Change) {
+    match change {
+        Change::Set { fact, value } => {
+            model.insert(fact.clone(), value.clone());
+        }
+        Change::Delete { pattern } => model.retain(|key, _| !pattern.matches(key)),
+        Change::Increase { fact, by } => {
+            let old = model.get(fact).and_then(Value::as_number).unwrap_or(0.0);
+            model.insert(fact.clone(), Value::Int((old + by) as i64));
+        }
+    }
+}
+
+fn facts(world: &World) -> BTreeMap<FactKey, Value> {
+    world.iter().map(|(key, fact)| (key.clone(), fact.value.clone())).collect()
+}
+
+proptest! {
+    #[test]
+    fn changes_and_patterns_do_what_the_obvious_model_does(
+        changes in prop::collection::vec(change(), 0..40),
+        patterns in prop::collection::vec(pattern(), 0..8),
+    ) {
+        let (mut world, mut model) = (World::default(), BTreeMap::new());
+        for change in &changes {
+            world.apply(std::slice::from_ref(change)).unwrap();
+            apply(&mut model, change);
+        }
+        prop_assert_eq!(&facts(&world), &model);
+        for pattern in &patterns {
+            let found: Vec<FactKey> = world.matching(pattern).map(|(key, _)| key.clone()).collect();
+            let expected: Vec<FactKey> = model.keys().filter(|key| pattern.matches(key)).cloned().collect();
+            prop_assert_eq!(found, expected);
+        }
+    }
+
+    #[test]
+    fn a_projection_is_the_root_with_the_changes_and_leaves_the_root_alone(
+        before in prop::collection::vec(change(), 0..20),
+        after in prop::collection::vec(change(), 0..20),
+    ) {
+        let mut root = World::default();
+        root.apply(&before).unwrap();
+        let unchanged = root.clone();
+        let projection = root.project(&after).unwrap();
+        prop_assert_eq!(&root, &unchanged);
+        root.apply(&after).unwrap();
+        prop_assert_eq!(facts(&projection), facts(&root));
+    }
+}
+
+#[test]
+fn a_list_of_changes_applies_as_a_whole_or_not_at_all() {
+    let key = |name: &str| FactKey { predicate: name.to_owned(), arguments: Vec::new() };
+    let mut world = World::default();
+    world.apply(&[Change::Set { fact: key("colour"), value: Value::String("red".to_owned()) }]).unwrap();
+    let before = world.clone();
+    let result = world.apply(&[
+        Change::Set { fact: key("count"), value: Value::Int(1) },
+        Change::Increase { fact: key("colour"), by: 1.0 },
+    ]);
+    assert!(matches!(result, Err(ChangeError::NotANumber { .. })));
+    assert_eq!(world, before);
+}
