@@ -87,6 +87,11 @@ impl Link {
 
     /// Returns when the manager is somewhere else.
     async fn keep_at(&mut self, channels: &Channels, endpoint: &Endpoint, session: &Session) -> Result<(), CallError> {
+        while session.alive(LOOK_INTERVAL).await.is_err() {
+            if self.manager.has_moved_from(endpoint) {
+                return Ok(());
+            }
+        }
         let provider = Provider::start(channels, endpoint, session)?;
         let mut offered = Wanted::new();
         let mut refused = Wanted::new();

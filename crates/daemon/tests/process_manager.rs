@@ -1,0 +1,112 @@
+//! The process manager with real processes, and a resource manager beside it.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod support;
+
+use nix::errno::Errno;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use ratn_daemon::process_manager::Template;
+use ratn_model::value::Value;
+use ratn_proto::types::{Resource, ResourceEventKind, WorkerState};
+use support::{TestSystem, in_time};
+use tonic::Code;
+
+fn template() -> Template {
+    Template {
+        program: Some(env!("CARGO_BIN_EXE_ratn-test-worker").into()),
+        args: ["serve", "{id}", "{kind}", "{endpoint_file}"].map(str::to_owned).to_vec(),
+        max: Some(3),
+        ..Template::new("planner", "PathPlanner")
+    }
+}
+
+fn pid(resource: &Resource) -> Pid {
+    match resource.attributes.get("pid") {
+        Some(Value::Int(pid)) => Pid::from_raw(i32::try_from(*pid).unwrap()),
+        other => panic!("no pid: {other:?}"),
+    }
+}
+
+async fn gone(pid: Pid) {
+    in_time(async {
+        while kill(pid, None) != Err(Errno::ESRCH) {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_killed_worker_is_withdrawn_and_replaced_under_a_new_id_and_endpoint() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut watch = system.watch(&manager, &["PathPlanner"]).await;
+    let processes = system.process_manager(vec![template()]).await;
+    let first = watch.created("PathPlanner").await;
+    assert_eq!((first.id.as_str(), first.host.as_str()), ("planner-1@compute", "compute"));
+    assert!(first.endpoint().starts_with("http://127.0.0.1:"));
+
+    kill(pid(&first), Signal::SIGKILL).unwrap();
+    let withdrawn = watch.event(|event| event.kind == ResourceEventKind::Deleted).await;
+    assert_eq!(withdrawn.resource.id, first.id);
+    let second = watch.created("PathPlanner").await;
+    assert_eq!(second.id, "planner-2@compute");
+    assert_ne!(second.endpoint(), first.endpoint());
+    let (host, pools) = system.processes(&processes).pools().await.unwrap();
+    assert_eq!((host.as_str(), pools[0].workers.len(), pools[0].failure.as_str()), ("compute", 1, ""));
+    assert!(pools[0].workers[0].resident_bytes > 0);
+
+    processes.end().await;
+    gone(pid(&second)).await;
+    assert_eq!(watch.event(|event| event.kind == ResourceEventKind::Deleted).await.resource.id, second.id);
+    assert!(system.directory.find("planner-2@compute").is_err(), "no endpoint file is left");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn workers_are_started_and_stopped_as_asked_within_the_pools_bounds() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut watch = system.watch(&manager, &["PathPlanner"]).await;
+    let processes = system.process_manager(vec![template()]).await;
+    let client = system.processes(&processes);
+    watch.created("PathPlanner").await;
+    assert_eq!(client.spawn("planner", 2).await.unwrap(), ["planner-2@compute", "planner-3@compute"]);
+    assert_eq!(client.spawn("planner", 1).await.unwrap_err().code(), Some(Code::ResourceExhausted));
+    assert_eq!(client.spawn("rm -rf /", 1).await.unwrap_err().code(), Some(Code::NotFound));
+    let (one, two) = (watch.created("PathPlanner").await, watch.created("PathPlanner").await);
+    let mut changes = client.watch().await.unwrap();
+    client.stop(&one.id).await.unwrap();
+    assert_eq!(watch.event(|event| event.kind == ResourceEventKind::Deleted).await.resource.id, one.id);
+    let exited = loop {
+        let change = in_time(changes.next()).await.unwrap().unwrap();
+        if change.state == WorkerState::Exited {
+            break change;
+        }
+    };
+    assert_eq!((exited.id.as_str(), exited.reason.as_str()), (one.id.as_str(), "exited with status 0"));
+    gone(pid(&one)).await;
+    assert_eq!(client.pools().await.unwrap().1[0].workers.len(), 2);
+    processes.end().await;
+    gone(pid(&two)).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_pool_whose_workers_crash_in_a_row_fails_with_their_last_words() {
+    let system = TestSystem::new();
+    let broken = Template { args: vec!["fail".to_owned()], backoff_ms: 1, crash_limit: 3, ..template() };
+    let processes = system.process_manager(vec![broken]).await;
+    let client = system.processes(&processes);
+    let failure = in_time(async {
+        loop {
+            let pool = client.pools().await.unwrap().1.remove(0);
+            if !pool.failure.is_empty() {
+                break pool.failure;
+            }
+        }
+    })
+    .await;
+    let words = "3 crashes in a row; planner-3@compute: exited with status 1; its last words: cannot open the model | \
+                 of the world";
+    assert_eq!(failure, words);
+}

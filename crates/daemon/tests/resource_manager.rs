@@ -1,0 +1,142 @@
+//! The resource manager over gRPC.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod support;
+
+use ratn_model::resource::ResourceClass;
+use ratn_proto::types::{Resource, ResourceEventKind, ResourceUpdate};
+use ratn_proto::v1;
+use ratn_proto::v1::resource_service_client::ResourceServiceClient;
+use ratn_worker::client::AcquireOptions;
+use std::time::Duration;
+use support::{TestSystem, block, in_time};
+use tonic::Code;
+
+fn arm() -> Resource {
+    Resource::new("arm", ResourceClass::Module, "Arm").with_endpoint("unix:/arm")
+}
+
+#[tokio::test]
+async fn two_clients_compete_for_one_resource_and_the_second_gets_it_with_a_larger_token() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
+    a.resources.create(arm()).await.unwrap();
+    let mut watch = system.watch(&manager, &["Arm"]).await;
+    let first = a.resources.acquire(vec![block("Arm")], AcquireOptions::default()).await.unwrap();
+    assert_eq!(first.resource("Arm").unwrap().endpoint, "unix:/arm");
+    let second = tokio::spawn({
+        let b = b.resources.clone();
+        async move { b.acquire(vec![block("Arm")], AcquireOptions::default()).await }
+    });
+    assert!(a.resources.release(first.id).await.unwrap());
+    let second = in_time(second).await.unwrap().unwrap();
+    assert!(second.token > first.token);
+    assert!(!a.resources.release(first.id).await.unwrap(), "released once");
+    let stranger = a.resources.release(second.id).await.unwrap_err();
+    assert_eq!(stranger.code(), Some(Code::PermissionDenied));
+
+    let mut kinds = Vec::new();
+    let ResourceUpdate::Snapshot { mut revision, .. } = watch.next().await else { panic!("a snapshot is first") };
+    while kinds.len() < 3 {
+        let ResourceUpdate::Event(event) = watch.next().await else { panic!("one snapshot only") };
+        assert_eq!(event.revision.0, revision.0 + 1, "no gap");
+        revision = event.revision;
+        kinds.push(event.kind);
+    }
+    use ResourceEventKind::{Leased, Released};
+    assert_eq!(kinds, [Leased, Released, Leased]);
+    manager.end().await;
+}
+
+#[tokio::test]
+async fn an_acquire_that_waits_in_vain_says_what_it_waited_for() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    let options = AcquireOptions { deadline: Duration::from_millis(30), ..AcquireOptions::default() };
+    let error = a.resources.acquire(vec![block("Arm")], options.clone()).await.unwrap_err();
+    assert_eq!(error.code(), Some(Code::DeadlineExceeded));
+    let words = "not granted: deadline passed while waiting for `block Arm`: no resource of kind Arm exists";
+    assert_eq!(error.to_string(), words);
+    a.resources.create(arm()).await.unwrap();
+    let held = AcquireOptions { holder: "fetch/move".to_owned(), ..AcquireOptions::default() };
+    a.resources.acquire(vec![block("Arm")], held).await.unwrap();
+    let error = a.resources.acquire(vec![block("Arm")], options).await.unwrap_err().to_string();
+    assert!(error.contains("held by lease-") && error.ends_with("for fetch/move"), "{error}");
+}
+
+#[tokio::test]
+async fn a_dropped_call_leaves_the_queue() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
+    a.resources.create(arm()).await.unwrap();
+    let held = a.resources.acquire(vec![block("Arm")], AcquireOptions::default()).await.unwrap();
+    // Both give up without an answer; then the arm is free and stays so.
+    for _ in 0..2 {
+        let waiting = b.resources.acquire(vec![block("Arm")], AcquireOptions::default());
+        assert!(tokio::time::timeout(Duration::from_millis(30), waiting).await.is_err());
+    }
+    a.resources.release(held.id).await.unwrap();
+    let again = in_time(a.resources.acquire(vec![block("Arm")], AcquireOptions::default())).await.unwrap();
+    assert!(again.token > held.token);
+}
+
+#[tokio::test]
+async fn a_grant_that_crossed_a_dropped_call_is_given_back_by_its_request_id() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(arm()).await.unwrap();
+    let options = AcquireOptions { request: "run/i1/acquire".to_owned(), ..AcquireOptions::default() };
+    let first = a.resources.acquire(vec![block("Arm")], options.clone()).await.unwrap();
+    let again = a.resources.acquire(vec![block("Arm")], options).await.unwrap();
+    assert_eq!(first, again, "asked twice, granted once");
+    let mut raw = ResourceServiceClient::new(system.channels.get(&manager.endpoint).unwrap());
+    let mut withdraw = async || {
+        let request =
+            v1::WithdrawRequest { request_id: "run/i1/acquire".to_owned(), session_id: a.session.id().to_owned() };
+        raw.withdraw(request).await.unwrap().into_inner().withdrawn
+    };
+    assert!(withdraw().await);
+    assert!(!withdraw().await);
+    assert_eq!(a.resources.list(&["Arm"]).await.unwrap()[0].free, 1);
+}
+
+#[tokio::test]
+async fn the_end_of_a_session_ends_its_leases_and_withdraws_its_resources() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
+    a.resources.create(arm()).await.unwrap();
+    b.resources.create(Resource::new("camera", ResourceClass::Module, "Camera")).await.unwrap();
+    let mut watch = system.watch(&manager, &[]).await;
+    let lease = b.resources.acquire(vec![block("Arm"), block("Camera")], AcquireOptions::default()).await.unwrap();
+    b.session.close().await;
+    let released = watch.event(|event| event.kind == ResourceEventKind::Released && event.resource.id == "arm").await;
+    assert_eq!(released.lease, Some((lease.id, lease.token)));
+    assert_eq!(released.reason, "session closed");
+    let gone = watch.event(|event| event.kind == ResourceEventKind::Deleted).await;
+    assert_eq!(gone.resource.id, "camera");
+    let again = in_time(a.resources.acquire(vec![block("Arm")], AcquireOptions::default())).await.unwrap();
+    assert!(again.token > lease.token);
+}
+
+#[tokio::test]
+async fn a_session_whose_pings_stay_away_expires() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut raw = ResourceServiceClient::new(system.channels.get(&manager.endpoint).unwrap());
+    let ping = v1::KeepAliveRequest { session_id: "silent".into(), ttl_ms: 60, client: "silent".into() };
+    let answer = raw.keep_alive(tokio_stream::once(ping)).await.unwrap().into_inner().message().await.unwrap().unwrap();
+    assert!(answer.created);
+    let request =
+        v1::CreateRequest { request_id: "c".into(), session_id: "silent".into(), resource: Some(arm().into()) };
+    let mut watch = system.watch(&manager, &[]).await;
+    raw.create(request.clone()).await.unwrap();
+    let gone = watch.event(|event| event.kind == ResourceEventKind::Deleted).await;
+    assert_eq!((gone.resource.id.as_str(), gone.reason.as_str()), ("arm", "session expired"));
+    let request = v1::CreateRequest { request_id: "d".into(), ..request };
+    assert_eq!(raw.create(request).await.unwrap_err().code(), Code::FailedPrecondition);
+}

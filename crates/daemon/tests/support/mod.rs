@@ -1,0 +1,171 @@
+//! A system of daemons inside a test, on Unix sockets in a directory of its own.
+#![allow(clippy::unwrap_used, dead_code, reason = "a test may panic; not every test file uses everything")]
+
+use ratn_daemon::{process_manager, resource_manager, world_pool};
+use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_proto::types::{ResourceEvent, ResourceEventKind, ResourceUpdate};
+use ratn_worker::client::{Channels, ProcessClient, ResourceClient, ResourceWatch, WorldClient};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::session::Session;
+use std::collections::BTreeMap;
+use std::future::Future;
+use std::time::Duration;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+/// Nothing in a test takes longer.
+pub(crate) const DEADLINE: Duration = Duration::from_secs(20);
+
+/// A daemon that is ended by [`Daemon::end`], or with the test.
+pub(crate) struct Daemon {
+    shutdown: CancellationToken,
+    running: JoinHandle<anyhow::Result<()>>,
+    pub(crate) endpoint: Endpoint,
+}
+
+pub(crate) struct TestSystem {
+    _parent: tempfile::TempDir,
+    pub(crate) directory: RuntimeDirectory,
+    pub(crate) channels: Channels,
+}
+
+impl Daemon {
+    pub(crate) async fn end(self) {
+        self.shutdown.cancel();
+        in_time(self.running).await.unwrap().unwrap();
+    }
+}
+
+impl TestSystem {
+    pub(crate) fn new() -> TestSystem {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
+        TestSystem { _parent: parent, directory, channels: Channels::new() }
+    }
+
+    pub(crate) async fn resource_manager(&self) -> Daemon {
+        self.resource_manager_at(self.directory.socket("rm")).await
+    }
+
+    pub(crate) async fn resource_manager_at(&self, listen: Endpoint) -> Daemon {
+        let config = resource_manager::ResourceManagerConfig { listen, ..Default::default() };
+        let shutdown = CancellationToken::new();
+        let run = resource_manager::run(config, self.directory.clone(), shutdown.clone());
+        self.started(resource_manager::ROLE, shutdown, run).await
+    }
+
+    pub(crate) async fn world_pool(&self, capacity: u32) -> Daemon {
+        let config = world_pool::WorldPoolConfig {
+            listen: self.directory.socket("wp"),
+            host: "compute".to_owned(),
+            session_ttl_ms: 1_000,
+            capacity,
+            ..Default::default()
+        };
+        let shutdown = CancellationToken::new();
+        let run = world_pool::run(config, self.directory.clone(), shutdown.clone());
+        self.started(world_pool::ROLE, shutdown, run).await
+    }
+
+    pub(crate) async fn process_manager(&self, templates: Vec<process_manager::Template>) -> Daemon {
+        let config = process_manager::ProcessManagerConfig {
+            listen: self.directory.socket("pm"),
+            host: "compute".to_owned(),
+            templates,
+            ..Default::default()
+        };
+        let shutdown = CancellationToken::new();
+        let run = process_manager::run(config, self.directory.clone(), shutdown.clone());
+        self.started(process_manager::ROLE, shutdown, run).await
+    }
+
+    async fn started(
+        &self,
+        role: &str,
+        shutdown: CancellationToken,
+        run: impl Future<Output = anyhow::Result<()>> + Send + 'static,
+    ) -> Daemon {
+        let running = tokio::spawn(run);
+        let endpoint = self.directory.wait_for(role, DEADLINE).await.unwrap();
+        Daemon { shutdown, running, endpoint }
+    }
+
+    pub(crate) async fn client(&self, manager: &Daemon, name: &str) -> Client {
+        let session = Session::open(&self.channels, &manager.endpoint, name, Duration::from_secs(5));
+        session.alive(DEADLINE).await.unwrap();
+        let resources = ResourceClient::new(&self.channels, &manager.endpoint, session.id()).unwrap();
+        Client { session, resources }
+    }
+
+    pub(crate) fn world(&self, pool: &Daemon) -> WorldClient {
+        WorldClient::new(&self.channels, &pool.endpoint).unwrap()
+    }
+
+    pub(crate) fn processes(&self, manager: &Daemon) -> ProcessClient {
+        ProcessClient::new(&self.channels, &manager.endpoint).unwrap()
+    }
+
+    /// Waits for an event of a watch that begins now, or for the snapshot to show it.
+    pub(crate) async fn watch(&self, manager: &Daemon, kinds: &[&str]) -> Watch {
+        let resources = ResourceClient::new(&self.channels, &manager.endpoint, "").unwrap();
+        Watch { updates: resources.watch(kinds).await.unwrap() }
+    }
+}
+
+pub(crate) struct Client {
+    pub(crate) session: Session,
+    pub(crate) resources: ResourceClient,
+}
+
+pub(crate) struct Watch {
+    pub(crate) updates: ResourceWatch,
+}
+
+impl Watch {
+    pub(crate) async fn next(&mut self) -> ResourceUpdate {
+        in_time(self.updates.next()).await.unwrap().expect("the watch goes on")
+    }
+
+    pub(crate) async fn event(&mut self, wanted: impl Fn(&ResourceEvent) -> bool) -> ResourceEvent {
+        loop {
+            if let ResourceUpdate::Event(event) = self.next().await
+                && wanted(&event)
+            {
+                return event;
+            }
+        }
+    }
+
+    /// The resource of a kind, from the snapshot or as soon as it is created.
+    pub(crate) async fn created(&mut self, kind: &str) -> ratn_proto::types::Resource {
+        loop {
+            match self.next().await {
+                ResourceUpdate::Snapshot { resources, .. } => {
+                    if let Some(found) = resources.into_iter().find(|resource| resource.kind == kind) {
+                        return found;
+                    }
+                }
+                ResourceUpdate::Event(event) => {
+                    if event.kind == ResourceEventKind::Created && event.resource.kind == kind {
+                        return event.resource;
+                    }
+                }
+            }
+        }
+    }
+}
+
+pub(crate) async fn in_time<T>(future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(DEADLINE, future).await.expect("in time")
+}
+
+pub(crate) fn block(kind: &str) -> Requirement {
+    Requirement {
+        operation: ResourceOperation::Block,
+        kind: kind.to_owned(),
+        class: None,
+        attributes: BTreeMap::new(),
+        count: 1,
+    }
+}
