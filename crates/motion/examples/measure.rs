@@ -1,6 +1,6 @@
 //! Measures planning in the cell: `cargo run --release -p ratn-motion --example measure`.
 
-#![allow(clippy::print_stdout, clippy::unwrap_used, reason = "a measurement prints, and may panic")]
+#![allow(clippy::print_stdout, clippy::unwrap_used, clippy::disallowed_methods, reason = "a measurement")]
 
 #[path = "../tests/common/mod.rs"]
 mod common;

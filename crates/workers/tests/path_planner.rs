@@ -1,0 +1,174 @@
+//! The path planner worker over real sockets, with a real world pool.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_daemon::world_pool::{self, WorldPoolConfig};
+use ratn_model::fact::{Change, FactKey, Term};
+use ratn_model::id::{FencingToken, LeaseId};
+use ratn_model::pose::Pose;
+use ratn_model::resource::{Lease, LeasedResource};
+use ratn_model::value::Value;
+use ratn_motion::aimm;
+use ratn_motion::collision::Contact;
+use ratn_motion::robot::Robot;
+use ratn_motion::validate::validate_trajectory;
+use ratn_proto::types::Goal;
+use ratn_worker::client::{ActionClient, Channels, WorldClient};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::runtime_directory::{RuntimeDirectory, wait_for_file};
+use ratn_worker::worker::WorkerOptions;
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+use tokio::sync::OnceCell;
+use tokio_util::sync::CancellationToken;
+
+const DEADLINE: Duration = Duration::from_secs(20);
+const RESOURCE: &str = "path-planner-1@here";
+const BOX_SIZE: [f64; 3] = [0.14, 0.08, 0.10];
+
+/// How many of the robot's seconds pass in one of ours.
+const SPEED: f64 = 10.0;
+
+struct System {
+    world_pool: Endpoint,
+    planner: Endpoint,
+    client: ActionClient,
+    _directory: tempfile::TempDir,
+}
+
+fn box_pose() -> Pose {
+    Pose::from_rpy([0.7, 0.1, aimm::TABLE_HEIGHT_M + BOX_SIZE[2] / 2.0], 0.0, 0.0, 0.5)
+}
+
+fn objects() -> Vec<SceneObject> {
+    let [x, y, z] = aimm::TABLE_CENTRE;
+    let object = |name: &str, size, pose| SceneObject {
+        name: name.to_owned(),
+        shape: Shape::Box { size },
+        placement: Placement::World(pose),
+    };
+    vec![object("box_1", BOX_SIZE, box_pose()), object("table", aimm::TABLE_SIZE, Pose::at(x, y, z))]
+}
+
+async fn system() -> System {
+    let temporary = tempfile::tempdir().unwrap();
+    let directory = RuntimeDirectory::create(temporary.path()).unwrap();
+    tokio::spawn(world_pool::run(WorldPoolConfig::default(), directory.clone(), CancellationToken::new()));
+    let file = temporary.path().join("planner");
+    let listen = Endpoint::Unix(temporary.path().join("planner.sock"));
+    let options = WorkerOptions {
+        id: RESOURCE.to_owned(),
+        listen,
+        endpoint_file: Some(file.clone()),
+        ..WorkerOptions::default()
+    };
+    tokio::spawn(ratn_workers::path_planner::run(options, SPEED));
+    let world_pool = directory.wait_for(world_pool::ROLE, DEADLINE).await.unwrap();
+    let planner = wait_for_file(&file, "planner", DEADLINE).await.unwrap();
+
+    let channels = Channels::new();
+    let fact = |predicate: &str, name: &str, value| {
+        let fact = FactKey { predicate: predicate.to_owned(), arguments: vec![Term::Name(name.to_owned())] };
+        Change::Set { fact, value }
+    };
+    let changes = objects().into_iter().flat_map(|object| {
+        let Placement::World(pose) = object.placement else { unreachable!("all stand") };
+        [fact("at", &object.name, Value::Pose(pose)), fact("shape", &object.name, object.shape.to_value())]
+    });
+    WorldClient::new(&channels, &world_pool).unwrap().commit("setup", changes.collect(), None).await.unwrap();
+    System { world_pool, planner, client: ActionClient::new(channels), _directory: temporary }
+}
+
+impl System {
+    fn goal(&self, id: &str, inputs: &[(&str, Value)]) -> Goal {
+        let resource = LeasedResource {
+            id: RESOURCE.to_owned(),
+            kind: "PathPlanner".to_owned(),
+            endpoint: self.planner.to_string(),
+        };
+        let mut goal_inputs: BTreeMap<String, Value> =
+            [("start".to_owned(), Value::Joints(aimm::OBSERVATION.to_vec()))].into();
+        goal_inputs.extend(inputs.iter().map(|(port, value)| ((*port).to_owned(), value.clone())));
+        Goal {
+            id: id.to_owned(),
+            action: "plan".to_owned(),
+            inputs: goal_inputs,
+            seed: 3,
+            lease: Some(Lease { id: LeaseId(1), token: FencingToken(1), resources: vec![resource] }),
+            world_pool: self.world_pool.to_string(),
+            ..Goal::default()
+        }
+    }
+
+    fn grasp(&self, id: &str, more: &[(&str, Value)]) -> Goal {
+        let grasps = aimm::grasp_poses(&box_pose(), BOX_SIZE).map(Value::Pose).to_vec();
+        let inputs = [("goal", Value::List(grasps)), ("approach_m", Value::Float(aimm::APPROACH_M))];
+        self.goal(id, &[&inputs[..], more].concat())
+    }
+}
+
+#[tokio::test]
+async fn a_grasp_is_planned_within_its_budget_in_the_scene_of_the_world_pool() {
+    let system = system().await;
+    let mut heard = Vec::new();
+    let goal = system.grasp("a", &[("budget_s", Value::Float(3.0))]);
+    let outcome = system.client.execute(&system.planner, goal, |message, _| heard.push(message)).await.unwrap();
+    assert!(outcome.is_success(), "{}", outcome.reason);
+    assert_eq!(heard, ["first path"]);
+    let number = |port: &str| outcome.outputs[port].as_number().unwrap();
+    assert!(number("planning_s") >= 3.0 && number("first_path_s") < number("planning_s"));
+    assert!(number("length_rad") <= number("first_length_rad"));
+    let Value::Trajectory(trajectory) = &outcome.outputs["trajectory"] else { panic!() };
+    assert_eq!(
+        Some(&outcome.outputs["end"]),
+        trajectory.points.last().map(|p| Value::Joints(p.positions.clone())).as_ref()
+    );
+    let scene = Scene { base: Pose::IDENTITY, objects: objects() };
+    let contact = Contact::Gripper(0.01);
+    validate_trajectory(&Robot::aimm(), &scene, &aimm::OBSERVATION, None, trajectory, contact).unwrap();
+}
+
+#[tokio::test]
+async fn without_a_budget_the_first_path_is_the_answer() {
+    let system = system().await;
+    let begin = Instant::now();
+    let outcome = system.client.execute(&system.planner, system.grasp("a", &[]), |_, _| {}).await.unwrap();
+    assert!(outcome.is_success() && begin.elapsed() < DEADLINE, "{}", outcome.reason);
+}
+
+#[tokio::test]
+async fn a_cancelled_planning_ends_preempted_long_before_its_budget() {
+    let system = system().await;
+    let goal = system.grasp("a", &[("budget_s", Value::Float(36_000.0))]);
+    let cancelling: OnceCell<tokio::task::JoinHandle<Instant>> = OnceCell::new();
+    let outcome = system.client.execute(&system.planner, goal, |_, _| {
+        let (client, planner) = (system.client.clone(), system.planner.clone());
+        let cancel = tokio::spawn(async move {
+            let asked = Instant::now();
+            assert!(client.cancel(&planner, "a").await.unwrap());
+            asked
+        });
+        cancelling.set(cancel).unwrap();
+    });
+    assert_eq!(outcome.await.unwrap().outcome, "preempted");
+    let asked = cancelling.into_inner().unwrap().await.unwrap();
+    assert!(asked.elapsed() < DEADLINE);
+}
+
+#[tokio::test]
+async fn what_cannot_be_planned_is_aborted_with_the_reason() {
+    let system = system().await;
+    let inside = Pose::from_rpy([0.7, -0.2, 0.60], std::f64::consts::PI, 0.0, 0.0);
+    for (id, goal, reason) in [
+        ("a", Value::Pose(inside), "table"),
+        ("b", Value::Pose(Pose::at(4.0, 0.0, 1.0)), "does not reach (4.000, 0.000, 1.000)"),
+        ("c", Value::Bool(true), "input `goal` has a bool: expected joints, a pose, or a list of these"),
+        ("d", Value::Joints(vec![0.0; 6]), "input `goal` has 6 joints: expected 7"),
+    ] {
+        let outcome =
+            system.client.execute(&system.planner, system.goal(id, &[("goal", goal)]), |_, _| {}).await.unwrap();
+        assert_eq!(outcome.outcome, "aborted");
+        assert!(outcome.reason.contains(reason), "{}", outcome.reason);
+    }
+}
