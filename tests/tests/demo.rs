@@ -1,0 +1,65 @@
+//! The main job on real processes.
+
+mod support;
+
+use anyhow::{Context, ensure};
+use serde_json::Value;
+use support::{Place, wait_for};
+
+/// Robot's seconds per second: what a debug build can follow.
+const SPEED: &str = "20";
+
+#[test]
+fn demo_delivers_the_box_in_every_run_and_says_where_the_time_went() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let out = place.path().join("out");
+    let out = out.to_str().context("a path")?;
+    let mut demo =
+        place.start(&["demo", "--boxes", "1", "--speed", SPEED, "--budget", "task", "--json", "--out", out])?;
+    let (code, document, said) = demo.finish()?;
+    ensure!(code == Some(0), "{code:?}\n{said}");
+    let document: Value = serde_json::from_str(&document).with_context(|| document.clone())?;
+    for key in ["hsm_s", "cdtn_1mp_s", "cdtn_2mp_s", "improvement_2mp_percent"] {
+        ensure!(document[key].as_f64().is_some_and(|n| n > 0.0), "{key} in {document}\n{said}");
+    }
+    ensure!(document["delivered"] == 1, "{document}");
+    let logs = document["logs"].as_array().context("no logs")?;
+    ensure!(logs.len() == 3);
+    for log in logs {
+        let log = log.as_str().context("a path")?;
+        let output = place.ratn(&["report", log, "--json"]).output()?;
+        let statistics: Value = serde_json::from_slice(&output.stdout)?;
+        ensure!(statistics["outcome"] == "success", "{statistics}");
+        // Four of them: approach, transfer, retract, stow.
+        ensure!(statistics["plans"].as_array().is_some_and(|plans| plans.len() == 4), "{statistics}");
+        ensure!(std::path::Path::new(log).with_extension("html").is_file(), "{log} has no chart");
+    }
+    place.wait_until_empty()
+}
+
+#[test]
+fn nothing_is_left_of_a_demo_that_is_killed() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let out = place.path().join("out");
+    let demo = place.start(&["demo", "--boxes", "1", "--speed", "4", "--out", out.to_str().context("a path")?])?;
+    // Four roles, two planners and a detector, and the demo itself, which names the place by its output folder.
+    wait_for("the whole system", || Ok((place.processes().len() >= 8).then_some(())))
+        .with_context(|| demo.said())?;
+    demo.process()?.kill()?;
+    drop(demo);
+    place.wait_until_empty()
+}
+
+#[test]
+fn a_demo_that_is_interrupted_ends_in_order() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let out = place.path().join("out");
+    let mut demo = place.start(&["demo", "--boxes", "1", "--speed", "4", "--out", out.to_str().context("a path")?])?;
+    wait_for("the first node", || Ok(demo.said().contains("start ").then_some(()))).with_context(|| demo.said())?;
+    demo.signal(nix::sys::signal::Signal::SIGINT)?;
+    let (code, _, said) = demo.finish()?;
+    ensure!(code == Some(1) && said.contains("interrupted"), "{code:?}\n{said}");
+    let left = place.processes();
+    ensure!(left.is_empty(), "{left:?}");
+    Ok(())
+}

@@ -1,0 +1,79 @@
+//! What is refused is refused before anything is started, with exit code 2 and the place of the mistake.
+
+mod support;
+
+use anyhow::{Context, ensure};
+use support::{Place, repository, texts};
+
+#[test]
+fn check_refuses_every_bad_task_for_its_rule() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let mut seen = 0;
+    for entry in std::fs::read_dir(repository("tests/bad-tasks"))? {
+        let file = entry?.path();
+        let text = std::fs::read_to_string(&file)?;
+        let rule = text.lines().next().and_then(|line| line.strip_prefix("# rule: ")).context("no rule is named")?;
+        let file = file.to_str().context("a path")?;
+        let output = place.ratn(&["check", file]).output()?;
+        let (out, err) = texts(&output);
+        ensure!(output.status.code() == Some(2), "{file}: {:?}, {err}", output.status);
+        ensure!(out.is_empty(), "{file}: {out}");
+        let place_and_rule = err.lines().any(|line| line.starts_with(file) && line.contains(&format!("error[{rule}]")));
+        ensure!(place_and_rule, "{file}: {err}");
+        seen += 1;
+    }
+    ensure!(seen >= 25, "only {seen} bad tasks");
+    Ok(())
+}
+
+#[test]
+fn run_refuses_a_bad_task_and_starts_nothing() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let task = repository("tests/bad-tasks/unknown-port.yaml");
+    let output = place.ratn(&["run", task.to_str().context("a path")?]).output()?;
+    let (out, err) = texts(&output);
+    ensure!(output.status.code() == Some(2), "{:?}, {err}", output.status);
+    ensure!(out.is_empty() && err.contains("error[unknown-port]"), "{out}{err}");
+    let left = std::fs::read_dir(place.path())?.count();
+    ensure!(left == 0 && place.processes().is_empty(), "{left} files, {:?}", place.processes());
+    Ok(())
+}
+
+#[test]
+fn a_parameter_that_the_task_does_not_have_is_refused() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let task = repository("examples/fetch_boxes.yaml");
+    for setting in ["boxs=2", "boxes=many"] {
+        let output = place.ratn(&["run", task.to_str().context("a path")?, "--set", setting]).output()?;
+        let (_, err) = texts(&output);
+        ensure!(output.status.code() == Some(2) && err.contains("error[invalid-parameter]"), "{err}");
+    }
+    ensure!(std::fs::read_dir(place.path())?.count() == 0);
+    Ok(())
+}
+
+#[test]
+fn a_bad_config_is_refused_by_every_role() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let config = place.path().join("ratn.toml");
+    std::fs::write(&config, "speed = 2\n[cell]\nboxs = 3\n")?;
+    let config = config.to_str().context("a path")?;
+    for role in ["resource-manager", "world-pool", "process-manager", "cell"] {
+        let output = place.ratn(&[role, "--config", config, "--check-config"]).output()?;
+        let (_, err) = texts(&output);
+        ensure!(output.status.code() == Some(2) && err.contains("line 3") && err.contains("boxs"), "{role}: {err}");
+        let output = place.ratn(&[role, "--check-config"]).output()?;
+        ensure!(output.status.success(), "{role}: {}", texts(&output).1);
+    }
+    Ok(())
+}
+
+#[test]
+fn what_the_command_line_cannot_mean_is_refused() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    for arguments in [&["demo", "--boxes", "10"][..], &["demo", "--speed", "0"], &["run"], &["fly"]] {
+        let output = place.ratn(arguments).output()?;
+        ensure!(output.status.code() == Some(2), "{arguments:?}: {:?}", output.status);
+    }
+    Ok(())
+}
