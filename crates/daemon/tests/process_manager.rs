@@ -3,7 +3,6 @@
 
 mod support;
 
-use nix::errno::Errno;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use ratn_daemon::process_manager::Template;
@@ -28,9 +27,14 @@ fn pid(resource: &Resource) -> Pid {
     }
 }
 
+/// Waits until a process has ended. One that nobody reaps (in a container without an init) has ended, too.
 async fn gone(pid: Pid) {
+    let ended = || match std::fs::read_to_string(format!("/proc/{pid}/stat")) {
+        Ok(stat) => stat.rsplit_once(") ").is_none_or(|(_, rest)| rest.starts_with('Z')),
+        Err(_) => true,
+    };
     in_time(async {
-        while kill(pid, None) != Err(Errno::ESRCH) {
+        while !ended() {
             tokio::task::yield_now().await;
         }
     })
@@ -89,6 +93,24 @@ async fn workers_are_started_and_stopped_as_asked_within_the_pools_bounds() {
     assert_eq!(client.pools().await.unwrap().1[0].workers.len(), 2);
     processes.end().await;
     gone(pid(&two)).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn no_worker_outlives_a_killed_process_manager_and_its_resources_vanish() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut watch = system.watch(&manager, &["PathPlanner"]).await;
+    let mut processes = std::process::Command::new(env!("CARGO_BIN_EXE_ratn-test-worker"))
+        .arg("manage")
+        .arg(system.directory.path())
+        .spawn()
+        .unwrap();
+    let worker = watch.created("PathPlanner").await;
+    processes.kill().unwrap();
+    processes.wait().unwrap();
+    gone(pid(&worker)).await;
+    let vanished = watch.event(|event| event.kind == ResourceEventKind::Deleted).await;
+    assert_eq!((vanished.resource.id, vanished.reason.as_str()), (worker.id, "session expired"));
 }
 
 #[tokio::test(flavor = "multi_thread")]
