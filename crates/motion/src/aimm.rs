@@ -1,6 +1,8 @@
 //! Our cell in numbers: where the table, the places on the base and the boxes are, and the postures that tasks name.
 //!
-//! World frame: metres, floor at z = 0, the robot's base at the origin looking along x. The tests of this file show that
+//! World frame: metres, floor at z = 0, the robot's base at the origin looking along x. The base's body is 1.10 × 0.60 × 0.60,
+//! centred at x = -0.20; the arm stands on it at x = 0.20, turned by 90° so that its first joint's dead sector points to the
+//! right; the mast stands at x = -0.68, and the camera hangs at (-0.49, 0, 1.88) looking ahead. The tests of this file show that
 //! every place below can be reached from above, with a straight approach of [`APPROACH_M`].
 
 use crate::robot::Joints;

@@ -10,7 +10,7 @@ use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact};
 use ratn_motion::pace::{Control, Progress};
-use ratn_motion::plan::{Goal, Plan, PlanError, plan};
+use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::robot::Robot;
 use ratn_motion::trajectory::ArmTrajectory;
 use ratn_motion::validate::{Violation, validate_trajectory};
@@ -126,6 +126,25 @@ fn a_cancelled_planning_ends_at_once() {
         if asked == 5 { Control::Cancelled } else { Control::Continue }
     });
     assert_eq!((outcome, asked), (Err(PlanError::Cancelled), 5));
+}
+
+#[test]
+fn what_stands_in_the_straight_way_is_gone_round() {
+    let mut cell = Cell::with_boxes(3, 8);
+    cell.improvement_iterations = 300;
+    let (shape, place) = (Shape::Box { size: [0.05, 0.4, 0.9] }, Pose::at(0.25, 0.48, 1.05));
+    cell.scene.objects.push(SceneObject { name: "wall".into(), shape, placement: Placement::World(place) });
+    let mut direct = Checker::new(&cell.robot, &cell.scene, 0.0);
+    let collision = direct.edge_collision(&cell.arm, &aimm::HOME, Contact::None);
+    assert_eq!(collision.map(|c| c.other).as_deref(), Some("wall"));
+    for seed in 0..5 {
+        let request = Request { seed, ..request(cell.arm, vec![Goal::Joints(aimm::HOME)]) };
+        let first = cell.plan(&request).unwrap();
+        assert_valid(&cell, &first, 0.3);
+        let improved = cell.plan(&Request { improvement_iterations: 1_000, ..request }).unwrap();
+        assert_valid(&cell, &improved, 0.3);
+        assert!(improved.length_rad < first.length_rad && first.length_rad <= first.first_length_rad);
+    }
 }
 
 #[test]
