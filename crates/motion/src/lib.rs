@@ -6,14 +6,17 @@
 pub mod aimm;
 pub mod collision;
 mod frame;
+mod geometry;
 mod improve;
 pub mod inverse;
 pub mod line;
 pub mod pace;
 pub mod plan;
+mod request;
 pub mod robot;
 mod search;
 pub mod shorten;
 pub mod timing;
 pub mod trajectory;
+mod urdf;
 pub mod validate;

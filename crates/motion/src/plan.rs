@@ -5,7 +5,7 @@
 //! ```
 //!
 //! A goal is a list of alternatives, and a pose has many postures: every posture from which the approach is free is a
-//! [`Candidate`] end of the free path. On straight parts the fingers and what they hold may touch their surroundings, the
+//! candidate end of the free path. On straight parts the fingers and what they hold may touch their surroundings, the
 //! arm may not; on the free path nothing touches anything.
 
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M, distance};
@@ -13,6 +13,7 @@ use crate::improve::improve;
 use crate::inverse::{Solver, is_same};
 use crate::line::{LineError, line};
 use crate::pace::{Control, Pace, Progress, Stop};
+pub use crate::request::{Goal, MAX_GOALS, MAX_STRAIGHT_M, Request};
 use crate::robot::{Configuration, Joints, Robot};
 use crate::search::search;
 use crate::shorten::{length, shortcut};
@@ -22,12 +23,6 @@ use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
 use ratn_world::scene::Scene;
-
-/// The most alternatives of one goal.
-pub const MAX_GOALS: usize = 64;
-
-/// The longest straight part, in metres.
-pub const MAX_STRAIGHT_M: f64 = 0.5;
 
 /// The padding where the start is too close to something for the usual one, in metres.
 const TIGHT_PADDING_M: f64 = 0.002;
@@ -40,34 +35,6 @@ const MAX_SEARCH_ITERATIONS: usize = 20_000;
 
 /// Shortcuts tried on the first path before anything else.
 const FIRST_SHORTCUTS: usize = 100;
-
-/// What to plan.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Request {
-    /// Where the arm is.
-    pub start: Joints,
-    /// Alternatives; any one will do.
-    pub goals: Vec<Goal>,
-    /// Leave straight up (world z) this far, in metres.
-    pub depart_m: f64,
-    /// Arrive straight down (world -z) this far, in metres.
-    pub approach_m: f64,
-    /// Fraction of the joints' velocity and acceleration limits.
-    pub speed: f64,
-    /// The same seed, scene and iterations give the same plan.
-    pub seed: u64,
-    /// Iterations of improvement after the first path and its shortcutting; time may be up before.
-    pub improvement_iterations: usize,
-}
-
-/// Where to go.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Goal {
-    /// A posture.
-    Joints(Joints),
-    /// The tool frame in the world frame.
-    Pose(Pose),
-}
 
 /// A motion.
 #[derive(Debug, Clone, PartialEq)]
@@ -184,7 +151,7 @@ pub fn plan(
     request: &Request,
     control: &mut dyn FnMut(Progress) -> Control,
 ) -> Result<Plan, PlanError> {
-    check_request(robot, request)?;
+    request.check(robot)?;
     let mut pace = Pace::new(control);
     let mut planning = Planning {
         checker: Checker::new(robot, scene, PADDING_M),
@@ -378,37 +345,3 @@ impl Planning<'_> {
 
 /// How many different reasons an error names.
 const MAX_REASONS: usize = 5;
-
-fn check_request(robot: &Robot, request: &Request) -> Result<(), PlanError> {
-    let malformed = |what: &str, value: String, expected: &str| {
-        Err(PlanError::Malformed { what: what.to_owned(), value, expected: expected.to_owned() })
-    };
-    if !(request.speed > 0.0 && request.speed <= 1.0) {
-        return malformed("speed", request.speed.to_string(), "a fraction above 0, at most 1");
-    }
-    for (what, value) in [("depart_m", request.depart_m), ("approach_m", request.approach_m)] {
-        if !(0.0..=MAX_STRAIGHT_M).contains(&value) {
-            return malformed(what, value.to_string(), &format!("0 to {MAX_STRAIGHT_M} m"));
-        }
-    }
-    if request.goals.is_empty() || request.goals.len() > MAX_GOALS {
-        return malformed("the number of goals", request.goals.len().to_string(), &format!("1 to {MAX_GOALS}"));
-    }
-    let goals = request.goals.iter().filter_map(|goal| match goal {
-        Goal::Joints(joints) => Some(("the goal's", joints)),
-        Goal::Pose(_) => None,
-    });
-    for (whose, posture) in std::iter::once(("the start's", &request.start)).chain(goals) {
-        for (q, joint) in posture.iter().zip(robot.arm_joints()) {
-            if !(joint.lower - 1e-6..=joint.upper + 1e-6).contains(q) {
-                let range = format!("{:.3} to {:.3} rad", joint.lower, joint.upper);
-                return malformed(&format!("{whose} {}", joint.name), q.to_string(), &range);
-            }
-        }
-    }
-    let finite = |pose: &Pose| pose.position.iter().chain(&pose.quaternion_xyzw).all(|c| c.is_finite());
-    if let Some(Goal::Pose(pose)) = request.goals.iter().find(|g| matches!(g, Goal::Pose(p) if !finite(p))) {
-        return malformed("a goal pose", format!("{pose:?}"), "finite numbers");
-    }
-    Ok(())
-}

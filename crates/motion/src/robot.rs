@@ -5,10 +5,12 @@
 //! [`Robot::update_arm`], the rest keeps its place.
 
 use crate::frame::compose;
+pub use crate::geometry::{Body, Geometry};
+use crate::urdf;
+pub use crate::urdf::RobotError;
 use parry3d::math::{Pose as Pose32, Rotation, Vector};
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
-use std::collections::BTreeMap;
 
 /// Positions of the seven arm joints, in radians.
 pub type Joints = [f64; 7];
@@ -17,7 +19,7 @@ pub type Joints = [f64; 7];
 pub const DEGREES_OF_FREEDOM: usize = 13;
 
 /// The URDF's joints in the order of the degrees of freedom.
-const JOINT_NAMES: [&str; DEGREES_OF_FREEDOM] = [
+pub(crate) const JOINT_NAMES: [&str; DEGREES_OF_FREEDOM] = [
     "base_x",
     "base_y",
     "base_yaw",
@@ -109,44 +111,6 @@ pub enum Motion {
     },
 }
 
-/// A primitive shape fixed to a link.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Body {
-    /// In the link's frame.
-    pub pose: Pose,
-    /// What it is.
-    pub geometry: Geometry,
-}
-
-/// A primitive, centred; axes along z. Metres.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Geometry {
-    /// Half of the edge lengths.
-    Box {
-        /// Along x, y, z.
-        half: [f64; 3],
-    },
-    /// A cylinder.
-    Cylinder {
-        /// Radius.
-        radius: f64,
-        /// Half of its length.
-        half_length: f64,
-    },
-    /// A cylinder with half spheres at both ends.
-    Capsule {
-        /// Radius.
-        radius: f64,
-        /// Half of the distance between the centres of the half spheres.
-        half_length: f64,
-    },
-    /// A sphere.
-    Sphere {
-        /// Radius.
-        radius: f64,
-    },
-}
-
 /// Positions of all degrees of freedom.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Configuration {
@@ -160,32 +124,6 @@ pub struct Configuration {
     pub tilt: f64,
     /// How far each finger is from the middle, in metres: half of the opening.
     pub finger: f64,
-}
-
-/// A URDF that does not describe this kind of robot.
-#[derive(Debug, thiserror::Error)]
-pub enum RobotError {
-    /// Not a URDF.
-    #[error("the robot description is not valid URDF")]
-    Urdf(#[from] urdf_rs::UrdfError),
-    /// A joint or link that must be there is not.
-    #[error("the robot description has no {what} `{name}`")]
-    Missing {
-        /// Link or joint.
-        what: &'static str,
-        /// Its name.
-        name: String,
-    },
-    /// Something this model does not support.
-    #[error("{what} `{name}` of the robot description is not supported: {reason}")]
-    Unsupported {
-        /// Link or joint.
-        what: &'static str,
-        /// Its name.
-        name: String,
-        /// Why not.
-        reason: &'static str,
-    },
 }
 
 impl Configuration {
@@ -221,23 +159,7 @@ impl Robot {
     /// # Errors
     /// [`RobotError`] names the link or joint.
     pub fn from_urdf(text: &str) -> Result<Robot, RobotError> {
-        let urdf = urdf_rs::read_from_string(text)?;
-        let mut joints = Vec::new();
-        for name in JOINT_NAMES {
-            let joint = urdf
-                .joints
-                .iter()
-                .find(|j| j.name == name)
-                .ok_or_else(|| RobotError::Missing { what: "joint", name: name.to_owned() })?;
-            joints.push(Joint {
-                name: name.to_owned(),
-                lower: joint.limit.lower,
-                upper: joint.limit.upper,
-                velocity: joint.limit.velocity,
-                acceleration: joint.limit.acceleration,
-            });
-        }
-        let links = sorted_links(&urdf)?;
+        let (joints, links) = urdf::read(text)?;
         let find = |name: &str| {
             links
                 .iter()
@@ -341,60 +263,6 @@ impl Robot {
     }
 }
 
-impl Geometry {
-    /// The shape for parry3d, grown by `padding` metres on every side.
-    pub fn shape(&self, padding: f64) -> SharedShape {
-        match *self {
-            Geometry::Box { half } => {
-                let [x, y, z] = half.map(|h| (h + padding) as f32);
-                SharedShape::cuboid(x, y, z)
-            }
-            Geometry::Cylinder { radius, half_length } => {
-                // parry's cylinder stands along y; `turn` says how ours lies.
-                SharedShape::cylinder((half_length + padding) as f32, (radius + padding) as f32)
-            }
-            Geometry::Capsule { radius, half_length } => {
-                SharedShape::capsule_z(half_length as f32, (radius + padding) as f32)
-            }
-            Geometry::Sphere { radius } => SharedShape::ball((radius + padding) as f32),
-        }
-    }
-
-    /// The rotation from this primitive's frame to the frame of its shape.
-    fn turn(&self) -> Pose {
-        match self {
-            Geometry::Cylinder { .. } => Pose::from_rpy([0.0; 3], std::f64::consts::FRAC_PI_2, 0.0, 0.0),
-            _ => Pose::IDENTITY,
-        }
-    }
-
-    /// A body of this geometry whose centre is at `pose`, axes along z.
-    pub fn at(self, pose: Pose) -> Body {
-        Body { pose: pose.compose(&self.turn()), geometry: self }
-    }
-
-    /// The radius of a sphere about the centre that holds the shape.
-    pub fn radius(&self) -> f64 {
-        match *self {
-            Geometry::Box { half: [x, y, z] } => (x * x + y * y + z * z).sqrt(),
-            Geometry::Cylinder { radius, half_length } => radius.hypot(half_length),
-            Geometry::Capsule { radius, half_length } => radius + half_length,
-            Geometry::Sphere { radius } => radius,
-        }
-    }
-}
-
-impl From<&ratn_world::scene::Shape> for Geometry {
-    fn from(shape: &ratn_world::scene::Shape) -> Geometry {
-        match *shape {
-            ratn_world::scene::Shape::Box { size } => Geometry::Box { half: size.map(|s| s / 2.0) },
-            ratn_world::scene::Shape::Cylinder { radius, length } => {
-                Geometry::Cylinder { radius, half_length: length / 2.0 }
-            }
-        }
-    }
-}
-
 /// A pose for parry3d.
 pub fn to_f32(pose: &Pose) -> Pose32 {
     let ([x, y, z], [i, j, k, w]) = (pose.position.map(|c| c as f32), pose.quaternion_xyzw.map(|c| c as f32));
@@ -413,86 +281,4 @@ fn local_pose(link: &Link, position: impl Fn(usize) -> f64) -> Pose {
             compose(&link.origin, &Pose { position: axis.map(|c| c * along), ..Pose::IDENTITY })
         }
     }
-}
-
-fn sorted_links(urdf: &urdf_rs::Robot) -> Result<Vec<Link>, RobotError> {
-    let descriptions: BTreeMap<&str, &urdf_rs::Link> = urdf.links.iter().map(|l| (l.name.as_str(), l)).collect();
-    let describe = |name: &str| {
-        descriptions.get(name).copied().ok_or_else(|| RobotError::Missing { what: "link", name: name.to_owned() })
-    };
-    let mut links = vec![Link {
-        name: "world".to_owned(),
-        parent: None,
-        origin: Pose::IDENTITY,
-        motion: Motion::Fixed,
-        bodies: bodies(describe("world")?)?,
-    }];
-    // Breadth first from the world: parents come before children.
-    let mut next = 0;
-    while next < links.len() {
-        let parent = links[next].name.clone();
-        for joint in urdf.joints.iter().filter(|j| j.parent.link == parent) {
-            let child = describe(&joint.child.link)?;
-            if links.iter().any(|l| l.name == child.name) {
-                let reason = "a link has two parents";
-                return Err(RobotError::Unsupported { what: "link", name: child.name.clone(), reason });
-            }
-            links.push(Link {
-                name: child.name.clone(),
-                parent: Some(next),
-                origin: origin(&joint.origin),
-                motion: motion(joint)?,
-                bodies: bodies(child)?,
-            });
-        }
-        next += 1;
-    }
-    Ok(links)
-}
-
-fn motion(joint: &urdf_rs::Joint) -> Result<Motion, RobotError> {
-    let unsupported = |reason| RobotError::Unsupported { what: "joint", name: joint.name.clone(), reason };
-    if joint.joint_type == urdf_rs::JointType::Fixed {
-        return Ok(Motion::Fixed);
-    }
-    let driver = match &joint.mimic {
-        None => &joint.name,
-        Some(mimic) if mimic.multiplier.unwrap_or(1.0) == 1.0 && mimic.offset.unwrap_or(0.0) == 0.0 => &mimic.joint,
-        Some(_) => return Err(unsupported("it mimics another joint by a factor or an offset")),
-    };
-    let index = JOINT_NAMES.iter().position(|name| name == driver);
-    let index = index.ok_or_else(|| unsupported("its name is none of the robot's degrees of freedom"))?;
-    let length = joint.axis.xyz.0.iter().map(|c| c * c).sum::<f64>().sqrt();
-    let axis = joint.axis.xyz.0.map(|c| c / length);
-    match joint.joint_type {
-        urdf_rs::JointType::Revolute => Ok(Motion::Turn { axis, joint: index }),
-        urdf_rs::JointType::Prismatic => Ok(Motion::Slide { axis, joint: index }),
-        _ => Err(unsupported("only fixed, revolute and prismatic joints are known")),
-    }
-}
-
-fn bodies(link: &urdf_rs::Link) -> Result<Vec<Body>, RobotError> {
-    let body = |collision: &urdf_rs::Collision| {
-        let geometry = match &collision.geometry {
-            urdf_rs::Geometry::Box { size } => Geometry::Box { half: size.0.map(|s| s / 2.0) },
-            urdf_rs::Geometry::Cylinder { radius, length } => {
-                Geometry::Cylinder { radius: *radius, half_length: length / 2.0 }
-            }
-            urdf_rs::Geometry::Capsule { radius, length } => {
-                Geometry::Capsule { radius: *radius, half_length: length / 2.0 }
-            }
-            urdf_rs::Geometry::Sphere { radius } => Geometry::Sphere { radius: *radius },
-            urdf_rs::Geometry::Mesh { .. } => {
-                let reason = "collision shapes are primitives, not meshes";
-                return Err(RobotError::Unsupported { what: "link", name: link.name.clone(), reason });
-            }
-        };
-        Ok(geometry.at(origin(&collision.origin)))
-    };
-    link.collision.iter().map(body).collect()
-}
-
-fn origin(pose: &urdf_rs::Pose) -> Pose {
-    let [roll, pitch, yaw] = pose.rpy.0;
-    Pose::from_rpy(pose.xyz.0, roll, pitch, yaw)
 }

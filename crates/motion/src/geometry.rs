@@ -1,0 +1,96 @@
+//! Primitive shapes, and how parry3d sees them.
+
+use parry3d::shape::SharedShape;
+use ratn_model::pose::Pose;
+
+/// A primitive shape fixed to a link.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Body {
+    /// In the link's frame.
+    pub pose: Pose,
+    /// What it is.
+    pub geometry: Geometry,
+}
+
+/// A primitive, centred; axes along z. Metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Geometry {
+    /// Half of the edge lengths.
+    Box {
+        /// Along x, y, z.
+        half: [f64; 3],
+    },
+    /// A cylinder.
+    Cylinder {
+        /// Radius.
+        radius: f64,
+        /// Half of its length.
+        half_length: f64,
+    },
+    /// A cylinder with half spheres at both ends.
+    Capsule {
+        /// Radius.
+        radius: f64,
+        /// Half of the distance between the centres of the half spheres.
+        half_length: f64,
+    },
+    /// A sphere.
+    Sphere {
+        /// Radius.
+        radius: f64,
+    },
+}
+
+impl Geometry {
+    /// The shape for parry3d, grown by `padding` metres on every side.
+    pub fn shape(&self, padding: f64) -> SharedShape {
+        match *self {
+            Geometry::Box { half } => {
+                let [x, y, z] = half.map(|h| (h + padding) as f32);
+                SharedShape::cuboid(x, y, z)
+            }
+            Geometry::Cylinder { radius, half_length } => {
+                // parry's cylinder stands along y; `turn` says how ours lies.
+                SharedShape::cylinder((half_length + padding) as f32, (radius + padding) as f32)
+            }
+            Geometry::Capsule { radius, half_length } => {
+                SharedShape::capsule_z(half_length as f32, (radius + padding) as f32)
+            }
+            Geometry::Sphere { radius } => SharedShape::ball((radius + padding) as f32),
+        }
+    }
+
+    /// The rotation from this primitive's frame to the frame of its shape.
+    fn turn(&self) -> Pose {
+        match self {
+            Geometry::Cylinder { .. } => Pose::from_rpy([0.0; 3], std::f64::consts::FRAC_PI_2, 0.0, 0.0),
+            _ => Pose::IDENTITY,
+        }
+    }
+
+    /// A body of this geometry whose centre is at `pose`, axes along z.
+    pub fn at(self, pose: Pose) -> Body {
+        Body { pose: pose.compose(&self.turn()), geometry: self }
+    }
+
+    /// The radius of a sphere about the centre that holds the shape.
+    pub fn radius(&self) -> f64 {
+        match *self {
+            Geometry::Box { half: [x, y, z] } => (x * x + y * y + z * z).sqrt(),
+            Geometry::Cylinder { radius, half_length } => radius.hypot(half_length),
+            Geometry::Capsule { radius, half_length } => radius + half_length,
+            Geometry::Sphere { radius } => radius,
+        }
+    }
+}
+
+impl From<&ratn_world::scene::Shape> for Geometry {
+    fn from(shape: &ratn_world::scene::Shape) -> Geometry {
+        match *shape {
+            ratn_world::scene::Shape::Box { size } => Geometry::Box { half: size.map(|s| s / 2.0) },
+            ratn_world::scene::Shape::Cylinder { radius, length } => {
+                Geometry::Cylinder { radius, half_length: length / 2.0 }
+            }
+        }
+    }
+}

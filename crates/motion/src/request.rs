@@ -1,0 +1,76 @@
+//! What the planner is asked for.
+
+use crate::plan::PlanError;
+use crate::robot::{Joints, Robot};
+use ratn_model::pose::Pose;
+
+/// The most alternatives of one goal.
+pub const MAX_GOALS: usize = 64;
+
+/// The longest straight part, in metres.
+pub const MAX_STRAIGHT_M: f64 = 0.5;
+
+/// What to plan.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Request {
+    /// Where the arm is.
+    pub start: Joints,
+    /// Alternatives; any one will do.
+    pub goals: Vec<Goal>,
+    /// Leave straight up (world z) this far, in metres.
+    pub depart_m: f64,
+    /// Arrive straight down (world -z) this far, in metres.
+    pub approach_m: f64,
+    /// Fraction of the joints' velocity and acceleration limits.
+    pub speed: f64,
+    /// The same seed, scene and iterations give the same plan.
+    pub seed: u64,
+    /// Iterations of improvement after the first path and its shortcutting; time may be up before.
+    pub improvement_iterations: usize,
+}
+
+/// Where to go.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Goal {
+    /// A posture.
+    Joints(Joints),
+    /// The tool frame in the world frame.
+    Pose(Pose),
+}
+
+impl Request {
+    /// Refuses what makes no sense before anything is planned.
+    pub(crate) fn check(&self, robot: &Robot) -> Result<(), PlanError> {
+        let malformed = |what: &str, value: String, expected: &str| {
+            Err(PlanError::Malformed { what: what.to_owned(), value, expected: expected.to_owned() })
+        };
+        if !(self.speed > 0.0 && self.speed <= 1.0) {
+            return malformed("speed", self.speed.to_string(), "a fraction above 0, at most 1");
+        }
+        for (what, value) in [("depart_m", self.depart_m), ("approach_m", self.approach_m)] {
+            if !(0.0..=MAX_STRAIGHT_M).contains(&value) {
+                return malformed(what, value.to_string(), &format!("0 to {MAX_STRAIGHT_M} m"));
+            }
+        }
+        if self.goals.is_empty() || self.goals.len() > MAX_GOALS {
+            return malformed("the number of goals", self.goals.len().to_string(), &format!("1 to {MAX_GOALS}"));
+        }
+        let goals = self.goals.iter().filter_map(|goal| match goal {
+            Goal::Joints(joints) => Some(("the goal's", joints)),
+            Goal::Pose(_) => None,
+        });
+        for (whose, posture) in std::iter::once(("the start's", &self.start)).chain(goals) {
+            for (q, joint) in posture.iter().zip(robot.arm_joints()) {
+                if !(joint.lower - 1e-6..=joint.upper + 1e-6).contains(q) {
+                    let range = format!("{:.3} to {:.3} rad", joint.lower, joint.upper);
+                    return malformed(&format!("{whose} {}", joint.name), q.to_string(), &range);
+                }
+            }
+        }
+        let finite = |pose: &Pose| pose.position.iter().chain(&pose.quaternion_xyzw).all(|c| c.is_finite());
+        if let Some(Goal::Pose(pose)) = self.goals.iter().find(|g| matches!(g, Goal::Pose(p) if !finite(p))) {
+            return malformed("a goal pose", format!("{pose:?}"), "finite numbers");
+        }
+        Ok(())
+    }
+}

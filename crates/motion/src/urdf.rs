@@ -1,0 +1,135 @@
+//! Reading the robot's description: its links, parents first, and the limits of its degrees of freedom.
+
+use crate::geometry::{Body, Geometry};
+use crate::robot::{JOINT_NAMES, Joint, Link, Motion};
+use ratn_model::pose::Pose;
+use std::collections::BTreeMap;
+
+/// A URDF that does not describe this kind of robot.
+#[derive(Debug, thiserror::Error)]
+pub enum RobotError {
+    /// Not a URDF.
+    #[error("the robot description is not valid URDF")]
+    Urdf(#[from] urdf_rs::UrdfError),
+    /// A joint or link that must be there is not.
+    #[error("the robot description has no {what} `{name}`")]
+    Missing {
+        /// Link or joint.
+        what: &'static str,
+        /// Its name.
+        name: String,
+    },
+    /// Something this model does not support.
+    #[error("{what} `{name}` of the robot description is not supported: {reason}")]
+    Unsupported {
+        /// Link or joint.
+        what: &'static str,
+        /// Its name.
+        name: String,
+        /// Why not.
+        reason: &'static str,
+    },
+}
+
+/// The degrees of freedom and the links of a description.
+pub(crate) fn read(text: &str) -> Result<(Vec<Joint>, Vec<Link>), RobotError> {
+    let urdf = urdf_rs::read_from_string(text)?;
+    let mut joints = Vec::new();
+    for name in JOINT_NAMES {
+        let joint = urdf
+            .joints
+            .iter()
+            .find(|j| j.name == name)
+            .ok_or_else(|| RobotError::Missing { what: "joint", name: name.to_owned() })?;
+        joints.push(Joint {
+            name: name.to_owned(),
+            lower: joint.limit.lower,
+            upper: joint.limit.upper,
+            velocity: joint.limit.velocity,
+            acceleration: joint.limit.acceleration,
+        });
+    }
+    Ok((joints, sorted_links(&urdf)?))
+}
+
+fn sorted_links(urdf: &urdf_rs::Robot) -> Result<Vec<Link>, RobotError> {
+    let descriptions: BTreeMap<&str, &urdf_rs::Link> = urdf.links.iter().map(|l| (l.name.as_str(), l)).collect();
+    let describe = |name: &str| {
+        descriptions.get(name).copied().ok_or_else(|| RobotError::Missing { what: "link", name: name.to_owned() })
+    };
+    let mut links = vec![Link {
+        name: "world".to_owned(),
+        parent: None,
+        origin: Pose::IDENTITY,
+        motion: Motion::Fixed,
+        bodies: bodies(describe("world")?)?,
+    }];
+    // Breadth first from the world: parents come before children.
+    let mut next = 0;
+    while next < links.len() {
+        let parent = links[next].name.clone();
+        for joint in urdf.joints.iter().filter(|j| j.parent.link == parent) {
+            let child = describe(&joint.child.link)?;
+            if links.iter().any(|l| l.name == child.name) {
+                let reason = "a link has two parents";
+                return Err(RobotError::Unsupported { what: "link", name: child.name.clone(), reason });
+            }
+            links.push(Link {
+                name: child.name.clone(),
+                parent: Some(next),
+                origin: origin(&joint.origin),
+                motion: motion(joint)?,
+                bodies: bodies(child)?,
+            });
+        }
+        next += 1;
+    }
+    Ok(links)
+}
+
+fn motion(joint: &urdf_rs::Joint) -> Result<Motion, RobotError> {
+    let unsupported = |reason| RobotError::Unsupported { what: "joint", name: joint.name.clone(), reason };
+    if joint.joint_type == urdf_rs::JointType::Fixed {
+        return Ok(Motion::Fixed);
+    }
+    let driver = match &joint.mimic {
+        None => &joint.name,
+        Some(mimic) if mimic.multiplier.unwrap_or(1.0) == 1.0 && mimic.offset.unwrap_or(0.0) == 0.0 => &mimic.joint,
+        Some(_) => return Err(unsupported("it mimics another joint by a factor or an offset")),
+    };
+    let index = JOINT_NAMES.iter().position(|name| name == driver);
+    let index = index.ok_or_else(|| unsupported("its name is none of the robot's degrees of freedom"))?;
+    let length = joint.axis.xyz.0.iter().map(|c| c * c).sum::<f64>().sqrt();
+    let axis = joint.axis.xyz.0.map(|c| c / length);
+    match joint.joint_type {
+        urdf_rs::JointType::Revolute => Ok(Motion::Turn { axis, joint: index }),
+        urdf_rs::JointType::Prismatic => Ok(Motion::Slide { axis, joint: index }),
+        _ => Err(unsupported("only fixed, revolute and prismatic joints are known")),
+    }
+}
+
+fn bodies(link: &urdf_rs::Link) -> Result<Vec<Body>, RobotError> {
+    let body = |collision: &urdf_rs::Collision| {
+        let geometry = match &collision.geometry {
+            urdf_rs::Geometry::Box { size } => Geometry::Box { half: size.0.map(|s| s / 2.0) },
+            urdf_rs::Geometry::Cylinder { radius, length } => {
+                Geometry::Cylinder { radius: *radius, half_length: length / 2.0 }
+            }
+            urdf_rs::Geometry::Capsule { radius, length } => {
+                Geometry::Capsule { radius: *radius, half_length: length / 2.0 }
+            }
+            urdf_rs::Geometry::Sphere { radius } => Geometry::Sphere { radius: *radius },
+            urdf_rs::Geometry::Mesh { .. } => {
+                let reason = "collision shapes are primitives, not meshes";
+                return Err(RobotError::Unsupported { what: "link", name: link.name.clone(), reason });
+            }
+        };
+        Ok(geometry.at(origin(&collision.origin)))
+    };
+    link.collision.iter().map(body).collect()
+}
+
+fn origin(pose: &urdf_rs::Pose) -> Pose {
+    let [roll, pitch, yaw] = pose.rpy.0;
+    Pose::from_rpy(pose.xyz.0, roll, pitch, yaw)
+}
