@@ -8,7 +8,6 @@ mod clock;
 mod goal;
 
 use clock::{Clock, Figures};
-use ratn_model::fact::{FactPattern, SCENE_PREDICATES};
 use ratn_model::value::Value;
 use ratn_motion::plan::{Plan, PlanError, plan};
 use ratn_motion::robot::Robot;
@@ -54,11 +53,8 @@ impl Action for PlanAction {
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let begin = Instant::now();
         let (request, budget_s) = goal::request(&goal)?;
-        let patterns = SCENE_PREDICATES.map(|(predicate, arguments)| FactPattern {
-            predicate: predicate.to_owned(),
-            arguments: vec![None; arguments],
-        });
-        let world = goal.unless_cancelled(goal.world(&patterns)).await??;
+        // Whatever the task declared that this plan depends on, and no more.
+        let world = goal.unless_cancelled(goal.world(&[])).await??;
         let scene = Scene::of(&world)?;
 
         let (robot, goal) = (Arc::clone(&self.robot), Arc::new(goal));

@@ -163,7 +163,8 @@ impl WorldPool {
         Ok(id)
     }
 
-    /// What matches any of the patterns, in the order of keys, of the root or of a projection.
+    /// What matches any of the patterns, in the order of keys, of the root or of a projection; without a pattern everything
+    /// that the projection shows.
     pub(super) fn query(
         &self,
         id: Option<ProjectionId>,
@@ -179,6 +180,11 @@ impl WorldPool {
                 };
                 if let Some(pattern) = patterns.iter().find(|pattern| !shown(pattern)) {
                     return Err(QueryError::Hidden { id, pattern: pattern.clone() });
+                }
+                if patterns.is_empty() {
+                    let all = projection.world.iter().filter(|(key, _)| projection.reads.contains(key));
+                    let all = all.map(|(key, fact)| (key.clone(), fact.clone())).collect();
+                    return Ok((all, projection.base));
                 }
                 (&projection.world, projection.base)
             }
@@ -347,6 +353,8 @@ mod tests {
         );
         let wider = FactPattern { predicate: "at".to_owned(), arguments: vec![None] };
         assert!(matches!(pool.query(Some(id), &[wider]), Err(QueryError::Hidden { .. })));
+        let (all, _) = pool.query(Some(id), &[]).unwrap();
+        assert_eq!(all.iter().map(|(key, _)| key.to_string()).collect::<Vec<_>>(), ["at(box)"]);
     }
 
     #[test]
