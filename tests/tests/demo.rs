@@ -43,8 +43,7 @@ fn nothing_is_left_of_a_demo_that_is_killed() -> anyhow::Result<()> {
     let out = place.path().join("out");
     let demo = place.start(&["demo", "--boxes", "1", "--speed", "4", "--out", out.to_str().context("a path")?])?;
     // Four roles, two planners and a detector, and the demo itself, which names the place by its output folder.
-    wait_for("the whole system", || Ok((place.processes().len() >= 8).then_some(())))
-        .with_context(|| demo.said())?;
+    wait_for("the whole system", || Ok((place.processes().len() >= 8).then_some(()))).with_context(|| demo.said())?;
     demo.process()?.kill()?;
     drop(demo);
     place.wait_until_empty()

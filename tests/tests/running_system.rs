@@ -17,7 +17,8 @@ fn a_task_runs_on_the_system_that_is_up_and_leaves_it_running() -> anyhow::Resul
     let task = repository("examples/fetch_boxes.yaml");
     let task = task.to_str().context("a path")?;
     let log = place.path().join("log.jsonl");
-    let arguments = ["run", task, "--set", "boxes=1", "--set", "budget=false", "--log", log.to_str().context("a path")?];
+    let arguments =
+        ["run", task, "--set", "boxes=1", "--set", "budget=false", "--log", log.to_str().context("a path")?];
     let output = place.ratn(&arguments).output()?;
     let (out, err) = support::texts(&output);
     ensure!(output.status.success(), "{err}");

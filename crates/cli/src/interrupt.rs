@@ -20,11 +20,8 @@ impl Interrupt {
     /// # Errors
     /// Where the signals cannot be caught.
     pub(crate) fn listen() -> std::io::Result<Interrupt> {
-        let (mut interrupt, mut terminate, mut hangup) = (
-            signal(SignalKind::interrupt())?,
-            signal(SignalKind::terminate())?,
-            signal(SignalKind::hangup())?,
-        );
+        let (mut interrupt, mut terminate, mut hangup) =
+            (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?, signal(SignalKind::hangup())?);
         let (counter, count) = watch::channel(0);
         tokio::spawn(async move {
             for n in 1..PATIENCE {

@@ -134,6 +134,7 @@ fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()
 
 fn log_file(task: &str) -> anyhow::Result<PathBuf> {
     let name = format!("ratn-{task}-");
-    let file = tempfile::Builder::new().prefix(&name).suffix(".jsonl").tempfile().context("cannot make an event log")?;
+    let file =
+        tempfile::Builder::new().prefix(&name).suffix(".jsonl").tempfile().context("cannot make an event log")?;
     Ok(file.into_temp_path().keep()?)
 }

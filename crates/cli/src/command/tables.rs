@@ -55,7 +55,8 @@ fn draw(directory: &Path, scenarios: &[Scenario]) -> anyhow::Result<()> {
     std::fs::create_dir_all(directory).with_context(|| format!("cannot make {}", directory.display()))?;
     for scenario in scenarios {
         let mut scale_s = None;
-        for (mode, planners, name) in [(Mode::Hsm, 1, "hsm"), (Mode::Cdtn, 1, "cdtn-1mp"), (Mode::Cdtn, 2, "cdtn-2mp")] {
+        for (mode, planners, name) in [(Mode::Hsm, 1, "hsm"), (Mode::Cdtn, 1, "cdtn-1mp"), (Mode::Cdtn, 2, "cdtn-2mp")]
+        {
             let run = scenario.replay(mode, planners)?;
             // All charts of a row have the time axis of the first, the longest.
             let scale_s = *scale_s.get_or_insert(run.end_s);

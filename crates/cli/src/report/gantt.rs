@@ -68,11 +68,8 @@ pub(crate) fn svg(run: &Timeline, scale_s: Option<f64>) -> String {
          <rect width=\"{WIDTH}\" height=\"{height}\" fill=\"#ffffff\"/>\n",
         height = bottom + BOTTOM,
     );
-    let _ = writeln!(
-        out,
-        "<text x=\"16\" y=\"30\" font-size=\"18\" font-weight=\"600\">{}</text>",
-        escaped(&title(run))
-    );
+    let _ =
+        writeln!(out, "<text x=\"16\" y=\"30\" font-size=\"18\" font-weight=\"600\">{}</text>", escaped(&title(run)));
     legend(&mut out);
     axis.draw(&mut out, bottom);
     for (i, row) in rows.iter().enumerate() {
@@ -100,10 +97,10 @@ fn legend(out: &mut String) {
         ("#c4c9d2", "discarded"),
     ];
     for (fill, what) in entries {
-        let _ = write!(
+        let _ = writeln!(
             out,
             "<rect x=\"{x:.0}\" y=\"46\" width=\"16\" height=\"12\" rx=\"2\" fill=\"{fill}\"/>\
-             <text x=\"{:.0}\" y=\"56.5\">{what}</text>\n",
+             <text x=\"{:.0}\" y=\"56.5\">{what}</text>",
             x + 22.0
         );
         x += 46.0 + 6.6 * what.len() as f64;
@@ -132,10 +129,10 @@ impl Axis {
         for i in 0..=(self.end_s / step + 1e-9).floor() as u32 {
             let seconds = f64::from(i) * step;
             let x = self.x(seconds);
-            let _ = write!(
+            let _ = writeln!(
                 out,
                 "<line x1=\"{x:.1}\" y1=\"{TOP}\" x2=\"{x:.1}\" y2=\"{:.1}\" stroke=\"#d5d9e0\"/>\
-                 <text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{seconds:.decimals$}</text>\n",
+                 <text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{seconds:.decimals$}</text>",
                 bottom + 5.0,
                 bottom + 20.0
             );

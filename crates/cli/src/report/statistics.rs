@@ -274,12 +274,7 @@ pub(crate) fn plan_table(plans: &[Plan]) -> String {
         return text;
     }
     let width = plans.iter().map(|p| p.instance.chars().count()).max().unwrap_or(0).max(22);
-    let _ = writeln!(
-        text,
-        "\n{:<w$} first path s  planned s  first rad  final rad  shortened",
-        "plan",
-        w = width + 2
-    );
+    let _ = writeln!(text, "\n{:<w$} first path s  planned s  first rad  final rad  shortened", "plan", w = width + 2);
     for p in plans {
         let _ = writeln!(
             text,

@@ -152,7 +152,10 @@ fn last_words(log: &Path) -> String {
         file.read_to_end(&mut bytes)?;
         Ok(String::from_utf8_lossy(&bytes).trim_end().to_owned())
     };
-    read().map_or_else(|error| format!("(unreadable: {error})"), |text| if text.is_empty() { "(empty)".into() } else { text })
+    read().map_or_else(
+        |error| format!("(unreadable: {error})"),
+        |text| if text.is_empty() { "(empty)".into() } else { text },
+    )
 }
 
 /// What of `wanted` (resources by kind) is not among `there`.

@@ -141,7 +141,7 @@ pub(crate) fn public_directory(given: Option<&Path>) -> PathBuf {
         return path.to_owned();
     }
     let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    variable(DIRECTORY_VARIABLE).or_else(|| variable("XDG_RUNTIME_DIR").map(|dir| dir.join("ratn"))).unwrap_or_else(
-        || std::env::temp_dir().join(format!("ratn-{}", nix::unistd::getuid())),
-    )
+    variable(DIRECTORY_VARIABLE)
+        .or_else(|| variable("XDG_RUNTIME_DIR").map(|dir| dir.join("ratn")))
+        .unwrap_or_else(|| std::env::temp_dir().join(format!("ratn-{}", nix::unistd::getuid())))
 }

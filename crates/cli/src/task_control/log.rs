@@ -97,8 +97,7 @@ pub(crate) fn read(path: &Path) -> Result<Vec<LogLine>, LogError> {
             }
             return Err(LogError::Torn { path: path.to_owned(), line });
         }
-        let parsed: LogLine = serde_json::from_slice(&text)
-            .map_err(|error| foreign(explain(&text, &error)))?;
+        let parsed: LogLine = serde_json::from_slice(&text).map_err(|error| foreign(explain(&text, &error)))?;
         if lines.is_empty() && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
             return Err(foreign("an event log begins with the event `started`".into()));
         }
@@ -174,6 +173,8 @@ mod tests {
         let strange = format!("{first}\n{{\"at\":1,\"event\":\"rained\"}}\n");
         assert!(refusal(&strange).starts_with("LOG:2: not a line of an event log: not a known event: unknown variant"));
         assert!(refusal("").contains("is empty"));
-        assert!(refusal("{\"at\":1,\"command\":\"note\",\"note\":\"retired\",\"instance\":1}\n").contains("begins with"));
+        assert!(
+            refusal("{\"at\":1,\"command\":\"note\",\"note\":\"retired\",\"instance\":1}\n").contains("begins with")
+        );
     }
 }

@@ -26,8 +26,15 @@ pub(super) enum Record {
         reads: Footprint,
         lease: Option<(LeaseId, FencingToken)>,
     },
-    Commit { instance: InstanceId, changes: Vec<Change>, revision: Revision },
-    Operate { instance: InstanceId, operations: Vec<Requirement> },
+    Commit {
+        instance: InstanceId,
+        changes: Vec<Change>,
+        revision: Revision,
+    },
+    Operate {
+        instance: InstanceId,
+        operations: Vec<Requirement>,
+    },
     /// Answers once everything before it is done.
     Flush(oneshot::Sender<()>),
 }
@@ -89,9 +96,7 @@ impl Recorder {
     async fn commit(&self, instance: InstanceId, changes: Vec<Change>, revision: Revision) -> Option<Event> {
         // One instance may commit more than once (the parts of a routine); the revision tells its commits apart.
         let commit = format!("{}/{instance}/{revision}", self.run);
-        let done = patiently(Attempts::IDEMPOTENT, || {
-            self.world.commit(&commit, changes.clone(), Some(revision))
-        });
+        let done = patiently(Attempts::IDEMPOTENT, || self.world.commit(&commit, changes.clone(), Some(revision)));
         match done.await {
             Ok(_) => None,
             Err(error) => Some(Event::RetirementFailed {

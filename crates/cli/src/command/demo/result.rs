@@ -10,8 +10,7 @@ use std::fmt;
 use std::path::PathBuf;
 
 /// Table I of the paper: boxes, HSM, CDTN 1 MP, CDTN 2 MP.
-const PAPER: [(u32, f64, f64, f64); 3] =
-    [(1, 81.3, 73.5, 72.3), (2, 123.7, 107.3, 97.3), (3, 164.2, 141.5, 116.5)];
+const PAPER: [(u32, f64, f64, f64); 3] = [(1, 81.3, 73.5, 72.3), (2, 123.7, 107.3, 97.3), (3, 164.2, 141.5, 116.5)];
 
 /// One run to be made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
