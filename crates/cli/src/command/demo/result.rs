@@ -99,38 +99,59 @@ impl Demonstration {
         self.outcomes.iter().any(|o| o.plan.budget) || self.outcomes.is_empty()
     }
 
-    /// The document of `--json`.
+    /// The document of `--json`. The keys of the main runs, with the task's budget, are at the top; those of the runs
+    /// without one are the same, below `budget_none`.
     pub(super) fn to_json(&self) -> Value {
-        let main = self.row(self.main_budget());
-        let none = self.row(false);
-        let delivered: Vec<usize> = self.outcomes.iter().map(|o| o.delivered).collect();
-        json!({
+        let main = self.main_budget();
+        let mut document = json!({
             "boxes": self.boxes,
             "planners": self.planners,
             "speed": self.speed,
             "seed": self.seed,
-            "hsm_s": main.hsm_s,
-            "cdtn_1mp_s": main.cdtn_1mp_s,
-            "cdtn_2mp_s": main.cdtn_nmp_s,
-            "improvement_2mp_percent": main.improvement(),
-            // What every run delivered, at the least.
-            "delivered": delivered.iter().min().copied().unwrap_or(0),
-            "delivered_per_run": delivered,
-            "logs": self.outcomes.iter().map(|o| &o.log).collect::<Vec<_>>(),
-            "charts": self.outcomes.iter().map(|o| &o.chart).collect::<Vec<_>>(),
-            "budget_none": {
-                "hsm_s": none.hsm_s, "cdtn_2mp_s": none.cdtn_nmp_s, "improvement_2mp_percent": none.improvement(),
-            },
+            "budget": budget_name(main),
             "runs": self.outcomes.iter().map(|o| json!({
                 "name": o.plan.name(),
                 "planners": o.plan.planners,
-                "budget": if o.plan.budget { "task" } else { "none" },
+                "budget": budget_name(o.plan.budget),
                 "delivered": o.delivered,
                 "log": o.log,
                 "chart": o.chart,
                 "statistics": Statistics::of(&o.timeline),
             })).collect::<Vec<_>>(),
+        });
+        merge(&mut document, self.row_json(main));
+        if main && self.outcomes.iter().any(|o| !o.plan.budget) {
+            document["budget_none"] = self.row_json(false);
+        }
+        document
+    }
+
+    fn row_json(&self, budget: bool) -> Value {
+        let row = self.row(budget);
+        let outcomes: Vec<&Outcome> = self.outcomes.iter().filter(|o| o.plan.budget == budget).collect();
+        let delivered: Vec<usize> = outcomes.iter().map(|o| o.delivered).collect();
+        let rounded = |number: Option<f64>| number.map(|n| (n * 1000.0).round() / 1000.0);
+        json!({
+            "hsm_s": rounded(row.hsm_s),
+            "cdtn_1mp_s": rounded(row.cdtn_1mp_s),
+            "cdtn_2mp_s": rounded(row.cdtn_nmp_s),
+            "improvement_2mp_percent": rounded(row.improvement()),
+            // What each of the runs delivered, at the least.
+            "delivered": delivered.iter().min().copied().unwrap_or(0),
+            "delivered_per_run": delivered,
+            "logs": outcomes.iter().map(|o| &o.log).collect::<Vec<_>>(),
+            "charts": outcomes.iter().map(|o| &o.chart).collect::<Vec<_>>(),
         })
+    }
+}
+
+fn budget_name(budget: bool) -> &'static str {
+    if budget { "task" } else { "none" }
+}
+
+fn merge(into: &mut Value, from: Value) {
+    if let (Value::Object(into), Value::Object(from)) = (into, from) {
+        into.extend(from);
     }
 }
 
