@@ -2,6 +2,7 @@
 
 use ratn_perception::camera::Intrinsics;
 use ratn_perception::noise::Noise;
+use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
 
 /// The most boxes that a cell can have: as many as there are places on the base.
@@ -13,6 +14,8 @@ pub const MAX_BOXES: usize = 9;
 pub struct CellConfig {
     /// Where to listen: `127.0.0.1:0` or `unix:/path`.
     pub listen: String,
+    /// Where the resource manager is; without it, where the runtime directory says.
+    pub resource_manager: Option<Endpoint>,
     /// The host that the resources say they are on.
     pub host: String,
     /// How many boxes stand on the table, 1 to 9.
@@ -162,6 +165,7 @@ impl Default for CellConfig {
     fn default() -> CellConfig {
         CellConfig {
             listen: "127.0.0.1:0".to_owned(),
+            resource_manager: None,
             host: "sim".to_owned(),
             boxes: 3,
             seed: 1,

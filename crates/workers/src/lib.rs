@@ -1,3 +1,4 @@
 //! The bundled workers: path planner and detector.
 
+pub mod detector;
 pub mod path_planner;

@@ -26,7 +26,7 @@ use ratn_motion::aimm;
 use ratn_motion::robot::{Configuration, Joints, Robot};
 use ratn_perception::camera::Camera;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::PI;
 
 /// What happens to the cell.
@@ -54,6 +54,16 @@ pub enum Event {
         lease: LeaseId,
         /// Why.
         reason: String,
+    },
+    /// Nobody knows any more which leases live.
+    LeasesLost {
+        /// Why.
+        reason: String,
+    },
+    /// Only these leases live.
+    LeasesAre {
+        /// All of them.
+        living: BTreeSet<LeaseId>,
     },
     /// A new table; the robot goes back to its first posture.
     Reset {
@@ -218,6 +228,14 @@ impl Cell {
             Event::LeaseEnded { lease, reason } => {
                 let ending = |_: &Activity| Ending::Aborted(format!("its lease {lease} ended: {reason}; it holds"));
                 self.hold(|a| a.lease == Some(lease), ending, &mut out);
+            }
+            Event::LeasesLost { reason } => {
+                let ending = |_: &Activity| Ending::Aborted(format!("its lease may have ended: {reason}; it holds"));
+                self.hold(|a| a.lease.is_some(), ending, &mut out);
+            }
+            Event::LeasesAre { living } => {
+                let ending = |_: &Activity| Ending::Aborted("its lease has ended; it holds".to_owned());
+                self.hold(|a| a.lease.is_some_and(|lease| !living.contains(&lease)), ending, &mut out);
             }
             Event::Reset { seed, boxes } => self.reset(seed, boxes, &mut out),
             Event::Tick => {}

@@ -1,0 +1,149 @@
+//! The actions of the four modules: reads a goal's inputs, has the core do it, writes its outputs.
+
+use super::keeper::Keeper;
+use crate::config::CellConfig;
+use crate::core::cell::{Ending, Event, MAX_FRAMES, Module, Product, Request};
+use ratn_model::fact::{FactKey, Term};
+use ratn_model::value::Value;
+use ratn_worker::action::{Action, ActionFailure, ActionResult, ActionServer, GoalContext, GoalOutcome};
+use ratn_worker::client::Channels;
+
+/// How fast `move_to` goes unless told otherwise, as a fraction of the limits: a line that nobody planned is taken with care.
+const MOVE_TO_SPEED: f64 = 0.2;
+
+/// The id of a module's resource on a host, `pan-tilt@sim`.
+pub(crate) fn resource_id(module: Module, host: &str) -> String {
+    let name = match module {
+        Module::Arm => "arm",
+        Module::Gripper => "gripper",
+        Module::PanTilt => "pan-tilt",
+        Module::Camera => "camera",
+    };
+    format!("{name}@{host}")
+}
+
+/// The server of all modules. Each takes one goal at a time, under a lease of its own resource.
+pub(crate) fn server(keeper: &Keeper, config: &CellConfig, channels: Channels) -> ActionServer {
+    let mut builder = ActionServer::builder("").one_at_a_time().channels(channels);
+    for (module, name, description, read) in ACTIONS {
+        builder = builder.action(ModuleAction {
+            name,
+            description,
+            resource: resource_id(module, &config.host),
+            keeper: keeper.clone(),
+            seed: config.seed,
+            read,
+        });
+    }
+    builder.build()
+}
+
+type Read = fn(&GoalContext) -> Result<Request, ActionFailure>;
+
+const ACTIONS: [(Module, &str, &str, Read); 6] = [
+    (Module::Arm, "follow", "moves the arm along a trajectory", |goal| {
+        Ok(Request::Follow { trajectory: goal.input_trajectory("trajectory")?.clone() })
+    }),
+    (Module::Arm, "move_to", "moves the arm on a straight line of joint space", |goal| {
+        let joints = goal.input_joints("joints")?;
+        let wrong = |_| ActionFailure::aborted(format!("input `joints` has {} values: the arm has 7", joints.len()));
+        let speed = goal.optional_float("speed")?.unwrap_or(MOVE_TO_SPEED);
+        Ok(Request::MoveTo { joints: joints.try_into().map_err(wrong)?, speed })
+    }),
+    (Module::Gripper, "grasp", "closes the fingers around an object", |goal| {
+        let expected = goal.port("expected").optional().map(|port| port.pose()).transpose()?;
+        Ok(Request::Grasp { object: goal.input_string("object")?.to_owned(), expected })
+    }),
+    (Module::Gripper, "release", "opens the fingers", |_| Ok(Request::Release)),
+    (Module::PanTilt, "look_at", "turns the camera to a point of the world", |goal| {
+        Ok(Request::LookAt { target: goal.input_pose("target")?.position })
+    }),
+    (Module::Camera, "capture", "takes a depth image, averaged over frames", |goal| {
+        let frames = goal.optional_int("frames")?.unwrap_or(1);
+        let wrong = |_| ActionFailure::aborted(format!("input `frames` is {frames}: expected 1 to {MAX_FRAMES}"));
+        Ok(Request::Capture { frames: u32::try_from(frames).map_err(wrong)? })
+    }),
+];
+
+struct ModuleAction {
+    name: &'static str,
+    description: &'static str,
+    resource: String,
+    keeper: Keeper,
+    seed: u64,
+    read: Read,
+}
+
+#[tonic::async_trait]
+impl Action for ModuleAction {
+    fn name(&self) -> &str {
+        self.name
+    }
+
+    fn description(&self) -> &str {
+        self.description
+    }
+
+    fn resource(&self) -> Option<&str> {
+        Some(&self.resource)
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        let request = (self.read)(&goal)?;
+        goal.checkpoint()?;
+        let (ticket, mut ended) = self.keeper.perform(goal.lease.as_ref().map(|lease| lease.id), request)?;
+        let ending = tokio::select! {
+            biased;
+            ending = &mut ended => ending,
+            () = goal.cancelled.cancelled() => {
+                self.keeper.tell(Event::Stop { ticket, reason: "the goal was told to stop".to_owned() })?;
+                match ended.await {
+                    // It had been done before the word came.
+                    Ok(Ending::Done(product)) => Ok(Ending::Done(product)),
+                    _ => return Err(goal.stopped()),
+                }
+            }
+        };
+        match ending? {
+            Ending::Done(product) => self.outcome(product).await,
+            Ending::Aborted(reason) => Err(ActionFailure::Aborted(reason)),
+            Ending::Preempted(reason) => Err(ActionFailure::Preempted(reason)),
+        }
+    }
+}
+
+impl ModuleAction {
+    async fn outcome(&self, product: Product) -> ActionResult {
+        let success = GoalOutcome::success();
+        Ok(match product {
+            Product::Moved { end } => success.with_output("end", Value::Joints(end.to_vec())),
+            Product::Grasped { object, width, in_gripper } => {
+                let outcome = success.with_output("width_m", Value::Float(width));
+                let fact = FactKey { predicate: "in_gripper".to_owned(), arguments: vec![Term::Name(object)] };
+                match in_gripper {
+                    Some(pose) => outcome.with_measured(fact, Value::Pose(pose)),
+                    None => outcome,
+                }
+            }
+            Product::Released => success,
+            Product::Looking { pan, tilt } => {
+                success.with_output("pan", Value::Float(pan)).with_output("tilt", Value::Float(tilt))
+            }
+            Product::Captured { camera, exposures } => {
+                let (keeper, seed) = (self.keeper.clone(), self.seed);
+                let developing = tokio::task::spawn_blocking(move || keeper.develop(&camera, seed, &exposures));
+                let image = developing.await?;
+                let optics = camera.intrinsics;
+                success
+                    .with_output("image", Value::Bytes(image.to_bytes()))
+                    .with_output("width", Value::Int(image.width as i64))
+                    .with_output("height", Value::Int(image.height as i64))
+                    .with_output("camera", Value::Pose(camera.pose))
+                    .with_output("fx", Value::Float(optics.fx))
+                    .with_output("fy", Value::Float(optics.fy))
+                    .with_output("cx", Value::Float(optics.cx))
+                    .with_output("cy", Value::Float(optics.cy))
+            }
+        })
+    }
+}

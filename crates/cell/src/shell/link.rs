@@ -1,0 +1,118 @@
+//! The link to the resource manager: a session, the modules and the battery as resources under it, the watch of leases.
+//! Follows the manager when it comes back somewhere else.
+
+use super::actions::resource_id;
+use super::keeper::Keeper;
+use super::leases::LeaseWatch;
+use crate::config::CellConfig;
+use crate::core::cell::Module;
+use ratn_model::resource::ResourceClass;
+use ratn_model::value::Value;
+use ratn_proto::types::Resource;
+use ratn_worker::action::ActionServer;
+use ratn_worker::client::{CallError, Channels, ResourceClient};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::provider::Provider;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::session::Session;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
+
+/// The role of the resource manager in the runtime directory.
+const RESOURCE_MANAGER: &str = "resource-manager";
+/// How long one wait for its endpoint file lasts; then it is looked for again.
+const FIND_DEADLINE: Duration = Duration::from_secs(60);
+/// How often the battery is looked at, and whether the manager has moved.
+const LOOK_INTERVAL: Duration = Duration::from_millis(500);
+/// The battery's level is told again when it has changed by this much.
+const LEVEL_STEP: f64 = 0.001;
+
+pub(crate) struct Link {
+    pub(crate) config: CellConfig,
+    pub(crate) directory: RuntimeDirectory,
+    pub(crate) channels: Channels,
+    /// Where the modules' actions are served.
+    pub(crate) endpoint: Endpoint,
+    pub(crate) keeper: Keeper,
+    pub(crate) server: ActionServer,
+}
+
+impl Link {
+    /// Keeps the link until `shutdown`.
+    pub(crate) async fn keep(self, shutdown: CancellationToken) {
+        while !shutdown.is_cancelled() {
+            let Some(Some(manager)) = shutdown.run_until_cancelled(self.find()).await else { continue };
+            let ttl = Duration::from_millis(self.config.session_ttl_ms);
+            let session = Session::open(&self.channels, &manager, &format!("cell@{}", self.config.host), ttl);
+            let linked = shutdown.run_until_cancelled(self.offer(&manager, &session)).await;
+            if let Some(Err(error)) = linked {
+                tracing::warn!(%manager, %error, "the resource manager does not want the cell's resources");
+            }
+            session.close().await;
+            // Gives a manager that refuses time to come to its senses.
+            let _ = shutdown.run_until_cancelled(tokio::time::sleep(LOOK_INTERVAL)).await;
+        }
+    }
+
+    async fn find(&self) -> Option<Endpoint> {
+        match &self.config.resource_manager {
+            Some(endpoint) => Some(endpoint.clone()),
+            None => {
+                let found = self.directory.wait_for(RESOURCE_MANAGER, FIND_DEADLINE).await;
+                found.inspect_err(|error| tracing::warn!(%error, "the cell's modules are offered to nobody yet")).ok()
+            }
+        }
+    }
+
+    /// Offers everything and keeps the battery's level up to date, until the manager is somewhere else.
+    async fn offer(&self, manager: &Endpoint, session: &Session) -> Result<(), CallError> {
+        let provider = Provider::start(&self.channels, manager, session)?;
+        let listening = Arc::new(Notify::new());
+        let watch = LeaseWatch {
+            client: ResourceClient::new(&self.channels, manager, "")?,
+            keeper: self.keeper.clone(),
+            server: self.server.clone(),
+            patience: Duration::from_millis(self.config.session_ttl_ms),
+            listening: Arc::clone(&listening),
+        };
+        let watching = watch.keep();
+        let offering = async {
+            // No lease of a module is given before its end can be heard.
+            listening.notified().await;
+            for module in Module::ALL {
+                let id = resource_id(module, &self.config.host);
+                let resource = Resource::new(id, ResourceClass::Module, module.kind()).with_endpoint(&self.endpoint);
+                provider.offer(resource.on_host(&self.config.host)).await?;
+            }
+            let mut told = f64::NEG_INFINITY;
+            loop {
+                let level = self.keeper.state().await.map_or(0.0, |state| state.battery);
+                if (level - told).abs() >= LEVEL_STEP {
+                    told = level;
+                    provider.offer(self.battery(level)).await?;
+                }
+                tokio::time::sleep(LOOK_INTERVAL).await;
+                if self.has_moved_from(manager) {
+                    return Ok(());
+                }
+            }
+        };
+        tokio::select! {
+            offered = offering => offered,
+            () = watching => Ok(()),
+        }
+    }
+
+    fn battery(&self, level: f64) -> Resource {
+        Resource::new(format!("battery@{}", self.config.host), ResourceClass::System, "Battery")
+            .with_attribute("level", Value::Float((level * 1000.0).round() / 1000.0))
+            .on_host(&self.config.host)
+    }
+
+    fn has_moved_from(&self, manager: &Endpoint) -> bool {
+        self.config.resource_manager.is_none()
+            && self.directory.find(RESOURCE_MANAGER).is_ok_and(|endpoint| endpoint != *manager)
+    }
+}

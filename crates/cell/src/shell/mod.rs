@@ -1,0 +1,58 @@
+//! The process around the cell's core.
+//!
+//! ```text
+//!   action service ─┐                                      ┌─▶ outcome of the goal
+//!   lease watch ────┼─event─▶ keeper.rs (Cell, a clock) ───┤
+//!   cell service ───┘         wakes when the core says     └─▶ ground truth
+//! ```
+//! The keeper's thread owns the core; everything else sends it messages.
+
+mod actions;
+mod clock;
+mod keeper;
+mod leases;
+mod link;
+mod service;
+
+use crate::config::CellConfig;
+use crate::core::cell::Cell;
+use anyhow::Context;
+use ratn_proto::v1::cell_service_server::CellServiceServer;
+use ratn_worker::client::Channels;
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::server::{Services, bind};
+use tokio_util::sync::CancellationToken;
+
+/// The role's name: of its endpoint file, its command and its section of a config.
+pub const ROLE: &str = "cell";
+
+/// Serves until `shutdown` is cancelled. The modules' resources are there as soon as the resource manager is.
+///
+/// # Errors
+/// Where the config is none, where it cannot listen or publish its endpoint, or where serving fails.
+pub async fn run(config: CellConfig, directory: RuntimeDirectory, shutdown: CancellationToken) -> anyhow::Result<()> {
+    config.check()?;
+    let listen: Endpoint = config.listen.parse().context("`listen` of the cell")?;
+    let laid = config.clone();
+    let cell = tokio::task::spawn_blocking(move || Cell::new(laid)).await.context("cannot lay the table")??;
+    let keeper = keeper::start(cell, clock::Clock::start(config.speed)).context("cannot start the cell")?;
+
+    let bound = bind(&listen).await?;
+    let endpoint = bound.endpoint().clone();
+    let channels = Channels::new();
+    let server = actions::server(&keeper, &config, channels.clone());
+    let services = Services::new()
+        .with(server.clone().into_service())
+        .with(CellServiceServer::new(service::Service::new(keeper.clone())));
+    let link =
+        link::Link { config, directory: directory.clone(), channels, endpoint: endpoint.clone(), keeper, server };
+    let linked = tokio::spawn(link.keep(shutdown.clone()));
+    let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
+    tracing::info!(%endpoint, "{ROLE} is ready");
+    let served = bound.serve(services, shutdown.clone()).await;
+    drop(published);
+    shutdown.cancel();
+    linked.await.context("the link to the resource manager")?;
+    Ok(served?)
+}

@@ -1,0 +1,68 @@
+//! The gRPC adapter of the ground truth.
+
+use super::keeper::{Keeper, KeeperError, State};
+use crate::config::MAX_BOXES;
+use crate::core::boxes::TrueBox;
+use ratn_proto::v1;
+use ratn_proto::v1::cell_service_server::CellService;
+use tonic::{Request, Response, Status};
+
+pub(crate) struct Service {
+    keeper: Keeper,
+}
+
+impl Service {
+    pub(crate) fn new(keeper: Keeper) -> Service {
+        Service { keeper }
+    }
+}
+
+#[tonic::async_trait]
+impl CellService for Service {
+    async fn get_ground_truth(
+        &self,
+        _: Request<v1::GetGroundTruthRequest>,
+    ) -> Result<Response<v1::GetGroundTruthResponse>, Status> {
+        let state = self.keeper.state().await.map_err(status)?;
+        Ok(Response::new(v1::GetGroundTruthResponse {
+            battery_level: state.battery,
+            arm: Some(v1::Joints { positions: state.arm.to_vec() }),
+            time_s: state.now.seconds(),
+            seed: state.seed,
+            boxes: boxes(state),
+        }))
+    }
+
+    async fn reset(&self, request: Request<v1::ResetRequest>) -> Result<Response<v1::ResetResponse>, Status> {
+        let v1::ResetRequest { seed, boxes: count } = request.into_inner();
+        let count = usize::try_from(count).unwrap_or(usize::MAX);
+        if !(1..=MAX_BOXES).contains(&count) {
+            return Err(Status::invalid_argument(format!("{count} boxes: a table has 1 to {MAX_BOXES}")));
+        }
+        let state = self.keeper.reset(seed, count).await.map_err(status)?;
+        if state.boxes.len() != count {
+            let message = format!("no feasible table with {count} boxes was found from seed {seed}; try another seed");
+            return Err(Status::failed_precondition(message));
+        }
+        Ok(Response::new(v1::ResetResponse { boxes: boxes(state) }))
+    }
+}
+
+fn boxes(state: State) -> Vec<v1::TrueBox> {
+    let wire = |b: TrueBox| v1::TrueBox {
+        id: b.id,
+        pose: Some(v1::Pose { position_m: b.pose.position.to_vec(), quaternion_xyzw: b.pose.quaternion_xyzw.to_vec() }),
+        size_m: b.size.to_vec(),
+        on_base: b.on_base,
+        held: b.held,
+        rests_on: b.on,
+    };
+    state.boxes.into_iter().map(wire).collect()
+}
+
+fn status(error: KeeperError) -> Status {
+    match error {
+        KeeperError::Overloaded => Status::resource_exhausted(error.to_string()),
+        KeeperError::Ended => Status::unavailable(error.to_string()),
+    }
+}

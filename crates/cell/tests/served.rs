@@ -1,0 +1,262 @@
+//! The cell over real sockets, with a real resource manager and the real detector.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_cell::config::CellConfig;
+use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
+use ratn_model::pose::Pose;
+use ratn_model::resource::{Lease, Requirement, ResourceOperation};
+use ratn_model::value::Value;
+use ratn_motion::aimm;
+use ratn_motion::collision::distance;
+use ratn_motion::robot::Joints;
+use ratn_proto::types::{Goal, GoalOutcome, ResourceEventKind, ResourceUpdate};
+use ratn_proto::v1;
+use ratn_proto::v1::cell_service_client::CellServiceClient;
+use ratn_worker::client::{AcquireOptions, ActionClient, CallError, Channels, ResourceClient, fresh_id};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::session::Session;
+use ratn_worker::worker::WorkerOptions;
+use std::collections::BTreeMap;
+use std::time::Duration;
+use tokio_util::sync::CancellationToken;
+
+const DEADLINE: Duration = Duration::from_secs(30);
+const TTL: Duration = Duration::from_secs(5);
+
+struct System {
+    manager: Endpoint,
+    cell: Endpoint,
+    channels: Channels,
+    resources: ResourceClient,
+    cell_end: CancellationToken,
+    end: CancellationToken,
+    _session: Session,
+    _directory: tempfile::TempDir,
+}
+
+/// A resource manager, a cell and a detector, with every resource there.
+async fn system(speed: f64, boxes: usize) -> System {
+    let temporary = tempfile::tempdir().unwrap();
+    let directory = RuntimeDirectory::create(temporary.path()).unwrap();
+    let end = CancellationToken::new();
+    let config = CellConfig { speed, boxes, seed: 3, ..CellConfig::default() };
+    let cell_end = end.child_token();
+    tokio::spawn(ratn_cell::run(config, directory.clone(), cell_end.clone()));
+    tokio::spawn(resource_manager::run(ResourceManagerConfig::default(), directory.clone(), end.clone()));
+    let manager = directory.wait_for(resource_manager::ROLE, DEADLINE).await.unwrap();
+    let cell = directory.wait_for(ratn_cell::ROLE, DEADLINE).await.unwrap();
+    let options = WorkerOptions {
+        id: "detector-1@here".to_owned(),
+        kind: "Detector".to_owned(),
+        resource_manager: Some(manager.clone()),
+        ..WorkerOptions::default()
+    };
+    tokio::spawn(ratn_workers::detector::worker(options).shutdown(end.clone()).run());
+    let channels = Channels::new();
+    let session = Session::open(&channels, &manager, "test", TTL);
+    session.alive(DEADLINE).await.unwrap();
+    let resources = ResourceClient::new(&channels, &manager, session.id()).unwrap();
+    System { manager, cell, channels, resources, cell_end, end, _session: session, _directory: temporary }
+}
+
+fn block(kind: &str) -> Requirement {
+    let (operation, kind) = (ResourceOperation::Block, kind.to_owned());
+    Requirement { operation, kind, class: None, attributes: BTreeMap::new(), count: 1 }
+}
+
+impl System {
+    /// Waits until the resources are there, too.
+    async fn acquire(&self, kinds: &[&str]) -> Lease {
+        let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+        self.resources.acquire(kinds.iter().map(|k| block(k)).collect(), options).await.unwrap()
+    }
+
+    async fn execute<const N: usize>(
+        &self,
+        lease: &Lease,
+        kind: &str,
+        action: &str,
+        inputs: [(&str, Value); N],
+    ) -> Result<GoalOutcome, CallError> {
+        let endpoint: Endpoint = lease.resource(kind).unwrap().endpoint.parse().unwrap();
+        let inputs = inputs.into_iter().map(|(port, value)| (port.to_owned(), value)).collect();
+        let goal =
+            Goal { id: fresh_id("goal"), action: action.to_owned(), inputs, lease: Some(lease.clone()), ..goal() };
+        ActionClient::new(self.channels.clone()).execute(&endpoint, goal, |_, _| {}).await
+    }
+
+    async fn truth(&self) -> v1::GetGroundTruthResponse {
+        let mut client = CellServiceClient::new(self.channels.get(&self.cell).unwrap());
+        client.get_ground_truth(v1::GetGroundTruthRequest {}).await.unwrap().into_inner()
+    }
+
+    async fn arm(&self) -> Joints {
+        self.truth().await.arm.unwrap().positions.try_into().unwrap()
+    }
+
+    /// Returns once the arm is on its way.
+    async fn under_way(&self) {
+        while distance(&self.arm().await, &aimm::HOME) < 0.02 {
+            tokio::task::yield_now().await;
+        }
+    }
+}
+
+fn goal() -> Goal {
+    Goal {
+        id: String::new(),
+        action: String::new(),
+        inputs: BTreeMap::new(),
+        seed: 0,
+        lease: None,
+        projection: None,
+        world_pool: String::new(),
+        deadline_ms: 0,
+    }
+}
+
+fn to_observation() -> [(&'static str, Value); 2] {
+    [("joints", Value::Joints(aimm::OBSERVATION.to_vec())), ("speed", Value::Float(0.3))]
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_cell_offers_its_modules_and_its_battery() {
+    let system = system(1.0, 1).await;
+    for kind in ["Arm", "Gripper", "PanTilt", "Camera"] {
+        let lease = system.acquire(&[kind]).await;
+        assert_eq!(lease.resource(kind).unwrap().endpoint, system.cell.to_string());
+    }
+    let exists = Requirement { operation: ResourceOperation::Exists, ..block("Battery") };
+    let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+    system.resources.acquire(vec![exists], options).await.unwrap();
+    let battery = system.resources.list(&["Battery"]).await.unwrap();
+    assert!(matches!(battery[0].attributes["level"], Value::Float(level) if level > 0.9));
+    system.end.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_detector_finds_the_boxes_through_the_leased_camera() {
+    let system = system(20.0, 3).await;
+    let lease = system.acquire(&["Arm", "PanTilt", "Camera", "Detector"]).await;
+    assert!(system.execute(&lease, "Arm", "move_to", to_observation()).await.unwrap().is_success());
+    let [x, y, _] = aimm::TABLE_CENTRE;
+    let table = Pose::at(x, y, aimm::TABLE_HEIGHT_M);
+    let looked = system.execute(&lease, "PanTilt", "look_at", [("target", Value::Pose(table))]).await.unwrap();
+    assert!(looked.is_success(), "{looked:?}");
+    let size = Value::List(vec![Value::Float(0.6), Value::Float(1.2)]);
+    let region = Value::map([("pose", Value::Pose(table)), ("size", size)]);
+    let outcome = system.execute(&lease, "Detector", "segment", [("region", region)]).await.unwrap();
+    assert!(outcome.is_success(), "{outcome:?}");
+    let Value::List(boxes) = &outcome.outputs["boxes"] else { panic!() };
+    let truth = system.truth().await.boxes;
+    assert_eq!(boxes.len(), truth.len());
+    for found in boxes {
+        let Some(Value::Pose(pose)) = found.field("pose") else { panic!() };
+        let off = |t: &v1::TrueBox| {
+            let p = &t.pose.as_ref().unwrap().position_m;
+            pose.distance(&Pose::at(p[0], p[1], p[2]))
+        };
+        assert!(truth.iter().map(off).fold(f64::INFINITY, f64::min) < 0.008);
+        let located = system.execute(&lease, "Detector", "locate", [("object", found.clone())]).await.unwrap();
+        assert!(matches!(&located.outputs["pose"], Value::Pose(again) if again.distance(pose) < 0.003));
+    }
+    system.end.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_arm_whose_lease_or_session_ends_in_mid_motion_stops_and_holds() {
+    for whole_session in [false, true] {
+        let system = system(1.0, 1).await;
+        let session = Session::open(&system.channels, &system.manager, "another", TTL);
+        session.alive(DEADLINE).await.unwrap();
+        let resources = ResourceClient::new(&system.channels, &system.manager, session.id()).unwrap();
+        let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+        let lease = resources.acquire(vec![block("Arm")], options).await.unwrap();
+        let moving = system.execute(&lease, "Arm", "move_to", to_observation());
+        let ending = async {
+            system.under_way().await;
+            if whole_session {
+                session.close().await;
+            } else {
+                resources.release(lease.id).await.unwrap();
+            }
+        };
+        let (outcome, ()) = tokio::join!(moving, ending);
+        let outcome = outcome.unwrap();
+        assert_eq!(outcome.outcome, "aborted");
+        assert!(outcome.reason.contains("lease"), "{}", outcome.reason);
+        let held = system.arm().await;
+        assert!(distance(&held, &aimm::OBSERVATION) > 0.1);
+        assert_eq!(system.arm().await, held);
+        system.end.cancel();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_arm_whose_client_is_gone_stops_and_holds() {
+    let system = system(1.0, 1).await;
+    let lease = system.acquire(&["Arm"]).await;
+    tokio::select! {
+        outcome = system.execute(&lease, "Arm", "move_to", to_observation()) => panic!("{outcome:?}"),
+        () = system.under_way() => {}
+    }
+    // The next goal is taken as soon as the abandoned one holds.
+    let here = loop {
+        let here = system.arm().await;
+        if here == system.arm().await {
+            break here;
+        }
+    };
+    assert!(distance(&here, &aimm::OBSERVATION) > 0.1);
+    let back = [("joints", Value::Joints(aimm::HOME.to_vec()))];
+    assert!(system.execute(&lease, "Arm", "move_to", back).await.unwrap().is_success());
+    system.end.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_goal_with_an_older_lease_or_without_one_is_refused() {
+    let system = system(20.0, 1).await;
+    let old = system.acquire(&["Arm"]).await;
+    system.resources.release(old.id).await.unwrap();
+    let new = system.acquire(&["Arm"]).await;
+    assert!(new.token > old.token);
+    assert!(system.execute(&new, "Arm", "move_to", to_observation()).await.unwrap().is_success());
+    let refused = system.execute(&old, "Arm", "move_to", to_observation()).await.unwrap_err();
+    assert!(!refused.is_crash() && refused.to_string().contains("is over"), "{refused}");
+    let none = Goal { id: fresh_id("goal"), action: "release".to_owned(), ..goal() };
+    let refused = ActionClient::new(system.channels.clone()).execute(&system.cell, none, |_, _| {}).await;
+    assert!(refused.unwrap_err().to_string().contains("no lease"));
+    system.end.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_reset_lays_the_same_table_again() {
+    let system = system(1.0, 4).await;
+    let first = system.truth().await.boxes;
+    let mut client = CellServiceClient::new(system.channels.get(&system.cell).unwrap());
+    let other = client.reset(v1::ResetRequest { seed: 8, boxes: 2 }).await.unwrap().into_inner().boxes;
+    assert_eq!(other.len(), 2);
+    let again = client.reset(v1::ResetRequest { seed: 3, boxes: 4 }).await.unwrap().into_inner().boxes;
+    assert_eq!(first, again);
+    assert!(client.reset(v1::ResetRequest { seed: 3, boxes: 10 }).await.is_err());
+    system.end.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_modules_vanish_when_the_cell_ends() {
+    let system = system(1.0, 1).await;
+    system.acquire(&["Arm"]).await;
+    let mut watch = system.resources.watch(&["Arm"]).await.unwrap();
+    system.cell_end.cancel();
+    loop {
+        if let Some(ResourceUpdate::Event(event)) = watch.next().await.unwrap()
+            && event.kind == ResourceEventKind::Deleted
+        {
+            break;
+        }
+    }
+    assert_eq!(system.resources.list(&["Arm", "Gripper", "PanTilt", "Camera", "Battery"]).await.unwrap().len(), 0);
+    system.end.cancel();
+}
