@@ -3,8 +3,9 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic and print")]
 
 use ratn_cell::config::CellConfig;
-use ratn_cell::core::cell::{Cell, Command, Ending, Event, Module, Product, Request, Ticket};
+use ratn_cell::core::cell::Cell;
 use ratn_cell::core::picture::develop;
+use ratn_cell::core::protocol::{Command, Ending, Event, Module, Product, Request, Ticket};
 use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;

@@ -5,8 +5,11 @@ pub mod cell;
 pub mod grasping;
 pub mod picture;
 pub mod placement;
+pub mod protocol;
 pub mod settling;
 
 mod activity;
 mod battery;
+mod holding;
+mod starting;
 mod trajectory;

@@ -2,9 +2,10 @@
 
 use super::keeper::Keeper;
 use crate::config::CellConfig;
-use crate::core::cell::{Ending, Event, MAX_FRAMES, Module, Product, Request};
+use crate::core::protocol::{Ending, Event, Module, Product, Request};
 use ratn_model::fact::{FactKey, Term};
 use ratn_model::value::Value;
+use ratn_perception::noise::MAX_FRAMES;
 use ratn_worker::action::{Action, ActionFailure, ActionResult, ActionServer, GoalContext, GoalOutcome};
 use ratn_worker::client::Channels;
 

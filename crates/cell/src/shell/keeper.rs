@@ -3,8 +3,9 @@
 //! A thread, not a task: checking a trajectory takes milliseconds, and a motion has to stop on time whatever the runtime does.
 
 use super::clock::Clock;
-use crate::core::cell::{Cell, Command, Ending, Event, Request, Ticket};
+use crate::core::cell::Cell;
 use crate::core::picture::{Exposure, develop};
+use crate::core::protocol::{Command, Ending, Event, Request, Ticket};
 use ratn_model::id::LeaseId;
 use ratn_model::time::Timestamp;
 use ratn_motion::robot::{Joints, Robot};

@@ -4,7 +4,7 @@
 //! a lease goes on. After a pause, what the manager says first is compared with what is under way.
 
 use super::keeper::Keeper;
-use crate::core::cell::{Event, Module};
+use crate::core::protocol::{Event, Module};
 use ratn_model::id::LeaseId;
 use ratn_proto::types::{ResourceEventKind, ResourceUpdate};
 use ratn_worker::action::ActionServer;

@@ -5,7 +5,7 @@ use super::actions::resource_id;
 use super::keeper::Keeper;
 use super::leases::LeaseWatch;
 use crate::config::CellConfig;
-use crate::core::cell::Module;
+use crate::core::protocol::Module;
 use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
 use ratn_proto::types::Resource;

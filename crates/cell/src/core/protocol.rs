@@ -1,0 +1,164 @@
+//! What goes into the cell's core and comes out of it.
+
+pub use super::activity::{Module, Ticket};
+use super::picture::Exposure;
+use ratn_model::id::LeaseId;
+use ratn_model::pose::Pose;
+use ratn_model::value::Trajectory;
+use ratn_motion::robot::Joints;
+use ratn_perception::camera::Camera;
+use std::collections::BTreeSet;
+
+/// What happens to the cell.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Event {
+    /// A goal for a module.
+    Start {
+        /// How the goal will be called.
+        ticket: Ticket,
+        /// Under which lease.
+        lease: Option<LeaseId>,
+        /// What to do.
+        request: Request,
+    },
+    /// A goal's giver wants it to stop, or is gone.
+    Stop {
+        /// Which goal.
+        ticket: Ticket,
+        /// Why.
+        reason: String,
+    },
+    /// A lease is over.
+    LeaseEnded {
+        /// Which.
+        lease: LeaseId,
+        /// Why.
+        reason: String,
+    },
+    /// Nobody knows any more which leases live.
+    LeasesLost {
+        /// Why.
+        reason: String,
+    },
+    /// Only these leases live.
+    LeasesAre {
+        /// All of them.
+        living: BTreeSet<LeaseId>,
+    },
+    /// A new table; the robot goes back to its first posture.
+    Reset {
+        /// From which seed.
+        seed: u64,
+        /// With how many boxes.
+        boxes: usize,
+    },
+    /// Only time has passed.
+    Tick,
+}
+
+/// What a module can do.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Request {
+    /// The arm along a trajectory.
+    Follow {
+        /// From where the arm is.
+        trajectory: Trajectory,
+    },
+    /// The arm straight to a posture.
+    MoveTo {
+        /// Where to.
+        joints: Joints,
+        /// How much of its greatest speed, above 0 and at most 1.
+        speed: f64,
+    },
+    /// Closes the fingers around something.
+    Grasp {
+        /// How the giver calls it.
+        object: String,
+        /// Where it should be in the tool frame then.
+        expected: Option<Pose>,
+    },
+    /// Opens the fingers.
+    Release,
+    /// Turns the camera.
+    LookAt {
+        /// Towards this point of the world.
+        target: [f64; 3],
+    },
+    /// Takes a picture.
+    Capture {
+        /// The average of so many frames.
+        frames: u32,
+    },
+}
+
+/// What the cell has to say.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Command {
+    /// A goal has ended.
+    Ended {
+        /// Which.
+        ticket: Ticket,
+        /// How.
+        ending: Ending,
+    },
+}
+
+/// How a goal ends.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Ending {
+    /// As it should.
+    Done(Product),
+    /// It was not done, or not to its end. The module holds.
+    Aborted(String),
+    /// It was stopped. The module holds.
+    Preempted(String),
+}
+
+/// What comes of a goal.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Product {
+    /// The arm is there.
+    Moved {
+        /// Its posture.
+        end: Joints,
+    },
+    /// Something is in the gripper.
+    Grasped {
+        /// How the giver calls it.
+        object: String,
+        /// The opening of the fingers around it, in metres.
+        width: f64,
+        /// Where it is in the tool frame; turned like the expected pose, as far as its symmetry allows. `None` when
+        /// nothing was expected: which way round it is would be anybody's guess.
+        in_gripper: Option<Pose>,
+    },
+    /// The fingers are open.
+    Released,
+    /// The camera looks there.
+    Looking {
+        /// Radians.
+        pan: f64,
+        /// Radians.
+        tilt: f64,
+    },
+    /// A picture to be developed.
+    Captured {
+        /// From where.
+        camera: Camera,
+        /// What was there, frame by frame.
+        exposures: Vec<Exposure>,
+    },
+}
+
+impl Request {
+    /// The module that does it.
+    pub fn module(&self) -> Module {
+        match self {
+            Request::Follow { .. } | Request::MoveTo { .. } => Module::Arm,
+            Request::Grasp { .. } | Request::Release => Module::Gripper,
+            Request::LookAt { .. } => Module::PanTilt,
+            Request::Capture { .. } => Module::Camera,
+        }
+    }
+}

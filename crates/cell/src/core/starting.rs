@@ -1,0 +1,110 @@
+//! How goals start: what is refused, and how long the rest will take.
+
+use super::activity::{Activity, Kind, Module, Ticket, seconds};
+use super::cell::Cell;
+use super::protocol::Request;
+use super::trajectory;
+use ratn_model::id::LeaseId;
+use ratn_model::pose::Pose;
+use ratn_motion::robot::Configuration;
+use ratn_perception::camera::Camera;
+use ratn_perception::noise::MAX_FRAMES;
+
+/// How far the camera may look past its target, in radians.
+const MAX_LOOK_ERROR_RAD: f64 = 0.02;
+
+impl Cell {
+    pub(super) fn start(&mut self, ticket: Ticket, lease: Option<LeaseId>, request: Request) -> Result<(), String> {
+        let module = request.module();
+        if let Some(other) = self.activities.get(&module) {
+            return Err(format!("the {} is busy with goal {}", module.kind(), other.ticket.0));
+        }
+        if self.battery.level() <= 0.0 {
+            return Err("the battery is empty".to_owned());
+        }
+        let here = self.configuration();
+        let (kind, lasts_s) = match request {
+            Request::Follow { trajectory } => {
+                self.no_motion_of(Module::Gripper)?;
+                let trajectory = trajectory::check(&self.robot, &self.scene(), &here, &trajectory)?;
+                let lasts_s = trajectory.duration_s();
+                (Kind::Follow { trajectory }, lasts_s)
+            }
+            Request::MoveTo { joints, speed } => {
+                self.no_motion_of(Module::Gripper)?;
+                let scene = self.scene();
+                let line = trajectory::straight(&self.robot, &scene, &here.arm, &joints, speed)?;
+                let trajectory = trajectory::check(&self.robot, &scene, &here, &line)?;
+                let lasts_s = trajectory.duration_s();
+                (Kind::Follow { trajectory }, lasts_s)
+            }
+            Request::Grasp { object, expected } => {
+                self.no_motion_of(Module::Arm)?;
+                if let Some(held) = self.held() {
+                    return Err(format!("the gripper holds {} already", self.boxes[held].id));
+                }
+                (Kind::Close { from: here.finger, object, expected }, self.config.gripper.close_s)
+            }
+            Request::Release => {
+                self.no_motion_of(Module::Arm)?;
+                self.let_go();
+                let to = self.config.gripper.opening_m / 2.0;
+                (Kind::Open { from: here.finger, to }, self.config.gripper.open_s)
+            }
+            Request::LookAt { target } => {
+                self.no_motion_of(Module::Camera)?;
+                let to = self.aim(target)?;
+                let from = [here.pan, here.tilt];
+                let lasts_s = self.turning_s(from, to) + self.config.pan_tilt.settle_s;
+                (Kind::Look { from, to }, lasts_s)
+            }
+            Request::Capture { frames } => {
+                self.no_motion_of(Module::PanTilt)?;
+                if !(1..=MAX_FRAMES).contains(&frames) {
+                    return Err(format!("a picture has 1 to {MAX_FRAMES} frames, not {frames}"));
+                }
+                let camera = Camera { intrinsics: self.config.camera.intrinsics, pose: self.robot.camera_pose(&here) };
+                let period = 1.0 / self.config.camera.frames_per_s;
+                let next = self.now + seconds(period);
+                let kind = Kind::Capture { camera, frames, taken: 0, next, exposures: Vec::new() };
+                (kind, period * f64::from(frames))
+            }
+        };
+        let (started, ends) = (self.now, self.now + seconds(lasts_s));
+        self.activities.insert(module, Activity { ticket, lease, started, ends, kind });
+        Ok(())
+    }
+
+    fn no_motion_of(&self, module: Module) -> Result<(), String> {
+        match self.activities.get(&module) {
+            None => Ok(()),
+            Some(other) => Err(format!("the {} is under way with goal {}", module.kind(), other.ticket.0)),
+        }
+    }
+
+    fn aim(&self, target: [f64; 3]) -> Result<[f64; 2], String> {
+        let (pan, tilt) = self.robot.look_at(&Pose::IDENTITY, target);
+        let camera = self.robot.camera_pose(&Configuration { pan, tilt, ..self.configuration() });
+        let seen = camera.inverse().transform(target);
+        let off = seen[0].hypot(seen[1]).atan2(seen[2]);
+        if off > MAX_LOOK_ERROR_RAD {
+            let degrees = off.to_degrees();
+            let [x, y, z] = target;
+            return Err(format!(
+                "the camera cannot be turned to ({x:.2}, {y:.2}, {z:.2}): its limits end {degrees:.0}° before"
+            ));
+        }
+        Ok([pan, tilt])
+    }
+
+    /// How long the head takes, with ramps of the greatest acceleration on the joint that takes longest.
+    fn turning_s(&self, from: [f64; 2], to: [f64; 2]) -> f64 {
+        let time = |joint: usize, way: f64| {
+            let (speed, acceleration) =
+                (self.robot.joints[joint].velocity * self.config.pan_tilt.speed, self.robot.joints[joint].acceleration);
+            let ramp = speed * speed / acceleration;
+            if way >= ramp { way / speed + speed / acceleration } else { 2.0 * (way / acceleration).sqrt() }
+        };
+        time(10, (to[0] - from[0]).abs()).max(time(11, (to[1] - from[1]).abs()))
+    }
+}
