@@ -214,6 +214,8 @@ pub enum Note {
     Decided {
         /// Its id.
         instance: InstanceId,
+        /// Its path.
+        path: String,
         /// What it came to: `then`, `else`, or the number of elements.
         decision: String,
     },

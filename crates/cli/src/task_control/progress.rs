@@ -51,9 +51,7 @@ impl Progress {
                 Command::Note(Note::Expanded { instance, path, .. }) => {
                     self.paths.insert(*instance, path.clone());
                 }
-                Command::Note(Note::Decided { instance, decision }) => {
-                    say(at, &format!("decide {}: {decision}", self.path(*instance)));
-                }
+                Command::Note(Note::Decided { path, decision, .. }) => say(at, &format!("decide {path}: {decision}")),
                 Command::Note(Note::Squashed { instance }) if self.started.remove(instance).is_some() => {
                     say(at, &format!("squash {}", self.path(*instance)));
                 }

@@ -55,7 +55,8 @@ impl Window {
             Some(Err(error)) => return self.end_instance(id, Ended::aborted(error.to_string())),
             None => return false,
         };
-        context.note(Note::Decided { instance: id, decision });
+        let path = self.path(id).to_owned();
+        context.note(Note::Decided { instance: id, path, decision });
         self.end_instance(id, Ended::success(Outputs::new()))
     }
 
