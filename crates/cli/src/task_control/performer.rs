@@ -17,7 +17,7 @@ use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::{DEFAULT_TTL, Session};
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
@@ -32,7 +32,19 @@ const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
 /// At the end of a run, for everything that is still being given back.
 const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
 
-type Leases = Arc<Mutex<BTreeMap<InstanceId, (LeaseId, FencingToken)>>>;
+/// An event on its way to the executive.
+#[derive(Debug)]
+pub(super) struct Answer {
+    event: Event,
+    /// Of an acquire: whether it was withdrawn meanwhile.
+    withdrawn: Option<CancellationToken>,
+}
+
+impl From<Event> for Answer {
+    fn from(event: Event) -> Answer {
+        Answer { event, withdrawn: None }
+    }
+}
 
 /// One run's hands.
 pub(super) struct Performer {
@@ -43,11 +55,11 @@ pub(super) struct Performer {
     actions: ActionClient,
     world: WorldClient,
     session: Session,
-    events: mpsc::Sender<Event>,
+    events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
     cancelled: Cancelled,
     asking: BTreeMap<InstanceId, CancellationToken>,
-    leases: Leases,
+    leases: BTreeMap<InstanceId, (LeaseId, FencingToken)>,
     jobs: BTreeMap<InstanceId, Job>,
     giving_back: JoinSet<()>,
     acquires: u64,
@@ -65,7 +77,7 @@ impl Performer {
         endpoints: &Endpoints,
         catalogue: Arc<Catalogue>,
         task: &str,
-        events: mpsc::Sender<Event>,
+        events: mpsc::Sender<Answer>,
     ) -> anyhow::Result<Performer> {
         let channels = Channels::new();
         let run = fresh_id("run");
@@ -95,7 +107,7 @@ impl Performer {
             records,
             cancelled,
             asking: BTreeMap::new(),
-            leases: Leases::default(),
+            leases: BTreeMap::new(),
             jobs: BTreeMap::new(),
             giving_back: JoinSet::new(),
             acquires: 0,
@@ -125,7 +137,7 @@ impl Performer {
                 }
             }
             Command::Project { instance, attempt, base, changes, reads } => {
-                let lease = self.leases.lock().unwrap_or_else(PoisonError::into_inner).get(&instance).copied();
+                let lease = self.leases.get(&instance).copied();
                 self.record(Record::Project { instance, attempt, base, changes, reads, lease })?;
             }
             Command::Start { instance, attempt, goal } => self.start(instance, attempt, goal),
@@ -176,31 +188,40 @@ impl Performer {
             deadline: ACQUIRE_DEADLINE,
             holder: format!("{} {instance}", self.task),
         };
-        let (resources, events, leases) = (self.resources.clone(), self.events.clone(), self.leases.clone());
+        let (resources, events) = (self.resources.clone(), self.events.clone());
         tokio::spawn(async move {
             let ask = || resources.acquire(requirements.clone(), options.clone());
             let answer = tokio::select! {
-                answer = patiently(Attempts::IDEMPOTENT, ask) => Some(answer),
-                () = withdrawn.cancelled() => None,
-            };
-            let event = match answer {
-                Some(Ok(lease)) if withdrawn.is_cancelled() => {
-                    let _ = resources.release(lease.id).await;
-                    return;
-                }
-                Some(Ok(lease)) => {
-                    leases.lock().unwrap_or_else(PoisonError::into_inner).insert(instance, (lease.id, lease.token));
-                    Event::Granted { instance, lease }
-                }
-                Some(Err(error)) => Event::Refused { instance, reason: said(&error) },
-                None => {
+                answer = patiently(Attempts::IDEMPOTENT, ask) => answer,
+                () = withdrawn.cancelled() => {
                     // The call is dropped; what was granted meanwhile goes back.
                     let _ = patiently(Attempts::IDEMPOTENT, || resources.withdraw(&options.request)).await;
                     return;
                 }
             };
-            let _ = events.send(event).await;
+            let event = match answer {
+                Ok(lease) => Event::Granted { instance, lease },
+                Err(error) => Event::Refused { instance, reason: said(&error) },
+            };
+            let _ = events.send(Answer { event, withdrawn: Some(withdrawn) }).await;
         });
+    }
+
+    /// The event of an answer; `None` when what it answers was withdrawn: a grant that crossed goes back.
+    pub(super) fn accept(&mut self, answer: Answer) -> Option<Event> {
+        let crossed = answer.withdrawn.is_some_and(|withdrawn| withdrawn.is_cancelled());
+        match answer.event {
+            Event::Granted { instance, lease } if crossed => {
+                self.give_back(instance, None, Some(lease.id), None);
+                None
+            }
+            _ if crossed => None,
+            Event::Granted { instance, lease } => {
+                self.leases.insert(instance, (lease.id, lease.token));
+                Some(Event::Granted { instance, lease })
+            }
+            event => Some(event),
+        }
     }
 
     fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal) {
@@ -226,7 +247,7 @@ impl Performer {
             if let Some(event) = event
                 && !stopped.is_cancelled()
             {
-                let _ = events.send(event).await;
+                let _ = events.send(event.into()).await;
             }
         });
         self.jobs.insert(instance, Job { attempt, stop, ended });
@@ -249,8 +270,18 @@ impl Performer {
 
     fn release(&mut self, instance: InstanceId, lease: Option<LeaseId>, projection: Option<ProjectionId>) {
         self.asking.remove(&instance);
-        self.leases.lock().unwrap_or_else(PoisonError::into_inner).remove(&instance);
+        self.leases.remove(&instance);
         let job = self.jobs.remove(&instance);
+        self.give_back(instance, job, lease, projection);
+    }
+
+    fn give_back(
+        &mut self,
+        instance: InstanceId,
+        job: Option<Job>,
+        lease: Option<LeaseId>,
+        projection: Option<ProjectionId>,
+    ) {
         let (resources, world) = (self.resources.clone(), self.world.clone());
         self.giving_back.spawn(async move {
             // Whoever gets the resources next finds them idle.
@@ -278,13 +309,13 @@ async fn execute(
     goal: types::Goal,
     instance: InstanceId,
     attempt: u32,
-    events: &mpsc::Sender<Event>,
+    events: &mpsc::Sender<Answer>,
     stop: &CancellationToken,
 ) -> Option<Event> {
     let id = goal.id.clone();
     let on_progress = |message: String, _: BTreeMap<String, Value>| {
         // Progress is for people: when events pile up, it is what can be missed.
-        let _ = events.try_send(Event::Progressed { instance, attempt, message });
+        let _ = events.try_send(Event::Progressed { instance, attempt, message }.into());
     };
     let mut executing = std::pin::pin!(actions.execute(endpoint, goal, on_progress));
     let answer = tokio::select! {
@@ -321,5 +352,55 @@ fn aborted(instance: InstanceId, attempt: u32, reason: String) -> Event {
         outputs: BTreeMap::new(),
         measured: Vec::new(),
         reason,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
+    use ratn_daemon::world_pool::{self, WorldPoolConfig};
+    use ratn_model::resource::{ResourceClass, ResourceOperation};
+    use ratn_proto::types::Resource;
+    use ratn_worker::runtime_directory::RuntimeDirectory;
+
+    fn arm() -> Vec<Requirement> {
+        vec![Requirement {
+            operation: ResourceOperation::Block,
+            kind: "Arm".into(),
+            class: None,
+            attributes: BTreeMap::new(),
+            count: 1,
+        }]
+    }
+
+    #[tokio::test]
+    async fn a_grant_that_crosses_its_withdrawal_goes_back() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        let directory = RuntimeDirectory::create(place.path())?;
+        let shutdown = CancellationToken::new();
+        tokio::spawn(resource_manager::run(ResourceManagerConfig::default(), directory.clone(), shutdown.clone()));
+        tokio::spawn(world_pool::run(WorldPoolConfig::default(), directory.clone(), shutdown.clone()));
+        let endpoints = Endpoints {
+            resource_manager: directory.wait_for(resource_manager::ROLE, SESSION_DEADLINE).await?,
+            world_pool: directory.wait_for(world_pool::ROLE, SESSION_DEADLINE).await?,
+        };
+        let (events, mut answers) = mpsc::channel(8);
+        let mut performer = Performer::connect(&endpoints, Arc::default(), "task", events).await?;
+        performer.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
+
+        let instance = InstanceId(1);
+        performer.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })?;
+        let granted = answers.recv().await;
+        performer.perform(Command::Withdraw { instance })?;
+        assert_eq!(granted.and_then(|answer| performer.accept(answer)), None);
+
+        // Nobody holds the arm: the same instance gets it when it asks again.
+        performer.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })?;
+        let granted = answers.recv().await.and_then(|answer| performer.accept(answer));
+        assert!(matches!(granted, Some(Event::Granted { .. })), "{granted:?}");
+        performer.close().await;
+        shutdown.cancel();
+        Ok(())
     }
 }

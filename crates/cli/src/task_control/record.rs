@@ -1,6 +1,7 @@
 //! What must reach the world pool and the resource manager in the order in which it was decided: projections, commits,
 //! creation and deletion of task resources. One task, one request at a time.
 
+use super::performer::Answer;
 use super::retry::{Attempts, patiently};
 use ratn_executive::protocol::Event;
 use ratn_model::fact::{Change, Footprint};
@@ -48,7 +49,7 @@ pub(super) struct Recorder {
     pub(super) world: WorldClient,
     pub(super) resources: ResourceClient,
     pub(super) cancelled: Cancelled,
-    pub(super) events: mpsc::Sender<Event>,
+    pub(super) events: mpsc::Sender<Answer>,
 }
 
 impl Recorder {
@@ -68,7 +69,7 @@ impl Recorder {
                 }
             };
             if let Some(event) = event
-                && self.events.send(event).await.is_err()
+                && self.events.send(event.into()).await.is_err()
             {
                 return;
             }

@@ -86,19 +86,25 @@ pub(crate) async fn run(run: Run, endpoints: &super::Endpoints, interrupt: &Inte
             }
             performer.perform(command)?;
         }
-        event = tokio::select! {
-            answer = answers.recv() => answer.context("nothing can answer any more")?,
-            () = interrupt.asked_times(1), if !asked_to_abort => {
-                asked_to_abort = true;
-                Event::AbortRequested { reason: "the user asked for it".into() }
-            }
-            () = performer.lost(), if !asked_to_abort => {
-                asked_to_abort = true;
-                Event::AbortRequested { reason: "the session with the resource manager, and every lease, is lost".into() }
-            }
-            () = interrupt.asked_times(2) => {
-                performer.close().await;
-                bail!("interrupted twice: the run was left where it was");
+        event = loop {
+            let answer = tokio::select! {
+                answer = answers.recv() => answer.context("nothing can answer any more")?,
+                () = interrupt.asked_times(1), if !asked_to_abort => {
+                    asked_to_abort = true;
+                    Event::AbortRequested { reason: "the user asked for it".into() }.into()
+                }
+                () = performer.lost(), if !asked_to_abort => {
+                    asked_to_abort = true;
+                    let reason = "the session with the resource manager, and every lease, is lost".into();
+                    Event::AbortRequested { reason }.into()
+                }
+                () = interrupt.asked_times(2) => {
+                    performer.close().await;
+                    bail!("interrupted twice: the run was left where it was");
+                }
+            };
+            if let Some(event) = performer.accept(answer) {
+                break event;
             }
         };
     };
