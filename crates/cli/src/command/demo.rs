@@ -52,9 +52,12 @@ pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     });
     // Whatever was run is shown, also when not all was.
     draw(&mut demonstration)?;
-    eprintln!("\n{demonstration}");
     if arguments.json {
+        eprintln!("\n{demonstration}");
         println!("{}", serde_json::to_string_pretty(&demonstration.to_json())?);
+    } else {
+        eprintln!();
+        println!("{demonstration}");
     }
     outcome
 }

@@ -14,6 +14,7 @@ use crate::task_control::shell::{self, Ended, Run};
 use anyhow::{Context, anyhow, bail};
 use ratn_executive::protocol::Mode;
 use ratn_model::program::SUCCESS;
+use ratn_model::value::Value;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -117,7 +118,7 @@ fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()
     }
     let statistics = Statistics::of(&timeline);
     if arguments.json {
-        let outputs = serde_json::to_value(&ended.outputs)?;
+        let outputs: serde_json::Map<_, _> = ended.outputs.iter().map(|(k, v)| (k.clone(), plain(v))).collect();
         let document = serde_json::json!({
             "outcome": ended.outcome, "reason": ended.reason, "outputs": outputs,
             "makespan_s": ended.makespan_s, "log": log, "statistics": statistics,
@@ -130,6 +131,21 @@ fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()
         println!("{name} = {value}");
     }
     Ok(())
+}
+
+/// A value as other programs expect it; what has no plain form is written as in an event log.
+fn plain(value: &Value) -> serde_json::Value {
+    match value {
+        Value::Null => serde_json::Value::Null,
+        Value::Bool(b) => (*b).into(),
+        Value::Int(i) => (*i).into(),
+        Value::Float(x) => (*x).into(),
+        Value::String(s) => s.as_str().into(),
+        Value::Joints(positions) => positions.clone().into(),
+        Value::List(items) => items.iter().map(plain).collect(),
+        Value::Map(fields) => fields.iter().map(|(name, value)| (name.clone(), plain(value))).collect(),
+        Value::Pose(_) | Value::Trajectory(_) | Value::Bytes(_) => serde_json::to_value(value).unwrap_or_default(),
+    }
 }
 
 fn log_file(task: &str) -> anyhow::Result<PathBuf> {
