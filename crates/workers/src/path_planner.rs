@@ -1,7 +1,7 @@
 //! The path planner worker: one action, `plan`.
 //!
 //! It reads the facts of the goal's projection that make the scene, plans on a thread of its own and answers with a timed
-//! trajectory. All durations in its goals and answers are in the robot's seconds; [`clock`] knows how many of them pass in
+//! trajectory. All durations in its goals and answers are in the robot's seconds; `clock` knows how many of them pass in
 //! one of ours. Where `budget_s` is given, planning takes exactly that long and gets a shorter path for it.
 
 mod clock;
