@@ -164,36 +164,32 @@ impl WorldPool {
     }
 
     /// What matches any of the patterns, in the order of keys, of the root or of a projection; without a pattern everything
-    /// that the projection shows.
+    /// that it shows.
     pub(super) fn query(
         &self,
         id: Option<ProjectionId>,
         patterns: &[FactPattern],
     ) -> Result<(Vec<(FactKey, Fact)>, Revision), QueryError> {
-        let (world, revision) = match id {
-            None => (self.root(), self.root().revision()),
+        let (world, revision, shown) = match id {
+            None => (self.root(), self.root().revision(), &Footprint::Everything),
             Some(id) => {
                 let projection = self.projections.get(&id).ok_or(QueryError::Unknown { id })?;
-                let shown = |pattern: &FactPattern| match &projection.reads {
-                    Footprint::Everything => true,
-                    Footprint::Patterns(reads) => reads.iter().any(|read| read.covers(pattern)),
+                let hidden = |pattern: &&FactPattern| match &projection.reads {
+                    Footprint::Everything => false,
+                    Footprint::Patterns(reads) => !reads.iter().any(|read| read.covers(pattern)),
                 };
-                if let Some(pattern) = patterns.iter().find(|pattern| !shown(pattern)) {
+                if let Some(pattern) = patterns.iter().find(hidden) {
                     return Err(QueryError::Hidden { id, pattern: pattern.clone() });
                 }
-                if patterns.is_empty() {
-                    let all = projection.world.iter().filter(|(key, _)| projection.reads.contains(key));
-                    let all = all.map(|(key, fact)| (key.clone(), fact.clone())).collect();
-                    return Ok((all, projection.base));
-                }
-                (&projection.world, projection.base)
+                (&projection.world, projection.base, &projection.reads)
             }
         };
-        let facts: BTreeMap<FactKey, Fact> = patterns
-            .iter()
-            .flat_map(|pattern| world.matching(pattern))
-            .map(|(key, fact)| (key.clone(), fact.clone()))
-            .collect();
+        let copy = |(key, fact): (&FactKey, &Fact)| (key.clone(), fact.clone());
+        if patterns.is_empty() {
+            let all = world.iter().filter(|(key, _)| shown.contains(key)).map(copy).collect();
+            return Ok((all, revision));
+        }
+        let facts: BTreeMap<FactKey, Fact> = patterns.iter().flat_map(|p| world.matching(p)).map(copy).collect();
         Ok((facts.into_iter().collect(), revision))
     }
 
