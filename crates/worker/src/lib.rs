@@ -28,6 +28,7 @@ pub mod action;
 pub mod client;
 pub mod endpoint;
 pub mod provider;
+pub mod robot_clock;
 pub mod runtime_directory;
 pub mod server;
 pub mod session;

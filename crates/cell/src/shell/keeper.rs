@@ -2,7 +2,6 @@
 //!
 //! A thread, not a task: checking a trajectory takes milliseconds, and a motion has to stop on time whatever the runtime does.
 
-use super::clock::Clock;
 use crate::core::cell::Cell;
 use crate::core::picture::{Exposure, develop};
 use crate::core::protocol::{Command, Ending, Event, Request, Ticket};
@@ -11,6 +10,7 @@ use ratn_model::time::Timestamp;
 use ratn_motion::robot::{Joints, Robot};
 use ratn_perception::camera::{Camera, DepthImage};
 use ratn_perception::noise::Noise;
+use ratn_worker::robot_clock::RobotClock;
 use std::collections::BTreeMap;
 use std::io;
 use std::sync::Arc;
@@ -67,7 +67,7 @@ enum Message {
 }
 
 /// Starts the thread.
-pub(crate) fn start(cell: Cell, clock: Clock) -> io::Result<Keeper> {
+pub(crate) fn start(cell: Cell, clock: RobotClock) -> io::Result<Keeper> {
     let (messages, inbox) = sync_channel(MAX_MESSAGES);
     let optics = Arc::new(Optics { robot: cell.robot().clone(), noise: cell.config().camera.noise });
     let keep = move || keep(cell, clock, &inbox);
@@ -120,7 +120,7 @@ impl Keeper {
     }
 }
 
-fn keep(mut cell: Cell, clock: Clock, inbox: &Receiver<Message>) {
+fn keep(mut cell: Cell, clock: RobotClock, inbox: &Receiver<Message>) {
     let mut waiting: BTreeMap<Ticket, oneshot::Sender<Ending>> = BTreeMap::new();
     loop {
         let sleep = cell.next_wake().map_or(MAX_SLEEP, |moment| clock.until(moment).min(MAX_SLEEP));

@@ -8,7 +8,6 @@
 //! The keeper's thread owns the core; everything else sends it messages.
 
 mod actions;
-mod clock;
 mod keeper;
 mod leases;
 mod link;
@@ -20,6 +19,7 @@ use anyhow::Context;
 use ratn_proto::v1::cell_service_server::CellServiceServer;
 use ratn_worker::client::Channels;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, bind};
 use tokio_util::sync::CancellationToken;
@@ -36,7 +36,7 @@ pub async fn run(config: CellConfig, directory: RuntimeDirectory, shutdown: Canc
     let listen: Endpoint = config.listen.parse().context("`listen` of the cell")?;
     let laid = config.clone();
     let cell = tokio::task::spawn_blocking(move || Cell::new(laid)).await.context("cannot lay the table")??;
-    let keeper = keeper::start(cell, clock::Clock::start(config.speed)).context("cannot start the cell")?;
+    let keeper = keeper::start(cell, RobotClock::start(config.speed)).context("cannot start the cell")?;
 
     let bound = bind(&listen).await?;
     let endpoint = bound.endpoint().clone();

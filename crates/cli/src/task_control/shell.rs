@@ -3,7 +3,7 @@
 //! Nothing is decided here. Whatever a command leads to comes back as an event through one bounded queue, so the event log is
 //! the whole story of the run.
 
-use super::clock::Clock;
+use ratn_worker::robot_clock::RobotClock;
 use super::log::LogWriter;
 use super::performer::Performer;
 use super::progress::Progress;
@@ -62,7 +62,7 @@ pub(crate) async fn run(run: Run, endpoints: &super::Endpoints, interrupt: &Inte
         .context("cannot begin the run")?;
     let (revision, world) = performer.root().await.context("cannot read the root world")?;
 
-    let clock = Clock::start(run.speed);
+    let clock = RobotClock::start(run.speed);
     let mut executive = Executive::new(run.program.clone(), Tolerance::ROBOT);
     let mut progress = Progress::new(run.quiet);
     let mut event = Event::Started {

@@ -1,0 +1,42 @@
+//! The robot's time: wall time since a start, times the speed at which the cell runs. Durations in goals, trajectories and
+//! event logs are in it.
+
+use ratn_model::time::Timestamp;
+use std::time::{Duration, Instant};
+
+/// A clock of the robot's time.
+#[derive(Debug, Clone, Copy)]
+pub struct RobotClock {
+    start: Instant,
+    speed: f64,
+}
+
+impl RobotClock {
+    /// Starts at zero now; `speed` is how many of the robot's seconds pass in one of ours, above 0.
+    pub fn start(speed: f64) -> RobotClock {
+        RobotClock { start: Instant::now(), speed }
+    }
+
+    /// The robot's time.
+    pub fn now(&self) -> Timestamp {
+        Timestamp::from_seconds(self.start.elapsed().as_secs_f64() * self.speed)
+    }
+
+    /// How long to wait, in wall time, until a moment of the robot's time; zero when it is past.
+    pub fn until(&self, moment: Timestamp) -> Duration {
+        moment.since(self.now()).div_f64(self.speed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_moment_of_the_robot_is_sooner_for_us_by_the_speed() {
+        let clock = RobotClock::start(10.0);
+        let wait = clock.until(Timestamp::from_seconds(100.0));
+        assert!(wait <= Duration::from_secs(10) && wait > Duration::from_secs(9), "{wait:?}");
+        assert_eq!(clock.until(Timestamp(0)), Duration::ZERO);
+    }
+}
