@@ -1,6 +1,5 @@
 //! Task control: the shell around the executive. Performs its commands over gRPC and brings the answers back as events.
 
-pub(crate) mod clock;
 pub(crate) mod log;
 mod performer;
 mod progress;

@@ -3,7 +3,6 @@
 //! Nothing is decided here. Whatever a command leads to comes back as an event through one bounded queue, so the event log is
 //! the whole story of the run.
 
-use ratn_worker::robot_clock::RobotClock;
 use super::log::LogWriter;
 use super::performer::Performer;
 use super::progress::Progress;
@@ -14,6 +13,7 @@ use ratn_executive::protocol::{Command, Event, Mode};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::program::Program;
 use ratn_model::value::Value;
+use ratn_worker::robot_clock::RobotClock;
 use ratn_world::tolerance::Tolerance;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
