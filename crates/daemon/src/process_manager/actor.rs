@@ -1,6 +1,7 @@
 //! The one task that owns the pools: performs their commands, and tells them what became of it.
 
 use super::config::ProcessManagerConfig;
+use super::log::EndedLogs;
 use super::pool::{Command, PoolError, Pools};
 use super::spawner::{self, Job, Outcome};
 use super::usage::Usage;
@@ -69,6 +70,7 @@ struct Actor {
     jobs: mpsc::Sender<Job>,
     serving: mpsc::Sender<(String, String)>,
     processes: BTreeMap<String, Process>,
+    ended_logs: EndedLogs,
     watchers: Vec<mpsc::Sender<WorkerStatus>>,
     usage: Usage,
 }
@@ -95,6 +97,7 @@ pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Resul
         jobs: spawner::start(told)?,
         serving,
         processes: BTreeMap::new(),
+        ended_logs: EndedLogs::default(),
         watchers: Vec::new(),
         usage: Usage::new(),
     };
@@ -204,6 +207,7 @@ impl Actor {
                 }
                 // One that was killed could not take it back itself.
                 let _ = std::fs::remove_file(self.directory.endpoint_file(&id));
+                self.ended_logs.add(self.log_file(&id));
                 self.pools.exited(self.now(), &id, &reason, &last_words);
             }
         }
@@ -246,7 +250,7 @@ impl Actor {
             id: id.to_owned(),
             args: template.args.iter().map(|arg| fill(arg)).collect(),
             env: template.env.iter().map(|(name, value)| (name.clone(), fill(value))).collect(),
-            log: self.directory.path().join("logs").join(format!("{id}.log")),
+            log: self.log_file(id),
             max_log_bytes: self.config.max_log_bytes,
             program: template.program.clone().unwrap_or_else(|| self.this_program.clone()),
         };
@@ -257,6 +261,10 @@ impl Actor {
         let readiness = ready(self.directory.clone(), id.to_owned(), template.start_timeout(), self.serving.clone());
         let readiness = tokio::spawn(readiness).abort_handle();
         self.processes.entry(id.to_owned()).or_default().readiness = Some(readiness);
+    }
+
+    fn log_file(&self, id: &str) -> PathBuf {
+        self.directory.path().join("logs").join(format!("{id}.log"))
     }
 
     fn signal(&self, id: &str, signal: Signal) {

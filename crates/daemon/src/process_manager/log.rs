@@ -1,4 +1,5 @@
-//! The output of a worker: into a bounded file, with its end kept at hand for whoever asks why it died.
+//! The output of a worker: into a bounded file, with its end kept at hand for whoever asks why it died. Of the workers that
+//! have ended, the logs of the last ones are kept.
 
 use std::collections::VecDeque;
 use std::fs::{self, File};
@@ -11,6 +12,8 @@ use tokio::io::{AsyncRead, AsyncReadExt};
 const LAST_WORDS_BYTES: usize = 400;
 /// How much is read at once.
 const CHUNK_BYTES: usize = 4_096;
+/// So many ended workers leave a log.
+const ENDED_LOGS_KEPT: usize = 64;
 
 /// A worker's log; clones write to the same.
 #[derive(Debug, Clone)]
@@ -25,6 +28,31 @@ struct Inner {
     written: u64,
     max_bytes: u64,
     tail: VecDeque<u8>,
+}
+
+/// The logs of workers that have ended, the oldest first.
+#[derive(Debug, Default)]
+pub(super) struct EndedLogs {
+    paths: VecDeque<PathBuf>,
+}
+
+impl EndedLogs {
+    /// One more has ended; the oldest beyond those kept is removed.
+    pub(super) fn add(&mut self, path: PathBuf) {
+        self.paths.push_back(path);
+        if self.paths.len() > ENDED_LOGS_KEPT
+            && let Some(oldest) = self.paths.pop_front()
+        {
+            // Somebody may have removed it before.
+            let _ = fs::remove_file(previous(&oldest));
+            let _ = fs::remove_file(oldest);
+        }
+    }
+}
+
+/// Where what was written before a log was begun anew is kept.
+fn previous(path: &Path) -> PathBuf {
+    path.with_extension("log.1")
 }
 
 impl Log {
@@ -65,7 +93,7 @@ impl Inner {
         let surplus = self.tail.len().saturating_sub(LAST_WORDS_BYTES);
         self.tail.drain(..surplus);
         if self.written + bytes.len() as u64 > self.max_bytes {
-            fs::rename(&self.path, self.path.with_extension("log.1"))?;
+            fs::rename(&self.path, previous(&self.path))?;
             self.file = File::create(&self.path)?;
             self.written = 0;
         }
@@ -78,6 +106,20 @@ impl Inner {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+
+    #[test]
+    fn the_logs_of_the_last_workers_that_ended_are_kept_and_no_more() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |i: usize| directory.path().join(format!("planner-{i}@compute.log"));
+        let mut ended = EndedLogs::default();
+        for i in 0..ENDED_LOGS_KEPT + 3 {
+            drop(Log::create(&path(i), 10_000).unwrap());
+            File::create(path(i).with_extension("log.1")).unwrap();
+            ended.add(path(i));
+        }
+        assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 2 * ENDED_LOGS_KEPT);
+        assert!(!path(2).exists() && path(3).exists());
+    }
 
     #[tokio::test]
     async fn a_log_is_bounded_and_its_end_is_at_hand() {

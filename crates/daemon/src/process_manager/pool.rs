@@ -201,9 +201,13 @@ impl Pools {
         let Some((pool, worker)) = self.worker(id) else { return };
         worker.pid = pid;
         let status = worker.status(id, &pool, String::new());
-        // One that was stopped before it was there is stopped now.
-        if matches!(worker.phase, Phase::Stopping { .. }) {
-            self.commands.push(Command::Terminate { id: id.to_owned() });
+        // One that was to end before it was there is ended now.
+        match worker.phase {
+            Phase::Stopping { kill_at: Some(_) } => self.commands.push(Command::Terminate { id: id.to_owned() }),
+            Phase::Stopping { kill_at: None } | Phase::TooLate => {
+                self.commands.push(Command::Kill { id: id.to_owned() });
+            }
+            Phase::Starting { .. } | Phase::Serving { .. } | Phase::Ready { .. } => {}
         }
         self.commands.push(Command::Tell(status));
     }
@@ -262,11 +266,12 @@ impl Pools {
             return Err(PoolError::UnknownTemplate { template: template.to_owned(), known });
         };
         let max = pool.template.max_workers();
-        let wanted = pool.wanted;
+        // What a failed pool lacks is wanted no more.
+        let wanted = if pool.failure.is_empty() { pool.wanted } else { pool.there() };
         if count > max.saturating_sub(wanted) {
             return Err(PoolError::TooMany { template: template.to_owned(), wanted, max, count });
         }
-        pool.wanted += count;
+        pool.wanted = (wanted + count).max(pool.template.min);
         pool.failure.clear();
         (pool.crashes, pool.restart_at) = (0, None);
         let started = pool.fill(now, &self.host, &mut self.commands);
@@ -329,10 +334,13 @@ impl Pools {
 }
 
 impl Pool {
-    fn missing(&self) -> u32 {
+    fn there(&self) -> u32 {
         let there = self.workers.values().filter(|worker| !matches!(worker.phase, Phase::Stopping { .. })).count();
-        let there = u32::try_from(there).unwrap_or(u32::MAX);
-        if self.failure.is_empty() { self.wanted.saturating_sub(there) } else { 0 }
+        u32::try_from(there).unwrap_or(u32::MAX)
+    }
+
+    fn missing(&self) -> u32 {
+        if self.failure.is_empty() { self.wanted.saturating_sub(self.there()) } else { 0 }
     }
 
     /// Starts what is missing, unless it has to wait; the ids.
@@ -482,9 +490,8 @@ mod tests {
             failure,
             "4 crashes in a row; planner-4@compute: exited with status 1; its last words: cannot open the model"
         );
-        pools.pools.get_mut("planner").unwrap().template.max = Some(2);
         pools.spawn(at(now), "planner", 1).unwrap();
-        assert_eq!(started(&mut pools).len(), 2, "somebody who asks starts it again");
+        assert_eq!(started(&mut pools).len(), 1, "somebody who asks starts it again");
     }
 
     #[test]
@@ -515,6 +522,40 @@ mod tests {
                 .iter()
                 .any(|command| matches!(command, Command::Tell(worker) if worker.reason == "not serving within 3 s"))
         );
+    }
+
+    #[test]
+    fn a_worker_whose_time_was_over_before_its_process_was_there_is_killed_when_it_is() {
+        let mut pools = pools(|template| template.start_timeout_s = 3.0);
+        pools.advance(at(3.0));
+        pools.take_commands();
+        pools.spawned("planner-1@compute", 4711);
+        assert_eq!(pools.take_commands()[0], Command::Kill { id: "planner-1@compute".into() });
+    }
+
+    #[test]
+    fn a_worker_stopped_before_its_process_was_there_is_terminated_and_if_late_killed_when_it_is() {
+        for (passed, command) in [(0.5, "Terminate"), (3.0, "Kill")] {
+            let mut pools = pools(|_| {});
+            pools.stop(at(0.0), "planner-1@compute").unwrap();
+            pools.advance(at(passed));
+            pools.take_commands();
+            pools.spawned("planner-1@compute", 4711);
+            assert!(format!("{:?}", pools.take_commands()[0]).starts_with(command));
+        }
+    }
+
+    #[test]
+    fn a_failed_pool_at_its_maximum_starts_again_when_somebody_asks() {
+        let mut pools = pools(|template| (template.min, template.crash_limit) = (2, 1));
+        for id in started(&mut pools) {
+            pools.exited(at(0.0), &id, "exited with status 1", "");
+        }
+        assert!(started(&mut pools).is_empty() && !pools.status()[0].failure.is_empty());
+        let asked = pools.spawn(at(1.0), "planner", 1).unwrap();
+        assert_eq!(asked.len(), 1);
+        assert_eq!(started(&mut pools).len(), 2, "the minimum is kept again");
+        assert!(matches!(pools.spawn(at(1.0), "planner", 1), Err(PoolError::TooMany { wanted: 2, .. })));
     }
 
     #[test]
