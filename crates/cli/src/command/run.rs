@@ -32,11 +32,11 @@ pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
     blocking(async {
         let interrupt = Interrupt::listen()?;
         let directory = public_directory(arguments.runtime_dir.as_deref());
-        let found = System::find(&directory).await?;
-        // The system that runs knows best what it offers.
+        let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
+        let found = System::find(&directory, given.clone()).await?;
         let mut config = match &found {
-            Some(system) if arguments.config.is_none() => system.config.clone(),
-            _ => SystemConfig::load(arguments.config.as_deref())?,
+            Some(system) => system.config.clone(),
+            None => given.map_or_else(|| SystemConfig::load(None), Ok)?,
         };
         config.apply(&SystemArguments { speed: arguments.speed, ..SystemArguments::default() });
 

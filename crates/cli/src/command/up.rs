@@ -5,7 +5,7 @@ use crate::arguments::UpArguments;
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
 use crate::system::config::SystemConfig;
-use crate::system::{System, public_directory};
+use crate::system::{System, public_directory, running};
 
 /// Starts it and keeps it running until the user or one of its processes ends it.
 pub(crate) fn run(arguments: &UpArguments) -> Result<(), Failure> {
@@ -14,7 +14,7 @@ pub(crate) fn run(arguments: &UpArguments) -> Result<(), Failure> {
     blocking(async {
         let interrupt = Interrupt::listen()?;
         let directory = public_directory(arguments.runtime_dir.as_deref());
-        if System::find(&directory).await?.is_some() {
+        if running(&directory).await.is_some() {
             return Err(Failure::Refused(format!("ratn: a system runs in {} already", directory.display())));
         }
         let mut system = starting(System::start_public(config, &directory), &interrupt).await?;

@@ -66,21 +66,17 @@ impl System {
         }
     }
 
-    /// The one that runs in `directory`, if one does.
-    pub(crate) async fn find(directory: &Path) -> anyhow::Result<Option<System>> {
-        let directory = RuntimeDirectory::at(directory);
-        let (Ok(resource_manager), Ok(world_pool)) = (directory.find(ROLES[0]), directory.find(ROLES[1])) else {
-            return Ok(None);
+    /// The one that runs in `directory`, if one does. Without a config of your own it is the one that it was started with.
+    pub(crate) async fn find(directory: &Path, config: Option<SystemConfig>) -> anyhow::Result<Option<System>> {
+        let Some(endpoints) = running(directory).await else { return Ok(None) };
+        let config = match config {
+            Some(config) => config,
+            None => SystemConfig::read(&directory.join(CONFIG_FILE)).with_context(|| {
+                let place = directory.display();
+                format!("a system runs in {place}, but not under `ratn up`: say its config with --config FILE")
+            })?,
         };
-        // A file of a system that was killed is there, too.
-        if endpoint::connect(&resource_manager).await.is_err() || endpoint::connect(&world_pool).await.is_err() {
-            return Ok(None);
-        }
-        let file = directory.path().join(CONFIG_FILE);
-        let config = SystemConfig::read(&file).with_context(|| {
-            format!("a system runs in {}, and its config cannot be read", directory.path().display())
-        })?;
-        let endpoints = Endpoints { resource_manager, world_pool };
+        let directory = RuntimeDirectory::at(directory);
         Ok(Some(System { config, endpoints, directory, processes: Processes::default(), _private: None }))
     }
 
@@ -106,6 +102,15 @@ impl System {
     pub(crate) async fn stop(self) {
         self.processes.stop().await;
     }
+}
+
+/// Where the system that runs in `directory` is reached, if one does. The files of a system that was killed do not count.
+pub(crate) async fn running(directory: &Path) -> Option<Endpoints> {
+    let directory = RuntimeDirectory::at(directory);
+    let (resource_manager, world_pool) = (directory.find(ROLES[0]).ok()?, directory.find(ROLES[1]).ok()?);
+    endpoint::connect(&resource_manager).await.ok()?;
+    endpoint::connect(&world_pool).await.ok()?;
+    Some(Endpoints { resource_manager, world_pool })
 }
 
 /// Waits until every role is there and every resource that the config promises.

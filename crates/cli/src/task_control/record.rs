@@ -117,8 +117,9 @@ impl Recorder {
                     self.resources.create(resource).await.map(|_| ())
                 }
                 ResourceOperation::Delete => self.resources.delete_matching(operation.clone()).await.map(|_| ()),
+                ResourceOperation::Consume => self.resources.consume(operation.clone()).await.map(|_| ()),
                 // The executive gives these to an acquire.
-                ResourceOperation::Block | ResourceOperation::Consume | ResourceOperation::Exists => Ok(()),
+                ResourceOperation::Block | ResourceOperation::Exists => Ok(()),
             };
             if let Err(error) = done {
                 let reason = format!("`{operation}` was not done: {}", said(&error));
