@@ -25,6 +25,8 @@ pub(crate) struct StateAnalysis {
     pub(crate) nature: NodeNature,
     /// Blocks (its own and its hierarchies', merged by maximum), consumes and exists.
     pub(crate) requirements: Vec<ResourceExpr>,
+    /// The kinds of resources that it, or what it contains, creates, deletes or consumes.
+    pub(crate) operated: BTreeSet<String>,
     /// What it does to resources when it ends with success.
     pub(crate) operations: Vec<ResourceExpr>,
     /// The states whose outputs it needs before it starts; for a routine, those outside of it.
@@ -92,9 +94,10 @@ fn analyse(program: &Program, state: &State) -> StateAnalysis {
             nature => nature.unwrap_or(NodeNature::Computes),
         },
         needs_world: requirements.iter().any(|r| r.kind == WORLD_MODEL),
+        operated: contained.iter().flat_map(|s| operated(s)).cloned().collect(),
         operations: operations(state),
         writes: contained.iter().map(|s| own_writes(s)).collect::<Option<Vec<_>>>().map(|all| all.concat()),
-        reads: reads(&contained, &around),
+        reads: reads(&contained, &around, &requirements),
         senses: contained
             .iter()
             .flat_map(|s| match &s.annotations.nature {
@@ -111,7 +114,16 @@ fn ancestors<'a>(program: &'a Program, state: &State) -> Vec<&'a State> {
     std::iter::successors(state.parent, |id| program.state(*id).parent).map(|id| program.state(id)).collect()
 }
 
+/// The kinds of resources that a state changes, rather than holds.
+fn operated(state: &State) -> impl Iterator<Item = &String> {
+    let changes = |r: &&ResourceExpr| !matches!(r.operation, ResourceOperation::Block | ResourceOperation::Exists);
+    state.annotations.resources.iter().filter(changes).map(|r| &r.kind)
+}
+
 fn own_nature(state: &State) -> NodeNature {
+    if operated(state).next().is_some() {
+        return NodeNature::Irreversible;
+    }
     match (&state.kind, &state.annotations.nature) {
         (StateKind::Action { .. }, Nature::Irreversible) => NodeNature::Irreversible,
         (StateKind::Action { .. }, Nature::Senses(_)) => NodeNature::Senses,
@@ -128,7 +140,7 @@ fn own_writes(state: &State) -> Option<Vec<EffectExpr>> {
     Some(effects.values().flatten().cloned().collect())
 }
 
-/// Blocks merge by maximum; consumes and exists add up as they are, but only from within (a hierarchy's happen once).
+/// Blocks merge by maximum; what an action consumes and what exists add up as they are, but only from within.
 fn requirements(contained: &[&State], around: &[&State]) -> Vec<ResourceExpr> {
     let mut merged: Vec<ResourceExpr> = Vec::new();
     for (state, within) in contained.iter().map(|s| (s, true)).chain(around.iter().map(|s| (s, false))) {
@@ -145,7 +157,8 @@ fn requirements(contained: &[&State], around: &[&State]) -> Vec<ResourceExpr> {
                         None => merged.push(wanted.clone()),
                     }
                 }
-                ResourceOperation::Consume | ResourceOperation::Exists if within => merged.push(wanted.clone()),
+                ResourceOperation::Exists if within => merged.push(wanted.clone()),
+                ResourceOperation::Consume if is_action(state) => merged.push(wanted.clone()),
                 _ => {}
             }
         }
@@ -153,17 +166,21 @@ fn requirements(contained: &[&State], around: &[&State]) -> Vec<ResourceExpr> {
     merged
 }
 
-/// A hierarchy consumes at its exit too; an action did so when it acquired.
+fn is_action(state: &State) -> bool {
+    matches!(state.kind, StateKind::Action { .. })
+}
+
+/// What contains others consumes at its exit too; an action did so when it acquired.
 fn operations(state: &State) -> Vec<ResourceExpr> {
     let at_end = |r: &&ResourceExpr| match r.operation {
         ResourceOperation::Create | ResourceOperation::Delete => true,
-        ResourceOperation::Consume => !matches!(state.kind, StateKind::Action { .. }) && !state.annotations.routine,
+        ResourceOperation::Consume => !is_action(state),
         ResourceOperation::Block | ResourceOperation::Exists => false,
     };
     state.annotations.resources.iter().filter(at_end).cloned().collect()
 }
 
-fn reads(contained: &[&State], around: &[&State]) -> Option<Vec<FactExpr>> {
+fn reads(contained: &[&State], around: &[&State], requirements: &[ResourceExpr]) -> Option<Vec<FactExpr>> {
     let mut all = Vec::new();
     for state in contained {
         match (&state.kind, &state.annotations.reads) {
@@ -177,11 +194,16 @@ fn reads(contained: &[&State], around: &[&State]) -> Option<Vec<FactExpr>> {
         {
             all.extend(expression.fact_expressions().into_iter().cloned());
         }
+        if let StateKind::Sequence { outputs, .. } = &state.kind {
+            all.extend(outputs.iter().flat_map(|o| o.value.fact_expressions()).cloned());
+        }
         all.extend(state.annotations.requires.iter().flat_map(Expr::fact_expressions).cloned());
     }
     for state in around {
         all.extend(state.annotations.reads.iter().flatten().cloned());
     }
+    let attributes = requirements.iter().flat_map(|r| &r.attributes);
+    all.extend(attributes.flat_map(|(_, value)| value.fact_expressions()).cloned());
     Some(all)
 }
 

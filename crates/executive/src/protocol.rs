@@ -177,11 +177,11 @@ pub enum Command {
         /// What the root's revision will be.
         revision: Revision,
     },
-    /// Create and delete task resources.
+    /// Create and delete task resources, and use up what a hierarchy consumes at its exit.
     Operate {
         /// Whose annotations.
         instance: InstanceId,
-        /// Creates and deletes.
+        /// Creates, deletes and consumes, in order.
         operations: Vec<Requirement>,
     },
     /// The run has ended; everything was released before.

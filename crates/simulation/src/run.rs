@@ -6,13 +6,13 @@ use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::program::Program;
-use ratn_model::resource::ResourceClass;
+use ratn_model::resource::{ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_resources::{AcquireRequest, Limits, Notice, Pool, ResourceSpec, SessionId, WaiterId};
 use ratn_world::tolerance::Tolerance;
 use ratn_world::world::World;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -80,6 +80,8 @@ pub struct Run {
     pub log: Vec<LogLine>,
     /// The root world at the end.
     pub world: World,
+    /// What there is of task resources at the end: units by kind.
+    pub units: BTreeMap<String, u64>,
 }
 
 /// A run that did not end as runs do: a broken promise of one of the cores.
@@ -117,6 +119,8 @@ struct Simulation<'a> {
     /// What the root was at each revision.
     roots: BTreeMap<Revision, World>,
     projections: BTreeMap<ProjectionId, World>,
+    /// What projections were asked for: the world pool makes one per instance and attempt.
+    projected: BTreeSet<(InstanceId, u32)>,
     next_projection: u64,
     waiters: BTreeMap<InstanceId, WaiterId>,
     leases: BTreeMap<LeaseId, InstanceId>,
@@ -158,6 +162,7 @@ pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
         roots: BTreeMap::from([(root.revision(), root.clone())]),
         root,
         projections: BTreeMap::new(),
+        projected: BTreeSet::new(),
         next_projection: 0,
         waiters: BTreeMap::new(),
         leases: BTreeMap::new(),
@@ -193,8 +198,9 @@ pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
         }
         simulation.check(&executive)?;
         if let Some((outcome, outputs, reason)) = simulation.end.take() {
+            let units = simulation.task_resources();
             let log = std::mem::take(&mut simulation.log);
-            return Ok(Run { end_s: now.seconds(), outcome, outputs, reason, log, world: simulation.root });
+            return Ok(Run { end_s: now.seconds(), outcome, outputs, reason, log, world: simulation.root, units });
         }
     }
     Err(RunError::Endless(MAX_EVENTS))
@@ -238,6 +244,9 @@ impl Simulation<'_> {
                     return Err(self.broken(format!("projection on {base}, the root is {}", self.root.revision())));
                 };
                 let world = below.project(&changes).map_err(|e| self.broken(e))?;
+                if !self.projected.insert((instance, attempt)) {
+                    return Err(self.broken(format!("a second projection for attempt {attempt} of {instance}")));
+                }
                 self.next_projection += 1;
                 let projection = ProjectionId(self.next_projection);
                 self.projections.insert(projection, world);
@@ -273,7 +282,13 @@ impl Simulation<'_> {
                 }
             }
             Command::Operate { operations, .. } => {
-                self.pool.operate(self.now, &self.session, &operations).map_err(|e| self.broken(e))?;
+                for operation in &operations {
+                    let done = match operation.operation {
+                        ResourceOperation::Consume => self.pool.consume(self.now, &self.session, operation),
+                        _ => self.pool.operate(self.now, &self.session, std::slice::from_ref(operation)),
+                    };
+                    done.map_err(|e| self.broken(e))?;
+                }
                 self.answers();
             }
             Command::End { outcome, outputs, reason } => self.end = Some((outcome, outputs, reason)),
@@ -305,6 +320,14 @@ impl Simulation<'_> {
             Answer::Crashed => Event::Crashed { instance, attempt, reason: "the worker died".to_owned() },
         };
         self.at(Duration::from_secs_f64(duration_s.max(0.0)), event);
+    }
+
+    fn task_resources(&self) -> BTreeMap<String, u64> {
+        let mut units = BTreeMap::new();
+        for resource in self.pool.list().into_iter().filter(|r| r.class == ResourceClass::Task) {
+            *units.entry(resource.kind).or_default() += u64::from(resource.capacity - resource.consumed);
+        }
+        units
     }
 
     /// The pool's answers become events.

@@ -119,7 +119,7 @@ impl Interpreter {
             _ => {}
         }
         self.hierarchy_effects(context, program.state(id), SUCCESS)?;
-        self.operate(context, program.state(id), InstanceId(0), None)
+        self.operate(context, program.state(id), InstanceId(0), self.outputs.get(&id).cloned())
     }
 
     /// A hierarchy's own effects for an outcome.

@@ -66,11 +66,9 @@ impl Place {
             return;
         }
         let state = program.state(instance.state);
-        for resource in &state.annotations.resources {
-            use ratn_model::resource::ResourceOperation::{Consume, Create, Delete};
-            if matches!(resource.operation, Create | Delete | Consume) {
-                self.operated.insert(resource.kind.clone());
-            }
+        match instance.role {
+            Role::Node => self.operated.extend(analysis.state(state.id).operated.iter().cloned()),
+            _ => self.operated.extend(analysis.state(state.id).operations.iter().map(|r| r.kind.clone())),
         }
         let ended = instance.ended.as_ref();
         if let Some(Changed::Exactly(changes)) = ended.map(|e| &e.changes) {
