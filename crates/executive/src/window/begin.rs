@@ -181,9 +181,14 @@ impl Window {
         // While it waited for its resources an older instance may have changed what it would look at.
         if instance.nature == NodeNature::Senses && !same_facts(&instance.senses, &place.world, context.root) {
             instance.status = Status::Expanded;
+            instance.attempt += 1;
             instance.wait = Wait::Environment;
             give_back(context, instance);
             return true;
+        }
+        // Its projection is of this place; by its start some of it may have come true, or not.
+        if instance.nature != NodeNature::Irreversible && instance.projection.is_none() {
+            instance.seen = Some(place.world.clone());
         }
         let is_routine = !matches!(state.kind, StateKind::Action { .. });
         if context.analysis.state(instance.state).needs_world && instance.projection.is_none() && !is_routine {

@@ -6,6 +6,7 @@ use crate::protocol::Note;
 use crate::window::instance::Ended;
 use crate::window::place::Place;
 use crate::window::{End, Window};
+use ratn_model::expression::FactExpr;
 use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, StateKind};
@@ -64,9 +65,14 @@ impl Window {
     pub(super) fn leave_composite(&mut self, context: &Context<'_>, id: InstanceId, place: &Place) -> bool {
         let Some(instance) = self.instances.alive.get(&id) else { return false };
         let mut written = Outputs::new();
+        let mut reads = Footprint::NOTHING;
         if let StateKind::Sequence { outputs, .. } = &context.program.state(instance.state).kind {
             for output in outputs {
-                let value = place.with_scope(&self.instances, id, None, |scope| output.value.evaluate(scope));
+                let facts: Vec<_> = output.value.fact_expressions().into_iter().cloned().collect();
+                let value = place.with_scope(&self.instances, id, None, |scope| {
+                    reads = std::mem::replace(&mut reads, Footprint::NOTHING).union(FactExpr::footprint(&facts, scope));
+                    output.value.evaluate(scope)
+                });
                 match value {
                     Some(Ok(value)) => {
                         written.insert(output.name.clone(), value);
@@ -78,6 +84,10 @@ impl Window {
                     None => return false,
                 }
             }
+        }
+        if let Some(instance) = self.instances.alive.get_mut(&id) {
+            instance.reads = reads;
+            instance.seen = Some(place.world.clone());
         }
         self.end_instance(id, Ended::success(written))
     }

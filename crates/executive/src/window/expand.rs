@@ -237,6 +237,7 @@ impl Window {
             status: Status::Expanded,
             wait: Wait::Nothing,
             attempt: 1,
+            crashes: 0,
             lease: None,
             projection: None,
             ended: None,
@@ -247,6 +248,7 @@ impl Window {
             reads: Footprint::NOTHING,
             senses: Footprint::NOTHING,
             writes: Footprint::NOTHING,
+            seen: None,
         };
         self.instances.alive.insert(id, instance);
         if role == Role::Node {

@@ -9,6 +9,7 @@ use ratn_model::id::{InstanceId, ProjectionId, StateId};
 use ratn_model::program::{ABORTED, SUCCESS};
 use ratn_model::resource::Lease;
 use ratn_model::value::Value;
+use ratn_world::world::World;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 
@@ -140,6 +141,8 @@ pub(crate) struct Instance {
     pub(crate) status: Status,
     pub(crate) wait: Wait,
     pub(crate) attempt: u32,
+    /// How many attempts its worker's death has cost; stepping back costs none.
+    pub(crate) crashes: u32,
     pub(crate) lease: Option<Lease>,
     pub(crate) projection: Option<ProjectionId>,
     pub(crate) ended: Option<Ended>,
@@ -154,6 +157,8 @@ pub(crate) struct Instance {
     pub(crate) reads: Footprint,
     pub(crate) senses: Footprint,
     pub(crate) writes: Footprint,
+    /// The world that it began in, unless that was the actual one.
+    pub(crate) seen: Option<World>,
 }
 
 impl Instance {

@@ -10,6 +10,7 @@
 
 mod begin;
 mod decide;
+mod deviation;
 mod expand;
 mod instance;
 mod place;
@@ -201,7 +202,6 @@ impl Window {
         instance.status = Status::Finished;
         give_back(context, instance);
         instance.ended = Some(ended);
-        self.compare_with_prediction(context, id);
     }
 
     /// An attempt ended without an answer.
@@ -209,7 +209,8 @@ impl Window {
         let Some(instance) = self.instances.alive.get_mut(&id) else { return };
         let limit = context.program.state(instance.state).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
         give_back(context, instance);
-        if instance.is_pia() || instance.attempt >= limit {
+        instance.crashes += 1;
+        if instance.is_pia() || instance.crashes >= limit {
             let reason = format!("crashed in attempt {}: {reason}", instance.attempt);
             context.note(Note::Finished { instance: id, outcome: ABORTED.to_owned() });
             instance.status = Status::Finished;

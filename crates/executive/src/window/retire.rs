@@ -8,7 +8,6 @@ use crate::protocol::{Command, Note};
 use crate::window::instance::{Changed, Ended, Role, Status};
 use crate::window::place::Place;
 use crate::window::{End, SWEEP_INTERVAL, Window, give_back};
-use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, SUCCESS, StateKind};
 use std::collections::BTreeSet;
@@ -45,6 +44,9 @@ impl Window {
             if reason.is_empty() { instance.path.clone() } else { format!("{}: {reason}", instance.path) }
         };
         let aborted = |reason: String| (ABORTED.to_owned(), named(reason));
+        if let Some(deviation) = self.deviation(id, context.root) {
+            return Err(aborted(deviation));
+        }
         // What began on a projection had its preconditions checked there; now the actual world decides.
         if instance.role == Role::Node && instance.nature != NodeNature::Irreversible && ended.outcome == SUCCESS {
             match place.with_scope(&self.instances, id, None, |scope| binding::unmet(state, scope)) {
@@ -114,14 +116,11 @@ impl Window {
         self.instances.retired.retain(|id, _| named.contains(id));
     }
 
-    /// The task is left by an outcome that is not success: every hierarchy around declares what that does, then it ends.
+    /// The task is left by an outcome that is not success: every hierarchy around the state declares what that does, then it ends.
     fn leave(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: &str, mut reason: String) -> Option<End> {
         let program = context.program;
-        let mut around = self.instances.alive.get(&id).map(|i| i.state);
-        let own = self.instances.alive.get(&id).is_some_and(|i| i.role == Role::Node);
-        if own {
-            around = around.and_then(|state| program.state(state).parent);
-        }
+        let state = self.instances.alive.get(&id).map(|i| i.state);
+        let mut around = state.and_then(|state| program.state(state).parent);
         while let Some(state) = around.map(|state| program.state(state)) {
             if let Some(declared) = state.annotations.effects.get(outcome) {
                 let place = Place::root(context.root);
@@ -225,48 +224,5 @@ impl Window {
             at = older.older;
         }
         false
-    }
-
-    /// A measured fact that differs from its prediction by more than the tolerance ends the run when a younger instance has
-    /// already built on the prediction: its result would be wrong, and it cannot be taken back yet.
-    pub(crate) fn compare_with_prediction(&mut self, context: &Context<'_>, id: InstanceId) {
-        let Some(instance) = self.instances.alive.get(&id) else { return };
-        let Some(ended) = instance.ended.as_ref().filter(|e| e.outcome == SUCCESS && !e.measured().is_empty()) else {
-            return;
-        };
-        let state = context.program.state(instance.state);
-        let Some(declared) = effects::declared(state, instance.nature, SUCCESS) else { return };
-        // A PIA is the oldest, so the root is its place; what sensing nodes declare has no value before they end.
-        let place = Place::root(context.root);
-        let mut deviation = None;
-        for effect in declared {
-            let one = std::slice::from_ref(effect);
-            let predicted =
-                place.with_scope(&self.instances, id, None, |scope| effects::actual(Some(one), SUCCESS, &[], scope));
-            let Some(Ok(predicted)) = predicted else { continue };
-            for change in &predicted {
-                let Change::Set { fact, value } = change else { continue };
-                let Some((_, actual)) = ended.measured().iter().find(|(key, _)| key == fact) else { continue };
-                let written = Footprint::Patterns(vec![change.pattern()]);
-                let used = |younger: &crate::window::instance::Instance| {
-                    younger.id > id
-                        && younger.reads.overlaps(&written)
-                        && matches!(younger.status, Status::Projecting | Status::Running | Status::Finished)
-                };
-                if !self.tolerance.equal(value, actual)
-                    && let Some(user) = self.instances.alive.values().find(|i| used(i))
-                {
-                    deviation = Some(format!(
-                        "it measured {fact} = {actual}, but {value} was predicted, and {} was already computed from that; run in HSM mode, \
-                         or do not declare this effect's value",
-                        user.path
-                    ));
-                }
-            }
-        }
-        if let (Some(reason), Some(instance)) = (deviation, self.instances.alive.get_mut(&id)) {
-            let measured = instance.ended.as_ref().map(|e| e.measured().to_vec()).unwrap_or_default();
-            instance.ended = Some(Ended { changes: Changed::Declared(measured), ..Ended::aborted(reason) });
-        }
     }
 }

@@ -84,7 +84,8 @@ impl Window {
         };
         let settled = self.instances.flows_settled(&instance.environment, &flows)
             && !instance.reads.overlaps(&place.written)
-            && !instance.senses.overlaps(&place.written);
+            && !instance.senses.overlaps(&place.written)
+            && self.deviation(id, &place.world).is_none();
         if let Some(instance) = self.instances.alive.get_mut(&id) {
             instance.settled = settled;
         }
