@@ -9,6 +9,7 @@ use ratn_daemon::process_manager::ProcessManagerConfig;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::world_pool::WorldPoolConfig;
 use ratn_model::catalogue::Catalogue;
+use ratn_model::resource::ResourceClass;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -92,15 +93,18 @@ impl SystemConfig {
     }
 
     /// What follows from the rest: one speed for all, and as many workers in the catalogue as the templates can provide.
+    /// A kind that no template provides is in a catalogue of one's own for another host's sake; not in the built-in one.
     fn settle(&mut self) {
         self.cell.speed = self.speed;
-        for (kind, offer) in &mut self.catalogue.resources {
-            let templates = self.process_manager.templates.iter().filter(|t| t.kind == *kind);
-            let provided: u32 = templates.map(|t| t.max_workers()).sum();
+        let built_in = self.catalogue == Catalogue::standard();
+        let templates = &self.process_manager.templates;
+        self.catalogue.resources.retain(|kind, offer| {
+            let provided: u32 = templates.iter().filter(|t| t.kind == *kind).map(|t| t.max_workers()).sum();
             if provided > 0 {
                 offer.count = provided;
             }
-        }
+            provided > 0 || offer.class != ResourceClass::Process || !built_in
+        });
     }
 
     /// With what the command line says.
@@ -162,6 +166,15 @@ mod tests {
         assert_eq!((config.cell.boxes, config.cell.seed, config.cell.speed), (5, 7, 8.0));
         assert_eq!(config.promised_resources()[PATH_PLANNER], 1);
         assert!(config.process_manager_config().templates[0].args.contains(&"8".to_owned()));
+    }
+
+    #[test]
+    fn what_no_template_provides_is_not_offered() {
+        let without = SystemConfig::parse("[process-manager]\ntemplate = []", "x.toml").unwrap();
+        assert!(!without.catalogue.resources.contains_key(PATH_PLANNER));
+        assert!(without.catalogue.resources.contains_key("Arm"));
+        let elsewhere = "[catalogue.resources]\nPathPlanner = { class = \"process\", count = 3 }";
+        assert_eq!(SystemConfig::parse(elsewhere, "x.toml").unwrap().catalogue.resources[PATH_PLANNER].count, 3);
     }
 
     #[test]
