@@ -100,8 +100,7 @@ impl Link {
             for id in offered.keys().filter(|id| !wanted.contains_key(*id)).cloned().collect::<Vec<_>>() {
                 offered.remove(&id);
                 if let Err(error) = provider.withdraw(&id).await {
-                    // Not offered again; at the latest it vanishes with the session.
-                    tracing::warn!(id, %error, "a resource could not be withdrawn");
+                    tracing::warn!(id, %error, "the resource manager does not let a resource go");
                 }
             }
             refused.retain(|id, resource| wanted.get(id) == Some(resource));

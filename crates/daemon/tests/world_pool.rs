@@ -5,9 +5,12 @@ mod support;
 
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint, Term};
 use ratn_model::id::{ProjectionId, Revision};
+use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
+use ratn_proto::types::{Resource, ResourceEventKind};
 use ratn_worker::client::{AcquireOptions, Projection, WorldClient};
 use ratn_worker::endpoint::Endpoint;
+use std::time::Duration;
 use support::{TestSystem, block, in_time};
 use tonic::Code;
 
@@ -89,4 +92,24 @@ async fn room_for_projections_is_a_resource_with_a_capacity_and_is_offered_again
         client.resources.acquire(vec![block("WorldModel")], AcquireOptions::default()).await.unwrap();
     }
     assert_eq!(client.resources.list(&["WorldModel"]).await.unwrap()[0].free, 0);
+}
+
+#[tokio::test]
+async fn a_world_pool_takes_the_place_of_a_killed_one_once_that_one_has_expired() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let killed = system.client(&manager, "world-pool@compute").await;
+    let room = Resource::new("world-model@compute", ResourceClass::World, "WorldModel");
+    killed.resources.create(room).await.unwrap();
+    let mut watch = system.watch(&manager, &["WorldModel"]).await;
+    let _pool = system.world_pool(2).await;
+    // Longer than its first attempt takes.
+    let waiting = killed.resources.acquire(vec![block("WorldModel"), block("WorldModel")], soon());
+    assert_eq!(waiting.await.unwrap_err().code(), Some(Code::DeadlineExceeded));
+    killed.session.close().await;
+    watch.event(|event| event.kind == ResourceEventKind::Created && event.resource.capacity == 2).await;
+}
+
+fn soon() -> AcquireOptions {
+    AcquireOptions { deadline: Duration::from_millis(300), ..AcquireOptions::default() }
 }

@@ -1,4 +1,5 @@
-//! Offering resources under a session, again whenever the resource manager has forgotten them.
+//! Offering resources under a session, again whenever the resource manager has forgotten them, and withdrawing them. What
+//! the manager cannot be told now it is told as soon as it can.
 
 use crate::client::{CallError, Channels, ResourceClient};
 use crate::endpoint::Endpoint;
@@ -25,9 +26,18 @@ pub struct Provider {
 struct Shared {
     client: ResourceClient,
     state: watch::Receiver<SessionState>,
-    /// What shall be there, by id. Held during a call, so that an older offer never overtakes a newer one.
-    wanted: Mutex<BTreeMap<String, Resource>>,
+    /// By id. Held during a call, so that an older wish never overtakes a newer one.
+    wishes: Mutex<BTreeMap<String, Wish>>,
     missing: Notify,
+}
+
+/// What shall be so at the manager.
+#[derive(Debug, Default)]
+struct Wish {
+    /// What shall be there; `None` for what shall be gone.
+    resource: Option<Resource>,
+    /// Why it is not so yet, as told in the log.
+    problem: String,
 }
 
 impl Provider {
@@ -38,7 +48,7 @@ impl Provider {
     pub fn start(channels: &Channels, endpoint: &Endpoint, session: &Session) -> Result<Provider, CallError> {
         let client = ResourceClient::new(channels, endpoint, session.id())?;
         let shared =
-            Arc::new(Shared { client, state: session.state(), wanted: Mutex::default(), missing: Notify::new() });
+            Arc::new(Shared { client, state: session.state(), wishes: Mutex::default(), missing: Notify::new() });
         let end = CancellationToken::new();
         tokio::spawn(end.clone().run_until_cancelled_owned(restore(Arc::clone(&shared))));
         Ok(Provider { shared, _end: end.drop_guard() })
@@ -50,56 +60,76 @@ impl Provider {
     }
 
     /// Offers a resource (its id must not be empty), or updates one offered before. True once it is there; false when the
-    /// manager cannot be asked now: it will be offered as soon as it can.
+    /// manager cannot be asked now, or another session still has one of this id: it will be offered as soon as it can.
     ///
     /// # Errors
     /// [`CallError::Refused`] when the manager does not want it; it is not offered again.
     pub async fn offer(&self, resource: Resource) -> Result<bool, CallError> {
-        let mut wanted = self.shared.wanted.lock().await;
-        let id = resource.id.clone();
-        wanted.insert(id.clone(), resource.clone());
-        if !self.shared.state.borrow().alive {
-            self.shared.missing.notify_one();
-            return Ok(false);
-        }
-        match self.shared.client.create(resource).await {
-            Ok(_) => Ok(true),
-            Err(error) if is_passing(&error) => {
-                self.shared.missing.notify_one();
-                Ok(false)
-            }
-            Err(error) => {
-                wanted.remove(&id);
-                Err(error)
-            }
-        }
+        self.wish(resource.id.clone(), Some(resource)).await
     }
 
-    /// Withdraws a resource; who holds a lease of it loses it.
+    /// Withdraws a resource; who holds a lease of it loses it. True once it is gone; false when the manager cannot be asked
+    /// now: it will be withdrawn as soon as it can.
     ///
     /// # Errors
-    /// [`CallError`] when the manager does not answer; it is not offered again all the same.
-    pub async fn withdraw(&self, id: &str) -> Result<(), CallError> {
-        let mut wanted = self.shared.wanted.lock().await;
-        wanted.remove(id);
-        match self.shared.client.delete(id).await {
-            Err(error) if error.code() == Some(Code::NotFound) => Ok(()),
-            done => done,
+    /// [`CallError::Refused`] when the manager does not let it go; that is not asked again.
+    pub async fn withdraw(&self, id: &str) -> Result<bool, CallError> {
+        self.wish(id.to_owned(), None).await
+    }
+
+    async fn wish(&self, id: String, resource: Option<Resource>) -> Result<bool, CallError> {
+        let mut wishes = self.shared.wishes.lock().await;
+        let alive = self.shared.state.borrow().alive;
+        let wish = wishes.entry(id.clone()).or_default();
+        wish.resource = resource;
+        let done = if alive { wish.ask(&self.shared.client, &id).await } else { Ok(false) };
+        match done {
+            Ok(true) if wish.resource.is_some() => {}
+            Ok(false) => self.shared.missing.notify_one(),
+            Ok(true) | Err(_) => drop(wishes.remove(&id)),
         }
+        done
     }
 
     /// What is offered, by id.
     pub async fn offered(&self) -> Vec<Resource> {
-        self.shared.wanted.lock().await.values().cloned().collect()
+        self.shared.wishes.lock().await.values().filter_map(|wish| wish.resource.clone()).collect()
     }
 }
 
-/// Whether asking again later may help: nobody answers, or the session is not known (yet, or any more).
-fn is_passing(error: &CallError) -> bool {
-    matches!(error.code(), None | Some(Code::FailedPrecondition | Code::ResourceExhausted | Code::DeadlineExceeded))
+impl Wish {
+    /// Whether it is so now; an error where it never will be.
+    async fn ask(&mut self, client: &ResourceClient, id: &str) -> Result<bool, CallError> {
+        let asked = match &self.resource {
+            Some(resource) => client.create(resource.clone()).await.map(drop),
+            None => client.delete(id).await,
+        };
+        match asked {
+            Err(error) if is_passing(&error) => {
+                let problem = error.to_string();
+                if self.problem != problem {
+                    tracing::warn!(resource = %id, "the resource manager will be asked again: {problem}");
+                    self.problem = problem;
+                }
+                return Ok(false);
+            }
+            Err(error) if self.resource.is_none() && error.code() == Some(Code::NotFound) => {}
+            Err(error) => return Err(error),
+            Ok(()) => {}
+        }
+        self.problem.clear();
+        Ok(true)
+    }
 }
 
-/// Offers everything again whenever the session was made anew, and what could not be offered.
+/// Whether asking again later may help: nobody answers, the session is not known (yet, or any more), or a session that has
+/// a resource of this id may end.
+fn is_passing(error: &CallError) -> bool {
+    use Code::{AlreadyExists, DeadlineExceeded, FailedPrecondition, ResourceExhausted};
+    matches!(error.code(), None | Some(FailedPrecondition | ResourceExhausted | DeadlineExceeded | AlreadyExists))
+}
+
+/// Asks for everything again whenever the session was made anew, and for what is not so yet.
 async fn restore(shared: Arc<Shared>) {
     let mut state = shared.state.clone();
     let mut restored = 0;
@@ -114,7 +144,7 @@ async fn restore(shared: Arc<Shared>) {
                 },
             }
         }
-        if offer_all(&shared).await {
+        if ask_for_all(&shared).await {
             restored = generation;
         } else {
             tokio::time::sleep(RETRY_INTERVAL).await;
@@ -123,22 +153,24 @@ async fn restore(shared: Arc<Shared>) {
     }
 }
 
-/// Offers everything; whether all is there (or refused for good).
-async fn offer_all(shared: &Shared) -> bool {
-    let mut wanted = shared.wanted.lock().await;
-    let mut refused = Vec::new();
-    for (id, resource) in wanted.iter() {
-        match shared.client.create(resource.clone()).await {
-            Ok(_) => {}
-            Err(error) if is_passing(&error) => return false,
+/// Asks for everything; whether all is so (or refused for good).
+async fn ask_for_all(shared: &Shared) -> bool {
+    let mut wishes = shared.wishes.lock().await;
+    let mut all = true;
+    let mut settled = Vec::new();
+    for (id, wish) in wishes.iter_mut() {
+        match wish.ask(&shared.client, id).await {
+            Ok(true) if wish.resource.is_some() => {}
+            Ok(true) => settled.push(id.clone()),
+            Ok(false) => all = false,
             Err(error) => {
-                tracing::warn!(resource = %id, %error, "the resource manager does not want the resource any more");
-                refused.push(id.clone());
+                tracing::warn!(resource = %id, %error, "the resource manager refuses for good");
+                settled.push(id.clone());
             }
         }
     }
-    for id in refused {
-        wanted.remove(&id);
+    for id in settled {
+        wishes.remove(&id);
     }
-    true
+    all
 }

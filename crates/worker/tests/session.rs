@@ -27,6 +27,8 @@ const TTL: Duration = Duration::from_millis(200);
 struct Pool {
     sessions: BTreeSet<String>,
     resources: BTreeMap<String, ratn_proto::v1::Resource>,
+    /// Ids that another session has.
+    taken: BTreeSet<String>,
 }
 
 #[derive(Clone)]
@@ -46,6 +48,9 @@ impl ResourceService for Manager {
         let resource = request.resource.unwrap();
         if resource.kind == "Forbidden" {
             return Err(Status::permission_denied("not here"));
+        }
+        if pool.taken.contains(&resource.id) {
+            return Err(Status::already_exists("another session has it"));
         }
         pool.resources.insert(resource.id.clone(), resource.clone());
         drop(pool);
@@ -217,4 +222,40 @@ async fn resources_are_offered_updated_and_withdrawn() {
     provider.withdraw("arm@sim").await.unwrap();
     provider.withdraw("arm@sim").await.unwrap();
     assert!(manager.pool.lock().unwrap().resources.is_empty());
+}
+
+#[tokio::test]
+async fn what_was_withdrawn_while_nobody_answered_is_gone_once_somebody_does() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    let (stop, serving) = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open(&channels, &endpoint, "cell", TTL);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    assert!(provider.offer(arm()).await.unwrap());
+
+    stop.cancel();
+    serving.await.unwrap();
+    let _ = provider.withdraw("arm@sim").await;
+    // It was away for a moment and has forgotten nothing.
+    let _serving = manager.serve(&endpoint).await;
+    manager.until(|pool| pool.resources.is_empty()).await;
+}
+
+#[tokio::test]
+async fn a_resource_that_another_session_still_has_is_offered_until_that_one_is_over() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    manager.pool.lock().unwrap().taken.insert("arm@sim".to_owned());
+    let _serving = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open(&channels, &endpoint, "cell", TTL);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    assert!(!provider.offer(arm()).await.unwrap());
+    manager.pool.lock().unwrap().taken.clear();
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
 }
