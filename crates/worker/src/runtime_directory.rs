@@ -4,12 +4,14 @@
 use crate::endpoint::{Endpoint, EndpointError};
 use std::fs;
 use std::io::{self, Write};
-use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// How often [`RuntimeDirectory::wait_for`] looks.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
+/// The bits of a mode that let the group or everybody write.
+const OTHERS_WRITE: u32 = 0o022;
 
 /// The runtime directory of one system.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -69,14 +71,18 @@ pub struct Published {
 }
 
 impl RuntimeDirectory {
-    /// The directory at `path`, made if need be, for this user only.
+    /// The directory at `path`, made for this user only if it is not there.
     ///
     /// # Errors
-    /// Where it cannot be made, or is no directory.
+    /// Where it cannot be made, is no directory, or is one that others may write to: they could stand in for a role.
     pub fn create(path: impl Into<PathBuf>) -> io::Result<RuntimeDirectory> {
         let path = path.into();
         fs::DirBuilder::new().recursive(true).mode(0o700).create(&path)?;
-        fs::set_permissions(&path, fs::Permissions::from_mode(0o700))?;
+        let is = fs::metadata(&path)?;
+        if is.uid() != nix::unistd::geteuid().as_raw() || is.mode() & OTHERS_WRITE != 0 {
+            let rule = "others than this user may write to it; choose another, or take that right away (chmod go-w)";
+            return Err(io::Error::new(io::ErrorKind::PermissionDenied, rule));
+        }
         Ok(RuntimeDirectory { path: path.canonicalize()? })
     }
 
@@ -189,6 +195,7 @@ impl Drop for Published {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use std::os::unix::fs::PermissionsExt;
 
     fn endpoint(port: u16) -> Endpoint {
         Endpoint::Tcp { host: "127.0.0.1".to_owned(), port }
@@ -208,6 +215,16 @@ mod tests {
         drop(published);
         assert!(matches!(directory.find("cell"), Err(FindError::NotPublished { .. })));
         assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_directory_that_others_may_write_to_is_refused_and_left_as_it_is() {
+        let parent = tempfile::tempdir().unwrap();
+        for (mode, good) in [(0o1777, false), (0o770, false), (0o755, true), (0o700, true)] {
+            fs::set_permissions(parent.path(), fs::Permissions::from_mode(mode)).unwrap();
+            assert_eq!(RuntimeDirectory::create(parent.path()).is_ok(), good, "{mode:o}");
+            assert_eq!(fs::metadata(parent.path()).unwrap().permissions().mode() & 0o7777, mode);
+        }
     }
 
     #[test]

@@ -3,8 +3,8 @@
 use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
 use std::convert::Infallible;
 use std::io;
-use std::os::unix::fs::DirBuilderExt;
-use std::path::PathBuf;
+use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt};
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tokio::net::{TcpListener, UnixListener, UnixStream};
 use tokio_stream::wrappers::UnixListenerStream;
@@ -32,9 +32,13 @@ enum Listener {
     Unix(UnixListener, SocketFile),
 }
 
-/// Removes the socket's file in the end.
+/// Removes the socket's file in the end, unless a successor has put its own there.
 #[derive(Debug)]
-struct SocketFile(PathBuf);
+struct SocketFile {
+    path: PathBuf,
+    /// Device and inode.
+    identity: (u64, u64),
+}
 
 /// An address that cannot be listened on.
 #[derive(Debug, thiserror::Error)]
@@ -112,14 +116,12 @@ pub async fn bind(listen: &Endpoint) -> Result<Bound, BindError> {
             if let Some(parent) = path.parent() {
                 std::fs::DirBuilder::new().recursive(true).mode(0o700).create(parent).map_err(failed)?;
             }
-            if path.exists() {
-                if UnixStream::connect(path).await.is_ok() {
-                    return Err(failed(io::Error::from(io::ErrorKind::AddrInUse)));
-                }
+            if is_dead_socket(path).await {
                 std::fs::remove_file(path).map_err(failed)?;
             }
             let listener = UnixListener::bind(path).map_err(failed)?;
-            let listener = Listener::Unix(listener, SocketFile(path.clone()));
+            let file = SocketFile { path: path.clone(), identity: identity(path).map_err(failed)? };
+            let listener = Listener::Unix(listener, file);
             Ok(Bound { listener, endpoint: listen.clone() })
         }
     }
@@ -162,9 +164,12 @@ impl Bound {
                     }
                     Listener::Unix(listener, file) => {
                         let incoming = UnixListenerStream::new(listener);
-                        let served = router.serve_with_incoming_shutdown(incoming, stop).await;
-                        drop(file);
-                        served
+                        // Removed while it is still listened on: afterwards the file may be a successor's.
+                        let stop = async {
+                            stop.await;
+                            drop(file);
+                        };
+                        router.serve_with_incoming_shutdown(incoming, stop).await
                     }
                 }
             }
@@ -187,8 +192,21 @@ impl Bound {
     }
 }
 
+/// Whether a killed process left this socket behind.
+async fn is_dead_socket(path: &Path) -> bool {
+    let is_socket = std::fs::symlink_metadata(path).is_ok_and(|is| is.file_type().is_socket());
+    let refused = |error: io::Error| error.kind() == io::ErrorKind::ConnectionRefused;
+    is_socket && UnixStream::connect(path).await.is_err_and(refused)
+}
+
+fn identity(path: &Path) -> io::Result<(u64, u64)> {
+    std::fs::symlink_metadata(path).map(|is| (is.dev(), is.ino()))
+}
+
 impl Drop for SocketFile {
     fn drop(&mut self) {
-        let _ = std::fs::remove_file(&self.0);
+        if identity(&self.path).is_ok_and(|there| there == self.identity) {
+            let _ = std::fs::remove_file(&self.path);
+        }
     }
 }

@@ -66,6 +66,28 @@ async fn a_socket_in_use_is_refused_and_a_dead_one_replaced() {
 }
 
 #[tokio::test]
+async fn a_file_that_is_no_socket_is_not_replaced_by_one() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("thesis.txt");
+    std::fs::write(&path, "words").unwrap();
+    assert!(bind(&Endpoint::Unix(path.clone())).await.is_err());
+    assert_eq!(std::fs::read_to_string(path).unwrap(), "words");
+}
+
+#[tokio::test]
+async fn a_server_that_ends_leaves_the_socket_of_its_successor_alone() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("a.sock");
+    let endpoint = Endpoint::Unix(path.clone());
+    let first = bind(&endpoint).await.unwrap();
+    // As a successor does that finds nobody listening, while the first still drains.
+    std::fs::remove_file(&path).unwrap();
+    let _second = bind(&endpoint).await.unwrap();
+    drop(first);
+    assert!(path.exists());
+}
+
+#[tokio::test]
 async fn a_worker_serves_from_its_options_and_leaves_nothing_behind() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("one.endpoint");
