@@ -1,7 +1,7 @@
 //! What goes into and comes out of the executive. Both are the event log, line by line.
 
 use ratn_model::fact::{Change, FactKey, Footprint};
-use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision, StateId};
+use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision, StateId};
 use ratn_model::resource::{Lease, Requirement};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -142,6 +142,8 @@ pub enum Command {
         changes: Vec<Change>,
         /// What of it may be seen.
         reads: Footprint,
+        /// What holds the room for it: the instance's lease, or that of the routine it is in.
+        lease: Option<(LeaseId, FencingToken)>,
     },
     /// Give a provider a goal; answered by `Finished` or `Crashed`.
     Start {

@@ -239,7 +239,12 @@ impl Simulation<'_> {
                 }
                 self.answers();
             }
-            Command::Project { instance, attempt, base, changes, reads: _ } => {
+            Command::Project { instance, attempt, base, changes, lease, reads: _ } => {
+                if let Some((lease, _)) = lease
+                    && !self.leases.contains_key(&lease)
+                {
+                    return Err(self.broken(format!("{instance} projects under {lease}, which it does not hold")));
+                }
                 let Some(below) = self.roots.get(&base) else {
                     return Err(self.broken(format!("projection on {base}, the root is {}", self.root.revision())));
                 };

@@ -8,7 +8,7 @@ use anyhow::bail;
 use ratn_executive::protocol::{Command, Event, Goal};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::FactKey;
-use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision};
+use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::program::ABORTED;
 use ratn_model::resource::Requirement;
 use ratn_model::value::Value;
@@ -59,7 +59,6 @@ pub(super) struct Performer {
     records: mpsc::Sender<Record>,
     cancelled: Cancelled,
     asking: BTreeMap<InstanceId, CancellationToken>,
-    leases: BTreeMap<InstanceId, (LeaseId, FencingToken)>,
     jobs: BTreeMap<InstanceId, Job>,
     giving_back: JoinSet<()>,
     acquires: u64,
@@ -67,6 +66,8 @@ pub(super) struct Performer {
 
 struct Job {
     attempt: u32,
+    /// What it works under; a routine's serves several jobs.
+    lease: Option<LeaseId>,
     stop: CancellationToken,
     ended: JoinHandle<()>,
 }
@@ -107,7 +108,6 @@ impl Performer {
             records,
             cancelled,
             asking: BTreeMap::new(),
-            leases: BTreeMap::new(),
             jobs: BTreeMap::new(),
             giving_back: JoinSet::new(),
             acquires: 0,
@@ -136,8 +136,7 @@ impl Performer {
                     asking.cancel();
                 }
             }
-            Command::Project { instance, attempt, base, changes, reads } => {
-                let lease = self.leases.get(&instance).copied();
+            Command::Project { instance, attempt, base, changes, reads, lease } => {
                 self.record(Record::Project { instance, attempt, base, changes, reads, lease })?;
             }
             Command::Start { instance, attempt, goal } => self.start(instance, attempt, goal),
@@ -207,26 +206,36 @@ impl Performer {
         });
     }
 
-    /// The event of an answer; `None` when what it answers was withdrawn: a grant that crossed goes back.
+    /// The event of an answer; `None` when what it answers was withdrawn or cancelled: what crossed with that goes back.
     pub(super) fn accept(&mut self, answer: Answer) -> Option<Event> {
-        let crossed = answer.withdrawn.is_some_and(|withdrawn| withdrawn.is_cancelled());
+        let withdrawn = answer.withdrawn.is_some_and(|withdrawn| withdrawn.is_cancelled());
         match answer.event {
-            Event::Granted { instance, lease } if crossed => {
-                self.give_back(instance, None, Some(lease.id), None);
+            Event::Granted { instance, lease } if withdrawn => {
+                self.give_back(instance, Vec::new(), Some(lease.id), None);
                 None
             }
-            _ if crossed => None,
-            Event::Granted { instance, lease } => {
-                self.leases.insert(instance, (lease.id, lease.token));
-                Some(Event::Granted { instance, lease })
+            _ if withdrawn => None,
+            Event::Projected { instance, attempt, projection } if self.was_cancelled(instance, attempt) => {
+                self.give_back(instance, Vec::new(), None, Some(projection));
+                None
             }
-            event => Some(event),
+            Event::Crashed { instance, attempt, .. } if self.was_cancelled(instance, attempt) => None,
+            event => {
+                if let Event::Granted { instance, .. } | Event::Refused { instance, .. } = &event {
+                    self.asking.remove(instance);
+                }
+                Some(event)
+            }
         }
     }
 
+    fn was_cancelled(&self, instance: InstanceId, attempt: u32) -> bool {
+        self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).remove(&(instance, attempt))
+    }
+
     fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal) {
-        self.asking.remove(&instance);
         let stop = CancellationToken::new();
+        let lease = goal.lease.as_ref().map(|lease| lease.id);
         let endpoint = self.endpoint_of(&goal);
         let (actions, events, stopped) = (self.actions.clone(), self.events.clone(), stop.clone());
         let goal = types::Goal {
@@ -250,7 +259,7 @@ impl Performer {
                 let _ = events.send(event.into()).await;
             }
         });
-        self.jobs.insert(instance, Job { attempt, stop, ended });
+        self.jobs.insert(instance, Job { attempt, lease, stop, ended });
     }
 
     /// Where the provider of a goal is: the leased resource of its kind.
@@ -269,23 +278,23 @@ impl Performer {
     }
 
     fn release(&mut self, instance: InstanceId, lease: Option<LeaseId>, projection: Option<ProjectionId>) {
-        self.asking.remove(&instance);
-        self.leases.remove(&instance);
-        let job = self.jobs.remove(&instance);
-        self.give_back(instance, job, lease, projection);
+        let over = |id: InstanceId, job: &Job| id == instance || (lease.is_some() && job.lease == lease);
+        let (ended, going_on) = std::mem::take(&mut self.jobs).into_iter().partition(|(id, job)| over(*id, job));
+        self.jobs = going_on;
+        self.give_back(instance, Vec::from_iter(BTreeMap::into_values(ended)), lease, projection);
     }
 
     fn give_back(
         &mut self,
         instance: InstanceId,
-        job: Option<Job>,
+        jobs: Vec<Job>,
         lease: Option<LeaseId>,
         projection: Option<ProjectionId>,
     ) {
         let (resources, world) = (self.resources.clone(), self.world.clone());
         self.giving_back.spawn(async move {
             // Whoever gets the resources next finds them idle.
-            if let Some(job) = job {
+            for job in jobs {
                 let _ = job.ended.await;
             }
             if let Some(projection) = projection
@@ -360,9 +369,11 @@ mod tests {
     use super::*;
     use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
     use ratn_daemon::world_pool::{self, WorldPoolConfig};
+    use ratn_model::fact::Footprint;
     use ratn_model::resource::{ResourceClass, ResourceOperation};
     use ratn_proto::types::Resource;
     use ratn_worker::runtime_directory::RuntimeDirectory;
+    use tokio_util::sync::DropGuard;
 
     fn arm() -> Vec<Requirement> {
         vec![Requirement {
@@ -374,33 +385,107 @@ mod tests {
         }]
     }
 
+    /// A performer with a resource manager, a world pool and one arm.
+    struct Bench {
+        performer: Performer,
+        answers: mpsc::Receiver<Answer>,
+        _place: tempfile::TempDir,
+        _shutdown: DropGuard,
+    }
+
+    impl Bench {
+        async fn new() -> anyhow::Result<Bench> {
+            let place = tempfile::tempdir()?;
+            let directory = RuntimeDirectory::create(place.path())?;
+            let shutdown = CancellationToken::new();
+            tokio::spawn(resource_manager::run(ResourceManagerConfig::default(), directory.clone(), shutdown.clone()));
+            tokio::spawn(world_pool::run(WorldPoolConfig::default(), directory.clone(), shutdown.clone()));
+            let endpoints = Endpoints {
+                resource_manager: directory.wait_for(resource_manager::ROLE, SESSION_DEADLINE).await?,
+                world_pool: directory.wait_for(world_pool::ROLE, SESSION_DEADLINE).await?,
+            };
+            let (events, answers) = mpsc::channel(8);
+            let performer = Performer::connect(&endpoints, Arc::default(), "task", events).await?;
+            performer.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
+            Ok(Bench { performer, answers, _place: place, _shutdown: shutdown.drop_guard() })
+        }
+
+        fn ask(&mut self, instance: InstanceId) -> anyhow::Result<()> {
+            self.performer.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })
+        }
+
+        /// The next event that the executive is given.
+        async fn event(&mut self) -> Option<Event> {
+            loop {
+                let answer = self.answers.recv().await?;
+                if let Some(event) = self.performer.accept(answer) {
+                    return Some(event);
+                }
+            }
+        }
+
+        async fn granted(&mut self, to: InstanceId) -> anyhow::Result<LeaseId> {
+            match self.event().await {
+                Some(Event::Granted { instance, lease }) if instance == to => Ok(lease.id),
+                other => bail!("the arm was to be granted to {to}: {other:?}"),
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn an_acquire_of_the_event_that_gave_a_lease_back_can_be_withdrawn() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        let (instance, other) = (InstanceId(1), InstanceId(2));
+        bench.ask(instance)?;
+        let lease = Some(bench.granted(instance).await?);
+        // Its worker died: it asks again, then gives back. Then its branch is not taken.
+        bench.ask(instance)?;
+        bench.performer.perform(Command::Release { instance, lease, projection: None })?;
+        bench.performer.perform(Command::Withdraw { instance })?;
+        bench.ask(other)?;
+        bench.granted(other).await?;
+        bench.performer.close().await;
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        let (instance, reads) = (InstanceId(1), Footprint::Everything);
+        bench.ask(instance)?;
+        bench.granted(instance).await?;
+        let project = |attempt| Command::Project {
+            instance,
+            attempt,
+            base: Revision(0),
+            changes: Vec::new(),
+            reads: reads.clone(),
+            lease: None,
+        };
+        bench.performer.perform(project(1))?;
+        let made = bench.answers.recv().await;
+        bench.performer.perform(Command::Cancel { instance, attempt: 1 })?;
+        assert_eq!(made.and_then(|answer| bench.performer.accept(answer)), None);
+        assert!(bench.performer.cancelled.lock().is_ok_and(|cancelled| cancelled.is_empty()));
+        bench.performer.perform(project(2))?;
+        assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 2, .. })));
+        bench.performer.close().await;
+        Ok(())
+    }
+
     #[tokio::test]
     async fn a_grant_that_crosses_its_withdrawal_goes_back() -> anyhow::Result<()> {
-        let place = tempfile::tempdir()?;
-        let directory = RuntimeDirectory::create(place.path())?;
-        let shutdown = CancellationToken::new();
-        tokio::spawn(resource_manager::run(ResourceManagerConfig::default(), directory.clone(), shutdown.clone()));
-        tokio::spawn(world_pool::run(WorldPoolConfig::default(), directory.clone(), shutdown.clone()));
-        let endpoints = Endpoints {
-            resource_manager: directory.wait_for(resource_manager::ROLE, SESSION_DEADLINE).await?,
-            world_pool: directory.wait_for(world_pool::ROLE, SESSION_DEADLINE).await?,
-        };
-        let (events, mut answers) = mpsc::channel(8);
-        let mut performer = Performer::connect(&endpoints, Arc::default(), "task", events).await?;
-        performer.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
-
+        let mut bench = Bench::new().await?;
         let instance = InstanceId(1);
-        performer.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })?;
-        let granted = answers.recv().await;
-        performer.perform(Command::Withdraw { instance })?;
-        assert_eq!(granted.and_then(|answer| performer.accept(answer)), None);
+        bench.ask(instance)?;
+        let granted = bench.answers.recv().await;
+        bench.performer.perform(Command::Withdraw { instance })?;
+        assert_eq!(granted.and_then(|answer| bench.performer.accept(answer)), None);
 
         // Nobody holds the arm: the same instance gets it when it asks again.
-        performer.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })?;
-        let granted = answers.recv().await.and_then(|answer| performer.accept(answer));
-        assert!(matches!(granted, Some(Event::Granted { .. })), "{granted:?}");
-        performer.close().await;
-        shutdown.cancel();
+        bench.ask(instance)?;
+        bench.granted(instance).await?;
+        bench.performer.close().await;
         Ok(())
     }
 }

@@ -47,6 +47,8 @@ impl Interpreter {
             return self.run(context);
         }
         current.phase = Phase::Projecting;
+        let lease = self.routine.as_ref().map_or(&current.lease, |routine| &routine.lease);
+        let lease = lease.as_ref().map(|l| (l.id, l.token));
         let (instance, attempt) = (current.instance, current.attempt);
         let reads = match &analysis.reads {
             None => Footprint::Everything,
@@ -56,7 +58,7 @@ impl Interpreter {
             Target::Actual => (context.root.revision(), Vec::new()),
             Target::Projection { base, changes, .. } => (*base, changes.clone()),
         };
-        context.commands.push(Command::Project { instance, attempt, base, changes, reads });
+        context.commands.push(Command::Project { instance, attempt, base, changes, reads, lease });
         Progress::Busy
     }
 

@@ -199,6 +199,7 @@ impl Window {
                 base: context.root.revision(),
                 changes: place.changes.clone(),
                 reads: instance.reads.clone(),
+                lease: instance.lease.as_ref().map(|l| (l.id, l.token)),
             });
             return true;
         }
