@@ -155,6 +155,7 @@ impl Maker {
             (true, 0) => self.hierarchy(id, &path, depth, visible),
             (true, 1) => self.for_each(id, &path, depth, visible),
             (true, _) => {
+                self.states[id.0 as usize].annotations.routine = self.dice.percent(15);
                 let predicate = self.predicate(visible);
                 let (then, _) = self.list(id, &path, depth + 1, visible.clone());
                 let (otherwise, _) = if self.dice.percent(60) {
@@ -174,19 +175,39 @@ impl Maker {
         let own = inner.ports.iter().rev().find(|state| !visible.ports.contains(state)).copied();
         let outputs = own
             .filter(|_| self.dice.percent(70))
-            .map(|state| TaskOutput {
-                name: "x".to_owned(),
-                ty: Type::Any,
-                value: Expr::Port { state, port: "x".to_owned() },
+            .map(|state| {
+                // A fact at the exit, as often as what a child put out.
+                let fact = self.fact(&Visible { ports: Vec::new(), ..visible.clone() });
+                let looked_up = Expr::Binary(
+                    BinaryOperator::Equal,
+                    Box::new(Expr::Fact(fact)),
+                    Box::new(Expr::Literal(Value::Int(1))),
+                );
+                let value = if self.dice.percent(30) { looked_up } else { Expr::Port { state, port: "x".to_owned() } };
+                TaskOutput { name: "x".to_owned(), ty: Type::Any, value }
             })
             .into_iter()
             .collect();
-        let annotations = &mut self.states[id.0 as usize].annotations;
-        annotations.routine = self.dice.percent(25);
-        if self.dice.percent(20) {
-            let effects = vec![self.effect(&Visible::default(), false)];
-            self.states[id.0 as usize].annotations.effects.insert(SUCCESS.to_owned(), effects);
+        let mut annotations = Annotations { routine: self.dice.percent(25), ..Annotations::default() };
+        for (outcome, chance) in [(SUCCESS, 20), (ABORTED, 20)] {
+            if self.dice.percent(chance) {
+                annotations.effects.insert(outcome.to_owned(), vec![self.effect(&Visible::default(), false)]);
+            }
         }
+        // As the loader has it: what its effects look up it reads.
+        let used = annotations.effects.values().flat_map(|effects| EffectExpr::fact_expressions(effects));
+        annotations.reads = Some(used.cloned().collect());
+        if self.dice.percent(15) {
+            let required = self.unlike_one(visible);
+            annotations.requires.push(required);
+        }
+        if self.dice.percent(20) {
+            annotations.resources.push(resource(ResourceOperation::Block, "Planner", 2));
+        }
+        if self.dice.percent(20) {
+            annotations.resources.push(task_resource(ResourceOperation::Create));
+        }
+        self.states[id.0 as usize].annotations = annotations;
         StateKind::Sequence { children, outputs }
     }
 
@@ -201,6 +222,7 @@ impl Maker {
                 Expr::List(items.collect())
             }
         };
+        self.states[id.0 as usize].annotations.routine = self.dice.percent(15);
         let mut inner = visible.clone();
         inner.variables.push(variable.clone());
         let (body, _) = self.list(id, path, depth + 1, inner);
@@ -232,13 +254,7 @@ impl Maker {
 
     fn annotations(&mut self, visible: &Visible) -> Annotations {
         let mut annotations = Annotations::default();
-        let block = |kind: &str| ResourceExpr {
-            operation: ResourceOperation::Block,
-            kind: kind.to_owned(),
-            class: None,
-            attributes: Vec::new(),
-            count: 1,
-        };
+        let block = |kind: &str| resource(ResourceOperation::Block, kind, 1);
         let facts = |maker: &mut Maker, most: u64| -> Vec<FactExpr> {
             (0..maker.dice.below(most + 1)).map(|_| maker.fact(visible)).collect()
         };
@@ -246,11 +262,16 @@ impl Maker {
             0..=4 => {
                 annotations.nature = Nature::Computes;
                 annotations.reads = self.dice.percent(90).then(|| facts(self, 3));
-                annotations.resources = vec![block("Planner"), block(WORLD_MODEL)];
+                let planners = if self.dice.percent(15) { 2 } else { 1 };
+                annotations.resources =
+                    vec![resource(ResourceOperation::Block, "Planner", planners), block(WORLD_MODEL)];
             }
             5 | 6 => {
                 annotations.nature = Nature::Senses(facts(self, 2));
                 annotations.resources = vec![block("Eye")];
+                if self.dice.percent(30) {
+                    annotations.resources.push(block(WORLD_MODEL));
+                }
                 if self.dice.percent(85) {
                     let effects = if self.dice.percent(60) { vec![self.effect(visible, true)] } else { Vec::new() };
                     annotations.effects.insert(SUCCESS.to_owned(), effects);
@@ -259,6 +280,9 @@ impl Maker {
             _ => {
                 annotations.reads = self.dice.percent(80).then(|| facts(self, 2));
                 annotations.resources = vec![block(if self.dice.percent(70) { "Arm" } else { "Head" })];
+                if self.dice.percent(15) {
+                    annotations.resources.push(task_resource(ResourceOperation::Create));
+                }
                 if self.dice.percent(85) {
                     let count = self.dice.below(3);
                     let effects = (0..count).map(|_| self.effect(visible, true)).collect();
@@ -270,20 +294,17 @@ impl Maker {
             }
         }
         if self.dice.percent(10) {
-            let fact = self.fact(visible);
-            if let Some(reads) = &mut annotations.reads {
-                reads.push(fact.clone());
-            }
-            annotations.requires.push(Expr::Unary(
-                ratn_model::expression::UnaryOperator::Not,
-                Box::new(Expr::Binary(
-                    BinaryOperator::Equal,
-                    Box::new(Expr::Fact(fact)),
-                    Box::new(Expr::Literal(Value::Int(1))),
-                )),
-            ));
+            let required = self.unlike_one(visible);
+            annotations.requires.push(required);
         }
         annotations
+    }
+
+    /// `not (fact = 1)`
+    fn unlike_one(&mut self, visible: &Visible) -> Expr {
+        let fact = Box::new(Expr::Fact(self.fact(visible)));
+        let is_one = Expr::Binary(BinaryOperator::Equal, fact, Box::new(Expr::Literal(Value::Int(1))));
+        Expr::Unary(ratn_model::expression::UnaryOperator::Not, Box::new(is_one))
     }
 
     fn fact(&mut self, visible: &Visible) -> FactExpr {
@@ -326,6 +347,14 @@ impl Maker {
         let limit = Expr::Literal(Value::Int(self.dice.below(3) as i64));
         Expr::Binary(BinaryOperator::Equal, Box::new(what), Box::new(limit))
     }
+}
+
+fn resource(operation: ResourceOperation, kind: &str, count: u32) -> ResourceExpr {
+    ResourceExpr { operation, kind: kind.to_owned(), class: None, attributes: Vec::new(), count }
+}
+
+fn task_resource(operation: ResourceOperation) -> ResourceExpr {
+    ResourceExpr { class: Some(ResourceClass::Task), ..resource(operation, "Part", 1) }
 }
 
 /// What nodes of random programs do.

@@ -71,6 +71,9 @@ fn compare(seed: u64) -> Result<(f64, f64), String> {
     if facts(&hsm) != facts(&cdtn) {
         return differ("worlds", format!("{:?}", facts(&hsm)), format!("{:?}", facts(&cdtn)));
     }
+    if hsm.units != cdtn.units {
+        return differ("task resources", format!("{:?}", hsm.units), format!("{:?}", cdtn.units));
+    }
     let ((hsm_started, mut hsm_retired), (cdtn_started, mut cdtn_retired)) =
         (story(&program, &hsm), story(&program, &cdtn));
     if hsm_started != cdtn_started {
