@@ -1,6 +1,7 @@
 //! One run of one task in virtual time: the same loop as the real task control's (receive, handle, perform), with the cores
 //! called directly.
 
+use crate::random::Dice;
 use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode};
 use ratn_model::fact::{Change, FactKey};
@@ -63,6 +64,8 @@ pub struct Setup {
     pub world: Vec<(FactKey, Value)>,
     /// When a measured value is the predicted one.
     pub tolerance: Tolerance,
+    /// Leases and projections take up to this long to come, at random by the seed; what crosses meanwhile, crosses.
+    pub latency: Duration,
 }
 
 /// What became of it.
@@ -127,6 +130,8 @@ struct Simulation<'a> {
     paths: BTreeMap<InstanceId, String>,
     agenda: BTreeMap<(Timestamp, u64), Event>,
     next_entry: u64,
+    latency: Duration,
+    dice: Dice,
     oracle: &'a mut dyn Oracle,
     log: Vec<LogLine>,
     end: Option<(String, BTreeMap<String, Value>, String)>,
@@ -169,6 +174,8 @@ pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
         paths: BTreeMap::new(),
         agenda: BTreeMap::new(),
         next_entry: 0,
+        latency: setup.latency,
+        dice: Dice(setup.seed),
         oracle,
         log: Vec::new(),
         end: None,
@@ -210,6 +217,11 @@ impl Simulation<'_> {
     fn at(&mut self, delay: Duration, event: Event) {
         self.next_entry += 1;
         self.agenda.insert((self.now + delay, self.next_entry), event);
+    }
+
+    fn late(&mut self) -> Duration {
+        let most = u64::try_from(self.latency.as_nanos()).unwrap_or(u64::MAX);
+        Duration::from_nanos(self.dice.below(most))
     }
 
     fn broken(&self, problem: impl ToString) -> RunError {
@@ -255,7 +267,8 @@ impl Simulation<'_> {
                 self.next_projection += 1;
                 let projection = ProjectionId(self.next_projection);
                 self.projections.insert(projection, world);
-                self.at(Duration::ZERO, Event::Projected { instance, attempt, projection });
+                let late = self.late();
+                self.at(late, Event::Projected { instance, attempt, projection });
             }
             Command::Start { instance, attempt, goal } => self.start(instance, attempt, &goal),
             Command::Cancel { instance, attempt } => {
@@ -347,7 +360,8 @@ impl Simulation<'_> {
             self.waiters.remove(&instance);
             if let Some(lease) = lease {
                 self.leases.insert(lease.id, instance);
-                self.at(Duration::ZERO, Event::Granted { instance, lease });
+                let late = self.late();
+                self.at(late, Event::Granted { instance, lease });
             }
         }
     }

@@ -13,6 +13,7 @@ use ratn_world::tolerance::Tolerance;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// The task of Table I.
 pub const FETCH_BOXES: &str = include_str!("../../../examples/fetch_boxes.yaml");
@@ -175,6 +176,7 @@ fn setup(program: Program, parameters: &[(String, String)], mode: Mode, planners
         resources,
         world: Vec::new(),
         tolerance: Tolerance::EXACT,
+        latency: Duration::ZERO,
     })
 }
 

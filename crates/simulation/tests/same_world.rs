@@ -12,6 +12,7 @@ use ratn_simulation::run::{Run, Setup, run};
 use ratn_world::tolerance::Tolerance;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 fn execute(program: &Arc<Program>, seed: u64, mode: Mode, failures_percent: u64) -> Result<Run, String> {
     let setup = Setup {
@@ -26,6 +27,7 @@ fn execute(program: &Arc<Program>, seed: u64, mode: Mode, failures_percent: u64)
         )>>(),
         world: Vec::new(),
         tolerance: Tolerance::EXACT,
+        latency: if seed.is_multiple_of(2) { Duration::ZERO } else { Duration::from_millis(1500) },
     };
     let mut oracle = HashOracle { program, seed, failures_percent, crashes_percent: 10 };
     run(setup, &mut oracle).map_err(|e| format!("{mode:?}: {e}"))

@@ -15,6 +15,7 @@ use ratn_world::tolerance::Tolerance;
 use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 const CATALOGUE: &str = r#"
 [resources]
@@ -84,6 +85,7 @@ fn simulate(task: &str, mode: Mode, script: &mut Script) -> Run {
         resources: catalogue.resources.iter().map(|(k, o)| (k.clone(), o.class, units(o.class, o.count))).collect(),
         world: Vec::new(),
         tolerance: Tolerance::ROBOT,
+        latency: Duration::ZERO,
     };
     run(setup, script).unwrap()
 }
