@@ -9,7 +9,7 @@ use ratn_cell::core::protocol::{Command, Ending, Event, Module, Product, Request
 use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
-use ratn_model::value::Trajectory;
+use ratn_model::value::{Trajectory, TrajectoryPoint};
 use ratn_motion::aimm;
 use ratn_motion::collision::{PADDING_M, distance};
 use ratn_motion::pace::Control;
@@ -342,4 +342,45 @@ fn believing_only_what_the_camera_sees_the_robot_delivers_every_box() {
         worst * 1e3,
         PADDING_M * 1e3
     );
+}
+
+#[test]
+fn a_motion_that_takes_hours_is_refused_and_not_checked_posture_by_posture() {
+    let mut bench = Bench::new(1, 1);
+    let joints: Vec<String> = bench.cell.robot().arm_joints().iter().map(|joint| joint.name.clone()).collect();
+    let point = |time_s| TrajectoryPoint { time_s, positions: aimm::HOME.to_vec(), velocities: vec![0.0; 7] };
+    for lasts_s in [1e5, 1e12, 1e300] {
+        let trajectory = Trajectory { joints: joints.clone(), points: vec![point(0.0), point(lasts_s)] };
+        let Ending::Aborted(reason) = bench.perform(Request::Follow { trajectory }) else { panic!() };
+        assert!(reason.contains("at most"), "{reason}");
+    }
+    let crawling = Request::MoveTo { joints: aimm::OBSERVATION, speed: 1e-7 };
+    assert!(matches!(bench.perform(crawling), Ending::Aborted(reason) if reason.contains("speed")));
+}
+
+#[test]
+fn nothing_begins_under_a_lease_that_has_ended_or_may_have() {
+    let mut bench = Bench::new(1, 1);
+    let refused = |bench: &mut Bench, lease| {
+        let (_, commands) = bench.start(Some(LeaseId(lease)), Request::Release);
+        match &commands[..] {
+            [] => {
+                bench.pass(60.0);
+                false
+            }
+            [Command::Ended { ending: Ending::Aborted(reason), .. }] => reason.contains("lease"),
+            other => panic!("{other:?}"),
+        }
+    };
+    assert!(!refused(&mut bench, 5), "nothing is known yet");
+    bench.cell.handle(bench.now, Event::LeasesAre { living: [LeaseId(4)].into(), youngest: LeaseId(6) });
+    assert_eq!([4, 5, 6, 7].map(|lease| refused(&mut bench, lease)), [false, true, true, false]);
+    bench.cell.handle(bench.now, Event::LeaseBegan { lease: LeaseId(8) });
+    assert_eq!([7, 8].map(|lease| refused(&mut bench, lease)), [true, false]);
+    bench.cell.handle(bench.now, Event::LeaseEnded { lease: LeaseId(8), reason: "released".to_owned() });
+    assert!(refused(&mut bench, 8));
+    bench.cell.handle(bench.now, Event::LeasesLost { reason: "silence".to_owned() });
+    assert!(refused(&mut bench, 4));
+    bench.cell.handle(bench.now, Event::LeasesAre { living: [LeaseId(4)].into(), youngest: LeaseId(8) });
+    assert!(!refused(&mut bench, 4));
 }

@@ -20,6 +20,10 @@ use ratn_worker::session::Session;
 use ratn_worker::worker::WorkerOptions;
 use std::collections::BTreeMap;
 use std::time::Duration;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::net::{UnixListener, UnixStream};
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 const DEADLINE: Duration = Duration::from_secs(30);
@@ -258,5 +262,85 @@ async fn the_modules_vanish_when_the_cell_ends() {
         }
     }
     assert_eq!(system.resources.list(&["Arm", "Gripper", "PanTilt", "Camera", "Battery"]).await.unwrap().len(), 0);
+    system.end.cancel();
+}
+
+/// A line to a socket that can hang: what is written waits, and no connection breaks.
+async fn line(from: &Endpoint, to: &Endpoint) -> watch::Sender<bool> {
+    let (Endpoint::Unix(from), Endpoint::Unix(to)) = (from.clone(), to.clone()) else { panic!("Unix sockets only") };
+    let listener = UnixListener::bind(from).unwrap();
+    let (hang, hangs) = watch::channel(false);
+    tokio::spawn(async move {
+        loop {
+            let (near_in, near_out) = listener.accept().await.unwrap().0.into_split();
+            let (far_in, far_out) = UnixStream::connect(&to).await.unwrap().into_split();
+            tokio::spawn(carry(near_in, far_out, hangs.clone()));
+            tokio::spawn(carry(far_in, near_out, hangs.clone()));
+        }
+    });
+    hang
+}
+
+async fn carry(mut from: OwnedReadHalf, mut to: OwnedWriteHalf, mut hangs: watch::Receiver<bool>) {
+    let mut bytes = [0; 4096];
+    while let Ok(length @ 1..) = from.read(&mut bytes).await {
+        if hangs.wait_for(|hangs| !hangs).await.is_err() || to.write_all(&bytes[..length]).await.is_err() {
+            return;
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_arm_stops_each_time_that_the_line_to_the_manager_hangs() {
+    let temporary = tempfile::tempdir().unwrap();
+    let directory = RuntimeDirectory::create(temporary.path()).unwrap();
+    let end = CancellationToken::new();
+    let (manager, over_the_line) = (directory.socket("rm"), directory.socket("line"));
+    let config = ResourceManagerConfig { listen: manager.clone(), ..ResourceManagerConfig::default() };
+    tokio::spawn(resource_manager::run(config, directory.clone(), end.clone()));
+    directory.wait_for(resource_manager::ROLE, DEADLINE).await.unwrap();
+    let hang = line(&over_the_line, &manager).await;
+    let config = CellConfig { resource_manager: Some(over_the_line), session_ttl_ms: 500, ..CellConfig::default() };
+    tokio::spawn(ratn_cell::run(config, directory.clone(), end.clone()));
+    let cell = directory.wait_for(ratn_cell::ROLE, DEADLINE).await.unwrap();
+
+    let channels = Channels::new();
+    let session = Session::open(&channels, &manager, "test", TTL);
+    session.alive(DEADLINE).await.unwrap();
+    let resources = ResourceClient::new(&channels, &manager, session.id()).unwrap();
+    for _ in 0..2 {
+        let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+        let lease = resources.acquire(vec![block("Arm")], options).await.unwrap();
+        let slowly = [("joints", Value::Joints(aimm::OBSERVATION.to_vec())), ("speed", Value::Float(0.02))];
+        let inputs = slowly.map(|(port, value)| (port.to_owned(), value)).into();
+        let goal =
+            Goal { id: fresh_id("goal"), action: "move_to".to_owned(), inputs, lease: Some(lease.clone()), ..goal() };
+        hang.send_replace(true);
+        let client = ActionClient::new(channels.clone());
+        let outcome = client.execute(&cell, goal, |_, _| {});
+        let outcome = tokio::time::timeout(Duration::from_secs(5), outcome).await.expect("soon").unwrap();
+        assert_eq!(outcome.outcome, "aborted", "{outcome:?}");
+        hang.send_replace(false);
+        resources.release(lease.id).await.unwrap();
+    }
+    end.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_goal_under_a_lease_that_has_ended_is_refused_though_nobody_has_a_newer_one() {
+    let system = system(20.0, 1).await;
+    let lease = system.acquire(&["Arm"]).await;
+    let mut watch = system.resources.watch(&["Arm"]).await.unwrap();
+    system.resources.release(lease.id).await.unwrap();
+    // The cell hears it when everybody does; were it a moment later, the goal would be aborted instead.
+    loop {
+        if let Some(ResourceUpdate::Event(event)) = watch.next().await.unwrap()
+            && event.kind == ResourceEventKind::Released
+        {
+            break;
+        }
+    }
+    let outcome = system.execute(&lease, "Arm", "move_to", to_observation()).await;
+    assert!(!outcome.is_ok_and(|outcome| outcome.is_success()));
     system.end.cancel();
 }

@@ -158,6 +158,8 @@ pub enum ResourceUpdate {
         revision: Revision,
         /// In the order of ids.
         resources: Vec<Resource>,
+        /// The lease that was granted last, living or not.
+        youngest: LeaseId,
     },
     /// What happened since.
     Event(ResourceEvent),

@@ -375,6 +375,11 @@ impl Pool {
         self.leases.iter().map(|(id, record)| record.view(*id)).collect()
     }
 
+    /// The lease that was granted last, living or not; ids grow.
+    pub fn youngest_lease(&self) -> LeaseId {
+        LeaseId(self.next_lease)
+    }
+
     /// Every session, in the order of ids.
     pub fn sessions(&self) -> Vec<SessionView> {
         self.sessions.iter().map(|(id, session)| session.view(id)).collect()

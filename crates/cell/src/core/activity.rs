@@ -101,7 +101,7 @@ impl Activity {
     }
 }
 
-/// Seconds of the robot as a duration; negative and NaN count as none.
+/// Seconds of the robot as a duration; negative and NaN count as none, and what no duration can hold as the longest.
 pub(crate) fn seconds(s: f64) -> Duration {
-    Duration::try_from_secs_f64(s.max(0.0)).unwrap_or(Duration::ZERO)
+    Duration::try_from_secs_f64(s.max(0.0)).unwrap_or(Duration::MAX)
 }

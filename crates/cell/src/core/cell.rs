@@ -12,6 +12,7 @@ use super::activity::{Activity, Kind, seconds};
 use super::battery::Battery;
 use super::boxes::{Place, SimulatedBox, TrueBox};
 use super::grasping::Pads;
+use super::leases::Leases;
 use super::picture::{Exposure, Scenery};
 use super::placement::{self, PlacementError};
 use super::protocol::{Command, Ending, Event, Module, Product};
@@ -32,6 +33,7 @@ pub struct Cell {
     pub(super) now: Timestamp,
     pub(super) resting: Configuration,
     pub(super) activities: BTreeMap<Module, Activity>,
+    pub(super) leases: Leases,
     pub(super) boxes: Vec<SimulatedBox>,
     pub(super) battery: Battery,
     pub(super) seed: u64,
@@ -56,8 +58,8 @@ impl Cell {
         let boxes = placement::boxes(&robot, config.boxes, config.seed)?;
         let resting = first_posture(&config);
         let (battery, seed) = (Battery::new(config.battery), config.seed);
-        let (now, activities) = (Timestamp::default(), BTreeMap::new());
-        Ok(Cell { robot, config, pads, now, resting, activities, boxes, battery, seed, frames_taken: 0 })
+        let (now, activities, leases) = (Timestamp::default(), BTreeMap::new(), Leases::default());
+        Ok(Cell { robot, config, pads, now, resting, activities, leases, boxes, battery, seed, frames_taken: 0 })
     }
 
     /// Time goes on to `now`, and then the event happens.
@@ -73,17 +75,21 @@ impl Cell {
             Event::Stop { ticket, reason } => {
                 self.hold(|a| a.ticket == ticket, |_| Ending::Preempted(reason.clone()), &mut out);
             }
+            Event::LeaseBegan { lease } => self.leases.began(lease),
             Event::LeaseEnded { lease, reason } => {
+                self.leases.ended(lease);
                 let ending = |_: &Activity| Ending::Aborted(format!("its lease {lease} ended: {reason}; it holds"));
                 self.hold(|a| a.lease == Some(lease), ending, &mut out);
             }
             Event::LeasesLost { reason } => {
                 let ending = |_: &Activity| Ending::Aborted(format!("its lease may have ended: {reason}; it holds"));
                 self.hold(|a| a.lease.is_some(), ending, &mut out);
+                self.leases.lost(reason);
             }
-            Event::LeasesAre { living } => {
+            Event::LeasesAre { living, youngest } => {
                 let ending = |_: &Activity| Ending::Aborted("its lease has ended; it holds".to_owned());
                 self.hold(|a| a.lease.is_some_and(|lease| !living.contains(&lease)), ending, &mut out);
+                self.leases.are(living, youngest);
             }
             Event::Reset { seed, boxes } => self.reset(seed, boxes, &mut out),
             Event::Tick => {}

@@ -11,5 +11,6 @@ pub mod settling;
 mod activity;
 mod battery;
 mod holding;
+mod leases;
 mod starting;
 mod trajectory;

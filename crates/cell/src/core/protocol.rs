@@ -28,6 +28,11 @@ pub enum Event {
         /// Why.
         reason: String,
     },
+    /// A lease was given.
+    LeaseBegan {
+        /// Which.
+        lease: LeaseId,
+    },
     /// A lease is over.
     LeaseEnded {
         /// Which.
@@ -35,7 +40,7 @@ pub enum Event {
         /// Why.
         reason: String,
     },
-    /// Nobody knows any more which leases live.
+    /// Nobody knows any more which leases live, until [`Event::LeasesAre`].
     LeasesLost {
         /// Why.
         reason: String,
@@ -44,6 +49,8 @@ pub enum Event {
     LeasesAre {
         /// All of them.
         living: BTreeSet<LeaseId>,
+        /// The last that was given, living or not.
+        youngest: LeaseId,
     },
     /// A new table; the robot goes back to its first posture.
     Reset {

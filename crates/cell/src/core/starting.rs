@@ -15,6 +15,7 @@ const MAX_LOOK_ERROR_RAD: f64 = 0.02;
 
 impl Cell {
     pub(super) fn start(&mut self, ticket: Ticket, lease: Option<LeaseId>, request: Request) -> Result<(), String> {
+        lease.map_or(Ok(()), |lease| self.leases.check(lease))?;
         let module = request.module();
         if let Some(other) = self.activities.get(&module) {
             return Err(format!("the {} is busy with goal {}", module.kind(), other.ticket.0));

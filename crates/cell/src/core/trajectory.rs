@@ -12,6 +12,12 @@ use ratn_world::scene::Scene;
 /// measured, and rubber and cardboard give way. Arm links may not.
 const COMPLIANCE_M: f64 = 0.015;
 
+/// The longest motion, in seconds: every posture of it is checked before it begins.
+const MAX_MOTION_S: f64 = 600.0;
+
+/// The slowest motion, as a fraction of the limits.
+const MIN_SPEED: f64 = 0.01;
+
 /// The trajectory, ready to be followed from `here`.
 ///
 /// # Errors
@@ -22,6 +28,12 @@ pub(crate) fn check(
     here: &Configuration,
     trajectory: &Trajectory,
 ) -> Result<ArmTrajectory, String> {
+    let lasts_s = trajectory.duration_s();
+    if lasts_s > MAX_MOTION_S {
+        return Err(format!(
+            "the trajectory is refused: it lasts {lasts_s:.0} s, a motion lasts at most {MAX_MOTION_S} s"
+        ));
+    }
     let contact = Contact::Gripper(COMPLIANCE_M);
     validate_trajectory(robot, scene, &here.arm, Some(here.finger), trajectory, contact)
         .map_err(|violation| format!("the trajectory is refused: {violation}"))
@@ -38,8 +50,8 @@ pub(crate) fn straight(
     to: &Joints,
     speed: f64,
 ) -> Result<Trajectory, String> {
-    if !(speed > 0.0 && speed <= 1.0) {
-        return Err(format!("a speed of {speed} is none: it is a fraction of the limits, above 0 and at most 1"));
+    if !(MIN_SPEED..=1.0).contains(&speed) {
+        return Err(format!("a speed of {speed} is none: it is a fraction of the limits, from {MIN_SPEED} to 1"));
     }
     let mut checker = Checker::new(robot, scene, 0.0);
     Ok(parameterise(&mut checker, &[Part::Free(vec![*from, *to])], speed))

@@ -2,7 +2,7 @@
 
 use super::keeper::Keeper;
 use crate::config::CellConfig;
-use crate::core::protocol::{Ending, Event, Module, Product, Request};
+use crate::core::protocol::{Ending, Module, Product, Request};
 use ratn_model::fact::{FactKey, Term};
 use ratn_model::value::Value;
 use ratn_perception::noise::MAX_FRAMES;
@@ -92,18 +92,15 @@ impl Action for ModuleAction {
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let request = (self.read)(&goal)?;
         goal.checkpoint()?;
-        let (ticket, mut ended) = self.keeper.perform(goal.lease.as_ref().map(|lease| lease.id), request)?;
+        let mut motion = self.keeper.perform(goal.lease.as_ref().map(|lease| lease.id), request)?;
         let ending = tokio::select! {
             biased;
-            ending = &mut ended => ending,
-            () = goal.cancelled.cancelled() => {
-                self.keeper.tell(Event::Stop { ticket, reason: "the goal was told to stop".to_owned() })?;
-                match ended.await {
-                    // It had been done before the word came.
-                    Ok(Ending::Done(product)) => Ok(Ending::Done(product)),
-                    _ => return Err(goal.stopped()),
-                }
-            }
+            ending = motion.ended() => ending,
+            () = goal.cancelled.cancelled() => match motion.stop().await {
+                // It had been done before the word came.
+                Ok(Ending::Done(product)) => Ok(Ending::Done(product)),
+                _ => return Err(goal.stopped()),
+            },
         };
         match ending? {
             Ending::Done(product) => self.outcome(product).await,

@@ -15,13 +15,13 @@ use std::collections::BTreeMap;
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
-use tokio::sync::oneshot;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
 use crate::core::boxes::TrueBox;
 
-/// Messages that wait for the keeper at the most.
+/// Messages that wait for the keeper at the most, besides one per goal that tells it to stop.
 const MAX_MESSAGES: usize = 256;
 /// It looks at the clock at least this often.
 const MAX_SLEEP: Duration = Duration::from_secs(1);
@@ -39,9 +39,19 @@ pub(crate) struct State {
 /// Sends messages to the keeper. Clones share it; it ends with the last of them.
 #[derive(Debug, Clone)]
 pub(crate) struct Keeper {
-    messages: SyncSender<Message>,
+    messages: Sender<Letter>,
+    room: Arc<Semaphore>,
     tickets: Arc<AtomicU64>,
     optics: Arc<Optics>,
+}
+
+/// A goal under way. Dropped before its end, it stops: nothing moves that nobody waits for.
+#[derive(Debug)]
+pub(crate) struct Motion {
+    ticket: Ticket,
+    ending: oneshot::Receiver<Ending>,
+    messages: Sender<Letter>,
+    over: bool,
 }
 
 #[derive(Debug)]
@@ -59,6 +69,12 @@ pub(crate) enum KeeperError {
     Ended,
 }
 
+/// A message with the room that it takes in the queue.
+struct Letter {
+    message: Message,
+    _room: Option<OwnedSemaphorePermit>,
+}
+
 enum Message {
     Start { ticket: Ticket, lease: Option<LeaseId>, request: Request, ended: oneshot::Sender<Ending> },
     Happened(Event),
@@ -68,42 +84,45 @@ enum Message {
 
 /// Starts the thread.
 pub(crate) fn start(cell: Cell, clock: RobotClock) -> io::Result<Keeper> {
-    let (messages, inbox) = sync_channel(MAX_MESSAGES);
-    let optics = Arc::new(Optics { robot: cell.robot().clone(), noise: cell.config().camera.noise });
+    let (keeper, inbox) = keeper_of(&cell);
     let keep = move || keep(cell, clock, &inbox);
     std::thread::Builder::new().name("cell".to_owned()).spawn(keep)?;
-    Ok(Keeper { messages, tickets: Arc::default(), optics })
+    Ok(keeper)
+}
+
+fn keeper_of(cell: &Cell) -> (Keeper, Receiver<Letter>) {
+    let (messages, inbox) = channel();
+    let optics = Arc::new(Optics { robot: cell.robot().clone(), noise: cell.config().camera.noise });
+    let room = Arc::new(Semaphore::new(MAX_MESSAGES));
+    (Keeper { messages, room, tickets: Arc::default(), optics }, inbox)
 }
 
 impl Keeper {
-    /// Starts a goal; its ticket, and how it ends.
-    pub(crate) fn perform(
-        &self,
-        lease: Option<LeaseId>,
-        request: Request,
-    ) -> Result<(Ticket, oneshot::Receiver<Ending>), KeeperError> {
+    /// Starts a goal.
+    pub(crate) fn perform(&self, lease: Option<LeaseId>, request: Request) -> Result<Motion, KeeperError> {
         let ticket = Ticket(self.tickets.fetch_add(1, Ordering::Relaxed) + 1);
-        let (ended, end) = oneshot::channel();
-        self.send(Message::Start { ticket, lease, request, ended })?;
-        Ok((ticket, end))
+        let (ended, ending) = oneshot::channel();
+        self.ask(Message::Start { ticket, lease, request, ended })?;
+        Ok(Motion { ticket, ending, messages: self.messages.clone(), over: false })
     }
 
-    /// Tells the core of an event.
-    pub(crate) fn tell(&self, event: Event) -> Result<(), KeeperError> {
-        self.send(Message::Happened(event))
+    /// Tells the core of an event, as soon as there is room.
+    pub(crate) async fn tell(&self, event: Event) -> Result<(), KeeperError> {
+        let room = Arc::clone(&self.room).acquire_owned().await.map_err(|_| KeeperError::Ended)?;
+        self.send(Message::Happened(event), room)
     }
 
     /// A new table; what is true then.
     pub(crate) async fn reset(&self, seed: u64, boxes: usize) -> Result<State, KeeperError> {
         let (state, answer) = oneshot::channel();
-        self.send(Message::Reset { seed, boxes, state })?;
+        self.ask(Message::Reset { seed, boxes, state })?;
         answer.await.map_err(|_| KeeperError::Ended)
     }
 
     /// What is true now.
     pub(crate) async fn state(&self) -> Result<State, KeeperError> {
         let (state, answer) = oneshot::channel();
-        self.send(Message::State(state))?;
+        self.ask(Message::State(state))?;
         answer.await.map_err(|_| KeeperError::Ended)
     }
 
@@ -112,20 +131,53 @@ impl Keeper {
         develop(&self.optics.robot, camera, &self.optics.noise, seed, exposures)
     }
 
-    fn send(&self, message: Message) -> Result<(), KeeperError> {
-        self.messages.try_send(message).map_err(|error| match error {
-            TrySendError::Full(_) => KeeperError::Overloaded,
-            TrySendError::Disconnected(_) => KeeperError::Ended,
-        })
+    /// Sends a message that can be refused.
+    fn ask(&self, message: Message) -> Result<(), KeeperError> {
+        let room = Arc::clone(&self.room).try_acquire_owned().map_err(|_| KeeperError::Overloaded)?;
+        self.send(message, room)
+    }
+
+    fn send(&self, message: Message, room: OwnedSemaphorePermit) -> Result<(), KeeperError> {
+        self.messages.send(Letter { message, _room: Some(room) }).map_err(|_| KeeperError::Ended)
     }
 }
 
-fn keep(mut cell: Cell, clock: RobotClock, inbox: &Receiver<Message>) {
+impl Motion {
+    /// How it ends.
+    pub(crate) async fn ended(&mut self) -> Result<Ending, KeeperError> {
+        let ending = (&mut self.ending).await.map_err(|_| KeeperError::Ended);
+        self.over = true;
+        ending
+    }
+
+    /// Tells it to stop, and how it ends then. Never refused: there is at most one such message per goal.
+    pub(crate) async fn stop(mut self) -> Result<Ending, KeeperError> {
+        self.tell_to_stop();
+        self.ended().await
+    }
+
+    fn tell_to_stop(&mut self) {
+        self.over = true;
+        let stop = Event::Stop { ticket: self.ticket, reason: "the goal was told to stop".to_owned() };
+        // A keeper that has ended moves nothing.
+        let _ = self.messages.send(Letter { message: Message::Happened(stop), _room: None });
+    }
+}
+
+impl Drop for Motion {
+    fn drop(&mut self) {
+        if !self.over {
+            self.tell_to_stop();
+        }
+    }
+}
+
+fn keep(mut cell: Cell, clock: RobotClock, inbox: &Receiver<Letter>) {
     let mut waiting: BTreeMap<Ticket, oneshot::Sender<Ending>> = BTreeMap::new();
     loop {
         let sleep = cell.next_wake().map_or(MAX_SLEEP, |moment| clock.until(moment).min(MAX_SLEEP));
         let message = match inbox.recv_timeout(sleep) {
-            Ok(message) => Some(message),
+            Ok(letter) => Some(letter.message),
             Err(RecvTimeoutError::Timeout) => None,
             Err(RecvTimeoutError::Disconnected) => return,
         };
@@ -154,4 +206,32 @@ fn keep(mut cell: Cell, clock: RobotClock, inbox: &Receiver<Message>) {
 
 fn state_of(cell: &Cell, now: Timestamp) -> State {
     State { boxes: cell.ground_truth(), battery: cell.battery(), arm: cell.configuration().arm, now, seed: cell.seed() }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::config::CellConfig;
+
+    #[tokio::test]
+    async fn a_stop_arrives_however_many_questions_wait_also_of_a_goal_that_nobody_waits_for() {
+        let (keeper, inbox) = keeper_of(&Cell::new(CellConfig::default()).unwrap());
+        let (stopped, dropped) =
+            (keeper.perform(None, Request::Release).unwrap(), keeper.perform(None, Request::Release).unwrap());
+        let tickets = [stopped.ticket, dropped.ticket];
+        while keeper.ask(Message::Happened(Event::Tick)).is_ok() {}
+        assert_eq!(keeper.state().await, Err(KeeperError::Overloaded));
+        drop(dropped);
+        let stopping = tokio::spawn(stopped.stop());
+        tokio::task::yield_now().await;
+
+        let stops = inbox.try_iter().filter_map(|letter| match letter.message {
+            Message::Happened(Event::Stop { ticket, .. }) => Some(ticket),
+            _ => None,
+        });
+        assert_eq!(stops.collect::<std::collections::BTreeSet<_>>(), tickets.into());
+        assert_eq!(stopping.await.unwrap(), Err(KeeperError::Ended));
+        keeper.tell(Event::Tick).await.unwrap();
+    }
 }

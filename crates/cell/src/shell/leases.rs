@@ -1,97 +1,117 @@
-//! Which leases live, as the resource manager tells: a motion under way whose lease ends stops and holds.
+//! Which leases live, as the resource manager tells: a motion under way whose lease ends stops and holds, and none begins
+//! under a lease that has ended.
 //!
-//! While the manager cannot be heard, leases are trusted as long as the cell's own session could live; then no motion under
-//! a lease goes on. After a pause, what the manager says first is compared with what is under way.
+//! While the manager cannot be heard, leases are trusted as long as the cell's own session lives; then no motion under a
+//! lease goes on or begins. What the manager says first after a pause is compared with what is under way.
 
 use super::keeper::Keeper;
 use crate::core::protocol::{Event, Module};
 use ratn_model::id::LeaseId;
-use ratn_proto::types::{ResourceEventKind, ResourceUpdate};
+use ratn_proto::types::{ResourceEvent, ResourceEventKind, ResourceUpdate};
 use ratn_worker::action::ActionServer;
-use ratn_worker::client::ResourceClient;
-use std::sync::Arc;
+use ratn_worker::client::{CallError, ResourceClient, ResourceWatch};
+use ratn_worker::session::Session;
 use std::time::Duration;
 use tokio::sync::Notify;
-use tokio::time::{Instant, sleep};
+use tokio::time::{sleep, timeout};
 
 /// The pause before the manager is asked again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
-pub(crate) struct LeaseWatch {
+pub(crate) struct LeaseWatch<'a> {
     pub(crate) client: ResourceClient,
     pub(crate) keeper: Keeper,
     pub(crate) server: ActionServer,
-    /// How long silence is borne.
+    /// The cell's own.
+    pub(crate) session: &'a Session,
+    /// How long leases are trusted without a watch.
     pub(crate) patience: Duration,
     /// Told once the manager has said which leases live.
-    pub(crate) listening: Arc<Notify>,
+    pub(crate) listening: &'a Notify,
 }
 
-impl LeaseWatch {
+impl LeaseWatch<'_> {
     /// Watches until dropped.
     pub(crate) async fn keep(self) {
-        let mut heard = Instant::now();
-        let mut silent = false;
+        let mut watch = self.begin().await;
         loop {
-            match self.listen(&mut heard).await {
-                Ok(()) => tracing::debug!("the watch of leases ended"),
-                Err(error) => tracing::debug!(%error, "the watch of leases broke"),
-            }
-            if heard.elapsed() < RETRY_INTERVAL * 2 {
-                silent = false;
-            }
-            if heard.elapsed() > self.patience && !silent {
-                silent = true;
-                let reason = format!("the resource manager was not heard for {:.1} s", self.patience.as_secs_f64());
-                tracing::warn!("{reason}: motions under a lease stop");
-                self.tell(Event::LeasesLost { reason });
+            let patience = tokio::select! {
+                biased;
+                // Known before a connection that hangs breaks.
+                () = self.session.lost() => Duration::ZERO,
+                () = self.follow(watch) => {
+                    sleep(RETRY_INTERVAL).await;
+                    self.patience
+                }
+            };
+            watch = match timeout(patience, self.begin()).await {
+                Ok(watch) => watch,
+                Err(_) => {
+                    let reason = "the resource manager is not heard".to_owned();
+                    tracing::warn!("{reason}: motions under a lease stop");
+                    self.tell(Event::LeasesLost { reason }).await;
+                    self.begin().await
+                }
+            };
+        }
+    }
+
+    /// A watch that has told which leases live.
+    async fn begin(&self) -> ResourceWatch {
+        loop {
+            match self.snapshot().await {
+                Ok(watch) => return watch,
+                Err(error) => tracing::debug!(%error, "no watch of leases"),
             }
             sleep(RETRY_INTERVAL).await;
         }
     }
 
-    async fn listen(&self, heard: &mut Instant) -> Result<(), ratn_worker::client::CallError> {
-        let kinds = Module::ALL.map(Module::kind);
-        let mut watch = self.client.watch(&kinds).await?;
+    async fn snapshot(&self) -> Result<ResourceWatch, CallError> {
+        let mut watch = self.client.watch(&Module::ALL.map(Module::kind)).await?;
+        // The snapshot is always first.
+        if let Some(ResourceUpdate::Snapshot { resources, youngest, .. }) = watch.next().await? {
+            let living = resources.iter().flat_map(|r| r.holdings.iter().map(|h| h.lease)).collect();
+            self.tell(Event::LeasesAre { living, youngest }).await;
+            self.listening.notify_one();
+        }
+        Ok(watch)
+    }
+
+    /// Returns when the watch has ended.
+    async fn follow(&self, mut watch: ResourceWatch) {
         loop {
-            let update = watch.next().await;
-            *heard = Instant::now();
-            match update? {
-                None => return Ok(()),
-                Some(ResourceUpdate::Snapshot { resources, .. }) => {
-                    let living = resources.iter().flat_map(|r| r.holdings.iter().map(|h| h.lease)).collect();
-                    self.tell(Event::LeasesAre { living });
-                    self.listening.notify_one();
-                }
-                Some(ResourceUpdate::Event(event)) => {
-                    let or =
-                        |reason: &str| if event.reason.is_empty() { reason.to_owned() } else { event.reason.clone() };
-                    match event.kind {
-                        ResourceEventKind::Released => {
-                            if let Some((lease, _)) = event.lease {
-                                self.ended(lease, &or("it was released"));
-                            }
-                        }
-                        ResourceEventKind::Deleted => {
-                            for holding in &event.resource.holdings {
-                                self.ended(holding.lease, &or("its resource is gone"));
-                            }
-                        }
-                        _ => {}
-                    }
-                }
+            match watch.next().await {
+                Ok(Some(ResourceUpdate::Event(event))) => self.happened(event).await,
+                Ok(Some(ResourceUpdate::Snapshot { .. })) => {}
+                Ok(None) => return tracing::debug!("the watch of leases ended"),
+                Err(error) => return tracing::debug!(%error, "the watch of leases broke"),
             }
         }
     }
 
+    async fn happened(&self, event: ResourceEvent) {
+        let or = |reason: &str| if event.reason.is_empty() { reason.to_owned() } else { event.reason.clone() };
+        match (event.kind, event.lease) {
+            (ResourceEventKind::Leased, Some((lease, _))) => self.tell(Event::LeaseBegan { lease }).await,
+            (ResourceEventKind::Released, Some((lease, _))) => self.ended(lease, &or("it was released")).await,
+            (ResourceEventKind::Deleted, _) => {
+                for holding in &event.resource.holdings {
+                    self.ended(holding.lease, &or("its resource is gone")).await;
+                }
+            }
+            _ => {}
+        }
+    }
+
     /// The core stops first; the goal's outcome follows.
-    fn ended(&self, lease: LeaseId, reason: &str) {
-        self.tell(Event::LeaseEnded { lease, reason: reason.to_owned() });
+    async fn ended(&self, lease: LeaseId, reason: &str) {
+        self.tell(Event::LeaseEnded { lease, reason: reason.to_owned() }).await;
         self.server.end_lease(lease, reason);
     }
 
-    fn tell(&self, event: Event) {
-        if let Err(error) = self.keeper.tell(event) {
+    async fn tell(&self, event: Event) {
+        if let Err(error) = self.keeper.tell(event).await {
             tracing::error!(%error, "a lease that ended could not be told");
         }
     }

@@ -15,7 +15,6 @@ use ratn_worker::endpoint::Endpoint;
 use ratn_worker::provider::Provider;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
-use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
@@ -69,13 +68,14 @@ impl Link {
     /// Offers everything and keeps the battery's level up to date, until the manager is somewhere else.
     async fn offer(&self, manager: &Endpoint, session: &Session) -> Result<(), CallError> {
         let provider = Provider::start(&self.channels, manager, session)?;
-        let listening = Arc::new(Notify::new());
+        let listening = Notify::new();
         let watch = LeaseWatch {
             client: ResourceClient::new(&self.channels, manager, "")?,
             keeper: self.keeper.clone(),
             server: self.server.clone(),
+            session,
             patience: Duration::from_millis(self.config.session_ttl_ms),
-            listening: Arc::clone(&listening),
+            listening: &listening,
         };
         let watching = watch.keep();
         let offering = async {

@@ -238,7 +238,8 @@ impl Actor {
         }
         let (sender, updates) = mpsc::channel(WATCH_BUFFER);
         let resources = self.pool.list().into_iter().map(wire::resource).collect();
-        let snapshot = ResourceUpdate::Snapshot { revision: self.pool.revision(), resources };
+        let (revision, youngest) = (self.pool.revision(), self.pool.youngest_lease());
+        let snapshot = ResourceUpdate::Snapshot { revision, resources, youngest };
         sender
             .try_send(Arc::new(snapshot))
             .map_err(|_| status_with(Code::Internal, "BROKEN", "a new watch took no snapshot"))?;

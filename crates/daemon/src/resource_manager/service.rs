@@ -275,8 +275,9 @@ fn filtered(update: &ResourceUpdate, kinds: &BTreeSet<String>) -> Option<Resourc
     match update {
         _ if kinds.is_empty() => Some(update.clone()),
         ResourceUpdate::Event(event) => kinds.contains(&event.resource.kind).then(|| update.clone()),
-        ResourceUpdate::Snapshot { revision, resources } => Some(ResourceUpdate::Snapshot {
+        ResourceUpdate::Snapshot { revision, resources, youngest } => Some(ResourceUpdate::Snapshot {
             revision: *revision,
+            youngest: *youngest,
             resources: resources.iter().filter(|resource| kinds.contains(&resource.kind)).cloned().collect(),
         }),
     }

@@ -16,7 +16,7 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct LiveLeases {
     held: BTreeMap<LeaseId, BTreeSet<String>>,
-    /// The youngest that was ever seen: ids grow, so an older one that does not live has ended.
+    /// The youngest that was ever told of: ids grow, so an older one that does not live has ended.
     youngest: LeaseId,
     /// Counts snapshots: each tells anew what lives.
     pub(super) snapshots: u64,
@@ -42,8 +42,9 @@ impl LiveLeases {
         }
     }
 
-    fn snapshot(&mut self, resources: &[Resource]) {
+    fn snapshot(&mut self, resources: &[Resource], youngest: LeaseId) {
         self.held.clear();
+        self.youngest = youngest;
         self.snapshots += 1;
         for resource in resources {
             for holding in &resource.holdings {
@@ -60,8 +61,8 @@ impl LiveLeases {
     /// Whether anything is known that was not before.
     fn update(&mut self, update: &ResourceUpdate) -> bool {
         let event = match update {
-            ResourceUpdate::Snapshot { resources, .. } => {
-                self.snapshot(resources);
+            ResourceUpdate::Snapshot { resources, youngest, .. } => {
+                self.snapshot(resources, *youngest);
                 return true;
             }
             ResourceUpdate::Event(event) => event,
@@ -136,5 +137,13 @@ mod tests {
         assert_eq!(leases.known(LeaseId(3)), Known::Lives);
         leases.update(&event(ResourceEventKind::Released, "world", 3));
         assert_eq!(leases.known(LeaseId(3)), Known::Ended);
+    }
+
+    #[test]
+    fn a_lease_that_came_and_went_while_nobody_listened_has_ended() {
+        let mut leases = LiveLeases::default();
+        let snapshot = ResourceUpdate::Snapshot { revision: Revision(9), resources: Vec::new(), youngest: LeaseId(5) };
+        leases.update(&snapshot);
+        assert_eq!((leases.known(LeaseId(5)), leases.known(LeaseId(6))), (Known::Ended, Known::NotYet));
     }
 }

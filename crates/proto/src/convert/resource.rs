@@ -251,9 +251,11 @@ impl From<ResourceUpdate> for v1::ResourceServiceWatchResponse {
     fn from(update: ResourceUpdate) -> v1::ResourceServiceWatchResponse {
         use v1::resource_service_watch_response::Kind;
         let kind = match update {
-            ResourceUpdate::Snapshot { revision, resources } => {
-                Kind::Snapshot(v1::ResourceSnapshot { revision: revision.0, resources: all(resources) })
-            }
+            ResourceUpdate::Snapshot { revision, resources, youngest } => Kind::Snapshot(v1::ResourceSnapshot {
+                revision: revision.0,
+                resources: all(resources),
+                youngest_lease_id: youngest.0,
+            }),
             ResourceUpdate::Event(event) => Kind::Event(event.into()),
         };
         v1::ResourceServiceWatchResponse { kind: Some(kind) }
@@ -269,6 +271,7 @@ impl TryFrom<v1::ResourceServiceWatchResponse> for ResourceUpdate {
             Kind::Snapshot(snapshot) => Ok(ResourceUpdate::Snapshot {
                 revision: Revision(snapshot.revision),
                 resources: each(snapshot.resources, "snapshot.resources")?,
+                youngest: LeaseId(snapshot.youngest_lease_id),
             }),
             Kind::Event(event) => {
                 ResourceEvent::try_from(event).map(ResourceUpdate::Event).map_err(|m| m.within("event"))

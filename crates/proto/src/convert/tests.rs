@@ -154,8 +154,9 @@ fn update() -> impl Strategy<Value = ResourceUpdate> {
             reason: "because".to_owned(),
         })
     });
-    let snapshot = (any::<u64>(), vec(resource(), 0..3))
-        .prop_map(|(revision, resources)| ResourceUpdate::Snapshot { revision: Revision(revision), resources });
+    let snapshot = (any::<u64>(), vec(resource(), 0..3), any::<u64>()).prop_map(|(revision, resources, youngest)| {
+        ResourceUpdate::Snapshot { revision: Revision(revision), resources, youngest: LeaseId(youngest) }
+    });
     prop_oneof![event, snapshot]
 }
 
