@@ -156,18 +156,26 @@ impl Performer {
     }
 
     /// Waits until what was decided is recorded and given back, and ends the session.
-    pub(super) async fn close(mut self) {
-        let closing = async {
+    ///
+    /// # Errors
+    /// When something that was decided is not recorded: the world pool or the resource manager know less than what happened.
+    pub(super) async fn close(mut self) -> anyhow::Result<()> {
+        let recording = async {
             let (done, recorded) = oneshot::channel();
-            if self.records.send(Record::Flush(done)).await.is_ok() {
-                let _ = recorded.await;
-            }
-            while self.giving_back.join_next().await.is_some() {}
+            self.records.send(Record::Flush(done)).await.map_err(|_| "the recorder is gone".to_owned())?;
+            recorded.await.unwrap_or_else(|_| Err("the recorder is gone".to_owned()))
         };
-        if tokio::time::timeout(CLOSE_DEADLINE, closing).await.is_err() {
+        let recorded = tokio::time::timeout(CLOSE_DEADLINE, recording).await;
+        let giving_back = async { while self.giving_back.join_next().await.is_some() {} };
+        if tokio::time::timeout(CLOSE_DEADLINE, giving_back).await.is_err() {
             tracing::warn!("what was left at the end of the run was not given back in time");
         }
         self.session.close().await;
+        match recorded {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(reason)) => bail!("what the run did is not all recorded: {reason}"),
+            Err(_) => bail!("what the run did is not all recorded: the world pool has not answered in time"),
+        }
     }
 
     fn record(&self, record: Record) -> anyhow::Result<()> {
@@ -369,7 +377,7 @@ mod tests {
     use super::*;
     use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
     use ratn_daemon::world_pool::{self, WorldPoolConfig};
-    use ratn_model::fact::Footprint;
+    use ratn_model::fact::{Change, Footprint};
     use ratn_model::resource::{ResourceClass, ResourceOperation};
     use ratn_proto::types::Resource;
     use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -444,7 +452,18 @@ mod tests {
         bench.performer.perform(Command::Withdraw { instance })?;
         bench.ask(other)?;
         bench.granted(other).await?;
-        bench.performer.close().await;
+        bench.performer.close().await
+    }
+
+    #[tokio::test]
+    async fn a_run_whose_effects_are_not_all_recorded_does_not_end_well() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        // The world pool's root will not have this revision.
+        let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
+        let changes = vec![Change::Set { fact, value: Value::Bool(true) }];
+        bench.performer.perform(Command::Commit { instance: InstanceId(1), changes, revision: Revision(99) })?;
+        let ended = bench.performer.close().await;
+        assert!(ended.is_err_and(|error| error.to_string().contains("not all recorded")));
         Ok(())
     }
 
@@ -469,8 +488,7 @@ mod tests {
         assert!(bench.performer.cancelled.lock().is_ok_and(|cancelled| cancelled.is_empty()));
         bench.performer.perform(project(2))?;
         assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 2, .. })));
-        bench.performer.close().await;
-        Ok(())
+        bench.performer.close().await
     }
 
     #[tokio::test]
@@ -485,7 +503,6 @@ mod tests {
         // Nobody holds the arm: the same instance gets it when it asks again.
         bench.ask(instance)?;
         bench.granted(instance).await?;
-        bench.performer.close().await;
-        Ok(())
+        bench.performer.close().await
     }
 }

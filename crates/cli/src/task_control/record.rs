@@ -36,8 +36,8 @@ pub(super) enum Record {
         instance: InstanceId,
         operations: Vec<Requirement>,
     },
-    /// Answers once everything before it is done.
-    Flush(oneshot::Sender<()>),
+    /// Answers once everything before it is done: with the first failure of the run, if there was one.
+    Flush(oneshot::Sender<Result<(), String>>),
 }
 
 /// Attempts whose projection nobody waits for any more.
@@ -55,6 +55,7 @@ pub(super) struct Recorder {
 impl Recorder {
     /// Until nobody can ask any more.
     pub(super) async fn work(self, mut records: mpsc::Receiver<Record>) {
+        let mut recorded = Ok(());
         while let Some(record) = records.recv().await {
             let event = match record {
                 Record::Project { instance, attempt, base, changes, reads, lease } => {
@@ -64,10 +65,13 @@ impl Recorder {
                 Record::Commit { instance, changes, revision } => self.commit(instance, changes, revision).await,
                 Record::Operate { instance, operations } => self.operate(instance, operations).await,
                 Record::Flush(done) => {
-                    let _ = done.send(());
+                    let _ = done.send(recorded.clone());
                     None
                 }
             };
+            if let (Some(Event::RetirementFailed { reason, .. }), Ok(())) = (&event, &recorded) {
+                recorded = Err(reason.clone());
+            }
             if let Some(event) = event
                 && self.events.send(event.into()).await.is_err()
             {

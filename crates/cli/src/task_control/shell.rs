@@ -11,7 +11,7 @@ use anyhow::{Context, bail};
 use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, Mode};
 use ratn_model::catalogue::Catalogue;
-use ratn_model::program::Program;
+use ratn_model::program::{Program, SUCCESS};
 use ratn_model::value::Value;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_world::tolerance::Tolerance;
@@ -99,7 +99,7 @@ pub(crate) async fn run(run: Run, endpoints: &super::Endpoints, interrupt: &Inte
                     Event::AbortRequested { reason }.into()
                 }
                 () = interrupt.asked_times(2) => {
-                    performer.close().await;
+                    let _ = performer.close().await;
                     bail!("interrupted twice: the run was left where it was");
                 }
             };
@@ -108,6 +108,10 @@ pub(crate) async fn run(run: Run, endpoints: &super::Endpoints, interrupt: &Inte
             }
         };
     };
-    performer.close().await;
-    Ok(ended)
+    match performer.close().await {
+        // A success of which not everything is known afterwards is none.
+        Err(error) if ended.outcome == SUCCESS => Err(error),
+        // The reason is in the outcome already, or matters less.
+        _ => Ok(ended),
+    }
 }
