@@ -22,6 +22,8 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
             offered(subject, state, i, resource, &created, findings);
         }
         too_many(subject, state, findings);
+        deletes_what_it_holds(subject, state, findings);
+        exists_of_a_composite(subject, state, findings);
         if let StateKind::Action { provider, .. } = &state.kind {
             provider_blocked(subject, state, provider, findings);
             only_looks(subject, state, findings);
@@ -88,6 +90,34 @@ fn too_many(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
 fn blocked<'a>(subject: &Subject<'a>, state: &State) -> BTreeSet<&'a str> {
     let lines = subject.around(state.id).flat_map(|state| &state.annotations.resources);
     lines.filter(|r| r.operation == ResourceOperation::Block).map(|r| r.kind.as_str()).collect()
+}
+
+/// What a state holds is deleted before it is given back: the pool would refuse.
+fn deletes_what_it_holds(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
+    let held = blocked(subject, state);
+    for (i, resource) in state.annotations.resources.iter().enumerate() {
+        if resource.operation == ResourceOperation::Delete && held.contains(resource.kind.as_str()) {
+            let message = format!("it blocks and deletes `{0}`: what it holds cannot be deleted", resource.kind);
+            let help = format!("write `consume: {}` instead of both", resource.kind);
+            let at = subject.place(state, &format!("resources.{i}"));
+            findings.error("conflicting-annotations", at, &state.path, message, help);
+        }
+    }
+}
+
+/// Only nodes ask the resource manager.
+fn exists_of_a_composite(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
+    if matches!(state.kind, StateKind::Action { .. }) || state.annotations.routine {
+        return;
+    }
+    for (i, resource) in state.annotations.resources.iter().enumerate() {
+        if resource.operation == ResourceOperation::Exists {
+            let message = format!("`exists: {}` of a state that contains others", resource.kind);
+            let at = subject.place(state, &format!("resources.{i}"));
+            let help = "put it on the states within that need it, or make it a `routine`";
+            findings.error("not-supported-yet", at, &state.path, message, help);
+        }
+    }
 }
 
 fn provider_blocked(subject: &Subject<'_>, state: &State, provider: &str, findings: &mut Findings) {
