@@ -8,8 +8,9 @@ use ratn_proto::types::{Resource, ResourceEventKind, ResourceUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_worker::client::AcquireOptions;
+use ratn_worker::session::Session;
 use std::time::Duration;
-use support::{TestSystem, block, in_time};
+use support::{DEADLINE, TestSystem, block, in_time};
 use tonic::Code;
 
 fn arm() -> Resource {
@@ -139,4 +140,55 @@ async fn a_session_whose_pings_stay_away_expires() {
     assert_eq!((gone.resource.id.as_str(), gone.reason.as_str()), ("arm", "session expired"));
     let request = v1::CreateRequest { request_id: "d".into(), ..request };
     assert_eq!(raw.create(request).await.unwrap_err().code(), Code::FailedPrecondition);
+}
+
+#[tokio::test]
+async fn a_release_gets_through_however_many_acquires_wait_on_its_connection() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(arm()).await.unwrap();
+    let held = a.resources.acquire(vec![block("Arm")], AcquireOptions::default()).await.unwrap();
+    let one = |_| {
+        let a = a.resources.clone();
+        tokio::spawn(async move {
+            let lease = a.acquire(vec![block("Arm")], AcquireOptions::default()).await.unwrap();
+            a.release(lease.id).await.unwrap()
+        })
+    };
+    let waiting: Vec<_> = (0..300).map(one).collect();
+    tokio::task::yield_now().await;
+    assert!(in_time(a.resources.release(held.id)).await.unwrap());
+    for one in waiting {
+        assert!(in_time(one).await.unwrap());
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_session_is_kept_alive_however_much_there_is_to_do() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    let short = Session::open(&system.channels, &manager.endpoint, "short", Duration::from_millis(500));
+    short.alive(DEADLINE).await.unwrap();
+    // Every change has all of these looked at.
+    let waits = |_| {
+        let a = a.resources.clone();
+        tokio::spawn(async move { a.acquire(vec![block("Arm"), block("Nothing")], AcquireOptions::default()).await })
+    };
+    let _waiting: Vec<_> = (0..3_000).map(waits).collect();
+    let changes = |_| {
+        let a = a.resources.clone();
+        tokio::spawn(async move { a.create(Resource::new("", ResourceClass::Module, "Arm")).await })
+    };
+    let changing: Vec<_> = (0..300).map(changes).collect();
+    let changed = async {
+        for one in changing {
+            one.await.unwrap().unwrap();
+        }
+    };
+    tokio::select! {
+        () = short.lost() => panic!("its pings were not heard"),
+        () = changed => {}
+    }
 }

@@ -439,8 +439,13 @@ impl Pool {
         if let Some(session) = self.sessions.get_mut(&request.session) {
             session.waiters.insert(id);
         }
+        // Nothing became free: only the new one can be served, and only if there is enough for it beside what is held.
+        let available = Available::Free(&Units::new());
+        let may_be_served = Assignment::of(&self.resources, available, &request.requirements).is_complete();
         self.queue.insert(id, Waiter { request, request_id: request_id.to_owned() });
-        self.schedule();
+        if may_be_served {
+            self.schedule();
+        }
         Ok(id)
     }
 

@@ -1,7 +1,8 @@
 //! The one task that owns the pool: takes messages in order, ends what time has ended, hands out grants and events.
 //!
 //! A grant that nobody takes any more (the call was dropped in the same moment) is released at once; a watcher that does
-//! not keep up is cut off rather than waited for.
+//! not keep up is cut off rather than waited for. Pings of sessions come first: a session does not expire because there is
+//! much to do.
 
 use super::wire;
 use super::{Granted, ResourceManagerConfig, status};
@@ -20,6 +21,8 @@ use tonic::{Code, Status};
 
 /// Messages that wait for the actor; more make their senders wait.
 const INBOX: usize = 1_024;
+/// Pings that wait for the actor.
+const PINGS: usize = 1_024;
 /// Updates that wait for a watcher; one that has more to catch up with is cut off.
 const WATCH_BUFFER: usize = 4_096;
 /// A session lives at least this long.
@@ -33,15 +36,18 @@ pub(super) struct KeptAlive {
     pub(super) revision: Revision,
 }
 
+/// A ping of a session.
+#[derive(Debug)]
+struct Ping {
+    session: SessionId,
+    client: String,
+    ttl: Duration,
+    answer: Answer<KeptAlive>,
+}
+
 /// What the service asks of the actor.
 #[derive(Debug)]
 pub(super) enum Message {
-    KeepAlive {
-        session: SessionId,
-        client: String,
-        ttl: Duration,
-        answer: Answer<KeptAlive>,
-    },
     Perform {
         request_id: String,
         request: Request,
@@ -85,6 +91,7 @@ pub(super) type Answer<T> = oneshot::Sender<Result<T, Status>>;
 #[derive(Debug, Clone)]
 pub(super) struct Handle {
     inbox: mpsc::Sender<Message>,
+    pings: mpsc::Sender<Ping>,
 }
 
 #[derive(Debug)]
@@ -101,6 +108,7 @@ struct Actor {
 /// Starts the actor; it ends with the token.
 pub(super) fn start(config: ResourceManagerConfig, shutdown: CancellationToken) -> Handle {
     let (inbox, messages) = mpsc::channel(INBOX);
+    let (pings, pinged) = mpsc::channel(PINGS);
     // Nothing is kept over a restart: tokens have to be above those of before all the same.
     let milliseconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis());
     let floor = u64::try_from(milliseconds).unwrap_or(0);
@@ -112,8 +120,8 @@ pub(super) fn start(config: ResourceManagerConfig, shutdown: CancellationToken) 
         tickets: BTreeMap::new(),
         watchers: Vec::new(),
     };
-    tokio::spawn(actor.run(messages, shutdown));
-    Handle { inbox }
+    tokio::spawn(actor.run(messages, pinged, shutdown));
+    Handle { inbox, pings }
 }
 
 impl Handle {
@@ -122,6 +130,18 @@ impl Handle {
         let (answer, answered) = oneshot::channel();
         self.send(message(answer)).await?;
         answered.await.map_err(|_| crate::details::ending())
+    }
+
+    pub(super) async fn keep_alive(
+        &self,
+        session: SessionId,
+        client: String,
+        ttl: Duration,
+    ) -> Result<KeptAlive, Status> {
+        let (answer, answered) = oneshot::channel();
+        let ping = Ping { session, client, ttl, answer };
+        self.pings.send(ping).await.map_err(|_| crate::details::ending())?;
+        answered.await.map_err(|_| crate::details::ending())?
     }
 
     pub(super) async fn send(&self, message: Message) -> Result<(), Status> {
@@ -138,16 +158,23 @@ impl Handle {
 }
 
 impl Actor {
-    async fn run(mut self, mut messages: mpsc::Receiver<Message>, shutdown: CancellationToken) {
+    async fn run(
+        mut self,
+        mut messages: mpsc::Receiver<Message>,
+        mut pinged: mpsc::Receiver<Ping>,
+        shutdown: CancellationToken,
+    ) {
         loop {
             let deadline = self.pool.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
             tokio::select! {
+                biased;
+                () = shutdown.cancelled() => return,
+                Some(ping) = pinged.recv() => self.pinged(ping),
+                () = sleep_until(deadline) => self.pool.advance(self.now()),
                 message = messages.recv() => match message {
                     Some(message) => self.receive(message),
                     None => return,
                 },
-                () = sleep_until(deadline) => self.pool.advance(self.now()),
-                () = shutdown.cancelled() => return,
             }
             self.deliver();
         }
@@ -157,13 +184,14 @@ impl Actor {
         Timestamp(u64::try_from(self.start.elapsed().as_nanos()).unwrap_or(u64::MAX))
     }
 
+    fn pinged(&mut self, Ping { session, client, ttl, answer }: Ping) {
+        let kept = self.keep_alive(&session, &client, ttl).map_err(|error| status::of_error(&error));
+        let _ = answer.send(kept);
+    }
+
     fn receive(&mut self, message: Message) {
         let now = self.now();
         match message {
-            Message::KeepAlive { session, client, ttl, answer } => {
-                let kept = self.keep_alive(&session, &client, ttl).map_err(|error| status::of_error(&error));
-                let _ = answer.send(kept);
-            }
             Message::Perform { request_id, request, answer } => {
                 let reply = self.pool.handle(now, &request_id, request);
                 let revision = self.pool.revision();

@@ -1,6 +1,6 @@
 //! gRPC in front of the actor: checks what the schema cannot say, and undoes what a dropped call was about to get.
 
-use super::actor::{Handle, KeptAlive, Message};
+use super::actor::{Handle, Message};
 use super::{Granted, wire};
 use crate::details::{ending, retry_later, status};
 use futures::{Stream, StreamExt};
@@ -262,7 +262,7 @@ async fn kept_alive(actor: &Handle, ping: v1::KeepAliveRequest) -> Result<v1::Ke
     label(&ping.client, "client")?;
     let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };
     let ttl = Duration::from_millis(ping.ttl_ms);
-    let kept: KeptAlive = actor.ask(|answer| Message::KeepAlive { session, client, ttl, answer }).await??;
+    let kept = actor.keep_alive(session, client, ttl).await?;
     Ok(v1::KeepAliveResponse {
         session_id: ping.session_id,
         ttl_ms: u64::try_from(kept.ttl.as_millis()).unwrap_or(u64::MAX),
