@@ -11,7 +11,9 @@ use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{ResourceEvent, ResourceUpdate};
-use ratn_resources::{AcquireRequest, Notice, Pool, PoolError, Reply, Request, ResourceView, SessionId, WaiterId};
+use ratn_resources::{
+    AcquireRequest, Change, Notice, Pool, PoolError, Reply, Request, ResourceView, SessionId, WaiterId,
+};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -102,6 +104,8 @@ struct Actor {
     /// Who waits for the answer of which waiter; a repeated request joins.
     calls: BTreeMap<WaiterId, Vec<(u64, oneshot::Sender<Granted>)>>,
     tickets: BTreeMap<u64, WaiterId>,
+    /// How many calls got a lease, where a repeated request had joined: as many have to be dropped before it goes back.
+    shared: BTreeMap<LeaseId, usize>,
     watchers: Vec<mpsc::Sender<Arc<ResourceUpdate>>>,
 }
 
@@ -118,6 +122,7 @@ pub(super) fn start(config: ResourceManagerConfig, shutdown: CancellationToken) 
         start: Instant::now(),
         calls: BTreeMap::new(),
         tickets: BTreeMap::new(),
+        shared: BTreeMap::new(),
         watchers: Vec::new(),
     };
     tokio::spawn(actor.run(messages, pinged, shutdown));
@@ -254,6 +259,10 @@ impl Actor {
     }
 
     fn give_back(&mut self, lease: LeaseId) {
+        if let Some(calls) = self.shared.get_mut(&lease).filter(|calls| **calls > 1) {
+            *calls -= 1;
+            return;
+        }
         tracing::debug!(%lease, "granted to a call that was dropped: released");
         let _ = self.pool.release(self.now(), None, lease);
     }
@@ -284,11 +293,18 @@ impl Actor {
             }
             for notice in notices {
                 match notice {
-                    Notice::Event(event) => wire::events(event).into_iter().for_each(|event| self.publish(event)),
+                    Notice::Event(event) => {
+                        if let Change::LeaseEnded { lease, .. } = &event.change {
+                            self.shared.remove(lease);
+                        }
+                        wire::events(event).into_iter().for_each(|event| self.publish(event));
+                    }
                     Notice::Granted { waiter, lease } => {
                         let id = lease.id;
-                        if !self.answer(waiter, Ok(lease)) {
-                            self.give_back(id);
+                        match self.answer(waiter, Ok(lease)) {
+                            0 => self.give_back(id),
+                            1 => {}
+                            calls => drop(self.shared.insert(id, calls)),
                         }
                     }
                     Notice::Refused { waiter, refusal } => {
@@ -299,12 +315,12 @@ impl Actor {
         }
     }
 
-    /// Whether anybody took it.
-    fn answer(&mut self, waiter: WaiterId, granted: Granted) -> bool {
-        let mut taken = false;
+    /// How many calls took it.
+    fn answer(&mut self, waiter: WaiterId, granted: Granted) -> usize {
+        let mut taken = 0;
         for (ticket, call) in self.calls.remove(&waiter).unwrap_or_default() {
             self.tickets.remove(&ticket);
-            taken |= call.send(granted.clone()).is_ok();
+            taken += usize::from(call.send(granted.clone()).is_ok());
         }
         taken
     }

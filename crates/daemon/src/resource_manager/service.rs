@@ -296,3 +296,41 @@ fn optional_session(id: &str) -> Result<Option<SessionId>, Status> {
 fn odd_reply(reply: &Reply) -> Status {
     status(Code::Internal, "BROKEN", format!("the pool answered with {reply:?}"))
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::super::{ResourceManagerConfig, actor};
+    use super::*;
+    use ratn_model::resource::ResourceClass;
+
+    #[tokio::test]
+    async fn a_lease_that_two_calls_of_one_request_got_goes_back_when_both_are_dropped() {
+        let actor = actor::start(ResourceManagerConfig::default(), CancellationToken::new());
+        let session = SessionId::from("s");
+        actor.keep_alive(session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
+        let requirement = Requirement {
+            operation: ResourceOperation::Block,
+            kind: "Arm".to_owned(),
+            class: None,
+            attributes: Default::default(),
+            count: 1,
+        };
+        let mut calls = Vec::new();
+        for ticket in [1, 2] {
+            let (answer, answered) = oneshot::channel();
+            let request = AcquireRequest::new(session.clone(), vec![requirement.clone()]);
+            let (request_id, wait) = ("run/i1".to_owned(), Duration::from_secs(60));
+            actor.send(Message::Acquire { ticket, request_id, request, wait, answer }).await.unwrap();
+            calls.push(WaitingCall { actor: actor.clone(), ticket, answered: Some(answered) });
+        }
+        let create = PoolRequest::Create { session: None, spec: ResourceSpec::new(ResourceClass::Module, "Arm") };
+        let request_id = String::new();
+        actor.ask(|answer| Message::Perform { request_id, request: create, answer }).await.unwrap().unwrap();
+        for free in [0, 0, 1] {
+            let (views, _) = actor.ask(|answer| Message::List { answer }).await.unwrap();
+            assert_eq!(views[0].free, free);
+            calls.pop();
+        }
+    }
+}
