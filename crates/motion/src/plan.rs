@@ -13,7 +13,7 @@ use crate::improve::improve;
 use crate::inverse::{Solver, is_same};
 use crate::line::{LineError, line};
 use crate::pace::{Control, Pace, Progress, Stop};
-pub use crate::request::{Goal, MAX_GOALS, MAX_STRAIGHT_M, Request};
+pub use crate::request::{Goal, MAX_GOALS, MAX_STRAIGHT_M, MIN_SPEED, Request};
 use crate::robot::{Configuration, Joints, Robot};
 use crate::search::search;
 use crate::shorten::{length, shortcut};

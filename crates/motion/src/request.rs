@@ -10,6 +10,9 @@ pub const MAX_GOALS: usize = 64;
 /// The longest straight part, in metres.
 pub const MAX_STRAIGHT_M: f64 = 0.5;
 
+/// The slowest motion, as a fraction of the limits: a trajectory's points are as many as its time is long.
+pub const MIN_SPEED: f64 = 0.01;
+
 /// What to plan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Request {
@@ -44,8 +47,8 @@ impl Request {
         let malformed = |what: &str, value: String, expected: &str| {
             Err(PlanError::Malformed { what: what.to_owned(), value, expected: expected.to_owned() })
         };
-        if !(self.speed > 0.0 && self.speed <= 1.0) {
-            return malformed("speed", self.speed.to_string(), "a fraction above 0, at most 1");
+        if !(MIN_SPEED..=1.0).contains(&self.speed) {
+            return malformed("speed", self.speed.to_string(), &format!("a fraction from {MIN_SPEED} to 1"));
         }
         for (what, value) in [("depart_m", self.depart_m), ("approach_m", self.approach_m)] {
             if !(0.0..=MAX_STRAIGHT_M).contains(&value) {

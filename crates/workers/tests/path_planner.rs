@@ -172,3 +172,12 @@ async fn what_cannot_be_planned_is_aborted_with_the_reason() {
         assert!(outcome.reason.contains(reason), "{}", outcome.reason);
     }
 }
+
+#[tokio::test]
+async fn a_plan_for_a_crawling_arm_is_refused_and_not_written_out_for_hours_of_motion() {
+    let system = system().await;
+    let goal = system.grasp("a", &[("speed", Value::Float(0.001))]);
+    let outcome = system.client.execute(&system.planner, goal, |_, _| {}).await.unwrap();
+    assert_eq!(outcome.outcome, "aborted");
+    assert!(outcome.reason.contains("speed"), "{}", outcome.reason);
+}

@@ -2,6 +2,7 @@
 
 use ratn_model::value::Trajectory;
 use ratn_motion::collision::{Checker, Contact};
+use ratn_motion::plan::MIN_SPEED;
 use ratn_motion::robot::{Configuration, Joints, Robot};
 use ratn_motion::timing::{Part, parameterise};
 use ratn_motion::trajectory::ArmTrajectory;
@@ -14,9 +15,6 @@ const COMPLIANCE_M: f64 = 0.015;
 
 /// The longest motion, in seconds: every posture of it is checked before it begins.
 const MAX_MOTION_S: f64 = 600.0;
-
-/// The slowest motion, as a fraction of the limits.
-const MIN_SPEED: f64 = 0.01;
 
 /// The trajectory, ready to be followed from `here`.
 ///
