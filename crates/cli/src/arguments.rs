@@ -14,7 +14,7 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Fetch boxes in the simulated cell three times (HSM, CDTN with one planner, CDTN with several) and compare
+    /// Fetch boxes in the simulated cell (HSM, CDTN with one planner, CDTN with several; each with and without a budget) and compare
     Demo(DemoArguments),
     /// Start a whole system on this machine and keep it running in the foreground
     Up(UpArguments),

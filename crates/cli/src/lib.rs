@@ -9,6 +9,7 @@ mod arguments;
 mod command;
 mod failure;
 mod interrupt;
+mod output;
 mod report;
 mod system;
 mod task_control;
@@ -29,7 +30,7 @@ pub fn main() -> ExitCode {
     match command::run(arguments.command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("{failure}");
+            output::progress(&failure);
             failure.exit_code()
         }
     }

@@ -2,6 +2,7 @@
 
 use crate::arguments::CheckArguments;
 use crate::failure::Failure;
+use crate::output;
 use crate::system::config::SystemConfig;
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
@@ -14,7 +15,8 @@ pub(crate) fn run(arguments: &CheckArguments) -> Result<(), Failure> {
     let program = load(&arguments.task, &config.catalogue)?;
     // State 0 is the task itself.
     let states = program.states.len().saturating_sub(1);
-    eprintln!("{}: task `{}` is good: {states} states", arguments.task.display(), program.name);
+    let plural = if states == 1 { "state" } else { "states" };
+    output::progress(format_args!("{}: task `{}` is good: {states} {plural}", arguments.task.display(), program.name));
     Ok(())
 }
 
@@ -29,7 +31,7 @@ pub(crate) fn load(path: &Path, catalogue: &Catalogue) -> Result<Program, Failur
 pub(crate) fn load_text(text: &str, file: &str, catalogue: &Catalogue) -> Result<Program, Failure> {
     match ratn_model::load::load(text, file, catalogue) {
         Ok(loaded) => {
-            loaded.warnings.iter().for_each(|warning| eprintln!("{warning}"));
+            loaded.warnings.iter().for_each(output::progress);
             Ok(loaded.program)
         }
         Err(findings) => {

@@ -1,4 +1,4 @@
-//! `ratn demo`: the main job. The same task three times on real processes, each time in the same cell.
+//! `ratn demo`: the main job. The same task on real processes in several ways, each time in the same cell.
 //!
 //! Every run gets a system of its own, started fresh from the same seed, so that nothing of one run helps or hinders the next.
 
@@ -9,6 +9,7 @@ use super::{blocking, check};
 use crate::arguments::{Budget, DemoArguments, SystemArguments};
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
+use crate::output;
 use crate::report::gantt;
 use crate::report::timeline::Timeline;
 use crate::system::System;
@@ -35,7 +36,7 @@ pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     let outcome: Result<(), Failure> = blocking(async {
         let interrupt = Interrupt::listen()?;
         for plan in plans(arguments) {
-            eprintln!("\n{}", plan.announcement(arguments));
+            output::progress(format_args!("\n{}", plan.announcement(arguments)));
             let outcome = one_run(&plan, arguments, &config, &program, &directory, &interrupt).await;
             let outcome = outcome.with_context(|| plan.name())?;
             let (end, delivered) = (outcome.end.clone(), outcome.delivered);
@@ -44,8 +45,8 @@ pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
                 return Err(anyhow!("interrupted").into());
             }
             if delivered != arguments.boxes as usize {
-                let boxes = arguments.boxes;
-                return Err(anyhow!("{}: {delivered} of {boxes} boxes are on the base; {end}", plan.name()).into());
+                let all = result::boxes(arguments.boxes);
+                return Err(anyhow!("{}: {delivered} of {all} delivered to the base; {end}", plan.name()).into());
             }
         }
         Ok(())
@@ -53,11 +54,11 @@ pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     // Whatever was run is shown, also when not all was.
     draw(&mut demonstration)?;
     if arguments.json {
-        eprintln!("\n{demonstration}");
-        println!("{}", serde_json::to_string_pretty(&demonstration.to_json())?);
+        output::progress(format_args!("\n{demonstration}"));
+        output::result(serde_json::to_string_pretty(&demonstration.to_json())?)?;
     } else {
-        eprintln!();
-        println!("{demonstration}");
+        output::progress("");
+        output::result(&demonstration)?;
     }
     outcome
 }

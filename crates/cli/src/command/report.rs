@@ -2,6 +2,7 @@
 
 use crate::arguments::ReportArguments;
 use crate::failure::Failure;
+use crate::output;
 use crate::report::gantt;
 use crate::report::statistics::Statistics;
 use crate::report::timeline::Timeline;
@@ -14,12 +15,12 @@ pub(crate) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
     let statistics = Statistics::of(&timeline);
     if let Some(path) = &arguments.gantt {
         gantt::write(path, &timeline, None).with_context(|| format!("cannot write {}", path.display()))?;
-        eprintln!("chart: {}", path.display());
+        output::progress(format_args!("chart: {}", path.display()));
     }
     if arguments.json {
-        println!("{}", serde_json::to_string_pretty(&statistics)?);
+        output::result(serde_json::to_string_pretty(&statistics)?)?;
     } else {
-        println!("{statistics}");
+        output::result(&statistics)?;
     }
     Ok(())
 }

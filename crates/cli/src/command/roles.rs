@@ -1,8 +1,9 @@
 //! The daemons and workers: this binary as something else.
 
-use super::blocking;
+use super::{blocking, blocking_on};
 use crate::arguments::{RoleArguments, WorkerArguments, WorkerKind};
 use crate::failure::Failure;
+use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::public_directory;
 use anyhow::Context;
@@ -16,7 +17,9 @@ use tokio_util::sync::CancellationToken;
 pub(super) fn resource_manager(arguments: &RoleArguments) -> Result<(), Failure> {
     let mut config = SystemConfig::load(arguments.config.as_deref())?.resource_manager;
     config.listen = arguments.listen.clone().unwrap_or(config.listen);
-    daemon(arguments, async |directory, token| resource_manager::run(config, directory, token).await)
+    // On one thread requests are handled in the order in which they arrive; task control sends the most urgent first.
+    let runtime = tokio::runtime::Builder::new_current_thread();
+    daemon_on(runtime, arguments, async |directory, token| resource_manager::run(config, directory, token).await)
 }
 
 /// `ratn world-pool`
@@ -64,17 +67,25 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
     })
 }
 
-/// What every daemon does around its own work.
 fn daemon(
     arguments: &RoleArguments,
     run: impl AsyncFnOnce(RuntimeDirectory, CancellationToken) -> anyhow::Result<()>,
 ) -> Result<(), Failure> {
+    daemon_on(tokio::runtime::Builder::new_multi_thread(), arguments, run)
+}
+
+/// What every daemon does around its own work.
+fn daemon_on(
+    runtime: tokio::runtime::Builder,
+    arguments: &RoleArguments,
+    run: impl AsyncFnOnce(RuntimeDirectory, CancellationToken) -> anyhow::Result<()>,
+) -> Result<(), Failure> {
     if arguments.check_config {
-        eprintln!("the config is good");
+        output::progress("the config is good");
         return Ok(());
     }
     telemetry::start();
-    blocking(async {
+    blocking_on(runtime, async {
         let token = CancellationToken::new();
         shutdown::on_signals(&token).context("cannot catch signals")?;
         if arguments.exit_with_parent {

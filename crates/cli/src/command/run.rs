@@ -4,6 +4,7 @@ use super::{blocking, check};
 use crate::arguments::{ModeArgument, RunArguments, SystemArguments};
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
+use crate::output;
 use crate::report::gantt;
 use crate::report::statistics::Statistics;
 use crate::report::timeline::Timeline;
@@ -53,11 +54,11 @@ pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
 
         let system = match found {
             Some(system) => {
-                eprintln!("on the system in {}", directory.display());
+                output::progress(format_args!("on the system in {}", directory.display()));
                 system
             }
             None => {
-                eprintln!("no system runs in {}: starting one for this run", directory.display());
+                output::progress(format_args!("no system runs in {}: starting one for this run", directory.display()));
                 starting(System::start_private(config.clone()), &interrupt).await?
             }
         };
@@ -72,7 +73,7 @@ pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
             quiet: false,
         };
         let ended = on_system(run, system, &interrupt, async |_| Ok(())).await;
-        eprintln!("event log: {}", log.display());
+        output::progress(format_args!("event log: {}", log.display()));
         let (ended, ()) = ended?;
         say(&ended, &log, arguments)?;
         if ended.outcome == SUCCESS { Ok(()) } else { Err(anyhow!("the task ended with {}", ended.outcome).into()) }
@@ -114,7 +115,7 @@ fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()
     let timeline = Timeline::of(&log::read(log)?);
     if let Some(path) = &arguments.gantt {
         gantt::write(path, &timeline, None).with_context(|| format!("cannot write {}", path.display()))?;
-        eprintln!("chart: {}", path.display());
+        output::progress(format_args!("chart: {}", path.display()));
     }
     let statistics = Statistics::of(&timeline);
     if arguments.json {
@@ -123,14 +124,10 @@ fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()
             "outcome": ended.outcome, "reason": ended.reason, "outputs": outputs,
             "makespan_s": ended.makespan_s, "log": log, "statistics": statistics,
         });
-        println!("{}", serde_json::to_string_pretty(&document)?);
-        return Ok(());
+        return output::result(serde_json::to_string_pretty(&document)?);
     }
-    println!("{statistics}");
-    for (name, value) in &ended.outputs {
-        println!("{name} = {value}");
-    }
-    Ok(())
+    let outputs = ended.outputs.iter().map(|(name, value)| format!("\n{name} = {value}"));
+    output::result(format_args!("{statistics}{}", outputs.collect::<String>()))
 }
 
 /// A value as other programs expect it; what has no plain form is written as in an event log.

@@ -2,6 +2,7 @@
 
 use crate::arguments::TablesArguments;
 use crate::failure::Failure;
+use crate::output;
 use crate::report::gantt;
 use crate::report::timeline::Timeline;
 use anyhow::Context;
@@ -17,20 +18,23 @@ pub(crate) fn run(arguments: &TablesArguments) -> Result<(), Failure> {
         draw(directory, &scenarios)?;
     }
     if arguments.json {
-        println!("{}", serde_json::to_string_pretty(&rows)?);
+        output::result(serde_json::to_string_pretty(&rows)?)
     } else {
-        print(&rows, &scenarios);
+        output::result(table(&rows, &scenarios))
     }
-    Ok(())
+    .map_err(Failure::from)
 }
 
-fn print(rows: &[Row], scenarios: &[Scenario]) {
-    println!("Seconds; each figure beside the paper's. MP: motion planner processes. Improvement: 2 MP over HSM.\n");
-    println!("table  objects          HSM  paper   CDTN 1 MP  paper   CDTN 2 MP  paper   improvement   paper");
+fn table(rows: &[Row], scenarios: &[Scenario]) -> String {
+    let mut lines = vec![
+        "Seconds; each figure beside the paper's. MP: motion planner processes. Improvement: 2 MP over HSM.\n"
+            .to_owned(),
+        "table  objects          HSM  paper   CDTN 1 MP  paper   CDTN 2 MP  paper   improvement   paper".to_owned(),
+    ];
     for (row, scenario) in rows.iter().zip(scenarios) {
         let paper = scenario.paper;
         let one = paper.cdtn_1mp_s.map_or_else(|| "-".to_owned(), |s| format!("{s:.1}"));
-        println!(
+        lines.push(format!(
             "{:<5}  {:<11} {:>8.1} {:>6.1}  {:>10.1} {:>6}  {:>10.1} {:>6.1}  {:>11.1}% {:>6.1}%",
             row.table,
             row.objects,
@@ -42,8 +46,9 @@ fn print(rows: &[Row], scenarios: &[Scenario]) {
             paper.cdtn_2mp_s,
             improvement(row.hsm_s, row.cdtn_2mp_s),
             paper.improvement_percent,
-        );
+        ));
     }
+    lines.join("\n")
 }
 
 /// In percent.
@@ -64,7 +69,7 @@ fn draw(directory: &Path, scenarios: &[Scenario]) -> anyhow::Result<()> {
             let path = directory.join(format!("table-{}-{objects}-{name}.html", scenario.table.to_lowercase()));
             gantt::write(&path, &Timeline::of(&run.log), Some(scale_s))
                 .with_context(|| format!("cannot write {}", path.display()))?;
-            eprintln!("chart: {}", path.display());
+            output::progress(format_args!("chart: {}", path.display()));
         }
     }
     Ok(())

@@ -4,6 +4,7 @@ use super::{blocking, run::starting};
 use crate::arguments::UpArguments;
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
+use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::{System, public_directory, running};
 
@@ -18,7 +19,10 @@ pub(crate) fn run(arguments: &UpArguments) -> Result<(), Failure> {
             return Err(Failure::Refused(format!("ratn: a system runs in {} already", directory.display())));
         }
         let mut system = starting(System::start_public(config, &directory), &interrupt).await?;
-        eprintln!("the system is ready in {}; Ctrl-C ends it", system.directory().path().display());
+        output::progress(format_args!(
+            "the system is ready in {}; Ctrl-C ends it",
+            system.directory().path().display()
+        ));
         let ended = tokio::select! {
             () = interrupt.asked_times(1) => Ok(()),
             error = system.one_ended() => Err(error.into()),

@@ -5,6 +5,7 @@
 //! a log file of the runtime directory. A system is ready when every role has published its endpoint and every resource that
 //! the config promises is there.
 
+use crate::output;
 use anyhow::{Context, bail};
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -136,7 +137,7 @@ impl Processes {
         for process in self.roles.iter_mut().rev() {
             let left = STOP_DEADLINE.saturating_sub(start.elapsed());
             if tokio::time::timeout(left, process.child.wait()).await.is_err() {
-                eprintln!("{} did not end in time and is killed", process.role);
+                output::progress(format_args!("{} did not end in time and is killed", process.role));
                 let _ = process.child.kill().await;
             }
         }

@@ -1,5 +1,6 @@
 //! What a run is doing, one line per node that starts or ends, on standard error.
 
+use crate::output;
 use ratn_executive::protocol::{Command, Event, Note};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, WORLD_MODEL};
@@ -78,5 +79,5 @@ impl Progress {
 }
 
 fn say(at: Timestamp, what: &str) {
-    eprintln!("{:>8.1} s  {what}", at.seconds());
+    output::progress(format_args!("{:>8.1} s  {what}", at.seconds()));
 }

@@ -71,7 +71,7 @@ impl Plan {
             Mode::Cdtn => format!("as a dataflow network, {} motion planners", self.planners),
         };
         let budget = if self.budget { "" } else { "; planning takes what it takes" };
-        format!("== {}: {} boxes {how}{budget} ==", self.name(), arguments.boxes)
+        format!("== {}: {} {how}{budget} ==", self.name(), boxes(arguments.boxes))
     }
 }
 
@@ -145,6 +145,11 @@ impl Demonstration {
     }
 }
 
+/// For people.
+pub(super) fn boxes(number: u32) -> String {
+    if number == 1 { "1 box".to_owned() } else { format!("{number} boxes") }
+}
+
 fn budget_name(budget: bool) -> &'static str {
     if budget { "task" } else { "none" }
 }
@@ -183,11 +188,11 @@ impl Row {
 
 impl fmt::Display for Demonstration {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (boxes, planners) = (self.boxes, self.planners);
-        let plural = if boxes == 1 { "box" } else { "boxes" };
+        let planners = self.planners;
         writeln!(
             f,
-            "Fetching {boxes} {plural}: seconds of the robot's time (wall time × {}); MP: motion planner processes\n",
+            "Fetching {}: seconds of the robot's time (wall time × {}); MP: motion planner processes\n",
+            boxes(self.boxes),
             self.speed
         )?;
         let columns = (format!("CDTN {planners} MP"), format!("{planners} MP over HSM"));
@@ -198,7 +203,7 @@ impl fmt::Display for Demonstration {
         if self.outcomes.iter().any(|o| !o.plan.budget) {
             self.row(false).write(f, "planning without a budget")?;
         }
-        if let Some((_, hsm, one, two)) = PAPER.into_iter().find(|row| row.0 == boxes) {
+        if let Some((_, hsm, one, two)) = PAPER.into_iter().find(|row| row.0 == self.boxes) {
             let paper = Row { hsm_s: Some(hsm), cdtn_1mp_s: Some(one), cdtn_nmp_s: (planners == 2).then_some(two) };
             paper.write(f, "the paper")?;
         }

@@ -1,0 +1,52 @@
+//! What a command writes: progress for people on standard error, results on standard output.
+//!
+//! Nothing depends on progress, so a display that is gone or full ends no run. A result that cannot be written is an
+//! error, except when its reader has had enough of it (`ratn report LOG | head`).
+
+use std::fmt::Display;
+use std::io::{self, ErrorKind, Write};
+
+/// Writes one line to standard error, if somebody is there to read it.
+pub(crate) fn progress(line: impl Display) {
+    let _ = io::stderr().write_all(format!("{line}\n").as_bytes());
+}
+
+/// Writes a result and the end of its last line to standard output.
+///
+/// # Errors
+/// When it cannot be written. A reader that stopped reading is no error.
+pub(crate) fn result(text: impl Display) -> anyhow::Result<()> {
+    write(&mut io::stdout().lock(), &text)
+}
+
+fn write(to: &mut impl Write, text: &impl Display) -> anyhow::Result<()> {
+    match to.write_all(format!("{text}\n").as_bytes()).and_then(|()| to.flush()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => {
+            Err(anyhow::Error::from(error).context("cannot write the result to standard output"))
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Broken(ErrorKind);
+
+    impl Write for Broken {
+        fn write(&mut self, _: &[u8]) -> io::Result<usize> {
+            Err(self.0.into())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_full_disk_is_an_error_and_a_reader_that_left_is_none() {
+        assert!(write(&mut Broken(ErrorKind::StorageFull), &"a").is_err());
+        assert!(write(&mut Broken(ErrorKind::BrokenPipe), &"a").is_ok());
+    }
+}
