@@ -8,6 +8,7 @@
 mod arguments;
 mod command;
 mod failure;
+mod input;
 mod interrupt;
 mod output;
 mod report;

@@ -13,6 +13,7 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_world::tolerance::Tolerance;
 use ratn_world::world::World;
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -65,7 +66,7 @@ impl Executive {
             }
             event => self.step(event, &mut commands),
         }
-        releases_last(commands)
+        most_urgent_first(commands)
     }
 
     /// The mirror of the root world model.
@@ -179,16 +180,16 @@ impl Executive {
     }
 }
 
-/// What is given back goes to whom it serves most: those who ask because of the same event must be in the queue by then.
-fn releases_last(commands: Vec<Command>) -> Vec<Command> {
-    let rank = |command: &Command| match command {
-        Command::Release { .. } => 1,
-        Command::End { .. } => 2,
-        _ => 0,
-    };
-    let mut ordered = commands;
-    ordered.sort_by_key(rank);
-    ordered
+/// Acquires of one event in the order of their priority, and what is given back after them: so that what is free, and what
+/// becomes free, goes to whom it serves most. The resource manager grants as requests arrive; it cannot know what comes next.
+fn most_urgent_first(mut commands: Vec<Command>) -> Vec<Command> {
+    commands.sort_by_key(|command| match command {
+        Command::Acquire { priority, .. } => (1, Reverse(*priority)),
+        Command::Release { .. } => (2, Reverse(0)),
+        Command::End { .. } => (3, Reverse(0)),
+        _ => (0, Reverse(0)),
+    });
+    commands
 }
 
 fn commit_initial(context: &mut Context<'_>, parameters: &BTreeMap<String, Value>) -> Result<(), String> {

@@ -110,7 +110,8 @@ pub enum Event {
 }
 
 /// What the shell shall do. Performed in order: commits and projections reach the world pool, acquires and releases the
-/// resource manager, in this order. The releases of one event come last, so that what is given back goes to the most urgent.
+/// resource manager, in this order. The
+/// acquires of one event come in the order of their priority and its releases last, so that what is free goes to the most urgent.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "command", rename_all = "snake_case")]
 pub enum Command {

@@ -2,7 +2,7 @@
 
 use crate::arguments::CheckArguments;
 use crate::failure::Failure;
-use crate::output;
+use crate::{input, output};
 use crate::system::config::SystemConfig;
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
@@ -22,7 +22,7 @@ pub(crate) fn run(arguments: &CheckArguments) -> Result<(), Failure> {
 
 /// Loads a task file; errors refuse it, warnings go to standard error.
 pub(crate) fn load(path: &Path, catalogue: &Catalogue) -> Result<Program, Failure> {
-    let text = std::fs::read_to_string(path)
+    let text = input::read(path)
         .map_err(|error| Failure::Refused(format!("{}: cannot be read: {error}", path.display())))?;
     load_text(&text, &path.display().to_string(), catalogue)
 }

@@ -35,10 +35,15 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
 
 /// Runs a future on a runtime of its own.
 fn blocking(future: impl Future<Output = Result<(), Failure>>) -> Result<(), Failure> {
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .enable_all()
-        .build()
-        .context("cannot start the asynchronous runtime")?;
+    blocking_on(tokio::runtime::Builder::new_multi_thread(), future)
+}
+
+/// As [`blocking`], on a runtime of another kind.
+fn blocking_on(
+    mut runtime: tokio::runtime::Builder,
+    future: impl Future<Output = Result<(), Failure>>,
+) -> Result<(), Failure> {
+    let runtime = runtime.enable_all().build().context("cannot start the asynchronous runtime")?;
     let done = runtime.block_on(future);
     // A computation that does not hear that it is over is not waited for.
     runtime.shutdown_timeout(LAST_WORK);

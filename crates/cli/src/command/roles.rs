@@ -39,9 +39,7 @@ pub(super) fn process_manager(arguments: &RoleArguments) -> Result<(), Failure> 
 /// `ratn cell`
 pub(super) fn cell(arguments: &RoleArguments) -> Result<(), Failure> {
     let mut config = SystemConfig::load(arguments.config.as_deref())?.cell;
-    if let Some(listen) = &arguments.listen {
-        config.listen = listen.to_string();
-    }
+    config.listen = arguments.listen.clone().unwrap_or(config.listen);
     daemon(arguments, async |directory, token| ratn_cell::run(config, directory, token).await)
 }
 

@@ -2,6 +2,7 @@
 
 use crate::arguments::SystemArguments;
 use crate::failure::Failure;
+use crate::input;
 use anyhow::Context;
 use ratn_cell::config::CellConfig;
 use ratn_daemon::config::Check;
@@ -65,7 +66,7 @@ impl SystemConfig {
     /// Reads and checks a config.
     pub(crate) fn read(file: &Path) -> anyhow::Result<SystemConfig> {
         let name = file.display().to_string();
-        let text = std::fs::read_to_string(file).with_context(|| format!("cannot read the config {name}"))?;
+        let text = input::read(file).with_context(|| format!("cannot read the config {name}"))?;
         SystemConfig::parse(&text, &name)
     }
 

@@ -5,14 +5,15 @@ use super::Endpoints;
 use super::record::{Cancelled, MAX_PENDING_RECORDS, Record, Recorder, said};
 use super::retry::{Attempts, patiently};
 use anyhow::bail;
+use futures::FutureExt;
 use ratn_executive::protocol::{Command, Event, Goal};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::program::ABORTED;
-use ratn_model::resource::Requirement;
+use ratn_model::resource::{Requirement, ResourceClass};
 use ratn_model::value::Value;
-use ratn_proto::types;
+use ratn_proto::types::{self, Resource};
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient, fresh_id};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::{DEFAULT_TTL, Session};
@@ -29,6 +30,8 @@ const SESSION_DEADLINE: Duration = Duration::from_secs(5);
 const ACQUIRE_DEADLINE: Duration = Duration::from_secs(3600);
 /// A provider that was told to stop and does not is left alone after this long.
 const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
+/// The resource that the one run of a system is.
+const RUN: &str = "run";
 /// At the end of a run, for everything that is still being given back.
 const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
 
@@ -85,6 +88,7 @@ impl Performer {
         let session = Session::open(&channels, &endpoints.resource_manager, "task-control", DEFAULT_TTL);
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, &endpoints.resource_manager, session.id())?;
+        only_run(&resources, task).await?;
         let world = WorldClient::new(&channels, &endpoints.world_pool)?;
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
         let cancelled = Cancelled::default();
@@ -196,7 +200,7 @@ impl Performer {
             holder: format!("{} {instance}", self.task),
         };
         let (resources, events) = (self.resources.clone(), self.events.clone());
-        tokio::spawn(async move {
+        let mut asking = Box::pin(async move {
             let ask = || resources.acquire(requirements.clone(), options.clone());
             let answer = tokio::select! {
                 answer = patiently(Attempts::IDEMPOTENT, ask) => answer,
@@ -212,6 +216,10 @@ impl Performer {
             };
             let _ = events.send(Answer { event, withdrawn: Some(withdrawn) }).await;
         });
+        // The request leaves here and now: tasks would be run, and requests arrive, in any order.
+        if asking.as_mut().now_or_never().is_none() {
+            tokio::spawn(asking);
+        }
     }
 
     /// The event of an answer; `None` when what it answers was withdrawn or cancelled: what crossed with that goes back.
@@ -319,6 +327,19 @@ impl Performer {
     }
 }
 
+/// Two runs would each change the world under the other's projections: a system has one at a time. The resource that says so
+/// goes with the run's session.
+async fn only_run(resources: &ResourceClient, task: &str) -> anyhow::Result<()> {
+    let claim = Resource::new(RUN, ResourceClass::Task, "Run").with_attribute("task", Value::String(task.to_owned()));
+    match patiently(Attempts::IDEMPOTENT, || resources.create(claim.clone())).await {
+        Ok(_) => Ok(()),
+        Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
+            bail!("another run is under way on this system: wait for its end, or use a system of your own")
+        }
+        Err(error) => bail!("cannot begin the run: {}", said(&error)),
+    }
+}
+
 /// Has a goal performed; `None` when it was told to stop.
 async fn execute(
     actions: &ActionClient,
@@ -378,8 +399,7 @@ mod tests {
     use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
     use ratn_daemon::world_pool::{self, WorldPoolConfig};
     use ratn_model::fact::{Change, Footprint};
-    use ratn_model::resource::{ResourceClass, ResourceOperation};
-    use ratn_proto::types::Resource;
+    use ratn_model::resource::ResourceOperation;
     use ratn_worker::runtime_directory::RuntimeDirectory;
     use tokio_util::sync::DropGuard;
 
@@ -397,6 +417,7 @@ mod tests {
     struct Bench {
         performer: Performer,
         answers: mpsc::Receiver<Answer>,
+        endpoints: Endpoints,
         _place: tempfile::TempDir,
         _shutdown: DropGuard,
     }
@@ -415,7 +436,7 @@ mod tests {
             let (events, answers) = mpsc::channel(8);
             let performer = Performer::connect(&endpoints, Arc::default(), "task", events).await?;
             performer.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
-            Ok(Bench { performer, answers, _place: place, _shutdown: shutdown.drop_guard() })
+            Ok(Bench { performer, answers, endpoints, _place: place, _shutdown: shutdown.drop_guard() })
         }
 
         fn ask(&mut self, instance: InstanceId) -> anyhow::Result<()> {
@@ -453,6 +474,15 @@ mod tests {
         bench.ask(other)?;
         bench.granted(other).await?;
         bench.performer.close().await
+    }
+
+    #[tokio::test]
+    async fn a_second_run_is_refused_before_anything_is_started() -> anyhow::Result<()> {
+        let bench = Bench::new().await?;
+        let (events, _) = mpsc::channel(1);
+        let second = Performer::connect(&bench.endpoints, Arc::default(), "second", events).await;
+        assert!(second.is_err_and(|error| error.to_string().contains("another run is under way")));
+        Ok(())
     }
 
     #[tokio::test]
