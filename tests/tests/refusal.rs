@@ -69,6 +69,33 @@ fn a_bad_config_is_refused_by_every_role() -> anyhow::Result<()> {
 }
 
 #[test]
+fn an_address_that_is_none_is_refused_for_every_role() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let config = place.path().join("ratn.toml");
+    let file = config.to_str().context("a path")?;
+    for role in ["resource-manager", "world-pool", "process-manager", "cell"] {
+        for key in ["listen", "resource_manager"] {
+            std::fs::write(&config, format!("[{role}]\n{key} = \"nonsense\"\n"))?;
+            let output = place.ratn(&["cell", "--config", file, "--check-config"]).output()?;
+            let (_, err) = texts(&output);
+            ensure!(output.status.code() == Some(2) && err.contains("line 2"), "{role} {key}: {err}");
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn what_is_no_file_is_refused() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    for arguments in [&["check", "/dev/zero"][..], &["run", "/dev/zero"], &["cell", "--config", "/dev/zero"]] {
+        let output = place.ratn(arguments).output()?;
+        let (_, err) = texts(&output);
+        ensure!(output.status.code() == Some(2) && err.contains("not a regular file"), "{arguments:?}: {err}");
+    }
+    Ok(())
+}
+
+#[test]
 fn what_the_command_line_cannot_mean_is_refused() -> anyhow::Result<()> {
     let place = Place::new()?;
     for arguments in [&["demo", "--boxes", "10"][..], &["demo", "--speed", "0"], &["run"], &["fly"]] {

@@ -13,7 +13,7 @@ pub const MAX_BOXES: usize = 9;
 #[serde(deny_unknown_fields, default)]
 pub struct CellConfig {
     /// Where to listen: `127.0.0.1:0` or `unix:/path`.
-    pub listen: String,
+    pub listen: Endpoint,
     /// Where the resource manager is; without it, where the runtime directory says.
     pub resource_manager: Option<Endpoint>,
     /// The host that the resources say they are on.
@@ -164,7 +164,7 @@ impl CellConfig {
 impl Default for CellConfig {
     fn default() -> CellConfig {
         CellConfig {
-            listen: "127.0.0.1:0".to_owned(),
+            listen: Endpoint::loopback(),
             resource_manager: None,
             host: "sim".to_owned(),
             boxes: 3,

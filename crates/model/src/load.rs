@@ -26,6 +26,7 @@ mod yaml;
 
 pub(crate) use fields::Places;
 pub(crate) use names::suggestion;
+pub use yaml::MAX_SOURCE;
 
 use crate::catalogue::Catalogue;
 use crate::check;

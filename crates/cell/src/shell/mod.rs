@@ -18,7 +18,6 @@ use crate::core::cell::Cell;
 use anyhow::Context;
 use ratn_proto::v1::cell_service_server::CellServiceServer;
 use ratn_worker::client::Channels;
-use ratn_worker::endpoint::Endpoint;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, bind};
@@ -33,12 +32,11 @@ pub const ROLE: &str = "cell";
 /// Where the config is none, where it cannot listen or publish its endpoint, or where serving fails.
 pub async fn run(config: CellConfig, directory: RuntimeDirectory, shutdown: CancellationToken) -> anyhow::Result<()> {
     config.check()?;
-    let listen: Endpoint = config.listen.parse().context("`listen` of the cell")?;
     let laid = config.clone();
     let cell = tokio::task::spawn_blocking(move || Cell::new(laid)).await.context("cannot lay the table")??;
     let keeper = keeper::start(cell, RobotClock::start(config.speed)).context("cannot start the cell")?;
 
-    let bound = bind(&listen).await?;
+    let bound = bind(&config.listen).await?;
     let endpoint = bound.endpoint().clone();
     let channels = Channels::new();
     let server = actions::server(&keeper, &config, channels.clone());

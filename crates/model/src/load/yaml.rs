@@ -9,7 +9,7 @@ use serde_saphyr::Spanned;
 use std::fmt;
 
 /// The largest task file, in bytes.
-pub(crate) const MAX_SOURCE: usize = 1 << 20;
+pub const MAX_SOURCE: usize = 1 << 20;
 
 /// A YAML node.
 #[derive(Debug, Clone, PartialEq)]
