@@ -85,6 +85,19 @@ fn an_address_that_is_none_is_refused_for_every_role() -> anyhow::Result<()> {
 }
 
 #[test]
+fn a_run_on_a_system_that_is_not_there_is_refused() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let task = repository("examples/fetch_boxes.yaml");
+    let directory = place.path().join("nothing");
+    let directory = directory.to_str().context("a path")?;
+    let output = place.ratn(&["run", task.to_str().context("a path")?, "--runtime-dir", directory]).output()?;
+    let (_, err) = texts(&output);
+    ensure!(output.status.code() == Some(2) && err.contains("ratn up --runtime-dir"), "{err}");
+    ensure!(std::fs::read_dir(place.path())?.count() == 0);
+    Ok(())
+}
+
+#[test]
 fn what_is_no_file_is_refused() -> anyhow::Result<()> {
     let place = Place::new()?;
     for arguments in [&["check", "/dev/zero"][..], &["run", "/dev/zero"], &["cell", "--config", "/dev/zero"]] {

@@ -163,7 +163,7 @@ pub(crate) struct RunArguments {
     /// The system's config, TOML; without it the built-in default
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
-    /// Where a running system's endpoint files are
+    /// Where a running system's endpoint files are; without it, a system is started where none runs
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
     /// Robot's seconds per second; a running system's own or the config's unless given

@@ -35,6 +35,12 @@ pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
         let directory = public_directory(arguments.runtime_dir.as_deref());
         let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
         let found = System::find(&directory, given.clone()).await?;
+        if found.is_none() && arguments.runtime_dir.is_some() {
+            let place = directory.display();
+            return Err(Failure::Refused(format!(
+                "ratn: no system runs in {place}: start one with `ratn up --runtime-dir {place}`, or leave --runtime-dir out"
+            )));
+        }
         let mut config = match &found {
             Some(system) => system.config.clone(),
             None => given.map_or_else(|| SystemConfig::load(None), Ok)?,
