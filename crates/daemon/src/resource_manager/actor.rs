@@ -14,6 +14,7 @@ use ratn_proto::types::{ResourceEvent, ResourceUpdate};
 use ratn_resources::{
     AcquireRequest, Change, Notice, Pool, PoolError, Reply, Request, ResourceView, SessionId, WaiterId,
 };
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -23,6 +24,8 @@ use tonic::{Code, Status};
 
 /// Messages that wait for the actor; more make their senders wait.
 const INBOX: usize = 1_024;
+/// Messages that are put into an order of urgency together.
+const AT_ONCE: usize = 64;
 /// Pings that wait for the actor.
 const PINGS: usize = 1_024;
 /// Updates that wait for a watcher; one that has more to catch up with is cut off.
@@ -162,6 +165,15 @@ impl Handle {
     }
 }
 
+/// Calls that arrive together are handled by separate tasks, so in no order of their own: the most urgent acquire goes first,
+/// and what is given back comes after those who ask for it. The rest keeps its order.
+fn most_urgent_first(messages: &mut [Message]) {
+    messages.sort_by_key(|message| match message {
+        Message::Acquire { request, .. } => (0, Reverse(request.priority)),
+        _ => (1, Reverse(0)),
+    });
+}
+
 impl Actor {
     async fn run(
         mut self,
@@ -169,6 +181,7 @@ impl Actor {
         mut pinged: mpsc::Receiver<Ping>,
         shutdown: CancellationToken,
     ) {
+        let mut arrived = Vec::new();
         loop {
             let deadline = self.pool.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
             tokio::select! {
@@ -176,10 +189,18 @@ impl Actor {
                 () = shutdown.cancelled() => return,
                 Some(ping) = pinged.recv() => self.pinged(ping),
                 () = sleep_until(deadline) => self.pool.advance(self.now()),
-                message = messages.recv() => match message {
-                    Some(message) => self.receive(message),
-                    None => return,
-                },
+                count = messages.recv_many(&mut arrived, AT_ONCE) => {
+                    if count == 0 {
+                        return;
+                    }
+                    most_urgent_first(&mut arrived);
+                    for message in arrived.drain(..) {
+                        while let Ok(ping) = pinged.try_recv() {
+                            self.pinged(ping);
+                        }
+                        self.receive(message);
+                    }
+                }
             }
             self.deliver();
         }
