@@ -2,8 +2,8 @@
 
 use crate::arguments::CheckArguments;
 use crate::failure::Failure;
-use crate::{input, output};
 use crate::system::config::SystemConfig;
+use crate::{input, output};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
 use ratn_model::program::Program;
@@ -22,8 +22,8 @@ pub(crate) fn run(arguments: &CheckArguments) -> Result<(), Failure> {
 
 /// Loads a task file; errors refuse it, warnings go to standard error.
 pub(crate) fn load(path: &Path, catalogue: &Catalogue) -> Result<Program, Failure> {
-    let text = input::read(path)
-        .map_err(|error| Failure::Refused(format!("{}: cannot be read: {error}", path.display())))?;
+    let text =
+        input::read(path).map_err(|error| Failure::Refused(format!("{}: cannot be read: {error}", path.display())))?;
     load_text(&text, &path.display().to_string(), catalogue)
 }
 

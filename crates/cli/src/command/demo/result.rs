@@ -5,6 +5,7 @@ use crate::command::tables::improvement;
 use crate::report::statistics::{self, Statistics, mode_name};
 use crate::report::timeline::Timeline;
 use ratn_executive::protocol::Mode;
+use ratn_model::program::SUCCESS;
 use serde_json::{Value, json};
 use std::fmt;
 use std::path::PathBuf;
@@ -81,9 +82,11 @@ impl Demonstration {
         Demonstration { boxes, planners, speed, seed, outcomes: Vec::new() }
     }
 
+    /// Of a run that ended with success; how long another lasted says nothing.
     fn makespan_s(&self, mode: Mode, planners: u32, budget: bool) -> Option<f64> {
         let mut fitting = self.outcomes.iter().filter(|o| o.plan.mode == mode && o.plan.budget == budget);
-        fitting.find(|o| mode == Mode::Hsm || o.plan.planners == planners).map(|o| o.timeline.end_s)
+        let run = fitting.find(|o| mode == Mode::Hsm || o.plan.planners == planners)?;
+        (run.timeline.outcome.as_deref() == Some(SUCCESS)).then_some(run.timeline.end_s)
     }
 
     fn row(&self, budget: bool) -> Row {
@@ -264,4 +267,28 @@ fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn outcome(mode: Mode, end: Option<&str>) -> Outcome {
+        let mut timeline = Timeline::of(&[]);
+        (timeline.outcome, timeline.end_s) = (end.map(str::to_owned), 50.0);
+        let plan = Plan { mode, planners: 2, budget: true };
+        Outcome { plan, timeline, delivered: 1, end: String::new(), log: PathBuf::new(), chart: PathBuf::new() }
+    }
+
+    #[test]
+    fn a_run_that_did_not_succeed_has_no_figure() {
+        let mut shown = Demonstration { boxes: 3, planners: 2, speed: 1.0, seed: 1, outcomes: vec![] };
+        shown.outcomes = vec![outcome(Mode::Hsm, Some(SUCCESS)), outcome(Mode::Cdtn, Some("preempted"))];
+        let json = shown.to_json();
+        assert_eq!((&json["hsm_s"], &json["cdtn_2mp_s"]), (&json!(50.0), &Value::Null));
+        assert_eq!(json["improvement_2mp_percent"], Value::Null);
+        let text = shown.to_string();
+        let row: Vec<&str> = text.lines().filter(|line| line.contains("this run")).collect();
+        assert!(row[0].split_whitespace().eq(["this", "run", "50.0", "-", "-", "-"]), "{row:?}");
+    }
 }
