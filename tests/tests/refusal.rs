@@ -98,6 +98,22 @@ fn a_run_on_a_system_that_is_not_there_is_refused() -> anyhow::Result<()> {
 }
 
 #[test]
+fn a_log_or_a_chart_that_cannot_be_written_is_refused_before_the_run() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let task = repository("examples/fetch_boxes.yaml");
+    let task = task.to_str().context("a path")?;
+    for (option, file) in
+        [("--log", "/nonex/x.jsonl"), ("--log", "/"), ("--gantt", "/nonex/x.svg"), ("--gantt", "x.png")]
+    {
+        let output = place.ratn(&["run", task, option, file]).output()?;
+        let (_, err) = texts(&output);
+        ensure!(output.status.code() == Some(2) && err.contains(file), "{option} {file}: {err}");
+    }
+    ensure!(std::fs::read_dir(place.path())?.count() == 0);
+    Ok(())
+}
+
+#[test]
 fn what_is_no_file_is_refused() -> anyhow::Result<()> {
     let place = Place::new()?;
     for arguments in [&["check", "/dev/zero"][..], &["run", "/dev/zero"], &["cell", "--config", "/dev/zero"]] {

@@ -125,8 +125,8 @@ pub(crate) struct ReportArguments {
     /// Print one JSON document
     #[arg(long)]
     pub(crate) json: bool,
-    /// Write a Gantt chart; `.svg` or HTML
-    #[arg(long, value_name = "FILE")]
+    /// Write a Gantt chart; `.svg` or `.html`
+    #[arg(long, value_name = "FILE", value_parser = chart)]
     pub(crate) gantt: Option<PathBuf>,
 }
 
@@ -154,8 +154,8 @@ pub(crate) struct RunArguments {
     /// Write the event log here
     #[arg(long, value_name = "FILE")]
     pub(crate) log: Option<PathBuf>,
-    /// Write a Gantt chart; `.svg` or HTML
-    #[arg(long, value_name = "FILE")]
+    /// Write a Gantt chart; `.svg` or `.html`
+    #[arg(long, value_name = "FILE", value_parser = chart)]
     pub(crate) gantt: Option<PathBuf>,
     /// What every random choice is derived from
     #[arg(long, value_name = "N", default_value_t = 1)]
@@ -250,6 +250,12 @@ fn speed(text: &str) -> Result<f64, String> {
         Ok(x) if (SLOWEST..=FASTEST).contains(&x) => Ok(x),
         _ => Err(format!("expected a number from {SLOWEST} to {FASTEST}")),
     }
+}
+
+fn chart(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    let known = path.extension().is_some_and(|end| ["svg", "html"].iter().any(|known| end.eq_ignore_ascii_case(known)));
+    if known { Ok(path) } else { Err("expected a file name that ends with .svg or .html".to_owned()) }
 }
 
 fn setting(text: &str) -> Result<(String, String), String> {

@@ -3,8 +3,12 @@
 //! Nothing depends on progress, so a display that is gone or full ends no run. A result that cannot be written is an
 //! error, except when its reader has had enough of it (`ratn report LOG | head`).
 
+use crate::failure::Failure;
+use nix::errno::Errno;
+use nix::unistd::{AccessFlags, access};
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Write};
+use std::path::Path;
 
 /// Writes one line to standard error, if somebody is there to read it.
 pub(crate) fn progress(line: impl Display) {
@@ -17,6 +21,15 @@ pub(crate) fn progress(line: impl Display) {
 /// When it cannot be written. A reader that stopped reading is no error.
 pub(crate) fn result(text: impl Display) -> anyhow::Result<()> {
     write(&mut io::stdout().lock(), &text)
+}
+
+/// Says whether a file could be written, before there is something to write to it; it is not made.
+pub(crate) fn check_writable(path: &Path) -> Result<(), Failure> {
+    // `.` in it makes a file that is no directory an error, and is the folder of a bare name.
+    let directory = path.parent().unwrap_or(path).join(".");
+    let place = if path.exists() { path } else { &directory };
+    let writable = if path.is_dir() { Err(Errno::EISDIR) } else { access(place, AccessFlags::W_OK) };
+    writable.map_err(|error| Failure::Refused(format!("ratn: cannot write {}: {}", path.display(), error.desc())))
 }
 
 fn write(to: &mut impl Write, text: &impl Display) -> anyhow::Result<()> {

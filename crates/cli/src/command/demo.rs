@@ -111,7 +111,7 @@ async fn one_run(
     };
     let system = starting(System::start_private(config), interrupt).await?;
     let (ended, delivered) = on_system(run, system, interrupt, async |system| system.delivered_boxes().await).await?;
-    let timeline = Timeline::of(&log::read(&log_file)?);
+    let timeline = Timeline::of(&log::read(&log_file)?.lines);
     if timeline.outcome.as_deref() != Some(ended.outcome.as_str()) {
         bail!("the event log {} does not end as the run did", log_file.display());
     }

@@ -11,7 +11,17 @@ use anyhow::Context;
 
 /// Prints statistics of an event log, and draws it.
 pub(crate) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
-    let timeline = Timeline::of(&log::read(&arguments.log)?);
+    if let Some(path) = &arguments.gantt {
+        output::check_writable(path)?;
+    }
+    let log = log::read(&arguments.log)?;
+    if let Some(line) = log.torn {
+        let place = arguments.log.display();
+        output::progress(format_args!(
+            "{place}:{line}: warning: the last line is torn (its writer was interrupted); this is what is before it"
+        ));
+    }
+    let timeline = Timeline::of(&log.lines);
     let statistics = Statistics::of(&timeline);
     if let Some(path) = &arguments.gantt {
         gantt::write(path, &timeline, None).with_context(|| format!("cannot write {}", path.display()))?;

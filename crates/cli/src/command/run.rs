@@ -56,6 +56,9 @@ pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
             let message = format!("ratn: a system runs in {}: its speed is its own", directory.display());
             return Err(Failure::Refused(message));
         }
+        for file in arguments.log.iter().chain(&arguments.gantt) {
+            output::check_writable(file)?;
+        }
         let log = arguments.log.clone().map_or_else(|| log_file(&program.name), Ok)?;
 
         let system = match found {
@@ -118,7 +121,7 @@ pub(super) async fn on_system<T>(
 }
 
 fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()> {
-    let timeline = Timeline::of(&log::read(log)?);
+    let timeline = Timeline::of(&log::read(log)?.lines);
     if let Some(path) = &arguments.gantt {
         gantt::write(path, &timeline, None).with_context(|| format!("cannot write {}", path.display()))?;
         output::progress(format_args!("chart: {}", path.display()));

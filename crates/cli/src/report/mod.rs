@@ -14,7 +14,7 @@ mod tests {
     /// A run with a wait, a crash and its second attempt, a discarded plan and an aborted motion.
     fn two_boxes() -> Timeline {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/report/fixtures/two_boxes.jsonl");
-        Timeline::of(&log::read(&path).unwrap())
+        Timeline::of(&log::read(&path).unwrap().lines)
     }
 
     #[test]

@@ -2,7 +2,7 @@
 //!
 //! It is the single source of Gantt charts, statistics, replay and resume, so each line is on its way to the file before the
 //! commands of its event are performed. Reading says which line is wrong and why; a torn last line (the writer was killed) is
-//! named as such.
+//! left out and named.
 
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::time::Timestamp;
@@ -22,14 +22,9 @@ pub(crate) enum LogError {
     Io { what: &'static str, path: PathBuf, source: std::io::Error },
     #[error("the event log {} would grow beyond {MAX_LOG_BYTES} bytes; the run ends here", path.display())]
     TooLong { path: PathBuf },
-    #[error(
-        "{}:{line}: the last line is torn (its writer was interrupted); remove it to read what is before it",
-        path.display()
-    )]
-    Torn { path: PathBuf, line: usize },
     #[error("{}:{line}: not a line of an event log: {reason}", path.display())]
     Foreign { path: PathBuf, line: usize, reason: String },
-    #[error("{} is empty: an event log begins with the event `started`", path.display())]
+    #[error("{} has no whole line: an event log begins with the event `started`", path.display())]
     Empty { path: PathBuf },
 }
 
@@ -73,14 +68,23 @@ impl LogWriter {
     }
 }
 
+/// What an event log says.
+#[derive(Debug)]
+pub(crate) struct Log {
+    pub(crate) lines: Vec<LogLine>,
+    /// The number of its last line if that is torn, which is not among the others.
+    pub(crate) torn: Option<usize>,
+}
+
 /// Reads a whole event log.
 ///
 /// # Errors
 /// [`LogError`] names the line.
-pub(crate) fn read(path: &Path) -> Result<Vec<LogLine>, LogError> {
+pub(crate) fn read(path: &Path) -> Result<Log, LogError> {
     let io = |source| LogError::Io { what: "read", path: path.to_owned(), source };
     let mut reader = BufReader::new(File::open(path).map_err(io)?);
     let mut lines = Vec::new();
+    let mut torn = None;
     let mut text = Vec::new();
     loop {
         text.clear();
@@ -95,7 +99,8 @@ pub(crate) fn read(path: &Path) -> Result<Vec<LogLine>, LogError> {
             if length as u64 == limit {
                 return Err(foreign(format!("longer than {MAX_LINE_BYTES} bytes")));
             }
-            return Err(LogError::Torn { path: path.to_owned(), line });
+            torn = Some(line);
+            break;
         }
         let parsed: LogLine = serde_json::from_slice(&text).map_err(|error| foreign(explain(&text, &error)))?;
         if lines.is_empty() && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
@@ -106,7 +111,7 @@ pub(crate) fn read(path: &Path) -> Result<Vec<LogLine>, LogError> {
     if lines.is_empty() {
         return Err(LogError::Empty { path: path.to_owned() });
     }
-    Ok(lines)
+    Ok(Log { lines, torn })
 }
 
 /// serde's message for an untagged enum says nothing; this one says what the line claims to be.
@@ -160,19 +165,30 @@ mod tests {
         let mut log = LogWriter::create(file.path()).unwrap();
         let command = Command::Note(Note::Retired { instance: InstanceId(1) });
         log.append(Timestamp(0), &started(), std::slice::from_ref(&command)).unwrap();
-        let lines = read(file.path()).unwrap();
+        let Log { lines, torn } = read(file.path()).unwrap();
+        assert_eq!((lines.len(), torn), (2, None));
         assert_eq!(lines[0], LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) });
         assert_eq!(lines[1], LogLine { at: Timestamp(0), entry: LogEntry::Command(command) });
     }
 
     #[test]
-    fn a_torn_or_foreign_line_is_named() {
+    fn a_torn_last_line_is_left_out() {
         let first = serde_json::to_string(&LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) }).unwrap();
-        assert!(refusal(&format!("{first}\n{{\"at\":1,")).starts_with("LOG:2: the last line is torn"));
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), format!("{first}\n{{\"at\":1,")).unwrap();
+        let log = read(file.path()).unwrap();
+        assert_eq!((log.lines.len(), log.torn), (1, Some(2)));
+        assert!(refusal(&first).contains("has no whole line"));
+    }
+
+    #[test]
+    fn a_foreign_line_is_named() {
+        let first = serde_json::to_string(&LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) }).unwrap();
+        assert!(refusal(&format!("{first}\n{{\"at\":1,\n{first}\n")).starts_with("LOG:2: not a line of an event log"));
         assert!(refusal(&format!("{first}\nhello\n")).starts_with("LOG:2: not a line of an event log: not JSON"));
         let strange = format!("{first}\n{{\"at\":1,\"event\":\"rained\"}}\n");
         assert!(refusal(&strange).starts_with("LOG:2: not a line of an event log: not a known event: unknown variant"));
-        assert!(refusal("").contains("is empty"));
+        assert!(refusal("").contains("has no whole line"));
         assert!(
             refusal("{\"at\":1,\"command\":\"note\",\"note\":\"retired\",\"instance\":1}\n").contains("begins with")
         );
