@@ -182,14 +182,30 @@ impl Executive {
 
 /// Acquires of one event in the order of their priority, and what is given back after them: so that what is free, and what
 /// becomes free, goes to whom it serves most. The resource manager grants as requests arrive; it cannot know what comes next.
-fn most_urgent_first(mut commands: Vec<Command>) -> Vec<Command> {
-    commands.sort_by_key(|command| match command {
+/// What one event both asked for and withdrew is not asked for.
+fn most_urgent_first(commands: Vec<Command>) -> Vec<Command> {
+    let mut ordered: Vec<Command> = Vec::with_capacity(commands.len());
+    for command in commands {
+        let asked = match &command {
+            Command::Withdraw { instance } => ordered
+                .iter()
+                .position(|earlier| matches!(earlier, Command::Acquire { instance: asked, .. } if asked == instance)),
+            _ => None,
+        };
+        match asked {
+            Some(asked) => {
+                ordered.remove(asked);
+            }
+            None => ordered.push(command),
+        }
+    }
+    ordered.sort_by_key(|command| match command {
         Command::Acquire { priority, .. } => (1, Reverse(*priority)),
         Command::Release { .. } => (2, Reverse(0)),
         Command::End { .. } => (3, Reverse(0)),
         _ => (0, Reverse(0)),
     });
-    commands
+    ordered
 }
 
 fn commit_initial(context: &mut Context<'_>, parameters: &BTreeMap<String, Value>) -> Result<(), String> {

@@ -171,6 +171,20 @@ states:
 }
 
 #[test]
+fn of_equally_long_ways_to_the_end_the_older_goes_first() {
+    let task = "
+task: order
+states:
+  - first: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain, count: 2 }], duration: 2 }
+  - second: { action: brain/think, in: { a: first.x }, computes: true, reads: [], resources: [{ block: Brain, count: 2 }], duration: 2 }
+  - third: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain, count: 2 }], duration: 2 }
+  - move: { action: arm/move, pia: true, effects: [], resources: [{ block: Arm }], duration: 1 }
+";
+    let run = simulate(task, Mode::Cdtn, &mut Script::default());
+    assert_eq!((at(&run, "start first"), at(&run, "start second"), at(&run, "start third")), (0.0, 2.0, 4.0));
+}
+
+#[test]
 fn an_effect_that_is_overwritten_later_holds_nobody_back() {
     let task = "
 task: overwritten

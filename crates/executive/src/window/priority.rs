@@ -10,8 +10,9 @@ use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
 use std::collections::BTreeMap;
 
-/// Priorities are milliseconds in this many bits, under the bit that says "not speculative".
+/// From the top: one bit that says "not speculative", milliseconds of remaining path, program order.
 const REMAINING_BITS: u32 = 40;
+const ORDER_BITS: u32 = 20;
 
 impl Window {
     /// Estimates durations and remaining paths of everything in the window.
@@ -60,8 +61,11 @@ impl Window {
     /// The priority of an acquire: larger first.
     pub(crate) fn priority(&self, id: InstanceId, speculative: bool) -> i64 {
         let remaining_s = self.instances.alive.get(&id).map_or(0.0, |i| i.remaining_s);
-        let limit = (1_i64 << REMAINING_BITS) - 1;
-        let remaining = ((remaining_s * 1000.0) as i64).clamp(0, limit);
-        if speculative { remaining } else { remaining | (1 << REMAINING_BITS) }
+        let greatest = |bits: u32| (1_i64 << bits) - 1;
+        let remaining = ((remaining_s * 1000.0) as i64).clamp(0, greatest(REMAINING_BITS));
+        // Ids grow in program order.
+        let order = i64::try_from(id.0).unwrap_or(i64::MAX).min(greatest(ORDER_BITS));
+        let certain = i64::from(!speculative);
+        (certain << (REMAINING_BITS + ORDER_BITS)) | (remaining << ORDER_BITS) | (greatest(ORDER_BITS) - order)
     }
 }
