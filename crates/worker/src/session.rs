@@ -168,6 +168,7 @@ impl Keeper {
     async fn stream(&mut self) {
         let Some(mut client) = self.connect() else { return };
         let (pings, outgoing) = mpsc::channel(1);
+        let mut asked = Instant::now();
         if pings.send(self.ping(self.ttl)).await.is_err() {
             return;
         }
@@ -180,11 +181,13 @@ impl Keeper {
         loop {
             let Ok(Ok(Some(answer))) = timeout(self.patience(), answers.message()).await else { return };
             let ttl = Duration::from_millis(answer.ttl_ms);
-            self.expires = Instant::now() + ttl;
+            // Counted from the question, so that it never lives longer here than there.
+            self.expires = asked + ttl;
             self.tell.send_if_modified(|state| {
                 let before = *state;
+                // One that was not alive here was not there: the answer that said so may have been lost with its stream.
+                state.generation += u64::from(answer.created || !before.alive);
                 state.alive = true;
-                state.generation += u64::from(answer.created);
                 *state != before
             });
             tokio::select! {
@@ -192,6 +195,7 @@ impl Keeper {
                 // Nothing is due: the stream broke, or the manager ended it.
                 _ = answers.message() => return,
             }
+            asked = Instant::now();
             if pings.send(self.ping(self.ttl)).await.is_err() {
                 return;
             }

@@ -11,6 +11,7 @@ use ratn_proto::types::{ResourceEvent, ResourceEventKind, ResourceUpdate};
 use ratn_worker::action::ActionServer;
 use ratn_worker::client::{CallError, ResourceClient, ResourceWatch};
 use ratn_worker::session::Session;
+use std::future::pending;
 use std::time::Duration;
 use tokio::sync::Notify;
 use tokio::time::{sleep, timeout};
@@ -33,19 +34,19 @@ pub(crate) struct LeaseWatch<'a> {
 impl LeaseWatch<'_> {
     /// Watches until dropped.
     pub(crate) async fn keep(self) {
-        let mut watch = self.begin().await;
+        let (mut generation, mut watch) = self.begin().await;
         loop {
             let patience = tokio::select! {
                 biased;
                 // Known before a connection that hangs breaks.
-                () = self.session.lost() => Duration::ZERO,
+                () = self.session_is_not(generation) => Duration::ZERO,
                 () = self.follow(watch) => {
                     sleep(RETRY_INTERVAL).await;
                     self.patience
                 }
             };
-            watch = match timeout(patience, self.begin()).await {
-                Ok(watch) => watch,
+            (generation, watch) = match timeout(patience, self.begin()).await {
+                Ok(begun) => begun,
                 Err(_) => {
                     let reason = "the resource manager is not heard".to_owned();
                     tracing::warn!("{reason}: motions under a lease stop");
@@ -56,15 +57,23 @@ impl LeaseWatch<'_> {
         }
     }
 
-    /// A watch that has told which leases live.
-    async fn begin(&self) -> ResourceWatch {
+    /// A watch that has told which leases live, and the generation of the session that was alive by then.
+    async fn begin(&self) -> (u64, ResourceWatch) {
+        let mut state = self.session.state();
         loop {
+            // A session that is closed tells nothing more, and this watch ends with it.
+            let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { pending().await };
             match self.snapshot().await {
-                Ok(watch) => return watch,
+                Ok(watch) => return (generation, watch),
                 Err(error) => tracing::debug!(%error, "no watch of leases"),
             }
             sleep(RETRY_INTERVAL).await;
         }
+    }
+
+    /// Resolves when the session of that generation is not alive, also when that was so before.
+    async fn session_is_not(&self, generation: u64) {
+        let _ = self.session.state().wait_for(|s| !s.alive || s.generation != generation).await;
     }
 
     async fn snapshot(&self) -> Result<ResourceWatch, CallError> {
