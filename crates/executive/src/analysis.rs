@@ -64,7 +64,8 @@ pub(crate) fn children(state: &State) -> Vec<StateId> {
     match &state.kind {
         StateKind::Action { .. } => Vec::new(),
         StateKind::Sequence { children, .. } => children.clone(),
-        StateKind::ForEach { body, .. } => body.clone(),
+        StateKind::ForEach { body, .. } | StateKind::While { body, .. } => body.clone(),
+        StateKind::Concurrency { regions, .. } => regions.clone(),
         StateKind::Condition { then, otherwise, .. } => then.iter().chain(otherwise).copied().collect(),
     }
 }
@@ -214,7 +215,8 @@ fn start_flows(state: &State) -> Vec<StateId> {
         StateKind::Action { inputs, .. } => inputs.iter().for_each(|(_, e)| flows.extend(e.flows())),
         StateKind::Sequence { outputs, .. } => outputs.iter().for_each(|o| flows.extend(o.value.flows())),
         StateKind::ForEach { collection, .. } => flows.extend(collection.flows()),
-        StateKind::Condition { predicate, .. } => flows.extend(predicate.flows()),
+        StateKind::Condition { predicate, .. } | StateKind::While { predicate, .. } => flows.extend(predicate.flows()),
+        StateKind::Concurrency { .. } => {}
     }
     state.annotations.requires.iter().for_each(|e| flows.extend(e.flows()));
     for resource in &state.annotations.resources {

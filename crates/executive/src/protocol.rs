@@ -18,6 +18,17 @@ pub enum Mode {
     Cdtn,
 }
 
+/// What earlier runs of a task have taught, by the path of the state (without visits).
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Learned {
+    /// Mean duration of an attempt, in seconds of the robot's time.
+    #[serde(default)]
+    pub durations_s: BTreeMap<String, f64>,
+    /// How often each outcome (of a condition: `then` and `else`; of a `while`: `again` and `done`) came, as a share of all.
+    #[serde(default)]
+    pub outcomes: BTreeMap<String, BTreeMap<String, f64>>,
+}
+
 /// What happened.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
@@ -38,6 +49,26 @@ pub enum Event {
         world: Vec<(FactKey, Value)>,
         /// The revision of that world.
         revision: Revision,
+        /// How many units of each resource kind there are, where that is known: whom a speculative holder keeps waiting follows
+        /// from it.
+        #[serde(default)]
+        capacity: BTreeMap<String, u32>,
+        /// What earlier runs of the task have taught.
+        #[serde(default)]
+        learned: Learned,
+    },
+    /// The moment of a [`Command::Wake`] has come. Logged, as every event.
+    Woken,
+    /// No PIA shall begin until further notice; what runs goes on, and what only computes or senses begins as ever.
+    PauseRequested,
+    /// PIAs may begin again.
+    ResumeRequested,
+    /// One PIA may begin; then it is a pause again.
+    StepRequested,
+    /// A look ahead found a better order: how long before the end of everything known each instance should begin.
+    Advised {
+        /// Seconds, by instance; it stands in for the longest remaining path.
+        urgency_s: Vec<(InstanceId, f64)>,
     },
     /// The resource manager granted an [`Command::Acquire`].
     Granted {
@@ -187,6 +218,11 @@ pub enum Command {
         /// Creates, deletes and consumes, in order.
         operations: Vec<Requirement>,
     },
+    /// Send [`Event::Woken`] at this moment or as soon after it as possible.
+    Wake {
+        /// When.
+        at: Timestamp,
+    },
     /// The run has ended; everything was released before.
     End {
         /// The task's outcome.
@@ -241,6 +277,18 @@ pub enum Note {
         /// Its id.
         instance: InstanceId,
     },
+    /// Its result, or what it is at, was made of something that came out otherwise: it is computed again.
+    Invalidated {
+        /// Its id.
+        instance: InstanceId,
+        /// What came out otherwise.
+        reason: String,
+    },
+    /// The same was computed before, from the same inputs and facts and with the same seed: that result is its result.
+    Reused {
+        /// Its id.
+        instance: InstanceId,
+    },
     /// It is discarded: its branch is not taken, or the task ended before it.
     Squashed {
         /// Its id.
@@ -265,6 +313,9 @@ pub struct Goal {
     pub projection: Option<ProjectionId>,
     /// How long it is expected to take, in seconds of the robot's time, where the task says so.
     pub expected_s: Option<f64>,
+    /// It is cancelled when it takes longer than this, in seconds of the robot's time.
+    #[serde(default)]
+    pub timeout_s: Option<f64>,
 }
 
 /// One line of an event log.

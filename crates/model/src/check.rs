@@ -73,8 +73,15 @@ pub(crate) fn expressions<'a>(program: &'a Program, state: &'a State) -> Vec<(St
             all.extend(own.iter().map(|o| (format!("outputs.{}", o.name), &o.value)));
         }
         StateKind::ForEach { collection, .. } => all.push(("for".to_owned(), collection)),
+        StateKind::While { predicate, .. } => all.push(("while".to_owned(), predicate)),
+        StateKind::Concurrency { decide, outputs, .. } => {
+            all.extend(decide.iter().map(|(outcome, e)| (format!("decide.{outcome}"), e)));
+            all.extend(outputs.iter().map(|o| (format!("outputs.{}", o.name), &o.value)));
+        }
         StateKind::Condition { predicate, .. } => all.push(("condition".to_owned(), predicate)),
     }
+    all.extend(state.variables.iter().map(|(name, e)| (format!("variables.{name}"), e)));
+    all.extend(state.assign.iter().map(|(name, e)| (format!("assign.{name}"), e)));
     let annotations = &state.annotations;
     all.extend(annotations.requires.iter().enumerate().map(|(i, e)| (format!("requires.{i}"), e)));
     all.extend(annotations.duration_s.iter().map(|e| ("duration".to_owned(), e)));
@@ -122,7 +129,8 @@ pub(crate) fn branches(state: &State) -> [&[StateId]; 2] {
     match &state.kind {
         StateKind::Action { .. } => [&[], &[]],
         StateKind::Sequence { children, .. } => [children, &[]],
-        StateKind::ForEach { body, .. } => [body, &[]],
+        StateKind::ForEach { body, .. } | StateKind::While { body, .. } => [body, &[]],
+        StateKind::Concurrency { regions, .. } => [regions, &[]],
         StateKind::Condition { then, otherwise, .. } => [then, otherwise],
     }
 }

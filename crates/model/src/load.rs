@@ -124,7 +124,18 @@ fn read(source: &str, catalogue: &Catalogue, out: &mut Output) -> Option<Program
         _ => Vec::new(),
     };
     let digest = blake3::hash(source.as_bytes()).to_hex().to_string();
-    Some(Program { name, horizon, parameters, outputs, initial, states, digest })
+    Some(Program {
+        name,
+        horizon,
+        speculation_width: Program::DEFAULT_SPECULATION_WIDTH,
+        deadline_s: None,
+        exceptions: crate::program::Exceptions::Precise,
+        parameters,
+        outputs,
+        initial,
+        states,
+        digest,
+    })
 }
 
 fn horizon(fields: &mut Fields<'_, '_>, node: &Node) -> usize {

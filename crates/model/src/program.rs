@@ -24,6 +24,12 @@ pub struct Program {
     pub name: String,
     /// At most this many instances are expanded on one logical branch.
     pub horizon: usize,
+    /// At most this many branches of undecided conditions are expanded, the likelier ones first.
+    pub speculation_width: usize,
+    /// The task ends `aborted` when it has taken this long, in the robot's seconds.
+    pub deadline_s: Option<f64>,
+    /// Whether states that do not say it fail precisely.
+    pub exceptions: Exceptions,
     /// What `--set` may give.
     pub parameters: Vec<Parameter>,
     /// What the task returns when it ends with success.
@@ -71,10 +77,33 @@ pub struct State {
     pub parent: Option<StateId>,
     /// What it is.
     pub kind: StateKind,
+    /// Its outcomes beside `success`, `aborted` and `preempted`.
+    pub outcomes: Vec<String>,
+    /// Where its outcomes lead; see [`Program::target`] for those that are not listed.
+    pub transitions: BTreeMap<String, Target>,
+    /// Scoped variables of a sequence (a library's parameters are its scoped variables): bound at entry, each in the scope of
+    /// the state itself, seen and assigned by what it contains.
+    pub variables: Vec<(String, Expr)>,
+    /// Scoped variables that it gives new values when it ends with an outcome that is neither `aborted` nor `preempted`,
+    /// evaluated where its effects are.
+    pub assign: Vec<(String, Expr)>,
+    /// What its output ports are while it has not run in this activation of what contains it.
+    pub defaults: BTreeMap<String, Value>,
     /// What it depends on and changes.
     pub annotations: Annotations,
     /// Where it stands in the task file.
     pub location: Location,
+}
+
+/// Where an outcome leads.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Target {
+    /// To a state of the same list.
+    State(StateId),
+    /// Out of the list, by this outcome. `success` of a loop's body is the end of an iteration; any other outcome of a body, a
+    /// branch or a list of children is the outcome of the state around it.
+    Outcome(String),
 }
 
 /// The kinds of states.
@@ -92,9 +121,9 @@ pub enum StateKind {
         /// Output ports with their types.
         outputs: BTreeMap<String, Type>,
     },
-    /// A hierarchy: its children succeed each other; an outcome that is not success leaves it by the same name.
+    /// A hierarchy: begins with its first child and goes on along their transitions.
     Sequence {
-        /// In program order.
+        /// In program order; the first is where it begins. Without children it succeeds at once.
         children: Vec<StateId>,
         /// Output ports, evaluated in the scope of the children when the last has ended.
         outputs: Vec<TaskOutput>,
@@ -109,6 +138,30 @@ pub enum StateKind {
         collection: Expr,
         /// The body, in program order.
         body: Vec<StateId>,
+    },
+    /// The body as long as a predicate holds.
+    While {
+        /// A boolean, evaluated before each iteration.
+        predicate: Expr,
+        /// The first iteration begins without it: a `do … while`.
+        body_first: bool,
+        /// The variable bound to the number of the iteration (from 0), if wanted.
+        index: Option<String>,
+        /// The body, in program order.
+        body: Vec<StateId>,
+    },
+    /// All regions at once. Each is a state with a path, a horizon and projections of its own; its outcome is seen as the port
+    /// `outcome` of the region.
+    Concurrency {
+        /// The regions; their order means nothing.
+        regions: Vec<StateId>,
+        /// The first region that ends preempts the others, and its outcome is the outcome; else all are waited for.
+        preemptive: bool,
+        /// The decider: the first outcome whose boolean holds. Where none does: `success` if all regions succeeded, `aborted` if
+        /// one aborted, else `preempted`.
+        decide: Vec<(String, Expr)>,
+        /// Output ports, evaluated in the scope of the regions when all have ended.
+        outputs: Vec<TaskOutput>,
     },
     /// One of two branches.
     Condition {
@@ -140,6 +193,39 @@ pub struct Annotations {
     pub duration_s: Option<Expr>,
     /// How often a computing or sensing node is tried when its worker dies; `None` is the executive's default.
     pub attempts: Option<u32>,
+    /// Whether it is tried again when it ends `aborted`.
+    pub retry: Option<Retry>,
+    /// It ends `aborted` when its goal takes longer than this, in the robot's seconds.
+    pub timeout_s: Option<f64>,
+    /// Whether younger PIAs may run beside it; `None` is what the task says.
+    pub exceptions: Option<Exceptions>,
+    /// Outcomes that are exceptional although they are connected: what follows them is not computed ahead.
+    pub exceptional: Vec<String>,
+    /// The same inputs and facts always give the same result, whatever the seed.
+    pub deterministic: bool,
+    /// On a region: facts that other regions may touch too. The programmer answers for their order.
+    pub shared: Vec<FactExpr>,
+}
+
+/// How often and after which pauses a state that ends `aborted` is tried again. Only the last try's outcome, outputs and effects
+/// count; each try has a seed of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Retry {
+    /// How many tries after the first.
+    pub count: u32,
+    /// The pause before the second try, in the robot's seconds; doubled before each further one.
+    pub backoff_s: f64,
+}
+
+/// What younger PIAs do while a PIA runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Exceptions {
+    /// They wait for its end: a failure leaves the world as the sequential program would.
+    #[default]
+    Precise,
+    /// They may run beside it where nothing else forbids it: what they did stands even if it fails.
+    Imprecise,
 }
 
 /// What a state does to the environment.
@@ -168,6 +254,8 @@ pub struct ResourceExpr {
     pub attributes: Vec<(String, Expr)>,
     /// How many, or how much.
     pub count: u32,
+    /// Of a resource that actuates: PIAs that block it need not do so in program order.
+    pub unordered: bool,
 }
 
 /// The resource kind that stands for room for a projection.
@@ -186,8 +274,66 @@ impl Program {
     /// The root state.
     pub const ROOT: StateId = StateId(0);
 
+    /// The branches expanded in a task that says nothing.
+    pub const DEFAULT_SPECULATION_WIDTH: usize = 8;
+
     /// The state of an id.
     pub fn state(&self, id: StateId) -> &State {
         &self.states[id.0 as usize]
+    }
+
+    /// Where an outcome of a state leads. An outcome that is not connected: `success` goes on with the next sibling, and after the
+    /// last one out by `success`; any other leaves by its own name. A region leads nowhere else.
+    pub fn target(&self, id: StateId, outcome: &str) -> Target {
+        let state = self.state(id);
+        if let Some(target) = state.transitions.get(outcome) {
+            return target.clone();
+        }
+        if outcome != SUCCESS {
+            return Target::Outcome(outcome.to_owned());
+        }
+        let siblings = state.parent.map_or(&[][..], |parent| self.state(parent).list_of(id));
+        let next = siblings.iter().position(|sibling| *sibling == id).and_then(|at| siblings.get(at + 1));
+        next.map_or_else(|| Target::Outcome(SUCCESS.to_owned()), |next| Target::State(*next))
+    }
+
+    /// Whether what follows an outcome is not computed ahead: `aborted` and `preempted` unless they are connected to something
+    /// else than what follows success, and whatever is marked so.
+    pub fn is_exceptional(&self, id: StateId, outcome: &str) -> bool {
+        let state = self.state(id);
+        if state.annotations.exceptional.iter().any(|marked| marked == outcome) {
+            return true;
+        }
+        matches!(outcome, ABORTED | PREEMPTED)
+            && state.transitions.get(outcome).is_none_or(|target| *target == self.target(id, SUCCESS))
+    }
+
+    /// The outcomes of a state, `success` first and the exceptional ones of every state last.
+    pub fn outcomes(&self, id: StateId) -> impl Iterator<Item = &str> {
+        let custom = self.state(id).outcomes.iter().map(String::as_str);
+        std::iter::once(SUCCESS).chain(custom).chain([ABORTED, PREEMPTED])
+    }
+}
+
+impl State {
+    /// The lists of states that it contains: one, or one per branch, or one per region.
+    pub fn lists(&self) -> Vec<&[StateId]> {
+        match &self.kind {
+            StateKind::Action { .. } => Vec::new(),
+            StateKind::Sequence { children, .. } => vec![children],
+            StateKind::ForEach { body, .. } | StateKind::While { body, .. } => vec![body],
+            StateKind::Condition { then, otherwise, .. } => vec![then, otherwise],
+            StateKind::Concurrency { regions, .. } => regions.chunks(1).collect(),
+        }
+    }
+
+    /// The states that it contains directly, in program order.
+    pub fn children(&self) -> impl Iterator<Item = StateId> {
+        self.lists().into_iter().flatten().copied()
+    }
+
+    /// The list that a child stands in.
+    pub fn list_of(&self, child: StateId) -> &[StateId] {
+        self.lists().into_iter().find(|list| list.contains(&child)).unwrap_or_default()
     }
 }

@@ -69,6 +69,11 @@ pub fn program(seed: u64) -> Program {
         path: String::new(),
         parent: None,
         kind: StateKind::Sequence { children: Vec::new(), outputs: Vec::new() },
+        outcomes: Vec::new(),
+        transitions: BTreeMap::new(),
+        variables: Vec::new(),
+        assign: Vec::new(),
+        defaults: BTreeMap::new(),
         annotations: Annotations::default(),
         location: Location::default(),
     });
@@ -89,6 +94,9 @@ pub fn program(seed: u64) -> Program {
     Program {
         name: format!("random {seed}"),
         horizon,
+        speculation_width: Program::DEFAULT_SPECULATION_WIDTH,
+        deadline_s: None,
+        exceptions: ratn_model::program::Exceptions::Precise,
         parameters: Vec::new(),
         outputs,
         initial: (0..PREDICATES)
@@ -146,6 +154,11 @@ impl Maker {
             path: path.clone(),
             parent: Some(parent),
             kind: StateKind::Sequence { children: Vec::new(), outputs: Vec::new() },
+            outcomes: Vec::new(),
+            transitions: BTreeMap::new(),
+            variables: Vec::new(),
+            assign: Vec::new(),
+            defaults: BTreeMap::new(),
             annotations: Annotations::default(),
             location: Location::default(),
         });
@@ -350,7 +363,7 @@ impl Maker {
 }
 
 fn resource(operation: ResourceOperation, kind: &str, count: u32) -> ResourceExpr {
-    ResourceExpr { operation, kind: kind.to_owned(), class: None, attributes: Vec::new(), count }
+    ResourceExpr { operation, kind: kind.to_owned(), class: None, attributes: Vec::new(), count, unordered: false }
 }
 
 fn task_resource(operation: ResourceOperation) -> ResourceExpr {

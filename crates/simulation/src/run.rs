@@ -3,7 +3,7 @@
 
 use crate::random::Dice;
 use ratn_executive::executive::Executive;
-use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode};
+use ratn_executive::protocol::{Command, Event, Goal, Learned, LogEntry, LogLine, Mode};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::program::Program;
@@ -191,6 +191,8 @@ pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
             seed: setup.seed,
             world: simulation.root.iter().map(|(k, f)| (k.clone(), f.value.clone())).collect(),
             revision: simulation.root.revision(),
+            capacity: setup.resources.iter().map(|(kind, _, units)| (kind.clone(), *units)).collect(),
+            learned: Learned::default(),
         },
     );
     for _ in 0..MAX_EVENTS {
@@ -309,6 +311,7 @@ impl Simulation<'_> {
                 }
                 self.answers();
             }
+            Command::Wake { at } => self.at(at.since(self.now), Event::Woken),
             Command::End { outcome, outputs, reason } => self.end = Some((outcome, outputs, reason)),
         }
         Ok(())

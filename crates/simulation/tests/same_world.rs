@@ -114,6 +114,8 @@ fn listing(program: &Program) -> String {
                 let outputs: Vec<String> = outputs.iter().map(|o| format!("{}: {}", o.name, o.value)).collect();
                 format!("sequence of {} → {}", children.len(), outputs.join(", "))
             }
+            StateKind::While { predicate, .. } => format!("while {predicate}"),
+            StateKind::Concurrency { regions, .. } => format!("{} regions", regions.len()),
             StateKind::ForEach { variable, collection, .. } => format!("for {variable} in {collection}"),
             StateKind::Condition { predicate, then, .. } => format!("if {predicate}, then {} states", then.len()),
         };

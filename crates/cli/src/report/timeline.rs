@@ -170,7 +170,12 @@ impl Fold {
             Event::Projected { .. }
             | Event::Progressed { .. }
             | Event::RetirementFailed { .. }
-            | Event::AbortRequested { .. } => {}
+            | Event::AbortRequested { .. }
+            | Event::Woken
+            | Event::PauseRequested
+            | Event::ResumeRequested
+            | Event::StepRequested
+            | Event::Advised { .. } => {}
         }
     }
 
@@ -224,7 +229,11 @@ impl Fold {
                 self.run.outputs.clone_from(outputs);
                 self.run.reason.clone_from(reason);
             }
-            Command::Project { .. } | Command::Release { .. } | Command::Commit { .. } | Command::Operate { .. } => {}
+            Command::Project { .. }
+            | Command::Release { .. }
+            | Command::Commit { .. }
+            | Command::Operate { .. }
+            | Command::Wake { .. } => {}
         }
     }
 

@@ -150,6 +150,8 @@ mod tests {
             seed: 7,
             world: vec![],
             revision: Revision(3),
+            capacity: Default::default(),
+            learned: Default::default(),
         }
     }
 

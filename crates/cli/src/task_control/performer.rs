@@ -133,7 +133,8 @@ impl Performer {
     pub(super) fn perform(&mut self, command: Command) -> anyhow::Result<()> {
         while self.giving_back.try_join_next().is_some() {}
         match command {
-            Command::Note(_) | Command::End { .. } => {}
+            // Waking is the shell's: it has the clock.
+            Command::Note(_) | Command::End { .. } | Command::Wake { .. } => {}
             Command::Acquire { instance, requirements, priority } => self.acquire(instance, requirements, priority),
             Command::Withdraw { instance } => {
                 if let Some(asking) = self.asking.remove(&instance) {

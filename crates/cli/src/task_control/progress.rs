@@ -45,7 +45,15 @@ impl Progress {
                 say(at, &format!("failed to make {} real: {reason}", self.path(*instance)));
             }
             Event::AbortRequested { reason } => say(at, &format!("abort: {reason}")),
-            Event::Started { .. } | Event::Granted { .. } | Event::Projected { .. } | Event::Progressed { .. } => {}
+            Event::PauseRequested => say(at, "pause"),
+            Event::ResumeRequested => say(at, "resume"),
+            Event::StepRequested => say(at, "step"),
+            Event::Started { .. }
+            | Event::Granted { .. }
+            | Event::Projected { .. }
+            | Event::Progressed { .. }
+            | Event::Woken
+            | Event::Advised { .. } => {}
         }
         for command in commands {
             match command {

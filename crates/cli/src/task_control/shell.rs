@@ -73,6 +73,8 @@ pub(crate) async fn run(run: Run, endpoints: &super::Endpoints, interrupt: &Inte
         seed: run.seed,
         world,
         revision,
+        capacity: run.catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
+        learned: Default::default(),
     };
     let mut asked_to_abort = false;
     let ended = 'run: loop {

@@ -83,6 +83,7 @@ impl Interpreter {
             lease: self.routine.as_ref().map_or(&current.lease, |routine| &routine.lease).clone(),
             projection: current.projection,
             expected_s,
+            timeout_s: state.annotations.timeout_s,
         };
         context.note(Note::Running { instance, attempt });
         context.commands.push(Command::Start { instance, attempt, goal });

@@ -87,6 +87,9 @@ impl Interpreter {
                     other => return Err(format!("{path} loops over a {}, not a list", other.type_name())),
                 }
             }
+            StateKind::While { .. } | StateKind::Concurrency { .. } => {
+                return Err(format!("{path}: no such state is executed yet"));
+            }
             StateKind::Condition { predicate, then, otherwise } => {
                 let taken = self.with_scope(context, None, |s| predicate.holds(s)).map_err(|e| e.to_string())?;
                 let children = if taken { then.clone() } else { otherwise.clone() };

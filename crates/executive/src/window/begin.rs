@@ -224,6 +224,7 @@ impl Window {
                     expected_s: place
                         .with_scope(&self.instances, id, None, |scope| binding::expected_s(state, scope))
                         .flatten(),
+                    timeout_s: state.annotations.timeout_s,
                 };
                 context.commands.push(Command::Start { instance: id, attempt, goal });
             }

@@ -79,7 +79,7 @@ fn list(program: &Program, state: StateId, which: Which) -> &[StateId] {
         (StateKind::ForEach { body, .. }, _) => body,
         (StateKind::Condition { then, .. }, Which::Then) => then,
         (StateKind::Condition { otherwise, .. }, _) => otherwise,
-        (StateKind::Action { .. }, _) => &[],
+        _ => &[],
     }
 }
 
@@ -165,7 +165,7 @@ impl Window {
             self.append(context, index, state, Role::Entry, path.clone());
         }
         match &state.kind {
-            StateKind::Action { .. } => {}
+            StateKind::Action { .. } | StateKind::While { .. } | StateKind::Concurrency { .. } => {}
             StateKind::Sequence { .. } => {
                 let frame = Frame::List { state: state.id, which: Which::Children, next: 0, path };
                 self.cursors[index].frames.push(frame);

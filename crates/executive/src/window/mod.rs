@@ -123,7 +123,7 @@ impl Window {
                 return self.stop(context, ABORTED, format!("what had happened could not be recorded: {reason}"));
             }
             Event::AbortRequested { reason } => return self.stop(context, PREEMPTED, reason),
-            Event::Started { .. } | Event::Progressed { .. } => {}
+            _ => {}
         }
         self.settle(context)
     }

@@ -39,7 +39,7 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
         let word = fields.word(item, "a kind of resource")?;
         let kind = if word == "world_model" { WORLD_MODEL } else { word }.to_owned();
         let operation = ResourceOperation::Block;
-        return Some(ResourceExpr { operation, kind, class: None, attributes: Vec::new(), count: 1 });
+        return Some(ResourceExpr { operation, kind, class: None, attributes: Vec::new(), count: 1, unordered: false });
     }
     let expected = "write `{block: Arm}` with one of block, consume, create, delete, exists";
     let operations: Vec<(&Entry, ResourceOperation)> = item
@@ -74,5 +74,5 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
     let attributes: Vec<(String, Option<Expr>)> =
         attributes.map(|attribute| (attribute.key.clone(), fields.expression(&attribute.value))).collect();
     let attributes = attributes.into_iter().filter_map(|(name, value)| Some((name, value?))).collect();
-    Some(ResourceExpr { operation: *operation, kind, class, attributes, count })
+    Some(ResourceExpr { operation: *operation, kind, class, attributes, count, unordered: false })
 }

@@ -71,6 +71,11 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
         path: step.path.clone(),
         parent: step.parent,
         kind,
+        outcomes: Vec::new(),
+        transitions: Default::default(),
+        variables: Vec::new(),
+        assign: Vec::new(),
+        defaults: Default::default(),
         annotations,
         location: step.at,
     }
@@ -284,7 +289,8 @@ fn add_used_facts(
         StateKind::Action { inputs, .. } => inputs.iter().flat_map(|(_, value)| value.fact_expressions()).collect(),
         StateKind::Sequence { .. } => Vec::new(),
         StateKind::ForEach { collection, .. } => collection.fact_expressions(),
-        StateKind::Condition { predicate, .. } => predicate.fact_expressions(),
+        StateKind::Condition { predicate, .. } | StateKind::While { predicate, .. } => predicate.fact_expressions(),
+        StateKind::Concurrency { decide, .. } => decide.iter().flat_map(|(_, e)| e.fact_expressions()).collect(),
     };
     used.extend(effects.values().flat_map(|effects| EffectExpr::fact_expressions(effects)));
     for fact in used {
