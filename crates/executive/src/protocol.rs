@@ -29,6 +29,24 @@ pub struct Learned {
     pub outcomes: BTreeMap<String, BTreeMap<String, f64>>,
 }
 
+/// Which run this is, so that task control can go on with it after it was killed.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Origin {
+    /// Its id: the first part of every idempotent id, and the id of its session with the resource manager. Empty where nobody
+    /// can resume it.
+    #[serde(default)]
+    pub run: String,
+    /// The version of the program that runs it.
+    #[serde(default)]
+    pub version: String,
+    /// The task file, as an absolute path.
+    #[serde(default)]
+    pub file: String,
+    /// When it began, in milliseconds since 1970.
+    #[serde(default)]
+    pub began_unix_ms: u64,
+}
+
 /// What happened.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
@@ -56,7 +74,12 @@ pub enum Event {
         /// What earlier runs of the task have taught.
         #[serde(default)]
         learned: Learned,
+        /// Which run this is.
+        #[serde(default)]
+        origin: Origin,
     },
+    /// Task control was gone and goes on from its log. Logged; changes nothing.
+    Resumed,
     /// The moment of a [`Command::Wake`] has come. Logged, as every event.
     Woken,
     /// No PIA shall begin until further notice; what runs goes on, and what only computes or senses begins as ever.

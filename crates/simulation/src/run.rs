@@ -3,7 +3,7 @@
 
 use crate::random::Dice;
 use ratn_executive::executive::Executive;
-use ratn_executive::protocol::{Command, Event, Goal, Learned, LogEntry, LogLine, Mode};
+use ratn_executive::protocol::{Command, Event, Goal, Learned, LogEntry, LogLine, Mode, Origin};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::program::Program;
@@ -193,6 +193,7 @@ pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
             revision: simulation.root.revision(),
             capacity: setup.resources.iter().map(|(kind, _, units)| (kind.clone(), *units)).collect(),
             learned: Learned::default(),
+            origin: Origin::default(),
         },
     );
     for _ in 0..MAX_EVENTS {

@@ -171,6 +171,7 @@ impl Fold {
             | Event::Progressed { .. }
             | Event::RetirementFailed { .. }
             | Event::AbortRequested { .. }
+            | Event::Resumed
             | Event::Woken
             | Event::PauseRequested
             | Event::ResumeRequested

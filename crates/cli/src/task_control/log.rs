@@ -152,6 +152,7 @@ mod tests {
             revision: Revision(3),
             capacity: Default::default(),
             learned: Default::default(),
+            origin: Default::default(),
         }
     }
 

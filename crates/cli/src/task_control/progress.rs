@@ -45,6 +45,7 @@ impl Progress {
                 say(at, &format!("failed to make {} real: {reason}", self.path(*instance)));
             }
             Event::AbortRequested { reason } => say(at, &format!("abort: {reason}")),
+            Event::Resumed => say(at, "task control goes on"),
             Event::PauseRequested => say(at, "pause"),
             Event::ResumeRequested => say(at, "resume"),
             Event::StepRequested => say(at, "step"),

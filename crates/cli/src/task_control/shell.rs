@@ -75,6 +75,7 @@ pub(crate) async fn run(run: Run, endpoints: &super::Endpoints, interrupt: &Inte
         revision,
         capacity: run.catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
         learned: Default::default(),
+        origin: Default::default(),
     };
     let mut asked_to_abort = false;
     let ended = 'run: loop {
