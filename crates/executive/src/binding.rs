@@ -134,10 +134,12 @@ pub(crate) fn expected_s(state: &State, scope: &dyn Scope) -> Option<f64> {
     (seconds.is_finite() && seconds >= 0.0).then_some(seconds)
 }
 
-/// A seed for one visit, the same in every mode and on every host (FNV-1a over the run's seed and the path).
-pub(crate) fn seed(run: u64, path: &str) -> u64 {
+/// A seed for one try of one visit, the same in every mode and on every host (FNV-1a over the run's seed, the path and, from
+/// the second on, the number of the try).
+pub(crate) fn seed(run: u64, path: &str, try_number: u32) -> u64 {
     let mut hash = 0xcbf2_9ce4_8422_2325_u64;
-    for byte in run.to_le_bytes().into_iter().chain(path.bytes()) {
+    let again = (try_number > 1).then(|| try_number.to_le_bytes());
+    for byte in run.to_le_bytes().into_iter().chain(path.bytes()).chain(again.into_iter().flatten()) {
         hash = (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
     }
     hash

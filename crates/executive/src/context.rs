@@ -5,6 +5,7 @@ use crate::protocol::{Command, Note};
 use ratn_model::fact::Change;
 use ratn_model::id::InstanceId;
 use ratn_model::program::Program;
+use ratn_model::time::Timestamp;
 use ratn_world::world::World;
 
 /// What every part of the executive works with.
@@ -13,6 +14,8 @@ pub(crate) struct Context<'a> {
     pub(crate) analysis: &'a Analysis,
     /// The mirror of the root world model.
     pub(crate) root: &'a mut World,
+    /// The moment of the event.
+    pub(crate) now: Timestamp,
     /// The last instance id given.
     pub(crate) last_instance: &'a mut u64,
     /// The run's seed.

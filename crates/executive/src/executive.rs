@@ -4,9 +4,8 @@ use crate::analysis::Analysis;
 use crate::context::Context;
 use crate::interpreter::{Interpreter, Progress};
 use crate::protocol::{Command, Event, Mode};
-use crate::window::{End, Wait, Window};
+use crate::window::{End, Window};
 use ratn_model::expression::EffectExpr;
-use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS};
 use ratn_model::time::Timestamp;
@@ -54,17 +53,22 @@ impl Executive {
     }
 
     /// Takes an event; what the shell shall do now, in order.
-    pub fn handle(&mut self, _now: Timestamp, event: Event) -> Vec<Command> {
+    pub fn handle(&mut self, now: Timestamp, event: Event) -> Vec<Command> {
         let mut commands = Vec::new();
         match event {
-            Event::Started { mode, parameters, seed, world, revision, .. } => {
+            Event::Started { mode, parameters, seed, world, revision, capacity, learned, .. } => {
                 if matches!(self.state, State::Fresh) {
                     self.root = World::from_facts(world, revision);
                     self.seed = seed;
-                    self.start(mode, &parameters, &mut commands);
+                    let window = || {
+                        let (program, analysis) = (&self.program, &self.analysis);
+                        Window::new(program, analysis, &parameters, capacity, learned, self.tolerance)
+                    };
+                    let window = (mode == Mode::Cdtn).then(|| Box::new(window()));
+                    self.start(now, window, &parameters, &mut commands);
                 }
             }
-            event => self.step(event, &mut commands),
+            event => self.step(now, event, &mut commands),
         }
         most_urgent_first(commands)
     }
@@ -82,36 +86,22 @@ impl Executive {
     /// What every instance that has not begun waits for, as sentences; empty in HSM mode.
     pub fn explain(&self) -> Vec<String> {
         let State::Cdtn(window) = &self.state else { return Vec::new() };
-        window.waits().map(|(path, wait)| format!("{path} {}", self.sentence(window, wait))).collect()
+        window.waits(&self.program)
     }
 
-    fn sentence(&self, window: &Window, wait: &Wait) -> String {
-        match wait {
-            Wait::Nothing => "has just been expanded".to_owned(),
-            Wait::Data(state) => format!("waits for an output of {}", self.program.state(*state).path),
-            Wait::World(Footprint::Everything) => {
-                "waits for an older state that may change everything (it declares no effects)".to_owned()
-            }
-            Wait::World(Footprint::Patterns(patterns)) => {
-                let facts: Vec<String> = patterns.iter().map(ToString::to_string).collect();
-                format!("waits for older states to know what they make of {}", facts.join(", "))
-            }
-            Wait::Environment => "waits for the environment to look as it does at its place in the program".to_owned(),
-            Wait::Order => "waits for every older state to have ended".to_owned(),
-            Wait::Sensing(id) => format!("waits for {} to have looked", window.path(*id)),
-            Wait::Writer(id) => format!("waits for {} to stop moving", window.path(*id)),
-            Wait::Precondition(reason) => format!("is held back: {reason}"),
-            Wait::TaskResource(kind) => format!("waits for older states that create, delete or consume {kind}"),
-            Wait::Resources => "waits for the resource manager".to_owned(),
-        }
-    }
-
-    fn start(&mut self, mode: Mode, parameters: &BTreeMap<String, Value>, commands: &mut Vec<Command>) {
+    fn start(
+        &mut self,
+        now: Timestamp,
+        window: Option<Box<Window>>,
+        parameters: &BTreeMap<String, Value>,
+        commands: &mut Vec<Command>,
+    ) {
         let program = self.program.clone();
         let mut context = Context {
             program: &program,
             analysis: &self.analysis,
             root: &mut self.root,
+            now,
             last_instance: &mut self.last_instance,
             seed: self.seed,
             commands,
@@ -122,16 +112,15 @@ impl Executive {
             commands.push(Command::End { outcome: ABORTED.to_owned(), outputs: BTreeMap::new(), reason });
             return;
         }
-        let end = match mode {
-            Mode::Hsm => {
+        let end = match window {
+            None => {
                 let mut interpreter = Box::new(Interpreter::of_program(parameters));
                 let progress = interpreter.start(&mut context, Program::ROOT, "");
                 let end = end_of(&mut context, &interpreter, progress);
                 self.state = State::Hsm(interpreter);
                 end
             }
-            Mode::Cdtn => {
-                let mut window = Box::new(Window::new(parameters, self.tolerance));
+            Some(mut window) => {
                 let end = window.start(&mut context);
                 self.state = State::Cdtn(window);
                 end
@@ -140,12 +129,13 @@ impl Executive {
         self.end(end, commands);
     }
 
-    fn step(&mut self, event: Event, commands: &mut Vec<Command>) {
+    fn step(&mut self, now: Timestamp, event: Event, commands: &mut Vec<Command>) {
         let program = self.program.clone();
         let mut context = Context {
             program: &program,
             analysis: &self.analysis,
             root: &mut self.root,
+            now,
             last_instance: &mut self.last_instance,
             seed: self.seed,
             commands,

@@ -307,6 +307,13 @@ pub enum Note {
         /// What came out otherwise.
         reason: String,
     },
+    /// It holds what another needs for which it is certain that it is needed: it gives it back and begins again later.
+    Preempted {
+        /// Its id.
+        instance: InstanceId,
+        /// Who needs it.
+        by: InstanceId,
+    },
     /// The same was computed before, from the same inputs and facts and with the same seed: that result is its result.
     Reused {
         /// Its id.

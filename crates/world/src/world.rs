@@ -128,7 +128,11 @@ impl World {
     }
 }
 
-fn increased(fact: &FactKey, old: Option<&Value>, by: f64) -> Result<Value, ChangeError> {
+/// What `increase` makes of a value; an absent one counts as 0.
+///
+/// # Errors
+/// [`ChangeError`] for what is no number.
+pub fn increased(fact: &FactKey, old: Option<&Value>, by: f64) -> Result<Value, ChangeError> {
     match old {
         None | Some(Value::Null) if by.fract() == 0.0 => Ok(Value::Int(by as i64)),
         None | Some(Value::Null) => Ok(Value::Float(by)),

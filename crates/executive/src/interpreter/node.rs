@@ -79,7 +79,7 @@ impl Interpreter {
             provider: provider.clone(),
             action: action.clone(),
             inputs,
-            seed: binding::seed(context.seed, &current.path),
+            seed: binding::seed(context.seed, &current.path, 1),
             lease: self.routine.as_ref().map_or(&current.lease, |routine| &routine.lease).clone(),
             projection: current.projection,
             expected_s,

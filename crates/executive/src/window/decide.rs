@@ -1,111 +1,232 @@
-//! What the window decides by itself, without a worker: conditions, lists of loops, outputs of composites, the end.
+//! What the window decides by itself, without a worker: conditions, lists of loops, deciders, what composite states do at
+//! their ends, the end of the task.
 
-use crate::binding::Outputs;
+use super::cursor::Todo;
+use super::environment::assigned;
+use super::instance::{Ended, Role, Seen, Wait, gives_outputs};
+use super::ready::{facts_of, not_bound};
+use super::{End, Window};
+use crate::binding::{BindError, Outputs};
 use crate::context::Context;
 use crate::protocol::Note;
-use crate::window::instance::Ended;
-use crate::window::place::Place;
-use crate::window::{End, Window};
-use ratn_model::expression::FactExpr;
-use ratn_model::fact::Footprint;
+use ratn_model::expression::Expr;
 use ratn_model::id::InstanceId;
-use ratn_model::program::{SUCCESS, StateKind};
+use ratn_model::program::{ABORTED, StateKind};
 use ratn_model::value::Value;
 
 impl Window {
-    /// A condition or a loop decides once what it is made of is settled.
-    pub(super) fn decide(&mut self, context: &mut Context<'_>, id: InstanceId, place: &Place) -> bool {
-        let Some(instance) = self.instances.alive.get(&id) else { return false };
+    /// A condition, or the test of a `while`.
+    pub(super) fn decide(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.instances.get(id) else { return };
         let state = context.program.state(instance.state);
-        let expression = match &state.kind {
-            StateKind::Condition { predicate, .. } => predicate,
-            StateKind::ForEach { collection, .. } => collection,
-            _ => return false,
+        let names = match instance.role {
+            Role::Test => ["again", "done"],
+            _ => ["then", "else"],
         };
-        let flows: Vec<_> = expression.flows().into_iter().collect();
-        let facts = expression.fact_expressions();
-        let settled = self.instances.flows_settled(&instance.environment, &flows)
-            && facts.iter().all(|fact| {
-                let read = place.with_scope(&self.instances, id, None, |scope| fact.pattern(scope));
-                read.is_some_and(|pattern| !place.written.overlaps(&Footprint::Patterns(vec![pattern])))
-            });
-        if !settled || place.speculative {
-            return false;
+        let (StateKind::Condition { predicate, .. } | StateKind::While { predicate, .. }) = &state.kind else { return };
+        if let Some(wait) = self.undecidable(context, instance, std::slice::from_ref(predicate)) {
+            return self.wait(id, wait);
         }
-        let value = place.with_scope(&self.instances, id, None, |scope| match &state.kind {
-            StateKind::Condition { .. } => expression.holds(scope).map(Value::Bool),
-            _ => expression.evaluate(scope),
-        });
-        let decision = match value {
-            Some(Ok(Value::Bool(taken))) => {
-                self.take_branch(context, id, taken);
-                if taken { "then".to_owned() } else { "else".to_owned() }
+        let view = self.sight(context).view(instance, None);
+        let taken = match predicate.holds(&view) {
+            Ok(true) => 0,
+            Ok(false) => 1,
+            Err(error) => {
+                let reason = BindError::at("its predicate", state)(error).reason();
+                return self.end_instance(id, Ended::aborted(reason));
             }
-            Some(Ok(Value::List(elements))) => {
-                let count = elements.len();
-                let path = self.path(id).to_owned();
-                for cursor in &mut self.cursors {
-                    cursor.unroll(id, state.id, elements.clone(), path.clone());
-                }
-                count.to_string()
-            }
-            Some(Ok(other)) => {
+        };
+        drop(view);
+        let path = self.path(context.program, id);
+        context.note(Note::Decided { instance: id, path, decision: names[taken].to_owned() });
+        self.end_instance(id, Ended::with(names[taken], Outputs::new()));
+        self.take_arm(context, id, taken);
+    }
+
+    /// The list of a loop.
+    pub(super) fn count(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.instances.get(id) else { return };
+        let state = context.program.state(instance.state);
+        let StateKind::ForEach { collection, .. } = &state.kind else { return };
+        if let Some(wait) = self.undecidable(context, instance, std::slice::from_ref(collection)) {
+            return self.wait(id, wait);
+        }
+        let view = self.sight(context).view(instance, None);
+        let elements = match collection.evaluate(&view) {
+            Ok(Value::List(elements)) => elements,
+            Ok(other) => {
                 let reason = format!("it loops over a {}, not a list", other.type_name());
                 return self.end_instance(id, Ended::aborted(reason));
             }
-            Some(Err(error)) => return self.end_instance(id, Ended::aborted(error.to_string())),
-            None => return false,
+            Err(error) => {
+                let reason = BindError::at("its list", state)(error).reason();
+                return self.end_instance(id, Ended::aborted(reason));
+            }
         };
-        let path = self.path(id).to_owned();
-        context.note(Note::Decided { instance: id, path, decision });
-        self.end_instance(id, Ended::success(Outputs::new()))
+        drop(view);
+        let path = self.path(context.program, id);
+        context.note(Note::Decided { instance: id, path, decision: elements.len().to_string() });
+        self.end_instance(id, Ended::success(Outputs::new()));
+        self.unroll(context, id, elements);
     }
 
-    /// The outputs of a composite are written as soon as what they are made of is.
-    pub(super) fn leave_composite(&mut self, context: &Context<'_>, id: InstanceId, place: &Place) -> bool {
-        let Some(instance) = self.instances.alive.get(&id) else { return false };
-        let mut written = Outputs::new();
-        let mut reads = Footprint::NOTHING;
-        if let StateKind::Sequence { outputs, .. } = &context.program.state(instance.state).kind {
-            for output in outputs {
-                let facts: Vec<_> = output.value.fact_expressions().into_iter().cloned().collect();
-                let value = place.with_scope(&self.instances, id, None, |scope| {
-                    reads = std::mem::replace(&mut reads, Footprint::NOTHING).union(FactExpr::footprint(&facts, scope));
-                    output.value.evaluate(scope)
-                });
-                match value {
-                    Some(Ok(value)) => {
-                        written.insert(output.name.clone(), value);
-                    }
-                    Some(Err(error)) if error.is_not_yet_known() => return false,
-                    Some(Err(error)) => {
-                        return self.end_instance(id, Ended::aborted(format!("output `{}`: {error}", output.name)));
-                    }
-                    None => return false,
+    /// The decider over the outcomes of regions.
+    pub(super) fn decide_join(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.instances.get(id) else { return };
+        let state = context.program.state(instance.state);
+        let StateKind::Concurrency { regions, decide, .. } = &state.kind else { return };
+        let expressions: Vec<Expr> = decide.iter().map(|(_, expression)| expression.clone()).collect();
+        if !expressions.is_empty()
+            && let Some(wait) = self.undecidable(context, instance, &expressions)
+        {
+            return self.wait(id, wait);
+        }
+        let (visit, plan) = (instance.visit, self.plan.clone());
+        let view = self.sight(context).view(instance, None);
+        let mut decision = None;
+        for (outcome, holds) in decide {
+            match holds.holds(&view) {
+                Ok(false) => {}
+                Ok(true) => decision = Some((outcome.clone(), None)),
+                Err(error) => {
+                    let reason = BindError::at(format!("`decide.{outcome}`"), state)(error).reason();
+                    decision = Some((ABORTED.to_owned(), Some(reason)));
                 }
             }
+            if decision.is_some() {
+                break;
+            }
         }
-        if let Some(instance) = self.instances.alive.get_mut(&id) {
-            instance.reads = reads;
-            instance.seen = Some(place.world.clone());
+        let (outcome, reason) = decision.unwrap_or_else(|| {
+            let outcomes: Vec<String> = regions
+                .iter()
+                .filter_map(|region| {
+                    use ratn_model::expression::Scope;
+                    view.port(*region, "outcome").and_then(|value| match value.as_ref() {
+                        Value::String(outcome) => Some(outcome.clone()),
+                        _ => None,
+                    })
+                })
+                .collect();
+            (Window::default_outcome(&outcomes).to_owned(), None)
+        });
+        drop(view);
+        let path = self.path(context.program, id);
+        context.note(Note::Decided { instance: id, path: path.clone(), decision: outcome.clone() });
+        self.end_instance(id, Ended::with(outcome.as_str(), Outputs::new()));
+        let own = plan.state(state.id);
+        let number = own.outcome(&outcome).unwrap_or(own.outcomes.len() - 2);
+        if let Some(cursor) = self.cursors.iter_mut().find(|cursor| cursor.todo == Todo::Await(id)) {
+            cursor.todo = Todo::Exit { state: state.id, visit, outcome: number };
+            let reason = reason.map(|reason| format!("{path}: {reason}"));
+            cursor.because = reason.map(Into::into).or(cursor.because.take());
         }
-        self.end_instance(id, Ended::success(written))
     }
 
-    pub(super) fn end_run(&mut self, context: &mut Context<'_>, id: InstanceId, place: &Place) -> bool {
+    /// Variables at the entry of a composite state; outputs and assignments at its exit.
+    pub(super) fn compute_boundary(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.instances.get(id) else { return };
+        let state = context.program.state(instance.state);
+        let own = self.plan.state(instance.state);
+        let leaves_by = own.outcomes[instance.leaves_by].clone();
+        let mut parts: Vec<(String, &Expr, String)> = Vec::new();
+        match instance.role {
+            Role::Entry => {
+                parts.extend(state.variables.iter().map(|(n, e)| (assigned(n), e, format!("variable `{n}`"))));
+            }
+            _ if gives_outputs(&leaves_by) => {
+                if let StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } = &state.kind {
+                    parts.extend(outputs.iter().map(|o| (o.name.clone(), &o.value, format!("output `{}`", o.name))));
+                }
+                let assigns = state.assign.iter();
+                parts.extend(assigns.map(|(n, e)| (assigned(n), e, format!("`assign` of `{n}`"))));
+            }
+            _ => {}
+        }
         let mut outputs = Outputs::new();
-        for output in &context.program.outputs {
-            match place.with_scope(&self.instances, id, None, |scope| output.value.evaluate(scope)) {
-                Some(Ok(value)) => {
-                    outputs.insert(output.name.clone(), value);
+        let mut seen = Seen::default();
+        let mut used = Vec::new();
+        let mut failed = None;
+        for (name, expression, what) in &parts {
+            // Assignments may be made of the outputs.
+            let view = self.sight(context).view(instance, Some(&outputs));
+            let facts = facts_of(std::slice::from_ref(*expression), &view);
+            match expression.evaluate(&view) {
+                Ok(value) => {
+                    if !facts.is_nothing() {
+                        seen.facts.extend(view.facts(&facts).unwrap_or_default());
+                        seen.read.push(facts);
+                    }
+                    used.extend(view.into_used());
+                    outputs.insert(name.clone(), value);
                 }
-                Some(Err(error)) => {
-                    return self.end_instance(id, Ended::aborted(format!("output `{}`: {error}", output.name)));
+                Err(error) => {
+                    let error = BindError::at(what.clone(), state)(error);
+                    failed = Some(not_bound(&view, &error));
+                    break;
                 }
-                None => {}
             }
         }
-        self.end = Some(End { outcome: SUCCESS.to_owned(), outputs, reason: String::new() });
-        true
+        match failed {
+            Some(super::ready::Readiness::Waits(wait)) => return self.wait(id, wait),
+            Some(super::ready::Readiness::Failed(reason)) => return self.end_instance(id, Ended::aborted(reason)),
+            _ => {}
+        }
+        if !parts.is_empty() {
+            used.extend(self.producers_of(instance));
+            used.sort_unstable();
+            used.dedup();
+            for producer in used {
+                if let Some(producer) = self.instances.get_mut(producer) {
+                    producer.users.push(id);
+                }
+            }
+        }
+        let outcome =
+            if self.instances.get(id).is_some_and(|i| i.role == Role::Entry) { "success".into() } else { leaves_by };
+        if let Some(instance) = self.instances.get_mut(id) {
+            instance.seen = Some(Box::new(seen));
+        }
+        self.end_instance(id, Ended::with(outcome, outputs));
+    }
+
+    /// Everything older has retired: the task is over.
+    pub(super) fn end_run(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.instances.get(id) else { return };
+        if !instance.is_head {
+            return self.wait(id, Wait::Order);
+        }
+        if let Some(beside) = self.detached.first() {
+            return self.wait(id, Wait::Data(*beside));
+        }
+        let outcome = self.plan.state(instance.state).outcomes[instance.leaves_by].to_string();
+        let reason = instance.left_because.as_ref().map_or(String::new(), ToString::to_string);
+        let mut end = End { outcome, outputs: Outputs::new(), reason };
+        if end.outcome == ratn_model::program::SUCCESS {
+            end.reason = String::new();
+            let view = self.sight(context).view(instance, None);
+            for output in &context.program.outputs {
+                match output.value.evaluate(&view) {
+                    Ok(value) => {
+                        end.outputs.insert(output.name.clone(), value);
+                    }
+                    Err(error) => {
+                        let reason = format!("output `{}`: {error}", output.name);
+                        end = End { outcome: ABORTED.to_owned(), outputs: Outputs::new(), reason };
+                        break;
+                    }
+                }
+            }
+        }
+        self.end = Some(end);
+    }
+
+    pub(super) fn end_instance(&mut self, id: InstanceId, ended: Ended) {
+        if let Some(instance) = self.instances.get_mut(id) {
+            instance.status = super::instance::Status::Finished;
+            instance.ended = Some(Box::new(ended));
+        }
+        self.wake_waiters(id);
+        self.enqueue(id);
     }
 }

@@ -1,260 +1,598 @@
-//! Expansion: from the tree of states to instances, along every branch that may be taken.
+//! Growing the window: a cursor walks the program along its transitions and appends instances, until the horizon.
 //!
-//! A cursor is a place in the program from which the window grows. At a condition it splits; at a loop it waits for the
-//! list. It stops at the horizon and behind too many undecided conditions, and goes on as older instances retire.
+//! An instance with several ways on gets an arm for each; each arm has a cursor. What follows the same condition on both arms
+//! is expanded twice: they are two futures.
 
+use super::Window;
+use super::cursor::{Cursor, Todo};
+use super::environment::{Binding, Frame, Iteration, Link, Producer};
+use super::instance::{Arm, Instance, Role, Segment, Status, Wait, gives_outputs};
+use super::plan::{Outcome, Predicate};
+use super::segment::Branch;
 use crate::analysis::NodeNature;
-use crate::binding::child_path;
 use crate::context::Context;
 use crate::protocol::Note;
-use crate::window::Window;
-use crate::window::instance::{Environment, Instance, Role, Status, Wait};
-use imbl::OrdMap;
-use ratn_model::fact::Footprint;
+use ratn_model::expression::scope::NothingKnown;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{Program, State, StateKind};
+use ratn_model::program::{ABORTED, Program, SUCCESS, State, StateKind, Target};
+use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use std::sync::Arc;
+use std::cell::Cell;
+use std::sync::{Arc, OnceLock};
 
-/// How many undecided conditions a path may have behind which it is still expanded.
-pub(crate) const MAX_UNDECIDED: usize = 3;
+/// A path that goes on for so many steps without doing anything goes in circles.
+const MAX_IDLE_STEPS: usize = 10_000;
 
 /// Duration assumed of a node that says none, in seconds.
-const DEFAULT_DURATION_S: f64 = 1.0;
+const DEFAULT_DURATION_S: f32 = 1.0;
 
-#[derive(Clone)]
-pub(crate) struct Cursor {
-    frames: Vec<Frame>,
-    environment: Environment,
-    /// The youngest instance on its path; may have retired since.
-    pub(crate) tail: Option<InstanceId>,
-    /// The branch it is on, when `tail` is an undecided condition.
-    pub(crate) assumption: Option<bool>,
-    /// The loop whose list it waits for.
-    waits_for: Option<InstanceId>,
-}
-
-#[derive(Clone)]
-enum Frame {
-    /// Children of a composite (for a condition: of one branch; for a loop: of one iteration).
-    List { state: StateId, which: Which, next: usize, path: String },
-    /// The iterations of a loop; what `$name` meant before it.
-    Loop { state: StateId, elements: Arc<Vec<Value>>, next: usize, path: String, before: OrdMap<String, Value> },
-}
-
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Which {
-    Children,
-    Body,
-    Then,
-    Otherwise,
-}
-
-impl Cursor {
-    /// At the beginning of the program.
-    pub(crate) fn start(parameters: impl IntoIterator<Item = (String, Value)>) -> Cursor {
-        let environment = Environment { variables: parameters.into_iter().collect(), producers: OrdMap::new() };
-        let root = Frame::List { state: Program::ROOT, which: Which::Children, next: 0, path: String::new() };
-        Cursor { frames: vec![root], environment, tail: None, assumption: None, waits_for: None }
-    }
-
-    /// The loop's list is known.
-    pub(crate) fn unroll(&mut self, window: InstanceId, state: StateId, elements: Vec<Value>, path: String) {
-        if self.waits_for == Some(window) {
-            self.waits_for = None;
-            let before = self.environment.variables.clone();
-            self.frames.push(Frame::Loop { state, elements: Arc::new(elements), next: 0, path, before });
-        }
-    }
-
-    /// The producers that what it will expand can still name.
-    pub(crate) fn producers(&self) -> impl Iterator<Item = InstanceId> {
-        self.environment.producers.values().copied()
-    }
-}
-
-fn list(program: &Program, state: StateId, which: Which) -> &[StateId] {
-    match (&program.state(state).kind, which) {
-        (StateKind::Sequence { children, .. }, _) => children,
-        (StateKind::ForEach { body, .. }, _) => body,
-        (StateKind::Condition { then, .. }, Which::Then) => then,
-        (StateKind::Condition { otherwise, .. }, _) => otherwise,
-        _ => &[],
-    }
-}
+/// How likely a connected failure is, unless it was learned.
+const FAILURE: f32 = 0.1;
 
 impl Window {
-    /// Grows the window at every cursor as far as it may; whether it grew.
-    pub(crate) fn expand(&mut self, context: &mut Context<'_>) -> bool {
+    /// Grows at every cursor that may; whether anything came of it.
+    pub(super) fn expand(&mut self, context: &mut Context<'_>) -> bool {
         let mut grew = false;
-        let mut index = 0;
-        while index < self.cursors.len() {
-            while self.may_grow(context.program, index) && self.step(context, index) {
-                grew = true;
+        'again: loop {
+            self.join_regions(context);
+            for index in self.awake() {
+                let cursors = self.cursors.len();
+                while self.may_grow(context.program, index) {
+                    grew = true;
+                    self.step(context, index);
+                    if self.cursors.len() != cursors || self.cursors[index].todo == Todo::Done {
+                        self.cursors.retain(|cursor| cursor.todo != Todo::Done);
+                        continue 'again;
+                    }
+                }
             }
-            index += 1;
+            return grew;
         }
-        self.cursors.retain(|cursor| !cursor.frames.is_empty());
-        grew
+    }
+
+    /// The cursors that may grow as far as the speculation width goes, the likelier ones first.
+    fn awake(&self) -> Vec<usize> {
+        if let [_] = self.cursors.as_slice() {
+            return vec![0];
+        }
+        let mut all: Vec<usize> = (0..self.cursors.len()).collect();
+        let rank = |index: &usize| {
+            let cursor = &self.cursors[*index];
+            (self.is_speculative(cursor.segment), -(f64::from(cursor.probability) * 1e9) as i64, cursor.order)
+        };
+        all.sort_by_cached_key(rank);
+        let certain = all.iter().filter(|index| !self.is_speculative(self.cursors[**index].segment)).count();
+        all.truncate(certain + self.speculation_width);
+        all
     }
 
     fn may_grow(&self, program: &Program, index: usize) -> bool {
         let cursor = &self.cursors[index];
-        if cursor.frames.is_empty() || cursor.waits_for.is_some() {
+        if matches!(cursor.todo, Todo::Await(_) | Todo::Done) {
             return false;
         }
-        let (mut length, mut undecided) = (0, 0);
-        let mut at = cursor.tail.and_then(|tail| self.instances.alive.get(&tail));
-        while let Some(instance) = at {
-            length += 1;
-            undecided += usize::from(instance.is_undecided());
-            at = instance.older.and_then(|older| self.instances.alive.get(&older));
-        }
-        length < program.horizon.max(1) && undecided <= MAX_UNDECIDED
+        let floor = self.threads.get(&cursor.line).map_or(0, |thread| thread.floor);
+        cursor.position < floor + program.horizon.max(1) as u64
     }
 
-    /// One step of a cursor; false when it cannot go on now.
-    fn step(&mut self, context: &mut Context<'_>, index: usize) -> bool {
-        let program = context.program;
-        let Some(frame) = self.cursors[index].frames.last_mut() else { return false };
-        match frame {
-            Frame::List { state, which, next, path } => {
-                let children = list(program, *state, *which);
-                if let Some(child) = children.get(*next) {
-                    *next += 1;
-                    let path = child_path(path, &program.state(*child).name);
-                    self.enter(context, index, program.state(*child), path);
-                    return true;
-                }
-                let (state, which, path) = (*state, *which, path.clone());
-                self.cursors[index].frames.pop();
-                if which != Which::Body {
-                    self.exit(context, index, program.state(state), path);
-                }
-            }
-            Frame::Loop { state, elements, next, path, before } => {
-                let Some(element) = elements.get(*next).cloned() else {
-                    let (state, path, before) = (*state, path.clone(), before.clone());
-                    self.cursors[index].frames.pop();
-                    self.cursors[index].environment.variables = before;
-                    self.exit(context, index, program.state(state), path);
-                    return true;
-                };
-                let (state, iteration, path) = (*state, *next, format!("{path}[{next}]"));
-                *next += 1;
-                if let StateKind::ForEach { variable, index: counter, .. } = &program.state(state).kind {
-                    let variables = &mut self.cursors[index].environment.variables;
-                    variables.insert(variable.clone(), element);
-                    if let Some(counter) = counter {
-                        variables.insert(counter.clone(), Value::Int(iteration as i64));
-                    }
-                }
-                self.cursors[index].frames.push(Frame::List { state, which: Which::Body, next: 0, path });
-            }
-        }
-        true
-    }
-
-    fn enter(&mut self, context: &mut Context<'_>, index: usize, state: &State, path: String) {
-        if matches!(state.kind, StateKind::Action { .. }) || state.annotations.routine {
-            let id = self.append(context, index, state, Role::Node, path);
-            self.cursors[index].environment.producers.insert(state.id, id);
+    fn step(&mut self, context: &mut Context<'_>, index: usize) {
+        let cursor = &mut self.cursors[index];
+        cursor.idle += 1;
+        if cursor.idle > MAX_IDLE_STEPS {
+            cursor.because = Some("the task goes in circles without doing anything".into());
+            self.end_of_task(context, index, ABORTED);
             return;
         }
-        if !state.annotations.requires.is_empty() {
-            self.append(context, index, state, Role::Entry, path.clone());
+        match std::mem::replace(&mut cursor.todo, Todo::Done) {
+            Todo::Enter(state) => self.enter(context, index, state),
+            Todo::Leave(state, outcome) => self.follow(context, index, state, outcome),
+            Todo::Exit { state, visit, outcome } => self.exit(context, index, state, visit, outcome),
+            Todo::Iterate => self.iterate(context, index),
+            todo @ (Todo::Await(_) | Todo::Done) => self.cursors[index].todo = todo,
         }
+    }
+
+    fn enter(&mut self, context: &mut Context<'_>, index: usize, id: StateId) {
+        let state = context.program.state(id);
+        let plan = self.plan.clone();
+        let own = plan.state(id);
+        let visit = self.count_visit(index, id);
+        if own.is_node {
+            let instance = self.append(context, index, state, Role::Node, visit, None, 0);
+            self.branch_by_outcome(context, index, instance, id);
+            return;
+        }
+        for inside in &own.read_inside {
+            let producers = &mut self.cursors[index].environment.producers;
+            for slot in [inside.0 as usize, plan.len() + inside.0 as usize] {
+                if producers.get(slot).is_some() {
+                    producers.set(slot, None);
+                }
+            }
+        }
+        let constant = |value: &ratn_model::expression::Expr| value.evaluate(&NothingKnown).ok();
+        let bound: Vec<_> = state.variables.iter().map(|(name, value)| (name, constant(value))).collect();
+        let base = self.cursors[index].environment.variables.len();
+        let computed = bound.iter().any(|(_, value)| value.is_none());
+        let entry = (computed || !state.annotations.requires.is_empty()).then(|| {
+            let entry = self.append(context, index, state, Role::Entry, visit, None, 0);
+            self.single_arm(index, entry);
+            self.instances.get(entry).and_then(|i| i.producer.clone())
+        });
+        for (name, value) in bound {
+            let binding = match (value, entry.as_ref().and_then(Option::as_ref)) {
+                (Some(value), _) => Binding::Known(value),
+                (None, Some(producer)) => Binding::Assigned(producer.clone()),
+                (None, None) => continue,
+            };
+            self.cursors[index].environment.variables.declare(name, binding);
+        }
+        let path: Arc<str> = self.cursors[index].environment.path(&state.name, visit, None).into();
+        let path = if id == Program::ROOT { Arc::from("") } else { path };
         match &state.kind {
-            StateKind::Action { .. } | StateKind::While { .. } | StateKind::Concurrency { .. } => {}
-            StateKind::Sequence { .. } => {
-                let frame = Frame::List { state: state.id, which: Which::Children, next: 0, path };
-                self.cursors[index].frames.push(frame);
-            }
+            StateKind::Action { .. } => {}
+            StateKind::Sequence { children, .. } => self.begin_list(index, id, visit, path, base, children),
             StateKind::ForEach { .. } => {
-                let id = self.append(context, index, state, Role::Loop, path);
-                self.cursors[index].waits_for = Some(id);
+                let instance = self.append(context, index, state, Role::Loop, visit, None, 0);
+                self.single_arm(index, instance);
+                self.cursors[index].todo = Todo::Await(instance);
             }
-            StateKind::Condition { .. } => {
-                self.append(context, index, state, Role::Condition, path.clone());
-                let branch = |which| Frame::List { state: state.id, which, next: 0, path: path.clone() };
-                let mut other = self.cursors[index].clone();
-                other.assumption = Some(false);
-                other.frames.push(branch(Which::Otherwise));
-                let cursor = &mut self.cursors[index];
-                cursor.assumption = Some(true);
-                cursor.frames.push(branch(Which::Then));
-                self.cursors.push(other);
+            StateKind::While { body_first, .. } => {
+                let frame = self.frame(index, id, visit, path, base, Some(Iteration { index: 0, elements: None }));
+                self.cursors[index].environment.frames = Some(frame);
+                if *body_first {
+                    self.begin_iteration(index, context.program);
+                } else {
+                    self.cursors[index].todo = Todo::Iterate;
+                    if let Some(frame) = self.top_frame(index)
+                        && let Some(iteration) = &mut frame.iteration
+                    {
+                        // Iterating counts on from here.
+                        iteration.index = usize::MAX;
+                    }
+                }
+            }
+            StateKind::Condition { then, otherwise, .. } => {
+                let instance = self.append(context, index, state, Role::Condition, visit, None, 0);
+                let decisions = [(0, "then"), (1, "else")];
+                for (cursor, taken) in self.branch(context, index, instance, id, &decisions) {
+                    let list = if taken == 0 { then } else { otherwise };
+                    self.begin_list(cursor, id, visit, path.clone(), base, list);
+                }
+            }
+            StateKind::Concurrency { regions, .. } => {
+                self.fork(context, index, state, visit, &path, base, regions);
             }
         }
     }
 
-    /// A composite state is left with success: what it still does at its end.
-    fn exit(&mut self, context: &mut Context<'_>, index: usize, state: &State, path: String) {
-        let outputs = matches!(&state.kind, StateKind::Sequence { outputs, .. } if !outputs.is_empty());
-        let effects = state.annotations.effects.values().any(|effects| !effects.is_empty());
-        if outputs || effects || !context.analysis.state(state.id).operations.is_empty() {
-            let id = self.append(context, index, state, Role::Exit, path.clone());
-            self.cursors[index].environment.producers.insert(state.id, id);
+    fn count_visit(&mut self, index: usize, id: StateId) -> u32 {
+        let plan = self.plan.clone();
+        let Some(frame) = &self.cursors[index].environment.frames else { return 1 };
+        if !plan.state(frame.owner).repeats {
+            return 1;
         }
-        if state.id == Program::ROOT {
-            self.append(context, index, state, Role::End, path);
+        let Some(frame) = self.top_frame(index) else { return 1 };
+        match frame.visits.iter_mut().find(|(state, _)| *state == id) {
+            Some((_, count)) => {
+                *count += 1;
+                *count
+            }
+            None => {
+                frame.visits.push((id, 1));
+                1
+            }
         }
     }
 
-    fn append(
+    fn top_frame(&mut self, index: usize) -> Option<&mut Frame> {
+        self.cursors[index].environment.frames.as_mut().map(Arc::make_mut)
+    }
+
+    fn frame(
+        &self,
+        index: usize,
+        owner: StateId,
+        visit: u32,
+        prefix: Arc<str>,
+        variables: usize,
+        iteration: Option<Iteration>,
+    ) -> Arc<Frame> {
+        let below = self.cursors[index].environment.frames.clone();
+        Arc::new(Frame { below, owner, visit, prefix, visits: Vec::new(), iteration, variables, fork: None })
+    }
+
+    /// Begins a list of a composite state that is no loop.
+    pub(super) fn begin_list(
+        &mut self,
+        index: usize,
+        owner: StateId,
+        visit: u32,
+        path: Arc<str>,
+        variables: usize,
+        list: &[StateId],
+    ) {
+        let Some(first) = list.first() else {
+            let cursor = &mut self.cursors[index];
+            cursor.environment.variables.truncate(variables);
+            cursor.todo = Todo::Exit { state: owner, visit, outcome: 0 };
+            return;
+        };
+        let frame = self.frame(index, owner, visit, path, variables, None);
+        let cursor = &mut self.cursors[index];
+        cursor.environment.frames = Some(frame);
+        cursor.todo = Todo::Enter(*first);
+    }
+
+    /// The list of a loop is known: its iterations begin.
+    pub(super) fn unroll(&mut self, context: &Context<'_>, waits_for: InstanceId, elements: Vec<Value>) {
+        let Some(index) = self.cursors.iter().position(|cursor| cursor.todo == Todo::Await(waits_for)) else { return };
+        let Some(instance) = self.instances.get(waits_for) else { return };
+        let (state, visit) = (context.program.state(instance.state), instance.visit);
+        let path: Arc<str> = self.cursors[index].environment.path(&state.name, visit, None).into();
+        let base = self.cursors[index].environment.variables.len();
+        let iteration = Iteration { index: usize::MAX, elements: Some(Arc::new(elements)) };
+        let frame = self.frame(index, state.id, visit, path, base, Some(iteration));
+        let cursor = &mut self.cursors[index];
+        cursor.environment.frames = Some(frame);
+        cursor.todo = Todo::Iterate;
+    }
+
+    /// The innermost loop goes on to its next iteration, or ends.
+    fn iterate(&mut self, context: &mut Context<'_>, index: usize) {
+        let program = context.program;
+        let Some(frame) = self.top_frame(index) else { return };
+        let (owner, visit, base) = (frame.owner, frame.visit, frame.variables);
+        let Some(iteration) = &mut frame.iteration else { return };
+        iteration.index = iteration.index.wrapping_add(1);
+        let (number, elements) = (iteration.index, iteration.elements.clone());
+        frame.visits.clear();
+        match elements {
+            Some(elements) if number < elements.len() => self.begin_iteration(index, program),
+            Some(_) => self.leave_frame(index, 0),
+            None => {
+                let state = program.state(owner);
+                self.bind_iteration(index, program);
+                // The test stands where the loop stands, not in its body.
+                let inside = self.cursors[index].environment.frames.clone();
+                self.cursors[index].environment.frames = inside.as_ref().and_then(|frame| frame.below.clone());
+                let test = self.append(context, index, state, Role::Test, visit, Some(number), 0);
+                let decisions = [(0, "again"), (1, "done")];
+                for (cursor, taken) in self.branch(context, index, test, owner, &decisions) {
+                    if taken == 0 {
+                        self.cursors[cursor].environment.frames = inside.clone();
+                        self.begin_iteration(cursor, program);
+                    } else {
+                        let ended = &mut self.cursors[cursor];
+                        ended.environment.variables.truncate(base);
+                        ended.todo = Todo::Exit { state: owner, visit, outcome: 0 };
+                    }
+                }
+            }
+        }
+    }
+
+    /// Variables of the innermost loop's iteration; the first state of its body is next.
+    fn begin_iteration(&mut self, index: usize, program: &Program) {
+        self.bind_iteration(index, program);
+        let Some(frame) = self.top_frame(index) else { return };
+        let owner = program.state(frame.owner);
+        let number = frame.iteration.as_ref().map_or(0, |iteration| iteration.index);
+        let visit = frame.visit;
+        let below = frame.below.clone();
+        let cursor = &mut self.cursors[index];
+        // The prefix has the number of the iteration.
+        let frames = std::mem::replace(&mut cursor.environment.frames, below);
+        let prefix: Arc<str> = cursor.environment.path(&owner.name, visit, Some(number)).into();
+        cursor.environment.frames = frames;
+        if let Some(frame) = self.top_frame(index) {
+            frame.prefix = prefix;
+        }
+        let body = match &owner.kind {
+            StateKind::ForEach { body, .. } | StateKind::While { body, .. } => body.first(),
+            _ => None,
+        };
+        self.cursors[index].todo = body.map_or(Todo::Iterate, |first| Todo::Enter(*first));
+    }
+
+    fn bind_iteration(&mut self, index: usize, program: &Program) {
+        let Some(frame) = self.top_frame(index) else { return };
+        let (owner, base) = (frame.owner, frame.variables);
+        let Some(iteration) = frame.iteration.clone() else { return };
+        let variables = &mut self.cursors[index].environment.variables;
+        variables.truncate(base);
+        let number = Value::Int(i64::try_from(iteration.index).unwrap_or(i64::MAX));
+        match &program.state(owner).kind {
+            StateKind::ForEach { variable, index, .. } => {
+                if let Some(element) = iteration.elements.as_ref().and_then(|all| all.get(iteration.index)) {
+                    variables.declare(variable, Binding::Known(element.clone()));
+                }
+                if let Some(index) = index {
+                    variables.declare(index, Binding::Known(number));
+                }
+            }
+            StateKind::While { index: Some(index), .. } => variables.declare(index, Binding::Known(number)),
+            _ => {}
+        }
+    }
+
+    /// Follows an outcome of a state that has ended.
+    fn follow(&mut self, context: &mut Context<'_>, index: usize, id: StateId, outcome: Outcome) {
+        let plan = self.plan.clone();
+        if id == Program::ROOT {
+            let name = plan.state(id).outcomes[outcome].clone();
+            self.end_of_task(context, index, &name);
+            return;
+        }
+        let by = match &plan.state(id).targets[outcome] {
+            Target::State(next) => {
+                self.cursors[index].todo = Todo::Enter(*next);
+                return;
+            }
+            Target::Outcome(by) => by,
+        };
+        let Some(frame) = self.cursors[index].environment.frames.clone() else { return };
+        if let Some(fork) = frame.fork {
+            self.end_region(context, index, fork, id, by);
+            return;
+        }
+        let is_loop =
+            matches!(context.program.state(frame.owner).kind, StateKind::ForEach { .. } | StateKind::While { .. });
+        if is_loop && by == SUCCESS {
+            self.cursors[index].todo = Todo::Iterate;
+            return;
+        }
+        let outcome = plan.state(frame.owner).outcome(by).unwrap_or_else(|| plan.state(frame.owner).outcomes.len() - 2);
+        self.leave_frame(index, outcome);
+    }
+
+    /// The innermost list has ended by an outcome of its owner.
+    fn leave_frame(&mut self, index: usize, outcome: Outcome) {
+        let cursor = &mut self.cursors[index];
+        let Some(frame) = cursor.environment.frames.clone() else { return };
+        cursor.environment.variables.truncate(frame.variables);
+        cursor.environment.frames = frame.below.clone();
+        cursor.todo = Todo::Exit { state: frame.owner, visit: frame.visit, outcome };
+    }
+
+    fn exit(&mut self, context: &mut Context<'_>, index: usize, id: StateId, visit: u32, outcome: Outcome) {
+        let plan = self.plan.clone();
+        let own = plan.state(id);
+        if own.exits & (1 << outcome) != 0 {
+            let state = context.program.state(id);
+            let instance = self.append(context, index, state, Role::Exit, visit, None, outcome);
+            self.single_arm(index, instance);
+            let links: Vec<Predicate> = own.effect_predicates[outcome]
+                .iter()
+                .chain(if outcome == 0 { &own.operated[..] } else { &[] })
+                .copied()
+                .collect();
+            self.come_after(index, instance, id, outcome, false, &links);
+        }
+        self.cursors[index].todo = Todo::Leave(id, outcome);
+    }
+
+    fn end_of_task(&mut self, context: &mut Context<'_>, index: usize, outcome: &str) {
+        let plan = self.plan.clone();
+        let root = plan.state(Program::ROOT);
+        let outcome = root.outcome(outcome).unwrap_or(root.outcomes.len() - 2);
+        self.append(context, index, context.program.state(Program::ROOT), Role::End, 1, None, outcome);
+        self.cursors[index].todo = Todo::Done;
+    }
+
+    /// The environment behind an instance that ends by an outcome.
+    pub(super) fn come_after(
+        &mut self,
+        index: usize,
+        instance: InstanceId,
+        id: StateId,
+        outcome: Outcome,
+        vague: bool,
+        writes: &[Predicate],
+    ) {
+        let plan = self.plan.clone();
+        let own = plan.state(id);
+        let producer = self.instances.get(instance).and_then(|i| i.producer.clone());
+        let environment = &mut self.cursors[index].environment;
+        for predicate in writes {
+            environment.writers.set(*predicate, Some(Link { writer: instance, outcome, vague }));
+        }
+        if let (Some(producer), true) = (producer, gives_outputs(&own.outcomes[outcome])) {
+            if own.is_read {
+                environment.producers.set(id.0 as usize, Some(producer.clone()));
+            }
+            for name in &own.assigns {
+                environment.variables.assign(name, Binding::Assigned(producer.clone()));
+            }
+        }
+    }
+
+    /// The arms of a node: one per target of the outcomes that are computed ahead.
+    fn branch_by_outcome(&mut self, context: &Context<'_>, index: usize, instance: InstanceId, id: StateId) {
+        let plan = self.plan.clone();
+        let own = plan.state(id);
+        let links = own.writes.as_slice();
+        match own.arms.as_slice() {
+            [] => self.cursors[index].todo = Todo::Done,
+            [arm] => {
+                self.single_arm(index, instance);
+                if let Some(instance) = self.instances.get_mut(instance) {
+                    instance.arms[0].outcomes = arm.outcomes;
+                    instance.arms[0].outcome = arm.outcome;
+                }
+                self.come_after(index, instance, id, arm.outcome, !arm.same_effects, links);
+                self.cursors[index].todo = Todo::Leave(id, arm.outcome);
+            }
+            arms => {
+                let decisions: Vec<(Outcome, &str)> =
+                    arms.iter().map(|arm| (arm.outcome, &*own.outcomes[arm.outcome])).collect();
+                for (cursor, outcome) in self.branch(context, index, instance, id, &decisions) {
+                    let Some(arm) = arms.iter().find(|arm| arm.outcome == outcome) else { continue };
+                    if let Some(instance) = self.instances.get_mut(instance)
+                        && let Some(own) = instance.arms.iter_mut().find(|own| own.outcome == outcome)
+                    {
+                        own.outcomes = arm.outcomes;
+                    }
+                    self.come_after(cursor, instance, id, outcome, !arm.same_effects, links);
+                    self.cursors[cursor].todo = Todo::Leave(id, outcome);
+                }
+            }
+        }
+    }
+
+    fn single_arm(&mut self, index: usize, instance: InstanceId) {
+        let segment = self.cursors[index].segment;
+        if let Some(instance) = self.instances.get_mut(instance) {
+            instance.arms = vec![Arm { outcomes: 1, outcome: 0, next: None, segment }];
+        }
+    }
+
+    /// One cursor per decision, each on a segment of its own, the likeliest first; cursors with what they stand for.
+    fn branch(
+        &mut self,
+        context: &Context<'_>,
+        index: usize,
+        instance: InstanceId,
+        id: StateId,
+        decisions: &[(Outcome, &str)],
+    ) -> Vec<(usize, Outcome)> {
+        let learned = self.learned.outcomes.get(&context.program.state(id).path);
+        let shares: Vec<f32> = decisions
+            .iter()
+            .map(|(_, name)| match learned {
+                Some(shares) => shares.get(*name).map_or(0.01, |share| *share as f32).max(0.01),
+                None if matches!(*name, ABORTED | ratn_model::program::PREEMPTED) => FAILURE,
+                None => 1.0,
+            })
+            .collect();
+        let total: f32 = shares.iter().sum();
+        let mut cursors = Vec::new();
+        let template = self.cursors[index].clone();
+        for (number, ((outcome, _), share)) in decisions.iter().zip(shares).enumerate() {
+            let probability = template.probability * share / total;
+            let segment = self.new_segment(Branch {
+                parent: template.segment,
+                decision: instance,
+                probability,
+                members: Vec::new(),
+            });
+            if let Some(instance) = self.instances.get_mut(instance) {
+                instance.arms.push(Arm { outcomes: 1 << outcome, outcome: *outcome, next: None, segment });
+            }
+            self.next_order += 1;
+            let cursor = Cursor {
+                tail: Some((instance, number)),
+                segment,
+                probability,
+                order: self.next_order,
+                ..template.clone()
+            };
+            if number == 0 {
+                self.cursors[index] = cursor;
+                cursors.push((index, *outcome));
+            } else {
+                self.cursors.push(cursor);
+                cursors.push((self.cursors.len() - 1, *outcome));
+            }
+        }
+        cursors
+    }
+
+    pub(super) fn new_segment(&mut self, branch: Branch) -> Segment {
+        self.next_segment += 1;
+        self.branches.insert(self.next_segment, branch);
+        self.next_segment
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "all of it is one visit")]
+    pub(super) fn append(
         &mut self,
         context: &mut Context<'_>,
         index: usize,
         state: &State,
         role: Role,
-        path: String,
+        visit: u32,
+        iteration: Option<usize>,
+        leaves_by: Outcome,
     ) -> InstanceId {
         let id = context.new_instance();
+        let plan = self.plan.clone();
+        let own = plan.state(state.id);
         let cursor = &mut self.cursors[index];
-        let older = cursor.tail.filter(|tail| self.instances.alive.contains_key(tail));
-        let assumption = cursor.assumption.take();
-        cursor.tail = Some(id);
+        cursor.idle = 0;
+        let (line, segment, position) = (cursor.line, cursor.segment, cursor.position);
+        cursor.position += 1;
         let environment = cursor.environment.clone();
-        if let Some(instance) = older.and_then(|older| self.instances.alive.get_mut(&older)) {
-            instance.next.push(id);
-        } else {
-            self.oldest = Some(id);
-        }
+        let tail = cursor.tail.replace((id, 0));
+        let left_because = cursor.because.clone();
+        let writes_outputs = match role {
+            Role::Node | Role::Exit => own.is_read || !own.assigns.is_empty(),
+            Role::Entry | Role::RegionEnd => true,
+            _ => false,
+        };
+        let linked = tail.and_then(|(tail, arm)| self.instances.get_mut(tail)?.arms.get_mut(arm));
+        let is_linked = linked.map(|arm| arm.next = Some(id)).is_some();
         let nature = match role {
             Role::Node => context.analysis.state(state.id).nature,
             _ => NodeNature::Computes,
         };
-        let instance = Instance {
+        let duration_s = match role {
+            Role::Node => self.learned.durations_s.get(&state.path).map_or(DEFAULT_DURATION_S, |s| *s as f32),
+            _ => 0.0,
+        };
+        self.instances.push(Instance {
             id,
             state: state.id,
+            visit,
+            iteration,
             role,
             nature,
-            path: path.clone(),
             environment,
-            older,
-            assumption,
-            next: Vec::new(),
+            producer: writes_outputs.then(|| Arc::new(Producer { instance: id, real: OnceLock::new() })),
+            line,
+            segment,
+            position,
+            arms: Vec::new(),
+            leaves_by,
+            left_because,
+            is_head: false,
+            detached: false,
+            queued: false,
             status: Status::Expanded,
             wait: Wait::Nothing,
             attempt: 1,
+            tries: 1,
             crashes: 0,
+            not_before: Timestamp(0),
             lease: None,
             projection: None,
             ended: None,
-            settled: false,
+            settled: Cell::new(false),
             routine: None,
-            duration_s: if role == Role::Node { DEFAULT_DURATION_S } else { 0.0 },
-            remaining_s: 0.0,
-            reads: Footprint::NOTHING,
-            senses: Footprint::NOTHING,
-            writes: Footprint::NOTHING,
             seen: None,
+            waiters: Vec::new(),
+            users: Vec::new(),
+            duration_s,
+            remaining_s: duration_s,
+            advised: false,
+            asked_with: 0,
+        });
+        if !is_linked && role != Role::Join {
+            self.set_head(line, Some(id));
+        }
+        let speculative = match self.branches.get_mut(&segment) {
+            Some(branch) => {
+                branch.members.push(id);
+                true
+            }
+            None => false,
         };
-        self.instances.alive.insert(id, instance);
         if role == Role::Node {
-            let speculative = self.is_speculative(id);
+            let path = self.path(context.program, id);
             context.note(Note::Expanded { instance: id, state: state.id, path, speculative });
         }
+        self.grown_since_estimate += 1;
+        self.enqueue(id);
         id
     }
 }

@@ -1,17 +1,18 @@
-//! One visit of a state, and what it can name.
+//! One visit of a state in the window.
 
-use crate::analysis::{NodeNature, StateAnalysis};
-use crate::binding::{Names, Outputs};
+use super::environment::{Environment, Producer};
+use super::plan::{Outcome, Outcomes};
+use crate::analysis::NodeNature;
+use crate::binding::Outputs;
 use crate::interpreter::Interpreter;
-use imbl::OrdMap;
 use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, StateId};
 use ratn_model::program::{ABORTED, SUCCESS};
 use ratn_model::resource::Lease;
+use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use ratn_world::world::World;
-use std::borrow::Cow;
-use std::collections::BTreeMap;
+use std::cell::Cell;
+use std::sync::Arc;
 
 /// What an instance is in the window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -20,12 +21,20 @@ pub(crate) enum Role {
     Node,
     /// Decides between two branches.
     Condition,
+    /// Decides whether there is another iteration.
+    Test,
     /// Decides how often the body is expanded.
     Loop,
-    /// The preconditions of a composite state.
+    /// The preconditions and variables of a composite state.
     Entry,
-    /// The outputs, effects and resource operations of a composite state.
+    /// What a composite state still does when it is left.
     Exit,
+    /// Where regions begin.
+    Fork,
+    /// Where a region has ended.
+    RegionEnd,
+    /// Where all regions have ended: the decider.
+    Join,
     /// The end of the task.
     End,
 }
@@ -34,7 +43,8 @@ pub(crate) enum Role {
 ///
 /// ```text
 /// Expanded ─► Acquiring ─► Granted ─► Projecting ─► Granted ─► Running ─► Finished
-///     ▲            └───────────┴── its worker died ──┴────────────┘
+///     ▲            └───────────┴── its worker died ──┴────────────┘           │
+///     └───────────────────────── invalidated, tried again ────────────────────┘
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Status {
@@ -53,26 +63,37 @@ pub(crate) enum Status {
 }
 
 /// What an instance waits for; for people.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) enum Wait {
     /// Nothing that is known.
+    #[default]
     Nothing,
     /// The output of another instance.
-    Data(StateId),
-    /// Facts that an older instance has yet to make known.
-    World(Footprint),
-    /// The environment does not look yet as it will at this place of the program.
-    Environment,
+    Data(InstanceId),
+    /// What an older instance makes of the facts it reads.
+    World(InstanceId),
+    /// The environment does not look yet as it will at this place of the program: an older instance has yet to change it.
+    Environment(InstanceId),
     /// Every older instance must have retired.
     Order,
     /// A sensing node is looking at what it would change.
     Sensing(InstanceId),
     /// A motion is changing what it would look at.
     Writer(InstanceId),
-    /// A precondition that does not hold in its projection.
-    Precondition(String),
     /// A task resource that an older instance operates on.
-    TaskResource(String),
+    TaskResource(InstanceId),
+    /// The same visit on another branch is computing the same.
+    Twin(InstanceId),
+    /// A condition on its path.
+    Decision(InstanceId),
+    /// A result that may still change.
+    Settling(InstanceId),
+    /// Its next try.
+    Backoff,
+    /// The operator.
+    Pause,
+    /// Room: what is speculative leaves some to what is not.
+    Room,
     /// The resource manager.
     Resources,
 }
@@ -80,7 +101,7 @@ pub(crate) enum Wait {
 /// How an instance ended.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Ended {
-    pub(crate) outcome: String,
+    pub(crate) outcome: Arc<str>,
     pub(crate) outputs: Outputs,
     pub(crate) reason: String,
     pub(crate) changes: Changed,
@@ -97,68 +118,99 @@ pub(crate) enum Changed {
 }
 
 impl Ended {
+    pub(crate) fn with(outcome: impl Into<Arc<str>>, outputs: Outputs) -> Ended {
+        Ended { outcome: outcome.into(), outputs, reason: String::new(), changes: Changed::Declared(Vec::new()) }
+    }
+
     pub(crate) fn success(outputs: Outputs) -> Ended {
-        let changes = Changed::Declared(Vec::new());
-        Ended { outcome: SUCCESS.to_owned(), outputs, reason: String::new(), changes }
+        Ended::with(SUCCESS, outputs)
     }
 
     /// It was never executed, or nobody knows how far: it changes nothing.
     pub(crate) fn aborted(reason: String) -> Ended {
         let changes = Changed::Exactly(Vec::new());
-        Ended { outcome: ABORTED.to_owned(), outputs: Outputs::new(), reason, changes }
-    }
-
-    /// Facts as measured.
-    pub(crate) fn measured(&self) -> &[(FactKey, Value)] {
-        match &self.changes {
-            Changed::Declared(measured) => measured,
-            Changed::Exactly(_) => &[],
-        }
+        Ended { outcome: ABORTED.into(), outputs: Outputs::new(), reason, changes }
     }
 }
 
-/// Variables, and which instance last wrote a state's outputs, on the way to one place of the program. Cloning is cheap.
+/// What a result was made of.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Environment {
-    pub(crate) variables: OrdMap<String, Value>,
-    pub(crate) producers: OrdMap<StateId, InstanceId>,
+pub(crate) struct Seen {
+    /// The facts that it may have read.
+    pub(crate) read: Vec<Footprint>,
+    /// As they were.
+    pub(crate) facts: Vec<(FactKey, Value)>,
+    /// Its inputs.
+    pub(crate) inputs: Outputs,
 }
+
+/// One continuation.
+#[derive(Debug, Clone)]
+pub(crate) struct Arm {
+    pub(crate) outcomes: Outcomes,
+    /// The one that the path assumes where they differ in effects.
+    pub(crate) outcome: Outcome,
+    pub(crate) next: Option<InstanceId>,
+    pub(crate) segment: Segment,
+}
+
+/// A stretch of the window between two decisions. 0 and every one whose decision is made are certain.
+pub(crate) type Segment = u64;
+/// A thread of control: the task's, or a region's.
+pub(crate) type Line = u64;
 
 /// One visit of a state.
 pub(crate) struct Instance {
     pub(crate) id: InstanceId,
     pub(crate) state: StateId,
+    pub(crate) visit: u32,
+    pub(crate) iteration: Option<usize>,
     pub(crate) role: Role,
     pub(crate) nature: NodeNature,
-    pub(crate) path: String,
     pub(crate) environment: Environment,
-    /// The one before it in program order; `None` when that has retired.
-    pub(crate) older: Option<InstanceId>,
-    /// The branch it assumes, when `older` is an undecided condition.
-    pub(crate) assumption: Option<bool>,
-    /// Those after it: one, or one per branch.
-    pub(crate) next: Vec<InstanceId>,
+    pub(crate) producer: Option<Arc<Producer>>,
+    pub(crate) line: Line,
+    pub(crate) segment: Segment,
+    /// How many instances of its line are before it on its path.
+    pub(crate) position: u64,
+    /// What follows: one arm, or one per branch. Empty where the path ends or nothing is expanded behind it yet.
+    pub(crate) arms: Vec<Arm>,
+    /// Exit, RegionEnd, End: the outcome by which the state is left.
+    pub(crate) leaves_by: Outcome,
+    /// Why it is left by that outcome.
+    pub(crate) left_because: Option<Arc<str>>,
+    /// It may start: everything older has retired, or runs imprecisely beside it.
+    pub(crate) is_head: bool,
+    /// Retired in order while it runs: an imprecise PIA.
+    pub(crate) detached: bool,
+    pub(crate) queued: bool,
     pub(crate) status: Status,
     pub(crate) wait: Wait,
+    /// Every goal and every projection has one of its own.
     pub(crate) attempt: u32,
-    /// How many attempts its worker's death has cost; stepping back costs none.
+    /// Of `retry`, from 1.
+    pub(crate) tries: u32,
+    /// How many attempts its worker's death has cost.
     pub(crate) crashes: u32,
-    pub(crate) lease: Option<Lease>,
+    pub(crate) not_before: Timestamp,
+    pub(crate) lease: Option<Box<Lease>>,
     pub(crate) projection: Option<ProjectionId>,
-    pub(crate) ended: Option<Ended>,
+    pub(crate) ended: Option<Box<Ended>>,
     /// Its result cannot change any more.
-    pub(crate) settled: bool,
+    pub(crate) settled: Cell<bool>,
     pub(crate) routine: Option<Box<Interpreter>>,
+    pub(crate) seen: Option<Box<Seen>>,
+    /// To be looked at again when this ends, settles, retires or is squashed.
+    pub(crate) waiters: Vec<InstanceId>,
+    /// Those whose results were made of this one's outputs or effects.
+    pub(crate) users: Vec<InstanceId>,
     /// Estimated, in seconds.
-    pub(crate) duration_s: f64,
-    /// The longest estimated path from its start to the end of the window.
-    pub(crate) remaining_s: f64,
-    /// What it read, sensed or may write, as bound when it began.
-    pub(crate) reads: Footprint,
-    pub(crate) senses: Footprint,
-    pub(crate) writes: Footprint,
-    /// The world that it began in, unless that was the actual one.
-    pub(crate) seen: Option<World>,
+    pub(crate) duration_s: f32,
+    /// The longest estimated path from its start to the end of the window, or what a look ahead advised.
+    pub(crate) remaining_s: f32,
+    pub(crate) advised: bool,
+    /// The priority it asked with.
+    pub(crate) asked_with: i64,
 }
 
 impl Instance {
@@ -167,14 +219,15 @@ impl Instance {
         matches!(self.status, Status::Acquiring | Status::Granted | Status::Projecting | Status::Running)
     }
 
-    /// Whether it decides control flow and has not yet.
+    /// Whether there are several ways on and it is not known which.
     pub(crate) fn is_undecided(&self) -> bool {
-        self.role == Role::Condition && self.ended.is_none()
+        self.arms.len() > 1
     }
 
-    /// Whether its result is known and good.
-    pub(crate) fn succeeded(&self) -> bool {
-        self.ended.as_ref().is_some_and(|ended| ended.outcome == SUCCESS)
+    /// Its outputs, if it has ended well.
+    pub(crate) fn outputs(&self) -> Option<&Outputs> {
+        let ended = self.ended.as_ref()?;
+        gives_outputs(&ended.outcome).then_some(&ended.outputs)
     }
 
     /// Whether it is an action or routine that may change the environment.
@@ -183,57 +236,7 @@ impl Instance {
     }
 }
 
-/// Instances that are in the window, and the outputs of those that have retired.
-#[derive(Default)]
-pub(crate) struct Instances {
-    pub(crate) alive: BTreeMap<InstanceId, Instance>,
-    pub(crate) retired: BTreeMap<InstanceId, Outputs>,
-}
-
-impl Instances {
-    /// The outputs of an instance that has ended with success.
-    pub(crate) fn outputs(&self, id: InstanceId) -> Option<&Outputs> {
-        match self.alive.get(&id) {
-            Some(instance) if instance.succeeded() => instance.ended.as_ref().map(|e| &e.outputs),
-            Some(_) => None,
-            None => self.retired.get(&id),
-        }
-    }
-
-    /// The first of the states whose output is not there yet.
-    pub(crate) fn missing_flow(&self, environment: &Environment, analysis: &StateAnalysis) -> Option<StateId> {
-        analysis
-            .flows
-            .iter()
-            .copied()
-            .find(|state| environment.producers.get(state).is_none_or(|producer| self.outputs(*producer).is_none()))
-    }
-
-    /// Whether every one of the states' outputs is there and cannot change any more.
-    pub(crate) fn flows_settled(&self, environment: &Environment, flows: &[StateId]) -> bool {
-        flows.iter().all(|state| match environment.producers.get(state) {
-            None => false,
-            Some(producer) => match self.alive.get(producer) {
-                Some(instance) => instance.settled && instance.succeeded(),
-                None => self.retired.contains_key(producer),
-            },
-        })
-    }
-}
-
-/// The names of one place of the program.
-pub(crate) struct PlaceNames<'a> {
-    pub(crate) instances: &'a Instances,
-    pub(crate) environment: &'a Environment,
-}
-
-impl Names for PlaceNames<'_> {
-    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.environment.variables.get(name).map(Cow::Borrowed)
-    }
-
-    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
-        let producer = self.environment.producers.get(&state)?;
-        self.instances.outputs(*producer)?.get(port).map(Cow::Borrowed)
-    }
+/// Whether outputs and assignments count after this outcome.
+pub(crate) fn gives_outputs(outcome: &str) -> bool {
+    !matches!(outcome, ABORTED | ratn_model::program::PREEMPTED)
 }

@@ -1,36 +1,64 @@
 //! The window: the instances expanded and not yet retired, executed out of order.
 //!
-//! After every event the window is grown ([`expand`]), surveyed in program order ([`survey`]: what can begin, what can be
-//! decided) and its oldest instances are retired ([`retire`]), until nothing changes any more. Retirement is in program
-//! order, so the root world always is the world after a prefix of the program: a failure is precise, and a projection is the
-//! root plus the effects of the older instances on the path.
+//! An event touches the instances that it is about and those that wait for them: each waits for one older instance at a time
+//! ([`ready`]). What holds at a place of the program is looked up along the chains of older writers ([`view`]), never copied.
+//! Lines retire in program order ([`retire`]), so the root world always is the world after a prefix of the program: a failure is
+//! precise, and a projection is the root plus the effects of the older instances on the path.
 //!
-//! Three moments of a result: *finished* feeds data flows and projections; *settled* cannot change any more (its path is
-//! decided, its inputs are settled, nobody older will write what it read) and decides conditions and loops; *retired* is real.
+//! Three moments of a result: *finished* feeds data flows and projections; *settled* cannot change any more ([`settle`]) and
+//! decides conditions and loops; *retired* is real.
+//!
+//! | | |
+//! |---|---|
+//! | growing | [`cursor`], [`expand`], [`concurrency`], [`environment`] |
+//! | beginning | [`ready`], [`begin`], [`priority`], [`hold`], [`timers`] |
+//! | ending | [`decide`], [`settle`], [`retire`], [`revalidate`], [`squash`], [`twins`] |
 
 mod begin;
+mod concurrency;
+mod cursor;
 mod decide;
-mod deviation;
+mod environment;
 mod expand;
+mod hold;
 mod instance;
-mod place;
+mod instances;
+mod plan;
 mod priority;
+mod ready;
 mod retire;
-mod survey;
+mod revalidate;
+mod segment;
+mod settle;
+mod squash;
+mod table;
+mod timers;
+mod twins;
+mod view;
 
+use crate::analysis::Analysis;
 use crate::binding;
 use crate::context::Context;
 use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
-use crate::protocol::{Command, Event, Note};
-use expand::Cursor;
-use instance::{Changed, Ended, Instance, Instances, Status};
+use crate::protocol::{Command, Event, Learned, Note};
+use concurrency::{Fork, Thread};
+use cursor::{Cursor, Todo};
+use environment::{Binding, Environment, Link, assigned};
+use hold::Hold;
+use instance::{Changed, Ended, Instance, Line, Role, Segment, Status, Wait};
+use instances::Instances;
+use plan::{Plan, Predicate};
 use ratn_model::id::InstanceId;
-use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, StateKind};
+use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind};
+use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_world::tolerance::Tolerance;
-use std::collections::BTreeMap;
-
-pub(crate) use instance::Wait;
+use segment::Branch;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
+use timers::Timer;
+use twins::Twins;
+use view::Sight;
 
 /// How a run ended.
 #[derive(Debug, Clone, PartialEq)]
@@ -42,52 +70,118 @@ pub(crate) struct End {
 
 /// CDTN mode.
 pub(crate) struct Window {
+    plan: Arc<Plan>,
+    tolerance: Tolerance,
+    learned: Learned,
+    capacity: BTreeMap<String, u32>,
+    speculation_width: usize,
     instances: Instances,
     cursors: Vec<Cursor>,
-    /// The oldest instance in the window.
-    oldest: Option<InstanceId>,
+    threads: BTreeMap<Line, Thread>,
+    branches: BTreeMap<Segment, Branch>,
+    forks: BTreeMap<InstanceId, Fork>,
+    joins: BTreeMap<InstanceId, Vec<(Predicate, Link)>>,
+    /// To be looked at.
+    queue: VecDeque<InstanceId>,
+    /// Nodes under way.
+    active: BTreeSet<InstanceId>,
+    detached: BTreeSet<InstanceId>,
+    /// Speculative nodes that leave room.
+    stalled: Vec<InstanceId>,
+    twins: Twins,
+    timers: BTreeSet<(Timestamp, Timer)>,
+    hold: Hold,
     end: Option<End>,
-    tolerance: Tolerance,
-    /// Retirements since the outputs that nobody can name any more were dropped.
-    retired_since_sweep: usize,
+    is_ending: bool,
+    next_segment: Segment,
+    next_line: Line,
+    next_order: u64,
+    grown_since_estimate: usize,
 }
 
-/// Outputs of retired instances are swept after this many retirements.
-const SWEEP_INTERVAL: usize = 64;
+/// The task's own line.
+const MAIN: Line = 0;
 
 impl Window {
     /// A window at the beginning of the program.
-    pub(crate) fn new(parameters: &BTreeMap<String, Value>, tolerance: Tolerance) -> Window {
+    pub(crate) fn new(
+        program: &Program,
+        analysis: &Analysis,
+        parameters: &BTreeMap<String, Value>,
+        capacity: BTreeMap<String, u32>,
+        learned: Learned,
+        tolerance: Tolerance,
+    ) -> Window {
+        let plan = Arc::new(Plan::of(program, analysis));
+        let mut environment = Environment::new(&plan);
+        for (name, value) in parameters {
+            environment.variables.declare(name, Binding::Known(value.clone()));
+        }
+        let cursor = Cursor {
+            environment,
+            tail: None,
+            line: MAIN,
+            segment: 0,
+            position: 0,
+            todo: Todo::Enter(Program::ROOT),
+            probability: 1.0,
+            because: None,
+            idle: 0,
+            order: 0,
+        };
         Window {
-            instances: Instances::default(),
-            cursors: vec![Cursor::start(parameters.clone())],
-            oldest: None,
-            end: None,
+            plan,
             tolerance,
-            retired_since_sweep: 0,
+            learned,
+            capacity,
+            speculation_width: program.speculation_width,
+            instances: Instances::default(),
+            cursors: vec![cursor],
+            threads: BTreeMap::from([(MAIN, Thread { is_active: true, ..Thread::default() })]),
+            branches: BTreeMap::new(),
+            forks: BTreeMap::new(),
+            joins: BTreeMap::new(),
+            queue: VecDeque::new(),
+            active: BTreeSet::new(),
+            detached: BTreeSet::new(),
+            stalled: Vec::new(),
+            twins: Twins::default(),
+            timers: BTreeSet::new(),
+            hold: Hold::default(),
+            end: None,
+            is_ending: false,
+            next_segment: 0,
+            next_line: MAIN,
+            next_order: 0,
+            grown_since_estimate: 0,
         }
     }
 
     /// Begins.
     pub(crate) fn start(&mut self, context: &mut Context<'_>) -> Option<End> {
+        if let Some(deadline_s) = context.program.deadline_s {
+            self.set_timer(context, deadline_s, Timer::Deadline);
+        }
         self.settle(context)
     }
 
     /// Takes an event; the end of the run, when this was it.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
+        self.fire(context);
         match event {
             Event::Granted { instance, lease } => {
                 if let Some(waiting) = self.with_status(instance, Status::Acquiring) {
-                    waiting.lease = Some(lease);
-                    waiting.status = Status::Granted;
+                    waiting.lease = Some(Box::new(lease));
+                    self.set_status(instance, Status::Granted, Wait::Nothing);
+                    self.proceed(context, instance);
                 } else {
                     self.in_routine(context, Event::Granted { instance, lease });
                 }
             }
             Event::Refused { instance, reason } => {
-                if let Some(waiting) = self.with_status(instance, Status::Acquiring) {
-                    waiting.status = Status::Finished;
-                    waiting.ended = Some(Ended::aborted(format!("its resources were refused: {reason}")));
+                if self.with_status(instance, Status::Acquiring).is_some() {
+                    self.active.remove(&instance);
+                    self.fail(context, instance, format!("its resources were refused: {reason}"));
                 } else {
                     self.in_routine(context, Event::Refused { instance, reason });
                 }
@@ -96,7 +190,8 @@ impl Window {
                 match self.with_status(instance, Status::Projecting) {
                     Some(waiting) if waiting.attempt == attempt => {
                         waiting.projection = Some(projection);
-                        waiting.status = Status::Granted;
+                        self.set_status(instance, Status::Granted, Wait::Nothing);
+                        self.proceed(context, instance);
                     }
                     _ => self.in_routine(context, Event::Projected { instance, attempt, projection }),
                 }
@@ -105,7 +200,7 @@ impl Window {
                 match self.with_status(instance, Status::Running) {
                     Some(running) if running.attempt == attempt && running.routine.is_none() => {
                         let changes = Changed::Declared(measured);
-                        self.finish(context, instance, Ended { outcome, outputs, reason, changes });
+                        self.goal_ended(context, instance, Ended { outcome: outcome.into(), outputs, reason, changes });
                     }
                     _ => {
                         let event = Event::Finished { instance, attempt, outcome, outputs, measured, reason };
@@ -113,52 +208,202 @@ impl Window {
                     }
                 }
             }
-            Event::Crashed { instance, attempt, reason } => match self.instances.alive.get(&instance) {
+            Event::Crashed { instance, attempt, reason } => match self.instances.get(instance) {
                 Some(at) if at.attempt == attempt && at.is_under_way() && at.routine.is_none() => {
                     self.crashed(context, instance, &reason);
                 }
                 _ => self.in_routine(context, Event::Crashed { instance, attempt, reason }),
             },
             Event::RetirementFailed { reason, .. } => {
-                return self.stop(context, ABORTED, format!("what had happened could not be recorded: {reason}"));
+                self.stop(context, ABORTED, format!("what had happened could not be recorded: {reason}"));
             }
-            Event::AbortRequested { reason } => return self.stop(context, PREEMPTED, reason),
-            _ => {}
+            Event::AbortRequested { reason } => self.stop(context, PREEMPTED, reason),
+            Event::PauseRequested => self.hold = Hold::Paused(0),
+            Event::ResumeRequested => {
+                self.hold = Hold::Running;
+                self.look_at_heads();
+            }
+            Event::StepRequested => {
+                self.hold.step();
+                self.look_at_heads();
+            }
+            Event::Advised { urgency_s } => self.advise(context, &urgency_s),
+            Event::Woken => self.wake_routines(context),
+            Event::Started { .. } | Event::Progressed { .. } => {}
         }
         self.settle(context)
     }
 
     /// What every instance that has not begun waits for.
-    pub(crate) fn waits(&self) -> impl Iterator<Item = (&str, &Wait)> {
-        let waiting = |i: &&Instance| matches!(i.status, Status::Expanded | Status::Acquiring);
-        self.instances.alive.values().filter(waiting).map(|i| (i.path.as_str(), &i.wait))
+    pub(crate) fn waits(&self, program: &Program) -> Vec<String> {
+        let waiting = |i: &&Instance| i.role == Role::Node && matches!(i.status, Status::Expanded | Status::Acquiring);
+        self.instances.iter().filter(waiting).map(|i| self.sentence(program, i)).collect()
     }
 
-    /// The path of an instance in the window.
-    pub(crate) fn path(&self, id: InstanceId) -> &str {
-        self.instances.alive.get(&id).map_or("", |i| &i.path)
+    fn sentence(&self, program: &Program, instance: &Instance) -> String {
+        let path = self.path(program, instance.id);
+        let named = |id: InstanceId| self.path(program, id);
+        match instance.wait {
+            Wait::Nothing => format!("{path} has just been expanded"),
+            Wait::Data(id) => format!("{path} waits for an output of {}", named(id)),
+            Wait::World(id) => format!("{path} waits for {} to be known or done, whose effects it reads", named(id)),
+            Wait::Environment(id) => {
+                format!("{path} waits for the environment to look as it does at its place: {} changes it", named(id))
+            }
+            Wait::Order => format!("{path} waits for every older state to have ended"),
+            Wait::Sensing(id) => format!("{path} waits for {} to have looked", named(id)),
+            Wait::Writer(id) => format!("{path} waits for {} to stop moving", named(id)),
+            Wait::TaskResource(id) => format!("{path} waits for {}, which operates on a resource it uses", named(id)),
+            Wait::Twin(id) => format!("{path} waits for {}, which computes the same on another branch", named(id)),
+            Wait::Decision(id) => format!("{path} waits for the decision of {}", named(id)),
+            Wait::Settling(id) => format!("{path} waits until the result of {} cannot change any more", named(id)),
+            Wait::Backoff => format!("{path} waits before it is tried again"),
+            Wait::Pause => format!("{path} waits for the operator"),
+            Wait::Room => format!("{path} is speculative and leaves room to what is not"),
+            Wait::Resources => format!("{path} waits for the resource manager"),
+        }
+    }
+
+    /// The path of an instance, with visits.
+    fn path(&self, program: &Program, id: InstanceId) -> String {
+        self.instances.get(id).map_or(String::new(), |instance| {
+            let state = program.state(instance.state);
+            instance.environment.path(&state.name, instance.visit, instance.iteration)
+        })
+    }
+
+    fn sight<'a>(&'a self, context: &'a Context<'_>) -> Sight<'a> {
+        Sight {
+            program: context.program,
+            analysis: context.analysis,
+            plan: &self.plan,
+            root: context.root,
+            instances: &self.instances,
+            detached: &self.detached,
+            joins: &self.joins,
+        }
     }
 
     fn with_status(&mut self, id: InstanceId, status: Status) -> Option<&mut Instance> {
-        self.instances.alive.get_mut(&id).filter(|i| i.status == status)
+        self.instances.get_mut(id).filter(|i| i.status == status)
     }
 
-    /// Grows, surveys and retires until nothing changes.
-    fn settle(&mut self, context: &mut Context<'_>) -> Option<End> {
-        loop {
-            let grew = self.expand(context);
-            if grew {
-                self.estimate(context);
-            }
-            let moved = self.survey(context);
-            let retired = self.retire(context);
-            if self.end.is_some() || !(grew || moved || retired) {
-                return self.end.clone();
+    fn set_status(&mut self, id: InstanceId, status: Status, wait: Wait) {
+        if let Some(instance) = self.instances.get_mut(id) {
+            instance.status = status;
+            instance.wait = wait;
+        }
+    }
+
+    /// It waits, for one instance or for somebody to look at it again.
+    fn wait(&mut self, id: InstanceId, wait: Wait) {
+        if let Some(instance) = self.instances.get_mut(id) {
+            instance.wait = wait;
+        }
+        if let Some(on) = wait.on() {
+            match self.instances.get_mut(on) {
+                Some(other) => other.waiters.push(id),
+                // It went on meanwhile.
+                None => self.enqueue(id),
             }
         }
     }
 
-    /// An event for a node inside of a routine.
+    fn wake_waiters(&mut self, id: InstanceId) {
+        let Some(instance) = self.instances.get_mut(id) else { return };
+        for waiter in std::mem::take(&mut instance.waiters) {
+            self.enqueue(waiter);
+        }
+    }
+
+    fn enqueue(&mut self, id: InstanceId) {
+        if let Some(instance) = self.instances.get_mut(id)
+            && !instance.queued
+        {
+            instance.queued = true;
+            self.queue.push_back(id);
+        }
+    }
+
+    /// It does not hold anything any more, nor does it act or look.
+    fn is_idle(&mut self, id: InstanceId) {
+        self.active.remove(&id);
+        self.wake_waiters(id);
+        for id in std::mem::take(&mut self.stalled) {
+            self.enqueue(id);
+        }
+    }
+
+    fn look_at_heads(&mut self) {
+        let heads: Vec<InstanceId> = self.threads.values().filter_map(|thread| thread.head).collect();
+        for head in heads {
+            self.enqueue(head);
+        }
+    }
+
+    /// Looks, retires and grows until nothing changes.
+    fn settle(&mut self, context: &mut Context<'_>) -> Option<End> {
+        loop {
+            while let Some(id) = self.queue.pop_front() {
+                if let Some(instance) = self.instances.get_mut(id) {
+                    instance.queued = false;
+                    self.examine(context, id);
+                }
+                if self.end.is_some() {
+                    return self.end.take();
+                }
+            }
+            let retired = self.retire(context);
+            let grew = self.expand(context);
+            if grew {
+                self.estimate(context);
+            }
+            if self.end.is_some() {
+                return self.end.take();
+            }
+            if !retired && !grew && self.queue.is_empty() {
+                return None;
+            }
+        }
+    }
+
+    fn examine(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.instances.get(id) else { return };
+        match (instance.role, instance.status) {
+            (Role::Node, Status::Expanded) => self.begin(context, id),
+            (Role::Node, Status::Finished) if instance.is_undecided() => self.decide_by_outcome(context, id),
+            (Role::Condition | Role::Test, Status::Expanded) => self.decide(context, id),
+            (Role::Loop, Status::Expanded) => self.count(context, id),
+            (Role::Join, Status::Expanded) => self.decide_join(context, id),
+            (Role::Entry | Role::Exit, Status::Expanded) => self.compute_boundary(context, id),
+            (Role::Fork, Status::Expanded) => self.end_instance(id, Ended::success(binding::Outputs::new())),
+            (Role::End, Status::Expanded) => self.end_run(context, id),
+            _ => {}
+        }
+    }
+
+    /// A node with several ways on has ended: its outcome decides once it cannot change any more.
+    fn decide_by_outcome(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        if let Some(blocker) = self.unsettled(context, id, 0) {
+            return self.wait(id, Wait::Settling(blocker));
+        }
+        let Some(instance) = self.instances.get(id) else { return };
+        let Some(ended) = &instance.ended else { return };
+        // `requires` is evaluated on the actual world when it retires, and may make another outcome of it.
+        if !context.program.state(instance.state).annotations.requires.is_empty() {
+            return;
+        }
+        let number = self.plan.state(instance.state).outcome(&ended.outcome);
+        let arm = number.and_then(|n| instance.arms.iter().position(|arm| arm.outcomes & (1 << n) != 0));
+        let decision = ended.outcome.to_string();
+        if let Some(arm) = arm {
+            let path = self.path(context.program, id);
+            context.note(Note::Decided { instance: id, path, decision });
+            self.take_arm(context, id, arm);
+        }
+    }
+
+    /// An event for the nodes inside of a routine.
     fn in_routine(&mut self, context: &mut Context<'_>, event: Event) {
         let inside = match &event {
             Event::Granted { instance, .. }
@@ -168,57 +413,134 @@ impl Window {
             | Event::Crashed { instance, .. } => *instance,
             _ => return,
         };
-        let routine = self
-            .instances
-            .alive
-            .values_mut()
-            .find(|i| i.routine.as_ref().is_some_and(|routine| routine.instance() == Some(inside)));
-        let Some(instance) = routine else { return };
-        let (id, Some(interpreter)) = (instance.id, instance.routine.as_mut()) else { return };
+        let routine = self.active.iter().copied().find(|id| {
+            let routine = self.instances.get(*id).and_then(|i| i.routine.as_ref());
+            routine.is_some_and(|routine| routine.instance() == Some(inside))
+        });
+        if let Some(routine) = routine {
+            self.tell_routine(context, routine, event);
+        }
+    }
+
+    /// Time has passed for the nodes inside of routines, too.
+    fn wake_routines(&mut self, context: &mut Context<'_>) {
+        let active = self.active.iter().copied();
+        let routines: Vec<InstanceId> =
+            active.filter(|id| self.instances.get(*id).is_some_and(|i| i.routine.is_some())).collect();
+        for routine in routines {
+            self.tell_routine(context, routine, Event::Woken);
+        }
+    }
+
+    fn tell_routine(&mut self, context: &mut Context<'_>, id: InstanceId, event: Event) {
+        let Some(interpreter) = self.instances.get_mut(id).and_then(|i| i.routine.as_mut()) else { return };
         let progress = interpreter.handle(context, event);
         self.routine_progressed(context, id, progress);
     }
 
     fn routine_progressed(&mut self, context: &mut Context<'_>, id: InstanceId, progress: Progress) {
         let Progress::Ended { outcome, reason } = progress else { return };
-        let Some(instance) = self.instances.alive.get_mut(&id) else { return };
+        let Some(instance) = self.instances.get_mut(id) else { return };
         let Some(routine) = instance.routine.take() else { return };
-        instance.lease = routine.lease().cloned();
+        instance.lease = routine.lease().cloned().map(Box::new);
         let outputs = routine.outputs().get(&instance.state).cloned().unwrap_or_default();
         let changes = Changed::Exactly(routine.into_changes());
-        self.finish(context, id, Ended { outcome, outputs, reason, changes });
+        self.finish(context, id, Ended { outcome: outcome.into(), outputs, reason, changes });
+    }
+
+    /// A goal has ended: that is the result, unless it is tried again.
+    fn goal_ended(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
+        let Some(instance) = self.instances.get_mut(id) else { return };
+        let state = context.program.state(instance.state);
+        if let (Some(retry), ABORTED) = (state.annotations.retry, &*ended.outcome)
+            && instance.tries <= retry.count
+        {
+            let pause_s = retry.backoff_s * f64::from(2_u32.saturating_pow(instance.tries - 1));
+            give_back(context, instance);
+            instance.tries += 1;
+            instance.attempt += 1;
+            instance.status = Status::Expanded;
+            instance.wait = Wait::Backoff;
+            instance.seen = None;
+            instance.not_before = context.now + std::time::Duration::try_from_secs_f64(pause_s).unwrap_or_default();
+            let due = instance.not_before <= context.now;
+            self.is_idle(id);
+            if due {
+                self.enqueue(id);
+            } else {
+                self.set_timer(context, pause_s, Timer::Retry(id));
+            }
+            return;
+        }
+        self.finish(context, id, ended);
     }
 
     /// A node's result is known: it gives back what it held.
     fn finish(&mut self, context: &mut Context<'_>, id: InstanceId, mut ended: Ended) {
-        let Some(instance) = self.instances.alive.get_mut(&id) else { return };
-        if let StateKind::Action { outputs, .. } = &context.program.state(instance.state).kind
-            && ended.outcome == SUCCESS
+        let Some(instance) = self.instances.get(id) else { return };
+        let state = context.program.state(instance.state);
+        if let StateKind::Action { outputs, .. } = &state.kind
+            && &*ended.outcome == SUCCESS
             && let Some(problem) = binding::missing_output(outputs, &ended.outputs)
         {
             ended = Ended { changes: ended.changes, ..Ended::aborted(problem) };
         }
-        context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
-        instance.status = Status::Finished;
+        if self.plan.state(instance.state).outcome(&ended.outcome).is_none() {
+            let problem = format!("it ended with `{}`, which is no outcome of its action", ended.outcome);
+            ended = Ended { changes: ended.changes, ..Ended::aborted(problem) };
+        }
+        if let Err(problem) = self.assign(context, id, &mut ended) {
+            ended = Ended { changes: ended.changes, ..Ended::aborted(problem) };
+        }
+        let Some(instance) = self.instances.get_mut(id) else { return };
+        context.note(Note::Finished { instance: id, outcome: ended.outcome.to_string() });
         give_back(context, instance);
-        instance.ended = Some(ended);
+        let detached = instance.detached;
+        self.is_idle(id);
+        self.end_instance(id, ended);
+        if detached {
+            self.retire_detached(context, id);
+        }
+    }
+
+    /// What an action assigns to variables is part of its result.
+    fn assign(&self, context: &Context<'_>, id: InstanceId, ended: &mut Ended) -> Result<(), String> {
+        let Some(instance) = self.instances.get(id) else { return Ok(()) };
+        let state = context.program.state(instance.state);
+        let is_action = matches!(state.kind, StateKind::Action { .. });
+        if state.assign.is_empty() || !is_action || !instance::gives_outputs(&ended.outcome) {
+            return Ok(());
+        }
+        let mut values = Vec::new();
+        for (name, expression) in &state.assign {
+            let view = self.sight(context).view(instance, Some(&ended.outputs));
+            let value = expression.evaluate(&view);
+            let value =
+                value.map_err(|e| binding::BindError::at(format!("`assign` of `{name}`"), state)(e).reason())?;
+            values.push((assigned(name), value));
+        }
+        ended.outputs.extend(values);
+        Ok(())
     }
 
     /// An attempt ended without an answer.
     fn crashed(&mut self, context: &mut Context<'_>, id: InstanceId, reason: &str) {
-        let Some(instance) = self.instances.alive.get_mut(&id) else { return };
+        let Some(instance) = self.instances.get_mut(id) else { return };
         let limit = context.program.state(instance.state).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
         give_back(context, instance);
         instance.crashes += 1;
-        if instance.is_pia() || instance.crashes >= limit {
-            let reason = format!("crashed in attempt {}: {reason}", instance.attempt);
-            context.note(Note::Finished { instance: id, outcome: ABORTED.to_owned() });
-            instance.status = Status::Finished;
-            instance.ended = Some(Ended::aborted(reason));
-        } else {
+        let ends = instance.is_pia() || instance.crashes >= limit;
+        let attempt = instance.attempt;
+        self.is_idle(id);
+        if ends {
+            return self.finish(context, id, Ended::aborted(format!("crashed in attempt {attempt}: {reason}")));
+        }
+        if let Some(instance) = self.instances.get_mut(id) {
             instance.attempt += 1;
             instance.status = Status::Expanded;
+            instance.seen = None;
         }
+        self.enqueue(id);
     }
 }
 

@@ -1,71 +1,202 @@
 //! Dispatch order: not speculative before speculative, then the longest remaining path, then program order.
 //!
 //! The remaining path of a node is its estimated duration plus the longest of what waits for it: the readers of its
-//! outputs, and the next PIA in program order, which may not begin before every older instance has ended.
+//! outputs, and the next PIA in program order, which may not begin before every older instance has ended. A look ahead may
+//! have advised something better. A speculative node counts as much as its path is likely.
 
+use super::Window;
+use super::environment::Binding;
+use super::instance::{Instance, Role, Status};
+use crate::binding;
 use crate::context::Context;
-use crate::window::Window;
-use crate::window::instance::Role;
-use ratn_model::fact::Footprint;
+use crate::protocol::Command;
 use ratn_model::id::InstanceId;
-use std::collections::BTreeMap;
+use ratn_model::resource::{Requirement, ResourceOperation};
 
 /// From the top: one bit that says "not speculative", milliseconds of remaining path, program order.
 const REMAINING_BITS: u32 = 40;
 const ORDER_BITS: u32 = 20;
 
+/// Up to this many instances the window is estimated anew whenever it grew; beyond, when it grew by this share.
+const ALWAYS_ESTIMATED: usize = 64;
+const ESTIMATED_SHARE: usize = 2;
+
 impl Window {
-    /// Estimates durations and remaining paths of everything in the window.
-    pub(crate) fn estimate(&mut self, context: &Context<'_>) {
-        let mut after: BTreeMap<InstanceId, f64> = BTreeMap::new();
-        let mut next_pia: BTreeMap<InstanceId, f64> = BTreeMap::new();
-        let ids: Vec<InstanceId> = self.instances.alive.keys().rev().copied().collect();
+    /// Estimates durations and remaining paths of everything in the window, if enough has changed.
+    pub(super) fn estimate(&mut self, context: &Context<'_>) {
+        let enough = if self.instances.len() <= ALWAYS_ESTIMATED {
+            self.grown_since_estimate > 0
+        } else {
+            self.grown_since_estimate * ESTIMATED_SHARE >= self.instances.len()
+        };
+        if !enough {
+            return;
+        }
+        self.grown_since_estimate = 0;
+        let ids = self.instances.ids();
+        let size = usize::try_from(ids.end - ids.start).unwrap_or(0);
+        // By id: the longest path of those that read its outputs, and of the next PIA behind it.
+        let (mut readers, mut pias) = (vec![0.0_f32; size], vec![0.0_f32; size]);
+        let place = |id: InstanceId| {
+            id.0.checked_sub(ids.start).and_then(|at| usize::try_from(at).ok()).filter(|at| *at < size)
+        };
         // A younger instance always has a larger id.
-        for id in ids {
-            let duration_s = self.duration_s(context, id);
-            let Some(instance) = self.instances.alive.get_mut(&id) else { continue };
-            let pia_s = instance.next.iter().filter_map(|next| next_pia.get(next)).fold(0.0, |a: f64, b| a.max(*b));
-            let readers_s = after.get(&id).copied().unwrap_or(0.0);
-            instance.duration_s = duration_s;
-            instance.remaining_s = duration_s + pia_s.max(readers_s);
-            let remaining_s = instance.remaining_s;
-            next_pia.insert(id, if instance.is_pia() { remaining_s } else { pia_s });
-            let analysis = context.analysis.state(instance.state);
-            if instance.role == Role::Node {
-                for state in &analysis.flows {
-                    if let Some(producer) = instance.environment.producers.get(state) {
-                        let longest = after.entry(*producer).or_default();
-                        *longest = longest.max(remaining_s);
-                    }
+        for id in ids.clone().rev().map(InstanceId) {
+            let Some(instance) = self.instances.get(id) else { continue };
+            let Some(at) = place(id) else { continue };
+            let behind = instance.arms.iter().filter_map(|arm| arm.next);
+            let join = match instance.role {
+                Role::RegionEnd => self.threads.get(&instance.line).and_then(|t| self.forks.get(&t.fork?)?.join),
+                _ => None,
+            };
+            let pia_s = behind.chain(join).filter_map(place).fold(0.0_f32, |most, next| most.max(pias[next]));
+            let duration_s = self.duration_s(context, instance);
+            let remaining_s = duration_s + pia_s.max(readers[at]);
+            pias[at] = if instance.is_pia() { remaining_s } else { pia_s };
+            let environment = &instance.environment;
+            let own = self.plan.state(instance.state);
+            let needs = match instance.role {
+                Role::Node => context.analysis.state(instance.state).flows.as_slice(),
+                _ => own.flows.as_slice(),
+            };
+            let assigned = own.variables.iter().filter_map(|name| match environment.variables.get(name)? {
+                Binding::Assigned(producer) => Some(producer),
+                Binding::Known(_) => None,
+            });
+            for producer in needs.iter().filter_map(|state| environment.producer(*state)).chain(assigned) {
+                if let Some(at) = place(producer.instance) {
+                    readers[at] = readers[at].max(remaining_s);
+                }
+            }
+            if let Some(instance) = self.instances.get_mut(id) {
+                instance.duration_s = duration_s;
+                if !instance.advised {
+                    instance.remaining_s = remaining_s;
                 }
             }
         }
     }
 
-    fn duration_s(&self, context: &Context<'_>, id: InstanceId) -> f64 {
-        let Some(instance) = self.instances.alive.get(&id) else { return 0.0 };
-        if instance.role != Role::Node {
-            return 0.0;
+    fn duration_s(&self, context: &Context<'_>, instance: &Instance) -> f32 {
+        let state = context.program.state(instance.state);
+        if instance.role != Role::Node || state.annotations.duration_s.is_none() {
+            return instance.duration_s;
         }
-        let names =
-            crate::window::instance::PlaceNames { instances: &self.instances, environment: &instance.environment };
-        let scope = crate::binding::Bindings {
-            names: &names,
-            outputs: None,
-            world: context.root,
-            unknown: &Footprint::Everything,
-        };
-        crate::binding::expected_s(context.program.state(instance.state), &scope).unwrap_or(instance.duration_s)
+        if self.learned.durations_s.contains_key(&state.path) {
+            return instance.duration_s;
+        }
+        let view = self.sight(context).view(instance, None);
+        binding::expected_s(state, &view).map_or(instance.duration_s, |seconds| seconds as f32)
     }
 
     /// The priority of an acquire: larger first.
-    pub(crate) fn priority(&self, id: InstanceId, speculative: bool) -> i64 {
-        let remaining_s = self.instances.alive.get(&id).map_or(0.0, |i| i.remaining_s);
+    pub(super) fn priority(&self, instance: &Instance) -> i64 {
+        let certain = i64::from(!self.is_speculative(instance.segment));
+        let remaining_s = instance.remaining_s * self.probability(instance.segment);
         let greatest = |bits: u32| (1_i64 << bits) - 1;
-        let remaining = ((remaining_s * 1000.0) as i64).clamp(0, greatest(REMAINING_BITS));
+        let remaining = (f64::from(remaining_s) * 1000.0).round() as i64;
+        let remaining = remaining.clamp(0, greatest(REMAINING_BITS));
         // Ids grow in program order.
-        let order = i64::try_from(id.0).unwrap_or(i64::MAX).min(greatest(ORDER_BITS));
-        let certain = i64::from(!speculative);
+        let order = i64::try_from(instance.id.0).unwrap_or(i64::MAX).min(greatest(ORDER_BITS));
         (certain << (REMAINING_BITS + ORDER_BITS)) | (remaining << ORDER_BITS) | (greatest(ORDER_BITS) - order)
+    }
+
+    /// A decision was made for its path: it is served before those for which none is.
+    pub(super) fn became_certain(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        self.ask_again(context, id);
+        self.enqueue(id);
+    }
+
+    /// Who waits for the resource manager asks again if its priority has changed.
+    fn ask_again(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.instances.get(id) else { return };
+        if instance.status != Status::Acquiring {
+            return;
+        }
+        let priority = self.priority(instance);
+        if priority == instance.asked_with {
+            return;
+        }
+        let state = context.program.state(instance.state);
+        let wanted = &context.analysis.state(instance.state).requirements;
+        let view = self.sight(context).view(instance, None);
+        let Ok(requirements) = binding::requirements(state, wanted, &view) else { return };
+        drop(view);
+        context.commands.push(Command::Withdraw { instance: id });
+        context.commands.push(Command::Acquire { instance: id, requirements, priority });
+        if let Some(instance) = self.instances.get_mut(id) {
+            instance.asked_with = priority;
+        }
+        self.preempt_for(context, id);
+    }
+
+    /// A look ahead found a better order.
+    pub(super) fn advise(&mut self, context: &mut Context<'_>, urgency_s: &[(InstanceId, f64)]) {
+        for (id, seconds) in urgency_s {
+            if let Some(instance) = self.instances.get_mut(*id)
+                && seconds.is_finite()
+            {
+                instance.remaining_s = *seconds as f32;
+                instance.advised = true;
+            }
+        }
+        let asking: Vec<InstanceId> = self.active.iter().copied().collect();
+        for id in asking {
+            self.ask_again(context, id);
+        }
+    }
+
+    /// A speculative node leaves room for projections to those that are not.
+    pub(super) fn leaves_room(&self, context: &Context<'_>, instance: &Instance, requirements: &[Requirement]) -> bool {
+        let kind = ratn_model::program::WORLD_MODEL;
+        if !self.is_speculative(instance.segment) || !requirements.iter().any(|r| r.kind == kind) {
+            return true;
+        }
+        let Some(capacity) = self.capacity.get(kind) else { return true };
+        let others = self.active.iter().filter_map(|id| self.instances.get(*id));
+        let taken = others
+            .filter(|other| self.is_speculative(other.segment))
+            .filter(|other| context.analysis.state(other.state).needs_world)
+            .count();
+        *capacity <= 1 || taken + 1 < *capacity as usize
+    }
+
+    /// Speculative holders give way to a node that is not speculative, where they keep it from its resources.
+    pub(super) fn preempt_for(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.instances.get(id) else { return };
+        if self.is_speculative(instance.segment) || self.branches.is_empty() {
+            return;
+        }
+        let needs = |state| -> Vec<(String, u32)> {
+            let blocks = context.analysis.state(state).requirements.iter();
+            let blocks = blocks.filter(|r| r.operation == ResourceOperation::Block);
+            blocks.map(|r| (r.kind.clone(), r.count)).collect()
+        };
+        for (kind, _) in needs(instance.state) {
+            let Some(capacity) = self.capacity.get(&kind).copied() else { continue };
+            let mut taken = 0;
+            let mut speculative: Vec<(i64, InstanceId, u32)> = Vec::new();
+            for other in self.active.iter().filter_map(|id| self.instances.get(*id)) {
+                let count: u32 = needs(other.state).iter().filter(|(k, _)| *k == kind).map(|(_, n)| n).sum();
+                let certain = !self.is_speculative(other.segment);
+                // What is not speculative and waits shall be served, too.
+                if count > 0 && (certain || other.lease.is_some()) {
+                    taken += count;
+                    if !certain {
+                        speculative.push((self.priority(other), other.id, count));
+                    }
+                }
+            }
+            speculative.sort_unstable();
+            for (_, holder, count) in speculative {
+                if taken <= capacity {
+                    break;
+                }
+                taken -= count;
+                context.note(crate::protocol::Note::Preempted { instance: holder, by: id });
+                self.step_back(context, holder, super::instance::Wait::Nothing);
+                self.enqueue(holder);
+            }
+        }
     }
 }

@@ -1,228 +1,331 @@
-//! Retirement and its opposite: what becomes real, what is discarded.
+//! Retirement: what becomes real. Every line retires in program order, so the root is the world after a prefix of the program
+//! (per region), and a failure leaves it so.
+//!
+//! A PIA with imprecise exceptions is passed over while it runs: it retires when it ends, and younger ones may run beside it.
 
+use super::Window;
+use super::cursor::{Cursor, Todo};
+use super::instance::{Changed, Line, Role, Status, Wait, gives_outputs};
+use super::plan::{Effects, Outcome};
 use crate::analysis::NodeNature;
 use crate::binding;
 use crate::context::Context;
 use crate::effects;
 use crate::protocol::{Command, Note};
-use crate::window::instance::{Changed, Ended, Role, Status};
-use crate::window::place::Place;
-use crate::window::{End, SWEEP_INTERVAL, Window, give_back};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, SUCCESS, StateKind};
-use std::collections::BTreeSet;
+use std::sync::Arc;
 
 impl Window {
-    /// Retires the oldest instances that have ended, in program order; whether there were any.
-    pub(crate) fn retire(&mut self, context: &mut Context<'_>) -> bool {
+    /// Retires what can be; whether there was anything.
+    pub(super) fn retire(&mut self, context: &mut Context<'_>) -> bool {
         let mut retired = false;
-        while let Some(id) = self.oldest {
-            let Some(instance) = self.instances.alive.get(&id) else { break };
-            if instance.status != Status::Finished {
-                break;
-            }
-            retired = true;
-            match self.make_real(context, id) {
-                Ok(()) => self.forget_retired(context, id),
-                Err((outcome, reason)) => {
-                    self.end = self.leave(context, id, &outcome, reason);
+        let mut last = None;
+        while let Some(line) = self.next_line_after(last) {
+            last = Some(line);
+            while let Some(id) = self.head_of(line) {
+                if self.pass_over(id) {
+                    retired = true;
+                    continue;
+                }
+                let finished = self.instances.get(id).is_some_and(|head| head.status == Status::Finished);
+                if !finished || !self.retire_head(context, id) {
                     break;
                 }
+                retired = true;
             }
         }
         retired
     }
 
-    /// The effects and resource operations of the oldest instance happen. An error is the outcome by which the task is left.
-    fn make_real(&mut self, context: &mut Context<'_>, id: InstanceId) -> Result<(), (String, String)> {
-        let (program, analysis) = (context.program, context.analysis);
-        let place = Place::root(context.root);
-        let Some(instance) = self.instances.alive.get(&id) else { return Ok(()) };
-        let state = program.state(instance.state);
-        let mut ended = instance.ended.clone().unwrap_or_else(|| Ended::aborted("it never ended".to_owned()));
-        let named = |reason: String| {
-            if reason.is_empty() { instance.path.clone() } else { format!("{}: {reason}", instance.path) }
-        };
-        let aborted = |reason: String| (ABORTED.to_owned(), named(reason));
-        if let Some(deviation) = self.deviation(id, context.root) {
-            return Err(aborted(deviation));
-        }
-        // What began on a projection had its preconditions checked there; now the actual world decides.
-        if instance.role == Role::Node && instance.nature != NodeNature::Irreversible && ended.outcome == SUCCESS {
-            match place.with_scope(&self.instances, id, None, |scope| binding::unmet(state, scope)) {
-                Some(Ok(Some(reason))) => ended = Ended::aborted(reason),
-                Some(Err(error)) => ended = Ended::aborted(error.reason()),
-                _ => {}
-            }
-        }
-        let declared = match instance.role {
-            Role::Node => effects::declared(state, instance.nature, &ended.outcome),
-            Role::Exit => state.annotations.effects.get(&ended.outcome).map_or(Some(&[][..]), |e| Some(e)),
-            _ => Some(&[][..]),
-        };
-        let outputs = Some(&ended.outputs);
-        let changes = match &ended.changes {
-            Changed::Exactly(changes) => changes.clone(),
-            Changed::Declared(measured) => place
-                .with_scope(&self.instances, id, outputs, |scope| {
-                    effects::actual(declared, &ended.outcome, measured, scope)
-                })
-                .unwrap_or_else(|| Ok(Vec::new()))
-                .map_err(|e| aborted(e.to_string()))?,
-        };
-        context.commit(id, changes).map_err(aborted)?;
-        if ended.outcome != SUCCESS {
-            return Err((ended.outcome.clone(), named(ended.reason)));
-        }
-        let wanted = &analysis.state(instance.state).operations;
-        // A routine has performed its own.
-        let is_routine = instance.role == Role::Node && !matches!(state.kind, StateKind::Action { .. });
-        if matches!(instance.role, Role::Node | Role::Exit) && !is_routine && !wanted.is_empty() {
-            let operations = place
-                .with_scope(&self.instances, id, outputs, |scope| binding::requirements(state, wanted, scope))
-                .unwrap_or_else(|| Ok(Vec::new()))
-                .map_err(|e| aborted(e.reason()))?;
-            context.commands.push(Command::Operate { instance: id, operations });
-        }
-        Ok(())
+    fn next_line_after(&self, last: Option<Line>) -> Option<Line> {
+        let from = last.map_or(0, |line| line + 1);
+        self.threads.range(from..).find(|(_, thread)| thread.is_active).map(|(line, _)| *line)
     }
 
-    fn forget_retired(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.instances.alive.remove(&id) else { return };
+    fn head_of(&self, line: Line) -> Option<InstanceId> {
+        let thread = self.threads.get(&line)?;
+        if thread.open_regions == 0 { thread.head } else { None }
+    }
+
+    /// A running imprecise PIA lets younger ones begin.
+    fn pass_over(&mut self, id: InstanceId) -> bool {
+        let Some(instance) = self.instances.get_mut(id) else { return false };
+        let passes = instance.status == Status::Running
+            && instance.is_pia()
+            && instance.arms.len() == 1
+            && self.plan.state(instance.state).imprecise;
+        if passes {
+            instance.detached = true;
+            let (line, next) = (instance.line, instance.arms[0].next);
+            let position = instance.position;
+            self.detached.insert(id);
+            self.advance(line, position, next);
+        }
+        passes
+    }
+
+    fn advance(&mut self, line: Line, position: u64, next: Option<InstanceId>) {
+        if let Some(thread) = self.threads.get_mut(&line) {
+            thread.head = None;
+            thread.floor = position + 1;
+        }
+        self.set_head(line, next);
+    }
+
+    /// The oldest instance of a line becomes real; false when it may not yet.
+    fn retire_head(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.instances.get(id) else { return false };
+        if let Some(beside) = self.conflict_beside(context, instance) {
+            self.wait(id, Wait::World(beside));
+            return false;
+        }
+        let role = instance.role;
+        let users = self.take_users(id);
+        let (outcome, reason) = self.make_real(context, id);
+        match role {
+            Role::Fork => self.begin_regions(context, id),
+            Role::RegionEnd => self.region_ended(context, id),
+            Role::End => {}
+            _ => self.go_on(context, id, &outcome, reason),
+        }
+        self.compare(context, users);
+        true
+    }
+
+    /// The line goes on behind an instance that is real, where its outcome leads.
+    fn go_on(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: &str, reason: String) {
+        let Some(instance) = self.instances.get(id) else { return };
+        let plan = self.plan.clone();
+        let own = plan.state(instance.state);
+        let arm = match instance.role {
+            Role::Condition | Role::Test => (!is_failure(outcome)).then_some(0),
+            Role::Join => Some(0),
+            Role::Exit if own.outcomes[instance.leaves_by].as_ref() == outcome => Some(0),
+            Role::Exit => None,
+            Role::Entry | Role::Loop => (outcome == SUCCESS).then_some(0),
+            _ => own.outcome(outcome).and_then(|n| instance.arms.iter().position(|arm| arm.outcomes & (1 << n) != 0)),
+        };
+        match arm {
+            Some(arm) => {
+                if instance.arms.len() > 1 {
+                    self.take_arm(context, id, arm);
+                }
+                let next = self.instances.get(id).and_then(|instance| instance.arms.first()?.next);
+                if let Some(instance) = self.remove_retired(context, id)
+                    && !instance.2
+                {
+                    self.advance(instance.0, instance.1, next);
+                }
+            }
+            None => {
+                let number = own.outcome(outcome).unwrap_or(own.outcomes.len() - 2);
+                self.leave_path(context, id, number, reason);
+            }
+        }
+    }
+
+    /// An instance ended otherwise than was computed ahead: what was expanded behind it is discarded, and the path goes on where
+    /// its outcome leads.
+    fn leave_path(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: Outcome, reason: String) {
+        let path = self.path(context.program, id);
+        let Some(instance) = self.instances.get(id) else { return };
+        let (line, state, position, producer) =
+            (instance.line, instance.state, instance.position, instance.producer.clone());
+        let is_node = instance.role == Role::Node;
+        let because: Arc<str> = if reason.is_empty() { path.into() } else { format!("{path}: {reason}").into() };
+        let environment = instance.environment.clone();
+        self.squash_behind(context, id);
+        self.remove_retired(context, id);
+        self.next_order += 1;
+        self.cursors.push(Cursor {
+            environment,
+            tail: None,
+            line,
+            segment: 0,
+            position: position + 1,
+            todo: Todo::Leave(state, outcome),
+            probability: 1.0,
+            because: Some(because),
+            idle: 0,
+            order: self.next_order,
+        });
+        let plan = self.plan.clone();
+        let own = plan.state(state);
+        if let (Some(producer), true, true) = (producer, is_node, gives_outputs(&own.outcomes[outcome])) {
+            let cursor = self.cursors.len() - 1;
+            let environment = &mut self.cursors[cursor].environment;
+            if own.is_read {
+                environment.producers.set(state.0 as usize, Some(producer.clone()));
+            }
+            for name in &own.assigns {
+                environment.variables.assign(name, super::environment::Binding::Assigned(producer.clone()));
+            }
+        }
+        if let Some(thread) = self.threads.get_mut(&line) {
+            thread.head = None;
+            thread.floor = position + 1;
+        }
+    }
+
+    /// Effects and resource operations happen. The outcome by which it is left, and why.
+    fn make_real(&mut self, context: &mut Context<'_>, id: InstanceId) -> (Arc<str>, String) {
+        let (program, analysis) = (context.program, context.analysis);
+        let aborted = |reason: String| (Arc::from(ABORTED), reason);
+        let Some(instance) = self.instances.get(id) else { return aborted(String::new()) };
+        let state = program.state(instance.state);
+        let Some(ended) = instance.ended.as_deref() else { return aborted("it never ended".to_owned()) };
+        let (mut outcome, mut reason) = (ended.outcome.clone(), ended.reason.clone());
+        let own = self.plan.state(instance.state);
+        let view = self.sight(context).view(instance, Some(&ended.outputs));
+        // What began on a projection had its preconditions checked there, if at all; now the actual world decides.
+        let checks = match instance.role {
+            Role::Node => instance.nature != NodeNature::Irreversible && !is_failure(&outcome),
+            Role::Entry => outcome.as_ref() == SUCCESS,
+            _ => false,
+        };
+        if checks && !state.annotations.requires.is_empty() {
+            match binding::unmet(state, &view) {
+                Ok(None) => {}
+                Ok(Some(unmet)) => return aborted(unmet),
+                Err(error) => return aborted(error.reason()),
+            }
+        }
+        if !matches!(instance.role, Role::Node | Role::Exit) {
+            return (outcome, reason);
+        }
+        let is_routine = instance.role == Role::Node && !matches!(state.kind, StateKind::Action { .. });
+        let declared = match own.outcome(&outcome).map(|number| &own.effects[number]) {
+            Some(Effects::Declared(declared)) => Some(declared.as_slice()),
+            _ => None,
+        };
+        let changes = match &ended.changes {
+            Changed::Exactly(changes) => Ok(changes.clone()),
+            Changed::Declared(_) if is_routine => Ok(Vec::new()),
+            Changed::Declared(measured) => effects::actual(declared, &outcome, measured, &view),
+        };
+        let wanted = &analysis.state(instance.state).operations;
+        let operations = if is_routine || wanted.is_empty() || outcome.as_ref() != SUCCESS {
+            // A routine has performed its own.
+            Ok(Vec::new())
+        } else {
+            binding::requirements(state, wanted, &view)
+        };
+        drop(view);
+        match changes {
+            Ok(changes) => {
+                if let Err(problem) = context.commit(id, changes) {
+                    return aborted(problem);
+                }
+            }
+            Err(problem) => return aborted(problem.to_string()),
+        }
+        match operations {
+            Ok(operations) if operations.is_empty() => {}
+            Ok(operations) => context.commands.push(Command::Operate { instance: id, operations }),
+            Err(error) => (outcome, reason) = aborted(error.reason()),
+        }
+        (outcome, reason)
+    }
+
+    /// An imprecise PIA that others were let pass by has ended.
+    pub(super) fn retire_detached(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let users = self.take_users(id);
+        let (outcome, reason) = self.make_real(context, id);
+        self.detached.remove(&id);
+        let Some(instance) = self.instances.get(id) else { return };
+        let number = self.plan.state(instance.state).outcome(&outcome);
+        let expected = number.is_some_and(|n| instance.arms.first().is_some_and(|arm| arm.outcomes & (1 << n) != 0));
+        let is_orphan = !self.threads.contains_key(&instance.line) || instance.arms.is_empty();
+        if expected || is_orphan {
+            self.remove_retired(context, id);
+        } else {
+            let number = number.unwrap_or(self.plan.state(instance.state).outcomes.len() - 2);
+            self.leave_path(context, id, number, reason);
+        }
+        self.compare(context, users);
+    }
+
+    /// Takes a retired instance out of the window: its line, its position, whether its line had passed it before.
+    fn remove_retired(&mut self, context: &mut Context<'_>, id: InstanceId) -> Option<(Line, u64, bool)> {
+        self.wake_waiters(id);
+        let instance = self.instances.remove(id)?;
+        self.active.remove(&id);
         if instance.role == Role::Node {
             context.note(Note::Retired { instance: id });
         }
-        self.oldest = instance.next.first().copied();
-        if let Some(next) = self.oldest.and_then(|next| self.instances.alive.get_mut(&next)) {
-            next.older = None;
-            next.assumption = None;
+        if instance.role == Role::Join {
+            self.joins.remove(&id);
+            self.forks.retain(|_, fork| fork.join != Some(id));
         }
-        if let Some(ended) = instance.ended {
-            self.instances.retired.insert(id, ended.outputs);
+        if let (Some(producer), Some(ended)) = (&instance.producer, instance.ended) {
+            let good = gives_outputs(&ended.outcome) || instance.role == Role::RegionEnd;
+            let _ = producer.real.set(if good { ended.outputs } else { Default::default() });
         }
-        self.retired_since_sweep += 1;
-        if self.retired_since_sweep >= SWEEP_INTERVAL {
-            self.sweep();
+        Some((instance.line, instance.position, instance.detached))
+    }
+
+    fn begin_regions(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some((line, position, _)) = self.remove_retired(context, id) else { return };
+        let Some(fork) = self.forks.get(&id) else { return };
+        let (regions, join) = (fork.regions.clone(), fork.join);
+        if let Some(thread) = self.threads.get_mut(&line) {
+            thread.open_regions = regions.len();
+            thread.floor = position + 1;
+            thread.head = None;
+        }
+        for region in &regions {
+            let head = self.threads.get_mut(region).and_then(|thread| {
+                thread.is_active = true;
+                thread.head
+            });
+            self.set_head(*region, head);
+        }
+        if regions.is_empty() {
+            self.set_head(line, join);
         }
     }
 
-    /// Drops the outputs that nothing in the window, and nothing still to be expanded, can name.
-    fn sweep(&mut self) {
-        self.retired_since_sweep = 0;
-        let mut named: BTreeSet<InstanceId> = self.cursors.iter().flat_map(|c| c.producers()).collect();
-        for instance in self.instances.alive.values() {
-            named.extend(instance.environment.producers.values());
-        }
-        self.instances.retired.retain(|id, _| named.contains(id));
-    }
-
-    /// The task is left by an outcome that is not success: every hierarchy around the state declares what that does, then it ends.
-    fn leave(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: &str, mut reason: String) -> Option<End> {
-        let program = context.program;
-        let state = self.instances.alive.get(&id).map(|i| i.state);
-        let mut around = state.and_then(|state| program.state(state).parent);
-        while let Some(state) = around.map(|state| program.state(state)) {
-            if let Some(declared) = state.annotations.effects.get(outcome) {
-                let place = Place::root(context.root);
-                let changes = place.with_scope(&self.instances, id, None, |scope| {
-                    effects::actual(Some(declared), outcome, &[], scope)
-                });
-                let made = match changes {
-                    Some(Ok(changes)) => context.commit(id, changes),
-                    Some(Err(error)) => Err(error.to_string()),
-                    None => Ok(()),
-                };
-                if let Err(problem) = made {
-                    reason = format!("{reason}; then {}: {problem}", state.path);
-                }
-            }
-            around = state.parent;
-        }
-        self.stop(context, outcome, reason)
-    }
-
-    /// Discards everything that is in the window.
-    pub(crate) fn stop(&mut self, context: &mut Context<'_>, outcome: &str, reason: String) -> Option<End> {
-        let all: Vec<InstanceId> = self.instances.alive.keys().copied().collect();
-        for id in all {
-            self.squash(context, id);
-        }
-        self.cursors.clear();
-        self.oldest = None;
-        self.end = Some(End { outcome: outcome.to_owned(), outputs: Default::default(), reason });
-        self.end.clone()
-    }
-
-    /// A condition is decided: the other branch is discarded.
-    pub(crate) fn take_branch(&mut self, context: &mut Context<'_>, condition: InstanceId, taken: bool) {
-        let Some(instance) = self.instances.alive.get_mut(&condition) else { return };
-        let next = std::mem::take(&mut instance.next);
-        let assumes = |window: &Self, id: &InstanceId| window.instances.alive.get(id).and_then(|i| i.assumption);
-        let (kept, lost): (Vec<_>, Vec<_>) = next.into_iter().partition(|id| assumes(self, id) == Some(taken));
-        for id in &kept {
-            if let Some(younger) = self.instances.alive.get_mut(id) {
-                younger.assumption = None;
-            }
-        }
-        if let Some(instance) = self.instances.alive.get_mut(&condition) {
-            instance.next = kept;
-        }
-        let mut open = lost;
-        let mut squashed = BTreeSet::new();
-        while let Some(id) = open.pop() {
-            open.extend(self.instances.alive.get(&id).map(|i| i.next.clone()).unwrap_or_default());
-            squashed.insert(id);
-            self.squash(context, id);
-        }
-        self.cursors.retain_mut(|cursor| match cursor.tail {
-            Some(tail) if squashed.contains(&tail) => false,
-            Some(tail) if tail == condition && cursor.assumption == Some(!taken) => false,
-            Some(tail) if tail == condition => {
-                cursor.assumption = None;
-                true
-            }
-            _ => true,
-        });
-    }
-
-    fn squash(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        self.stop_instance(context, id);
-        if let Some(instance) = self.instances.alive.remove(&id)
-            && instance.role == Role::Node
-        {
-            context.note(Note::Squashed { instance: id });
+    fn region_ended(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some((region, _, _)) = self.remove_retired(context, id) else { return };
+        let Some(fork) = self.threads.remove(&region).and_then(|thread| thread.fork) else { return };
+        let Some(fork) = self.forks.get(&fork) else { return };
+        let (line, join) = (fork.line, fork.join);
+        let Some(thread) = self.threads.get_mut(&line) else { return };
+        thread.open_regions -= 1;
+        if thread.open_regions == 0 {
+            self.set_head(line, join);
         }
     }
 
-    /// Takes back what was asked for an instance; it holds nothing afterwards.
-    pub(crate) fn stop_instance(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.instances.alive.get_mut(&id) else { return };
-        match instance.status {
-            Status::Acquiring => context.commands.push(Command::Withdraw { instance: id }),
-            Status::Projecting => {
-                context.commands.push(Command::Cancel { instance: id, attempt: instance.attempt });
-            }
-            Status::Running => match instance.routine.take() {
-                Some(mut routine) => {
-                    routine.abort(context);
-                    instance.lease = routine.lease().cloned();
-                }
-                None => context.commands.push(Command::Cancel { instance: id, attempt: instance.attempt }),
-            },
-            Status::Expanded | Status::Granted | Status::Finished => {}
+    /// The oldest instance of a line from now on.
+    pub(super) fn set_head(&mut self, line: Line, head: Option<InstanceId>) {
+        let Some(thread) = self.threads.get_mut(&line) else { return };
+        thread.head = head;
+        let Some(instance) = head.and_then(|head| self.instances.get_mut(head)) else { return };
+        thread.floor = instance.position;
+        if thread.is_active && thread.open_regions == 0 {
+            instance.is_head = true;
+            let id = instance.id;
+            self.enqueue(id);
         }
-        give_back(context, instance);
     }
 
-    /// Whether a condition on an instance's path is undecided.
-    pub(crate) fn is_speculative(&self, id: InstanceId) -> bool {
-        let mut at = self.instances.alive.get(&id).and_then(|i| i.older);
-        while let Some(older) = at.and_then(|id| self.instances.alive.get(&id)) {
-            if older.is_undecided() {
-                return true;
-            }
-            at = older.older;
-        }
-        false
+    fn take_users(&mut self, id: InstanceId) -> Vec<InstanceId> {
+        let mut users = self.instances.get_mut(id).map(|i| std::mem::take(&mut i.users)).unwrap_or_default();
+        users.sort_unstable();
+        users.dedup();
+        users
     }
+
+    /// What was made of predicted effects is compared with what they came to.
+    fn compare(&mut self, context: &mut Context<'_>, users: Vec<InstanceId>) {
+        for user in users {
+            self.revalidate(context, user);
+        }
+    }
+}
+
+fn is_failure(outcome: &str) -> bool {
+    !gives_outputs(outcome)
 }

@@ -1,0 +1,151 @@
+//! What is fixed about a place of the program when the window grows there: where it stands in the tree of states, what its
+//! variables are, which older instance wrote each port last (register renaming), and which older instances write each
+//! predicate (memory renaming). Copies share everything.
+
+use super::plan::{Outcome, Plan, Predicate};
+use super::table::Table;
+use crate::binding::Outputs;
+use ratn_model::id::{InstanceId, StateId};
+use ratn_model::value::Value;
+use std::fmt::Write;
+use std::sync::{Arc, OnceLock};
+
+/// A place's environment.
+#[derive(Debug, Clone)]
+pub(crate) struct Environment {
+    pub(crate) frames: Option<Arc<Frame>>,
+    pub(crate) variables: Variables,
+    /// By predicate, the youngest older instance that writes it.
+    pub(crate) writers: Table<Link>,
+    /// By state, who wrote its outputs last; at the number of states plus its own, how a region ended.
+    pub(crate) producers: Table<Arc<Producer>>,
+}
+
+/// An instance as a writer, seen along one of its arms. Its own environment has the link to the next older one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Link {
+    pub(crate) writer: InstanceId,
+    /// The outcome that the path assumes.
+    pub(crate) outcome: Outcome,
+    /// The arm's outcomes do not all change the same.
+    pub(crate) vague: bool,
+}
+
+/// An instance as the writer of outputs. They stand here once it has retired, for as long as somebody can name them.
+#[derive(Debug)]
+pub(crate) struct Producer {
+    pub(crate) instance: InstanceId,
+    pub(crate) real: OnceLock<Outputs>,
+}
+
+/// One activation of a list of states.
+#[derive(Debug, Clone)]
+pub(crate) struct Frame {
+    pub(crate) below: Option<Arc<Frame>>,
+    /// The state whose list it is, and its visit number.
+    pub(crate) owner: StateId,
+    pub(crate) visit: u32,
+    /// Path of the activation: of the owner, with the iteration.
+    pub(crate) prefix: Arc<str>,
+    /// How often states were visited, where that may be more than once.
+    pub(crate) visits: Vec<(StateId, u32)>,
+    /// Of a loop.
+    pub(crate) iteration: Option<Iteration>,
+    /// Variables that there were before the owner was entered.
+    pub(crate) variables: usize,
+    /// Of a region: the fork.
+    pub(crate) fork: Option<InstanceId>,
+}
+
+/// Which iteration of a loop.
+#[derive(Debug, Clone)]
+pub(crate) struct Iteration {
+    pub(crate) index: usize,
+    /// The elements; none of a `while`.
+    pub(crate) elements: Option<Arc<Vec<Value>>>,
+}
+
+/// Variables in sight, the innermost last. Copying is cheap.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Variables(Arc<Vec<(Arc<str>, Binding)>>);
+
+/// What a variable is.
+#[derive(Debug, Clone)]
+pub(crate) enum Binding {
+    Known(Value),
+    /// What an instance assigns: its output port of the name [`assigned`].
+    Assigned(Arc<Producer>),
+}
+
+/// The output port under which an instance keeps what it assigns to a variable.
+pub(crate) fn assigned(variable: &str) -> String {
+    format!("${variable}")
+}
+
+impl Variables {
+    pub(crate) fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    pub(crate) fn get(&self, name: &str) -> Option<&Binding> {
+        self.0.iter().rev().find(|(n, _)| &**n == name).map(|(_, binding)| binding)
+    }
+
+    pub(crate) fn declare(&mut self, name: &str, binding: Binding) {
+        Arc::make_mut(&mut self.0).push((Arc::from(name), binding));
+    }
+
+    /// Gives the innermost variable of a name another value.
+    pub(crate) fn assign(&mut self, name: &str, binding: Binding) {
+        if let Some(slot) = Arc::make_mut(&mut self.0).iter_mut().rev().find(|(n, _)| &**n == name) {
+            slot.1 = binding;
+        }
+    }
+
+    pub(crate) fn truncate(&mut self, len: usize) {
+        if self.0.len() > len {
+            Arc::make_mut(&mut self.0).truncate(len);
+        }
+    }
+
+    pub(crate) fn iter(&self) -> impl Iterator<Item = &(Arc<str>, Binding)> {
+        self.0.iter()
+    }
+}
+
+impl Environment {
+    pub(crate) fn new(plan: &Plan) -> Environment {
+        Environment {
+            frames: None,
+            variables: Variables::default(),
+            writers: Table::new(plan.width),
+            producers: Table::new(2 * plan.len()),
+        }
+    }
+
+    pub(crate) fn producer(&self, state: StateId) -> Option<&Arc<Producer>> {
+        self.producers.get(state.0 as usize)
+    }
+
+    pub(crate) fn writer(&self, predicate: Predicate) -> Option<Link> {
+        self.writers.get(predicate).copied()
+    }
+
+    /// The path of a state visited here.
+    pub(crate) fn path(&self, name: &str, visit: u32, iteration: Option<usize>) -> String {
+        let prefix = self.frames.as_ref().map_or("", |frame| &*frame.prefix);
+        let mut path = String::with_capacity(prefix.len() + name.len() + 8);
+        path.push_str(prefix);
+        if !prefix.is_empty() && !name.is_empty() {
+            path.push('/');
+        }
+        path.push_str(name);
+        if visit > 1 {
+            let _ = write!(path, "#{visit}");
+        }
+        if let Some(index) = iteration {
+            let _ = write!(path, "[{index}]");
+        }
+        path
+    }
+}

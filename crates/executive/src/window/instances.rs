@@ -1,0 +1,67 @@
+//! The instances that are in the window, by id: found in constant time, however many there are.
+
+use super::instance::Instance;
+use ratn_model::id::InstanceId;
+use std::collections::VecDeque;
+
+/// The table of instances. Ids grow; what has left the window leaves a hole until everything older has left, too.
+#[derive(Default)]
+pub(crate) struct Instances {
+    first: u64,
+    slots: VecDeque<Option<Box<Instance>>>,
+    alive: usize,
+}
+
+impl Instances {
+    /// How many there are.
+    pub(crate) fn len(&self) -> usize {
+        self.alive
+    }
+
+    fn place(&self, id: InstanceId) -> Option<usize> {
+        id.0.checked_sub(self.first).and_then(|place| usize::try_from(place).ok())
+    }
+
+    pub(crate) fn get(&self, id: InstanceId) -> Option<&Instance> {
+        self.slots.get(self.place(id)?)?.as_deref()
+    }
+
+    pub(crate) fn get_mut(&mut self, id: InstanceId) -> Option<&mut Instance> {
+        let place = self.place(id)?;
+        self.slots.get_mut(place)?.as_deref_mut()
+    }
+
+    /// Adds the youngest.
+    pub(crate) fn push(&mut self, instance: Instance) {
+        if self.slots.is_empty() {
+            self.first = instance.id.0;
+        }
+        // Ids given to what never enters the window (nodes inside of routines) are holes.
+        while self.first + (self.slots.len() as u64) < instance.id.0 {
+            self.slots.push_back(None);
+        }
+        self.slots.push_back(Some(Box::new(instance)));
+        self.alive += 1;
+    }
+
+    pub(crate) fn remove(&mut self, id: InstanceId) -> Option<Box<Instance>> {
+        let place = self.place(id)?;
+        let removed = self.slots.get_mut(place)?.take()?;
+        self.alive -= 1;
+        while matches!(self.slots.front(), Some(None)) {
+            self.slots.pop_front();
+            self.first += 1;
+        }
+        Some(removed)
+    }
+
+    /// All, oldest id first.
+    pub(crate) fn iter(&self) -> impl DoubleEndedIterator<Item = &Instance> {
+        self.slots.iter().filter_map(Option::as_deref)
+    }
+
+    /// The ids that are in use, and holes between them.
+    pub(crate) fn ids(&self) -> std::ops::Range<u64> {
+        self.first..self.first + self.slots.len() as u64
+    }
+}
