@@ -229,7 +229,7 @@ impl Window {
             }
             Event::Advised { urgency_s } => self.advise(context, &urgency_s),
             Event::Woken => self.wake_routines(context),
-            Event::Started { .. } | Event::Progressed { .. } => {}
+            Event::Started { .. } | Event::Progressed { .. } | Event::Resumed => {}
         }
         self.settle(context)
     }
