@@ -109,16 +109,7 @@ impl System {
 }
 
 fn goal() -> Goal {
-    Goal {
-        id: String::new(),
-        action: String::new(),
-        inputs: BTreeMap::new(),
-        seed: 0,
-        lease: None,
-        projection: None,
-        world_pool: String::new(),
-        deadline_ms: 0,
-    }
+    Goal::default()
 }
 
 fn to_observation() -> [(&'static str, Value); 2] {

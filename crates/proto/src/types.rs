@@ -244,6 +244,8 @@ pub struct Goal {
     pub world_pool: String,
     /// Cancelled this long after its arrival, in milliseconds of wall time; 0 never.
     pub deadline_ms: u64,
+    /// How long it may go on when nobody listens to it, in milliseconds of wall time; 0 not at all.
+    pub grace_ms: u64,
 }
 
 /// How a goal has ended.

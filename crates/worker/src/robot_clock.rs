@@ -8,18 +8,25 @@ use std::time::{Duration, Instant};
 #[derive(Debug, Clone, Copy)]
 pub struct RobotClock {
     start: Instant,
+    /// What it was at the start.
+    at: Timestamp,
     speed: f64,
 }
 
 impl RobotClock {
     /// Starts at zero now; `speed` is how many of the robot's seconds pass in one of ours, above 0.
     pub fn start(speed: f64) -> RobotClock {
-        RobotClock { start: Instant::now(), speed }
+        RobotClock::going_on(Timestamp(0), speed)
+    }
+
+    /// Goes on from `at`, which is now.
+    pub fn going_on(at: Timestamp, speed: f64) -> RobotClock {
+        RobotClock { start: Instant::now(), at, speed }
     }
 
     /// The robot's time.
     pub fn now(&self) -> Timestamp {
-        Timestamp::from_seconds(self.start.elapsed().as_secs_f64() * self.speed)
+        self.at + self.start.elapsed().mul_f64(self.speed)
     }
 
     /// How long to wait, in wall time, until a moment of the robot's time; zero when it is past.
@@ -38,5 +45,12 @@ mod tests {
         let wait = clock.until(Timestamp::from_seconds(100.0));
         assert!(wait <= Duration::from_secs(10) && wait > Duration::from_secs(9), "{wait:?}");
         assert_eq!(clock.until(Timestamp(0)), Duration::ZERO);
+    }
+
+    #[test]
+    fn a_clock_that_goes_on_is_never_behind_where_it_was() {
+        let at = Timestamp::from_seconds(100.0);
+        let clock = RobotClock::going_on(at, 10.0);
+        assert!(clock.now() >= at && clock.until(at + Duration::from_secs(10)) <= Duration::from_secs(1));
     }
 }

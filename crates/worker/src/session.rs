@@ -60,7 +60,12 @@ pub struct SessionError {
 impl Session {
     /// Begins to keep a session alive with the resource manager at `endpoint`. `client` says who this is, for people.
     pub fn open(channels: &Channels, endpoint: &Endpoint, client: &str, ttl: Duration) -> Session {
-        let id = fresh_id(client);
+        Session::open_as(channels, endpoint, fresh_id(client), client, ttl)
+    }
+
+    /// As [`Session::open`], under an id of the caller's: that of a session whose client is gone goes on with it, if it still
+    /// lives. Nobody else may have it.
+    pub fn open_as(channels: &Channels, endpoint: &Endpoint, id: String, client: &str, ttl: Duration) -> Session {
         let end = CancellationToken::new();
         let (tell, state) = watch::channel(SessionState::default());
         let keeper = Keeper {

@@ -87,6 +87,34 @@ async fn a_lease_that_ends_aborts_the_goal_under_way() {
 }
 
 #[tokio::test]
+async fn a_goal_goes_on_for_its_grace_when_its_client_leaves() {
+    let provider = provider(None).await;
+    let patient = |id, grace_ms| Goal { grace_ms, ..goal(id, "wait", 1) };
+    begin(&provider, patient("a", 60_000)).await.abort();
+    // Who comes back hears how it ends.
+    let (client, endpoint) = (provider.client.clone(), provider.endpoint.clone());
+    let back = tokio::spawn(async move { client.attach(&endpoint, goal("a", "wait", 1), |_, _| {}).await });
+    while !provider.client.cancel(&provider.endpoint, "a").await.unwrap() {}
+    let fate = back.await.unwrap().unwrap();
+    assert_eq!((fate.outcome.outcome.as_str(), fate.orphaned), ("preempted", false));
+    provider.ended.notified().await;
+
+    // Nobody comes back: it ends by itself, and says whose doing that was.
+    begin(&provider, patient("b", 20)).await.abort();
+    provider.ended.notified().await;
+    let fate = provider.client.attach(&provider.endpoint, goal("b", "wait", 1), |_, _| {}).await.unwrap();
+    assert_eq!((fate.outcome.outcome.as_str(), fate.orphaned), ("preempted", true));
+}
+
+#[tokio::test]
+async fn attaching_to_a_goal_that_was_never_given_does_not_begin_it() {
+    let provider = provider(None).await;
+    let attached = provider.client.attach(&provider.endpoint, goal("a", "double", 1), |_, _| {}).await;
+    assert_eq!(attached.unwrap_err().code(), Some(Code::NotFound));
+    assert_eq!(provider.runs.load(Ordering::SeqCst), 0);
+}
+
+#[tokio::test]
 async fn the_same_goal_twice_runs_once() {
     let provider = provider(None).await;
     let first = run(&provider, goal("a", "double", 1)).await.unwrap();

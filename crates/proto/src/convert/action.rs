@@ -17,6 +17,7 @@ impl From<Goal> for v1::Goal {
             projection_id: goal.projection.map(|projection| projection.0),
             world_pool_endpoint: goal.world_pool,
             deadline_ms: goal.deadline_ms,
+            grace_ms: goal.grace_ms,
         }
     }
 }
@@ -37,6 +38,7 @@ impl TryFrom<v1::Goal> for Goal {
             projection: goal.projection_id.map(ProjectionId),
             world_pool: goal.world_pool_endpoint,
             deadline_ms: goal.deadline_ms,
+            grace_ms: goal.grace_ms,
         })
     }
 }
@@ -48,6 +50,7 @@ impl From<GoalOutcome> for v1::GoalResult {
             outputs: wire_ports(outcome.outputs),
             measured: wire_facts(outcome.measured),
             reason: outcome.reason,
+            orphaned: false,
         }
     }
 }

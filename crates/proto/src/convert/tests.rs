@@ -172,6 +172,7 @@ fn goal() -> impl Strategy<Value = Goal> {
             projection: projection.map(ProjectionId),
             world_pool: "unix:/world.sock".to_owned(),
             deadline_ms: seed / 2,
+            grace_ms: seed / 3,
         },
     )
 }

@@ -271,6 +271,8 @@ impl GoalContext {
             projection: self.projection,
             world_pool: self.world_pool.clone(),
             deadline_ms: 0,
+            // Whoever asks here is a goal itself, and has its own.
+            grace_ms: 0,
         };
         let client = ActionClient::new(self.channels.clone());
         let performed = client.execute(&endpoint, goal, |_, _| {});

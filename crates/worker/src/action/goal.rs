@@ -6,11 +6,15 @@ use ratn_proto::types::{Goal, GoalOutcome};
 use ratn_proto::v1;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 use tokio::sync::{broadcast, watch};
 use tokio_util::sync::CancellationToken;
 
 /// A listener that falls further behind misses the oldest progress messages.
 const PROGRESS_KEPT: usize = 256;
+
+/// However long a client may want to come back.
+const MAX_GRACE: Duration = Duration::from_secs(60);
 
 /// Why a goal was told to stop.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -32,13 +36,18 @@ pub(crate) enum StopCause {
 /// How a goal ended.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Ending {
-    /// With an outcome.
-    Outcome(GoalOutcome),
+    /// With an outcome, and whether that is because its client or its lease was gone.
+    Outcome(GoalOutcome, bool),
     /// Without one, as if the process had been killed: the provider ends, which is not the goal's doing.
     Gone,
 }
 
 impl StopCause {
+    /// Whether it has nothing to do with what the goal was about.
+    pub(crate) fn is_orphaning(&self) -> bool {
+        matches!(self, StopCause::Abandoned | StopCause::Fenced(_) | StopCause::LeaseEnded(_))
+    }
+
     /// What the goal comes to: who asked for the stop gets `preempted`, who lost the right to go on `aborted`.
     pub(crate) fn failure(&self) -> ActionFailure {
         match self {
@@ -66,8 +75,12 @@ pub(crate) struct GoalEntry {
     pub(crate) progress: broadcast::Sender<v1::GoalProgress>,
     pub(crate) result: watch::Sender<Option<Ending>>,
     stop_when_abandoned: bool,
+    /// For how long nobody may listen to it.
+    grace: Duration,
     cause: Mutex<Option<StopCause>>,
     listeners: AtomicUsize,
+    /// How often its last listener has left.
+    left: AtomicUsize,
 }
 
 /// Somebody who waits for a goal's result.
@@ -85,8 +98,10 @@ impl GoalEntry {
             progress: broadcast::channel(PROGRESS_KEPT).0,
             result: watch::channel(None).0,
             stop_when_abandoned,
+            grace: Duration::from_millis(goal.grace_ms).min(MAX_GRACE),
             cause: Mutex::new(None),
             listeners: AtomicUsize::new(0),
+            left: AtomicUsize::new(0),
         })
     }
 
@@ -125,8 +140,26 @@ impl GoalEntry {
 impl Drop for Listener {
     fn drop(&mut self) {
         let last = self.0.listeners.fetch_sub(1, Ordering::AcqRel) == 1;
-        if last && self.0.stop_when_abandoned && !self.0.is_over() {
-            self.0.stop(StopCause::Abandoned);
+        if !last || !self.0.stop_when_abandoned || self.0.is_over() {
+            return;
         }
+        let left = self.0.left.fetch_add(1, Ordering::AcqRel) + 1;
+        match tokio::runtime::Handle::try_current() {
+            Ok(runtime) if !self.0.grace.is_zero() => {
+                runtime.spawn(abandoned(Arc::clone(&self.0), left));
+            }
+            _ => self.0.stop(StopCause::Abandoned),
+        }
+    }
+}
+
+/// Stops a goal to which nobody has listened again for its grace since its last listener left the `left`-th time.
+async fn abandoned(goal: Arc<GoalEntry>, left: usize) {
+    tokio::select! {
+        () = goal.over() => return,
+        () = tokio::time::sleep(goal.grace) => {}
+    }
+    if goal.listeners.load(Ordering::Acquire) == 0 && goal.left.load(Ordering::Acquire) == left {
+        goal.stop(StopCause::Abandoned);
     }
 }

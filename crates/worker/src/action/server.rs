@@ -148,6 +148,16 @@ impl ActionServer {
         state.running.iter().filter(|goal| which(goal)).map(|goal| goal.stop(cause.clone())).count()
     }
 
+    /// Finds a goal that was given before; what is to be heard of it.
+    ///
+    /// # Errors
+    /// NOT_FOUND where it was never given, or has been forgotten.
+    pub(super) fn join(&self, goal: &str) -> Result<Messages, Status> {
+        let known = self.inner.state().goals.get(goal).map(|entry| Messages::of(entry, true));
+        known
+            .ok_or_else(|| Status::not_found(format!("goal {goal} is not known here: never given, or forgotten since")))
+    }
+
     /// Starts a goal, or finds the one of the same id; what is to be heard of it.
     ///
     /// # Errors
@@ -275,7 +285,10 @@ async fn run(
     server.state().end(&entry, server.results_kept);
     let ending = match entry.cause() {
         Some(StopCause::ShuttingDown) if !outcome.is_success() => Ending::Gone,
-        _ => Ending::Outcome(outcome),
+        cause => {
+            let orphaned = !outcome.is_success() && cause.is_some_and(|cause| cause.is_orphaning());
+            Ending::Outcome(outcome, orphaned)
+        }
     };
     entry.result.send_replace(Some(ending));
 }

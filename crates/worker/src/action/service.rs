@@ -28,7 +28,11 @@ impl ActionService for ActionServer {
     type ExecuteStream = BoxStream<'static, Result<v1::ExecuteResponse, Status>>;
 
     async fn execute(&self, request: Request<v1::ExecuteRequest>) -> Result<Response<Self::ExecuteStream>, Status> {
-        let goal: Goal = required(request.into_inner().goal, "goal")?;
+        let request = request.into_inner();
+        let goal: Goal = required(request.goal, "goal")?;
+        if request.known_only {
+            return Ok(Response::new(self.join(&goal.id)?.into_stream()));
+        }
         Ok(Response::new(self.admit(goal).await?.into_stream()))
     }
 
@@ -104,7 +108,7 @@ impl Messages {
             }
             self.over = true;
             return Some(match ending {
-                Ending::Outcome(outcome) => Ok(Kind::Result(outcome.into())),
+                Ending::Outcome(outcome, orphaned) => Ok(Kind::Result(v1::GoalResult { orphaned, ..outcome.into() })),
                 Ending::Gone => Err(Status::unavailable("the provider shuts down")),
             });
         }

@@ -27,6 +27,15 @@ pub struct ProviderInfo {
     pub actions: Vec<ActionInfo>,
 }
 
+/// What has become of a goal that was given before.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fate {
+    /// How it ended.
+    pub outcome: GoalOutcome,
+    /// It was stopped because nobody listened to it or its lease had ended: its outcome is not its own doing.
+    pub orphaned: bool,
+}
+
 /// An action of a provider.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ActionInfo {
@@ -57,12 +66,35 @@ impl ActionClient {
         &self,
         endpoint: &Endpoint,
         goal: Goal,
-        mut on_progress: impl FnMut(String, BTreeMap<String, Value>),
+        on_progress: impl FnMut(String, BTreeMap<String, Value>),
     ) -> Result<GoalOutcome, CallError> {
+        let question = v1::ExecuteRequest { goal: Some(goal.into()), known_only: false };
+        self.listen(endpoint, question, on_progress).await.map(|fate| fate.outcome)
+    }
+
+    /// Waits for the end of a goal that was given before, by this client or by one that is gone; it is never begun by this.
+    ///
+    /// # Errors
+    /// As [`ActionClient::execute`]; [`CallError::Refused`] with `NotFound` when the provider does not know the goal: it was
+    /// never given, or the provider has been restarted, or has performed many others since.
+    pub async fn attach(
+        &self,
+        endpoint: &Endpoint,
+        goal: Goal,
+        on_progress: impl FnMut(String, BTreeMap<String, Value>),
+    ) -> Result<Fate, CallError> {
+        self.listen(endpoint, v1::ExecuteRequest { goal: Some(goal.into()), known_only: true }, on_progress).await
+    }
+
+    async fn listen(
+        &self,
+        endpoint: &Endpoint,
+        question: v1::ExecuteRequest,
+        mut on_progress: impl FnMut(String, BTreeMap<String, Value>),
+    ) -> Result<Fate, CallError> {
         let failed = |status: tonic::Status| CallError::from_status(endpoint, &status);
         let malformed = |m: Malformed| CallError::malformed(endpoint, m);
         let mut client = self.client(endpoint)?;
-        let question = v1::ExecuteRequest { goal: Some(goal.into()) };
         let mut stream = client.execute(question).await.map_err(failed)?.into_inner();
         while let Some(message) = stream.message().await.map_err(failed)? {
             match message.kind {
@@ -70,7 +102,10 @@ impl ActionClient {
                 Some(Kind::Progress(progress)) => {
                     on_progress(progress.message, ports(progress.values, "progress.values").map_err(malformed)?);
                 }
-                Some(Kind::Result(result)) => return result.try_into().map_err(malformed),
+                Some(Kind::Result(result)) => {
+                    let orphaned = result.orphaned;
+                    return Ok(Fate { outcome: result.try_into().map_err(malformed)?, orphaned });
+                }
                 None => return Err(malformed(Malformed::new("kind", "is not set"))),
             }
         }

@@ -7,7 +7,7 @@ mod process;
 mod resource;
 mod world;
 
-pub use action::{ActionClient, ActionInfo, ProviderInfo};
+pub use action::{ActionClient, ActionInfo, Fate, ProviderInfo};
 pub use error::CallError;
 pub use health::wait_until_serving;
 pub use process::{ProcessClient, WorkerWatch};

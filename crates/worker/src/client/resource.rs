@@ -75,7 +75,15 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn create(&self, resource: Resource) -> Result<Resource, CallError> {
-        let (request_id, session_id) = self.mutation();
+        self.create_once("", resource).await
+    }
+
+    /// As [`ResourceClient::create`], once however often it is asked for with this request id.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn create_once(&self, request: &str, resource: Resource) -> Result<Resource, CallError> {
+        let (request_id, session_id) = self.mutation(request);
         let question = v1::CreateRequest { request_id, session_id, resource: Some(resource.into()) };
         let answer = self.client.clone().create(question).await.map_err(|status| self.failed(&status))?;
         self.field(answer.into_inner().resource, "resource")
@@ -86,7 +94,15 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn consume(&self, requirement: Requirement) -> Result<Vec<String>, CallError> {
-        let (request_id, session_id) = self.mutation();
+        self.consume_once("", requirement).await
+    }
+
+    /// As [`ResourceClient::consume`], once however often it is asked for with this request id.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn consume_once(&self, request: &str, requirement: Requirement) -> Result<Vec<String>, CallError> {
+        let (request_id, session_id) = self.mutation(request);
         let question = v1::ConsumeRequest { request_id, session_id, requirement: Some(requirement.into()) };
         let answer = self.client.clone().consume(question).await.map_err(|status| self.failed(&status))?;
         Ok(answer.into_inner().resource_ids)
@@ -97,7 +113,7 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn delete(&self, resource: &str) -> Result<(), CallError> {
-        self.delete_target(v1::delete_request::Target::ResourceId(resource.to_owned())).await.map(|_| ())
+        self.delete_target("", v1::delete_request::Target::ResourceId(resource.to_owned())).await.map(|_| ())
     }
 
     /// Removes as many resources as the requirement says; their ids.
@@ -105,11 +121,23 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn delete_matching(&self, requirement: Requirement) -> Result<Vec<String>, CallError> {
-        self.delete_target(v1::delete_request::Target::Requirement(requirement.into())).await
+        self.delete_matching_once("", requirement).await
     }
 
-    async fn delete_target(&self, target: v1::delete_request::Target) -> Result<Vec<String>, CallError> {
-        let (request_id, session_id) = self.mutation();
+    /// As [`ResourceClient::delete_matching`], once however often it is asked for with this request id.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn delete_matching_once(
+        &self,
+        request: &str,
+        requirement: Requirement,
+    ) -> Result<Vec<String>, CallError> {
+        self.delete_target(request, v1::delete_request::Target::Requirement(requirement.into())).await
+    }
+
+    async fn delete_target(&self, request: &str, target: v1::delete_request::Target) -> Result<Vec<String>, CallError> {
+        let (request_id, session_id) = self.mutation(request);
         let question = v1::DeleteRequest { request_id, session_id, target: Some(target) };
         let answer = self.client.clone().delete(question).await.map_err(|status| self.failed(&status))?;
         Ok(answer.into_inner().resource_ids)
@@ -120,9 +148,9 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn block(&self, requirement: Requirement, options: AcquireOptions) -> Result<Lease, CallError> {
-        let (fresh, session_id) = self.mutation();
+        let (request_id, session_id) = self.mutation(&options.request);
         let question = v1::BlockRequest {
-            request_id: if options.request.is_empty() { fresh } else { options.request },
+            request_id,
             session_id,
             requirement: Some(requirement.into()),
             priority: options.priority,
@@ -139,9 +167,9 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn acquire(&self, requirements: Vec<Requirement>, options: AcquireOptions) -> Result<Lease, CallError> {
-        let (fresh, session_id) = self.mutation();
+        let (request_id, session_id) = self.mutation(&options.request);
         let question = v1::AcquireRequest {
-            request_id: if options.request.is_empty() { fresh } else { options.request },
+            request_id,
             session_id,
             requirements: all(requirements),
             priority: options.priority,
@@ -168,7 +196,7 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn release(&self, lease: LeaseId) -> Result<bool, CallError> {
-        let (request_id, session_id) = self.mutation();
+        let (request_id, session_id) = self.mutation("");
         let question = v1::ResourceServiceReleaseRequest { request_id, session_id, lease_id: lease.0 };
         let answer = self.client.clone().release(question).await.map_err(|status| self.failed(&status))?;
         Ok(answer.into_inner().released)
@@ -204,8 +232,10 @@ impl ResourceClient {
         Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
-    fn mutation(&self) -> (String, String) {
-        (fresh_id("request"), self.session.clone())
+    /// A request's id, a fresh one where it has none, and the session's.
+    fn mutation(&self, request: &str) -> (String, String) {
+        let id = if request.is_empty() { fresh_id("request") } else { request.to_owned() };
+        (id, self.session.clone())
     }
 
     fn field<W, T: TryFrom<W, Error = Malformed>>(&self, message: Option<W>, field: &str) -> Result<T, CallError> {
