@@ -174,6 +174,10 @@ impl Executive {
 /// becomes free, goes to whom it serves most. The resource manager grants as requests arrive; it cannot know what comes next.
 /// What one event both asked for and withdrew is not asked for.
 fn most_urgent_first(commands: Vec<Command>) -> Vec<Command> {
+    let asks = |c: &Command| matches!(c, Command::Acquire { .. } | Command::Withdraw { .. } | Command::Release { .. });
+    if !commands.iter().any(asks) {
+        return commands;
+    }
     let mut ordered: Vec<Command> = Vec::with_capacity(commands.len());
     for command in commands {
         let asked = match &command {

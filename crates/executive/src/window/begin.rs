@@ -60,7 +60,7 @@ impl Window {
         if requirements.is_empty() {
             self.active.insert(id);
             self.set_status(id, Status::Granted, Wait::Nothing);
-            self.proceed(context, id);
+            self.launch(context, id);
             return;
         }
         if !self.leaves_room(context, instance, &requirements) {
@@ -128,9 +128,6 @@ impl Window {
     /// It has its resources: it gets its projection, then its goal starts.
     pub(super) fn proceed(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.instances.get(id) else { return };
-        let state = context.program.state(instance.state);
-        let analysis = context.analysis.state(instance.state);
-        let is_routine = !matches!(state.kind, StateKind::Action { .. });
         let sight = self.sight(context);
         // While it waited for its resources an older instance may have changed what it would look at.
         let looked = if instance.is_pia() || instance.projection.is_some() {
@@ -150,6 +147,15 @@ impl Window {
                 }
             }
         }
+        self.launch(context, id);
+    }
+
+    /// What it reads is as it was when it asked.
+    fn launch(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.instances.get(id) else { return };
+        let state = context.program.state(instance.state);
+        let analysis = context.analysis.state(instance.state);
+        let is_routine = !matches!(state.kind, StateKind::Action { .. });
         let Some(instance) = self.instances.get(id) else { return };
         let attempt = instance.attempt;
         let view = self.sight(context).view(instance, None);
@@ -175,7 +181,11 @@ impl Window {
             return self.start_routine(context, id);
         }
         let StateKind::Action { provider, action, inputs, .. } = &state.kind else { return };
-        let inputs = match binding::inputs(state, inputs, &view) {
+        let bound = match &instance.seen {
+            Some(seen) => Ok(seen.inputs.clone()),
+            None => binding::inputs(state, inputs, &view),
+        };
+        let inputs = match bound {
             Ok(inputs) => inputs,
             Err(error) => {
                 return match not_bound(&view, &error) {

@@ -197,10 +197,13 @@ impl Window {
                 }
             }
             Event::Finished { instance, attempt, outcome, outputs, measured, reason } => {
-                match self.with_status(instance, Status::Running) {
+                match self.instances.get(instance).filter(|running| running.status == Status::Running) {
                     Some(running) if running.attempt == attempt && running.routine.is_none() => {
                         let changes = Changed::Declared(measured);
-                        self.goal_ended(context, instance, Ended { outcome: outcome.into(), outputs, reason, changes });
+                        let own = self.plan.state(running.state);
+                        let known = own.outcome(&outcome).map(|number| own.outcomes[number].clone());
+                        let outcome = known.unwrap_or_else(|| outcome.into());
+                        self.goal_ended(context, instance, Ended { outcome, outputs, reason, changes });
                     }
                     _ => {
                         let event = Event::Finished { instance, attempt, outcome, outputs, measured, reason };

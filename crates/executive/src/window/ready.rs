@@ -181,6 +181,9 @@ impl Window {
 
     /// An imprecise PIA that still runs beside an instance, although older, and must end before it begins.
     pub(super) fn conflict_beside(&self, context: &Context<'_>, instance: &Instance) -> Option<InstanceId> {
+        if self.detached.is_empty() {
+            return None;
+        }
         let sight = self.sight(context);
         let (reads, writes) = self.touches(context, instance);
         self.detached.iter().copied().filter(|id| *id < instance.id).find(|id| {
