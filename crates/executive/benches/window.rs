@@ -23,6 +23,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 struct Counting;
 
 static IN_USE: AtomicUsize = AtomicUsize::new(0);
+static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
 
 #[expect(
     unsafe_code,
@@ -32,6 +33,7 @@ static IN_USE: AtomicUsize = AtomicUsize::new(0);
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         IN_USE.fetch_add(layout.size(), Ordering::Relaxed);
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
         // SAFETY: the caller keeps the contract of `alloc`.
         unsafe { System.alloc(layout) }
     }
@@ -80,13 +82,16 @@ fn conversion(bencher: divan::Bencher<'_, '_>) {
     });
 }
 
-/// Bytes per instance of a window of 10⁵; printed, because it is no time.
+/// Bytes per instance of a window of 10⁵, and allocations per event; printed, because they are no times.
 #[divan::bench(consts = [0, 1, 2, 3], sample_count = 1, sample_size = 1)]
 fn memory<const SHAPE: usize>() {
     let before = IN_USE.load(Ordering::Relaxed);
-    let harness = Harness::new(SHAPES[SHAPE], 100_000);
+    let mut harness = Harness::new(SHAPES[SHAPE], 100_000);
     let bytes = IN_USE.load(Ordering::Relaxed).saturating_sub(before) - harness.pending_bytes();
-    println!("{}: {} bytes per instance", SHAPES[SHAPE], bytes / 100_000);
+    let before = ALLOCATIONS.load(Ordering::Relaxed);
+    harness.run(1_000);
+    let allocations = (ALLOCATIONS.load(Ordering::Relaxed) - before) as f64 / 1_000.0;
+    println!("{}: {} bytes per instance, {allocations} allocations per event", SHAPES[SHAPE], bytes / 100_000);
 }
 
 struct Harness {

@@ -54,7 +54,7 @@ impl Executive {
 
     /// Takes an event; what the shell shall do now, in order.
     pub fn handle(&mut self, now: Timestamp, event: Event) -> Vec<Command> {
-        let mut commands = Vec::new();
+        let mut commands = Vec::with_capacity(8);
         match event {
             Event::Started { mode, parameters, seed, world, revision, capacity, learned, .. } => {
                 if matches!(self.state, State::Fresh) {

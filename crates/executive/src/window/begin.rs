@@ -4,7 +4,7 @@ use super::Window;
 use super::instance::{Ended, Seen, Status, Wait};
 use super::ready::{Readiness, not_bound, senses_of};
 use crate::analysis::NodeNature;
-use crate::binding;
+use crate::binding::{self, Outputs};
 use crate::context::Context;
 use crate::interpreter::{Interpreter, Routine, Target};
 use crate::protocol::{Command, Goal, Note};
@@ -27,7 +27,7 @@ impl Window {
                 }
                 self.fail(context, id, reason);
             }
-            Readiness::Ready(requirements) => self.acquire(context, id, requirements, seen, &used),
+            Readiness::Ready(requirements, inputs) => self.acquire(context, id, requirements, inputs, seen, &used),
         }
     }
 
@@ -42,6 +42,7 @@ impl Window {
         context: &mut Context<'_>,
         id: InstanceId,
         requirements: Vec<Requirement>,
+        inputs: Option<Outputs>,
         seen: Seen,
         used: &[InstanceId],
     ) {
@@ -60,7 +61,7 @@ impl Window {
         if requirements.is_empty() {
             self.active.insert(id);
             self.set_status(id, Status::Granted, Wait::Nothing);
-            self.launch(context, id);
+            self.launch(context, id, inputs);
             return;
         }
         if !self.leaves_room(context, instance, &requirements) {
@@ -147,11 +148,11 @@ impl Window {
                 }
             }
         }
-        self.launch(context, id);
+        self.launch(context, id, None);
     }
 
     /// What it reads is as it was when it asked.
-    fn launch(&mut self, context: &mut Context<'_>, id: InstanceId) {
+    fn launch(&mut self, context: &mut Context<'_>, id: InstanceId, known: Option<Outputs>) {
         let Some(instance) = self.instances.get(id) else { return };
         let state = context.program.state(instance.state);
         let analysis = context.analysis.state(instance.state);
@@ -181,8 +182,8 @@ impl Window {
             return self.start_routine(context, id);
         }
         let StateKind::Action { provider, action, inputs, .. } = &state.kind else { return };
-        let bound = match &instance.seen {
-            Some(seen) => Ok(seen.inputs.clone()),
+        let bound = match known {
+            Some(inputs) => Ok(inputs),
             None => binding::inputs(state, inputs, &view),
         };
         let inputs = match bound {
@@ -234,6 +235,9 @@ impl Window {
                 use ratn_model::expression::Scope;
                 Some((name.to_string(), view.variable(name)?.into_owned()))
             })
+            .chain(
+                environment.loop_variables(context.program).map(|(name, value)| (name.to_owned(), value.into_owned())),
+            )
             .collect();
         let target = if instance.is_pia() {
             Target::Actual

@@ -10,6 +10,7 @@ use crate::context::Context;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, State, StateKind};
 use ratn_model::value::Value;
+use smallvec::smallvec;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -80,7 +81,7 @@ impl Window {
                 below: template.environment.frames.clone(),
                 owner: state.id,
                 visit,
-                prefix: path.clone(),
+                path: path.clone(),
                 visits: Vec::new(),
                 iteration: None,
                 variables,
@@ -199,7 +200,7 @@ impl Window {
         if let Some(instance) = self.instances.get_mut(join) {
             instance.environment = environment;
             let segment = instance.segment;
-            instance.arms = vec![Arm { outcomes: u64::MAX, outcome: 0, next: None, segment }];
+            instance.arms = smallvec![Arm { outcomes: u64::MAX, outcome: 0, next: None, segment }];
         }
         if let Some(fork) = self.forks.get_mut(&id) {
             fork.join = Some(join);

@@ -6,7 +6,9 @@ use super::plan::{Outcome, Plan, Predicate};
 use super::table::Table;
 use crate::binding::Outputs;
 use ratn_model::id::{InstanceId, StateId};
+use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
+use std::borrow::Cow;
 use std::fmt::Write;
 use std::sync::{Arc, OnceLock};
 
@@ -17,6 +19,8 @@ pub(crate) struct Environment {
     pub(crate) variables: Variables,
     /// By predicate, the youngest older instance that writes it.
     pub(crate) writers: Table<Link>,
+    /// Of the test of a `while`: its iteration, which is not begun yet.
+    pub(crate) test: Option<Box<(StateId, Iteration)>>,
     /// By state, who wrote its outputs last; at the number of states plus its own, how a region ended.
     pub(crate) producers: Table<Arc<Producer>>,
 }
@@ -45,8 +49,8 @@ pub(crate) struct Frame {
     /// The state whose list it is, and its visit number.
     pub(crate) owner: StateId,
     pub(crate) visit: u32,
-    /// Path of the activation: of the owner, with the iteration.
-    pub(crate) prefix: Arc<str>,
+    /// Path of the owner, without the iteration.
+    pub(crate) path: Arc<str>,
     /// How often states were visited, where that may be more than once.
     pub(crate) visits: Vec<(StateId, u32)>,
     /// Of a loop.
@@ -118,9 +122,34 @@ impl Environment {
         Environment {
             frames: None,
             variables: Variables::default(),
+            test: None,
             writers: Table::new(plan.width),
             producers: Table::new(2 * plan.len()),
         }
+    }
+
+    /// The loop variables in sight, innermost first: name and value.
+    pub(crate) fn loop_variables<'a>(
+        &'a self,
+        program: &'a Program,
+    ) -> impl Iterator<Item = (&'a str, Cow<'a, Value>)> + 'a {
+        let frames = std::iter::successors(self.frames.as_deref(), |frame| frame.below.as_deref());
+        let looping = self
+            .test
+            .iter()
+            .map(|test| (test.0, &test.1))
+            .chain(frames.filter_map(|frame| Some((frame.owner, frame.iteration.as_ref()?))));
+        looping.flat_map(|(owner, iteration)| {
+            let (variable, index) = match &program.state(owner).kind {
+                StateKind::ForEach { variable, index, .. } => (Some(variable.as_str()), index.as_deref()),
+                StateKind::While { index, .. } => (None, index.as_deref()),
+                _ => (None, None),
+            };
+            let element = iteration.elements.as_ref().and_then(|all| all.get(iteration.index));
+            let number = || Cow::Owned(Value::Int(i64::try_from(iteration.index).unwrap_or(i64::MAX)));
+            let element = variable.zip(element.map(Cow::Borrowed));
+            element.into_iter().chain(index.map(|name| (name, number())))
+        })
     }
 
     pub(crate) fn producer(&self, state: StateId) -> Option<&Arc<Producer>> {
@@ -133,9 +162,12 @@ impl Environment {
 
     /// The path of a state visited here.
     pub(crate) fn path(&self, name: &str, visit: u32, iteration: Option<usize>) -> String {
-        let prefix = self.frames.as_ref().map_or("", |frame| &*frame.prefix);
-        let mut path = String::with_capacity(prefix.len() + name.len() + 8);
+        let prefix = self.frames.as_ref().map_or("", |frame| &*frame.path);
+        let mut path = String::with_capacity(prefix.len() + name.len() + 16);
         path.push_str(prefix);
+        if let Some(iteration) = self.frames.as_ref().and_then(|frame| frame.iteration.as_ref()) {
+            let _ = write!(path, "[{}]", iteration.index);
+        }
         if !prefix.is_empty() && !name.is_empty() {
             path.push('/');
         }

@@ -17,6 +17,7 @@ use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Program, SUCCESS, State, StateKind, Target};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
+use smallvec::{SmallVec, smallvec};
 use std::cell::Cell;
 use std::sync::{Arc, OnceLock};
 
@@ -34,7 +35,26 @@ impl Window {
     pub(super) fn expand(&mut self, context: &mut Context<'_>) -> bool {
         let mut grew = false;
         'again: loop {
-            self.join_regions(context);
+            if !self.forks.is_empty() {
+                self.join_regions(context);
+            }
+            if let [only] = self.cursors.as_slice()
+                && only.todo != Todo::Done
+            {
+                while matches!(self.cursors.as_slice(), [only] if only.todo != Todo::Done)
+                    && self.may_grow(context.program, 0)
+                {
+                    grew = true;
+                    self.step(context, 0);
+                }
+                if let [only] = self.cursors.as_slice()
+                    && only.todo != Todo::Done
+                    && self.forks.is_empty()
+                {
+                    return grew;
+                }
+                self.cursors.retain(|cursor| cursor.todo != Todo::Done);
+            }
             for index in self.awake() {
                 let cursors = self.cursors.len();
                 while self.may_grow(context.program, index) {
@@ -52,9 +72,6 @@ impl Window {
 
     /// The cursors that may grow as far as the speculation width goes, the likelier ones first.
     fn awake(&self) -> Vec<usize> {
-        if let [_] = self.cursors.as_slice() {
-            return vec![0];
-        }
         let mut all: Vec<usize> = (0..self.cursors.len()).collect();
         let rank = |index: &usize| {
             let cursor = &self.cursors[*index];
@@ -194,12 +211,12 @@ impl Window {
         index: usize,
         owner: StateId,
         visit: u32,
-        prefix: Arc<str>,
+        path: Arc<str>,
         variables: usize,
         iteration: Option<Iteration>,
     ) -> Arc<Frame> {
         let below = self.cursors[index].environment.frames.clone();
-        Arc::new(Frame { below, owner, visit, prefix, visits: Vec::new(), iteration, variables, fork: None })
+        Arc::new(Frame { below, owner, visit, path, visits: Vec::new(), iteration, variables, fork: None })
     }
 
     /// Begins a list of a composite state that is no loop.
@@ -252,11 +269,14 @@ impl Window {
             Some(_) => self.leave_frame(index, 0),
             None => {
                 let state = program.state(owner);
-                self.bind_iteration(index, program);
                 // The test stands where the loop stands, not in its body.
-                let inside = self.cursors[index].environment.frames.clone();
-                self.cursors[index].environment.frames = inside.as_ref().and_then(|frame| frame.below.clone());
+                let environment = &mut self.cursors[index].environment;
+                environment.variables.truncate(base);
+                let inside = environment.frames.clone();
+                environment.frames = inside.as_ref().and_then(|frame| frame.below.clone());
+                environment.test = Some(Box::new((owner, Iteration { index: number, elements: None })));
                 let test = self.append(context, index, state, Role::Test, visit, Some(number), 0);
+                self.cursors[index].environment.test = None;
                 let decisions = [(0, "again"), (1, "done")];
                 for (cursor, taken) in self.branch(context, index, test, owner, &decisions) {
                     if taken == 0 {
@@ -264,7 +284,6 @@ impl Window {
                         self.begin_iteration(cursor, program);
                     } else {
                         let ended = &mut self.cursors[cursor];
-                        ended.environment.variables.truncate(base);
                         ended.todo = Todo::Exit { state: owner, visit, outcome: 0 };
                     }
                 }
@@ -272,48 +291,16 @@ impl Window {
         }
     }
 
-    /// Variables of the innermost loop's iteration; the first state of its body is next.
+    /// The first state of the innermost loop's body is next.
     fn begin_iteration(&mut self, index: usize, program: &Program) {
-        self.bind_iteration(index, program);
-        let Some(frame) = self.top_frame(index) else { return };
-        let owner = program.state(frame.owner);
-        let number = frame.iteration.as_ref().map_or(0, |iteration| iteration.index);
-        let visit = frame.visit;
-        let below = frame.below.clone();
-        let cursor = &mut self.cursors[index];
-        // The prefix has the number of the iteration.
-        let frames = std::mem::replace(&mut cursor.environment.frames, below);
-        let prefix: Arc<str> = cursor.environment.path(&owner.name, visit, Some(number)).into();
-        cursor.environment.frames = frames;
-        if let Some(frame) = self.top_frame(index) {
-            frame.prefix = prefix;
-        }
-        let body = match &owner.kind {
+        let Some(frame) = &self.cursors[index].environment.frames else { return };
+        let body = match &program.state(frame.owner).kind {
             StateKind::ForEach { body, .. } | StateKind::While { body, .. } => body.first(),
             _ => None,
         };
+        let base = frame.variables;
+        self.cursors[index].environment.variables.truncate(base);
         self.cursors[index].todo = body.map_or(Todo::Iterate, |first| Todo::Enter(*first));
-    }
-
-    fn bind_iteration(&mut self, index: usize, program: &Program) {
-        let Some(frame) = self.top_frame(index) else { return };
-        let (owner, base) = (frame.owner, frame.variables);
-        let Some(iteration) = frame.iteration.clone() else { return };
-        let variables = &mut self.cursors[index].environment.variables;
-        variables.truncate(base);
-        let number = Value::Int(i64::try_from(iteration.index).unwrap_or(i64::MAX));
-        match &program.state(owner).kind {
-            StateKind::ForEach { variable, index, .. } => {
-                if let Some(element) = iteration.elements.as_ref().and_then(|all| all.get(iteration.index)) {
-                    variables.declare(variable, Binding::Known(element.clone()));
-                }
-                if let Some(index) = index {
-                    variables.declare(index, Binding::Known(number));
-                }
-            }
-            StateKind::While { index: Some(index), .. } => variables.declare(index, Binding::Known(number)),
-            _ => {}
-        }
     }
 
     /// Follows an outcome of a state that has ended.
@@ -443,7 +430,7 @@ impl Window {
     fn single_arm(&mut self, index: usize, instance: InstanceId) {
         let segment = self.cursors[index].segment;
         if let Some(instance) = self.instances.get_mut(instance) {
-            instance.arms = vec![Arm { outcomes: 1, outcome: 0, next: None, segment }];
+            instance.arms = smallvec![Arm { outcomes: 1, outcome: 0, next: None, segment }];
         }
     }
 
@@ -552,7 +539,7 @@ impl Window {
             line,
             segment,
             position,
-            arms: Vec::new(),
+            arms: SmallVec::new(),
             leaves_by,
             left_because,
             is_head: false,

@@ -11,6 +11,7 @@ use ratn_model::program::{ABORTED, SUCCESS};
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
+use smallvec::SmallVec;
 use std::cell::Cell;
 use std::sync::Arc;
 
@@ -140,8 +141,8 @@ pub(crate) struct Seen {
     pub(crate) read: Vec<Footprint>,
     /// As they were.
     pub(crate) facts: Vec<(FactKey, Value)>,
-    /// Its inputs.
-    pub(crate) inputs: Outputs,
+    /// What its inputs come to: [`super::twins::digest`].
+    pub(crate) inputs: u128,
 }
 
 /// One continuation.
@@ -174,7 +175,7 @@ pub(crate) struct Instance {
     /// How many instances of its line are before it on its path.
     pub(crate) position: u64,
     /// What follows: one arm, or one per branch. Empty where the path ends or nothing is expanded behind it yet.
-    pub(crate) arms: Vec<Arm>,
+    pub(crate) arms: SmallVec<[Arm; 1]>,
     /// Exit, RegionEnd, End: the outcome by which the state is left.
     pub(crate) leaves_by: Outcome,
     /// Why it is left by that outcome.

@@ -8,7 +8,7 @@ use super::environment::Binding;
 use super::instance::{Instance, Seen, Wait};
 use super::view::{Blocked, Sight, View};
 use crate::analysis::NodeNature;
-use crate::binding::{self, BindError};
+use crate::binding::{self, BindError, Outputs};
 use crate::context::Context;
 use ratn_model::expression::{Expr, FactExpr};
 use ratn_model::fact::{FactKey, Footprint};
@@ -20,8 +20,8 @@ use ratn_world::world::World;
 
 /// Whether a node may begin.
 pub(super) enum Readiness {
-    /// With these resources.
-    Ready(Vec<Requirement>),
+    /// With these resources and, of what is no PIA, these inputs.
+    Ready(Vec<Requirement>, Option<Outputs>),
     /// Not before something else; whom to wait for is in it, or somebody else will look again.
     Waits(Wait),
     /// It never will: the reason it ends `aborted`.
@@ -110,13 +110,17 @@ impl Window {
             Ok(requirements) => requirements,
             Err(error) => return not_bound(view, &error),
         };
+        let mut bound = None;
         if let (StateKind::Action { inputs, .. }, false) = (&state.kind, is_pia) {
             match binding::inputs(state, inputs, view) {
-                Ok(inputs) => seen.inputs = inputs,
+                Ok(inputs) => {
+                    seen.inputs = super::twins::digest(&inputs);
+                    bound = Some(inputs);
+                }
                 Err(error) => return not_bound(view, &error),
             }
         }
-        Readiness::Ready(requirements)
+        Readiness::Ready(requirements, bound)
     }
 
     /// The facts that a computing or sensing node reads, as they are at its place; a sensing one only when the environment

@@ -6,6 +6,7 @@ use super::{Window, give_back};
 use crate::context::Context;
 use crate::protocol::{Command, Note};
 use ratn_model::id::InstanceId;
+use smallvec::smallvec;
 use std::collections::BTreeSet;
 
 impl Window {
@@ -18,7 +19,7 @@ impl Window {
         let mut arms = std::mem::take(&mut instance.arms);
         let kept = arms.swap_remove(taken);
         let (kept_segment, kept_arm) = (kept.segment, kept.clone());
-        instance.arms = vec![kept];
+        instance.arms = smallvec![kept];
         let lost: Vec<InstanceId> = arms.iter().filter_map(|arm| arm.next).collect();
         let lost_segments: BTreeSet<u64> = arms.iter().map(|arm| arm.segment).collect();
         self.discard(context, lost, lost_segments);

@@ -390,9 +390,11 @@ impl<'a> View<'a> {
 
 impl Scope for View<'_> {
     fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
-        match self.instance.environment.variables.get(name)? {
-            Binding::Known(value) => Some(Cow::Borrowed(value)),
-            Binding::Assigned(producer) => self.produced(producer)?.get(&assigned(name)).map(Cow::Borrowed),
+        let environment = &self.instance.environment;
+        match environment.variables.get(name) {
+            Some(Binding::Known(value)) => Some(Cow::Borrowed(value)),
+            Some(Binding::Assigned(producer)) => self.produced(producer)?.get(&assigned(name)).map(Cow::Borrowed),
+            None => environment.loop_variables(self.sight.program).find(|(n, _)| *n == name).map(|(_, value)| value),
         }
     }
 
