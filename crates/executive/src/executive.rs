@@ -15,6 +15,7 @@ use ratn_world::world::World;
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// Executes one program once.
 ///
@@ -27,6 +28,8 @@ pub struct Executive {
     root: World,
     last_instance: u64,
     seed: u64,
+    /// Of HSM mode.
+    deadline: Option<Timestamp>,
     state: State,
 }
 
@@ -48,6 +51,7 @@ impl Executive {
             root: World::default(),
             last_instance: 0,
             seed: 0,
+            deadline: None,
             state: State::Fresh,
         }
     }
@@ -114,6 +118,10 @@ impl Executive {
         }
         let end = match window {
             None => {
+                let seconds =
+                    program.deadline_s.map(|s| Duration::try_from_secs_f64(s.max(0.0)).unwrap_or(Duration::MAX));
+                self.deadline = seconds.map(|seconds| now + seconds);
+                context.commands.extend(self.deadline.map(|at| Command::Wake { at }));
                 let mut interpreter = Box::new(Interpreter::of_program(parameters));
                 let progress = interpreter.start(&mut context, Program::ROOT, "");
                 let end = end_of(&mut context, &interpreter, progress);
@@ -143,6 +151,12 @@ impl Executive {
         let end = match &mut self.state {
             State::Fresh | State::Ended => None,
             State::Cdtn(window) => window.handle(&mut context, event),
+            State::Hsm(interpreter) if self.deadline.is_some_and(|deadline| deadline <= now) => {
+                interpreter.abort(&mut context);
+                let limit = program.deadline_s.unwrap_or_default();
+                let reason = format!("the task took longer than its deadline of {limit} s");
+                Some(End { outcome: ABORTED.to_owned(), outputs: BTreeMap::new(), reason })
+            }
             State::Hsm(interpreter) => match event {
                 Event::AbortRequested { reason } => {
                     interpreter.abort(&mut context);

@@ -9,6 +9,7 @@ mod binding;
 mod context;
 mod effects;
 pub mod executive;
+mod hold;
 mod interpreter;
 pub mod protocol;
 mod window;

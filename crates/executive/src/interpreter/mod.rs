@@ -1,24 +1,27 @@
-//! The sequential interpreter: executes a state and what it contains as written, one node after the other.
+//! The sequential interpreter: executes a state and what it contains as written, one node after the other; the regions of a
+//! concurrency beside each other.
 //!
 //! It is HSM mode (from the root, on the actual world), and it runs inside a routine of the window (under the routine's
 //! lease, on the actual world or, for a routine that only computes, on a projection). It shares no code with the window's
-//! scheduling.
+//! scheduling: the two check each other.
 //!
-//! ```text
-//! one action:  acquiring ─► projecting ─► running ─► its effects are made, the next begins
-//!              (none within a routine)  (only with a world model)
-//! ```
+//! A thread of control has a stack of frames (the lists it is in) and does one thing at a time: [`walk`] says what is next,
+//! [`node`] lives the life of one action, [`exit`] does what composite states do at their ends, [`regions`] forks and joins.
 
+mod exit;
 mod node;
+mod regions;
 mod walk;
 
 use crate::binding::{Bindings, Names, Outputs};
 use crate::context::Context;
+use crate::hold::Hold;
 use crate::protocol::{Command, Event, Note};
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, Revision, StateId};
-use ratn_model::program::ABORTED;
+use ratn_model::program::StateKind;
 use ratn_model::resource::{Lease, Requirement};
+use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_world::world::World;
 use std::borrow::Cow;
@@ -58,37 +61,83 @@ pub(crate) enum Progress {
     },
 }
 
-enum Frame {
-    /// The children of a sequence, or one branch of a condition.
-    List { state: StateId, children: Vec<StateId>, next: usize, path: String },
-    /// The iterations of a loop.
-    Loop { state: StateId, elements: Vec<Value>, next: usize, path: String },
+/// One activation of a list of states.
+struct Frame {
+    /// The state whose list it is.
+    owner: StateId,
+    /// Which of its lists.
+    list: usize,
+    /// The owner's path, without the iteration.
+    path: String,
+    /// How often each state of the list was visited.
+    visits: BTreeMap<StateId, u32>,
+    /// Of a loop: the number of the iteration, and its elements; none of a `while`.
+    iteration: Option<(usize, Option<Vec<Value>>)>,
+    /// How many variables there were before the owner was entered.
+    variables: usize,
 }
 
+/// What a thread does next.
+enum Todo {
+    /// Visit a state, under this path if it is the first.
+    Enter(StateId, Option<String>),
+    /// A state has ended.
+    Ended { state: StateId, outcome: String, reason: String },
+    /// The next iteration of the innermost loop, or its end.
+    Iterate,
+    /// An action is under way.
+    Busy,
+    /// Its regions are under way.
+    Join { state: StateId, path: String, regions: Vec<u64> },
+    /// It has come to its end.
+    Done { outcome: String, reason: String },
+}
+
+/// A thread of control: the state's, or a region's.
+struct Thread {
+    frames: Vec<Frame>,
+    variables: Vec<(String, Value)>,
+    todo: Todo,
+    current: Option<Current>,
+}
+
+/// How far an action is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
+    /// The operator lets nothing begin.
+    Held,
+    /// It waits before its next try.
+    Backoff(Timestamp),
     Acquiring,
     Projecting,
     Running,
 }
 
+/// An action under way.
 struct Current {
     instance: InstanceId,
     state: StateId,
     path: String,
     attempt: u32,
+    tries: u32,
+    crashes: u32,
     phase: Phase,
+    /// When its goal has had its time.
+    timeout: Option<Timestamp>,
     lease: Option<Lease>,
     projection: Option<ProjectionId>,
 }
 
 /// The interpreter of one state.
 pub(crate) struct Interpreter {
-    frames: Vec<Frame>,
-    variables: Vec<(String, Value)>,
+    threads: BTreeMap<u64, Thread>,
+    last_thread: u64,
     outputs: BTreeMap<StateId, Outputs>,
-    current: Option<Current>,
+    /// How regions ended.
+    regions: BTreeMap<StateId, String>,
     routine: Option<Routine>,
     target: Target,
+    hold: Hold,
 }
 
 /// What a routine holds for everything it contains.
@@ -99,32 +148,14 @@ pub(crate) struct Routine {
     pub(crate) lease: Option<Lease>,
 }
 
-struct Scoped<'a> {
-    variables: &'a [(String, Value)],
-    outputs: &'a BTreeMap<StateId, Outputs>,
-}
-
-impl Names for Scoped<'_> {
-    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.variables.iter().rev().find(|(n, _)| n == name).map(|(_, v)| Cow::Borrowed(v))
-    }
-
-    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
-        self.outputs.get(&state)?.get(port).map(Cow::Borrowed)
-    }
-}
+/// The thread of the state itself.
+const MAIN: u64 = 0;
 
 impl Interpreter {
     /// HSM mode: the whole program on the actual world.
     pub(crate) fn of_program(parameters: &BTreeMap<String, Value>) -> Interpreter {
-        Interpreter {
-            frames: Vec::new(),
-            variables: parameters.iter().map(|(n, v)| (n.clone(), v.clone())).collect(),
-            outputs: BTreeMap::new(),
-            current: None,
-            routine: None,
-            target: Target::Actual,
-        }
+        let variables = parameters.iter().map(|(n, v)| (n.clone(), v.clone())).collect();
+        Interpreter::new(variables, BTreeMap::new(), None, Target::Actual)
     }
 
     /// A routine: its own lease serves everything it contains.
@@ -134,7 +165,26 @@ impl Interpreter {
         routine: Routine,
         target: Target,
     ) -> Interpreter {
-        Interpreter { frames: Vec::new(), variables, outputs, current: None, routine: Some(routine), target }
+        Interpreter::new(variables, outputs, Some(routine), target)
+    }
+
+    fn new(
+        variables: Vec<(String, Value)>,
+        outputs: BTreeMap<StateId, Outputs>,
+        routine: Option<Routine>,
+        target: Target,
+    ) -> Interpreter {
+        let todo = Todo::Done { outcome: String::new(), reason: String::new() };
+        let main = Thread { frames: Vec::new(), variables, todo, current: None };
+        Interpreter {
+            threads: BTreeMap::from([(MAIN, main)]),
+            last_thread: MAIN,
+            outputs,
+            regions: BTreeMap::new(),
+            routine,
+            target,
+            hold: Hold::default(),
+        }
     }
 
     /// What a routine holds now.
@@ -142,22 +192,28 @@ impl Interpreter {
         self.routine.as_ref()?.lease.as_ref()
     }
 
-    /// Begins with `state`.
+    /// Begins with `state`, visited at `path`.
     pub(crate) fn start(&mut self, context: &mut Context<'_>, state: StateId, path: &str) -> Progress {
-        match self.enter(context, state, path) {
-            Ok(()) => self.advance(context),
-            Err(reason) => self.leave(context, ABORTED, reason),
+        if let Some(main) = self.threads.get_mut(&MAIN) {
+            main.todo = Todo::Enter(state, Some(path.to_owned()));
         }
+        self.advance(context)
     }
 
-    /// The instances it has under way.
-    pub(crate) fn instance(&self) -> Option<InstanceId> {
-        self.current.as_ref().map(|c| c.instance)
+    /// Whether an instance is one of those under way.
+    pub(crate) fn is_at(&self, instance: InstanceId) -> bool {
+        self.threads.values().flat_map(|thread| &thread.current).any(|current| current.instance == instance)
     }
 
-    /// What the states it executed have written so far.
+    /// What the states it executed have written.
     pub(crate) fn outputs(&self) -> &BTreeMap<StateId, Outputs> {
         &self.outputs
+    }
+
+    /// The value of a variable outside of the state it executes.
+    pub(crate) fn variable(&self, name: &str) -> Option<&Value> {
+        let main = self.threads.get(&MAIN)?;
+        main.variables.iter().rev().find(|(n, _)| n == name).map(|(_, value)| value)
     }
 
     /// The changes it has made to its projection; none in the actual world, where they are real already.
@@ -174,61 +230,109 @@ impl Interpreter {
         context: &Context<'_>,
         use_scope: impl FnOnce(&dyn ratn_model::expression::Scope) -> T,
     ) -> T {
-        self.with_scope(context, None, use_scope)
+        self.with_scope(context, MAIN, None, use_scope)
     }
 
-    /// An event for the instance under way; others are not for us.
+    /// An event for an instance under way, for all of them, or for the operator's wishes; others are not for us.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Progress {
-        let Some(current) = self.current.as_mut() else { return Progress::Busy };
+        self.look_at_the_time(context);
+        let of = |interpreter: &Interpreter, id: InstanceId, attempt: Option<u32>| {
+            let at = |thread: &Thread| {
+                thread.current.as_ref().is_some_and(|c| c.instance == id && attempt.is_none_or(|a| a == c.attempt))
+            };
+            interpreter.threads.iter().find(|(_, thread)| at(thread)).map(|(thread, _)| *thread)
+        };
         match event {
-            Event::Granted { instance, lease } if instance == current.instance => {
-                match &mut self.routine {
-                    Some(routine) => routine.lease = Some(lease),
-                    None => current.lease = Some(lease),
+            Event::Granted { instance, lease } => {
+                if let Some(thread) = of(self, instance, None) {
+                    self.granted(context, thread, lease);
                 }
-                self.project_or_run(context)
             }
-            Event::Refused { instance, reason } if instance == current.instance => {
-                self.leave(context, ABORTED, format!("its resources were refused: {reason}"))
+            Event::Refused { instance, reason } => {
+                if let Some(thread) = of(self, instance, None).filter(|t| self.phase(*t) == Some(Phase::Acquiring)) {
+                    self.end_node(context, thread, format!("its resources were refused: {reason}"));
+                }
             }
-            Event::Projected { instance, attempt, projection }
-                if instance == current.instance && attempt == current.attempt =>
-            {
-                current.projection = Some(projection);
-                self.run(context)
+            Event::Projected { instance, attempt, projection } => {
+                if let Some(thread) = of(self, instance, Some(attempt))
+                    && self.phase(thread) == Some(Phase::Projecting)
+                {
+                    if let Some(current) = self.current(thread) {
+                        current.projection = Some(projection);
+                    }
+                    self.run(context, thread);
+                }
             }
-            Event::Crashed { instance, attempt, reason }
-                if instance == current.instance && attempt == current.attempt =>
-            {
-                self.crashed(context, &reason)
+            Event::Crashed { instance, attempt, reason } => {
+                if let Some(thread) = of(self, instance, Some(attempt)) {
+                    self.crashed(context, thread, &reason);
+                }
             }
-            Event::Finished { instance, attempt, outcome, outputs, measured, reason }
-                if instance == current.instance && attempt == current.attempt =>
-            {
-                self.finished(context, outcome, outputs, &measured, reason)
+            Event::Finished { instance, attempt, outcome, outputs, measured, reason } => {
+                if let Some(thread) = of(self, instance, Some(attempt))
+                    && self.phase(thread) == Some(Phase::Running)
+                {
+                    self.goal_ended(context, thread, outcome, outputs, &measured, reason);
+                }
             }
-            _ => Progress::Busy,
+            Event::PauseRequested => self.hold = Hold::Paused(0),
+            Event::ResumeRequested => {
+                self.hold = Hold::Running;
+                self.let_go(context);
+            }
+            Event::StepRequested => {
+                self.hold.step();
+                self.let_go(context);
+            }
+            _ => {}
         }
+        self.advance(context)
     }
 
     /// Ends everything under way.
     pub(crate) fn abort(&mut self, context: &mut Context<'_>) {
-        if let Some(current) = self.current.take() {
-            match current.phase {
-                Phase::Acquiring => context.commands.push(Command::Withdraw { instance: current.instance }),
-                Phase::Projecting | Phase::Running => {
-                    context.commands.push(Command::Cancel { instance: current.instance, attempt: current.attempt });
-                }
-            }
-            self.give_back(context, &current);
-            context.note(Note::Squashed { instance: current.instance });
+        let all: Vec<u64> = self.threads.keys().copied().collect();
+        for thread in all {
+            self.stop(context, thread);
         }
-        self.frames.clear();
     }
 
-    pub(super) fn with_scope<T>(
+    /// Ends what a thread has under way; it does nothing any more.
+    fn stop(&mut self, context: &mut Context<'_>, id: u64) {
+        let Some(thread) = self.threads.get_mut(&id) else { return };
+        thread.frames.clear();
+        let stopped = Todo::Done { outcome: ratn_model::program::PREEMPTED.to_owned(), reason: String::new() };
+        if let Todo::Join { regions, .. } = std::mem::replace(&mut thread.todo, stopped) {
+            for region in regions {
+                self.stop(context, region);
+                self.threads.remove(&region);
+            }
+        }
+        let Some(current) = self.threads.get_mut(&id).and_then(|thread| thread.current.take()) else { return };
+        match current.phase {
+            Phase::Held | Phase::Backoff(_) => {}
+            Phase::Acquiring => context.commands.push(Command::Withdraw { instance: current.instance }),
+            Phase::Projecting | Phase::Running => {
+                context.commands.push(Command::Cancel { instance: current.instance, attempt: current.attempt });
+            }
+        }
+        self.give_back(context, &current);
+        context.note(Note::Squashed { instance: current.instance });
+    }
+
+    fn current(&mut self, thread: u64) -> Option<&mut Current> {
+        self.threads.get_mut(&thread)?.current.as_mut()
+    }
+
+    fn phase(&self, thread: u64) -> Option<Phase> {
+        self.threads.get(&thread)?.current.as_ref().map(|current| current.phase)
+    }
+
+    /// Uses the scope of a thread where it stands.
+    fn with_scope<T>(
         &self,
         context: &Context<'_>,
+        thread: u64,
         outputs: Option<&Outputs>,
         use_scope: impl FnOnce(&dyn ratn_model::expression::Scope) -> T,
     ) -> T {
@@ -236,7 +340,34 @@ impl Interpreter {
             Target::Actual => &*context.root,
             Target::Projection { world, .. } => world,
         };
-        let names = Scoped { variables: &self.variables, outputs: &self.outputs };
+        let none = Thread { frames: Vec::new(), variables: Vec::new(), todo: Todo::Busy, current: None };
+        let thread = self.threads.get(&thread).unwrap_or(&none);
+        let names = Scoped { interpreter: self, thread, program: context.program };
         use_scope(&Bindings { names: &names, outputs, world, unknown: &Footprint::NOTHING })
+    }
+}
+
+struct Scoped<'a> {
+    interpreter: &'a Interpreter,
+    thread: &'a Thread,
+    program: &'a ratn_model::program::Program,
+}
+
+impl Names for Scoped<'_> {
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
+        let known = self.thread.variables.iter().rev().find(|(n, _)| n == name);
+        known.map(|(_, value)| Cow::Borrowed(value))
+    }
+
+    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
+        let source = self.program.state(state);
+        let around = source.parent.map(|parent| &self.program.state(parent).kind);
+        if port == "outcome" && matches!(around, Some(StateKind::Concurrency { .. })) {
+            return self.interpreter.regions.get(&state).map(|outcome| Cow::Owned(Value::String(outcome.clone())));
+        }
+        match self.interpreter.outputs.get(&state) {
+            Some(outputs) => outputs.get(port).map(Cow::Borrowed),
+            None => source.defaults.get(port).map(Cow::Borrowed),
+        }
     }
 }

@@ -1,223 +1,323 @@
-//! One node: acquire, project, run, and what its end changes.
+//! One action: acquire, project, run, and what its end changes.
 
-use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase, Progress, Target};
+use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase, Target};
 use crate::analysis::NodeNature;
 use crate::binding::{self, Outputs};
 use crate::context::Context;
 use crate::effects;
 use crate::protocol::{Command, Goal, Note};
 use ratn_model::expression::FactExpr;
-use ratn_model::fact::{Change, FactKey, Footprint};
-use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{ABORTED, SUCCESS, State, StateKind, WORLD_MODEL};
+use ratn_model::fact::{FactKey, Footprint};
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, StateKind, WORLD_MODEL};
+use ratn_model::resource::Lease;
 use ratn_model::value::Value;
+use std::time::Duration;
 
 impl Interpreter {
-    pub(super) fn begin(&mut self, context: &mut Context<'_>, id: StateId, path: &str) -> Result<(), String> {
-        let (program, analysis) = (context.program, context.analysis);
+    pub(super) fn begin(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: &str) {
         let instance = context.new_instance();
         context.note(Note::Expanded { instance, state: id, path: path.to_owned(), speculative: false });
-        self.current = Some(Current {
+        let current = Current {
             instance,
             state: id,
             path: path.to_owned(),
             attempt: 1,
-            phase: Phase::Acquiring,
+            tries: 1,
+            crashes: 0,
+            phase: Phase::Held,
+            timeout: None,
             lease: None,
             projection: None,
-        });
-        let wanted = &analysis.state(id).requirements;
-        if self.routine.is_some() || wanted.is_empty() {
-            return match self.project_or_run(context) {
-                Progress::Busy => Ok(()),
-                Progress::Ended { reason, .. } => Err(reason),
-            };
+        };
+        if let Some(thread) = self.threads.get_mut(&thread) {
+            thread.current = Some(current);
         }
-        let requirements = self
-            .with_scope(context, None, |scope| binding::requirements(program.state(id), wanted, scope))
-            .map_err(|e| e.reason())?;
-        context.commands.push(Command::Acquire { instance, requirements, priority: i64::MAX });
-        Ok(())
+        self.try_now(context, thread);
     }
 
-    pub(super) fn project_or_run(&mut self, context: &mut Context<'_>) -> Progress {
-        let Some(current) = self.current.as_mut() else { return Progress::Busy };
+    /// Begins a try, unless the operator holds it.
+    fn try_now(&mut self, context: &mut Context<'_>, thread: u64) {
+        let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
+        let (id, instance) = (current.state, current.instance);
+        let is_pia = context.analysis.state(id).nature == NodeNature::Irreversible;
+        if is_pia && self.routine.is_none() {
+            if !self.hold.lets_begin() {
+                return self.set_phase(thread, Phase::Held);
+            }
+            self.hold.has_begun();
+        }
+        let wanted = &context.analysis.state(id).requirements;
+        if self.routine.is_some() || wanted.is_empty() {
+            return self.project_or_run(context, thread);
+        }
+        let state = context.program.state(id);
+        match self.with_scope(context, thread, None, |scope| binding::requirements(state, wanted, scope)) {
+            Ok(requirements) => {
+                self.set_phase(thread, Phase::Acquiring);
+                context.commands.push(Command::Acquire { instance, requirements, priority: i64::MAX });
+            }
+            Err(error) => self.end_node(context, thread, error.reason()),
+        }
+    }
+
+    /// The operator lets something begin.
+    pub(super) fn let_go(&mut self, context: &mut Context<'_>) {
+        let held: Vec<u64> =
+            self.threads.keys().copied().filter(|thread| self.phase(*thread) == Some(Phase::Held)).collect();
+        for thread in held {
+            self.try_now(context, thread);
+        }
+    }
+
+    pub(super) fn granted(&mut self, context: &mut Context<'_>, thread: u64, lease: Lease) {
+        if self.phase(thread) != Some(Phase::Acquiring) {
+            return;
+        }
+        if let Some(routine) = &mut self.routine {
+            routine.lease = Some(lease);
+        } else if let Some(current) = self.current(thread) {
+            current.lease = Some(lease);
+        }
+        self.project_or_run(context, thread);
+    }
+
+    fn set_phase(&mut self, thread: u64, phase: Phase) {
+        if let Some(current) = self.current(thread) {
+            current.phase = phase;
+        }
+    }
+
+    fn project_or_run(&mut self, context: &mut Context<'_>, thread: u64) {
+        let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let analysis = context.analysis.state(current.state);
         if !analysis.requirements.iter().any(|r| r.kind == WORLD_MODEL) {
-            return self.run(context);
+            return self.run(context, thread);
         }
-        current.phase = Phase::Projecting;
         let lease = self.routine.as_ref().map_or(&current.lease, |routine| &routine.lease);
         let lease = lease.as_ref().map(|l| (l.id, l.token));
         let (instance, attempt) = (current.instance, current.attempt);
         let reads = match &analysis.reads {
             None => Footprint::Everything,
-            Some(reads) => self.with_scope(context, None, |s| FactExpr::footprint(reads, s)),
+            Some(reads) => self.with_scope(context, thread, None, |s| FactExpr::footprint(reads, s)),
         };
         let (base, changes) = match &self.target {
             Target::Actual => (context.root.revision(), Vec::new()),
             Target::Projection { base, changes, .. } => (*base, changes.clone()),
         };
+        self.set_phase(thread, Phase::Projecting);
         context.commands.push(Command::Project { instance, attempt, base, changes, reads, lease });
-        Progress::Busy
     }
 
-    pub(super) fn run(&mut self, context: &mut Context<'_>) -> Progress {
+    pub(super) fn run(&mut self, context: &mut Context<'_>, thread: u64) {
         let program = context.program;
-        let Some(current) = self.current.as_ref() else { return Progress::Busy };
+        let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let state = program.state(current.state);
-        let StateKind::Action { provider, action, inputs, .. } = &state.kind else { return Progress::Busy };
-        let inputs = match self.with_scope(context, None, |scope| binding::inputs(state, inputs, scope)) {
+        let StateKind::Action { provider, action, inputs, .. } = &state.kind else { return };
+        let inputs = match self.with_scope(context, thread, None, |scope| binding::inputs(state, inputs, scope)) {
             Ok(inputs) => inputs,
-            Err(error) => return self.leave(context, ABORTED, error.reason()),
+            Err(error) => return self.end_node(context, thread, error.reason()),
         };
-        let expected_s = self.with_scope(context, None, |scope| binding::expected_s(state, scope));
-        let Some(current) = self.current.as_mut() else { return Progress::Busy };
-        current.phase = Phase::Running;
         let (instance, attempt) = (current.instance, current.attempt);
+        let tries = if state.annotations.deterministic { 1 } else { current.tries };
         let goal = Goal {
             provider: provider.clone(),
             action: action.clone(),
             inputs,
-            seed: binding::seed(context.seed, &current.path, 1),
+            seed: binding::seed(context.seed, &current.path, tries),
             lease: self.routine.as_ref().map_or(&current.lease, |routine| &routine.lease).clone(),
             projection: current.projection,
-            expected_s,
+            expected_s: self.with_scope(context, thread, None, |scope| binding::expected_s(state, scope)),
             timeout_s: state.annotations.timeout_s,
         };
+        let timeout = state.annotations.timeout_s.map(|seconds| context.now + duration(seconds));
+        if let Some(current) = self.current(thread) {
+            current.phase = Phase::Running;
+            current.timeout = timeout;
+        }
+        context.commands.extend(timeout.map(|at| Command::Wake { at }));
         context.note(Note::Running { instance, attempt });
         context.commands.push(Command::Start { instance, attempt, goal });
-        Progress::Busy
     }
 
-    pub(super) fn crashed(&mut self, context: &mut Context<'_>, reason: &str) -> Progress {
-        let Some(mut current) = self.current.take() else { return Progress::Busy };
-        let state = context.program.state(current.state);
-        self.give_back(context, &current);
-        let again = context.analysis.state(current.state).nature != NodeNature::Irreversible
-            && current.attempt < state.annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
-        if !again {
-            let (path, attempt) = (current.path.clone(), current.attempt);
-            current.lease = None;
-            current.projection = None;
-            self.current = Some(current);
-            return self.leave(context, ABORTED, format!("{path} crashed in attempt {attempt}: {reason}"));
+    /// Pauses between tries that are over, and goals that have had their time.
+    pub(super) fn look_at_the_time(&mut self, context: &mut Context<'_>) {
+        let all: Vec<u64> = self.threads.keys().copied().collect();
+        for thread in all {
+            let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { continue };
+            let (instance, attempt) = (current.instance, current.attempt);
+            match current.phase {
+                Phase::Backoff(until) if until <= context.now => self.try_now(context, thread),
+                Phase::Running if current.timeout.is_some_and(|at| at <= context.now) => {
+                    let limit = context.program.state(current.state).annotations.timeout_s.unwrap_or_default();
+                    context.commands.push(Command::Cancel { instance, attempt });
+                    let reason = format!("it took longer than {limit} s");
+                    self.goal_ended(context, thread, ABORTED.to_owned(), Outputs::new(), &[], reason);
+                }
+                _ => {}
+            }
         }
-        let (instance, id) = (current.instance, current.state);
-        let requirements = match &mut self.routine {
-            // Nothing of it moves between two nodes: it gives everything back and asks for all of it again.
-            Some(routine) => {
+    }
+
+    pub(super) fn crashed(&mut self, context: &mut Context<'_>, thread: u64, reason: &str) {
+        let alone = self.threads.values().filter(|thread| thread.current.is_some()).count() == 1;
+        let Some(current) = self.current(thread) else { return };
+        if !matches!(current.phase, Phase::Acquiring | Phase::Projecting | Phase::Running) {
+            return;
+        }
+        current.crashes += 1;
+        let (instance, attempt, id, crashes) = (current.instance, current.attempt, current.state, current.crashes);
+        let given = Current {
+            lease: current.lease.take(),
+            projection: current.projection.take(),
+            path: String::new(),
+            ..*current
+        };
+        self.give_back(context, &given);
+        let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
+        if context.analysis.state(id).nature == NodeNature::Irreversible || crashes >= limit {
+            return self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
+        }
+        if let Some(current) = self.current(thread) {
+            current.attempt += 1;
+        }
+        match &mut self.routine {
+            // Nothing else of it moves: it gives everything back and asks for all of it again.
+            Some(routine) if alone => {
                 let lease = routine.lease.take().map(|l| l.id);
+                let requirements = routine.requirements.clone();
                 if lease.is_some() {
                     context.commands.push(Command::Release { instance, lease, projection: None });
                 }
-                Ok(routine.requirements.clone())
+                if requirements.is_empty() {
+                    return self.project_or_run(context, thread);
+                }
+                self.set_phase(thread, Phase::Acquiring);
+                context.commands.push(Command::Acquire { instance, requirements, priority: i64::MAX });
             }
-            None => self.with_scope(context, None, |scope| {
-                binding::requirements(state, &context.analysis.state(id).requirements, scope)
-            }),
-        };
-        let requirements = match requirements {
-            Ok(requirements) => requirements,
-            Err(error) => return self.leave(context, ABORTED, error.reason()),
-        };
-        let phase = Phase::Acquiring;
-        let attempt = current.attempt + 1;
-        self.current = Some(Current { attempt, phase, lease: None, projection: None, ..current });
-        if requirements.is_empty() {
-            return self.project_or_run(context);
+            Some(_) => self.project_or_run(context, thread),
+            None => self.try_now(context, thread),
         }
-        context.commands.push(Command::Acquire { instance, requirements, priority: i64::MAX });
-        Progress::Busy
     }
 
-    pub(super) fn finished(
+    /// A goal has ended: that is the result, unless it is tried again.
+    pub(super) fn goal_ended(
         &mut self,
         context: &mut Context<'_>,
-        mut outcome: String,
+        thread: u64,
+        outcome: String,
         outputs: Outputs,
         measured: &[(FactKey, Value)],
+        reason: String,
+    ) {
+        let Some(current) = self.current(thread) else { return };
+        let retry = context.program.state(current.state).annotations.retry;
+        if let Some(retry) = retry.filter(|retry| outcome == ABORTED && current.tries <= retry.count) {
+            let pause = duration(retry.backoff_s * f64::from(2_u32.saturating_pow(current.tries - 1)));
+            let given = Current {
+                lease: current.lease.take(),
+                projection: current.projection.take(),
+                path: String::new(),
+                ..*current
+            };
+            current.tries += 1;
+            current.attempt += 1;
+            let until = context.now + pause;
+            current.phase = Phase::Backoff(until);
+            self.give_back(context, &given);
+            if pause.is_zero() {
+                return self.try_now(context, thread);
+            }
+            context.commands.push(Command::Wake { at: until });
+            return;
+        }
+        self.finish(context, thread, outcome, outputs, measured, reason);
+    }
+
+    /// It ends `aborted` without having done anything (more).
+    pub(super) fn end_node(&mut self, context: &mut Context<'_>, thread: u64, reason: String) {
+        let Some(current) = self.threads.get_mut(&thread).and_then(|thread| thread.current.take()) else { return };
+        context.note(Note::Finished { instance: current.instance, outcome: ABORTED.to_owned() });
+        self.give_back(context, &current);
+        if matches!(self.target, Target::Actual) {
+            context.note(Note::Retired { instance: current.instance });
+        }
+        self.ended(thread, current.state, ABORTED, format!("{}: {reason}", current.path));
+    }
+
+    fn finish(
+        &mut self,
+        context: &mut Context<'_>,
+        thread: u64,
+        mut outcome: String,
+        mut outputs: Outputs,
+        measured: &[(FactKey, Value)],
         mut reason: String,
-    ) -> Progress {
-        let Some(current) = self.current.take() else { return Progress::Busy };
+    ) {
+        let Some(current) = self.threads.get_mut(&thread).and_then(|thread| thread.current.take()) else { return };
         let program = context.program;
         let state = program.state(current.state);
         let (id, instance) = (current.state, current.instance);
+        let mut aborted = |outcome: &mut String, problem: String| {
+            ABORTED.clone_into(outcome);
+            reason = problem;
+        };
         if let StateKind::Action { outputs: declared, .. } = &state.kind
             && outcome == SUCCESS
             && let Some(problem) = binding::missing_output(declared, &outputs)
         {
-            (outcome, reason) = (ABORTED.to_owned(), problem);
+            outputs.clear();
+            aborted(&mut outcome, problem);
         }
-        let nature = context.analysis.state(id).nature;
-        let declared = effects::declared(state, nature, &outcome);
-        let changes = self.with_scope(context, Some(&outputs), |s| effects::actual(declared, &outcome, measured, s));
-        if outcome == SUCCESS {
-            self.outputs.insert(id, outputs);
+        if !program.outcomes(id).any(|known| known == outcome) {
+            let problem = format!("it ended with `{outcome}`, which is no outcome of its action");
+            outputs.clear();
+            aborted(&mut outcome, problem);
         }
-        let made = changes.map_err(|e| e.to_string()).and_then(|changes| self.apply(context, instance, changes));
-        if let Err(problem) = made {
-            (outcome, reason) = (ABORTED.to_owned(), format!("{}: {problem}", current.path));
+        let mut assigned = Vec::new();
+        if !matches!(outcome.as_str(), ABORTED | PREEMPTED) {
+            match self.assigned(context, thread, state, &outputs) {
+                Ok(values) => assigned = values,
+                Err(problem) => {
+                    outputs.clear();
+                    aborted(&mut outcome, problem);
+                }
+            }
         }
         context.note(Note::Finished { instance, outcome: outcome.clone() });
-        if outcome == SUCCESS
-            && let Err(problem) = self.operate(context, state, instance, self.outputs.get(&id).cloned())
+        let nature = context.analysis.state(id).nature;
+        let declared = effects::declared(state, nature, &outcome);
+        let changes =
+            self.with_scope(context, thread, Some(&outputs), |s| effects::actual(declared, &outcome, measured, s));
+        let made = changes.map_err(|e| e.to_string()).and_then(|changes| self.apply(context, instance, changes));
+        if let Err(problem) = made {
+            aborted(&mut outcome, problem);
+        } else if outcome == SUCCESS
+            && let Err(problem) = self.operate(context, thread, state, instance, &outputs)
         {
-            (outcome, reason) = (ABORTED.to_owned(), problem);
+            aborted(&mut outcome, problem);
+        }
+        if !matches!(outcome.as_str(), ABORTED | PREEMPTED) {
+            self.outputs.insert(id, outputs);
+            self.assign(thread, assigned);
         }
         self.give_back(context, &current);
         if matches!(self.target, Target::Actual) {
             context.note(Note::Retired { instance });
         }
-        if outcome == SUCCESS {
-            return self.advance(context);
-        }
-        let reason = if reason.starts_with(&current.path) { reason } else { format!("{}: {reason}", current.path) };
-        self.leave(context, &outcome, reason)
-    }
-
-    pub(super) fn apply(
-        &mut self,
-        context: &mut Context<'_>,
-        instance: InstanceId,
-        changes: Vec<Change>,
-    ) -> Result<(), String> {
-        match &mut self.target {
-            Target::Actual => context.commit(instance, changes),
-            Target::Projection { changes: all, world, .. } => {
-                world.apply(&changes).map_err(|e| e.to_string())?;
-                all.extend(changes);
-                Ok(())
-            }
-        }
-    }
-
-    pub(super) fn operate(
-        &self,
-        context: &mut Context<'_>,
-        state: &State,
-        instance: InstanceId,
-        outputs: Option<Outputs>,
-    ) -> Result<(), String> {
-        let wanted = &context.analysis.state(state.id).operations;
-        if wanted.is_empty() {
-            return Ok(());
-        }
-        let operations = self
-            .with_scope(context, outputs.as_ref(), |s| binding::requirements(state, wanted, s))
-            .map_err(|e| e.reason())?;
-        context.commands.push(Command::Operate { instance, operations });
-        Ok(())
+        let reason = if outcome == SUCCESS { String::new() } else { format!("{}: {reason}", current.path) };
+        self.ended(thread, id, outcome, reason);
     }
 
     pub(super) fn give_back(&self, context: &mut Context<'_>, current: &Current) {
         let lease = current.lease.as_ref().map(|l| l.id);
         if lease.is_some() || current.projection.is_some() {
-            context.commands.push(Command::Release {
-                instance: current.instance,
-                lease,
-                projection: current.projection,
-            });
+            let (instance, projection) = (current.instance, current.projection);
+            context.commands.push(Command::Release { instance, lease, projection });
         }
     }
+}
+
+fn duration(seconds: f64) -> Duration {
+    Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(Duration::MAX)
 }

@@ -1,165 +1,273 @@
-//! The walk over the tree of states: which node comes next, and what composite states do at their ends.
+//! The walk over the tree of states: which state comes next.
 
-use super::{Frame, Interpreter, Progress};
-use crate::binding::{self, Outputs, child_path};
+use super::{Frame, Interpreter, MAIN, Progress, Todo};
+use crate::binding::{self, child_path};
 use crate::context::Context;
-use crate::effects;
+use crate::protocol::Note;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, State, StateKind};
+use ratn_model::program::{ABORTED, Program, SUCCESS, StateKind, Target};
 use ratn_model::value::Value;
 
 impl Interpreter {
-    /// Leaves sequences that are done, until an action has begun or all is done.
+    /// Lets every thread go on until all wait for events, or the state has ended.
     pub(super) fn advance(&mut self, context: &mut Context<'_>) -> Progress {
         loop {
-            if self.current.is_some() {
-                return Progress::Busy;
-            }
-            let step = match self.frames.last_mut() {
-                None => return Progress::Ended { outcome: SUCCESS.to_owned(), reason: String::new() },
-                Some(Frame::List { children, next, path, .. }) if *next < children.len() => {
-                    *next += 1;
-                    Some((children[*next - 1], path.clone()))
-                }
-                Some(Frame::Loop { state, elements, next, path }) if *next < elements.len() => {
-                    *next += 1;
-                    let (index, element) = (*next - 1, elements[*next - 1].clone());
-                    let (state, path) = (*state, format!("{path}[{index}]"));
-                    self.iterate(context, state, index, element, path);
-                    None
-                }
-                Some(_) => match self.exit(context) {
-                    Ok(()) => None,
-                    Err(reason) => return self.leave(context, ABORTED, reason),
-                },
-            };
-            if let Some((child, path)) = step {
-                let path = child_path(&path, &context.program.state(child).name);
-                if let Err(reason) = self.enter(context, child, &path) {
-                    return self.leave(context, ABORTED, reason);
-                }
+            let ready = self.threads.iter().find(|(id, thread)| match &thread.todo {
+                Todo::Enter(..) | Todo::Ended { .. } | Todo::Iterate => true,
+                Todo::Busy => false,
+                Todo::Join { state, regions, .. } => self.may_join(context.program, *state, regions),
+                Todo::Done { .. } => **id == MAIN,
+            });
+            let Some((id, _)) = ready else { return Progress::Busy };
+            let id = *id;
+            let Some(thread) = self.threads.get_mut(&id) else { return Progress::Busy };
+            match std::mem::replace(&mut thread.todo, Todo::Busy) {
+                Todo::Enter(state, path) => self.enter(context, id, state, path),
+                Todo::Ended { state, outcome, reason } => self.follow(context, id, state, outcome, reason),
+                Todo::Iterate => self.iterate(context, id),
+                Todo::Busy => {}
+                Todo::Join { state, path, regions } => self.join(context, id, state, path, &regions),
+                Todo::Done { outcome, reason } => return Progress::Ended { outcome, reason },
             }
         }
     }
 
-    pub(super) fn iterate(
-        &mut self,
-        context: &Context<'_>,
-        state: StateId,
-        index: usize,
-        element: Value,
-        path: String,
-    ) {
-        if let StateKind::ForEach { variable, index: counter, body, .. } = &context.program.state(state).kind {
-            self.unbind(variable, counter.as_deref());
-            self.variables.push((variable.clone(), element));
-            if let Some(counter) = counter {
-                self.variables.push((counter.clone(), Value::Int(index as i64)));
-            }
-            self.frames.push(Frame::List { state, children: body.clone(), next: 0, path });
+    /// A state has ended, as far as its thread is concerned.
+    pub(super) fn ended(&mut self, thread: u64, state: StateId, outcome: impl Into<String>, reason: String) {
+        if let Some(thread) = self.threads.get_mut(&thread) {
+            thread.todo = Todo::Ended { state, outcome: outcome.into(), reason };
         }
     }
 
-    pub(super) fn unbind(&mut self, variable: &str, counter: Option<&str>) {
-        while self.variables.last().is_some_and(|(n, _)| n == variable || Some(n.as_str()) == counter) {
-            self.variables.pop();
-        }
-    }
-
-    pub(super) fn enter(&mut self, context: &mut Context<'_>, id: StateId, path: &str) -> Result<(), String> {
+    fn enter(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: Option<String>) {
         let program = context.program;
         let state = program.state(id);
-        let unmet = self.with_scope(context, None, |scope| binding::unmet(state, scope)).map_err(|e| e.reason())?;
-        if let Some(reason) = unmet {
-            return Err(reason);
+        let path = path.unwrap_or_else(|| self.visit(thread, id, &state.name));
+        match self.with_scope(context, thread, None, |scope| binding::unmet(state, scope)) {
+            Ok(None) => {}
+            Ok(Some(reason)) => return self.ended(thread, id, ABORTED, format!("{path}: {reason}")),
+            Err(error) => return self.ended(thread, id, ABORTED, format!("{path}: {}", error.reason())),
         }
-        match &state.kind {
-            StateKind::Action { .. } => return self.begin(context, id, path),
-            StateKind::Sequence { children, .. } => {
-                let children = children.clone();
-                self.frames.push(Frame::List { state: id, children, next: 0, path: path.to_owned() });
-            }
-            StateKind::ForEach { collection, .. } => {
-                match self.with_scope(context, None, |s| collection.evaluate(s)).map_err(|e| e.to_string())? {
-                    Value::List(elements) => {
-                        self.frames.push(Frame::Loop { state: id, elements, next: 0, path: path.to_owned() });
-                    }
-                    other => return Err(format!("{path} loops over a {}, not a list", other.type_name())),
+        if let StateKind::Action { .. } = state.kind {
+            return self.begin(context, thread, id, &path);
+        }
+        self.forget_inside(program, id);
+        let base = self.threads.get(&thread).map_or(0, |thread| thread.variables.len());
+        let mut bound = Vec::new();
+        for (name, value) in &state.variables {
+            match self.with_scope(context, thread, None, |scope| value.evaluate(scope)) {
+                Ok(value) => bound.push((name.clone(), value)),
+                Err(error) => {
+                    let reason = format!("{path}: variable `{name}`: {error}");
+                    return self.ended(thread, id, ABORTED, reason);
                 }
             }
-            StateKind::While { .. } | StateKind::Concurrency { .. } => {
-                return Err(format!("{path}: no such state is executed yet"));
+        }
+        if let Some(thread) = self.threads.get_mut(&thread) {
+            thread.variables.extend(bound);
+        }
+        let wrong = |what: &str, error: &dyn std::fmt::Display| format!("{path}: {what}: {error}");
+        match &state.kind {
+            StateKind::Action { .. } => {}
+            StateKind::Sequence { children, .. } => self.begin_list(context, thread, id, 0, path, base, children),
+            StateKind::ForEach { collection, .. } => {
+                let list = self.with_scope(context, thread, None, |scope| collection.evaluate(scope));
+                match list {
+                    Ok(Value::List(elements)) => {
+                        self.decided(context, &path, elements.len().to_string());
+                        self.push_frame(thread, id, 0, path, base, Some((usize::MAX, Some(elements))));
+                        self.set(thread, Todo::Iterate);
+                    }
+                    Ok(other) => {
+                        let reason = format!("{path}: it loops over a {}, not a list", other.type_name());
+                        self.ended(thread, id, ABORTED, reason);
+                    }
+                    Err(error) => self.ended(thread, id, ABORTED, wrong("its list", &error)),
+                }
+            }
+            StateKind::While { body_first, .. } => {
+                let before = if *body_first { 0 } else { usize::MAX };
+                self.push_frame(thread, id, 0, path, base, Some((before, None)));
+                if *body_first {
+                    self.begin_iteration(program, thread);
+                } else {
+                    self.set(thread, Todo::Iterate);
+                }
             }
             StateKind::Condition { predicate, then, otherwise } => {
-                let taken = self.with_scope(context, None, |s| predicate.holds(s)).map_err(|e| e.to_string())?;
-                let children = if taken { then.clone() } else { otherwise.clone() };
-                self.frames.push(Frame::List { state: id, children, next: 0, path: path.to_owned() });
-            }
-        }
-        Ok(())
-    }
-
-    /// The innermost frame is done: its state's outputs, effects and resource operations happen.
-    pub(super) fn exit(&mut self, context: &mut Context<'_>) -> Result<(), String> {
-        let Some(frame) = self.frames.pop() else { return Ok(()) };
-        let program = context.program;
-        let id = match frame {
-            Frame::List { state, .. } | Frame::Loop { state, .. } => state,
-        };
-        match (&program.state(id).kind, frame) {
-            (StateKind::ForEach { .. }, Frame::List { .. }) => return Ok(()),
-            (StateKind::ForEach { variable, index, .. }, Frame::Loop { .. }) => {
-                self.unbind(variable, index.as_deref());
-            }
-            (StateKind::Sequence { outputs, .. }, _) => {
-                let mut written = Outputs::new();
-                for output in outputs {
-                    let value = self.with_scope(context, None, |s| output.value.evaluate(s));
-                    written.insert(output.name.clone(), value.map_err(|e| format!("output `{}`: {e}", output.name))?);
+                match self.with_scope(context, thread, None, |scope| predicate.holds(scope)) {
+                    Ok(taken) => {
+                        self.decided(context, &path, if taken { "then" } else { "else" }.to_owned());
+                        let (list, children) = if taken { (0, then) } else { (1, otherwise) };
+                        self.begin_list(context, thread, id, list, path, base, children);
+                    }
+                    Err(error) => self.ended(thread, id, ABORTED, wrong("its predicate", &error)),
                 }
-                self.outputs.insert(id, written);
             }
-            _ => {}
+            StateKind::Concurrency { regions, .. } => self.fork(thread, id, path, regions),
         }
-        self.hierarchy_effects(context, program.state(id), SUCCESS)?;
-        self.operate(context, program.state(id), InstanceId(0), self.outputs.get(&id).cloned())
     }
 
-    /// A hierarchy's own effects for an outcome.
-    pub(super) fn hierarchy_effects(
+    /// A decision is no instance here; it is noted for what later runs learn.
+    pub(super) fn decided(&self, context: &mut Context<'_>, path: &str, decision: String) {
+        context.note(Note::Decided { instance: InstanceId(0), path: path.to_owned(), decision });
+    }
+
+    pub(super) fn set(&mut self, thread: u64, todo: Todo) {
+        if let Some(thread) = self.threads.get_mut(&thread) {
+            thread.todo = todo;
+        }
+    }
+
+    /// The path of a state visited now.
+    fn visit(&mut self, thread: u64, id: StateId, name: &str) -> String {
+        let Some(frame) = self.threads.get_mut(&thread).and_then(|thread| thread.frames.last_mut()) else {
+            return name.to_owned();
+        };
+        let visits = frame.visits.entry(id).or_default();
+        *visits += 1;
+        let name = if *visits > 1 { format!("{name}#{visits}") } else { name.to_owned() };
+        match &frame.iteration {
+            Some((index, _)) => child_path(&format!("{}[{index}]", frame.path), &name),
+            None => child_path(&frame.path, &name),
+        }
+    }
+
+    /// What the states inside have written in an earlier activation is not seen in this one.
+    fn forget_inside(&mut self, program: &Program, id: StateId) {
+        for child in program.state(id).children() {
+            self.outputs.remove(&child);
+            self.regions.remove(&child);
+            self.forget_inside(program, child);
+        }
+    }
+
+    fn push_frame(
+        &mut self,
+        thread: u64,
+        owner: StateId,
+        list: usize,
+        path: String,
+        variables: usize,
+        iteration: Option<(usize, Option<Vec<Value>>)>,
+    ) {
+        let frame = Frame { owner, list, path, visits: Default::default(), iteration, variables };
+        if let Some(thread) = self.threads.get_mut(&thread) {
+            thread.frames.push(frame);
+        }
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "all of it is one activation")]
+    fn begin_list(
         &mut self,
         context: &mut Context<'_>,
-        state: &State,
-        outcome: &str,
-    ) -> Result<(), String> {
-        let Some(declared) = state.annotations.effects.get(outcome) else { return Ok(()) };
-        let outputs = self.outputs.get(&state.id).cloned();
-        let changes = self
-            .with_scope(context, outputs.as_ref(), |s| effects::actual(Some(declared), outcome, &[], s))
-            .map_err(|e| e.to_string())?;
-        self.apply(context, InstanceId(0), changes)
+        thread: u64,
+        owner: StateId,
+        list: usize,
+        path: String,
+        variables: usize,
+        children: &[StateId],
+    ) {
+        self.push_frame(thread, owner, list, path, variables, None);
+        match children.first() {
+            Some(first) => self.set(thread, Todo::Enter(*first, None)),
+            None => self.leave_list(context, thread, SUCCESS.to_owned(), String::new()),
+        }
     }
 
-    /// An outcome that is not success leaves every state around by the same name.
-    pub(super) fn leave(&mut self, context: &mut Context<'_>, outcome: &str, mut reason: String) -> Progress {
-        if self.current.is_some() {
-            let frames = std::mem::take(&mut self.frames);
-            self.abort(context);
-            self.frames = frames;
-        }
-        while let Some(frame) = self.frames.pop() {
-            let id = match frame {
-                Frame::List { state, .. } | Frame::Loop { state, .. } => state,
-            };
-            let state = context.program.state(id);
-            if matches!(state.kind, StateKind::Sequence { .. })
-                && let Err(problem) = self.hierarchy_effects(context, state, outcome)
-            {
-                reason = format!("{reason}; then {}: {problem}", state.path);
+    fn iterate(&mut self, context: &mut Context<'_>, id: u64) {
+        let program = context.program;
+        let Some(thread) = self.threads.get_mut(&id) else { return };
+        let Some(frame) = thread.frames.last_mut() else { return };
+        frame.visits.clear();
+        thread.variables.truncate(frame.variables);
+        let (owner, path) = (frame.owner, frame.path.clone());
+        let Some((index, elements)) = &mut frame.iteration else { return };
+        *index = index.wrapping_add(1);
+        match elements {
+            Some(elements) if *index < elements.len() => self.begin_iteration(program, id),
+            Some(_) => self.leave_list(context, id, SUCCESS.to_owned(), String::new()),
+            None => {
+                let path = format!("{path}[{index}]");
+                self.bind_iteration(program, id);
+                let StateKind::While { predicate, .. } = &program.state(owner).kind else { return };
+                match self.with_scope(context, id, None, |scope| predicate.holds(scope)) {
+                    Ok(true) => {
+                        self.decided(context, &path, "again".to_owned());
+                        self.begin_iteration(program, id);
+                    }
+                    Ok(false) => {
+                        self.decided(context, &path, "done".to_owned());
+                        self.leave_list(context, id, SUCCESS.to_owned(), String::new());
+                    }
+                    Err(error) => {
+                        // It fails as the state, not by an outcome of its body.
+                        if let Some(thread) = self.threads.get_mut(&id)
+                            && let Some(frame) = thread.frames.pop()
+                        {
+                            thread.variables.truncate(frame.variables);
+                        }
+                        self.ended(id, owner, ABORTED, format!("{path}: its predicate: {error}"));
+                    }
+                }
             }
         }
-        debug_assert!(outcome != SUCCESS, "only another outcome than success leaves before the end");
-        debug_assert!(outcome != PREEMPTED || !reason.is_empty(), "a preemption says who asked for it");
-        Progress::Ended { outcome: outcome.to_owned(), reason }
+    }
+
+    fn begin_iteration(&mut self, program: &Program, thread: u64) {
+        self.bind_iteration(program, thread);
+        let Some(frame) = self.threads.get(&thread).and_then(|thread| thread.frames.last()) else { return };
+        let body = match &program.state(frame.owner).kind {
+            StateKind::ForEach { body, .. } | StateKind::While { body, .. } => body.first(),
+            _ => None,
+        };
+        self.set(thread, body.map_or(Todo::Iterate, |first| Todo::Enter(*first, None)));
+    }
+
+    fn bind_iteration(&mut self, program: &Program, thread: u64) {
+        let Some(thread) = self.threads.get_mut(&thread) else { return };
+        let Some(frame) = thread.frames.last() else { return };
+        let Some((number, elements)) = &frame.iteration else { return };
+        thread.variables.truncate(frame.variables);
+        let count = Value::Int(i64::try_from(*number).unwrap_or(i64::MAX));
+        match &program.state(frame.owner).kind {
+            StateKind::ForEach { variable, index, .. } => {
+                let element = elements.as_ref().and_then(|all| all.get(*number)).cloned();
+                thread.variables.extend(element.map(|element| (variable.clone(), element)));
+                thread.variables.extend(index.clone().map(|index| (index, count)));
+            }
+            StateKind::While { index, .. } => thread.variables.extend(index.clone().map(|index| (index, count))),
+            _ => {}
+        }
+    }
+
+    /// Follows the outcome of a state that has ended.
+    fn follow(&mut self, context: &mut Context<'_>, id: u64, state: StateId, outcome: String, reason: String) {
+        let Some(frame) = self.threads.get(&id).and_then(|thread| thread.frames.last()) else {
+            return self.set(id, Todo::Done { outcome, reason });
+        };
+        if matches!(context.program.state(frame.owner).kind, StateKind::Concurrency { .. }) {
+            // A region ends as its state does.
+            return self.set(id, Todo::Done { outcome, reason });
+        }
+        match context.program.target(state, &outcome) {
+            Target::State(next) => self.set(id, Todo::Enter(next, None)),
+            Target::Outcome(by) => {
+                let owner = context.program.state(frame.owner);
+                let is_loop = matches!(owner.kind, StateKind::ForEach { .. } | StateKind::While { .. });
+                debug_assert!(owner.lists().get(frame.list).is_some_and(|list| list.contains(&state)));
+                if is_loop && by == SUCCESS {
+                    self.set(id, Todo::Iterate);
+                } else {
+                    self.leave_list(context, id, by, reason);
+                }
+            }
+        }
+    }
+
+    /// The innermost list has ended, and with it the state around it.
+    fn leave_list(&mut self, context: &mut Context<'_>, id: u64, outcome: String, reason: String) {
+        let Some(frame) = self.threads.get_mut(&id).and_then(|thread| thread.frames.pop()) else { return };
+        self.exit(context, id, frame.owner, &frame.path, frame.variables, outcome, reason);
     }
 }

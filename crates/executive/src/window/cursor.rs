@@ -34,8 +34,8 @@ pub(crate) enum Todo {
     Enter(StateId),
     /// A state has ended: follow the outcome.
     Leave(StateId, Outcome),
-    /// The lists of a composite state have ended: what it does when it is left.
-    Exit { state: StateId, visit: u32, outcome: Outcome },
+    /// The lists of a composite state have ended: what it does when it is left. Of its variables, those before it stay.
+    Exit { state: StateId, visit: u32, outcome: Outcome, variables: usize },
     /// The next iteration of the innermost loop, or its end.
     Iterate,
     /// Waits for the list of a loop, or for the regions of a fork.

@@ -117,7 +117,8 @@ impl Window {
         let own = plan.state(state.id);
         let number = own.outcome(&outcome).unwrap_or(own.outcomes.len() - 2);
         if let Some(cursor) = self.cursors.iter_mut().find(|cursor| cursor.todo == Todo::Await(id)) {
-            cursor.todo = Todo::Exit { state: state.id, visit, outcome: number };
+            let variables = cursor.environment.variables.len();
+            cursor.todo = Todo::Exit { state: state.id, visit, outcome: number, variables };
             let reason = reason.map(|reason| format!("{path}: {reason}"));
             cursor.because = reason.map(Into::into).or(cursor.because.take());
         }

@@ -103,7 +103,9 @@ impl Window {
         match std::mem::replace(&mut cursor.todo, Todo::Done) {
             Todo::Enter(state) => self.enter(context, index, state),
             Todo::Leave(state, outcome) => self.follow(context, index, state, outcome),
-            Todo::Exit { state, visit, outcome } => self.exit(context, index, state, visit, outcome),
+            Todo::Exit { state, visit, outcome, variables } => {
+                self.exit(context, index, state, visit, outcome, variables);
+            }
             Todo::Iterate => self.iterate(context, index),
             todo @ (Todo::Await(_) | Todo::Done) => self.cursors[index].todo = todo,
         }
@@ -230,9 +232,7 @@ impl Window {
         list: &[StateId],
     ) {
         let Some(first) = list.first() else {
-            let cursor = &mut self.cursors[index];
-            cursor.environment.variables.truncate(variables);
-            cursor.todo = Todo::Exit { state: owner, visit, outcome: 0 };
+            self.cursors[index].todo = Todo::Exit { state: owner, visit, outcome: 0, variables };
             return;
         };
         let frame = self.frame(index, owner, visit, path, variables, None);
@@ -284,7 +284,7 @@ impl Window {
                         self.begin_iteration(cursor, program);
                     } else {
                         let ended = &mut self.cursors[cursor];
-                        ended.todo = Todo::Exit { state: owner, visit, outcome: 0 };
+                        ended.todo = Todo::Exit { state: owner, visit, outcome: 0, variables: base };
                     }
                 }
             }
@@ -337,18 +337,27 @@ impl Window {
     fn leave_frame(&mut self, index: usize, outcome: Outcome) {
         let cursor = &mut self.cursors[index];
         let Some(frame) = cursor.environment.frames.clone() else { return };
-        cursor.environment.variables.truncate(frame.variables);
         cursor.environment.frames = frame.below.clone();
-        cursor.todo = Todo::Exit { state: frame.owner, visit: frame.visit, outcome };
+        let variables = frame.variables;
+        cursor.todo = Todo::Exit { state: frame.owner, visit: frame.visit, outcome, variables };
     }
 
-    fn exit(&mut self, context: &mut Context<'_>, index: usize, id: StateId, visit: u32, outcome: Outcome) {
+    fn exit(
+        &mut self,
+        context: &mut Context<'_>,
+        index: usize,
+        id: StateId,
+        visit: u32,
+        outcome: Outcome,
+        variables: usize,
+    ) {
         let plan = self.plan.clone();
         let own = plan.state(id);
         if own.exits & (1 << outcome) != 0 {
             let state = context.program.state(id);
             let instance = self.append(context, index, state, Role::Exit, visit, None, outcome);
             self.single_arm(index, instance);
+            self.cursors[index].environment.variables.truncate(variables);
             let links: Vec<Predicate> = own.effect_predicates[outcome]
                 .iter()
                 .chain(if outcome == 0 { &own.operated[..] } else { &[] })
@@ -356,7 +365,9 @@ impl Window {
                 .collect();
             self.come_after(index, instance, id, outcome, false, &links);
         }
-        self.cursors[index].todo = Todo::Leave(id, outcome);
+        let cursor = &mut self.cursors[index];
+        cursor.environment.variables.truncate(variables);
+        cursor.todo = Todo::Leave(id, outcome);
     }
 
     fn end_of_task(&mut self, context: &mut Context<'_>, index: usize, outcome: &str) {

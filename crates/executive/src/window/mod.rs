@@ -11,7 +11,7 @@
 //! | | |
 //! |---|---|
 //! | growing | [`cursor`], [`expand`], [`concurrency`], [`environment`] |
-//! | beginning | [`ready`], [`begin`], [`priority`], [`hold`], [`timers`] |
+//! | beginning | [`ready`], [`begin`], [`priority`], [`timers`] |
 //! | ending | [`decide`], [`settle`], [`retire`], [`revalidate`], [`squash`], [`twins`] |
 
 mod begin;
@@ -20,7 +20,6 @@ mod cursor;
 mod decide;
 mod environment;
 mod expand;
-mod hold;
 mod instance;
 mod instances;
 mod plan;
@@ -39,12 +38,12 @@ mod view;
 use crate::analysis::Analysis;
 use crate::binding;
 use crate::context::Context;
+use crate::hold::Hold;
 use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
 use crate::protocol::{Command, Event, Learned, Note};
 use concurrency::{Fork, Thread};
 use cursor::{Cursor, Todo};
 use environment::{Binding, Environment, Link, assigned};
-use hold::Hold;
 use instance::{Changed, Ended, Instance, Line, Role, Segment, Status, Wait};
 use instances::Instances;
 use plan::{Plan, Predicate};
@@ -418,7 +417,7 @@ impl Window {
         };
         let routine = self.active.iter().copied().find(|id| {
             let routine = self.instances.get(*id).and_then(|i| i.routine.as_ref());
-            routine.is_some_and(|routine| routine.instance() == Some(inside))
+            routine.is_some_and(|routine| routine.is_at(inside))
         });
         if let Some(routine) = routine {
             self.tell_routine(context, routine, event);
@@ -446,7 +445,10 @@ impl Window {
         let Some(instance) = self.instances.get_mut(id) else { return };
         let Some(routine) = instance.routine.take() else { return };
         instance.lease = routine.lease().cloned().map(Box::new);
-        let outputs = routine.outputs().get(&instance.state).cloned().unwrap_or_default();
+        let mut outputs = routine.outputs().get(&instance.state).cloned().unwrap_or_default();
+        for name in &self.plan.state(instance.state).assigns {
+            outputs.extend(routine.variable(name).map(|value| (assigned(name), value.clone())));
+        }
         let changes = Changed::Exactly(routine.into_changes());
         self.finish(context, id, Ended { outcome: outcome.into(), outputs, reason, changes });
     }

@@ -1,0 +1,141 @@
+//! What composite states do when they are left: outputs, assignments, effects, resource operations.
+
+use super::{Interpreter, Target};
+use crate::binding::{self, Outputs};
+use crate::context::Context;
+use crate::effects;
+use ratn_model::fact::Change;
+use ratn_model::id::{InstanceId, StateId};
+use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, State, StateKind};
+use ratn_model::value::Value;
+
+impl Interpreter {
+    /// A composite state is left. What fails on the way makes it `aborted`.
+    #[expect(clippy::too_many_arguments, reason = "all of it is one activation")]
+    pub(super) fn exit(
+        &mut self,
+        context: &mut Context<'_>,
+        thread: u64,
+        id: StateId,
+        path: &str,
+        variables: usize,
+        mut outcome: String,
+        mut reason: String,
+    ) {
+        let state = context.program.state(id);
+        let result = self.boundary(context, thread, state, variables, &outcome);
+        if let Some(thread) = self.threads.get_mut(&thread) {
+            thread.variables.truncate(variables);
+        }
+        match result {
+            Ok(assigned) => self.assign(thread, assigned),
+            Err(problem) => {
+                outcome = ABORTED.to_owned();
+                reason = format!("{path}: {problem}");
+            }
+        }
+        self.ended(thread, id, outcome, reason);
+    }
+
+    /// What it does; the new values of variables.
+    fn boundary(
+        &mut self,
+        context: &mut Context<'_>,
+        thread: u64,
+        state: &State,
+        variables: usize,
+        outcome: &str,
+    ) -> Result<Vec<(String, Value)>, String> {
+        // Its loop variables are gone, its scoped ones are still seen.
+        if matches!(state.kind, StateKind::ForEach { .. } | StateKind::While { .. })
+            && let Some(thread) = self.threads.get_mut(&thread)
+        {
+            thread.variables.truncate(variables);
+        }
+        let good = !matches!(outcome, ABORTED | PREEMPTED);
+        let mut written = Outputs::new();
+        if let (true, StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) =
+            (good, &state.kind)
+        {
+            for output in outputs {
+                let value = self.with_scope(context, thread, Some(&written), |scope| output.value.evaluate(scope));
+                let value = value.map_err(|error| format!("output `{}`: {error}", output.name))?;
+                written.insert(output.name.clone(), value);
+            }
+        }
+        let assigned = if good { self.assigned(context, thread, state, &written)? } else { Vec::new() };
+        if let Some(declared) = state.annotations.effects.get(outcome) {
+            let changes = self
+                .with_scope(context, thread, Some(&written), |s| effects::actual(Some(declared), outcome, &[], s))
+                .map_err(|error| error.to_string())?;
+            self.apply(context, InstanceId(0), changes)?;
+        }
+        if outcome == SUCCESS {
+            self.operate(context, thread, state, InstanceId(0), &written)?;
+        }
+        if good && matches!(state.kind, StateKind::Sequence { .. } | StateKind::Concurrency { .. }) {
+            self.outputs.insert(state.id, written);
+        }
+        Ok(assigned)
+    }
+
+    /// The values that a state assigns to variables.
+    pub(super) fn assigned(
+        &self,
+        context: &Context<'_>,
+        thread: u64,
+        state: &State,
+        outputs: &Outputs,
+    ) -> Result<Vec<(String, Value)>, String> {
+        let value = |(name, value): &(String, ratn_model::expression::Expr)| {
+            let value = self.with_scope(context, thread, Some(outputs), |scope| value.evaluate(scope));
+            Ok((name.clone(), value.map_err(|error| format!("`assign` of `{name}`: {error}"))?))
+        };
+        state.assign.iter().map(value).collect()
+    }
+
+    /// Variables get new values, each the innermost of its name.
+    pub(super) fn assign(&mut self, thread: u64, assigned: Vec<(String, Value)>) {
+        let Some(thread) = self.threads.get_mut(&thread) else { return };
+        for (name, value) in assigned {
+            if let Some(variable) = thread.variables.iter_mut().rev().find(|(n, _)| *n == name) {
+                variable.1 = value;
+            }
+        }
+    }
+
+    pub(super) fn apply(
+        &mut self,
+        context: &mut Context<'_>,
+        instance: InstanceId,
+        changes: Vec<Change>,
+    ) -> Result<(), String> {
+        match &mut self.target {
+            Target::Actual => context.commit(instance, changes),
+            Target::Projection { changes: all, world, .. } => {
+                world.apply(&changes).map_err(|e| e.to_string())?;
+                all.extend(changes);
+                Ok(())
+            }
+        }
+    }
+
+    pub(super) fn operate(
+        &self,
+        context: &mut Context<'_>,
+        thread: u64,
+        state: &State,
+        instance: InstanceId,
+        outputs: &Outputs,
+    ) -> Result<(), String> {
+        let wanted = &context.analysis.state(state.id).operations;
+        if wanted.is_empty() {
+            return Ok(());
+        }
+        let operations = self
+            .with_scope(context, thread, Some(outputs), |s| binding::requirements(state, wanted, s))
+            .map_err(|e| e.reason())?;
+        context.commands.push(crate::protocol::Command::Operate { instance, operations });
+        Ok(())
+    }
+}

@@ -1,0 +1,112 @@
+//! Concurrency: a thread per region, and the decider when they have ended.
+
+use super::{Interpreter, Thread, Todo};
+use crate::context::Context;
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind};
+
+impl Interpreter {
+    /// Every region begins, each with its own copy of the variables.
+    pub(super) fn fork(&mut self, thread: u64, state: StateId, path: String, regions: &[StateId]) {
+        let Some(variables) = self.threads.get(&thread).map(|thread| thread.variables.clone()) else { return };
+        let mut threads = Vec::new();
+        for region in regions {
+            self.last_thread += 1;
+            threads.push(self.last_thread);
+            let todo = Todo::Enter(*region, None);
+            let frame = super::Frame {
+                owner: state,
+                list: threads.len() - 1,
+                path: path.clone(),
+                visits: Default::default(),
+                iteration: None,
+                variables: variables.len(),
+            };
+            let region = Thread { frames: vec![frame], variables: variables.clone(), todo, current: None };
+            self.threads.insert(self.last_thread, region);
+        }
+        self.set(thread, Todo::Join { state, path, regions: threads });
+    }
+
+    /// Whether enough regions have ended.
+    pub(super) fn may_join(&self, program: &Program, state: StateId, regions: &[u64]) -> bool {
+        let mut ended = regions.iter().map(|region| self.region_end(*region).is_some());
+        match program.state(state).kind {
+            StateKind::Concurrency { preemptive: true, .. } => regions.is_empty() || ended.any(|ended| ended),
+            _ => ended.all(|ended| ended),
+        }
+    }
+
+    /// How a region has ended, and why.
+    fn region_end(&self, region: u64) -> Option<(&str, &str)> {
+        match &self.threads.get(&region)?.todo {
+            Todo::Done { outcome, reason } => Some((outcome, reason)),
+            _ => None,
+        }
+    }
+
+    /// The regions have ended: their outcomes decide.
+    pub(super) fn join(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: String, regions: &[u64]) {
+        let program = context.program;
+        let StateKind::Concurrency { regions: states, decide, preemptive, .. } = &program.state(id).kind else {
+            return;
+        };
+        let first = regions.iter().position(|region| self.region_end(*region).is_some());
+        let mut outcomes = Vec::new();
+        let mut reasons = Vec::new();
+        for (region, state) in regions.iter().zip(states) {
+            let end = self.region_end(*region).map(|(outcome, reason)| (outcome.to_owned(), reason.to_owned()));
+            let (outcome, reason) = end.unwrap_or_else(|| {
+                self.stop(context, *region);
+                (PREEMPTED.to_owned(), String::new())
+            });
+            self.regions.insert(*state, outcome.clone());
+            if !reason.is_empty() {
+                reasons.push(reason);
+            }
+            outcomes.push(outcome);
+        }
+        self.merge_variables(thread, regions);
+        for region in regions {
+            self.threads.remove(region);
+        }
+        let base = self.threads.get(&thread).map_or(0, |thread| thread.variables.len());
+        let mut reason = reasons.join("; ");
+        let mut decision = None;
+        for (outcome, holds) in decide {
+            match self.with_scope(context, thread, None, |scope| holds.holds(scope)) {
+                Ok(false) => {}
+                Ok(true) => decision = Some(outcome.clone()),
+                Err(error) => {
+                    reason = format!("{path}: `decide.{outcome}`: {error}");
+                    decision = Some(ABORTED.to_owned());
+                }
+            }
+            if decision.is_some() {
+                break;
+            }
+        }
+        let outcome = decision.unwrap_or_else(|| match first {
+            Some(first) if *preemptive && decide.is_empty() => outcomes[first].clone(),
+            _ if outcomes.iter().all(|outcome| outcome == SUCCESS) => SUCCESS.to_owned(),
+            _ if outcomes.iter().any(|outcome| outcome == ABORTED) => ABORTED.to_owned(),
+            _ => PREEMPTED.to_owned(),
+        });
+        self.decided(context, &path, outcome.clone());
+        self.exit(context, thread, id, &path, base, outcome, reason);
+    }
+
+    /// What regions assigned to variables outside is seen from here on; where several did, the last region's.
+    fn merge_variables(&mut self, thread: u64, regions: &[u64]) {
+        let Some(before) = self.threads.get(&thread).map(|thread| thread.variables.clone()) else { return };
+        for region in regions {
+            let Some(theirs) = self.threads.get(region).map(|region| region.variables.clone()) else { continue };
+            let Some(thread) = self.threads.get_mut(&thread) else { return };
+            for ((own, old), new) in thread.variables.iter_mut().zip(&before).zip(theirs) {
+                if new.1 != old.1 {
+                    own.1 = new.1;
+                }
+            }
+        }
+    }
+}
