@@ -1,5 +1,6 @@
 //! The command line.
 
+use crate::task_control::control::Word;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use ratn_worker::endpoint::Endpoint;
 use std::path::PathBuf;
@@ -20,6 +21,8 @@ pub(crate) enum Command {
     Up(UpArguments),
     /// Run a task on a running system, or on one started for it
     Run(RunArguments),
+    /// Pause a run that is under way, let it go on, let it do one step, or end it
+    Control(ControlArguments),
     /// Check a task file without starting anything
     Check(CheckArguments),
     /// Say where the time of a run went, from its event log
@@ -142,9 +145,15 @@ pub(crate) struct TablesArguments {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct RunArguments {
-    /// The task file
-    #[arg(value_name = "TASK")]
-    pub(crate) task: PathBuf,
+    /// The task file; with --resume the one that the log names unless given
+    #[arg(value_name = "TASK", required_unless_present = "resume")]
+    pub(crate) task: Option<PathBuf>,
+    /// Go on with the run of this event log, whose task control was killed, on the system that it was on
+    #[arg(long, value_name = "LOG", conflicts_with_all = ["mode", "set", "seed", "log", "learn", "speed"])]
+    pub(crate) resume: Option<PathBuf>,
+    /// Learn durations and the shares of outcomes from event logs of earlier runs of the task, or folders of them
+    #[arg(long, value_name = "LOG", num_args = 1..)]
+    pub(crate) learn: Vec<PathBuf>,
     /// How it is executed
     #[arg(long, value_enum, default_value = "cdtn")]
     pub(crate) mode: ModeArgument,
@@ -172,6 +181,16 @@ pub(crate) struct RunArguments {
     /// Print one JSON document on standard output
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ControlArguments {
+    /// What the run shall do
+    #[arg(value_enum)]
+    pub(crate) word: Word,
+    /// Where the endpoint files of the run's system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, Args)]

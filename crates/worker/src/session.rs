@@ -45,6 +45,8 @@ pub struct SessionState {
     pub alive: bool,
     /// How often the manager made it; when it grows beyond 1, what the session owned and held is gone.
     pub generation: u64,
+    /// The manager knew it from before when it was pinged for the first time: it goes on with what it has there.
+    pub found: bool,
 }
 
 /// No session within the deadline.
@@ -191,6 +193,7 @@ impl Keeper {
             self.tell.send_if_modified(|state| {
                 let before = *state;
                 // One that was not alive here was not there: the answer that said so may have been lost with its stream.
+                state.found |= before.generation == 0 && !answer.created;
                 state.generation += u64::from(answer.created || !before.alive);
                 state.alive = true;
                 *state != before

@@ -101,11 +101,12 @@ async fn one_run(
     let log_file = directory.join(format!("{}.jsonl", plan.file_stem()));
     let run = Run {
         program: program.clone(),
-        catalogue: Arc::new(config.catalogue.clone()),
+        // Its task file is built in.
+        file: String::new(),
         parameters: program.bind_parameters(&set)?,
         mode: plan.mode,
         seed: arguments.seed,
-        speed: arguments.speed,
+        learned: Default::default(),
         log: log_file.clone(),
         quiet: false,
     };

@@ -1,6 +1,7 @@
 //! One file per command of the user; `roles.rs` holds the daemons and workers.
 
 mod check;
+mod control;
 mod demo;
 mod report;
 mod roles;
@@ -22,6 +23,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Demo(arguments) => demo::run(&arguments),
         Command::Up(arguments) => up::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
+        Command::Control(arguments) => control::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Tables(arguments) => tables::run(&arguments),

@@ -1,4 +1,6 @@
-//! `ratn run TASK`: on the system that runs here, or on one started for it.
+//! `ratn run TASK`: on the system that runs here, or on one started for it; `ratn run --resume LOG`.
+
+mod resume;
 
 use super::{blocking, check};
 use crate::arguments::{ModeArgument, RunArguments, SystemArguments};
@@ -10,8 +12,8 @@ use crate::report::statistics::Statistics;
 use crate::report::timeline::Timeline;
 use crate::system::config::SystemConfig;
 use crate::system::{System, public_directory};
-use crate::task_control::log;
 use crate::task_control::shell::{self, Ended, Run};
+use crate::task_control::{learn, log};
 use anyhow::{Context, anyhow, bail};
 use ratn_executive::protocol::Mode;
 use ratn_model::program::SUCCESS;
@@ -28,65 +30,80 @@ impl From<ModeArgument> for Mode {
     }
 }
 
-/// Runs a task once.
+/// Runs a task once, or goes on with a run.
 pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
     blocking(async {
         let interrupt = Interrupt::listen()?;
         let directory = public_directory(arguments.runtime_dir.as_deref());
-        let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
-        let found = System::find(&directory, given.clone()).await?;
-        if found.is_none() && arguments.runtime_dir.is_some() {
-            let place = directory.display();
-            return Err(Failure::Refused(format!(
-                "ratn: no system runs in {place}: start one with `ratn up --runtime-dir {place}`, or leave --runtime-dir out"
-            )));
+        match (&arguments.resume, &arguments.task) {
+            (Some(log), task) => resume::run(arguments, log, task.as_deref(), &directory, &interrupt).await,
+            (None, Some(task)) => begin(arguments, task, &directory, &interrupt).await,
+            (None, None) => Err(Failure::Refused("ratn: no task file is named".to_owned())),
         }
-        let mut config = match &found {
-            Some(system) => system.config.clone(),
-            None => given.map_or_else(|| SystemConfig::load(None), Ok)?,
-        };
-        config.apply(&SystemArguments { speed: arguments.speed, ..SystemArguments::default() });
-
-        // Everything that can be refused is refused before anything is started.
-        let program = check::load(&arguments.task, &config.catalogue)?;
-        let parameters = program.bind_parameters(&arguments.set).map_err(|error| {
-            Failure::Refused(format!("{}: error[invalid-parameter]: {error}", arguments.task.display()))
-        })?;
-        if found.is_some() && arguments.speed.is_some() {
-            let message = format!("ratn: a system runs in {}: its speed is its own", directory.display());
-            return Err(Failure::Refused(message));
-        }
-        for file in arguments.log.iter().chain(&arguments.gantt) {
-            output::check_writable(file)?;
-        }
-        let log = arguments.log.clone().map_or_else(|| log_file(&program.name), Ok)?;
-
-        let system = match found {
-            Some(system) => {
-                output::progress(format_args!("on the system in {}", directory.display()));
-                system
-            }
-            None => {
-                output::progress(format_args!("no system runs in {}: starting one for this run", directory.display()));
-                starting(System::start_private(config.clone()), &interrupt).await?
-            }
-        };
-        let run = Run {
-            program: Arc::new(program),
-            catalogue: Arc::new(config.catalogue.clone()),
-            parameters,
-            mode: arguments.mode.into(),
-            seed: arguments.seed,
-            speed: system.config.speed,
-            log: log.clone(),
-            quiet: false,
-        };
-        let ended = on_system(run, system, &interrupt, async |_| Ok(())).await;
-        output::progress(format_args!("event log: {}", log.display()));
-        let (ended, ()) = ended?;
-        say(&ended, &log, arguments)?;
-        if ended.outcome == SUCCESS { Ok(()) } else { Err(anyhow!("the task ended with {}", ended.outcome).into()) }
     })
+}
+
+async fn begin(arguments: &RunArguments, task: &Path, directory: &Path, interrupt: &Interrupt) -> Result<(), Failure> {
+    let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
+    let found = System::find(directory, given.clone()).await?;
+    if found.is_none() && arguments.runtime_dir.is_some() {
+        let place = directory.display();
+        return Err(Failure::Refused(format!(
+            "ratn: no system runs in {place}: start one with `ratn up --runtime-dir {place}`, or leave --runtime-dir out"
+        )));
+    }
+    let mut config = match &found {
+        Some(system) => system.config.clone(),
+        None => given.map_or_else(|| SystemConfig::load(None), Ok)?,
+    };
+    config.apply(&SystemArguments { speed: arguments.speed, ..SystemArguments::default() });
+
+    // Everything that can be refused is refused before anything is started.
+    let program = check::load(task, &config.catalogue)?;
+    let parameters = program
+        .bind_parameters(&arguments.set)
+        .map_err(|error| Failure::Refused(format!("{}: error[invalid-parameter]: {error}", task.display())))?;
+    if found.is_some() && arguments.speed.is_some() {
+        let message = format!("ratn: a system runs in {}: its speed is its own", directory.display());
+        return Err(Failure::Refused(message));
+    }
+    for file in arguments.log.iter().chain(&arguments.gantt) {
+        output::check_writable(file)?;
+    }
+    let learned = learn::from_files(&arguments.learn, &program.name)?;
+    let log = arguments.log.clone().map_or_else(|| log_file(&program.name), Ok)?;
+
+    let system = match found {
+        Some(system) => {
+            output::progress(format_args!("on the system in {}", directory.display()));
+            system
+        }
+        None => {
+            output::progress(format_args!("no system runs in {}: starting one for this run", directory.display()));
+            let system = starting(System::start_private(config.clone()), interrupt).await?;
+            output::progress(format_args!("its runtime directory: {}", system.directory().path().display()));
+            system
+        }
+    };
+    let run = Run {
+        program: Arc::new(program),
+        file: std::path::absolute(task)?.display().to_string(),
+        parameters,
+        mode: arguments.mode.into(),
+        seed: arguments.seed,
+        learned,
+        log: log.clone(),
+        quiet: false,
+    };
+    let ended = on_system(run, system, interrupt, async |_| Ok(())).await;
+    output::progress(format_args!("event log: {}", log.display()));
+    let (ended, ()) = ended?;
+    conclude(&ended, &log, arguments)
+}
+
+fn conclude(ended: &Ended, log: &Path, arguments: &RunArguments) -> Result<(), Failure> {
+    say(ended, log, arguments)?;
+    if ended.outcome == SUCCESS { Ok(()) } else { Err(anyhow!("the task ended with {}", ended.outcome).into()) }
 }
 
 /// Starts something, unless the user has enough of it first.
@@ -107,9 +124,9 @@ pub(super) async fn on_system<T>(
     interrupt: &Interrupt,
     afterwards: impl AsyncFnOnce(&System) -> anyhow::Result<T>,
 ) -> anyhow::Result<(Ended, T)> {
-    let endpoints = system.endpoints.clone();
+    let place = system.place();
     let ended = tokio::select! {
-        ended = shell::run(run, &endpoints, interrupt) => ended,
+        ended = shell::run(run, &place, interrupt) => ended,
         error = system.one_ended() => Err(error.context("a part of the system ended during the run")),
     };
     let answer = match ended {

@@ -185,10 +185,12 @@ fn states(run: &Timeline) -> Vec<StateTime> {
 /// `place_all[2]/plan_transfer` → `place_all/plan_transfer`
 pub(crate) fn without_visits(path: &str) -> String {
     let mut depth = 0_usize;
+    let mut number = false;
     path.chars()
         .filter(|c| {
             depth += usize::from(*c == '[');
-            let keep = depth == 0;
+            number = *c == '#' || (number && c.is_ascii_digit());
+            let keep = depth == 0 && !number;
             depth -= usize::from(*c == ']' && depth > 0);
             keep
         })

@@ -4,6 +4,7 @@ pub(crate) mod config;
 mod launch;
 
 use crate::task_control::Endpoints;
+use crate::task_control::shell::Place;
 use anyhow::Context;
 use config::SystemConfig;
 use launch::Processes;
@@ -14,6 +15,7 @@ use ratn_worker::endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// The environment variable that says where endpoint files are.
 const DIRECTORY_VARIABLE: &str = "RATN_RUNTIME_DIR";
@@ -78,6 +80,16 @@ impl System {
         };
         let directory = RuntimeDirectory::at(directory);
         Ok(Some(System { config, endpoints, directory, processes: Processes::default(), _private: None }))
+    }
+
+    /// Where a run finds what it needs of it.
+    pub(crate) fn place(&self) -> Place {
+        Place {
+            endpoints: self.endpoints.clone(),
+            directory: self.directory.path().to_owned(),
+            catalogue: Arc::new(self.config.catalogue.clone()),
+            speed: self.config.speed,
+        }
     }
 
     /// Where its endpoint files and logs are.

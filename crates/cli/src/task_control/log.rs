@@ -1,12 +1,12 @@
 //! The event log: one JSON object per line, every event that the executive was given and every command that it gave.
 //!
 //! It is the single source of Gantt charts, statistics, replay and resume, so each line is on its way to the file before the
-//! commands of its event are performed. Reading says which line is wrong and why; a torn last line (the writer was killed) is
-//! left out and named.
+//! commands of its event are performed, and on the disk where they cannot be undone. Its writer holds a lock on it: nobody else
+//! writes it meanwhile. Reading says which line is wrong and why; a torn last line (the writer was killed) is left out and named.
 
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::time::Timestamp;
-use std::fs::File;
+use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{BufRead, BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
@@ -20,6 +20,8 @@ const MAX_LOG_BYTES: u64 = 4 << 30;
 pub(crate) enum LogError {
     #[error("cannot {what} the event log {}", path.display())]
     Io { what: &'static str, path: PathBuf, source: std::io::Error },
+    #[error("the event log {} is being written by a run that is under way", path.display())]
+    UnderWay { path: PathBuf },
     #[error("the event log {} would grow beyond {MAX_LOG_BYTES} bytes; the run ends here", path.display())]
     TooLong { path: PathBuf },
     #[error("{}:{line}: not a line of an event log: {reason}", path.display())]
@@ -34,28 +36,81 @@ pub(crate) struct LogWriter {
     path: PathBuf,
     file: BufWriter<File>,
     written: u64,
+    /// It is on a disk, so that it can be made safe there.
+    on_disk: bool,
+    /// What was behind the last whole line is away.
+    is_cut: bool,
 }
 
 impl LogWriter {
     /// Creates the file, or empties it.
     pub(crate) fn create(path: &Path) -> Result<Self, LogError> {
-        let file =
-            File::create(path).map_err(|source| LogError::Io { what: "create", path: path.to_owned(), source })?;
-        Ok(LogWriter { path: path.to_owned(), file: BufWriter::new(file), written: 0 })
+        let mut writer = LogWriter::open(path, OpenOptions::new().write(true).create(true).truncate(false), "create")?;
+        writer.cut()?;
+        if writer.on_disk {
+            // The file's name has to be safe, too.
+            let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            File::open(folder).and_then(|folder| folder.sync_all()).map_err(|source| writer.io(source))?;
+        }
+        Ok(writer)
+    }
+
+    /// Goes on with a log, of which nobody else is the writer; and what it says. A torn line is cut off before the first line
+    /// is written.
+    pub(crate) fn go_on(path: &Path) -> Result<(Self, Log), LogError> {
+        let mut writer = LogWriter::open(path, OpenOptions::new().append(true), "go on with")?;
+        let log = read(path)?;
+        writer.written = log.whole;
+        Ok((writer, log))
+    }
+
+    fn open(path: &Path, options: &OpenOptions, what: &'static str) -> Result<Self, LogError> {
+        let io = |source| LogError::Io { what, path: path.to_owned(), source };
+        let file = options.open(path).map_err(io)?;
+        let on_disk = file.metadata().map_err(io)?.is_file();
+        if on_disk {
+            file.try_lock().map_err(|error| match error {
+                TryLockError::WouldBlock => LogError::UnderWay { path: path.to_owned() },
+                TryLockError::Error(source) => io(source),
+            })?;
+        }
+        Ok(LogWriter { path: path.to_owned(), file: BufWriter::new(file), written: 0, on_disk, is_cut: false })
+    }
+
+    fn cut(&mut self) -> Result<(), LogError> {
+        if self.on_disk && !self.is_cut {
+            self.file.get_ref().set_len(self.written).map_err(|source| self.io(source))?;
+        }
+        self.is_cut = true;
+        Ok(())
     }
 
     /// Writes what happened and what was decided then, and hands it to the operating system.
     pub(crate) fn append(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Result<(), LogError> {
         self.write(&LogLine { at, entry: LogEntry::Event(event.clone()) })?;
+        self.append_commands(at, commands)
+    }
+
+    /// Writes what was decided on the last event.
+    pub(crate) fn append_commands(&mut self, at: Timestamp, commands: &[Command]) -> Result<(), LogError> {
         for command in commands {
             self.write(&LogLine { at, entry: LogEntry::Command(command.clone()) })?;
         }
         self.file.flush().map_err(|source| self.io(source))
     }
 
+    /// Returns once everything written so far outlives a loss of power.
+    pub(crate) fn make_durable(&mut self) -> Result<(), LogError> {
+        if self.on_disk {
+            self.file.get_ref().sync_data().map_err(|source| self.io(source))?;
+        }
+        Ok(())
+    }
+
     fn write(&mut self, line: &LogLine) -> Result<(), LogError> {
         let mut text = serde_json::to_vec(line).map_err(|source| self.io(source.into()))?;
         text.push(b'\n');
+        self.cut()?;
         self.written += text.len() as u64;
         if self.written > MAX_LOG_BYTES {
             return Err(LogError::TooLong { path: self.path.clone() });
@@ -74,6 +129,8 @@ pub(crate) struct Log {
     pub(crate) lines: Vec<LogLine>,
     /// The number of its last line if that is torn, which is not among the others.
     pub(crate) torn: Option<usize>,
+    /// How many bytes the whole lines have.
+    pub(crate) whole: u64,
 }
 
 /// Reads a whole event log.
@@ -84,7 +141,7 @@ pub(crate) fn read(path: &Path) -> Result<Log, LogError> {
     let io = |source| LogError::Io { what: "read", path: path.to_owned(), source };
     let mut reader = BufReader::new(File::open(path).map_err(io)?);
     let mut lines = Vec::new();
-    let mut torn = None;
+    let (mut torn, mut whole) = (None, 0);
     let mut text = Vec::new();
     loop {
         text.clear();
@@ -107,11 +164,12 @@ pub(crate) fn read(path: &Path) -> Result<Log, LogError> {
             return Err(foreign("an event log begins with the event `started`".into()));
         }
         lines.push(parsed);
+        whole += length as u64;
     }
     if lines.is_empty() {
         return Err(LogError::Empty { path: path.to_owned() });
     }
-    Ok(Log { lines, torn })
+    Ok(Log { lines, torn, whole })
 }
 
 /// serde's message for an untagged enum says nothing; this one says what the line claims to be.
@@ -168,10 +226,20 @@ mod tests {
         let mut log = LogWriter::create(file.path()).unwrap();
         let command = Command::Note(Note::Retired { instance: InstanceId(1) });
         log.append(Timestamp(0), &started(), std::slice::from_ref(&command)).unwrap();
-        let Log { lines, torn } = read(file.path()).unwrap();
+        let Log { lines, torn, .. } = read(file.path()).unwrap();
         assert_eq!((lines.len(), torn), (2, None));
         assert_eq!(lines[0], LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) });
         assert_eq!(lines[1], LogLine { at: Timestamp(0), entry: LogEntry::Command(command) });
+    }
+
+    #[test]
+    fn a_log_has_one_writer() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let mut writer = LogWriter::create(file.path()).unwrap();
+        writer.append(Timestamp(0), &started(), &[]).unwrap();
+        assert!(matches!(LogWriter::create(file.path()), Err(LogError::UnderWay { .. })));
+        assert!(matches!(LogWriter::go_on(file.path()), Err(LogError::UnderWay { .. })));
+        assert_eq!(read(file.path()).unwrap().lines.len(), 1);
     }
 
     #[test]
@@ -181,6 +249,12 @@ mod tests {
         std::fs::write(file.path(), format!("{first}\n{{\"at\":1,")).unwrap();
         let log = read(file.path()).unwrap();
         assert_eq!((log.lines.len(), log.torn), (1, Some(2)));
+        // Who goes on with it writes over the torn line.
+        let (mut writer, _) = LogWriter::go_on(file.path()).unwrap();
+        writer.append(Timestamp(2), &Event::Resumed, &[]).unwrap();
+        writer.make_durable().unwrap();
+        let log = read(file.path()).unwrap();
+        assert_eq!((log.lines.len(), log.torn), (2, None));
         assert!(refusal(&first).contains("has no whole line"));
     }
 

@@ -1,9 +1,13 @@
 //! Task control: the shell around the executive. Performs its commands over gRPC and brings the answers back as events.
 
+pub(crate) mod control;
+pub(crate) mod learn;
+mod ledger;
 pub(crate) mod log;
 mod performer;
 mod progress;
 mod record;
+mod replay;
 mod retry;
 pub(crate) mod shell;
 

@@ -1,7 +1,7 @@
 //! What a run is doing, one line per node that starts or ends, on standard error.
 
 use crate::output;
-use ratn_executive::protocol::{Command, Event, Note};
+use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Note};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, WORLD_MODEL};
 use ratn_model::time::Timestamp;
@@ -19,6 +19,21 @@ impl Progress {
     /// One that prints, or not.
     pub(crate) fn new(quiet: bool) -> Progress {
         Progress { quiet, ..Progress::default() }
+    }
+
+    /// Knows what was said before of a run that goes on, and says nothing of it again.
+    pub(crate) fn catch_up(&mut self, lines: &[LogLine]) {
+        for line in lines {
+            match &line.entry {
+                LogEntry::Event(Event::Finished { instance, .. }) => drop(self.started.remove(instance)),
+                LogEntry::Event(_) => {}
+                LogEntry::Command(Command::Note(Note::Expanded { instance, path, .. })) => {
+                    self.paths.insert(*instance, path.clone());
+                }
+                LogEntry::Command(Command::Start { instance, .. }) => drop(self.started.insert(*instance, line.at)),
+                LogEntry::Command(_) => {}
+            }
+        }
     }
 
     /// Prints what there is to say of one step.

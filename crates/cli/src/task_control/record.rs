@@ -1,7 +1,8 @@
 //! What must reach the world pool and the resource manager in the order in which it was decided: projections, commits,
 //! creation and deletion of task resources. One task, one request at a time.
 
-use super::performer::Answer;
+use super::ledger::operation_request;
+use super::performer::{Answer, commit_request};
 use super::retry::{Attempts, patiently};
 use ratn_executive::protocol::Event;
 use ratn_model::fact::{Change, Footprint};
@@ -34,6 +35,8 @@ pub(super) enum Record {
     },
     Operate {
         instance: InstanceId,
+        /// Its number in the run.
+        number: u64,
         operations: Vec<Requirement>,
     },
     /// Answers once everything before it is done: with the first failure of the run, if there was one.
@@ -63,7 +66,7 @@ impl Recorder {
                     self.project(instance, attempt, Projection { request, base, changes, reads, lease }).await
                 }
                 Record::Commit { instance, changes, revision } => self.commit(instance, changes, revision).await,
-                Record::Operate { instance, operations } => self.operate(instance, operations).await,
+                Record::Operate { instance, number, operations } => self.operate(instance, number, operations).await,
                 Record::Flush(done) => {
                     let _ = done.send(recorded.clone());
                     None
@@ -99,8 +102,7 @@ impl Recorder {
     }
 
     async fn commit(&self, instance: InstanceId, changes: Vec<Change>, revision: Revision) -> Option<Event> {
-        // One instance may commit more than once (the parts of a routine); the revision tells its commits apart.
-        let commit = format!("{}/{instance}/{revision}", self.run);
+        let commit = commit_request(&self.run, instance, revision);
         let done = patiently(Attempts::IDEMPOTENT, || self.world.commit(&commit, changes.clone(), Some(revision)));
         match done.await {
             Ok(_) => None,
@@ -111,27 +113,37 @@ impl Recorder {
         }
     }
 
-    async fn operate(&self, instance: InstanceId, operations: Vec<Requirement>) -> Option<Event> {
-        for operation in operations {
-            let done = match operation.operation {
-                ResourceOperation::Create => {
-                    let class = operation.class.unwrap_or(ResourceClass::Task);
-                    let mut resource = Resource::new("", class, operation.kind.clone()).with_capacity(operation.count);
-                    resource.attributes = operation.attributes.clone();
-                    self.resources.create(resource).await.map(|_| ())
-                }
-                ResourceOperation::Delete => self.resources.delete_matching(operation.clone()).await.map(|_| ()),
-                ResourceOperation::Consume => self.resources.consume(operation.clone()).await.map(|_| ()),
-                // The executive gives these to an acquire.
-                ResourceOperation::Block | ResourceOperation::Exists => Ok(()),
-            };
-            if let Err(error) = done {
+    async fn operate(&self, instance: InstanceId, number: u64, operations: Vec<Requirement>) -> Option<Event> {
+        for (index, operation) in operations.into_iter().enumerate() {
+            let request = operation_request(&self.run, instance, number, index);
+            if let Err(error) = operate_once(&self.resources, &request, &operation).await {
                 let reason = format!("`{operation}` was not done: {}", said(&error));
                 return Some(Event::RetirementFailed { instance, reason });
             }
         }
         None
     }
+}
+
+/// Creates, deletes or consumes, once however often it is asked for under this request id.
+pub(super) async fn operate_once(
+    resources: &ResourceClient,
+    request: &str,
+    operation: &Requirement,
+) -> Result<(), CallError> {
+    let ask = async || match operation.operation {
+        ResourceOperation::Create => {
+            let class = operation.class.unwrap_or(ResourceClass::Task);
+            let mut resource = Resource::new("", class, operation.kind.clone()).with_capacity(operation.count);
+            resource.attributes = operation.attributes.clone();
+            resources.create_once(request, resource).await.map(|_| ())
+        }
+        ResourceOperation::Delete => resources.delete_matching_once(request, operation.clone()).await.map(|_| ()),
+        ResourceOperation::Consume => resources.consume_once(request, operation.clone()).await.map(|_| ()),
+        // The executive gives these to an acquire.
+        ResourceOperation::Block | ResourceOperation::Exists => Ok(()),
+    };
+    patiently(Attempts::IDEMPOTENT, ask).await
 }
 
 /// An error with its sources in one line.

@@ -1,23 +1,30 @@
 //! The one loop of task control: receive an event, log it, hand it to the executive, log its commands, perform them.
 //!
 //! Nothing is decided here. Whatever a command leads to comes back as an event through one bounded queue, so the event log is
-//! the whole story of the run.
+//! the whole story of the run, and a run whose task control was killed goes on from it ([`resume`]).
 
+use super::Endpoints;
+use super::control::Control;
 use super::log::LogWriter;
-use super::performer::Performer;
+use super::performer::{self, Performer};
 use super::progress::Progress;
+use super::replay::{self, ReplayError, Replayed, VERSION};
 use crate::interrupt::Interrupt;
 use anyhow::{Context, bail};
 use ratn_executive::executive::Executive;
-use ratn_executive::protocol::{Command, Event, Mode};
+use ratn_executive::protocol::{Command, Event, Learned, LogLine, Mode, Origin};
 use ratn_model::catalogue::Catalogue;
+use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Program, SUCCESS};
+use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
+use ratn_worker::client::fresh_id;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_world::tolerance::Tolerance;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::{SystemTime, UNIX_EPOCH};
 use tokio::sync::mpsc;
 
 /// Answers that the executive has not been given yet.
@@ -27,16 +34,50 @@ pub(super) const MAX_PENDING_EVENTS: usize = 1024;
 #[derive(Debug, Clone)]
 pub(crate) struct Run {
     pub(crate) program: Arc<Program>,
-    pub(crate) catalogue: Arc<Catalogue>,
+    /// The task file, as an absolute path; empty where there is none.
+    pub(crate) file: String,
     pub(crate) parameters: BTreeMap<String, Value>,
     pub(crate) mode: Mode,
     pub(crate) seed: u64,
-    /// The robot's seconds per second of wall time.
-    pub(crate) speed: f64,
+    /// What earlier runs have taught.
+    pub(crate) learned: Learned,
     /// Where the event log goes.
     pub(crate) log: PathBuf,
     /// Whether every node that starts and ends is printed.
     pub(crate) quiet: bool,
+}
+
+/// The system that a run is on.
+#[derive(Debug, Clone)]
+pub(crate) struct Place {
+    pub(crate) endpoints: Endpoints,
+    /// Where its endpoint files are.
+    pub(crate) directory: PathBuf,
+    pub(crate) catalogue: Arc<Catalogue>,
+    /// The robot's seconds per second of wall time.
+    pub(crate) speed: f64,
+}
+
+/// A run to go on with, as its log has it.
+pub(crate) struct Resumption {
+    program: Arc<Program>,
+    replayed: Replayed,
+    progress: Progress,
+    log: LogWriter,
+}
+
+impl Resumption {
+    /// Replays what the log says. Touches nothing of the run.
+    ///
+    /// # Errors
+    /// Where the log is not of this program and this version, or the run has ended.
+    pub(crate) fn new(program: Program, log: LogWriter, lines: &[LogLine]) -> Result<Resumption, ReplayError> {
+        let program = Arc::new(program);
+        let replayed = replay::replay(&program, lines)?;
+        let mut progress = Progress::new(false);
+        progress.catch_up(lines);
+        Ok(Resumption { program, replayed, progress, log })
+    }
 }
 
 /// How a run ended.
@@ -54,67 +95,197 @@ pub(crate) struct Ended {
 /// # Errors
 /// When the system cannot be reached, the log cannot be written, or the user insists. A task that ends badly is no error: its
 /// outcome says so.
-pub(crate) async fn run(run: Run, endpoints: &super::Endpoints, interrupt: &Interrupt) -> anyhow::Result<Ended> {
-    let mut log = LogWriter::create(&run.log)?;
-    let (events, mut answers) = mpsc::channel(MAX_PENDING_EVENTS);
-    let mut performer = Performer::connect(endpoints, run.catalogue.clone(), &run.program.name, events)
-        .await
-        .context("cannot begin the run")?;
-    let (revision, world) = performer.root().await.context("cannot read the root world")?;
-
-    let clock = RobotClock::start(run.speed);
-    let mut executive = Executive::new(run.program.clone(), Tolerance::ROBOT);
-    let mut progress = Progress::new(run.quiet);
-    let mut event = Event::Started {
-        task: run.program.name.clone(),
-        digest: run.program.digest.clone(),
-        mode: run.mode,
-        parameters: run.parameters,
-        seed: run.seed,
-        world,
-        revision,
-        capacity: run.catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
-        learned: Default::default(),
-        origin: Default::default(),
+pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
+    let log = LogWriter::create(&run.log)?;
+    let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
+    let id = fresh_id("run");
+    let performer = Performer::connect(place, &id, &run.program.name, events).await.context("cannot begin the run")?;
+    let shell = Shell {
+        executive: Executive::new(run.program.clone(), Tolerance::ROBOT),
+        states: BTreeMap::new(),
+        timers: BTreeSet::new(),
+        progress: Progress::new(run.quiet),
+        program: run.program.clone(),
+        log,
+        clock: RobotClock::start(place.speed),
+        control: Control::listen_if_possible(&place.directory),
+        performer,
+        answers,
     };
-    let mut asked_to_abort = false;
-    let ended = 'run: loop {
-        let now = clock.now();
-        let commands = executive.handle(now, event.clone());
-        log.append(now, &event, &commands)?;
-        progress.follow(now, &event, &commands);
-        for command in commands {
-            if let Command::End { outcome, outputs, reason } = command {
-                break 'run Ended { outcome, outputs, reason, makespan_s: now.seconds() };
-            }
-            performer.perform(command)?;
+    let began_unix_ms = unix_ms();
+    let begin = async |shell: &mut Shell| {
+        let (revision, world) = shell.performer.root().await.context("cannot read the root world")?;
+        shell.clock = RobotClock::start(place.speed);
+        let begun = Event::Started {
+            task: run.program.name.clone(),
+            digest: run.program.digest.clone(),
+            mode: run.mode,
+            parameters: run.parameters,
+            seed: run.seed,
+            world,
+            revision,
+            capacity: place.catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
+            learned: run.learned,
+            origin: Origin { run: id, version: VERSION.to_owned(), file: run.file, began_unix_ms },
+        };
+        shell.step(begun)
+    };
+    shell.to_the_end(begin, interrupt).await
+}
+
+/// Goes on with a run whose task control was killed, on the system that it was on.
+///
+/// # Errors
+/// As [`run`]; and where the run cannot go on: its log is of another program, its world is not there any more, another run is
+/// under way.
+pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
+    let Resumption { program, replayed, progress, log } = resumption;
+    let Replayed { executive, mut ledger, missing, states } = replayed;
+    performer::check_world(&place.endpoints, &ledger, executive.root()).await?;
+    let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
+    let performer = Performer::connect(place, &ledger.origin.run, &program.name, events).await;
+    let shell = Shell {
+        executive,
+        states,
+        timers: std::mem::take(&mut ledger.wakes),
+        progress,
+        program,
+        log,
+        clock: RobotClock::going_on(replay::now(&ledger, unix_ms(), place.speed), place.speed),
+        control: Control::listen_if_possible(&place.directory),
+        performer: performer.context("cannot go on with the run")?,
+        answers,
+    };
+    let begin = async |shell: &mut Shell| {
+        shell.log.append_commands(ledger.last, &missing)?;
+        ledger.event(shell.clock.now(), &Event::Resumed);
+        shell.performer.take_up(ledger, shell.executive.root()).await?;
+        let ended = missing.into_iter().find_map(|command| ended(command, shell.clock.now()));
+        // Everything that the executive had wanted is asked for by now; what it wants on top of that follows.
+        Ok(ended.or(shell.step(Event::Resumed)?))
+    };
+    shell.to_the_end(begin, interrupt).await
+}
+
+/// A run under way.
+struct Shell {
+    program: Arc<Program>,
+    executive: Executive,
+    /// Which states the instances are of.
+    states: BTreeMap<InstanceId, StateId>,
+    /// When the executive wants to be woken.
+    timers: BTreeSet<Timestamp>,
+    log: LogWriter,
+    progress: Progress,
+    clock: RobotClock,
+    control: Option<Control>,
+    performer: Performer,
+    answers: mpsc::Receiver<performer::Answer>,
+}
+
+impl Shell {
+    /// Begins and goes on until the run has ended; then everything is recorded and given back, whatever happened.
+    async fn to_the_end(
+        mut self,
+        begin: impl AsyncFnOnce(&mut Shell) -> anyhow::Result<Option<Ended>>,
+        interrupt: &Interrupt,
+    ) -> anyhow::Result<Ended> {
+        let ended = self.until_ended(begin, interrupt).await;
+        let closed = self.performer.close().await;
+        match (ended, closed) {
+            // A success of which not everything is known afterwards is none.
+            (Ok(ended), Err(error)) if ended.outcome == SUCCESS => Err(error),
+            // The reason is in the outcome already, or matters less.
+            (ended, _) => ended,
         }
-        event = loop {
-            let answer = tokio::select! {
-                answer = answers.recv() => answer.context("nothing can answer any more")?,
-                () = interrupt.asked_times(1), if !asked_to_abort => {
-                    asked_to_abort = true;
-                    Event::AbortRequested { reason: "the user asked for it".into() }.into()
-                }
-                () = performer.lost(), if !asked_to_abort => {
-                    asked_to_abort = true;
-                    let reason = "the session with the resource manager, and every lease, is lost".into();
-                    Event::AbortRequested { reason }.into()
-                }
-                () = interrupt.asked_times(2) => {
-                    let _ = performer.close().await;
-                    bail!("interrupted twice: the run was left where it was");
+    }
+
+    async fn until_ended(
+        &mut self,
+        begin: impl AsyncFnOnce(&mut Shell) -> anyhow::Result<Option<Ended>>,
+        interrupt: &Interrupt,
+    ) -> anyhow::Result<Ended> {
+        let mut ended = begin(self).await?;
+        let mut asked_to_abort = false;
+        loop {
+            if let Some(ended) = ended {
+                return Ok(ended);
+            }
+            let event = self.next(interrupt, &mut asked_to_abort).await?;
+            ended = self.step(event)?;
+        }
+    }
+
+    /// Hands an event to the executive, and what it commands to whoever does it.
+    fn step(&mut self, event: Event) -> anyhow::Result<Option<Ended>> {
+        let now = self.clock.now();
+        if event == Event::Woken {
+            self.timers.retain(|at| *at > now);
+        }
+        let commands = self.executive.handle(now, event.clone());
+        commands.iter().for_each(|command| replay::follow(&mut self.states, command));
+        self.log.append(now, &event, &commands)?;
+        if replay::must_be_durable(&self.program, &self.states, &commands) {
+            self.log.make_durable()?;
+        }
+        self.progress.follow(now, &event, &commands);
+        for command in commands {
+            match command {
+                Command::Wake { at } => drop(self.timers.insert(at)),
+                Command::End { .. } => return Ok(ended(command, now)),
+                command => self.performer.perform(command)?,
+            }
+        }
+        Ok(None)
+    }
+
+    /// The next event that the executive has to know of.
+    async fn next(&mut self, interrupt: &Interrupt, asked_to_abort: &mut bool) -> anyhow::Result<Event> {
+        loop {
+            let timer = self.timers.first().copied();
+            let due = async {
+                match timer {
+                    Some(at) => tokio::time::sleep(self.clock.until(at)).await,
+                    None => std::future::pending().await,
                 }
             };
-            if let Some(event) = performer.accept(answer) {
-                break event;
+            let told = async {
+                match &mut self.control {
+                    Some(control) => control.told().await,
+                    None => std::future::pending().await,
+                }
+            };
+            let answer = tokio::select! {
+                answer = self.answers.recv() => answer.context("nothing can answer any more")?,
+                () = due => return Ok(Event::Woken),
+                event = told => return Ok(event),
+                () = interrupt.asked_times(1), if !*asked_to_abort => {
+                    *asked_to_abort = true;
+                    return Ok(Event::AbortRequested { reason: "the user asked for it".into() });
+                }
+                () = self.performer.lost(), if !*asked_to_abort => {
+                    *asked_to_abort = true;
+                    let reason = "the session with the resource manager, and every lease, is lost".into();
+                    return Ok(Event::AbortRequested { reason });
+                }
+                () = interrupt.asked_times(2) => bail!("interrupted twice: the run was left where it was"),
+            };
+            if let Some(event) = self.performer.accept(answer) {
+                return Ok(event);
             }
-        };
-    };
-    match performer.close().await {
-        // A success of which not everything is known afterwards is none.
-        Err(error) if ended.outcome == SUCCESS => Err(error),
-        // The reason is in the outcome already, or matters less.
-        _ => Ok(ended),
+        }
     }
+}
+
+fn ended(command: Command, now: Timestamp) -> Option<Ended> {
+    match command {
+        Command::End { outcome, outputs, reason } => {
+            Some(Ended { outcome, outputs, reason, makespan_s: now.seconds() })
+        }
+        _ => None,
+    }
+}
+
+fn unix_ms() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
 }

@@ -1,20 +1,28 @@
 //! Performs the executive's commands: asks the resource manager, gives goals to providers, hands what needs an order to
 //! [`super::record`]. Never waits: every answer comes back as an event.
 
-use super::Endpoints;
+mod goal;
+mod resume;
+#[cfg(test)]
+mod tests;
+
+pub(super) use resume::{check_world, commit_request};
+
+use super::ledger::acquire_request;
 use super::record::{Cancelled, MAX_PENDING_RECORDS, Record, Recorder, said};
 use super::retry::{Attempts, patiently};
+use super::shell::Place;
 use anyhow::bail;
 use futures::FutureExt;
+use goal::{Given, Performing};
 use ratn_executive::protocol::{Command, Event, Goal};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
-use ratn_model::program::ABORTED;
 use ratn_model::resource::{Requirement, ResourceClass};
 use ratn_model::value::Value;
 use ratn_proto::types::{self, Resource};
-use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient, fresh_id};
+use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::{DEFAULT_TTL, Session};
 use std::collections::BTreeMap;
@@ -28,8 +36,6 @@ use tokio_util::sync::CancellationToken;
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
 /// A task that waits this long for its resources has waited in vain.
 const ACQUIRE_DEADLINE: Duration = Duration::from_secs(3600);
-/// A provider that was told to stop and does not is left alone after this long.
-const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
 /// The resource that the one run of a system is.
 const RUN: &str = "run";
 /// At the end of a run, for everything that is still being given back.
@@ -53,6 +59,8 @@ impl From<Event> for Answer {
 pub(super) struct Performer {
     run: String,
     task: String,
+    /// The robot's seconds per second.
+    speed: f64,
     catalogue: Arc<Catalogue>,
     resources: ResourceClient,
     actions: ActionClient,
@@ -65,6 +73,9 @@ pub(super) struct Performer {
     jobs: BTreeMap<InstanceId, Job>,
     giving_back: JoinSet<()>,
     acquires: u64,
+    operations: u64,
+    /// How often task control has come back to this run.
+    resumptions: u32,
 }
 
 struct Job {
@@ -76,20 +87,22 @@ struct Job {
 }
 
 impl Performer {
-    /// Opens a session and begins to listen to commands.
+    /// Opens the run's session and begins to listen to commands. The session has the run's id, so that whoever resumes the run
+    /// goes on with it.
     pub(super) async fn connect(
-        endpoints: &Endpoints,
-        catalogue: Arc<Catalogue>,
+        place: &Place,
+        run: &str,
         task: &str,
         events: mpsc::Sender<Answer>,
     ) -> anyhow::Result<Performer> {
         let channels = Channels::new();
-        let run = fresh_id("run");
-        let session = Session::open(&channels, &endpoints.resource_manager, "task-control", DEFAULT_TTL);
+        let run = run.to_owned();
+        let manager = &place.endpoints.resource_manager;
+        let session = Session::open_as(&channels, manager, run.clone(), "task-control", DEFAULT_TTL);
         session.alive(SESSION_DEADLINE).await?;
-        let resources = ResourceClient::new(&channels, &endpoints.resource_manager, session.id())?;
+        let resources = ResourceClient::new(&channels, manager, session.id())?;
         only_run(&resources, task).await?;
-        let world = WorldClient::new(&channels, &endpoints.world_pool)?;
+        let world = WorldClient::new(&channels, &place.endpoints.world_pool)?;
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
         let cancelled = Cancelled::default();
         let recorder = Recorder {
@@ -103,7 +116,8 @@ impl Performer {
         Ok(Performer {
             run,
             task: task.to_owned(),
-            catalogue,
+            speed: place.speed,
+            catalogue: place.catalogue.clone(),
             resources,
             actions: ActionClient::new(channels),
             world,
@@ -115,6 +129,8 @@ impl Performer {
             jobs: BTreeMap::new(),
             giving_back: JoinSet::new(),
             acquires: 0,
+            operations: 0,
+            resumptions: 0,
         })
     }
 
@@ -135,7 +151,10 @@ impl Performer {
         match command {
             // Waking is the shell's: it has the clock.
             Command::Note(_) | Command::End { .. } | Command::Wake { .. } => {}
-            Command::Acquire { instance, requirements, priority } => self.acquire(instance, requirements, priority),
+            Command::Acquire { instance, requirements, priority } => {
+                self.acquires += 1;
+                self.acquire(instance, self.acquires, requirements, priority);
+            }
             Command::Withdraw { instance } => {
                 if let Some(asking) = self.asking.remove(&instance) {
                     asking.cancel();
@@ -144,7 +163,7 @@ impl Performer {
             Command::Project { instance, attempt, base, changes, reads, lease } => {
                 self.record(Record::Project { instance, attempt, base, changes, reads, lease })?;
             }
-            Command::Start { instance, attempt, goal } => self.start(instance, attempt, goal),
+            Command::Start { instance, attempt, goal } => self.start(instance, attempt, goal, Given::Now),
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
                 Some(job) if job.attempt == attempt => job.stop.cancel(),
                 _ => {
@@ -155,7 +174,10 @@ impl Performer {
             Command::Commit { instance, changes, revision } => {
                 self.record(Record::Commit { instance, changes, revision })?;
             }
-            Command::Operate { instance, operations } => self.record(Record::Operate { instance, operations })?,
+            Command::Operate { instance, operations } => {
+                self.operations += 1;
+                self.record(Record::Operate { instance, number: self.operations, operations })?;
+            }
         }
         Ok(())
     }
@@ -190,12 +212,11 @@ impl Performer {
         Ok(())
     }
 
-    fn acquire(&mut self, instance: InstanceId, requirements: Vec<Requirement>, priority: i64) {
-        self.acquires += 1;
+    fn acquire(&mut self, instance: InstanceId, number: u64, requirements: Vec<Requirement>, priority: i64) {
         let withdrawn = CancellationToken::new();
         self.asking.insert(instance, withdrawn.clone());
         let options = AcquireOptions {
-            request: format!("{}/{instance}/acquire-{}", self.run, self.acquires),
+            request: acquire_request(&self.run, instance, number, self.resumptions),
             priority,
             deadline: ACQUIRE_DEADLINE,
             holder: format!("{} {instance}", self.task),
@@ -250,32 +271,32 @@ impl Performer {
         self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).remove(&(instance, attempt))
     }
 
-    fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal) {
+    /// Gives a goal to its provider, or waits for one that was given before.
+    fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal, given: Given) {
         let stop = CancellationToken::new();
         let lease = goal.lease.as_ref().map(|lease| lease.id);
-        let endpoint = self.endpoint_of(&goal);
-        let (actions, events, stopped) = (self.actions.clone(), self.events.clone(), stop.clone());
-        let goal = types::Goal {
-            id: format!("{}/{instance}/{attempt}", self.run),
-            action: goal.action,
-            inputs: goal.inputs,
-            seed: goal.seed,
-            lease: goal.lease,
-            projection: goal.projection,
-            world_pool: self.world.endpoint().to_string(),
-            deadline_ms: 0,
+        let performing = Performing {
+            instance,
+            attempt,
+            endpoint: self.endpoint_of(&goal),
+            timeout_s: goal.timeout_s,
+            speed: self.speed,
+            actions: self.actions.clone(),
+            events: self.events.clone(),
+            stop: stop.clone(),
+            goal: types::Goal {
+                id: format!("{}/{instance}/{attempt}", self.run),
+                action: goal.action,
+                inputs: goal.inputs,
+                seed: goal.seed,
+                lease: goal.lease,
+                projection: goal.projection,
+                world_pool: self.world.endpoint().to_string(),
+                deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),
+                grace_ms: goal::GRACE_MS,
+            },
         };
-        let ended = tokio::spawn(async move {
-            let event = match endpoint {
-                Ok(endpoint) => execute(&actions, &endpoint, goal, instance, attempt, &events, &stopped).await,
-                Err(reason) => Some(aborted(instance, attempt, reason)),
-            };
-            if let Some(event) = event
-                && !stopped.is_cancelled()
-            {
-                let _ = events.send(event.into()).await;
-            }
-        });
+        let ended = tokio::spawn(performing.perform(given));
         self.jobs.insert(instance, Job { attempt, lease, stop, ended });
     }
 
@@ -338,202 +359,5 @@ async fn only_run(resources: &ResourceClient, task: &str) -> anyhow::Result<()> 
             bail!("another run is under way on this system: wait for its end, or use a system of your own")
         }
         Err(error) => bail!("cannot begin the run: {}", said(&error)),
-    }
-}
-
-/// Has a goal performed; `None` when it was told to stop.
-async fn execute(
-    actions: &ActionClient,
-    endpoint: &Endpoint,
-    goal: types::Goal,
-    instance: InstanceId,
-    attempt: u32,
-    events: &mpsc::Sender<Answer>,
-    stop: &CancellationToken,
-) -> Option<Event> {
-    let id = goal.id.clone();
-    let on_progress = |message: String, _: BTreeMap<String, Value>| {
-        // Progress is for people: when events pile up, it is what can be missed.
-        let _ = events.try_send(Event::Progressed { instance, attempt, message }.into());
-    };
-    let mut executing = std::pin::pin!(actions.execute(endpoint, goal, on_progress));
-    let answer = tokio::select! {
-        answer = &mut executing => answer,
-        () = stop.cancelled() => {
-            let stopping = async {
-                let _ = actions.cancel(endpoint, &id).await;
-                let _ = executing.await;
-            };
-            let _ = tokio::time::timeout(CANCEL_DEADLINE, stopping).await;
-            return None;
-        }
-    };
-    Some(match answer {
-        Ok(done) => Event::Finished {
-            instance,
-            attempt,
-            outcome: done.outcome,
-            outputs: done.outputs,
-            measured: done.measured,
-            reason: done.reason,
-        },
-        // What was wrong with the goal is wrong with it the next time, too.
-        Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => aborted(instance, attempt, said(&error)),
-        Err(error) => Event::Crashed { instance, attempt, reason: said(&error) },
-    })
-}
-
-fn aborted(instance: InstanceId, attempt: u32, reason: String) -> Event {
-    Event::Finished {
-        instance,
-        attempt,
-        outcome: ABORTED.to_owned(),
-        outputs: BTreeMap::new(),
-        measured: Vec::new(),
-        reason,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
-    use ratn_daemon::world_pool::{self, WorldPoolConfig};
-    use ratn_model::fact::{Change, Footprint};
-    use ratn_model::resource::ResourceOperation;
-    use ratn_worker::runtime_directory::RuntimeDirectory;
-    use tokio_util::sync::DropGuard;
-
-    fn arm() -> Vec<Requirement> {
-        vec![Requirement {
-            operation: ResourceOperation::Block,
-            kind: "Arm".into(),
-            class: None,
-            attributes: BTreeMap::new(),
-            count: 1,
-        }]
-    }
-
-    /// A performer with a resource manager, a world pool and one arm.
-    struct Bench {
-        performer: Performer,
-        answers: mpsc::Receiver<Answer>,
-        endpoints: Endpoints,
-        _place: tempfile::TempDir,
-        _shutdown: DropGuard,
-    }
-
-    impl Bench {
-        async fn new() -> anyhow::Result<Bench> {
-            let place = tempfile::tempdir()?;
-            let directory = RuntimeDirectory::create(place.path())?;
-            let shutdown = CancellationToken::new();
-            tokio::spawn(resource_manager::run(ResourceManagerConfig::default(), directory.clone(), shutdown.clone()));
-            tokio::spawn(world_pool::run(WorldPoolConfig::default(), directory.clone(), shutdown.clone()));
-            let endpoints = Endpoints {
-                resource_manager: directory.wait_for(resource_manager::ROLE, SESSION_DEADLINE).await?,
-                world_pool: directory.wait_for(world_pool::ROLE, SESSION_DEADLINE).await?,
-            };
-            let (events, answers) = mpsc::channel(8);
-            let performer = Performer::connect(&endpoints, Arc::default(), "task", events).await?;
-            performer.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
-            Ok(Bench { performer, answers, endpoints, _place: place, _shutdown: shutdown.drop_guard() })
-        }
-
-        fn ask(&mut self, instance: InstanceId) -> anyhow::Result<()> {
-            self.performer.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })
-        }
-
-        /// The next event that the executive is given.
-        async fn event(&mut self) -> Option<Event> {
-            loop {
-                let answer = self.answers.recv().await?;
-                if let Some(event) = self.performer.accept(answer) {
-                    return Some(event);
-                }
-            }
-        }
-
-        async fn granted(&mut self, to: InstanceId) -> anyhow::Result<LeaseId> {
-            match self.event().await {
-                Some(Event::Granted { instance, lease }) if instance == to => Ok(lease.id),
-                other => bail!("the arm was to be granted to {to}: {other:?}"),
-            }
-        }
-    }
-
-    #[tokio::test]
-    async fn an_acquire_of_the_event_that_gave_a_lease_back_can_be_withdrawn() -> anyhow::Result<()> {
-        let mut bench = Bench::new().await?;
-        let (instance, other) = (InstanceId(1), InstanceId(2));
-        bench.ask(instance)?;
-        let lease = Some(bench.granted(instance).await?);
-        // Its worker died: it asks again, then gives back. Then its branch is not taken.
-        bench.ask(instance)?;
-        bench.performer.perform(Command::Release { instance, lease, projection: None })?;
-        bench.performer.perform(Command::Withdraw { instance })?;
-        bench.ask(other)?;
-        bench.granted(other).await?;
-        bench.performer.close().await
-    }
-
-    #[tokio::test]
-    async fn a_second_run_is_refused_before_anything_is_started() -> anyhow::Result<()> {
-        let bench = Bench::new().await?;
-        let (events, _) = mpsc::channel(1);
-        let second = Performer::connect(&bench.endpoints, Arc::default(), "second", events).await;
-        assert!(second.is_err_and(|error| error.to_string().contains("another run is under way")));
-        Ok(())
-    }
-
-    #[tokio::test]
-    async fn a_run_whose_effects_are_not_all_recorded_does_not_end_well() -> anyhow::Result<()> {
-        let mut bench = Bench::new().await?;
-        // The world pool's root will not have this revision.
-        let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
-        let changes = vec![Change::Set { fact, value: Value::Bool(true) }];
-        bench.performer.perform(Command::Commit { instance: InstanceId(1), changes, revision: Revision(99) })?;
-        let ended = bench.performer.close().await;
-        assert!(ended.is_err_and(|error| error.to_string().contains("not all recorded")));
-        Ok(())
-    }
-
-    #[tokio::test]
-    async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> {
-        let mut bench = Bench::new().await?;
-        let (instance, reads) = (InstanceId(1), Footprint::Everything);
-        bench.ask(instance)?;
-        bench.granted(instance).await?;
-        let project = |attempt| Command::Project {
-            instance,
-            attempt,
-            base: Revision(0),
-            changes: Vec::new(),
-            reads: reads.clone(),
-            lease: None,
-        };
-        bench.performer.perform(project(1))?;
-        let made = bench.answers.recv().await;
-        bench.performer.perform(Command::Cancel { instance, attempt: 1 })?;
-        assert_eq!(made.and_then(|answer| bench.performer.accept(answer)), None);
-        assert!(bench.performer.cancelled.lock().is_ok_and(|cancelled| cancelled.is_empty()));
-        bench.performer.perform(project(2))?;
-        assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 2, .. })));
-        bench.performer.close().await
-    }
-
-    #[tokio::test]
-    async fn a_grant_that_crosses_its_withdrawal_goes_back() -> anyhow::Result<()> {
-        let mut bench = Bench::new().await?;
-        let instance = InstanceId(1);
-        bench.ask(instance)?;
-        let granted = bench.answers.recv().await;
-        bench.performer.perform(Command::Withdraw { instance })?;
-        assert_eq!(granted.and_then(|answer| bench.performer.accept(answer)), None);
-
-        // Nobody holds the arm: the same instance gets it when it asks again.
-        bench.ask(instance)?;
-        bench.granted(instance).await?;
-        bench.performer.close().await
     }
 }

@@ -1,0 +1,17 @@
+//! `ratn control pause|resume|step|abort`
+
+use super::blocking_on;
+use crate::arguments::ControlArguments;
+use crate::failure::Failure;
+use crate::system::public_directory;
+use crate::task_control::control;
+use anyhow::Context;
+
+/// Tells the run of a system.
+pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
+    blocking_on(tokio::runtime::Builder::new_current_thread(), async {
+        let directory = public_directory(arguments.runtime_dir.as_deref());
+        let told = control::tell(&directory, arguments.word).await;
+        Ok(told.with_context(|| format!("no run in {} takes that", directory.display()))?)
+    })
+}

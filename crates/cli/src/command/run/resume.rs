@@ -1,0 +1,59 @@
+//! `ratn run --resume LOG`: what can be said against it before anything of the run is touched, then the run.
+
+use super::conclude;
+use crate::arguments::RunArguments;
+use crate::command::check;
+use crate::failure::Failure;
+use crate::interrupt::Interrupt;
+use crate::output;
+use crate::system::System;
+use crate::system::config::SystemConfig;
+use crate::task_control::log::{Log, LogWriter};
+use crate::task_control::shell::{self, Resumption};
+use ratn_executive::protocol::{Event, LogEntry};
+use std::path::{Path, PathBuf};
+
+/// Goes on with the run that `file` tells of.
+pub(super) async fn run(
+    arguments: &RunArguments,
+    file: &Path,
+    task: Option<&Path>,
+    directory: &Path,
+    interrupt: &Interrupt,
+) -> Result<(), Failure> {
+    let refused = |reason: &dyn std::fmt::Display| {
+        Failure::Refused(format!("ratn: cannot resume the run of {}: {reason}", file.display()))
+    };
+    // From here on nobody else goes on with it.
+    let (writer, log) = LogWriter::go_on(file).map_err(|error| refused(&error))?;
+    if let Some(line) = log.torn {
+        output::progress(format_args!("{}:{line}: the last line is torn and is cut off", file.display()));
+    }
+    let task = task.map(Path::to_owned).or_else(|| named(&log));
+    let task = task.ok_or_else(|| refused(&"it does not name its task file: say `ratn run --resume LOG TASK`"))?;
+    let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
+    let Some(mut system) = System::find(directory, given).await? else {
+        let place = directory.display();
+        return Err(refused(&format_args!(
+            "no system runs in {place}: a run goes on where it was, on a system that outlives it (`ratn up`)"
+        )));
+    };
+    let program = check::load(&task, &system.config.catalogue)?;
+    let resumption = Resumption::new(program, writer, &log.lines).map_err(|error| refused(&error))?;
+    output::progress(format_args!("on the system in {}", directory.display()));
+    let place = system.place();
+    let ended = tokio::select! {
+        ended = shell::resume(resumption, &place, interrupt) => ended,
+        error = system.one_ended() => Err(error.context("a part of the system ended during the run")),
+    };
+    conclude(&ended?, file, arguments)
+}
+
+fn named(log: &Log) -> Option<PathBuf> {
+    match log.lines.first().map(|line| &line.entry) {
+        Some(LogEntry::Event(Event::Started { origin, .. })) if !origin.file.is_empty() => {
+            Some(PathBuf::from(&origin.file))
+        }
+        _ => None,
+    }
+}

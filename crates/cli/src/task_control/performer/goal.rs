@@ -1,0 +1,155 @@
+//! One goal, from giving it to a provider (or finding it there again) to the event of its end.
+
+use super::Answer;
+use crate::task_control::record::said;
+use ratn_executive::protocol::Event;
+use ratn_model::id::InstanceId;
+use ratn_model::program::{ABORTED, PREEMPTED};
+use ratn_model::value::Value;
+use ratn_proto::types::{Goal, GoalOutcome};
+use ratn_worker::client::{ActionClient, CallError};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::session::DEFAULT_TTL;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+/// A provider that was told to stop and does not is left alone after this long.
+const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
+/// How long a goal goes on without task control, so that a run that is resumed finds it under way: as long as its lease would
+/// live.
+pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
+/// The executive ends a goal that takes too long. The provider does so this much later, where nobody tells it to.
+const DEADLINE_SLACK: Duration = Duration::from_millis(500);
+
+/// Whether a goal is new to its provider.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Given {
+    /// It is given now.
+    Now,
+    /// Task control gave it before it was killed, or was about to: it is not given again.
+    Before,
+}
+
+/// A goal's way.
+pub(super) struct Performing {
+    pub(super) instance: InstanceId,
+    pub(super) attempt: u32,
+    pub(super) endpoint: Result<Endpoint, String>,
+    pub(super) timeout_s: Option<f64>,
+    pub(super) speed: f64,
+    pub(super) actions: ActionClient,
+    pub(super) events: mpsc::Sender<Answer>,
+    pub(super) stop: CancellationToken,
+    pub(super) goal: Goal,
+}
+
+/// The deadline that the provider is told, in wall time; 0 for none.
+pub(super) fn deadline_ms(timeout_s: Option<f64>, speed: f64) -> u64 {
+    let Some(timeout_s) = timeout_s else { return 0 };
+    // A float to an integer saturates.
+    (timeout_s / speed * 1e3).ceil() as u64 + DEADLINE_SLACK.as_millis() as u64
+}
+
+impl Performing {
+    /// Until its end; the event goes to the shell, unless the goal was told to stop.
+    pub(super) async fn perform(self, given: Given) {
+        let event = match &self.endpoint {
+            Ok(endpoint) => self.execute(endpoint, given).await,
+            Err(reason) => Some(self.aborted(reason.clone())),
+        };
+        if let Some(event) = event
+            && !self.stop.is_cancelled()
+        {
+            let _ = self.events.send(event.into()).await;
+        }
+    }
+
+    /// `None` when it was told to stop.
+    async fn execute(&self, endpoint: &Endpoint, given: Given) -> Option<Event> {
+        let begun = Instant::now();
+        let mut ending = std::pin::pin!(self.ending(endpoint, given));
+        let event = tokio::select! {
+            event = &mut ending => event,
+            () = self.stop.cancelled() => {
+                let stopping = async {
+                    let _ = self.actions.cancel(endpoint, &self.goal.id).await;
+                    let _ = ending.await;
+                };
+                let _ = tokio::time::timeout(CANCEL_DEADLINE, stopping).await;
+                return None;
+            }
+        };
+        Some(self.in_time(event, begun))
+    }
+
+    async fn ending(&self, endpoint: &Endpoint, given: Given) -> Event {
+        if given == Given::Now {
+            match self.actions.execute(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
+                Ok(outcome) => return self.finished(outcome),
+                // What was wrong with the goal is wrong with it the next time, too.
+                Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => return self.aborted(said(&error)),
+                Err(error @ CallError::Broken { .. }) => {
+                    // Only the connection may have broken; the goal is still there then.
+                    return self.attached(endpoint, &error).await;
+                }
+                Err(error) => return self.crashed(said(&error)),
+            }
+        }
+        match self.actions.attach(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
+            Ok(fate) if fate.orphaned => {
+                self.crashed(format!("it was stopped while task control was gone: {}", fate.outcome.reason))
+            }
+            Ok(fate) => self.finished(fate.outcome),
+            Err(error) => {
+                self.crashed(format!("nobody knows what became of it while task control was gone: {}", said(&error)))
+            }
+        }
+    }
+
+    async fn attached(&self, endpoint: &Endpoint, broken: &CallError) -> Event {
+        match self.actions.attach(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
+            Ok(fate) if !fate.orphaned => self.finished(fate.outcome),
+            _ => self.crashed(said(broken)),
+        }
+    }
+
+    /// What the provider ended at its deadline has failed, whatever the provider calls that.
+    fn in_time(&self, event: Event, begun: Instant) -> Event {
+        match (event, self.timeout_s) {
+            (Event::Finished { outcome, .. }, Some(timeout_s))
+                if outcome == PREEMPTED && begun.elapsed().as_secs_f64() * self.speed >= timeout_s =>
+            {
+                self.aborted(format!("took longer than {timeout_s} s"))
+            }
+            (event, _) => event,
+        }
+    }
+
+    fn progressed(&self, message: String) {
+        let (instance, attempt) = (self.instance, self.attempt);
+        // Progress is for people: when events pile up, it is what can be missed.
+        let _ = self.events.try_send(Event::Progressed { instance, attempt, message }.into());
+    }
+
+    fn finished(&self, done: GoalOutcome) -> Event {
+        Event::Finished {
+            instance: self.instance,
+            attempt: self.attempt,
+            outcome: done.outcome,
+            outputs: done.outputs,
+            measured: done.measured,
+            reason: done.reason,
+        }
+    }
+
+    fn aborted(&self, reason: String) -> Event {
+        let outputs: BTreeMap<String, Value> = BTreeMap::new();
+        self.finished(GoalOutcome { outputs, reason, ..GoalOutcome::named(ABORTED) })
+    }
+
+    fn crashed(&self, reason: String) -> Event {
+        Event::Crashed { instance: self.instance, attempt: self.attempt, reason }
+    }
+}
