@@ -11,5 +11,6 @@ mod effects;
 pub mod executive;
 mod hold;
 mod interpreter;
+pub mod lookahead;
 pub mod protocol;
 mod window;

@@ -1,0 +1,64 @@
+//! What a look-ahead plans: the tasks that have not ended, what they wait for and what they occupy.
+
+use ratn_model::id::InstanceId;
+use std::collections::BTreeMap;
+
+/// The rest of a window, as it is most likely to go on: of an undecided condition only the likelier branch.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Problem {
+    /// In program order.
+    pub tasks: Vec<Task>,
+    /// How many units of each resource kind there are, whoever holds them; of a kind that is not listed there is enough.
+    pub capacity: BTreeMap<String, u32>,
+}
+
+/// An instance that has not ended.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Task {
+    /// Which.
+    pub instance: InstanceId,
+    /// How long it takes, of a running one how long it still takes, in seconds of the robot's time; 0 of what only decides.
+    pub duration_s: f64,
+    /// It holds its resources already.
+    pub is_running: bool,
+    /// What it blocks: kind and units, all at once, from its begin to its end.
+    pub demands: Vec<(String, u32)>,
+    /// The tasks that must have ended before it may ask for resources, as places in [`Problem::tasks`]: producers of its inputs, the writers
+    /// of what it reads, and for a PIA everything that must have ended before it.
+    pub after: Vec<usize>,
+    /// A condition on its path is undecided: it is served after everything for which none is.
+    pub is_speculative: bool,
+    /// How likely its path is, in (0, 1].
+    pub probability: f64,
+}
+
+/// A problem that cannot be planned.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ProblemError {
+    /// A duration or a probability is not a usable number.
+    #[error("{instance}: its duration of {duration_s} s or its probability of {probability} is not a usable number")]
+    Number {
+        /// Whose.
+        instance: InstanceId,
+        /// The duration.
+        duration_s: f64,
+        /// The probability.
+        probability: f64,
+    },
+    /// It waits for a task that is not there.
+    #[error("{instance} waits for task {after}, and there are only {tasks}")]
+    Unknown {
+        /// Who.
+        instance: InstanceId,
+        /// For which place.
+        after: usize,
+        /// How many there are.
+        tasks: usize,
+    },
+    /// Tasks wait for each other.
+    #[error("{instance} waits, over others, for itself")]
+    Circular {
+        /// One of them.
+        instance: InstanceId,
+    },
+}
