@@ -36,8 +36,14 @@ impl Place {
 
     /// Starts it; what it says goes to files here, and what is still running is killed in the end.
     pub(crate) fn start(&self, arguments: &[&str]) -> anyhow::Result<Started> {
-        let (out, err) = (self.path().join("stdout"), self.path().join("stderr"));
+        self.start_as("std", arguments)
+    }
+
+    /// As [`Place::start`], beside others: what it says goes to files of this name.
+    pub(crate) fn start_as(&self, name: &str, arguments: &[&str]) -> anyhow::Result<Started> {
+        let (out, err) = (self.path().join(format!("{name}out")), self.path().join(format!("{name}err")));
         let mut command = self.ratn(arguments);
+        command.env("RATN_LOG", "info,ratn_worker=debug");
         command.stdout(std::fs::File::create(&out)?).stderr(std::fs::File::create(&err)?);
         Ok(Started { child: command.spawn()?, out, err })
     }

@@ -9,6 +9,9 @@ mod run;
 mod tables;
 mod up;
 
+#[cfg(test)]
+pub(crate) use check::load_text;
+
 use crate::arguments::Command;
 use crate::failure::Failure;
 use anyhow::Context;

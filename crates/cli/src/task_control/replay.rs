@@ -149,3 +149,124 @@ pub(super) fn now(ledger: &Ledger, unix_ms: u64, speed: f64) -> Timestamp {
     let since = unix_ms.saturating_sub(ledger.origin.began_unix_ms);
     Timestamp::from_seconds(since as f64 / 1e3 * speed).max(ledger.last)
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::command::load_text;
+    use crate::system::config::SystemConfig;
+    use ratn_executive::protocol::{Mode, Origin};
+    use ratn_simulation::run::Setup;
+    use ratn_simulation::timed::TimedProviders;
+    use std::time::Duration;
+
+    fn program(text: &str) -> Arc<Program> {
+        let catalogue = SystemConfig::load(None).unwrap().catalogue;
+        Arc::new(load_text(text, "fetch_boxes.yaml", &catalogue).ok().unwrap())
+    }
+
+    fn fetch_boxes() -> Arc<Program> {
+        program(include_str!("../../../../examples/fetch_boxes.yaml"))
+    }
+
+    /// A whole run in virtual time, as task control would have logged it.
+    fn log(program: &Arc<Program>, mode: Mode) -> Vec<LogLine> {
+        let resources = SystemConfig::load(None).unwrap().catalogue.resources;
+        let setup = Setup {
+            program: program.clone(),
+            mode,
+            parameters: program.bind_parameters(&[("boxes".into(), "2".into())]).unwrap(),
+            seed: 3,
+            resources: resources.iter().map(|(kind, offer)| (kind.clone(), offer.class, offer.count)).collect(),
+            world: Vec::new(),
+            tolerance: Tolerance::ROBOT,
+            latency: Duration::from_millis(50),
+        };
+        let mut lines = ratn_simulation::run::run(setup, &mut TimedProviders { boxes: 2 }).unwrap().log;
+        let LogEntry::Event(Event::Started { origin, .. }) = &mut lines[0].entry else { panic!("no start") };
+        *origin = Origin { run: "run-1".into(), version: VERSION.into(), ..Origin::default() };
+        lines
+    }
+
+    #[test]
+    fn a_run_that_is_cut_anywhere_goes_on_where_it_was() {
+        let program = fetch_boxes();
+        for mode in [Mode::Hsm, Mode::Cdtn] {
+            let lines = log(&program, mode);
+            // The last line is the end.
+            for length in 1..lines.len() {
+                let Replayed { mut executive, missing, ledger, .. } = replay(&program, &lines[..length]).unwrap();
+                assert_eq!(ledger.last, lines[length - 1].at);
+                // What was not written is what would have been, and so is what follows.
+                let mut commands = missing.into_iter();
+                for line in &lines[length..] {
+                    match &line.entry {
+                        LogEntry::Command(command) => assert_eq!(commands.next().as_ref(), Some(command)),
+                        LogEntry::Event(event) => {
+                            commands = executive.handle(line.at, event.clone()).into_iter();
+                        }
+                    }
+                }
+                assert!(executive.has_ended());
+            }
+            let ended = ReplayError::Ended { outcome: "success".into() };
+            assert_eq!(replay(&program, &lines).err(), Some(ended));
+        }
+    }
+
+    #[test]
+    fn a_log_that_says_otherwise_is_refused_with_its_line() {
+        let program = fetch_boxes();
+        let mut lines = log(&program, Mode::Cdtn);
+        let is_start = |line: &LogLine| matches!(line.entry, LogEntry::Command(Command::Start { .. }));
+        let at = lines.iter().position(is_start).unwrap();
+        lines[at].entry = LogEntry::Command(Command::Wake { at: Timestamp(1) });
+        let refused = replay(&program, &lines).err().unwrap();
+        assert!(matches!(refused, ReplayError::Otherwise { line, .. } if line == at + 1), "{refused}");
+        // A command that is missing in the middle.
+        let mut lines = log(&program, Mode::Cdtn);
+        lines.remove(at);
+        assert!(matches!(replay(&program, &lines).err().unwrap(), ReplayError::Otherwise { .. }));
+    }
+
+    #[test]
+    fn a_log_of_something_else_is_refused_for_what_it_is() {
+        let program = fetch_boxes();
+        let lines = log(&program, Mode::Hsm);
+        let changed = |change: fn(&mut Origin, &mut String)| {
+            let mut lines = lines.clone();
+            if let LogEntry::Event(Event::Started { origin, task, .. }) = &mut lines[0].entry {
+                change(origin, task);
+            }
+            replay(&program, &lines).err().unwrap().to_string()
+        };
+        assert!(changed(|origin, _| origin.run.clear()).contains("names no run"));
+        assert!(changed(|origin, _| origin.version = "0.0.1".into()).contains("written by ratn 0.0.1"));
+        assert!(changed(|_, task| *task = "other".into()).contains("of the task `other`, not of `fetch_boxes`"));
+        let edited = include_str!("../../../../examples/fetch_boxes.yaml").replace("duration: 7.7", "duration: 7.8");
+        assert_eq!(replay(&self::program(&edited), &lines).err(), Some(ReplayError::Digest));
+    }
+
+    #[test]
+    fn what_cannot_be_undone_must_be_durable_before() {
+        let program = fetch_boxes();
+        let lines = log(&program, Mode::Cdtn);
+        let (mut states, mut durable, mut starts) = (BTreeMap::new(), 0, 0);
+        for line in &lines {
+            let LogEntry::Command(command) = &line.entry else { continue };
+            follow(&mut states, command);
+            let must_be = must_be_durable(&program, &states, std::slice::from_ref(command));
+            match command {
+                Command::Start { goal, .. } => {
+                    let moves = ["arm", "gripper", "pan_tilt"].contains(&goal.provider.as_str());
+                    assert_eq!(must_be, moves, "{command:?}");
+                    (durable, starts) = (durable + usize::from(must_be), starts + 1);
+                }
+                Command::Commit { .. } | Command::Operate { .. } => assert!(must_be),
+                _ => assert!(!must_be),
+            }
+        }
+        assert!(durable > 0 && durable < starts);
+    }
+}

@@ -258,6 +258,7 @@ async fn run(
     context: GoalContext,
     deadline_ms: u64,
 ) {
+    tracing::debug!(goal = %entry.id, action = %context.action, "begun");
     let mut performing = tokio::spawn(async move { action.execute(context).await });
     let deadline = async {
         if deadline_ms > 0 {
@@ -281,6 +282,7 @@ async fn run(
         }
         never = deadline => match never {},
     };
+    tracing::debug!(goal = %entry.id, outcome = %outcome.outcome, reason = %outcome.reason, "ended");
     // No longer running before anybody hears of its end: the next goal must find its place free.
     server.state().end(&entry, server.results_kept);
     let ending = match entry.cause() {

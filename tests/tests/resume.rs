@@ -1,0 +1,195 @@
+//! Task control is killed in the middle of a task and goes on from its event log.
+
+mod support;
+
+use anyhow::{Context, ensure};
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::Write;
+use std::path::Path;
+use support::{Place, Started, repository, texts, wait_for};
+
+/// What a debug build can follow, with motions that are long enough to be killed in.
+const SPEED: &str = "8";
+
+/// A system that outlives its runs, and says which goals its providers begin.
+fn up(place: &Place, speed: &str, boxes: &str) -> anyhow::Result<Started> {
+    let directory = place.path().join("run");
+    let directory = directory.to_str().context("a path")?;
+    let up = place.start_as("up", &["up", "--runtime-dir", directory, "--speed", speed, "--boxes", boxes])?;
+    wait_for("the system", || Ok(up.said().contains("is ready").then_some(()))).with_context(|| up.said())?;
+    Ok(up)
+}
+
+fn lines(log: &Path) -> anyhow::Result<Vec<Value>> {
+    let text = std::fs::read_to_string(log)?;
+    text.lines().map(|line| serde_json::from_str(line).with_context(|| line.to_owned())).collect()
+}
+
+/// Waits until a log has a line like this; what is torn there is not looked at.
+fn wait_for_line(log: &Path, what: &str, is: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
+    wait_for(what, || {
+        let text = std::fs::read_to_string(log).unwrap_or_default();
+        let whole = text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+        Ok(whole.into_iter().find(&is))
+    })
+}
+
+fn starts(line: &Value, provider: &str) -> bool {
+    line["command"] == "start" && line["goal"]["provider"] == provider
+}
+
+/// Ids of the goals that the cell has begun, by its own record.
+fn begun_in_the_cell(place: &Place) -> anyhow::Result<Vec<String>> {
+    let record = std::fs::read_to_string(place.path().join("run/cell.log"))?;
+    let begun = record.lines().filter(|line| line.contains("begun"));
+    let id = |line: &str| Some(line.split_once("goal=")?.1.split_whitespace().next()?.to_owned());
+    begun.map(|line| id(line).with_context(|| line.to_owned())).collect()
+}
+
+/// Every motion that the log has, by its goal id: no path twice.
+fn motions(lines: &[Value]) -> anyhow::Result<BTreeMap<String, String>> {
+    let run = lines[0]["origin"]["run"].as_str().context("no run")?;
+    let mut paths = BTreeMap::new();
+    let mut motions = BTreeMap::new();
+    for line in lines {
+        if line["note"] == "expanded" {
+            paths.insert(line["instance"].as_u64(), line["path"].as_str().unwrap_or_default().to_owned());
+        }
+        if ["arm", "gripper", "pan_tilt"].iter().any(|provider| starts(line, provider)) {
+            let path = paths.get(&line["instance"].as_u64()).cloned().context("an instance without a path")?;
+            ensure!(!motions.values().any(|other| *other == path), "{path} was begun twice");
+            motions.insert(format!("{run}/i{}/{}", line["instance"], line["attempt"]), path);
+        }
+    }
+    Ok(motions)
+}
+
+#[test]
+fn a_run_whose_task_control_is_killed_goes_on_and_repeats_no_motion() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let _up = up(&place, SPEED, "2")?;
+    let task = repository("examples/fetch_boxes.yaml");
+    let task = task.to_str().context("a path")?;
+    let log = place.path().join("log.jsonl");
+    let file = log.to_str().context("a path")?;
+    let run = place.start(&["run", task, "--set", "boxes=2", "--set", "budget=false", "--log", file])?;
+
+    // Once while the arm moves for the first time with a box before it, and once in the middle of the second part.
+    wait_for_line(&log, "the arm to move to a box", |line| starts(line, "gripper")).with_context(|| run.said())?;
+    run.process()?.kill()?;
+    drop(run);
+    // As if it had been killed while it wrote.
+    std::fs::OpenOptions::new().append(true).open(&log)?.write_all(b"{\"at\":1,\"eve")?;
+    let again = place.start_as("again", &["run", "--resume", file])?;
+    wait_for_line(&log, "a box to be delivered", |line| line["command"] == "operate").with_context(|| again.said())?;
+    again.process()?.kill()?;
+    let before = lines(&log).map(|lines| lines.len()).unwrap_or_default();
+    drop(again);
+
+    let output = place.ratn(&["run", "--resume", file, "--json"]).output()?;
+    let (out, err) = texts(&output);
+    ensure!(output.status.success(), "{err}");
+    let result: Value = serde_json::from_str(&out)?;
+    ensure!(result["outcome"] == "success" && result["outputs"]["delivered"] == 2, "{result}");
+
+    let lines = lines(&log)?;
+    ensure!(lines.len() > before && lines.iter().filter(|line| line["event"] == "resumed").count() == 2);
+    // No motion was lost and none ran twice: neither by the log nor by the cell's own record.
+    let motions = motions(&lines)?;
+    let begun = begun_in_the_cell(&place)?;
+    let once: BTreeSet<&String> = begun.iter().collect();
+    ensure!(once.len() == begun.len(), "{begun:?}");
+    for (goal, path) in &motions {
+        ensure!(once.contains(goal), "{path} ({goal}) is not among {begun:?}");
+    }
+    // Approach, grasp, transfer, release and retract of each box, and four of the task's own.
+    ensure!(motions.len() == 14, "{motions:?}");
+
+    // It has ended: there is nothing to go on with.
+    let output = place.ratn(&["run", "--resume", file]).output()?;
+    let (_, err) = texts(&output);
+    ensure!(output.status.code() == Some(2) && err.contains("has ended with success"), "{err}");
+    Ok(())
+}
+
+#[test]
+fn a_motion_whose_lease_has_ended_is_not_repeated() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    // The first motion takes longer than the run's session lives without task control.
+    let _up = up(&place, "1", "1")?;
+    let task = repository("examples/fetch_boxes.yaml");
+    let log = place.path().join("log.jsonl");
+    let file = log.to_str().context("a path")?;
+    let run = place.start(&["run", task.to_str().context("a path")?, "--set", "boxes=1", "--log", file])?;
+    wait_for("the cell to move", || Ok((!begun_in_the_cell(&place)?.is_empty()).then_some(())))
+        .with_context(|| run.said())?;
+    run.process()?.kill()?;
+    wait_for("the motion to stop", || {
+        let record = std::fs::read_to_string(place.path().join("run/cell.log"))?;
+        Ok((record.contains("ended") && record.contains("lease")).then_some(()))
+    })?;
+
+    let output = place.ratn(&["run", "--resume", file]).output()?;
+    let (out, err) = texts(&output);
+    ensure!(output.status.code() == Some(1), "{err}");
+    ensure!(out.contains("aborted") && out.contains("stopped while task control was gone"), "{out}{err}");
+    ensure!(begun_in_the_cell(&place)?.len() == 1);
+    Ok(())
+}
+
+#[test]
+fn a_run_is_paused_and_stepped_from_outside() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let _up = up(&place, "20", "1")?;
+    let task = repository("examples/fetch_boxes.yaml");
+    let log = place.path().join("log.jsonl");
+    let file = log.to_str().context("a path")?;
+    let arguments =
+        ["run", task.to_str().context("a path")?, "--set", "boxes=1", "--set", "budget=false", "--log", file];
+    let mut run = place.start(&arguments)?;
+    let tell = |word: &str| {
+        let output = place.ratn(&["control", word]).output()?;
+        ensure!(output.status.success(), "{word}: {}", texts(&output).1);
+        Ok(())
+    };
+    let moves = |line: &Value| ["arm", "gripper", "pan_tilt"].iter().any(|provider| starts(line, provider));
+    wait_for_line(&log, "the run", moves).with_context(|| run.said())?;
+    tell("pause")?;
+    for steps in 1..=2 {
+        tell("step")?;
+        wait_for("a step", || {
+            let text = std::fs::read_to_string(&log)?;
+            let whole: Vec<Value> = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+            let paused = whole.iter().position(|line| line["event"] == "pause_requested");
+            let since = paused.map(|paused| whole[paused..].iter().filter(|line| moves(line)).count());
+            Ok((since == Some(steps)).then_some(()))
+        })
+        .with_context(|| run.said())?;
+    }
+    // Nothing else runs on this system meanwhile, and its log is its own.
+    let output = place.ratn(&["run", "--resume", file]).output()?;
+    ensure!(output.status.code() == Some(2) && texts(&output).1.contains("is under way"), "{}", texts(&output).1);
+    tell("resume")?;
+    let (code, out, said) = run.finish()?;
+    ensure!(code == Some(0), "{code:?}\n{out}{said}");
+    // The chart and the figures know of it.
+    let output = place.ratn(&["control", "pause"]).output()?;
+    ensure!(output.status.code() == Some(1) && texts(&output).1.contains("no run"), "{}", texts(&output).1);
+
+    // What was measured is used the next time; a run that is told to end ends.
+    let next = place.path().join("next.jsonl");
+    let mut arguments = arguments.to_vec();
+    arguments[7] = next.to_str().context("a path")?;
+    arguments.extend(["--learn", file]);
+    let mut run = place.start_as("next", &arguments)?;
+    wait_for_line(&next, "the run", moves).with_context(|| run.said())?;
+    tell("abort")?;
+    let (code, _, said) = run.finish()?;
+    ensure!(code == Some(1), "{code:?}\n{said}");
+    let lines = lines(&next)?;
+    let learned = lines[0]["learned"]["durations_s"]["stow_arm"].as_f64();
+    ensure!(learned.is_some_and(|seconds| seconds > 0.1), "{}", lines[0]["learned"]);
+    ensure!(lines.last().is_some_and(|line| line["outcome"] == "preempted"), "{:?}", lines.last());
+    Ok(())
+}
