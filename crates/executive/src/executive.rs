@@ -3,6 +3,7 @@
 use crate::analysis::Analysis;
 use crate::context::Context;
 use crate::interpreter::{Interpreter, Progress};
+use crate::lookahead::Problem;
 use crate::protocol::{Command, Event, Mode};
 use crate::window::{End, Window};
 use ratn_model::expression::EffectExpr;
@@ -91,6 +92,25 @@ impl Executive {
     pub fn explain(&self) -> Vec<String> {
         let State::Cdtn(window) = &self.state else { return Vec::new() };
         window.waits(&self.program)
+    }
+
+    /// What is still to be done, as far as it is certain, for a look ahead ([`crate::lookahead`]); nothing in HSM mode.
+    pub fn outlook(&mut self, now: Timestamp) -> Problem {
+        let program = self.program.clone();
+        let mut commands = Vec::new();
+        let context = Context {
+            program: &program,
+            analysis: &self.analysis,
+            root: &mut self.root,
+            now,
+            last_instance: &mut self.last_instance,
+            seed: self.seed,
+            commands: &mut commands,
+        };
+        match &self.state {
+            State::Cdtn(window) => window.outlook(&context),
+            _ => Problem::default(),
+        }
     }
 
     fn start(

@@ -562,6 +562,7 @@ impl Window {
             tries: 1,
             crashes: 0,
             not_before: Timestamp(0),
+            began: Timestamp(0),
             lease: None,
             projection: None,
             ended: None,

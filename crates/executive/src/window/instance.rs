@@ -194,6 +194,8 @@ pub(crate) struct Instance {
     /// How many attempts its worker's death has cost.
     pub(crate) crashes: u32,
     pub(crate) not_before: Timestamp,
+    /// When it got its resources.
+    pub(crate) began: Timestamp,
     pub(crate) lease: Option<Box<Lease>>,
     pub(crate) projection: Option<ProjectionId>,
     pub(crate) ended: Option<Box<Ended>>,

@@ -171,6 +171,7 @@ impl Window {
             Event::Granted { instance, lease } => {
                 if let Some(waiting) = self.with_status(instance, Status::Acquiring) {
                     waiting.lease = Some(Box::new(lease));
+                    waiting.began = context.now;
                     self.set_status(instance, Status::Granted, Wait::Nothing);
                     self.proceed(context, instance);
                 } else {

@@ -9,9 +9,11 @@ use super::environment::Binding;
 use super::instance::{Instance, Role, Status};
 use crate::binding;
 use crate::context::Context;
+use crate::lookahead;
 use crate::protocol::Command;
 use ratn_model::id::InstanceId;
 use ratn_model::resource::{Requirement, ResourceOperation};
+use std::collections::BTreeMap;
 
 /// From the top: one bit that says "not speculative", milliseconds of remaining path, program order.
 const REMAINING_BITS: u32 = 40;
@@ -198,5 +200,46 @@ impl Window {
                 self.enqueue(holder);
             }
         }
+    }
+
+    /// What is still to be done on the path that is certain, as a scheduling problem.
+    pub(crate) fn outlook(&self, context: &Context<'_>) -> lookahead::Problem {
+        let mut places: BTreeMap<InstanceId, usize> = BTreeMap::new();
+        let mut tasks: Vec<lookahead::Task> = Vec::new();
+        // Per line, the last PIA and what came since: a PIA waits for all of it.
+        let mut since: BTreeMap<u64, Vec<usize>> = BTreeMap::new();
+        let open = |instance: &&Instance| {
+            instance.role == Role::Node && instance.ended.is_none() && !self.is_speculative(instance.segment)
+        };
+        for instance in self.instances.iter().filter(open).take(lookahead::MAX_TASKS) {
+            let analysis = context.analysis.state(instance.state);
+            let blocks = analysis.requirements.iter().filter(|r| r.operation == ResourceOperation::Block);
+            let runs = matches!(instance.status, Status::Granted | Status::Projecting | Status::Running);
+            let elapsed_s = if runs { context.now.since(instance.began).as_secs_f64() } else { 0.0 };
+            let mut after: Vec<usize> = Vec::new();
+            if !runs {
+                after.extend(self.producers_of(instance).filter_map(|producer| places.get(&producer)));
+                after.extend(instance.wait.on().and_then(|on| places.get(&on)));
+                if instance.is_pia() {
+                    after.extend(since.get(&instance.line).into_iter().flatten());
+                }
+                after.sort_unstable();
+                after.dedup();
+            }
+            let line = since.entry(instance.line).or_default();
+            if instance.is_pia() {
+                line.clear();
+            }
+            line.push(tasks.len());
+            places.insert(instance.id, tasks.len());
+            tasks.push(lookahead::Task {
+                id: instance.id,
+                duration_s: (f64::from(instance.duration_s) - elapsed_s).max(0.0),
+                runs,
+                demands: blocks.map(|r| (r.kind.clone(), r.count)).collect(),
+                after,
+            });
+        }
+        lookahead::Problem { tasks, capacity: self.capacity.clone() }
     }
 }
