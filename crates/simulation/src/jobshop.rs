@@ -22,9 +22,6 @@ use std::time::Duration;
 /// No instance has more operations.
 const MAX_OPERATIONS: usize = 10_000;
 
-/// Rollouts of a look ahead, unless told otherwise.
-pub const DEFAULT_ROLLOUTS: usize = 20_000;
-
 /// Published makespans: proven optima.
 const BEST_KNOWN: [(&str, f64); 23] = [
     ("ft06", 55.0),
@@ -184,11 +181,11 @@ impl JobShop {
         }
     }
 
-    /// Executes the task in CDTN mode with a look ahead of so many rollouts; none is plain dispatch.
+    /// Executes the task in CDTN mode.
     ///
     /// # Errors
     /// As [`run`].
-    pub fn execute(&self, rollouts: Option<usize>, seed: u64) -> Result<Run, RunError> {
+    pub fn execute(&self, seed: u64) -> Result<Run, RunError> {
         let setup = Setup {
             program: Arc::new(self.program()),
             mode: Mode::Cdtn,
@@ -198,7 +195,6 @@ impl JobShop {
             world: Vec::new(),
             tolerance: Tolerance::EXACT,
             latency: Duration::ZERO,
-            lookahead: rollouts,
         };
         run(setup, &mut Machines)
     }
@@ -258,7 +254,7 @@ mod tests {
     #[test]
     fn operations_of_a_job_follow_each_other_and_a_machine_has_one_at_a_time() {
         let shop = JobShop::parse("2 2\n0 3 1 2\n0 2 1 4\n").unwrap();
-        let run = shop.execute(None, 1).unwrap();
+        let run = shop.execute(1).unwrap();
         assert_eq!((run.outcome.as_str(), run.end_s), ("success", 8.0), "job 1 first: its rest is longer");
     }
 }

@@ -23,6 +23,9 @@ const ORDER_BITS: u32 = 20;
 const ALWAYS_ESTIMATED: usize = 64;
 const ESTIMATED_SHARE: usize = 2;
 
+/// A window is looked ahead for so many nodes; what comes later keeps its longest remaining path.
+const MAX_TASKS: usize = 2_000;
+
 impl Window {
     /// Estimates durations and remaining paths of everything in the window, if enough has changed.
     pub(super) fn estimate(&mut self, context: &Context<'_>) {
@@ -202,16 +205,16 @@ impl Window {
         }
     }
 
-    /// What is still to be done on the path that is certain, as a scheduling problem.
+    /// What is still to be done, as a scheduling problem: of an undecided condition the likelier branch.
     pub(crate) fn outlook(&self, context: &Context<'_>) -> lookahead::Problem {
         let mut places: BTreeMap<InstanceId, usize> = BTreeMap::new();
         let mut tasks: Vec<lookahead::Task> = Vec::new();
         // Per line, the last PIA and what came since: a PIA waits for all of it.
         let mut since: BTreeMap<u64, Vec<usize>> = BTreeMap::new();
         let open = |instance: &&Instance| {
-            instance.role == Role::Node && instance.ended.is_none() && !self.is_speculative(instance.segment)
+            instance.role == Role::Node && instance.ended.is_none() && self.is_likeliest(instance.segment)
         };
-        for instance in self.instances.iter().filter(open).take(lookahead::MAX_TASKS) {
+        for instance in self.instances.iter().filter(open).take(MAX_TASKS) {
             let analysis = context.analysis.state(instance.state);
             let blocks = analysis.requirements.iter().filter(|r| r.operation == ResourceOperation::Block);
             let runs = matches!(instance.status, Status::Granted | Status::Projecting | Status::Running);
@@ -233,9 +236,11 @@ impl Window {
             line.push(tasks.len());
             places.insert(instance.id, tasks.len());
             tasks.push(lookahead::Task {
-                id: instance.id,
+                instance: instance.id,
                 duration_s: (f64::from(instance.duration_s) - elapsed_s).max(0.0),
-                runs,
+                is_running: runs,
+                is_speculative: self.is_speculative(instance.segment),
+                probability: f64::from(self.probability(instance.segment)),
                 demands: blocks.map(|r| (r.kind.clone(), r.count)).collect(),
                 after,
             });

@@ -32,6 +32,22 @@ impl Window {
         Some(branch.decision)
     }
 
+    /// Whether no decision on the way to a segment is more likely to go another way.
+    pub(super) fn is_likeliest(&self, segment: Segment) -> bool {
+        let mut at = segment;
+        while let Some(branch) = self.branches.get(&at) {
+            let better = |(other, arm): (&Segment, &Branch)| {
+                arm.decision == branch.decision
+                    && (arm.probability > branch.probability || (arm.probability == branch.probability && *other < at))
+            };
+            if self.branches.iter().any(better) {
+                return false;
+            }
+            at = branch.parent;
+        }
+        true
+    }
+
     /// How likely an instance's path is taken.
     pub(super) fn probability(&self, segment: Segment) -> f32 {
         self.branches.get(&segment).map_or(1.0, |branch| branch.probability)
