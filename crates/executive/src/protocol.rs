@@ -45,6 +45,9 @@ pub struct Origin {
     /// When it began, in milliseconds since 1970.
     #[serde(default)]
     pub began_unix_ms: u64,
+    /// Paths (without visits) of PIAs beside which younger ones may run: their exceptions are imprecise.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub imprecise: Vec<String>,
 }
 
 /// What happened.

@@ -5,7 +5,7 @@
 //! The same timeline gives the same bytes. SVG when the file is named so, else HTML with the statistics below the chart.
 
 use super::statistics::{Statistics, mode_name};
-use super::timeline::{Activity, Ending, Instance, Job, Timeline};
+use super::timeline::{Activity, Ending, Instance, Job, Span, Timeline};
 use std::fmt::Write as _;
 use std::path::Path;
 
@@ -24,6 +24,8 @@ const SHORTEST_WAIT_S: f64 = 0.25;
 /// Mean width of a character in a bar.
 const CHARACTER: f64 = 6.1;
 const TICKS: f64 = 14.0;
+const PAUSED: &str = "#efe4f7";
+const ABSENT: &str = "#f7dedb";
 const ELSEWHERE: &str = "no resource";
 
 /// Writes the chart as the file's name says. `scale_s` makes charts of different runs comparable: where the axis ends.
@@ -70,7 +72,12 @@ pub(crate) fn svg(run: &Timeline, scale_s: Option<f64>) -> String {
     );
     let _ =
         writeln!(out, "<text x=\"16\" y=\"30\" font-size=\"18\" font-weight=\"600\">{}</text>", escaped(&title(run)));
-    legend(&mut out);
+    legend(&mut out, run);
+    for (spans, colour, what) in [(&run.pauses, PAUSED, "paused"), (&run.absences, ABSENT, "task control was gone")] {
+        for span in spans {
+            band(&mut out, &axis, bottom, *span, colour, what);
+        }
+    }
     axis.draw(&mut out, bottom);
     for (i, row) in rows.iter().enumerate() {
         row.draw(&mut out, &axis, TOP + ROW * i as f64, i % 2 == 1);
@@ -86,7 +93,20 @@ pub(crate) fn svg(run: &Timeline, scale_s: Option<f64>) -> String {
     out
 }
 
-fn legend(out: &mut String) {
+/// A time from top to bottom.
+fn band(out: &mut String, axis: &Axis, bottom: f64, span: Span, colour: &str, what: &str) {
+    let (x, width) = (axis.x(span.from_s), (axis.x(span.to_s) - axis.x(span.from_s)).max(1.0));
+    let _ = writeln!(
+        out,
+        "<rect x=\"{x:.1}\" y=\"{TOP}\" width=\"{width:.1}\" height=\"{:.1}\" fill=\"{colour}\"><title>{what} from {:.1} to \
+         {:.1} s</title></rect>",
+        bottom - TOP,
+        span.from_s,
+        span.to_s
+    );
+}
+
+fn legend(out: &mut String, run: &Timeline) {
     let mut x = 16.0;
     let entries = [
         (colour(Activity::Motion, 0), "motion"),
@@ -96,7 +116,9 @@ fn legend(out: &mut String) {
         ("none\" stroke=\"#c3362b\" stroke-width=\"2", "aborted or crashed"),
         ("#c4c9d2", "discarded"),
     ];
-    for (fill, what) in entries {
+    let bands = [(!run.pauses.is_empty(), PAUSED, "paused"), (!run.absences.is_empty(), ABSENT, "task control gone")];
+    let bands = bands.into_iter().filter_map(|(there, fill, what)| there.then_some((fill, what)));
+    for (fill, what) in entries.into_iter().chain(bands) {
         let _ = writeln!(
             out,
             "<rect x=\"{x:.0}\" y=\"46\" width=\"16\" height=\"12\" rx=\"2\" fill=\"{fill}\"/>\
@@ -230,7 +252,7 @@ impl Row<'_> {
 
 fn draw_job(out: &mut String, axis: &Axis, y: f64, instance: &Instance, job: &Job) {
     let (x, width) = (axis.x(job.from_s), (axis.x(job.to_s) - axis.x(job.from_s)).max(1.0));
-    let discarded = instance.squashed || job.ending == Ending::Cancelled;
+    let discarded = instance.squashed || job.ending == Ending::Cancelled || job.invalidated.is_some();
     let fill = if discarded { "#c4c9d2" } else { colour(job.activity, visit(&instance.path)) };
     let (how, failed) = match &job.ending {
         Ending::Outcome(outcome, reason) if outcome == "aborted" => (format!("aborted: {reason}"), true),
@@ -241,7 +263,11 @@ fn draw_job(out: &mut String, axis: &Axis, y: f64, instance: &Instance, job: &Jo
     };
     let stroke = if failed { "#c3362b\" stroke-width=\"2" } else { "#ffffff\" stroke-width=\"0.8" };
     let attempt = if job.attempt > 1 { format!(", attempt {}", job.attempt) } else { String::new() };
-    let discarded = if discarded { ", discarded" } else { "" };
+    let discarded = match &job.invalidated {
+        Some(reason) => format!(", done again: {}", escaped(reason)),
+        None if discarded => ", discarded".into(),
+        None => String::new(),
+    };
     let _ = write!(
         out,
         "<g><title>{}: {}/{}\n{:.1} to {:.1} s ({:.1} s), {}{attempt}{discarded}</title><rect x=\"{x:.1}\" y=\"{y:.1}\" \

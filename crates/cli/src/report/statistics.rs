@@ -3,7 +3,7 @@
 //! Every moment of a run counts once in [`Shares`]: to motion if anything moves, else to detection, else to planning that
 //! everything waits for, else to idleness; the four add up to the makespan.
 
-use super::timeline::{Activity, Ending, Job, Timeline};
+use super::timeline::{Activity, Ending, Job, Span, Timeline};
 use ratn_executive::protocol::Mode;
 use ratn_model::value::Value;
 use serde::Serialize;
@@ -25,6 +25,14 @@ pub(crate) struct Statistics {
     pub(crate) work_s: f64,
     /// How long at least two jobs ran at once.
     pub(crate) overlap_s: f64,
+    /// How long no PIA was to begin, because the user paused the run.
+    pub(crate) paused_s: f64,
+    /// How many single steps the user asked for.
+    pub(crate) steps: usize,
+    /// How long task control was gone; what ran then went on or was stopped by its provider.
+    pub(crate) away_s: f64,
+    /// PIAs that began beside an older one whose exceptions are imprecise.
+    pub(crate) imprecise: Vec<Beside>,
     pub(crate) instances: Instances,
     pub(crate) ahead_of_time: AheadOfTime,
     pub(crate) resources: Vec<Busy>,
@@ -48,6 +56,19 @@ pub(crate) struct Instances {
     pub(crate) retired: usize,
     pub(crate) squashed: usize,
     pub(crate) crashed_attempts: usize,
+    /// How often a result did not count because something came out otherwise.
+    pub(crate) invalidated: usize,
+    /// How many took the result of an equal one.
+    pub(crate) reused: usize,
+}
+
+/// One PIA beside another.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Beside {
+    /// What ran, and might have failed.
+    pub(crate) older: String,
+    /// What began, and would have stood.
+    pub(crate) younger: String,
 }
 
 /// Computing and detecting jobs that began before an instance that was expanded earlier had finished.
@@ -105,10 +126,20 @@ impl Statistics {
             time,
             work_s: jobs.iter().map(|job| job.to_s - job.from_s).sum(),
             overlap_s,
+            paused_s: run.pauses.iter().map(Span::length_s).sum(),
+            steps: run.steps,
+            away_s: run.absences.iter().map(Span::length_s).sum(),
+            imprecise: run
+                .beside
+                .iter()
+                .map(|(older, younger)| Beside { older: older.clone(), younger: younger.clone() })
+                .collect(),
             instances: Instances {
                 expanded: run.instances.len(),
                 retired: run.instances.iter().filter(|i| i.retired).count(),
                 squashed: run.instances.iter().filter(|i| i.squashed).count(),
+                invalidated: run.instances.iter().map(|i| i.invalidations.len()).sum(),
+                reused: run.instances.iter().filter(|i| i.reused).count(),
                 crashed_attempts: jobs.iter().filter(|job| matches!(job.ending, Ending::Crashed(_))).count(),
             },
             ahead_of_time: ahead_of_time(run),
@@ -251,6 +282,7 @@ impl fmt::Display for Statistics {
             self.ahead_of_time.squashed,
             self.instances.crashed_attempts
         )?;
+        self.incidents(f)?;
         let width = self.resources.iter().map(|r| r.resource.chars().count()).max().unwrap_or(0).max(22);
         writeln!(f, "\n{:<w$} busy s      %", "resource", w = width + 2)?;
         for r in &self.resources {
@@ -266,6 +298,27 @@ impl fmt::Display for Statistics {
             )?;
         }
         f.write_str(&plan_table(&self.plans))
+    }
+}
+
+impl Statistics {
+    /// What does not happen in most runs.
+    fn incidents(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Instances { invalidated, reused, .. } = self.instances;
+        if invalidated > 0 || reused > 0 {
+            writeln!(f, "  results invalidated and computed again: {invalidated}; taken from an equal one: {reused}")?;
+        }
+        if self.paused_s > 0.0 || self.steps > 0 {
+            writeln!(f, "  paused for {:.1} s; single steps: {}", self.paused_s, self.steps)?;
+        }
+        if self.away_s > 0.0 {
+            writeln!(f, "  task control was gone for {:.1} s", self.away_s)?;
+        }
+        if let Some(Beside { older, younger }) = self.imprecise.first() {
+            let all = self.imprecise.len();
+            writeln!(f, "  exceptions were imprecise: {younger} began beside {older}, which might have failed ({all} in all)")?;
+        }
+        Ok(())
     }
 }
 

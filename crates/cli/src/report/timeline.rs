@@ -3,12 +3,13 @@
 //! Everything is in the robot's seconds since the start of the run. Only what the log says is used, so a log can be read
 //! without the task file and the system that made it.
 
+use super::statistics::without_visits;
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Mode, Note};
 use ratn_model::id::InstanceId;
 use ratn_model::program::WORLD_MODEL;
 use ratn_model::value::Value;
 use serde::Serialize;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A run, as its log tells it.
 #[derive(Debug, Clone)]
@@ -23,8 +24,30 @@ pub(crate) struct Timeline {
     pub(crate) outputs: BTreeMap<String, Value>,
     /// When the run (or the log) ends.
     pub(crate) end_s: f64,
+    /// From each request for a pause to its end.
+    pub(crate) pauses: Vec<Span>,
+    /// How many single steps were asked for.
+    pub(crate) steps: usize,
+    /// When task control was gone.
+    pub(crate) absences: Vec<Span>,
+    /// PIAs that began beside an older one that was still running and might have failed: its path, then theirs.
+    pub(crate) beside: Vec<(String, String)>,
     /// In the order of expansion.
     pub(crate) instances: Vec<Instance>,
+}
+
+/// A time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Span {
+    pub(crate) from_s: f64,
+    pub(crate) to_s: f64,
+}
+
+impl Span {
+    /// How long it is.
+    pub(crate) fn length_s(&self) -> f64 {
+        self.to_s - self.from_s
+    }
 }
 
 /// One visit of a state.
@@ -38,6 +61,10 @@ pub(crate) struct Instance {
     pub(crate) finished: bool,
     pub(crate) retired: bool,
     pub(crate) squashed: bool,
+    /// Its result was taken from an equal one.
+    pub(crate) reused: bool,
+    /// Why its result, or what it was at, did not count; once for each time.
+    pub(crate) invalidations: Vec<String>,
 }
 
 /// From asking for resources to their grant.
@@ -64,6 +91,8 @@ pub(crate) struct Job {
     pub(crate) outputs: BTreeMap<String, Value>,
     /// Some instance that was expanded earlier had not finished when this began.
     pub(crate) ahead_of_time: bool,
+    /// Why it had to be done again, where it had to.
+    pub(crate) invalidated: Option<String>,
 }
 
 /// What a job is, as far as a log tells.
@@ -100,12 +129,16 @@ impl Timeline {
         let mut fold = Fold::default();
         for line in lines {
             let at = line.at.seconds();
+            if line.entry == LogEntry::Event(Event::Resumed) {
+                fold.run.absences.push(Span { from_s: fold.run.end_s, to_s: at });
+            }
             fold.run.end_s = fold.run.end_s.max(at);
             match &line.entry {
                 LogEntry::Event(event) => fold.event(at, event),
                 LogEntry::Command(command) => fold.command(at, command),
             }
         }
+        fold.goes_on(fold.run.end_s);
         let mut run = fold.run;
         for job in run.instances.iter_mut().flat_map(|i| &mut i.jobs).filter(|j| j.ending == Ending::Open) {
             job.to_s = run.end_s;
@@ -124,6 +157,9 @@ struct Fold {
     run: Timeline,
     index: BTreeMap<InstanceId, usize>,
     asked: BTreeMap<InstanceId, f64>,
+    paused: Option<f64>,
+    /// Plain paths of PIAs whose exceptions are imprecise.
+    imprecise: BTreeSet<String>,
 }
 
 impl Default for Fold {
@@ -137,16 +173,21 @@ impl Default for Fold {
             reason: String::new(),
             outputs: BTreeMap::new(),
             end_s: 0.0,
+            pauses: Vec::new(),
+            steps: 0,
+            absences: Vec::new(),
+            beside: Vec::new(),
             instances: Vec::new(),
         };
-        Fold { run, index: BTreeMap::new(), asked: BTreeMap::new() }
+        Fold { run, index: BTreeMap::new(), asked: BTreeMap::new(), paused: None, imprecise: BTreeSet::new() }
     }
 }
 
 impl Fold {
     fn event(&mut self, at: f64, event: &Event) {
         match event {
-            Event::Started { task, mode, parameters, seed, .. } => {
+            Event::Started { task, mode, parameters, seed, origin, .. } => {
+                self.imprecise = origin.imprecise.iter().cloned().collect();
                 self.run.task.clone_from(task);
                 self.run.mode = *mode;
                 self.run.parameters.clone_from(parameters);
@@ -173,10 +214,13 @@ impl Fold {
             | Event::AbortRequested { .. }
             | Event::Resumed
             | Event::Woken
-            | Event::PauseRequested
-            | Event::ResumeRequested
-            | Event::StepRequested
             | Event::Advised { .. } => {}
+            Event::PauseRequested => _ = self.paused.get_or_insert(at),
+            Event::StepRequested => {
+                self.paused.get_or_insert(at);
+                self.run.steps += 1;
+            }
+            Event::ResumeRequested => self.goes_on(at),
         }
     }
 
@@ -188,6 +232,14 @@ impl Fold {
             Command::Note(Note::Finished { instance, .. }) => self.instance(*instance).finished = true,
             Command::Note(Note::Retired { instance }) => self.instance(*instance).retired = true,
             Command::Note(Note::Squashed { instance }) => self.instance(*instance).squashed = true,
+            Command::Note(Note::Reused { instance }) => self.instance(*instance).reused = true,
+            Command::Note(Note::Invalidated { instance, reason }) => {
+                let instance = self.instance(*instance);
+                instance.invalidations.push(reason.clone());
+                if let Some(job) = instance.jobs.last_mut() {
+                    job.invalidated = Some(reason.clone());
+                }
+            }
             Command::Note(_) => {}
             Command::Acquire { instance, .. } => {
                 self.asked.insert(*instance, at);
@@ -208,6 +260,9 @@ impl Fold {
                     .instances
                     .iter()
                     .any(|other| other.id < *instance && !(other.finished || other.retired || other.squashed));
+                if activity == Activity::Motion {
+                    self.begins_beside(*instance);
+                }
                 let job = Job {
                     provider: goal.provider.clone(),
                     action: goal.action.clone(),
@@ -219,6 +274,7 @@ impl Fold {
                     resources: named(leased.map(|r| (r.kind.as_str(), r.id.as_str()))),
                     outputs: BTreeMap::new(),
                     ahead_of_time,
+                    invalidated: None,
                 };
                 self.instance(*instance).jobs.push(job);
             }
@@ -236,6 +292,22 @@ impl Fold {
             | Command::Operate { .. }
             | Command::Wake { .. } => {}
         }
+    }
+
+    fn goes_on(&mut self, at: f64) {
+        if let Some(from_s) = self.paused.take() {
+            self.run.pauses.push(Span { from_s, to_s: at });
+        }
+    }
+
+    /// A PIA begins: which older ones of imprecise exceptions are still at it.
+    fn begins_beside(&mut self, id: InstanceId) {
+        let path = self.instance(id).path.clone();
+        let open = |other: &&Instance| other.id < id && other.jobs.last().is_some_and(|job| job.ending == Ending::Open);
+        let imprecise = |other: &&Instance| self.imprecise.contains(&without_visits(&other.path));
+        let older = self.run.instances.iter().filter(open).filter(imprecise).map(|other| other.path.clone());
+        let pairs: Vec<_> = older.map(|older| (older, path.clone())).collect();
+        self.run.beside.extend(pairs);
     }
 
     fn end(&mut self, id: InstanceId, attempt: u32, at: f64, ending: Ending, outputs: &BTreeMap<String, Value>) {
@@ -259,6 +331,8 @@ impl Fold {
                 finished: false,
                 retired: false,
                 squashed: false,
+                reused: false,
+                invalidations: vec![],
             });
             instances.len() - 1
         });

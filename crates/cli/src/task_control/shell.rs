@@ -15,7 +15,7 @@ use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, Learned, LogLine, Mode, Origin};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{Program, SUCCESS};
+use ratn_model::program::{Exceptions, Nature, Program, SUCCESS, State, StateKind};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_worker::client::fresh_id;
@@ -126,7 +126,13 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
             revision,
             capacity: place.catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
             learned: run.learned,
-            origin: Origin { run: id, version: VERSION.to_owned(), file: run.file, began_unix_ms },
+            origin: Origin {
+                run: id,
+                version: VERSION.to_owned(),
+                file: run.file,
+                began_unix_ms,
+                imprecise: imprecise(&run.program),
+            },
         };
         shell.step(begun)
     };
@@ -284,6 +290,15 @@ fn ended(command: Command, now: Timestamp) -> Option<Ended> {
         }
         _ => None,
     }
+}
+
+/// Where the program lets younger PIAs run beside one that might still fail.
+fn imprecise(program: &Program) -> Vec<String> {
+    let is_pia = |state: &&State| {
+        matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature == Nature::Irreversible
+    };
+    let lets = |state: &&State| state.annotations.exceptions.unwrap_or(program.exceptions) == Exceptions::Imprecise;
+    program.states.iter().filter(is_pia).filter(lets).map(|state| state.path.clone()).collect()
 }
 
 fn unix_ms() -> u64 {
