@@ -316,7 +316,10 @@ impl Statistics {
         }
         if let Some(Beside { older, younger }) = self.imprecise.first() {
             let all = self.imprecise.len();
-            writeln!(f, "  exceptions were imprecise: {younger} began beside {older}, which might have failed ({all} in all)")?;
+            writeln!(
+                f,
+                "  exceptions were imprecise: {younger} began beside {older}, which might have failed ({all} in all)"
+            )?;
         }
         Ok(())
     }

@@ -136,7 +136,7 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
         };
         shell.step(begun)
     };
-    shell.to_the_end(begin, interrupt).await
+    shell.run_to_its_end(begin, interrupt).await
 }
 
 /// Goes on with a run whose task control was killed, on the system that it was on.
@@ -170,7 +170,7 @@ pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &In
         // Everything that the executive had wanted is asked for by now; what it wants on top of that follows.
         Ok(ended.or(shell.step(Event::Resumed)?))
     };
-    shell.to_the_end(begin, interrupt).await
+    shell.run_to_its_end(begin, interrupt).await
 }
 
 /// A run under way.
@@ -191,7 +191,7 @@ struct Shell {
 
 impl Shell {
     /// Begins and goes on until the run has ended; then everything is recorded and given back, whatever happened.
-    async fn to_the_end(
+    async fn run_to_its_end(
         mut self,
         begin: impl AsyncFnOnce(&mut Shell) -> anyhow::Result<Option<Ended>>,
         interrupt: &Interrupt,

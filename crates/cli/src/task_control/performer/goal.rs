@@ -153,3 +153,122 @@ impl Performing {
         Event::Crashed { instance: self.instance, attempt: self.attempt, reason }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
+    use ratn_worker::client::Channels;
+    use ratn_worker::server::{Services, bind};
+    use tokio_util::sync::DropGuard;
+
+    /// `work`: is done at once. `hang`: never, unless it is told to stop.
+    struct Named(&'static str);
+
+    #[tonic::async_trait]
+    impl Action for Named {
+        fn name(&self) -> &str {
+            self.0
+        }
+
+        async fn execute(&self, goal: GoalContext) -> ActionResult {
+            if self.0 == "hang" {
+                goal.cancelled.cancelled().await;
+                return Err(goal.stopped());
+            }
+            Ok(GoalOutcome::success())
+        }
+    }
+
+    struct Bench {
+        endpoint: Endpoint,
+        server: ActionServer,
+        events: mpsc::Sender<Answer>,
+        answers: mpsc::Receiver<Answer>,
+        _place: tempfile::TempDir,
+        _shutdown: DropGuard,
+    }
+
+    impl Bench {
+        async fn new() -> anyhow::Result<Bench> {
+            let place = tempfile::tempdir()?;
+            let server = ActionServer::builder("").action(Named("work")).action(Named("hang")).build();
+            let bound = bind(&Endpoint::Unix(place.path().join("provider.sock"))).await?;
+            let (endpoint, shutdown) = (bound.endpoint().clone(), CancellationToken::new());
+            tokio::spawn(bound.serve(Services::new().with(server.clone().into_service()), shutdown.clone()));
+            let (events, answers) = mpsc::channel(8);
+            Ok(Bench { endpoint, server, events, answers, _place: place, _shutdown: shutdown.drop_guard() })
+        }
+
+        fn performing(&self, action: &str, timeout_s: Option<f64>, grace_ms: u64) -> Performing {
+            Performing {
+                instance: InstanceId(1),
+                attempt: 1,
+                endpoint: Ok(self.endpoint.clone()),
+                timeout_s,
+                speed: 10.0,
+                actions: ActionClient::new(Channels::new()),
+                events: self.events.clone(),
+                stop: CancellationToken::new(),
+                goal: Goal {
+                    id: format!("run/1/{action}"),
+                    action: action.to_owned(),
+                    deadline_ms: deadline_ms(timeout_s, 10.0),
+                    grace_ms,
+                    ..Goal::default()
+                },
+            }
+        }
+
+        async fn event(&mut self) -> Option<Event> {
+            Some(self.answers.recv().await?.event)
+        }
+    }
+
+    #[tokio::test]
+    async fn a_worker_that_hangs_ends_at_the_goals_timeout() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        bench.performing("hang", Some(0.5), GRACE_MS).perform(Given::Now).await;
+        let event = bench.event().await;
+        assert!(
+            matches!(&event, Some(Event::Finished { outcome, reason, .. })
+                if outcome == ABORTED && reason == "took longer than 0.5 s"),
+            "{event:?}"
+        );
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_goal_of_before_is_found_and_not_given_again() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        // Nobody has given it: what became of it is not known, and it is not begun.
+        bench.performing("work", None, 0).perform(Given::Before).await;
+        let event = bench.event().await;
+        assert!(
+            matches!(&event, Some(Event::Crashed { reason, .. }) if reason.contains("not known here")),
+            "{event:?}"
+        );
+        // It has ended since.
+        bench.performing("work", None, 0).perform(Given::Now).await;
+        bench.event().await;
+        bench.performing("work", None, 0).perform(Given::Before).await;
+        let event = bench.event().await;
+        assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == "success"), "{event:?}");
+        // Nobody listened to it.
+        let left = tokio::spawn(bench.performing("hang", None, 0).perform(Given::Now));
+        while bench.server.running() == 0 {
+            tokio::task::yield_now().await;
+        }
+        left.abort();
+        while bench.server.running() > 0 {
+            tokio::task::yield_now().await;
+        }
+        bench.performing("hang", None, 0).perform(Given::Before).await;
+        let event = bench.event().await;
+        assert!(
+            matches!(&event, Some(Event::Crashed { reason, .. }) if reason.contains("nobody listened")),
+            "{event:?}"
+        );
+        Ok(())
+    }
+}

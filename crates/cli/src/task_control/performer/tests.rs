@@ -2,22 +2,35 @@
 
 use super::*;
 use crate::task_control::Endpoints;
+use crate::task_control::ledger::Ledger;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
+use ratn_executive::protocol::Origin;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::resource::ResourceOperation;
+use ratn_model::time::Timestamp;
 use ratn_worker::client::fresh_id;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_world::world::World;
 use tokio_util::sync::DropGuard;
 
 async fn connect(endpoints: &Endpoints, task: &str, events: mpsc::Sender<Answer>) -> anyhow::Result<Performer> {
+    connect_as(endpoints, &fresh_id("run"), task, events).await
+}
+
+async fn connect_as(
+    endpoints: &Endpoints,
+    run: &str,
+    task: &str,
+    events: mpsc::Sender<Answer>,
+) -> anyhow::Result<Performer> {
     let place = Place {
         endpoints: endpoints.clone(),
         directory: std::path::PathBuf::new(),
         catalogue: Arc::default(),
         speed: 1.0,
     };
-    Performer::connect(&place, &fresh_id("run"), task, events).await
+    Performer::connect(&place, run, task, events).await
 }
 
 fn arm() -> Vec<Requirement> {
@@ -35,6 +48,8 @@ struct Bench {
     performer: Performer,
     answers: mpsc::Receiver<Answer>,
     endpoints: Endpoints,
+    /// Whoever offers the arm.
+    _robot: Session,
     _place: tempfile::TempDir,
     _shutdown: DropGuard,
 }
@@ -52,8 +67,12 @@ impl Bench {
         };
         let (events, answers) = mpsc::channel(8);
         let performer = connect(&endpoints, "task", events).await?;
-        performer.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
-        Ok(Bench { performer, answers, endpoints, _place: place, _shutdown: shutdown.drop_guard() })
+        let channels = Channels::new();
+        let robot = Session::open(&channels, &endpoints.resource_manager, "robot", DEFAULT_TTL);
+        robot.alive(SESSION_DEADLINE).await?;
+        let offering = ResourceClient::new(&channels, &endpoints.resource_manager, robot.id())?;
+        offering.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
+        Ok(Bench { performer, answers, endpoints, _robot: robot, _place: place, _shutdown: shutdown.drop_guard() })
     }
 
     fn ask(&mut self, instance: InstanceId) -> anyhow::Result<()> {
@@ -68,6 +87,28 @@ impl Bench {
                 return Some(event);
             }
         }
+    }
+
+    /// Task control is killed and comes back; `lives` says whether its session still does.
+    async fn comes_back(mut self, lives: bool) -> anyhow::Result<Bench> {
+        let run = self.performer.run.clone();
+        let (events, answers) = mpsc::channel(8);
+        self.answers = answers;
+        if lives {
+            // Nobody says farewell.
+            std::mem::forget(self.performer);
+        } else {
+            // Its farewell is what the end of its time would be.
+            self.performer.session.close().await;
+        }
+        self.performer = connect_as(&self.endpoints, &run, "task", events).await?;
+        Ok(self)
+    }
+
+    /// How many units of a kind there are.
+    async fn units(&self, kind: &str) -> anyhow::Result<u32> {
+        let resources = self.performer.resources.list(&[kind]).await?;
+        Ok(resources.iter().map(|resource| resource.capacity).sum())
     }
 
     async fn granted(&mut self, to: InstanceId) -> anyhow::Result<LeaseId> {
@@ -150,5 +191,84 @@ async fn a_grant_that_crosses_its_withdrawal_goes_back() -> anyhow::Result<()> {
     // Nobody holds the arm: the same instance gets it when it asks again.
     bench.ask(instance)?;
     bench.granted(instance).await?;
+    bench.performer.close().await
+}
+
+fn create(kind: &str, count: u32) -> Requirement {
+    Requirement { operation: ResourceOperation::Create, kind: kind.to_owned(), count, ..arm().remove(0) }
+}
+
+fn done() -> Vec<Change> {
+    let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
+    vec![Change::Set { fact, value: Value::Bool(true) }]
+}
+
+/// What a run had commanded before it was killed, as its log has it.
+fn ledger(run: &str, commands: &[Command]) -> Ledger {
+    let mut ledger = Ledger { origin: Origin { run: run.to_owned(), ..Origin::default() }, ..Ledger::default() };
+    commands.iter().for_each(|command| ledger.command(command));
+    ledger.event(Timestamp(0), &Event::Resumed);
+    ledger
+}
+
+#[tokio::test]
+async fn who_comes_back_to_a_living_session_does_nothing_twice() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let operate = Command::Operate { instance: InstanceId(1), operations: vec![create("Box", 2)] };
+    let commit = Command::Commit { instance: InstanceId(1), changes: done(), revision: Revision(1) };
+    bench.performer.perform(commit.clone())?;
+    bench.performer.perform(operate.clone())?;
+    // A grant that was on its way when task control was killed.
+    bench.ask(InstanceId(2))?;
+    bench.granted(InstanceId(2)).await?;
+    let waiting = Command::Acquire { instance: InstanceId(2), requirements: arm(), priority: 0 };
+
+    let mut bench = bench.comes_back(true).await?;
+    let mut mirror = World::default();
+    mirror.apply(&done())?;
+    let ledger = ledger(&run, &[commit, operate, waiting]);
+    bench.performer.take_up(ledger, &mirror).await?;
+    // It is asked for anew, and what nobody knew to have is free for it.
+    bench.granted(InstanceId(2)).await?;
+    assert_eq!(bench.units("Box").await?, 2);
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn who_comes_back_too_late_makes_anew_what_went_with_the_session() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let operate = Command::Operate { instance: InstanceId(1), operations: vec![create("Box", 2)] };
+    bench.performer.perform(operate.clone())?;
+    while bench.units("Box").await? == 0 {}
+    let mut bench = bench.comes_back(false).await?;
+    assert_eq!(bench.units("Box").await?, 0);
+    bench.performer.take_up(ledger(&run, &[operate]), &World::default()).await?;
+    assert_eq!(bench.units("Box").await?, 2);
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn a_commit_that_did_not_leave_is_made_and_another_world_is_refused() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let commit = Command::Commit { instance: InstanceId(1), changes: done(), revision: Revision(1) };
+    let open = ledger(&run, &[commit]);
+    let mut mirror = World::default();
+    mirror.apply(&done())?;
+    check_world(&bench.endpoints, &open, &mirror).await?;
+    bench.performer.take_up(open.clone(), &mirror).await?;
+    let (revision, facts) = bench.performer.root().await?;
+    assert_eq!((revision, facts.len()), (Revision(1), 1));
+
+    // Somebody else changes it.
+    bench.performer.world.commit("other/1/2", done(), None).await?;
+    let refused = check_world(&bench.endpoints, &open, &mirror).await;
+    assert!(refused.is_err_and(|error| error.to_string().contains("somebody else has changed the world")));
+    // A pool that began anew.
+    let later = Ledger { first_revision: Revision(9), ..open };
+    let refused = check_world(&bench.endpoints, &later, &mirror).await;
+    assert!(refused.is_err_and(|error| error.to_string().contains("restarted")));
     bench.performer.close().await
 }
