@@ -216,6 +216,41 @@ mod tests {
     }
 
     #[test]
+    fn whatever_is_answered_after_the_cut_is_open_at_the_cut_and_nothing_else_is() {
+        let program = fetch_boxes();
+        let lines = log(&program, Mode::Cdtn);
+        let mut checked = 0;
+        for cut in (1..lines.len()).filter(|cut| matches!(lines[*cut].entry, LogEntry::Event(_))) {
+            let ledger = replay(&program, &lines[..cut]).unwrap().ledger;
+            let (mut goals, mut projecting, mut waiting) = (ledger.goals, ledger.projecting, ledger.waiting);
+            // What is asked for after the cut is answered after the cut, too, and was not open.
+            let mut asked: Vec<InstanceId> = Vec::new();
+            for line in &lines[cut..] {
+                match &line.entry {
+                    LogEntry::Command(
+                        Command::Start { instance, .. }
+                        | Command::Project { instance, .. }
+                        | Command::Acquire { instance, .. },
+                    ) => asked.push(*instance),
+                    LogEntry::Event(Event::Finished { instance, attempt, .. }) if !asked.contains(instance) => {
+                        assert_eq!(goals.remove(instance).map(|goal| goal.0), Some(*attempt));
+                    }
+                    LogEntry::Event(Event::Projected { instance, .. }) if !asked.contains(instance) => {
+                        assert!(projecting.remove(instance).is_some());
+                    }
+                    LogEntry::Event(Event::Granted { instance, .. }) if !asked.contains(instance) => {
+                        assert!(waiting.remove(instance).is_some());
+                    }
+                    _ => continue,
+                }
+                checked += 1;
+            }
+            assert!(goals.is_empty() && projecting.is_empty() && waiting.is_empty(), "cut at {cut}");
+        }
+        assert!(checked > 100);
+    }
+
+    #[test]
     fn a_log_that_says_otherwise_is_refused_with_its_line() {
         let program = fetch_boxes();
         let mut lines = log(&program, Mode::Cdtn);
