@@ -28,7 +28,9 @@ pub struct Task {
     pub after: Vec<usize>,
     /// A condition on its path is undecided: it is served after everything for which none is.
     pub is_speculative: bool,
-    /// How likely its path is, in (0, 1].
+    /// By what it is served now, in seconds: the longest remaining path, or what was advised before.
+    pub urgency_s: f64,
+    /// How likely its path is, in (0, 1]; what is speculative is served by its urgency times this.
     pub probability: f64,
 }
 

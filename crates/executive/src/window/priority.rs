@@ -240,6 +240,7 @@ impl Window {
                 duration_s: (f64::from(instance.duration_s) - elapsed_s).max(0.0),
                 is_running: runs,
                 is_speculative: self.is_speculative(instance.segment),
+                urgency_s: f64::from(instance.remaining_s),
                 probability: f64::from(self.probability(instance.segment)),
                 demands: blocks.map(|r| (r.kind.clone(), r.count)).collect(),
                 after,

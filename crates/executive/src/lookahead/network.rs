@@ -1,0 +1,178 @@
+//! A problem as numbers: what the inner loop of a look-ahead works on.
+
+use super::problem::{Problem, ProblemError};
+use std::collections::BTreeMap;
+
+/// A task, as its place in [`Problem::tasks`].
+pub(super) type Place = u32;
+
+pub(super) const NANOSECONDS: f64 = 1e9;
+/// A task takes at most this long: a hundred years add up without overflow.
+const LONGEST_S: f64 = 1e8;
+
+/// Lists of numbers, one per task, in one piece.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Lists<T> {
+    bounds: Vec<u32>,
+    items: Vec<T>,
+}
+
+impl<T> Lists<T> {
+    fn of(lists: impl Iterator<Item = Vec<T>>) -> Lists<T> {
+        let (mut bounds, mut items) = (vec![0], Vec::new());
+        for list in lists {
+            items.extend(list);
+            bounds.push(items.len() as u32);
+        }
+        Lists { bounds, items }
+    }
+
+    /// The list of a task.
+    pub(super) fn of_place(&self, place: Place) -> &[T] {
+        let at = place as usize;
+        &self.items[self.bounds[at] as usize..self.bounds[at + 1] as usize]
+    }
+}
+
+/// What one task takes of one kind.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Demand {
+    /// The kind, as an index.
+    pub(super) kind: u32,
+    pub(super) units: u32,
+}
+
+/// A compiled problem.
+#[derive(Debug, Clone)]
+pub(super) struct Network {
+    /// In nanoseconds.
+    pub(super) durations: Vec<u64>,
+    pub(super) is_running: Vec<bool>,
+    pub(super) is_speculative: Vec<bool>,
+    pub(super) demands: Lists<Demand>,
+    pub(super) before: Lists<Place>,
+    pub(super) behind: Lists<Place>,
+    /// Units per kind.
+    pub(super) capacity: Vec<u32>,
+    /// In nanoseconds, with its own duration; plain dispatch goes by it.
+    pub(super) remaining: Vec<u64>,
+}
+
+impl Network {
+    pub(super) fn of(problem: &Problem) -> Result<Network, ProblemError> {
+        let size = problem.tasks.len();
+        let mut kinds: BTreeMap<&str, u32> = BTreeMap::new();
+        for (number, kind) in problem.capacity.keys().enumerate() {
+            kinds.insert(kind, number as u32);
+        }
+        let capacity: Vec<u32> = problem.capacity.values().copied().collect();
+        let mut behind = vec![Vec::new(); size];
+        for (place, task) in problem.tasks.iter().enumerate() {
+            let (instance, duration_s, probability) = (task.instance, task.duration_s, task.probability);
+            let is_number = (0.0..=LONGEST_S).contains(&duration_s) && probability > 0.0 && probability <= 1.0;
+            if !is_number {
+                return Err(ProblemError::Number { instance, duration_s, probability });
+            }
+            for after in &task.after {
+                let Some(list) = behind.get_mut(*after) else {
+                    return Err(ProblemError::Unknown { instance, after: *after, tasks: size });
+                };
+                list.push(place as Place);
+            }
+        }
+        let demands = |task: &super::problem::Task| {
+            let mut units: BTreeMap<u32, u32> = BTreeMap::new();
+            for (kind, count) in &task.demands {
+                if let Some(kind) = kinds.get(kind.as_str()) {
+                    *units.entry(*kind).or_default() += count;
+                }
+            }
+            // More than there is can never be granted; the executive hears of that otherwise.
+            units.into_iter().map(|(kind, units)| Demand { kind, units: units.min(capacity[kind as usize]) }).collect()
+        };
+        let mut network = Network {
+            durations: problem.tasks.iter().map(|task| (task.duration_s * NANOSECONDS).round() as u64).collect(),
+            is_running: problem.tasks.iter().map(|task| task.is_running).collect(),
+            is_speculative: problem.tasks.iter().map(|task| task.is_speculative).collect(),
+            demands: Lists::of(problem.tasks.iter().map(demands)),
+            before: Lists::of(problem.tasks.iter().map(|t| t.after.iter().map(|at| *at as Place).collect())),
+            behind: Lists::of(behind.into_iter()),
+            remaining: vec![0; size],
+            capacity,
+        };
+        match network.measure() {
+            Some(in_a_circle) => Err(ProblemError::Circular { instance: problem.tasks[in_a_circle as usize].instance }),
+            None => Ok(network),
+        }
+    }
+
+    /// No schedule ends earlier, in nanoseconds: by the longest path, and by what each kind has to do, with the shortest way there
+    /// and from there on.
+    pub(super) fn bound(&self) -> u64 {
+        let places = || 0..self.len() as Place;
+        let heads = self.heads();
+        let path = places().map(|place| heads[place as usize] + self.remaining[place as usize]).max().unwrap_or(0);
+        let (mut work, mut head, mut tail) = (
+            vec![0_u128; self.capacity.len()],
+            vec![u64::MAX; self.capacity.len()],
+            vec![u64::MAX; self.capacity.len()],
+        );
+        for place in places() {
+            let at = place as usize;
+            for demand in self.demands.of_place(place) {
+                let kind = demand.kind as usize;
+                work[kind] += u128::from(self.durations[at]) * u128::from(demand.units);
+                head[kind] = head[kind].min(heads[at]);
+                tail[kind] = tail[kind].min(self.remaining[at] - self.durations[at]);
+            }
+        }
+        let loads = (0..self.capacity.len()).filter(|kind| work[*kind] > 0).map(|kind| {
+            let busy = work[kind].div_ceil(u128::from(self.capacity[kind].max(1)));
+            u64::try_from(busy).unwrap_or(u64::MAX).saturating_add(head[kind]).saturating_add(tail[kind])
+        });
+        loads.max().unwrap_or(0).max(path)
+    }
+
+    /// The longest path to each, without its own duration.
+    fn heads(&self) -> Vec<u64> {
+        let mut heads = vec![0; self.len()];
+        let mut open: Vec<u32> = (0..self.len()).map(|at| self.before.of_place(at as Place).len() as u32).collect();
+        let mut next: Vec<Place> = (0..self.len() as Place).filter(|place| open[*place as usize] == 0).collect();
+        while let Some(place) = next.pop() {
+            let end = heads[place as usize] + self.durations[place as usize];
+            for behind in self.behind.of_place(place) {
+                let at = *behind as usize;
+                heads[at] = heads[at].max(end);
+                open[at] -= 1;
+                if open[at] == 0 {
+                    next.push(*behind);
+                }
+            }
+        }
+        heads
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.durations.len()
+    }
+
+    /// Remaining paths, from the last tasks on; a task that waits for itself, if there is one.
+    fn measure(&mut self) -> Option<Place> {
+        let size = self.len();
+        let mut open: Vec<u32> = (0..size).map(|at| self.behind.of_place(at as Place).len() as u32).collect();
+        let mut next: Vec<Place> = (0..size as Place).filter(|place| open[*place as usize] == 0).collect();
+        let mut measured = 0;
+        while let Some(place) = next.pop() {
+            measured += 1;
+            let behind = self.behind.of_place(place).iter().map(|after| self.remaining[*after as usize]);
+            self.remaining[place as usize] = self.durations[place as usize] + behind.max().unwrap_or(0);
+            for before in self.before.of_place(place) {
+                open[*before as usize] -= 1;
+                if open[*before as usize] == 0 {
+                    next.push(*before);
+                }
+            }
+        }
+        if measured == size { None } else { (0..size as Place).find(|place| open[*place as usize] > 0) }
+    }
+}
