@@ -4,7 +4,7 @@
 //! one job after the other, as its sequential program would do them; how well CDTN mode interleaves them is a measure
 //! of its dispatch, on instances that nobody here has made.
 
-use crate::run::{Answer, Oracle, Performance, Run, RunError, Setup, run};
+use crate::run::{Answer, Oracle, Performance, Run, RunError, Setup, run_looking_ahead};
 use ratn_executive::protocol::{Goal, Mode};
 use ratn_model::expression::Expr;
 use ratn_model::id::StateId;
@@ -181,11 +181,11 @@ impl JobShop {
         }
     }
 
-    /// Executes the task in CDTN mode.
+    /// Executes the task in CDTN mode, with a look ahead at so many orders whenever much has changed; none is plain dispatch.
     ///
     /// # Errors
-    /// As [`run`].
-    pub fn execute(&self, seed: u64) -> Result<Run, RunError> {
+    /// As [`crate::run::run`].
+    pub fn execute(&self, orders: usize, seed: u64) -> Result<Run, RunError> {
         let setup = Setup {
             program: Arc::new(self.program()),
             mode: Mode::Cdtn,
@@ -196,7 +196,7 @@ impl JobShop {
             tolerance: Tolerance::EXACT,
             latency: Duration::ZERO,
         };
-        run(setup, &mut Machines)
+        run_looking_ahead(setup, &mut Machines, orders)
     }
 }
 
@@ -254,7 +254,7 @@ mod tests {
     #[test]
     fn operations_of_a_job_follow_each_other_and_a_machine_has_one_at_a_time() {
         let shop = JobShop::parse("2 2\n0 3 1 2\n0 2 1 4\n").unwrap();
-        let run = shop.execute(1).unwrap();
+        let run = shop.execute(0, 1).unwrap();
         assert_eq!((run.outcome.as_str(), run.end_s), ("success", 8.0), "job 1 first: its rest is longer");
     }
 }

@@ -3,6 +3,7 @@
 
 use crate::random::Dice;
 use ratn_executive::executive::Executive;
+use ratn_executive::lookahead::{Lookout, Problem, Search};
 use ratn_executive::protocol::{Command, Event, Goal, Learned, LogEntry, LogLine, Mode, Origin};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
@@ -142,6 +143,15 @@ struct Simulation<'a> {
 /// # Errors
 /// [`RunError`] where a core breaks a promise: the run gets stuck, never ends, or an invariant fails.
 pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
+    run_looking_ahead(setup, oracle, 0)
+}
+
+/// As [`run`]; whenever much of the window has changed, so many orders of what is still to be done are simulated, and the
+/// executive is advised of one that is better than its own. None is plain dispatch.
+///
+/// # Errors
+/// As [`run`].
+pub fn run_looking_ahead(setup: Setup, oracle: &mut dyn Oracle, orders: usize) -> Result<Run, RunError> {
     let mut root = World::default();
     let initial: Vec<Change> =
         setup.world.iter().map(|(fact, value)| Change::Set { fact: fact.clone(), value: value.clone() }).collect();
@@ -181,6 +191,7 @@ pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
         end: None,
     };
     let mut executive = Executive::new(setup.program.clone(), setup.tolerance);
+    let mut lookout = Lookout::default();
     simulation.at(
         Duration::ZERO,
         Event::Started {
@@ -201,10 +212,20 @@ pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
             return Err(RunError::Stuck { at_s: simulation.now.seconds(), waits: executive.explain() });
         };
         simulation.now = now;
-        simulation.log.push(LogLine { at: now, entry: LogEntry::Event(event.clone()) });
-        for command in executive.handle(now, event) {
-            simulation.log.push(LogLine { at: now, entry: LogEntry::Command(command.clone()) });
-            simulation.perform(command)?;
+        let mut next = Some(event);
+        while let Some(event) = next.take() {
+            simulation.log.push(LogLine { at: now, entry: LogEntry::Event(event.clone()) });
+            let commands = executive.handle(now, event);
+            lookout.observe(&commands);
+            for command in commands {
+                simulation.log.push(LogLine { at: now, entry: LogEntry::Command(command.clone()) });
+                simulation.perform(command)?;
+            }
+            if orders > 0 && lookout.is_due() && simulation.end.is_none() {
+                let outlook = executive.outlook(now);
+                lookout.looks(outlook.tasks.len());
+                next = advice(&outlook, orders, setup.seed);
+            }
         }
         simulation.check(&executive)?;
         if let Some((outcome, outputs, reason)) = simulation.end.take() {
@@ -214,6 +235,15 @@ pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
         }
     }
     Err(RunError::Endless(MAX_EVENTS))
+}
+
+/// A better order than the executive's own, if so many tries find one.
+fn advice(outlook: &Problem, orders: usize, seed: u64) -> Option<Event> {
+    // What cannot be planned goes as it goes.
+    let mut search = Search::new(outlook, seed).ok()?;
+    search.step(orders);
+    let advice = search.best();
+    (advice.end_s < advice.plain_s).then_some(Event::Advised { urgency_s: advice.urgency_s })
 }
 
 impl Simulation<'_> {

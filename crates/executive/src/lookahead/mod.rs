@@ -6,14 +6,17 @@
 //! that simulation. It never advises anything worse than the longest remaining path.
 //!
 //! Pure and anytime: a shell runs [`Search::step`] in a thread while the robot moves, a simulation with a fixed number of
-//! steps. It owns a copy of what it plans ([`Problem`]) and knows nothing of the executive's state.
+//! steps; [`Lookout`] says when it is worth it. It owns a copy of what it plans ([`Problem`], from
+//! [`crate::executive::Executive::outlook`]) and knows nothing of the executive's state.
 
 mod dice;
+mod lookout;
 mod network;
 mod problem;
 mod rollout;
 mod search;
 
+pub use lookout::Lookout;
 pub use problem::{Problem, ProblemError, Task};
 pub use search::{Advice, Search};
 
