@@ -29,6 +29,8 @@ pub(crate) enum Command {
     Report(ReportArguments),
     /// Replay the paper's tables in virtual time
     Tables(TablesArguments),
+    /// Run a scheduling problem of the literature in virtual time, as a task, and compare with the best known schedule
+    Simulate(SimulateArguments),
     /// Own the resources: who has what, and who waits (host compute)
     ResourceManager(RoleArguments),
     /// Hold the root world model and its projections (host compute)
@@ -141,6 +143,25 @@ pub(crate) struct TablesArguments {
     /// Write a Gantt chart of every run into this folder
     #[arg(long, value_name = "DIR")]
     pub(crate) gantt: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct SimulateArguments {
+    /// A job shop: a line with the numbers of jobs and machines, then per job a line of pairs of machine and duration
+    #[arg(long, value_name = "FILE")]
+    pub(crate) jobshop: PathBuf,
+    /// The best makespan known; of well-known instances it is known
+    #[arg(long, value_name = "N", value_parser = makespan)]
+    pub(crate) best: Option<f64>,
+    /// Orders to look at whenever much of what is to be done has changed; 0 for plain dispatch
+    #[arg(long, value_name = "N", default_value_t = ratn_simulation::jobshop::DEFAULT_ORDERS)]
+    pub(crate) orders: usize,
+    /// What every random choice is derived from
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub(crate) seed: u64,
+    /// Print one JSON document on standard output
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -268,6 +289,13 @@ fn speed(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(x) if (SLOWEST..=FASTEST).contains(&x) => Ok(x),
         _ => Err(format!("expected a number from {SLOWEST} to {FASTEST}")),
+    }
+}
+
+fn makespan(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(makespan) if makespan > 0.0 && makespan.is_finite() => Ok(makespan),
+        _ => Err("expected a number greater than 0".to_owned()),
     }
 }
 

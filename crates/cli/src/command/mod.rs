@@ -6,6 +6,7 @@ mod demo;
 mod report;
 mod roles;
 mod run;
+mod simulate;
 mod tables;
 mod up;
 
@@ -29,6 +30,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Control(arguments) => control::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
+        Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Tables(arguments) => tables::run(&arguments),
         Command::ResourceManager(arguments) => roles::resource_manager(&arguments),
         Command::WorldPool(arguments) => roles::world_pool(&arguments),

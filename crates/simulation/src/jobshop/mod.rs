@@ -4,6 +4,12 @@
 //! one job after the other, as its sequential program would do them; how well CDTN mode interleaves them is a measure
 //! of its dispatch, on instances that nobody here has made.
 
+mod best_known;
+mod format;
+
+pub use best_known::best_known;
+pub use format::{InvalidJobShop, MAX_OPERATIONS};
+
 use crate::run::{Answer, Oracle, Performance, Run, RunError, Setup, run_looking_ahead};
 use ratn_executive::protocol::{Goal, Mode};
 use ratn_model::expression::Expr;
@@ -19,35 +25,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// No instance has more operations.
-const MAX_OPERATIONS: usize = 10_000;
-
-/// Published makespans: proven optima.
-const BEST_KNOWN: [(&str, f64); 23] = [
-    ("ft06", 55.0),
-    ("ft10", 930.0),
-    ("ft20", 1165.0),
-    ("la01", 666.0),
-    ("la02", 655.0),
-    ("la03", 597.0),
-    ("la04", 590.0),
-    ("la05", 593.0),
-    ("la06", 926.0),
-    ("la07", 890.0),
-    ("la08", 863.0),
-    ("la09", 951.0),
-    ("la10", 958.0),
-    ("la11", 1222.0),
-    ("la12", 1039.0),
-    ("la13", 1150.0),
-    ("la14", 1292.0),
-    ("la15", 1207.0),
-    ("la16", 945.0),
-    ("la17", 784.0),
-    ("la18", 848.0),
-    ("la19", 842.0),
-    ("la20", 902.0),
-];
+/// Orders that are looked at whenever much has changed, unless told otherwise.
+pub const DEFAULT_ORDERS: usize = 10_000;
 
 /// An instance.
 #[derive(Debug, Clone, PartialEq)]
@@ -58,78 +37,7 @@ pub struct JobShop {
     pub jobs: Vec<Vec<(usize, f64)>>,
 }
 
-/// A text that is no instance.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("line {line}: {problem}")]
-pub struct InvalidJobShop {
-    /// Which line, from 1.
-    pub line: usize,
-    /// What is wrong, and what to write instead.
-    pub problem: String,
-}
-
-/// The best makespan published for an instance of that name.
-pub fn best_known(instance: &str) -> Option<f64> {
-    BEST_KNOWN.iter().find(|(name, _)| *name == instance).map(|(_, best)| *best)
-}
-
 impl JobShop {
-    /// Reads the standard format: a line with the numbers of jobs and machines, then a line per job with pairs of
-    /// machine (from 0) and duration. Lines that begin with `#` or with a letter, and empty ones, are comments.
-    ///
-    /// # Errors
-    /// [`InvalidJobShop`] names the first line that does not fit.
-    pub fn parse(text: &str) -> Result<JobShop, InvalidJobShop> {
-        let is_comment = |line: &str| line.is_empty() || !line.starts_with(|c: char| c.is_ascii_digit() || c == '-');
-        let mut lines = text.lines().enumerate().map(|(i, line)| (i + 1, line.trim())).filter(|(_, l)| !is_comment(l));
-        let wrong = |line: usize, problem: String| InvalidJobShop { line, problem };
-        let Some((line, first)) = lines.next() else {
-            return Err(wrong(1, "there is no line with the numbers of jobs and machines".to_owned()));
-        };
-        let numbers: Vec<usize> = first.split_whitespace().map_while(|word| word.parse().ok()).collect();
-        let [jobs, machines, ..] = numbers.as_slice() else {
-            return Err(wrong(line, format!("expected the numbers of jobs and machines, found `{first}`")));
-        };
-        let (count, machines) = (*jobs, *machines);
-        if count == 0 || machines == 0 || count.saturating_mul(machines) > MAX_OPERATIONS {
-            let problem = format!(
-                "{count} jobs on {machines} machines; both at least 1, and {MAX_OPERATIONS} operations at most"
-            );
-            return Err(wrong(line, problem));
-        }
-        let mut jobs = Vec::new();
-        for (line, text) in lines {
-            if jobs.len() == count {
-                return Err(wrong(line, format!("this is the line of a job, and there are {count} already")));
-            }
-            let words: Vec<&str> = text.split_whitespace().collect();
-            if words.is_empty() || words.len() % 2 == 1 {
-                return Err(wrong(
-                    line,
-                    format!("expected pairs of machine and duration, found {} numbers", words.len()),
-                ));
-            }
-            let mut operations = Vec::new();
-            for pair in words.chunks(2) {
-                let machine = pair[0].parse::<usize>().ok().filter(|machine| *machine < machines);
-                let Some(machine) = machine else {
-                    return Err(wrong(line, format!("`{}` is no machine: they are 0 to {}", pair[0], machines - 1)));
-                };
-                let duration = pair[1].parse::<f64>().ok().filter(|d| d.is_finite() && *d >= 0.0);
-                let Some(duration) = duration else {
-                    return Err(wrong(line, format!("`{}` is no duration", pair[1])));
-                };
-                operations.push((machine, duration));
-            }
-            jobs.push(operations);
-        }
-        if jobs.len() < count {
-            let problem = format!("{count} jobs are announced and {} are there", jobs.len());
-            return Err(wrong(text.lines().count(), problem));
-        }
-        Ok(JobShop { machines, jobs })
-    }
-
     /// The instance as a task.
     pub fn program(&self) -> Program {
         let operations: usize = self.jobs.iter().map(Vec::len).sum();
@@ -239,22 +147,22 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
     use super::*;
-
-    #[test]
-    fn what_is_no_instance_is_refused_with_its_line() {
-        let refusal = |text: &str| JobShop::parse(text).unwrap_err().to_string();
-        assert_eq!(refusal(""), "line 1: there is no line with the numbers of jobs and machines");
-        assert_eq!(refusal("# a comment\n2 2\n0 1 1 2\n0 1 2 2\n"), "line 4: `2` is no machine: they are 0 to 1");
-        assert_eq!(refusal("1 1\n0 1\n0 1\n"), "line 3: this is the line of a job, and there are 1 already");
-        assert_eq!(refusal("2 1\n0 1\n"), "line 2: 2 jobs are announced and 1 are there");
-        assert_eq!(refusal("1 1\n0 x\n"), "line 2: `x` is no duration");
-        assert_eq!(refusal("1 1\n0 1 0\n"), "line 2: expected pairs of machine and duration, found 3 numbers");
-    }
+    use ratn_executive::protocol::{Event, LogEntry, LogLine};
 
     #[test]
     fn operations_of_a_job_follow_each_other_and_a_machine_has_one_at_a_time() {
         let shop = JobShop::parse("2 2\n0 3 1 2\n0 2 1 4\n").unwrap();
         let run = shop.execute(0, 1).unwrap();
         assert_eq!((run.outcome.as_str(), run.end_s), ("success", 8.0), "job 1 first: its rest is longer");
+    }
+
+    #[test]
+    fn what_a_look_ahead_promises_is_what_the_run_takes() {
+        let shop = JobShop::parse(include_str!("../../../../tests/jobshop/ft06.txt")).unwrap();
+        let plain = shop.execute(0, 1).unwrap();
+        let ahead = shop.execute(1000, 1).unwrap();
+        assert!(ahead.end_s < plain.end_s && ahead.end_s >= 55.0, "{} after {}", ahead.end_s, plain.end_s);
+        let advice = |line: &LogLine| matches!(line.entry, LogEntry::Event(Event::Advised { .. }));
+        assert!(ahead.log.iter().any(advice) && !plain.log.iter().any(advice));
     }
 }
