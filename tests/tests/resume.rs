@@ -127,7 +127,7 @@ fn a_motion_whose_lease_has_ended_is_not_repeated() -> anyhow::Result<()> {
     run.process()?.kill()?;
     wait_for("the motion to stop", || {
         let record = std::fs::read_to_string(place.path().join("run/cell.log"))?;
-        Ok((record.contains("ended") && record.contains("lease")).then_some(()))
+        Ok(record.contains("ended goal=").then_some(()))
     })?;
 
     let output = place.ratn(&["run", "--resume", file]).output()?;

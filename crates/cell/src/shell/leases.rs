@@ -115,6 +115,7 @@ impl LeaseWatch<'_> {
 
     /// The core stops first; the goal's outcome follows.
     async fn ended(&self, lease: LeaseId, reason: &str) {
+        self.server.lease_has_ended(lease, reason);
         self.tell(Event::LeaseEnded { lease, reason: reason.to_owned() }).await;
         self.server.end_lease(lease, reason);
     }

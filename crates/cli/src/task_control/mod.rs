@@ -1,5 +1,6 @@
 //! Task control: the shell around the executive. Performs its commands over gRPC and brings the answers back as events.
 
+mod advisor;
 pub(crate) mod control;
 pub(crate) mod learn;
 mod ledger;

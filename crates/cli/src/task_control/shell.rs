@@ -4,6 +4,7 @@
 //! the whole story of the run, and a run whose task control was killed goes on from it ([`resume`]).
 
 use super::Endpoints;
+use super::advisor::{self, Advisor};
 use super::control::Control;
 use super::log::LogWriter;
 use super::performer::{self, Performer};
@@ -12,7 +13,7 @@ use super::replay::{self, ReplayError, Replayed, VERSION};
 use crate::interrupt::Interrupt;
 use anyhow::{Context, bail};
 use ratn_executive::executive::Executive;
-use ratn_executive::protocol::{Command, Event, Learned, LogLine, Mode, Origin};
+use ratn_executive::protocol::{Command, Event, Learned, LogEntry, LogLine, Mode, Origin};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Exceptions, Nature, Program, SUCCESS, State, StateKind};
@@ -24,7 +25,7 @@ use ratn_world::tolerance::Tolerance;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use tokio::sync::mpsc;
 
 /// Answers that the executive has not been given yet.
@@ -61,6 +62,8 @@ pub(crate) struct Place {
 /// A run to go on with, as its log has it.
 pub(crate) struct Resumption {
     program: Arc<Program>,
+    mode: Mode,
+    seed: u64,
     replayed: Replayed,
     progress: Progress,
     log: LogWriter,
@@ -76,7 +79,11 @@ impl Resumption {
         let replayed = replay::replay(&program, lines)?;
         let mut progress = Progress::new(false);
         progress.catch_up(lines);
-        Ok(Resumption { program, replayed, progress, log })
+        let (mode, seed) = match lines.first().map(|line| &line.entry) {
+            Some(LogEntry::Event(Event::Started { mode, seed, .. })) => (*mode, *seed),
+            _ => (Mode::Hsm, 0),
+        };
+        Ok(Resumption { program, mode, seed, replayed, progress, log })
     }
 }
 
@@ -109,6 +116,8 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
         log,
         clock: RobotClock::start(place.speed),
         control: Control::listen_if_possible(&place.directory),
+        advisor: advisor_of(run.mode, run.seed),
+        ask_at: None,
         performer,
         answers,
     };
@@ -145,7 +154,7 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
 /// As [`run`]; and where the run cannot go on: its log is of another program, its world is not there any more, another run is
 /// under way.
 pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
-    let Resumption { program, replayed, progress, log } = resumption;
+    let Resumption { program, mode, seed, replayed, progress, log } = resumption;
     let Replayed { executive, mut ledger, missing, states } = replayed;
     performer::check_world(&place.endpoints, &ledger, executive.root()).await?;
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
@@ -159,6 +168,8 @@ pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &In
         log,
         clock: RobotClock::going_on(replay::now(&ledger, unix_ms(), place.speed), place.speed),
         control: Control::listen_if_possible(&place.directory),
+        advisor: advisor_of(mode, seed),
+        ask_at: None,
         performer: performer.context("cannot go on with the run")?,
         answers,
     };
@@ -185,6 +196,10 @@ struct Shell {
     progress: Progress,
     clock: RobotClock,
     control: Option<Control>,
+    /// None in HSM mode, which has one order only.
+    advisor: Option<Advisor>,
+    /// When the advisor may be asked, where something has changed since it was.
+    ask_at: Option<Instant>,
     performer: Performer,
     answers: mpsc::Receiver<performer::Answer>,
 }
@@ -235,6 +250,9 @@ impl Shell {
             self.log.make_durable()?;
         }
         self.progress.follow(now, &event, &commands);
+        if !commands.is_empty() && !matches!(event, Event::Advised { .. }) {
+            self.ask_at.get_or_insert_with(|| Instant::now() + advisor::PAUSE);
+        }
         for command in commands {
             match command {
                 Command::Wake { at } => drop(self.timers.insert(at)),
@@ -245,6 +263,17 @@ impl Shell {
         Ok(None)
     }
 
+    /// What is still to be done may be done in a better order, while something runs.
+    fn ask_for_advice(&mut self) {
+        self.ask_at = None;
+        let outlook = self.executive.outlook(self.clock.now());
+        if let Some(advisor) = &self.advisor
+            && advisor::is_worth_asking(&outlook)
+        {
+            advisor.ask(outlook);
+        }
+    }
+
     /// The next event that the executive has to know of.
     async fn next(&mut self, interrupt: &Interrupt, asked_to_abort: &mut bool) -> anyhow::Result<Event> {
         loop {
@@ -252,6 +281,19 @@ impl Shell {
             let due = async {
                 match timer {
                     Some(at) => tokio::time::sleep(self.clock.until(at)).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let ask_at = self.ask_at.filter(|_| self.advisor.is_some());
+            let to_ask = async {
+                match ask_at {
+                    Some(at) => tokio::time::sleep_until(at.into()).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let advised = async {
+                match &mut self.advisor {
+                    Some(advisor) => advisor.told().await,
                     None => std::future::pending().await,
                 }
             };
@@ -265,6 +307,11 @@ impl Shell {
                 answer = self.answers.recv() => answer.context("nothing can answer any more")?,
                 () = due => return Ok(Event::Woken),
                 event = told => return Ok(event),
+                event = advised => return Ok(event),
+                () = to_ask => {
+                    self.ask_for_advice();
+                    continue;
+                }
                 () = interrupt.asked_times(1), if !*asked_to_abort => {
                     *asked_to_abort = true;
                     return Ok(Event::AbortRequested { reason: "the user asked for it".into() });
@@ -289,6 +336,14 @@ fn ended(command: Command, now: Timestamp) -> Option<Ended> {
             Some(Ended { outcome, outputs, reason, makespan_s: now.seconds() })
         }
         _ => None,
+    }
+}
+
+/// Whoever looks for a better order, where there is more than one. A run goes on without.
+fn advisor_of(mode: Mode, seed: u64) -> Option<Advisor> {
+    match mode {
+        Mode::Hsm => None,
+        Mode::Cdtn => Advisor::start(seed).inspect_err(|error| tracing::warn!(%error, "nobody looks ahead")).ok(),
     }
 }
 

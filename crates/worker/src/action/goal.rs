@@ -112,8 +112,13 @@ impl GoalEntry {
 
     /// Tells it to stop; the first cause counts.
     pub(crate) fn stop(&self, cause: StopCause) {
-        self.cause.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(cause);
+        self.blame(cause);
         self.cancelled.cancel();
+    }
+
+    /// Why it ends, if it ends without success.
+    pub(crate) fn blame(&self, cause: StopCause) {
+        self.cause.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(cause);
     }
 
     pub(crate) fn is_over(&self) -> bool {

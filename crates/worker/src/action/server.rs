@@ -123,6 +123,14 @@ impl ActionServer {
         self.stop_where(|goal| goal.lease == Some(lease), &StopCause::LeaseEnded(reason.to_owned()))
     }
 
+    /// A lease has ended, and whoever moves may find that out before [`ActionServer::end_lease`] says so: the goals under it that
+    /// fail from now on fail because of that.
+    pub fn lease_has_ended(&self, lease: LeaseId, reason: &str) {
+        let state = self.inner.state();
+        let cause = StopCause::LeaseEnded(reason.to_owned());
+        state.running.iter().filter(|goal| goal.lease == Some(lease)).for_each(|goal| goal.blame(cause.clone()));
+    }
+
     /// Ends with the process: tells every goal to stop, and returns when all have ended. Their clients hear what they would
     /// hear if the process had been killed, unless a goal made it in time: a crash of the attempt, not an outcome.
     pub async fn shut_down(&self) {

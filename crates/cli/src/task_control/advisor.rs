@@ -1,0 +1,183 @@
+//! Looks for a better order of what is ready, in one thread, while something runs: what the window still has to do goes in, and an
+//! advice comes out as an event where one was found. What is advised is in the log, so a replay needs no search.
+//!
+//! Bounded: one thread; a question replaces the one before it; each is thought about for [`THINKING`] at the most, and at most
+//! one is asked per [`PAUSE`]. Where the window does not change, nothing is thought about.
+
+use ratn_executive::lookahead::{Problem, Search};
+use ratn_executive::protocol::Event;
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
+
+/// Wall time for one question.
+const THINKING: Duration = Duration::from_millis(50);
+/// Wall time from one question to the next.
+pub(super) const PAUSE: Duration = Duration::from_millis(200);
+/// Orders that are simulated between two looks at the clock.
+const ORDERS: usize = 32;
+/// A gain below this share of what is left is not worth asking for everything again.
+const WORTHWHILE: f64 = 0.002;
+/// Advice that the run has not been told yet.
+const MAX_PENDING: usize = 2;
+
+/// The thread, and what lies on its desk.
+#[derive(Debug)]
+pub(super) struct Advisor {
+    desk: Arc<Desk>,
+    advice: mpsc::Receiver<Event>,
+}
+
+#[derive(Debug, Default)]
+struct Desk {
+    question: Mutex<Question>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct Question {
+    problem: Option<Problem>,
+    /// Nobody wants to know any more.
+    is_over: bool,
+}
+
+impl Advisor {
+    /// Begins to wait for questions. `seed` is what the search's choices are derived from.
+    ///
+    /// # Errors
+    /// Where there can be no further thread.
+    pub(super) fn start(seed: u64) -> std::io::Result<Advisor> {
+        let desk = Arc::new(Desk::default());
+        let (tell, advice) = mpsc::channel(MAX_PENDING);
+        let at_desk = Arc::clone(&desk);
+        std::thread::Builder::new().name("look-ahead".to_owned()).spawn(move || at_desk.work(seed, &tell))?;
+        Ok(Advisor { desk, advice })
+    }
+
+    /// Asks for a better order; the question before is forgotten.
+    pub(super) fn ask(&self, problem: Problem) {
+        self.desk.change(|question| question.problem = Some(problem));
+    }
+
+    /// The next advice.
+    pub(super) async fn told(&mut self) -> Event {
+        match self.advice.recv().await {
+            Some(event) => event,
+            None => std::future::pending().await,
+        }
+    }
+}
+
+impl Drop for Advisor {
+    fn drop(&mut self) {
+        self.desk.change(|question| question.is_over = true);
+    }
+}
+
+impl Desk {
+    fn change(&self, change: impl FnOnce(&mut Question)) {
+        change(&mut self.question.lock().unwrap_or_else(PoisonError::into_inner));
+        self.changed.notify_one();
+    }
+
+    /// Waits for a question; `None` when there will be none.
+    fn next(&self) -> Option<Problem> {
+        let question = self.question.lock().unwrap_or_else(PoisonError::into_inner);
+        let nothing = |question: &mut Question| question.problem.is_none() && !question.is_over;
+        let mut question = self.changed.wait_while(question, nothing).unwrap_or_else(PoisonError::into_inner);
+        if question.is_over { None } else { question.problem.take() }
+    }
+
+    fn has_news(&self) -> bool {
+        let question = self.question.lock().unwrap_or_else(PoisonError::into_inner);
+        question.is_over || question.problem.is_some()
+    }
+
+    fn work(&self, seed: u64, tell: &mpsc::Sender<Event>) {
+        let mut asked = 0;
+        while let Some(problem) = self.next() {
+            asked += 1;
+            if let Some(advice) = self.think(&problem, seed.wrapping_add(asked)) {
+                // Whoever is that far behind will ask again.
+                let _ = tell.try_send(advice);
+            }
+        }
+    }
+
+    /// A better order than the present one, if one is found in time and nobody asks for something else meanwhile.
+    fn think(&self, problem: &Problem, seed: u64) -> Option<Event> {
+        let mut search =
+            Search::new(problem, seed).inspect_err(|error| tracing::debug!(%error, "no look ahead")).ok()?;
+        let begun = Instant::now();
+        while !search.is_over() && begun.elapsed() < THINKING {
+            search.step(ORDERS);
+            if self.has_news() {
+                return None;
+            }
+        }
+        let best = search.best();
+        let is_worthwhile = best.end_s < best.plain_s * (1.0 - WORTHWHILE) && !best.urgency_s.is_empty();
+        is_worthwhile.then_some(Event::Advised { urgency_s: best.urgency_s })
+    }
+}
+
+/// Whether there is something to be gained: something runs, and two others want one kind of which there is a bounded number.
+pub(super) fn is_worth_asking(problem: &Problem) -> bool {
+    let waiting = || problem.tasks.iter().filter(|task| !task.is_running);
+    problem.tasks.iter().any(|task| task.is_running)
+        && problem.capacity.keys().any(|kind| {
+            let wants = |task: &&ratn_executive::lookahead::Task| task.demands.iter().any(|(of, _)| of == kind);
+            waiting().filter(wants).nth(1).is_some()
+        })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_executive::lookahead::Task;
+    use ratn_model::id::InstanceId;
+
+    fn task(id: u64, duration_s: f64, kind: &str, after: &[usize]) -> Task {
+        Task {
+            instance: InstanceId(id),
+            duration_s,
+            is_running: id == 0,
+            demands: vec![(kind.to_owned(), 1)],
+            after: after.to_vec(),
+            is_speculative: false,
+            urgency_s: 0.0,
+            probability: 1.0,
+        }
+    }
+
+    /// One arm is busy; then a short task that a long one waits for, and one that nobody waits for. Nothing is more urgent yet,
+    /// so it is served in program order: the idle one first.
+    fn problem() -> Problem {
+        let tasks = vec![
+            task(0, 1.0, "Arm", &[]),
+            task(1, 9.0, "Arm", &[]),
+            task(2, 1.0, "Arm", &[]),
+            task(3, 9.0, "Oven", &[2]),
+        ];
+        Problem { tasks, capacity: [("Arm".to_owned(), 1), ("Oven".to_owned(), 1)].into() }
+    }
+
+    #[tokio::test]
+    async fn a_better_order_is_advised() -> anyhow::Result<()> {
+        let mut advisor = Advisor::start(1)?;
+        assert!(is_worth_asking(&problem()));
+        advisor.ask(problem());
+        let Event::Advised { urgency_s } = advisor.told().await else { anyhow::bail!("no advice") };
+        let urgency = |id| urgency_s.iter().find(|(instance, _)| *instance == InstanceId(id)).map(|(_, s)| *s);
+        assert!(urgency(2) > urgency(1), "{urgency_s:?}");
+        Ok(())
+    }
+
+    #[test]
+    fn where_nothing_runs_or_nobody_competes_nothing_is_asked() {
+        let alone = Problem { tasks: vec![task(0, 1.0, "Arm", &[]), task(1, 1.0, "Arm", &[])], ..problem() };
+        assert!(!is_worth_asking(&alone));
+        let idle = Problem { tasks: problem().tasks.split_off(1), ..problem() };
+        assert!(!is_worth_asking(&Problem { tasks: idle.tasks[..2].to_vec(), ..problem() }));
+    }
+}
