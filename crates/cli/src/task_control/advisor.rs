@@ -2,7 +2,7 @@
 //! advice comes out as an event where one was found. What is advised is in the log, so a replay needs no search.
 //!
 //! Bounded: one thread; a question replaces the one before it; each is thought about for [`THINKING`] at the most, and at most
-//! one is asked per [`PAUSE`]. Where the window does not change, nothing is thought about.
+//! one is asked per [`PAUSE`], when enough has changed ([`ratn_executive::lookahead::Lookout`]).
 
 use ratn_executive::lookahead::{Problem, Search};
 use ratn_executive::protocol::Event;

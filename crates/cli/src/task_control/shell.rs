@@ -13,6 +13,7 @@ use super::replay::{self, ReplayError, Replayed, VERSION};
 use crate::interrupt::Interrupt;
 use anyhow::{Context, bail};
 use ratn_executive::executive::Executive;
+use ratn_executive::lookahead::Lookout;
 use ratn_executive::protocol::{Command, Event, Learned, LogEntry, LogLine, Mode, Origin};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::id::{InstanceId, StateId};
@@ -117,6 +118,7 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
         clock: RobotClock::start(place.speed),
         control: Control::listen_if_possible(&place.directory),
         advisor: advisor_of(run.mode, run.seed),
+        lookout: Lookout::default(),
         ask_at: None,
         performer,
         answers,
@@ -169,6 +171,7 @@ pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &In
         clock: RobotClock::going_on(replay::now(&ledger, unix_ms(), place.speed), place.speed),
         control: Control::listen_if_possible(&place.directory),
         advisor: advisor_of(mode, seed),
+        lookout: Lookout::default(),
         ask_at: None,
         performer: performer.context("cannot go on with the run")?,
         answers,
@@ -198,7 +201,9 @@ struct Shell {
     control: Option<Control>,
     /// None in HSM mode, which has one order only.
     advisor: Option<Advisor>,
-    /// When the advisor may be asked, where something has changed since it was.
+    /// Whether enough has changed since the advisor was asked.
+    lookout: Lookout,
+    /// When it may be asked again.
     ask_at: Option<Instant>,
     performer: Performer,
     answers: mpsc::Receiver<performer::Answer>,
@@ -250,7 +255,8 @@ impl Shell {
             self.log.make_durable()?;
         }
         self.progress.follow(now, &event, &commands);
-        if !commands.is_empty() && !matches!(event, Event::Advised { .. }) {
+        self.lookout.observe(&commands);
+        if self.lookout.is_due() {
             self.ask_at.get_or_insert_with(|| Instant::now() + advisor::PAUSE);
         }
         for command in commands {
@@ -270,6 +276,7 @@ impl Shell {
         if let Some(advisor) = &self.advisor
             && advisor::is_worth_asking(&outlook)
         {
+            self.lookout.looks(outlook.tasks.len());
             advisor.ask(outlook);
         }
     }
