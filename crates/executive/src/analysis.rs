@@ -190,14 +190,17 @@ fn reads(contained: &[&State], around: &[&State], requirements: &[ResourceExpr])
             (StateKind::Action { .. }, None) if !matches!(state.annotations.nature, Nature::Senses(_)) => return None,
             _ => {}
         }
-        if let StateKind::Condition { predicate: expression, .. } | StateKind::ForEach { collection: expression, .. } =
-            &state.kind
-        {
-            all.extend(expression.fact_expressions().into_iter().cloned());
-        }
-        if let StateKind::Sequence { outputs, .. } = &state.kind {
-            all.extend(outputs.iter().flat_map(|o| o.value.fact_expressions()).cloned());
-        }
+        let expressions: Vec<&Expr> = match &state.kind {
+            StateKind::Action { .. } => Vec::new(),
+            StateKind::Condition { predicate, .. } | StateKind::While { predicate, .. } => vec![predicate],
+            StateKind::ForEach { collection, .. } => vec![collection],
+            StateKind::Sequence { outputs, .. } => outputs.iter().map(|o| &o.value).collect(),
+            StateKind::Concurrency { decide, outputs, .. } => {
+                decide.iter().map(|(_, e)| e).chain(outputs.iter().map(|o| &o.value)).collect()
+            }
+        };
+        let boundary = state.variables.iter().chain(&state.assign).map(|(_, e)| e);
+        all.extend(expressions.into_iter().chain(boundary).flat_map(Expr::fact_expressions).cloned());
         all.extend(state.annotations.requires.iter().flat_map(Expr::fact_expressions).cloned());
     }
     for state in around {
@@ -216,8 +219,13 @@ fn start_flows(state: &State) -> Vec<StateId> {
         StateKind::Sequence { outputs, .. } => outputs.iter().for_each(|o| flows.extend(o.value.flows())),
         StateKind::ForEach { collection, .. } => flows.extend(collection.flows()),
         StateKind::Condition { predicate, .. } | StateKind::While { predicate, .. } => flows.extend(predicate.flows()),
-        StateKind::Concurrency { .. } => {}
+        StateKind::Concurrency { decide, outputs, .. } => {
+            decide.iter().for_each(|(_, e)| flows.extend(e.flows()));
+            outputs.iter().for_each(|o| flows.extend(o.value.flows()));
+        }
     }
+    let boundary = state.variables.iter().chain(&state.assign);
+    boundary.for_each(|(_, e)| flows.extend(e.flows()));
     state.annotations.requires.iter().for_each(|e| flows.extend(e.flows()));
     for resource in &state.annotations.resources {
         if !matches!(resource.operation, ResourceOperation::Create | ResourceOperation::Delete) {

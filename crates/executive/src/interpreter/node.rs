@@ -33,7 +33,12 @@ impl Interpreter {
         if let Some(thread) = self.threads.get_mut(&thread) {
             thread.current = Some(current);
         }
-        self.try_now(context, thread);
+        let state = context.program.state(id);
+        match self.with_scope(context, thread, None, |scope| binding::unmet(state, scope)) {
+            Ok(None) => self.try_now(context, thread),
+            Ok(Some(reason)) => self.end_node(context, thread, reason),
+            Err(error) => self.end_node(context, thread, error.reason()),
+        }
     }
 
     /// Begins a try, unless the operator holds it.

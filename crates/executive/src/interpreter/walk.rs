@@ -8,10 +8,13 @@ use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Program, SUCCESS, StateKind, Target};
 use ratn_model::value::Value;
 
+/// So many steps without an event between them go in circles.
+const MAX_STEPS: usize = 1_000_000;
+
 impl Interpreter {
     /// Lets every thread go on until all wait for events, or the state has ended.
     pub(super) fn advance(&mut self, context: &mut Context<'_>) -> Progress {
-        loop {
+        for _ in 0..MAX_STEPS {
             let ready = self.threads.iter().find(|(id, thread)| match &thread.todo {
                 Todo::Enter(..) | Todo::Ended { .. } | Todo::Iterate => true,
                 Todo::Busy => false,
@@ -30,6 +33,9 @@ impl Interpreter {
                 Todo::Done { outcome, reason } => return Progress::Ended { outcome, reason },
             }
         }
+        self.abort(context);
+        let reason = "the task goes in circles without doing anything".to_owned();
+        Progress::Ended { outcome: ABORTED.to_owned(), reason }
     }
 
     /// A state has ended, as far as its thread is concerned.
@@ -43,13 +49,13 @@ impl Interpreter {
         let program = context.program;
         let state = program.state(id);
         let path = path.unwrap_or_else(|| self.visit(thread, id, &state.name));
+        if let StateKind::Action { .. } = state.kind {
+            return self.begin(context, thread, id, &path);
+        }
         match self.with_scope(context, thread, None, |scope| binding::unmet(state, scope)) {
             Ok(None) => {}
             Ok(Some(reason)) => return self.ended(thread, id, ABORTED, format!("{path}: {reason}")),
             Err(error) => return self.ended(thread, id, ABORTED, format!("{path}: {}", error.reason())),
-        }
-        if let StateKind::Action { .. } = state.kind {
-            return self.begin(context, thread, id, &path);
         }
         self.forget_inside(program, id);
         let base = self.threads.get(&thread).map_or(0, |thread| thread.variables.len());

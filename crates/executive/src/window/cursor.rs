@@ -23,7 +23,7 @@ pub(crate) struct Cursor {
     pub(crate) because: Option<Arc<str>>,
     /// Steps since an instance came of one.
     pub(crate) idle: usize,
-    /// Cursors of the same probability grow in this order.
+    /// Cursors grow in this order.
     pub(crate) order: u64,
 }
 

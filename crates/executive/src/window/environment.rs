@@ -81,9 +81,12 @@ pub(crate) enum Binding {
     Assigned(Arc<Producer>),
 }
 
+/// Output ports that begin so are no ports: no port is called so.
+pub(crate) const ASSIGNED: char = '$';
+
 /// The output port under which an instance keeps what it assigns to a variable.
 pub(crate) fn assigned(variable: &str) -> String {
-    format!("${variable}")
+    format!("{ASSIGNED}{variable}")
 }
 
 impl Variables {

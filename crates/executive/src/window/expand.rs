@@ -38,7 +38,8 @@ impl Window {
             if !self.forks.is_empty() {
                 self.join_regions(context);
             }
-            if let [only] = self.cursors.as_slice()
+            if self.branches.is_empty()
+                && let [only] = self.cursors.as_slice()
                 && only.todo != Todo::Done
             {
                 while matches!(self.cursors.as_slice(), [only] if only.todo != Todo::Done)
@@ -70,16 +71,23 @@ impl Window {
         }
     }
 
-    /// The cursors that may grow as far as the speculation width goes, the likelier ones first.
-    fn awake(&self) -> Vec<usize> {
-        let mut all: Vec<usize> = (0..self.cursors.len()).collect();
-        let rank = |index: &usize| {
-            let cursor = &self.cursors[*index];
-            (self.is_speculative(cursor.segment), -(f64::from(cursor.probability) * 1e9) as i64, cursor.order)
-        };
-        all.sort_by_cached_key(rank);
-        let certain = all.iter().filter(|index| !self.is_speculative(self.cursors[**index].segment)).count();
-        all.truncate(certain + self.speculation_width);
+    /// The cursors on certain paths and on expanded branches. Branches are expanded, the likelier ones first, until there are
+    /// as many as the speculation width says.
+    fn awake(&mut self) -> Vec<usize> {
+        let mut expanded = self.branches.values().filter(|branch| branch.expanded).count();
+        while expanded < self.speculation_width {
+            let dormant = self.branches.iter().filter(|(_, branch)| !branch.expanded);
+            let likeliest = dormant.max_by(|(a, x), (b, y)| x.probability.total_cmp(&y.probability).then(b.cmp(a)));
+            let Some(segment) = likeliest.map(|(segment, _)| *segment) else { break };
+            if let Some(branch) = self.branches.get_mut(&segment) {
+                branch.expanded = true;
+            }
+            expanded += 1;
+        }
+        let mut all: Vec<usize> = (0..self.cursors.len())
+            .filter(|index| self.branches.get(&self.cursors[*index].segment).is_none_or(|branch| branch.expanded))
+            .collect();
+        all.sort_by_key(|index| self.cursors[*index].order);
         all
     }
 
@@ -388,19 +396,28 @@ impl Window {
         vague: bool,
         writes: &[Predicate],
     ) {
+        let producer = self.instances.get(instance).and_then(|i| i.producer.clone());
+        for predicate in writes {
+            let link = Link { writer: instance, outcome, vague };
+            self.cursors[index].environment.writers.set(*predicate, Some(link));
+        }
+        self.produce(index, producer, id, outcome);
+    }
+
+    /// Its outputs and what it assigns are seen from here on.
+    pub(super) fn produce(&mut self, index: usize, producer: Option<Arc<Producer>>, id: StateId, outcome: Outcome) {
         let plan = self.plan.clone();
         let own = plan.state(id);
-        let producer = self.instances.get(instance).and_then(|i| i.producer.clone());
         let environment = &mut self.cursors[index].environment;
-        for predicate in writes {
-            environment.writers.set(*predicate, Some(Link { writer: instance, outcome, vague }));
-        }
-        if let (Some(producer), true) = (producer, gives_outputs(&own.outcomes[outcome])) {
-            if own.is_read {
+        let good = gives_outputs(&own.outcomes[outcome]);
+        if let Some(producer) = producer {
+            if own.is_read && good {
                 environment.producers.set(id.0 as usize, Some(producer.clone()));
             }
-            for name in &own.assigns {
-                environment.variables.assign(name, Binding::Assigned(producer.clone()));
+            if good || own.is_routine {
+                for name in &own.assigns {
+                    environment.variables.assign(name, Binding::Assigned(producer.clone()));
+                }
             }
         }
     }
@@ -472,6 +489,7 @@ impl Window {
                 parent: template.segment,
                 decision: instance,
                 probability,
+                expanded: false,
                 members: Vec::new(),
             });
             if let Some(instance) = self.instances.get_mut(instance) {
@@ -528,8 +546,16 @@ impl Window {
             Role::Entry | Role::RegionEnd => true,
             _ => false,
         };
-        let linked = tail.and_then(|(tail, arm)| self.instances.get_mut(tail)?.arms.get_mut(arm));
-        let is_linked = linked.map(|arm| arm.next = Some(id)).is_some();
+        // The first of a line, and what follows one that others were let pass, is nobody's next in line.
+        let mut is_next = false;
+        if let Some((tail, arm)) = tail
+            && let Some(older) = self.instances.get_mut(tail)
+        {
+            is_next = older.role != Role::Fork && !older.detached;
+            if let Some(arm) = older.arms.get_mut(arm) {
+                arm.next = Some(id);
+            }
+        }
         let nature = match role {
             Role::Node => context.analysis.state(state.id).nature,
             _ => NodeNature::Computes,
@@ -576,7 +602,7 @@ impl Window {
             advised: false,
             asked_with: 0,
         });
-        if !is_linked && role != Role::Join {
+        if !is_next && role != Role::Join {
             self.set_head(line, Some(id));
         }
         let speculative = match self.branches.get_mut(&segment) {

@@ -230,7 +230,9 @@ impl Instance {
     /// Its outputs, if it has ended well.
     pub(crate) fn outputs(&self) -> Option<&Outputs> {
         let ended = self.ended.as_ref()?;
-        gives_outputs(&ended.outcome).then_some(&ended.outputs)
+        // How a region ended is known also where it ended badly.
+        let counts = self.role == Role::RegionEnd || gives_outputs(&ended.outcome);
+        counts.then_some(&ended.outputs)
     }
 
     /// Whether it is an action or routine that may change the environment.

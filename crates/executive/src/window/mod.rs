@@ -98,6 +98,9 @@ pub(crate) struct Window {
     grown_since_estimate: usize,
 }
 
+/// More instances than this in one event, beyond the horizon, go in circles.
+const MAX_INSTANCES_AT_ONCE: u64 = 10_000_000;
+
 /// The task's own line.
 const MAIN: Line = 0;
 
@@ -346,7 +349,11 @@ impl Window {
 
     /// Looks, retires and grows until nothing changes.
     fn settle(&mut self, context: &mut Context<'_>) -> Option<End> {
+        let newest = context.last_instance.saturating_add(MAX_INSTANCES_AT_ONCE);
         loop {
+            if *context.last_instance > newest {
+                self.stop(context, ABORTED, "the task goes in circles without doing anything".to_owned());
+            }
             while let Some(id) = self.queue.pop_front() {
                 if let Some(instance) = self.instances.get_mut(id) {
                     instance.queued = false;

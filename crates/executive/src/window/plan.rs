@@ -1,6 +1,7 @@
 //! What the window needs to know of every state before anything runs: where its outcomes lead, which of them are computed
 //! ahead, and which predicates and kinds of task resources it touches, as small numbers.
 
+use super::instance::gives_outputs;
 use crate::analysis::{Analysis, NodeNature};
 use crate::effects;
 use ratn_model::expression::{EffectExpr, Expr, FactExpr};
@@ -67,6 +68,8 @@ pub(crate) struct StatePlan {
     pub(crate) repeats: bool,
     /// An action or a routine: executed as one node.
     pub(crate) is_node: bool,
+    /// A composite state that is one node.
+    pub(crate) is_routine: bool,
     /// It has something to do when it is left by this outcome: [`StatePlan::outcomes`].
     pub(crate) exits: Outcomes,
     /// Younger PIAs may run beside it.
@@ -75,7 +78,7 @@ pub(crate) struct StatePlan {
     pub(crate) is_region: bool,
 }
 
-/// Outcomes that lead to the same place.
+/// Outcomes that lead to the same place and agree on whether there are outputs.
 #[derive(Debug, Clone)]
 pub(crate) struct ArmPlan {
     pub(crate) outcomes: Outcomes,
@@ -236,7 +239,11 @@ fn plan(
     };
     let mut arms: Vec<ArmPlan> = Vec::new();
     for number in (0..outcomes.len()).filter(|number| !exceptional(*number)) {
-        match arms.iter_mut().find(|arm| targets[arm.outcome] == targets[number]) {
+        let same = |arm: &&mut ArmPlan| {
+            targets[arm.outcome] == targets[number]
+                && gives_outputs(outcomes[arm.outcome]) == gives_outputs(outcomes[number])
+        };
+        match arms.iter_mut().find(same) {
             Some(arm) => {
                 arm.outcomes |= 1 << number;
                 arm.same_effects &= effects[arm.outcome] == effects[number];
@@ -321,6 +328,7 @@ fn plan(
         read_inside: Vec::new(),
         repeats,
         is_node,
+        is_routine,
         exits,
         imprecise: nature == NodeNature::Irreversible
             && state.annotations.exceptions.unwrap_or(program.exceptions) == Exceptions::Imprecise,

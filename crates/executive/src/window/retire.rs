@@ -150,17 +150,9 @@ impl Window {
             idle: 0,
             order: self.next_order,
         });
-        let plan = self.plan.clone();
-        let own = plan.state(state);
-        if let (Some(producer), true, true) = (producer, is_node, gives_outputs(&own.outcomes[outcome])) {
+        if is_node {
             let cursor = self.cursors.len() - 1;
-            let environment = &mut self.cursors[cursor].environment;
-            if own.is_read {
-                environment.producers.set(state.0 as usize, Some(producer.clone()));
-            }
-            for name in &own.assigns {
-                environment.variables.assign(name, super::environment::Binding::Assigned(producer.clone()));
-            }
+            self.produce(cursor, producer, state, outcome);
         }
         if let Some(thread) = self.threads.get_mut(&line) {
             thread.head = None;
@@ -260,7 +252,11 @@ impl Window {
         }
         if let (Some(producer), Some(ended)) = (&instance.producer, instance.ended) {
             let good = gives_outputs(&ended.outcome) || instance.role == Role::RegionEnd;
-            let _ = producer.real.set(if good { ended.outputs } else { Default::default() });
+            let mut outputs = ended.outputs;
+            if !good {
+                outputs.retain(|port, _| port.starts_with(super::environment::ASSIGNED));
+            }
+            let _ = producer.real.set(outputs);
         }
         Some((instance.line, instance.position, instance.detached))
     }

@@ -14,6 +14,8 @@ pub(crate) struct Branch {
     /// The instance that decides.
     pub(crate) decision: InstanceId,
     pub(crate) probability: f32,
+    /// It may be expanded: there are as many as the speculation width at most.
+    pub(crate) expanded: bool,
     pub(crate) members: Vec<InstanceId>,
 }
 

@@ -4,6 +4,7 @@
 //! The seed stands for run, path with visits, and try: with equal seeds, inputs and facts the result is the same.
 
 use super::Window;
+use super::environment::ASSIGNED;
 use super::instance::{Ended, Instance, Seen, Status, Wait};
 use crate::analysis::NodeNature;
 use crate::binding::{self, Outputs};
@@ -53,7 +54,12 @@ impl Window {
                 None => {}
             }
         }
-        if let Some(ended) = found {
+        if let Some(mut ended) = found {
+            // What it assigns may be made of what differs between the branches.
+            ended.outputs.retain(|port, _| !port.starts_with(ASSIGNED));
+            if let Err(problem) = self.assign(context, id, &mut ended) {
+                ended = Ended { changes: ended.changes, ..Ended::aborted(problem) };
+            }
             context.note(Note::Reused { instance: id });
             context.note(Note::Finished { instance: id, outcome: ended.outcome.to_string() });
             self.end_instance(id, ended);

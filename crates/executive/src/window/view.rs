@@ -59,6 +59,12 @@ impl<'a> Sight<'a> {
         View { sight: self, instance, outputs, depth: 0, blocker: Cell::new(None), used: RefCell::new(Vec::new()) }
     }
 
+    /// What a producer that has ended assigns to variables: a routine does also where it ends badly.
+    pub(crate) fn assigned_by(self, producer: &'a Producer) -> Option<&'a Outputs> {
+        let alive = || self.instances.get(producer.instance)?.ended.as_ref().map(|ended| &ended.outputs);
+        producer.real.get().or_else(alive)
+    }
+
     /// The outputs of a producer that has ended well.
     pub(crate) fn outputs_of(&self, producer: &'a Producer) -> Option<&'a Outputs> {
         producer.real.get().or_else(|| self.instances.get(producer.instance)?.outputs())
@@ -393,7 +399,13 @@ impl Scope for View<'_> {
         let environment = &self.instance.environment;
         match environment.variables.get(name) {
             Some(Binding::Known(value)) => Some(Cow::Borrowed(value)),
-            Some(Binding::Assigned(producer)) => self.produced(producer)?.get(&assigned(name)).map(Cow::Borrowed),
+            Some(Binding::Assigned(producer)) => {
+                let outputs = self.sight.assigned_by(producer);
+                if outputs.is_none() {
+                    self.blocker.set(Some(producer.instance));
+                }
+                outputs?.get(&assigned(name)).map(Cow::Borrowed)
+            }
             None => environment.loop_variables(self.sight.program).find(|(n, _)| *n == name).map(|(_, value)| value),
         }
     }
