@@ -120,6 +120,21 @@ pub(crate) struct CheckArguments {
     /// The system to check it against; without it the built-in default
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
+    /// Only check: leave out the simulation that says what keeps the task sequential
+    #[arg(long)]
+    pub(crate) no_simulation: bool,
+    /// Give a parameter of the task a value for the simulation, `boxes=3`; may be repeated
+    #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
+    pub(crate) set: Vec<(String, String)>,
+    /// How many elements a list has that an action answers, in the simulation
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u16).range(0..=100))]
+    pub(crate) elements: u16,
+    /// Take durations from event logs of earlier runs of the task, or folders of them
+    #[arg(long, value_name = "LOG", num_args = 1..)]
+    pub(crate) learn: Vec<PathBuf>,
+    /// Print one JSON document on standard output
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 #[derive(Debug, Clone, Args)]

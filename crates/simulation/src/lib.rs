@@ -7,5 +7,6 @@
 pub mod jobshop;
 pub mod random;
 pub mod run;
+pub mod sequential;
 pub mod tables;
 pub mod timed;

@@ -1,30 +1,148 @@
 //! `ratn check TASK`, and what `ratn run` does first.
 
+use super::tables::improvement;
 use crate::arguments::CheckArguments;
 use crate::failure::Failure;
 use crate::system::config::SystemConfig;
+use crate::task_control::learn;
 use crate::{input, output};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
+use ratn_model::parameters::ParameterError;
 use ratn_model::program::Program;
+use ratn_simulation::sequential::{Assumptions, Gain, Link, Sequential, sequential};
+use serde::Serialize;
 use std::path::Path;
 
-/// Says what is wrong with a task file.
+/// Of a longer chain the last states are shown; `--json` has all.
+const MAX_LINKS: usize = 40;
+
+/// What `--json` prints.
+#[derive(Debug, Serialize)]
+struct Checked<'a> {
+    /// The task's name; of a task that is refused, none.
+    task: Option<&'a str>,
+    findings: &'a [Diagnostic],
+    /// What keeps it sequential, unless it was left out or cannot be said.
+    sequential: Option<&'a Sequential>,
+    /// Why it cannot be said.
+    obstacle: Option<&'a str>,
+}
+
+/// Says what is wrong with a task file, and what keeps the task sequential.
 pub(crate) fn run(arguments: &CheckArguments) -> Result<(), Failure> {
     let config = SystemConfig::load(arguments.config.as_deref())?;
-    let program = load(&arguments.task, &config.catalogue)?;
+    let file = arguments.task.display().to_string();
+    let text = read(&arguments.task)?;
+    let loaded = match ratn_model::load::load(&text, &file, &config.catalogue) {
+        Ok(loaded) => loaded,
+        Err(findings) => {
+            if arguments.json {
+                let checked = Checked { task: None, findings: &findings, sequential: None, obstacle: None };
+                output::result(serde_json::to_string_pretty(&checked)?)?;
+            }
+            return Err(refused(&findings));
+        }
+    };
+    let (program, findings) = (loaded.program, loaded.warnings);
+    let simulated = if arguments.no_simulation { None } else { Some(simulate(&program, &config, arguments)?) };
+    if arguments.json {
+        let (sequential, obstacle) = match &simulated {
+            Some(Ok(sequential)) => (Some(sequential), None),
+            Some(Err(obstacle)) => (None, Some(obstacle.as_str())),
+            None => (None, None),
+        };
+        let checked = Checked { task: Some(&program.name), findings: &findings, sequential, obstacle };
+        return output::result(serde_json::to_string_pretty(&checked)?).map_err(Failure::from);
+    }
+    findings.iter().for_each(output::progress);
     // State 0 is the task itself.
     let states = program.states.len().saturating_sub(1);
     let plural = if states == 1 { "state" } else { "states" };
-    output::progress(format_args!("{}: task `{}` is good: {states} {plural}", arguments.task.display(), program.name));
-    Ok(())
+    output::progress(format_args!("{file}: task `{}` is good: {states} {plural}", program.name));
+    match simulated {
+        None => Ok(()),
+        Some(Ok(sequential)) => output::result(report(&sequential)).map_err(Failure::from),
+        Some(Err(obstacle)) => {
+            output::progress(format_args!("what keeps it sequential cannot be said: {obstacle}"));
+            Ok(())
+        }
+    }
+}
+
+/// What keeps the task sequential, or why that cannot be said.
+fn simulate(
+    program: &Program,
+    config: &SystemConfig,
+    arguments: &CheckArguments,
+) -> Result<Result<Sequential, String>, Failure> {
+    let parameters = match program.bind_parameters(&arguments.set) {
+        Ok(parameters) => parameters,
+        Err(missing @ ParameterError::Missing { .. }) => return Ok(Err(missing.to_string())),
+        Err(error) => {
+            let file = arguments.task.display();
+            return Err(Failure::Refused(format!("{file}: error[invalid-parameter]: {error}")));
+        }
+    };
+    let learned = learn::from_files(&arguments.learn, &program.name)?;
+    let assumptions = Assumptions {
+        parameters,
+        elements: usize::from(arguments.elements),
+        durations_s: learned.durations_s,
+        // What a system starts when there is demand is there in time.
+        units: config.promised_resources().into_iter().map(|(kind, units)| (kind, units.max(1))).collect(),
+    };
+    Ok(sequential(program, &config.catalogue, &assumptions).map_err(|obstacle| obstacle.to_string()))
+}
+
+fn report(sequential: &Sequential) -> String {
+    let Sequential { hsm_s, cdtn_s, .. } = sequential;
+    let mut lines = vec![format!(
+        "as written {hsm_s:.1} s; as a dataflow network {cdtn_s:.1} s ({:.1} % less), by simulation with the durations that are known",
+        improvement(*hsm_s, *cdtn_s)
+    )];
+    if !sequential.unknown_durations.is_empty() {
+        let states = sequential.unknown_durations.join(", ");
+        lines.push(format!("a second is assumed, for want of a `duration`, of: {states}"));
+    }
+    lines.push("\nthe longest chain:".to_owned());
+    let hidden = sequential.chain.len().saturating_sub(MAX_LINKS);
+    let width = sequential.chain.iter().skip(hidden).map(|link| link.path.len()).max().unwrap_or(0);
+    if hidden > 0 {
+        lines.push(format!("  … {hidden} states before"));
+    }
+    for Link { path, began_s, ended_s, because } in sequential.chain.iter().skip(hidden) {
+        lines.push(format!("{began_s:>9.1} – {ended_s:>7.1} s  {path:<width$}  {because}"));
+    }
+    if sequential.gains.is_empty() {
+        lines.push("\nevery state that is executed says what it reads and changes".to_owned());
+        return lines.join("\n");
+    }
+    lines.push("\nwhat annotating would gain, if nothing is read or changed but what the state names:".to_owned());
+    lines.push("    alone           with all the others".to_owned());
+    for Gain { path, missing, alone_s, alone_percent, last_s } in &sequential.gains {
+        let keys = missing.join(", ");
+        lines.push(format!("{alone_s:>7.1} s {alone_percent:>5.1} %  {last_s:>8.1} s          {path}: {keys}"));
+    }
+    if let Some(annotated_s) = sequential.annotated_s {
+        let less = improvement(*hsm_s, annotated_s);
+        lines.push(format!("all of them: {annotated_s:.1} s ({less:.1} % less than as written)"));
+    }
+    lines.join("\n")
+}
+
+fn read(path: &Path) -> Result<String, Failure> {
+    input::read(path).map_err(|error| Failure::Refused(format!("{}: cannot be read: {error}", path.display())))
+}
+
+fn refused(findings: &[Diagnostic]) -> Failure {
+    let lines: Vec<String> = findings.iter().map(Diagnostic::to_string).collect();
+    Failure::Refused(lines.join("\n"))
 }
 
 /// Loads a task file; errors refuse it, warnings go to standard error.
 pub(crate) fn load(path: &Path, catalogue: &Catalogue) -> Result<Program, Failure> {
-    let text =
-        input::read(path).map_err(|error| Failure::Refused(format!("{}: cannot be read: {error}", path.display())))?;
-    load_text(&text, &path.display().to_string(), catalogue)
+    load_text(&read(path)?, &path.display().to_string(), catalogue)
 }
 
 /// Loads a task file's text; `file` is its name in messages.
@@ -34,9 +152,6 @@ pub(crate) fn load_text(text: &str, file: &str, catalogue: &Catalogue) -> Result
             loaded.warnings.iter().for_each(output::progress);
             Ok(loaded.program)
         }
-        Err(findings) => {
-            let lines: Vec<String> = findings.iter().map(Diagnostic::to_string).collect();
-            Err(Failure::Refused(lines.join("\n")))
-        }
+        Err(findings) => Err(refused(&findings)),
     }
 }

@@ -1,0 +1,65 @@
+//! States that say too little, and what they would say if nothing of it were so.
+
+use ratn_model::catalogue::Catalogue;
+use ratn_model::expression::{Expr, FactExpr};
+use ratn_model::id::StateId;
+use ratn_model::program::{Annotations, Nature, Program, SUCCESS, State, StateKind};
+use ratn_model::resource::ResourceOperation;
+
+/// What an action does not say, in the words of the task file; empty of every other state.
+pub(super) fn missing(program: &Program, catalogue: &Catalogue, id: StateId) -> Vec<&'static str> {
+    let state = program.state(id);
+    let annotations = &state.annotations;
+    if !matches!(state.kind, StateKind::Action { .. }) {
+        return Vec::new();
+    }
+    let mut missing = Vec::new();
+    if annotations.reads.is_none() && !matches!(annotations.nature, Nature::Senses(_)) {
+        missing.push("reads");
+    }
+    if annotations.nature != Nature::Computes && !annotations.effects.contains_key(SUCCESS) {
+        missing.push("effects");
+    }
+    if could_compute(program, catalogue, state) {
+        missing.push("computes");
+    }
+    missing
+}
+
+/// Whether nothing that an irreversible action says keeps it from being one that only computes.
+fn could_compute(program: &Program, catalogue: &Catalogue, state: &State) -> bool {
+    let Annotations { nature, effects, .. } = &state.annotations;
+    let around = std::iter::successors(Some(state), |state| state.parent.map(|parent| program.state(parent)));
+    let acts = around.flat_map(|state| &state.annotations.resources).any(|resource| match resource.operation {
+        ResourceOperation::Block => catalogue.resources.get(&resource.kind).is_some_and(|offer| offer.actuates),
+        ResourceOperation::Exists => false,
+        _ => true,
+    });
+    *nature == Nature::Irreversible && !acts && effects.values().all(Vec::is_empty)
+}
+
+/// The program with these states annotated: they read and change only what they name.
+pub(super) fn annotated(program: &Program, catalogue: &Catalogue, ids: &[StateId]) -> Program {
+    let mut annotated = program.clone();
+    for id in ids {
+        let computes = could_compute(program, catalogue, program.state(*id));
+        let state = &mut annotated.states[id.0 as usize];
+        let named = named_facts(state);
+        state.annotations.reads.get_or_insert(named);
+        state.annotations.effects.entry(SUCCESS.to_owned()).or_default();
+        if computes {
+            state.annotations.nature = Nature::Computes;
+        }
+    }
+    annotated
+}
+
+/// The facts that its inputs and preconditions look up.
+fn named_facts(state: &State) -> Vec<FactExpr> {
+    let inputs = match &state.kind {
+        StateKind::Action { inputs, .. } => inputs.as_slice(),
+        _ => &[],
+    };
+    let expressions = inputs.iter().map(|(_, expression)| expression).chain(&state.annotations.requires);
+    expressions.flat_map(Expr::fact_expressions).cloned().collect()
+}

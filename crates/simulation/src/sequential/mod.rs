@@ -1,0 +1,208 @@
+//! What keeps a task sequential: it is simulated as written and as a dataflow network with the durations that are known, and again
+//! with states annotated that say too little.
+//!
+//! Nobody knows here what the actions will answer: they succeed, with assumed outputs of the declared types ([`providers`]). So a figure
+//! is what an annotation is worth if it is true, not a promise.
+
+mod annotate;
+mod chain;
+mod providers;
+
+pub use chain::Link;
+
+use crate::run::{Run, RunError, Setup, run};
+use annotate::{annotated, missing};
+use providers::AssumedProviders;
+use ratn_executive::protocol::{Command, LogEntry};
+use ratn_executive::protocol::{Mode, Note};
+use ratn_model::catalogue::Catalogue;
+use ratn_model::id::StateId;
+use ratn_model::program::{Program, SUCCESS};
+use ratn_model::resource::ResourceClass;
+use ratn_model::value::Value;
+use ratn_world::tolerance::Tolerance;
+use serde::Serialize;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Of more states that say too little, those that take longest are looked at.
+const MAX_CANDIDATES: usize = 40;
+/// A gain below this, in seconds, is none.
+const NO_GAIN_S: f64 = 1e-6;
+
+/// What is assumed where nothing is known.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Assumptions {
+    /// The task's parameters, all bound.
+    pub parameters: BTreeMap<String, Value>,
+    /// How many elements a list has that an action answers.
+    pub elements: usize,
+    /// Durations that earlier runs have taught, by plain path, in seconds.
+    pub durations_s: BTreeMap<String, f64>,
+    /// Units of each resource kind, where they are not as many as the catalogue allows.
+    pub units: BTreeMap<String, u32>,
+}
+
+/// What keeps a task sequential.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Sequential {
+    /// As written, in seconds.
+    pub hsm_s: f64,
+    /// As a dataflow network, in seconds.
+    pub cdtn_s: f64,
+    /// Of the latter, what waited for what, from the first to the last.
+    pub chain: Vec<Link>,
+    /// The states that say too little, those whose annotation gains most first.
+    pub gains: Vec<Gain>,
+    /// As a dataflow network if all of these were annotated, in seconds; `None` where that cannot be simulated.
+    pub annotated_s: Option<f64>,
+    /// The actions whose duration nobody knows: a second is assumed.
+    pub unknown_durations: Vec<String>,
+}
+
+/// What annotating a state would gain.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Gain {
+    /// The state.
+    pub path: String,
+    /// What it does not say: `reads`, `effects`, `computes`.
+    pub missing: Vec<&'static str>,
+    /// Seconds by which the task is shorter, if only this state is annotated.
+    pub alone_s: f64,
+    /// The same, in percent.
+    pub alone_percent: f64,
+    /// Seconds by which the task is shorter than if all the others are annotated and this one is not.
+    pub last_s: f64,
+}
+
+/// Why nothing can be said.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Obstacle {
+    /// A core gave up.
+    #[error("the simulation in {mode} mode comes to no end: {source}")]
+    Run {
+        /// In which mode.
+        mode: &'static str,
+        /// Why.
+        source: RunError,
+    },
+    /// It ended otherwise than tasks should.
+    #[error("with assumed outputs the task ends in {mode} mode with `{outcome}`: {reason}")]
+    Outcome {
+        /// In which mode.
+        mode: &'static str,
+        /// How.
+        outcome: String,
+        /// Why.
+        reason: String,
+    },
+}
+
+/// Simulates a checked program.
+///
+/// # Errors
+/// [`Obstacle`] where the task does not come to a successful end with what is assumed.
+pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assumptions) -> Result<Sequential, Obstacle> {
+    let mut unknown = BTreeSet::new();
+    let hsm = simulate(program, catalogue, assumptions, Mode::Hsm, &mut unknown)?;
+    let cdtn = simulate(program, catalogue, assumptions, Mode::Cdtn, &mut unknown)?;
+    let mut ends_s = |annotating: &[StateId]| {
+        let program = annotated(program, catalogue, annotating);
+        simulate(&program, catalogue, assumptions, Mode::Cdtn, &mut unknown).ok().map(|run| run.end_s)
+    };
+    let candidates = candidates(program, catalogue, &cdtn);
+    let annotated_s = if candidates.is_empty() { Some(cdtn.end_s) } else { ends_s(&candidates) };
+    let mut gains: Vec<Gain> = candidates
+        .iter()
+        .filter_map(|id| {
+            let alone_s = cdtn.end_s - ends_s(&[*id])?;
+            let others: Vec<StateId> = candidates.iter().copied().filter(|other| other != id).collect();
+            let last_s = ends_s(&others).zip(annotated_s).map_or(0.0, |(without_s, with_s)| without_s - with_s);
+            let rounded = |seconds: f64| if seconds.abs() < NO_GAIN_S { 0.0 } else { (seconds * 1e6).round() / 1e6 };
+            Some(Gain {
+                path: program.state(*id).path.clone(),
+                missing: missing(program, catalogue, *id),
+                alone_s: rounded(alone_s),
+                alone_percent: if cdtn.end_s > 0.0 { 100.0 * rounded(alone_s) / cdtn.end_s } else { 0.0 },
+                last_s: rounded(last_s),
+            })
+        })
+        .collect();
+    gains.sort_by(|a, b| b.alone_s.total_cmp(&a.alone_s).then(b.last_s.total_cmp(&a.last_s)));
+    Ok(Sequential {
+        hsm_s: hsm.end_s,
+        cdtn_s: cdtn.end_s,
+        chain: chain::chain(program, &cdtn.log),
+        gains,
+        annotated_s,
+        unknown_durations: unknown.into_iter().collect(),
+    })
+}
+
+/// The actions that say too little and are executed; of many, those that take longest.
+fn candidates(program: &Program, catalogue: &Catalogue, run: &Run) -> Vec<StateId> {
+    let mut busy_s: BTreeMap<StateId, f64> = BTreeMap::new();
+    let mut states = BTreeMap::new();
+    let mut began = BTreeMap::new();
+    for line in &run.log {
+        let LogEntry::Command(Command::Note(note)) = &line.entry else { continue };
+        match note {
+            Note::Expanded { instance, state, .. } => {
+                states.insert(*instance, *state);
+            }
+            Note::Running { instance, .. } => {
+                began.insert(*instance, line.at);
+            }
+            Note::Finished { instance, .. } => {
+                if let (Some(state), Some(began)) = (states.get(instance), began.get(instance)) {
+                    *busy_s.entry(*state).or_default() += line.at.since(*began).as_secs_f64();
+                }
+            }
+            _ => {}
+        }
+    }
+    let mut found: Vec<(StateId, f64)> =
+        busy_s.into_iter().filter(|(id, _)| !missing(program, catalogue, *id).is_empty()).collect();
+    found.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+    found.truncate(MAX_CANDIDATES);
+    found.into_iter().map(|(id, _)| id).collect()
+}
+
+fn simulate(
+    program: &Program,
+    catalogue: &Catalogue,
+    assumptions: &Assumptions,
+    mode: Mode,
+    unknown: &mut BTreeSet<String>,
+) -> Result<Run, Obstacle> {
+    let name = match mode {
+        Mode::Hsm => "HSM",
+        Mode::Cdtn => "CDTN",
+    };
+    let units = |kind: &str, count: u32| assumptions.units.get(kind).copied().unwrap_or(count);
+    let offered = catalogue.resources.iter().filter(|(_, offer)| offer.class != ResourceClass::Task);
+    let mut program = program.clone();
+    // How long it may take is not asked here.
+    program.deadline_s = None;
+    let program = Arc::new(program);
+    let setup = Setup {
+        program: program.clone(),
+        mode,
+        parameters: assumptions.parameters.clone(),
+        seed: 1,
+        resources: offered.map(|(kind, offer)| (kind.clone(), offer.class, units(kind, offer.count))).collect(),
+        world: Vec::new(),
+        tolerance: Tolerance::EXACT,
+        latency: Duration::ZERO,
+    };
+    let mut providers = AssumedProviders::new(&program, assumptions);
+    let run = run(setup, &mut providers).map_err(|source| Obstacle::Run { mode: name, source })?;
+    unknown.extend(providers.unknown_durations());
+    if run.outcome == SUCCESS {
+        Ok(run)
+    } else {
+        let reason = providers.gave_up().unwrap_or(run.reason);
+        Err(Obstacle::Outcome { mode: name, outcome: run.outcome, reason })
+    }
+}
