@@ -114,6 +114,27 @@ fn a_log_or_a_chart_that_cannot_be_written_is_refused_before_the_run() -> anyhow
 }
 
 #[test]
+fn what_cannot_be_resumed_is_refused() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let fixture = repository("crates/cli/src/report/fixtures/two_boxes.jsonl");
+    let (fixture, task) = (fixture.to_str().context("a path")?, repository("examples/fetch_boxes.yaml"));
+    let task = task.to_str().context("a path")?;
+    for (arguments, reason) in [
+        (vec!["run", "--resume", "/nonex/log.jsonl"], "/nonex/log.jsonl"),
+        (vec!["run", "--resume", fixture], "does not name its task file"),
+        (vec!["run", "--resume", fixture, task], "no system runs in"),
+        (vec!["run", "--resume", fixture, "--mode", "hsm"], "cannot be used with"),
+        (vec!["run", task, "--learn", fixture], "not of the task `fetch_boxes`"),
+    ] {
+        let output = place.ratn(&arguments).output()?;
+        let (out, err) = texts(&output);
+        ensure!(output.status.code() == Some(2) && err.contains(reason), "{arguments:?}: {out}{err}");
+    }
+    ensure!(std::fs::read_dir(place.path())?.count() == 0);
+    Ok(())
+}
+
+#[test]
 fn what_is_no_file_is_refused() -> anyhow::Result<()> {
     let place = Place::new()?;
     for arguments in [&["check", "/dev/zero"][..], &["run", "/dev/zero"], &["cell", "--config", "/dev/zero"]] {

@@ -77,6 +77,11 @@ impl Progress {
                     self.paths.insert(*instance, path.clone());
                 }
                 Command::Note(Note::Decided { path, decision, .. }) => say(at, &format!("decide {path}: {decision}")),
+                Command::Note(Note::Invalidated { instance, reason }) => {
+                    self.started.remove(instance);
+                    say(at, &format!("again  {}: {reason}", self.path(*instance)));
+                }
+                Command::Note(Note::Reused { instance }) => say(at, &format!("reuse  {}", self.path(*instance))),
                 Command::Note(Note::Squashed { instance }) if self.started.remove(instance).is_some() => {
                     say(at, &format!("squash {}", self.path(*instance)));
                 }

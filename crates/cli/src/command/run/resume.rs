@@ -24,6 +24,9 @@ pub(super) async fn run(
     let refused = |reason: &dyn std::fmt::Display| {
         Failure::Refused(format!("ratn: cannot resume the run of {}: {reason}", file.display()))
     };
+    if let Some(chart) = &arguments.gantt {
+        output::check_writable(chart)?;
+    }
     // From here on nobody else goes on with it.
     let (writer, log) = LogWriter::go_on(file).map_err(|error| refused(&error))?;
     if let Some(line) = log.torn {
