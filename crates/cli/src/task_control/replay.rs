@@ -41,6 +41,7 @@ pub(super) struct Replayed {
     pub(super) executive: Executive,
     pub(super) ledger: Ledger,
     /// Commands of the last event that are not in the log: its writer was killed among them, and has performed none of them.
+    /// They are to be performed.
     pub(super) missing: Vec<Command>,
     /// Which states the instances are of.
     pub(super) states: BTreeMap<InstanceId, StateId>,
@@ -93,8 +94,11 @@ pub(super) fn replay(program: &Arc<Program>, lines: &[LogLine]) -> Result<Replay
         if let Some(Command::End { outcome, .. }) = logged.last() {
             return Err(ReplayError::Ended { outcome: outcome.clone() });
         }
-        missing.iter().for_each(|command| ledger.command(command));
+        logged.iter().for_each(|command| ledger.command(command));
         missing.drain(..logged.len());
+        // Nothing of these was performed, so they are no open items; what they commit is in the executive's world already.
+        let commits = missing.iter().filter(|command| matches!(command, Command::Commit { .. }));
+        commits.for_each(|command| ledger.command(command));
         next += logged.len();
     }
     Ok(Replayed { executive, ledger, missing, states })

@@ -177,12 +177,14 @@ pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &In
         answers,
     };
     let begin = async |shell: &mut Shell| {
+        let mirror = shell.executive.root().clone();
         shell.log.append_commands(ledger.last, &missing)?;
-        ledger.event(shell.clock.now(), &Event::Resumed);
-        shell.performer.take_up(ledger, shell.executive.root()).await?;
-        let ended = missing.into_iter().find_map(|command| ended(command, shell.clock.now()));
-        // Everything that the executive had wanted is asked for by now; what it wants on top of that follows.
-        Ok(ended.or(shell.step(Event::Resumed)?))
+        // Request ids of now on have the number of this resumption: it is in the log before they are used.
+        let (now, commands) = shell.decide(&Event::Resumed)?;
+        shell.log.make_durable()?;
+        ledger.event(now, &Event::Resumed);
+        shell.performer.take_up(ledger, &mirror).await?;
+        shell.perform(now, missing.into_iter().chain(commands))
     };
     shell.run_to_its_end(begin, interrupt).await
 }
@@ -244,21 +246,35 @@ impl Shell {
 
     /// Hands an event to the executive, and what it commands to whoever does it.
     fn step(&mut self, event: Event) -> anyhow::Result<Option<Ended>> {
+        let (now, commands) = self.decide(&event)?;
+        self.perform(now, commands)
+    }
+
+    /// What the executive makes of an event, written down.
+    fn decide(&mut self, event: &Event) -> anyhow::Result<(Timestamp, Vec<Command>)> {
         let now = self.clock.now();
-        if event == Event::Woken {
+        if *event == Event::Woken {
             self.timers.retain(|at| *at > now);
         }
         let commands = self.executive.handle(now, event.clone());
         commands.iter().for_each(|command| replay::follow(&mut self.states, command));
-        self.log.append(now, &event, &commands)?;
+        self.log.append(now, event, &commands)?;
         if replay::must_be_durable(&self.program, &self.states, &commands) {
             self.log.make_durable()?;
         }
-        self.progress.follow(now, &event, &commands);
+        self.progress.follow(now, event, &commands);
         self.lookout.observe(&commands);
         if self.lookout.is_due() {
             self.ask_at.get_or_insert_with(|| Instant::now() + advisor::PAUSE);
         }
+        Ok((now, commands))
+    }
+
+    fn perform(
+        &mut self,
+        now: Timestamp,
+        commands: impl IntoIterator<Item = Command>,
+    ) -> anyhow::Result<Option<Ended>> {
         for command in commands {
             match command {
                 Command::Wake { at } => drop(self.timers.insert(at)),
