@@ -1,0 +1,87 @@
+//! `ratn simulate` and what `ratn check` says of what keeps a task sequential: nothing is started for them.
+
+mod support;
+
+use anyhow::{Context, ensure};
+use serde_json::Value;
+use support::{Place, repository, texts};
+
+fn json(place: &Place, arguments: &[&str]) -> anyhow::Result<Value> {
+    let output = place.ratn(arguments).output()?;
+    let (out, err) = texts(&output);
+    ensure!(output.status.success(), "{arguments:?}: {:?}, {err}", output.status);
+    serde_json::from_str(&out).with_context(|| out)
+}
+
+#[test]
+fn a_job_shop_is_simulated_and_compared_with_the_best_known() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let file = repository("tests/jobshop/ft06.txt");
+    let file = file.to_str().context("a path")?;
+    let found = json(&place, &["simulate", "--jobshop", file, "--json"])?;
+    let keys: Vec<&String> = found.as_object().context("an object")?.keys().collect();
+    ensure!(keys == ["best_known", "instance", "makespan", "ratio"] && found["instance"] == "ft06", "{found}");
+    let number = |found: &Value, key: &str| found[key].as_f64().with_context(|| format!("no {key} in {found}"));
+    let ratio = number(&found, "ratio")?;
+    ensure!((1.0..=1.06).contains(&ratio) && number(&found, "best_known")? == 55.0, "{found}");
+    ensure!((number(&found, "makespan")? / 55.0 - ratio).abs() < 1e-3, "{found}");
+    let plain = json(&place, &["simulate", "--jobshop", file, "--orders", "0", "--best", "50", "--json"])?;
+    ensure!(number(&plain, "best_known")? == 50.0 && number(&plain, "ratio")? > 1.2, "{plain}");
+    Ok(())
+}
+
+#[test]
+fn of_an_unknown_job_shop_there_is_no_ratio() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let file = place.path().join("mine.txt");
+    std::fs::write(&file, "# two jobs\n2 2\n0 3 1 2\n0 2 1 4\n")?;
+    let found = json(&place, &["simulate", "--jobshop", file.to_str().context("a path")?, "--json"])?;
+    ensure!(found["makespan"] == 8.0 && found["ratio"].is_null() && found["best_known"].is_null(), "{found}");
+    Ok(())
+}
+
+#[test]
+fn what_is_no_job_shop_is_refused_with_its_line() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let file = place.path().join("bad.txt");
+    std::fs::write(&file, "2 2\n0 3 1 2\n0 2 7 4\n")?;
+    let output = place.ratn(&["simulate", "--jobshop", file.to_str().context("a path")?]).output()?;
+    let (out, err) = texts(&output);
+    ensure!(output.status.code() == Some(2) && out.is_empty(), "{:?}, {out}", output.status);
+    ensure!(err.contains("bad.txt: no job shop: line 3: `7` is no machine: they are 0 to 1"), "{err}");
+    Ok(())
+}
+
+#[test]
+fn check_says_what_an_annotation_is_worth() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let text = std::fs::read_to_string(repository("examples/fetch_boxes.yaml"))?;
+    let said = "          computes: true\n          reads: [\"at(?)\", \"shape(?)\"]\n";
+    ensure!(text.contains(said));
+    let (whole, half) = (place.path().join("whole.yaml"), place.path().join("half.yaml"));
+    std::fs::write(&whole, &text)?;
+    std::fs::write(&half, text.replace(said, ""))?;
+    let check = |file: &std::path::Path| json(&place, &["check", file.to_str().context("a path")?, "--json"]);
+    let (whole, half) = (check(&whole)?, check(&half)?);
+    let seconds =
+        |found: &Value, key: &str| found["sequential"][key].as_f64().with_context(|| format!("{key}: {found}"));
+    ensure!(whole["task"] == "fetch_boxes" && whole["sequential"]["gains"] == serde_json::json!([]), "{whole}");
+    ensure!(seconds(&half, "cdtn_s")? > 1.2 * seconds(&whole, "cdtn_s")?, "{half}");
+    ensure!(seconds(&half, "annotated_s")? == seconds(&whole, "cdtn_s")?, "{half}");
+    ensure!(half["sequential"]["gains"].as_array().is_some_and(|gains| gains.len() == 2), "{half}");
+    ensure!(whole["sequential"]["chain"][0]["because"] == "it is the first", "{whole}");
+    Ok(())
+}
+
+#[test]
+fn a_check_without_simulation_says_only_what_is_wrong() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let task = repository("examples/fetch_boxes.yaml");
+    let task = task.to_str().context("a path")?;
+    let (with, without) =
+        (place.ratn(&["check", task]).output()?, place.ratn(&["check", task, "--no-simulation"]).output()?);
+    ensure!(texts(&with).0.contains("the longest chain:") && texts(&without).0.is_empty(), "{with:?} {without:?}");
+    let found = json(&place, &["check", task, "--no-simulation", "--json"])?;
+    ensure!(found["sequential"].is_null() && found["findings"] == serde_json::json!([]), "{found}");
+    Ok(())
+}
