@@ -246,7 +246,8 @@ pub enum Command {
     },
     /// Send [`Event::Woken`] at this moment or as soon after it as possible.
     Wake {
-        /// When.
+        /// When. Named otherwise in a log, whose lines have a time of their own.
+        #[serde(rename = "when")]
         at: Timestamp,
     },
     /// The run has ended; everything was released before.

@@ -225,9 +225,12 @@ mod tests {
         let file = tempfile::NamedTempFile::new().unwrap();
         let mut log = LogWriter::create(file.path()).unwrap();
         let command = Command::Note(Note::Retired { instance: InstanceId(1) });
-        log.append(Timestamp(0), &started(), std::slice::from_ref(&command)).unwrap();
+        // It has a time of its own.
+        let wake = Command::Wake { at: Timestamp(7) };
+        log.append(Timestamp(0), &started(), &[command.clone(), wake.clone()]).unwrap();
         let Log { lines, torn, .. } = read(file.path()).unwrap();
-        assert_eq!((lines.len(), torn), (2, None));
+        assert_eq!((lines.len(), torn), (3, None));
+        assert_eq!(lines[2], LogLine { at: Timestamp(0), entry: LogEntry::Command(wake) });
         assert_eq!(lines[0], LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) });
         assert_eq!(lines[1], LogLine { at: Timestamp(0), entry: LogEntry::Command(command) });
     }

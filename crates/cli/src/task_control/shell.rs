@@ -3,18 +3,22 @@
 //! Nothing is decided here. Whatever a command leads to comes back as an event through one bounded queue, so the event log is
 //! the whole story of the run, and a run whose task control was killed goes on from it ([`resume`]).
 
+mod resume;
+
+pub(crate) use resume::{Resumption, resume};
+
 use super::Endpoints;
 use super::advisor::{self, Advisor};
 use super::control::Control;
 use super::log::LogWriter;
 use super::performer::{self, Performer};
 use super::progress::Progress;
-use super::replay::{self, ReplayError, Replayed, VERSION};
+use super::replay::{self, VERSION};
 use crate::interrupt::Interrupt;
 use anyhow::{Context, bail};
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::Lookout;
-use ratn_executive::protocol::{Command, Event, Learned, LogEntry, LogLine, Mode, Origin};
+use ratn_executive::protocol::{Command, Event, Learned, Mode, Origin};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Exceptions, Nature, Program, SUCCESS, State, StateKind};
@@ -58,34 +62,6 @@ pub(crate) struct Place {
     pub(crate) catalogue: Arc<Catalogue>,
     /// The robot's seconds per second of wall time.
     pub(crate) speed: f64,
-}
-
-/// A run to go on with, as its log has it.
-pub(crate) struct Resumption {
-    program: Arc<Program>,
-    mode: Mode,
-    seed: u64,
-    replayed: Replayed,
-    progress: Progress,
-    log: LogWriter,
-}
-
-impl Resumption {
-    /// Replays what the log says. Touches nothing of the run.
-    ///
-    /// # Errors
-    /// Where the log is not of this program and this version, or the run has ended.
-    pub(crate) fn new(program: Program, log: LogWriter, lines: &[LogLine]) -> Result<Resumption, ReplayError> {
-        let program = Arc::new(program);
-        let replayed = replay::replay(&program, lines)?;
-        let mut progress = Progress::new(false);
-        progress.catch_up(lines);
-        let (mode, seed) = match lines.first().map(|line| &line.entry) {
-            Some(LogEntry::Event(Event::Started { mode, seed, .. })) => (*mode, *seed),
-            _ => (Mode::Hsm, 0),
-        };
-        Ok(Resumption { program, mode, seed, replayed, progress, log })
-    }
 }
 
 /// How a run ended.
@@ -146,45 +122,6 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
             },
         };
         shell.step(begun)
-    };
-    shell.run_to_its_end(begin, interrupt).await
-}
-
-/// Goes on with a run whose task control was killed, on the system that it was on.
-///
-/// # Errors
-/// As [`run`]; and where the run cannot go on: its log is of another program, its world is not there any more, another run is
-/// under way.
-pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
-    let Resumption { program, mode, seed, replayed, progress, log } = resumption;
-    let Replayed { executive, mut ledger, missing, states } = replayed;
-    performer::check_world(&place.endpoints, &ledger, executive.root()).await?;
-    let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
-    let performer = Performer::connect(place, &ledger.origin.run, &program.name, events).await;
-    let shell = Shell {
-        executive,
-        states,
-        timers: std::mem::take(&mut ledger.wakes),
-        progress,
-        program,
-        log,
-        clock: RobotClock::going_on(replay::now(&ledger, unix_ms(), place.speed), place.speed),
-        control: Control::listen_if_possible(&place.directory),
-        advisor: advisor_of(mode, seed),
-        lookout: Lookout::default(),
-        ask_at: None,
-        performer: performer.context("cannot go on with the run")?,
-        answers,
-    };
-    let begin = async |shell: &mut Shell| {
-        let mirror = shell.executive.root().clone();
-        shell.log.append_commands(ledger.last, &missing)?;
-        // Request ids of now on have the number of this resumption: it is in the log before they are used.
-        let (now, commands) = shell.decide(&Event::Resumed)?;
-        shell.log.make_durable()?;
-        ledger.event(now, &Event::Resumed);
-        shell.performer.take_up(ledger, &mirror).await?;
-        shell.perform(now, missing.into_iter().chain(commands))
     };
     shell.run_to_its_end(begin, interrupt).await
 }
@@ -382,3 +319,6 @@ fn imprecise(program: &Program) -> Vec<String> {
 fn unix_ms() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
 }
+
+#[cfg(test)]
+mod tests;
