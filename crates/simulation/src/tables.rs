@@ -1,6 +1,6 @@
 //! The paper's Table I and Table II, replayed: the example tasks with their estimated durations, through the executive.
 
-use crate::run::{Run, RunError, Setup, run};
+use crate::run::{Run, RunError, Setup, run_looking_ahead};
 use crate::timed::TimedProviders;
 use ratn_executive::protocol::Mode;
 use ratn_model::catalogue::Catalogue;
@@ -19,6 +19,9 @@ use std::time::Duration;
 pub const FETCH_BOXES: &str = include_str!("../../../examples/fetch_boxes.yaml");
 /// The task of Table II.
 pub const SET_TABLE: &str = include_str!("../../../examples/set_table.yaml");
+
+/// Orders of what is left that are looked at whenever much of it has changed.
+const ORDERS: usize = 500;
 
 /// One row, in seconds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -145,7 +148,7 @@ impl Scenario {
         let catalogue = Catalogue::standard();
         let loaded = ratn_model::load::load(self.source, "example.yaml", &catalogue).map_err(TableError::Refused)?;
         let setup = setup(loaded.program, &self.parameters, mode, planners)?;
-        let run = run(setup, &mut TimedProviders { boxes: self.boxes })?;
+        let run = run_looking_ahead(setup, &mut TimedProviders { boxes: self.boxes }, ORDERS)?;
         if run.outcome == ratn_model::program::SUCCESS {
             Ok(run)
         } else {
