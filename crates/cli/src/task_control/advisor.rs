@@ -116,7 +116,9 @@ impl Desk {
             }
         }
         let best = search.best();
-        let is_worthwhile = best.end_s < best.plain_s * (1.0 - WORTHWHILE) && !best.urgency_s.is_empty();
+        // What is no number would not read back from a log.
+        let is_usable = best.urgency_s.iter().all(|(_, seconds)| seconds.is_finite());
+        let is_worthwhile = is_usable && best.end_s < best.plain_s * (1.0 - WORTHWHILE) && !best.urgency_s.is_empty();
         is_worthwhile.then_some(Event::Advised { urgency_s: best.urgency_s })
     }
 }
