@@ -26,8 +26,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Of more states that say too little, those that take longest are looked at.
+/// Of more states that say too little, those that take longest are looked at …
 const MAX_CANDIDATES: usize = 40;
+/// … and so few that all simulations together have about so many goals.
+const MAX_GOALS: usize = 20_000;
+/// Of each state: it alone, and all but it.
+const SIMULATIONS: usize = 2;
 /// A gain below this, in seconds, is none.
 const NO_GAIN_S: f64 = 1e-6;
 
@@ -165,7 +169,8 @@ fn candidates(program: &Program, catalogue: &Catalogue, run: &Run) -> Vec<StateI
     let mut found: Vec<(StateId, f64)> =
         busy_s.into_iter().filter(|(id, _)| !missing(program, catalogue, *id).is_empty()).collect();
     found.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
-    found.truncate(MAX_CANDIDATES);
+    let goals = began.len().max(1);
+    found.truncate((MAX_GOALS / (SIMULATIONS * goals)).clamp(1, MAX_CANDIDATES));
     found.into_iter().map(|(id, _)| id).collect()
 }
 
