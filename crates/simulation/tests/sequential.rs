@@ -94,7 +94,7 @@ fn a_loop_over_an_answer_runs_over_as_many_elements_as_are_assumed() {
     let task = format!(
         "task: t\nstates:\n  - look: {{ action: brain/think, computes: true, reads: [], resources: [{{ block: Brain }}], \
          duration: 1 }}\n  - for: thing in look.list\n    do:\n    {}",
-        move_arm("go", "$thing", 5).replace("  - ", "  - ")
+        move_arm("go", "$thing", 5)
     );
     let found = check(&task).unwrap();
     assert_eq!(found.hsm_s, 11.0, "{found:?}");
