@@ -19,6 +19,19 @@ pub(crate) fn read(path: &Path) -> Result<String> {
     String::from_utf8(bytes).map_err(|error| Error::new(ErrorKind::InvalidData, error))
 }
 
+/// Libraries stand beside the files that use them.
+pub(crate) struct Libraries;
+
+impl ratn_model::load::Files for Libraries {
+    fn read(&self, using: &str, path: &str) -> std::result::Result<(String, String), String> {
+        let file = Path::new(using).parent().unwrap_or(Path::new("")).join(path);
+        let text = read(&file).map_err(|error| error.to_string())?;
+        // Two ways to one file are one file.
+        let name = file.canonicalize().unwrap_or(file);
+        Ok((name.display().to_string(), text))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]

@@ -8,12 +8,15 @@
 //! | [`actions`] | unknown-provider, unknown-action, unknown-port, missing-input, unknown-outcome |
 //! | [`types`] | type-mismatch |
 //! | [`flows`] | unservable-flow, branch-may-not-have-written, unknown-state |
+//! | [`reach`] | unreachable-state, no-way-out, horizon-too-small, region-conflict, region-unannotated |
 //! | [`resources`] | unknown-resource, too-many-resources, provider-not-blocked, computes-actuates |
 //! | [`preconditions`] | unestablished-precondition |
 
 mod actions;
 mod flows;
+mod graph;
 mod preconditions;
+mod reach;
 mod resources;
 pub(crate) mod types;
 
@@ -23,6 +26,7 @@ use crate::expression::{EffectExpr, Expr};
 use crate::id::StateId;
 use crate::load::Places;
 use crate::program::{Location, Program, State, StateKind};
+use graph::ControlFlow;
 use std::collections::BTreeMap;
 
 /// What a rule sees.
@@ -32,6 +36,7 @@ pub(crate) struct Subject<'a> {
     /// The task says what holds at the start.
     pub(crate) declares_world: bool,
     pub(crate) places: &'a Places,
+    pub(crate) control: &'a ControlFlow,
 }
 
 /// Applies every rule.
@@ -42,10 +47,12 @@ pub(crate) fn check(
     places: &Places,
     findings: &mut Findings,
 ) {
-    let subject = Subject { program, catalogue, declares_world, places };
+    let control = ControlFlow::of(program);
+    let subject = Subject { program, catalogue, declares_world, places, control: &control };
     actions::check(&subject, findings);
     types::check(&subject, findings);
     flows::check(&subject, findings);
+    reach::check(&subject, findings);
     resources::check(&subject, findings);
     preconditions::check(&subject, findings);
 }

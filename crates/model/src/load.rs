@@ -18,6 +18,8 @@
 
 mod effects;
 mod fields;
+mod flow;
+mod library;
 mod names;
 mod outline;
 mod resources;
@@ -25,6 +27,7 @@ mod state;
 mod yaml;
 
 pub(crate) use fields::Places;
+pub use library::Files;
 pub(crate) use names::suggestion;
 pub use yaml::MAX_SOURCE;
 
@@ -33,19 +36,33 @@ use crate::check;
 use crate::diagnostic::{Diagnostic, Findings};
 use crate::expression::EffectExpr;
 use crate::expression::scope::NothingKnown;
+use crate::id::StateId;
 use crate::program::{Parameter, Program, StateKind, TaskOutput};
 use crate::value::{Type, Value};
 use fields::{Fields, Output};
 use names::{Ports, Task, View};
 use outline::{Form, Outline};
+use std::collections::BTreeMap;
 use yaml::{Content, Node};
 
 /// The horizon of a task that names none.
 pub const DEFAULT_HORIZON: usize = 120;
 
-const TASK_KEYS: [&str; 7] = ["task", "description", "horizon", "parameters", "world", "outputs", "states"];
-const LATER_TASK_KEYS: [&str; 7] =
-    ["ontology", "exceptions", "variables", "deadline", "imports", "tolerance", "speculation_width"];
+const TASK_KEYS: [&str; 12] = [
+    "task",
+    "description",
+    "horizon",
+    "speculation_width",
+    "deadline",
+    "exceptions",
+    "parameters",
+    "variables",
+    "world",
+    "outputs",
+    "outcomes",
+    "states",
+];
+const LATER_TASK_KEYS: [&str; 3] = ["ontology", "imports", "tolerance"];
 
 /// A program and what was noticed about it.
 #[derive(Debug, Clone, PartialEq)]
@@ -56,27 +73,57 @@ pub struct Loaded {
     pub warnings: Vec<Diagnostic>,
 }
 
-/// Loads and checks a task file; `file` is its name in messages.
+/// Loads and checks a task file that uses no libraries; `file` is its name in messages.
 ///
 /// # Errors
 /// Every finding, at least one of them an error, in the order of the file.
 pub fn load(source: &str, file: &str, catalogue: &Catalogue) -> Result<Loaded, Vec<Diagnostic>> {
+    load_with(source, file, catalogue, &library::NoFiles)
+}
+
+/// Loads and checks a task file; its libraries are read from `files`.
+///
+/// # Errors
+/// Every finding, at least one of them an error: those of libraries first, each file's in its order.
+pub fn load_with(
+    source: &str,
+    file: &str,
+    catalogue: &Catalogue,
+    files: &dyn Files,
+) -> Result<Loaded, Vec<Diagnostic>> {
+    load_within(source, &Loading { file, catalogue, files, around: Vec::new() })
+}
+
+/// What a file is loaded with.
+#[derive(Clone)]
+pub(crate) struct Loading<'a> {
+    /// Its name.
+    pub(crate) file: &'a str,
+    pub(crate) catalogue: &'a Catalogue,
+    pub(crate) files: &'a dyn Files,
+    /// The files that use it, outermost first.
+    pub(crate) around: Vec<String>,
+}
+
+pub(crate) fn load_within(source: &str, loading: &Loading<'_>) -> Result<Loaded, Vec<Diagnostic>> {
     let mut out = Output::default();
-    let program = read(source, catalogue, &mut out);
+    let mut findings = Vec::new();
+    let program = read(source, loading, &mut out, &mut findings);
     if let Some(program) = &program
         && !out.findings.has_errors()
     {
-        check::check(program, catalogue, out.declares_world, &out.places, &mut out.findings);
+        check::check(program, loading.catalogue, out.declares_world, &out.places, &mut out.findings);
     }
     let refused = out.findings.has_errors();
-    let findings = out.findings.in_file(file);
+    findings.extend(out.findings.in_file(loading.file));
     match program {
         Some(program) if !refused => Ok(Loaded { program, warnings: findings }),
         _ => Err(findings),
     }
 }
 
-fn read(source: &str, catalogue: &Catalogue, out: &mut Output) -> Option<Program> {
+fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mut Vec<Diagnostic>) -> Option<Program> {
+    let catalogue = loading.catalogue;
     let root = match yaml::read(source) {
         Ok(root) => root,
         Err(error) => {
@@ -103,16 +150,20 @@ fn read(source: &str, catalogue: &Catalogue, out: &mut Output) -> Option<Program
         }
     };
     let outline = outline::outline(&name, &root, &mut out.findings);
-    let ports = ports(&outline, catalogue, &mut out.findings);
+    let libraries = library::load_all(&outline, loading, &mut out.findings, of_libraries);
+    let ports = ports(&outline, catalogue, &libraries, &mut out.findings);
     let parameters = root.get("parameters").map(Node::entries).unwrap_or_default();
     let parameters = parameters.iter().map(|entry| entry.key.clone()).collect();
-    let task = Task { source, catalogue, outline, ports, parameters };
+    let task = Task { source, catalogue, outline, ports, parameters, libraries };
     let mut fields = Fields { task: &task, view: View::default(), path: String::new(), out };
     fields.keys(&root, &TASK_KEYS, &LATER_TASK_KEYS);
     let horizon = match root.get("horizon") {
         Some(node) => horizon(&mut fields, node),
         None => DEFAULT_HORIZON,
     };
+    let speculation_width = root.get("speculation_width").and_then(|node| fields.count(node, "speculation_width", 1));
+    let deadline_s = root.get("deadline").and_then(|node| flow::seconds(&mut fields, node, "deadline"));
+    let exceptions = root.get("exceptions").and_then(|node| flow::exceptions(&mut fields, node));
     let parameters = read_parameters(&mut fields, &root);
     let initial = root.get("world").map(|node| world(&mut fields, node)).unwrap_or_default();
     out.declares_world = root.get("world").is_some();
@@ -123,13 +174,19 @@ fn read(source: &str, catalogue: &Catalogue, out: &mut Output) -> Option<Program
         StateKind::Sequence { outputs, .. } => std::mem::take(outputs),
         _ => Vec::new(),
     };
-    let digest = blake3::hash(source.as_bytes()).to_hex().to_string();
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(source.as_bytes());
+    for (id, library) in &task.libraries {
+        hasher.update(library.digest.as_bytes());
+        library::graft(&mut states, *id, library);
+    }
+    let digest = hasher.finalize().to_hex().to_string();
     Some(Program {
         name,
         horizon,
-        speculation_width: Program::DEFAULT_SPECULATION_WIDTH,
-        deadline_s: None,
-        exceptions: crate::program::Exceptions::Precise,
+        speculation_width: speculation_width.map_or(Program::DEFAULT_SPECULATION_WIDTH, |width| width as usize),
+        deadline_s,
+        exceptions: exceptions.unwrap_or_default(),
         parameters,
         outputs,
         initial,
@@ -225,8 +282,13 @@ fn type_of(node: &Node) -> Result<Type, String> {
 }
 
 /// The output ports of every state: those of its action, narrowed by `out` where it is given.
-fn ports(outline: &Outline<'_>, catalogue: &Catalogue, findings: &mut Findings) -> Vec<Ports> {
-    let of_step = |step: &outline::Step<'_>| match &step.form {
+fn ports(
+    outline: &Outline<'_>,
+    catalogue: &Catalogue,
+    libraries: &BTreeMap<StateId, Program>,
+    findings: &mut Findings,
+) -> Vec<Ports> {
+    let of_step = |(index, step): (usize, &outline::Step<'_>)| match &step.form {
         Form::Action { action } => {
             let signature = state::action_name(action).and_then(|(p, a)| catalogue.action(&p, &a));
             let Some(node) = step.body.get("out") else {
@@ -253,18 +315,33 @@ fn ports(outline: &Outline<'_>, catalogue: &Catalogue, findings: &mut Findings) 
             }
             ports
         }
-        Form::Sequence { .. } => {
+        Form::Library { .. } => match libraries.get(&StateId(index as u64)) {
+            None => Ports { open: true, ..Ports::default() },
+            Some(library) => {
+                let types = library.outputs.iter().map(|output| (output.name.clone(), output.ty.clone()));
+                Ports { types: types.collect(), open: false }
+            }
+        },
+        Form::Sequence { .. } | Form::Concurrency { .. } => {
             let declared = step.body.get("outputs").map(Node::entries).unwrap_or_default();
             let typed = |entry: &yaml::Entry| entry.value.get("type").and_then(|node| type_of(node).ok());
             let types = declared.iter().map(|entry| (entry.key.clone(), typed(entry).unwrap_or(Type::Any)));
             Ports { types: types.collect(), open: false }
         }
-        Form::ForEach { .. } | Form::Condition { .. } => Ports::default(),
+        Form::ForEach { .. } | Form::While { .. } | Form::Condition { .. } => Ports::default(),
     };
-    outline.steps.iter().map(of_step).collect()
+    outline.steps.iter().enumerate().map(of_step).collect()
 }
 
-/// `[a, b]`, `{a, b}`, `{a: type}` or `a`.
+/// `{type: int, default: 0}` with either or both, and not the record of these two fields.
+fn is_port_form(node: &Node) -> bool {
+    let entries = node.entries();
+    !entries.is_empty()
+        && entries.iter().all(|entry| matches!(entry.key.as_str(), "type" | "default"))
+        && (node.get("default").is_some() || entries.len() == 1)
+}
+
+/// `[a, b]`, `{a, b}`, `{a: type}`, `{a: {type: int, default: 0}}` or `a`.
 fn declared_ports(
     node: &Node,
     path: &str,
@@ -278,7 +355,10 @@ fn declared_ports(
                 for entry in entries {
                     let ty = match &entry.value.content {
                         Content::Null => None,
-                        _ => match type_of(&entry.value) {
+                        _ if is_port_form(&entry.value) && entry.value.get("type").is_none() => None,
+                        _ => match type_of(
+                            entry.value.get("type").filter(|_| is_port_form(&entry.value)).unwrap_or(&entry.value),
+                        ) {
                             Ok(ty) => Some(ty),
                             Err(message) => {
                                 findings.error("type-mismatch", entry.value.at, path, message, "");

@@ -315,6 +315,42 @@ impl Program {
     }
 }
 
+impl Program {
+    /// Every state's outcomes: `success`, its own, those by which what it contains leaves it, `aborted`, `preempted`.
+    pub fn all_outcomes(&self) -> Vec<Vec<String>> {
+        let mut all: Vec<Vec<String>> = vec![Vec::new(); self.states.len()];
+        // What a state contains comes after it.
+        for state in self.states.iter().rev() {
+            let mut own = vec![SUCCESS.to_owned()];
+            let add = |own: &mut Vec<String>, name: &str| {
+                if !matches!(name, SUCCESS | ABORTED | PREEMPTED) && !own.iter().any(|known| known == name) {
+                    own.push(name.to_owned());
+                }
+            };
+            state.outcomes.iter().for_each(|name| add(&mut own, name));
+            let decides = match &state.kind {
+                StateKind::Concurrency { decide, preemptive, .. } => {
+                    decide.iter().for_each(|(name, _)| add(&mut own, name));
+                    !preemptive || !decide.is_empty()
+                }
+                _ => false,
+            };
+            for child in state.children().filter(|_| !decides) {
+                for outcome in &all[child.0 as usize] {
+                    match self.state(child).transitions.get(outcome.as_str()) {
+                        Some(Target::State(_)) => {}
+                        Some(Target::Outcome(name)) => add(&mut own, name),
+                        None => add(&mut own, outcome),
+                    }
+                }
+            }
+            own.extend([ABORTED.to_owned(), PREEMPTED.to_owned()]);
+            all[state.id.0 as usize] = own;
+        }
+        all
+    }
+}
+
 impl State {
     /// The lists of states that it contains: one, or one per branch, or one per region.
     pub fn lists(&self) -> Vec<&[StateId]> {

@@ -108,5 +108,5 @@ fn what_the_document_says_is_not_supported_yet_is_refused_as_that() {
             seen += 1;
         }
     }
-    assert!(seen > 30, "only {seen} keys");
+    assert!(seen > 0, "the table is not there");
 }

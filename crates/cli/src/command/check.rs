@@ -147,7 +147,7 @@ pub(crate) fn load(path: &Path, catalogue: &Catalogue) -> Result<Program, Failur
 
 /// Loads a task file's text; `file` is its name in messages.
 pub(crate) fn load_text(text: &str, file: &str, catalogue: &Catalogue) -> Result<Program, Failure> {
-    match ratn_model::load::load(text, file, catalogue) {
+    match ratn_model::load::load_with(text, file, catalogue, &input::Libraries) {
         Ok(loaded) => {
             loaded.warnings.iter().for_each(output::progress);
             Ok(loaded.program)

@@ -58,9 +58,14 @@ impl Interpreter {
             (good, &state.kind)
         {
             for output in outputs {
-                let value = self.with_scope(context, thread, Some(&written), |scope| output.value.evaluate(scope));
-                let value = value.map_err(|error| format!("output `{}`: {error}", output.name))?;
-                written.insert(output.name.clone(), value);
+                match self.with_scope(context, thread, Some(&written), |scope| output.value.evaluate(scope)) {
+                    Ok(value) => {
+                        written.insert(output.name.clone(), value);
+                    }
+                    // Left by an outcome of its own, before it was written.
+                    Err(error) if outcome != SUCCESS && error.is_not_yet_known() => {}
+                    Err(error) => return Err(format!("output `{}`: {error}", output.name)),
+                }
             }
         }
         let assigned = if good { self.assigned(context, thread, state, &written)? } else { Vec::new() };

@@ -2,7 +2,7 @@
 //! their ends, the end of the task.
 
 use super::cursor::Todo;
-use super::environment::assigned;
+use super::environment::{ASSIGNED, assigned};
 use super::instance::{Ended, Role, Seen, Wait, gives_outputs};
 use super::ready::{facts_of, not_bound};
 use super::{End, Window};
@@ -11,7 +11,7 @@ use crate::context::Context;
 use crate::protocol::Note;
 use ratn_model::expression::Expr;
 use ratn_model::id::InstanceId;
-use ratn_model::program::{ABORTED, StateKind};
+use ratn_model::program::{ABORTED, SUCCESS, StateKind};
 use ratn_model::value::Value;
 
 impl Window {
@@ -162,6 +162,11 @@ impl Window {
                     outputs.insert(name.clone(), value);
                 }
                 Err(error) => {
+                    // Left by an outcome of its own, before it was written: there is nobody to wait for.
+                    let missing = error.is_not_yet_known() && view.blocker().is_none();
+                    if missing && &*leaves_by != SUCCESS && !name.starts_with(ASSIGNED) {
+                        continue;
+                    }
                     let error = BindError::at(what.clone(), state)(error);
                     failed = Some(not_bound(&view, &error));
                     break;

@@ -126,7 +126,7 @@ impl Plan {
                 repeats[index(state.id)] |= list.iter().any(back);
             }
         }
-        let outcomes = outcomes(program);
+        let outcomes = program.all_outcomes();
         let states = program
             .states
             .iter()
@@ -378,42 +378,6 @@ fn visit_state<'a>(state: &'a State, visit: &mut dyn FnMut(&'a Expr)) {
     annotations.reads.iter().flatten().chain(senses).for_each(|fact| fact.visit(visit));
     annotations.effects.values().flatten().for_each(|effect| effect.visit(visit));
     annotations.resources.iter().flat_map(|r| &r.attributes).for_each(|(_, e)| e.visit(visit));
-}
-
-/// Every state's outcomes: `success`, its own, those by which what it contains leaves it, `aborted`, `preempted`.
-fn outcomes(program: &Program) -> Vec<Vec<String>> {
-    let mut all: Vec<Vec<String>> = vec![Vec::new(); program.states.len()];
-    // What a state contains comes after it.
-    for state in program.states.iter().rev() {
-        let mut own = vec![SUCCESS.to_owned()];
-        let add = |own: &mut Vec<String>, name: &str| {
-            if !matches!(name, SUCCESS | ABORTED | PREEMPTED) && !own.iter().any(|known| known == name) {
-                own.push(name.to_owned());
-            }
-        };
-        state.outcomes.iter().for_each(|name| add(&mut own, name));
-        let decides = match &state.kind {
-            StateKind::Concurrency { decide, preemptive, .. } => {
-                decide.iter().for_each(|(name, _)| add(&mut own, name));
-                !preemptive || !decide.is_empty()
-            }
-            _ => false,
-        };
-        if !decides {
-            for child in state.children() {
-                for outcome in &all[index(child)] {
-                    match program.state(child).transitions.get(outcome.as_str()) {
-                        Some(Target::State(_)) => {}
-                        Some(Target::Outcome(name)) => add(&mut own, name),
-                        None => add(&mut own, outcome),
-                    }
-                }
-            }
-        }
-        own.extend([ABORTED.to_owned(), PREEMPTED.to_owned()]);
-        all[index(state.id)] = own;
-    }
-    all
 }
 
 /// What a routine contains, itself included; any other state alone.

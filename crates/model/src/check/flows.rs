@@ -1,12 +1,14 @@
 //! Data flows that no order of execution can serve: from a state that comes later, contains this one, or may not have run.
 //!
-//! The flows of the whole program form a graph (petgraph): it tells a flow that reordering would repair from a cycle.
+//! Whether an output is there is read from the control flow ([`super::graph`]). The flows of the whole program form a graph, too
+//! (petgraph): it tells a flow that reordering would repair from a cycle.
 
+use super::graph::{ControlFlow, Point};
 use super::{Subject, branches, expressions};
 use crate::diagnostic::Findings;
 use crate::expression::Expr;
 use crate::id::StateId;
-use crate::program::{Program, State, StateKind};
+use crate::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind};
 use petgraph::graph::{DiGraph, NodeIndex};
 use std::collections::BTreeSet;
 
@@ -23,10 +25,25 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
         })
         .collect();
     let graph = graph(program, flows.iter().map(|(to, _, from, _)| (*from, to.id)));
+    let control = subject.control;
     for (to, part, from, port) in flows {
         let at = subject.place(to, &part);
         let source = program.state(from);
         let flow = format!("`{}.{port}`", source.name);
+        let is_region =
+            matches!(source.parent.map(|parent| &program.state(parent).kind), Some(StateKind::Concurrency { .. }));
+        let (surely, maybe) = written(control, program, to, &part, from);
+        let hidden = hides(subject, to, &part, source);
+        if hidden.is_none() && (surely || source.defaults.contains_key(port) || (is_region && at_join(to, &part))) {
+            continue;
+        }
+        if hidden.is_none() && maybe {
+            let message =
+                format!("{flow} may not have been written when this state needs it: not on every way that leads here");
+            let help = "give the port a default, or use it only where it was written";
+            findings.error("branch-may-not-have-written", at, &to.path, message, help);
+            continue;
+        }
         match relation(subject, to, &part, source) {
             Relation::Before => {}
             Relation::Itself => {
@@ -102,7 +119,8 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, part: &str, from: &'a State) 
     let (shared, side) = (down[depth], down[depth - 1]);
     if shared.id == to.id {
         let at_its_end = part.starts_with("outputs.") || part.starts_with("effects.");
-        if !at_its_end || !matches!(to.kind, StateKind::Sequence { .. }) {
+        let at_its_end = at_its_end || part.starts_with("assign.") || part.starts_with("decide.") || part == "while";
+        if !at_its_end || matches!(to.kind, StateKind::ForEach { .. } | StateKind::Condition { .. }) {
             return Relation::Inside;
         }
     } else {
@@ -121,11 +139,55 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, part: &str, from: &'a State) 
     // From the child down to the source: only what surely runs, and lets its outputs out.
     for container in down[..depth].iter().skip(1).rev() {
         match container.kind {
-            StateKind::ForEach { .. } | StateKind::Condition { .. } => return Relation::Maybe(container),
+            StateKind::ForEach { .. } | StateKind::While { .. } | StateKind::Condition { .. } => {
+                return Relation::Maybe(container);
+            }
             _ => {}
         }
     }
     if depth > 1 { Relation::Hidden(side) } else { Relation::Before }
+}
+
+/// Whether the source has surely, and whether it may have, written its outputs when the part of the target is evaluated.
+fn written(control: &ControlFlow, program: &Program, to: &State, part: &str, from: StateId) -> (bool, bool) {
+    let contains = !matches!(to.kind, StateKind::Action { .. });
+    let is_loop = matches!(to.kind, StateKind::While { .. });
+    let is_concurrency = matches!(to.kind, StateKind::Concurrency { .. });
+    if is_concurrency && (part.starts_with("decide.") || part.starts_with("outputs.")) {
+        return control.written(Point::Middle(to.id), from);
+    }
+    if is_loop && part == "while" {
+        return control.written(Point::Middle(to.id), from);
+    }
+    let at_end = part.starts_with("outputs.") || part.starts_with("effects.") || part.starts_with("assign.");
+    if !contains || !at_end {
+        return control.written(Point::Begin(to.id), from);
+    }
+    // What an output is made of may be missing where the state is left by an outcome of its own; then it is not written.
+    let only = part.strip_prefix("effects.").or(part.starts_with("outputs.").then_some(SUCCESS));
+    let outcomes = control.outcomes(to.id).iter().enumerate().filter(|(_, outcome)| match only {
+        Some(only) => outcome.as_str() == only,
+        None => !matches!(outcome.as_str(), ABORTED | PREEMPTED),
+    });
+    let _ = program;
+    outcomes
+        .map(|(number, _)| Point::End(to.id, number))
+        .filter(|point| control.is_reached(*point))
+        .map(|point| control.written(point, from))
+        .fold((true, false), |(surely, maybe), (s, m)| (surely && s, maybe || m))
+}
+
+fn at_join(to: &State, part: &str) -> bool {
+    matches!(to.kind, StateKind::Concurrency { .. })
+        && (part.starts_with("decide.") || part.starts_with("outputs.") || part.starts_with("effects."))
+}
+
+/// The hierarchy inside of which a source is not seen from the target.
+fn hides<'a>(subject: &Subject<'a>, to: &State, part: &str, from: &'a State) -> Option<&'a State> {
+    match relation(subject, to, part, from) {
+        Relation::Hidden(container) => Some(container),
+        _ => None,
+    }
 }
 
 fn ports(expr: &Expr) -> Vec<(StateId, &str)> {

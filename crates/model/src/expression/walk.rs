@@ -55,7 +55,30 @@ impl Expr {
     }
 }
 
+impl Expr {
+    /// Names other states: where one program's states are put into another.
+    pub(crate) fn move_states(&mut self, moved: &dyn Fn(StateId) -> StateId) {
+        match self {
+            Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) => {}
+            Expr::Port { state, .. } => *state = moved(*state),
+            Expr::Field(of, _) | Expr::Unary(_, of) => of.move_states(moved),
+            Expr::Index(a, b) | Expr::Binary(_, a, b) => {
+                a.move_states(moved);
+                b.move_states(moved);
+            }
+            Expr::List(items) | Expr::Call(_, items) => items.iter_mut().for_each(|item| item.move_states(moved)),
+            Expr::Map(fields) => fields.iter_mut().for_each(|(_, item)| item.move_states(moved)),
+            Expr::Fact(fact) | Expr::Exists(fact) => fact.move_states(moved),
+        }
+    }
+}
+
 impl FactExpr {
+    /// As [`Expr::move_states`].
+    pub(crate) fn move_states(&mut self, moved: &dyn Fn(StateId) -> StateId) {
+        self.arguments.iter_mut().flatten().for_each(|argument| argument.move_states(moved));
+    }
+
     /// Calls `visit` for every argument and every part of it.
     pub fn visit<'a>(&'a self, visit: &mut dyn FnMut(&'a Expr)) {
         self.arguments.iter().flatten().for_each(|argument| argument.visit(visit));
@@ -63,6 +86,21 @@ impl FactExpr {
 }
 
 impl EffectExpr {
+    /// As [`Expr::move_states`].
+    pub(crate) fn move_states(&mut self, moved: &dyn Fn(StateId) -> StateId) {
+        match self {
+            EffectExpr::Set(fact, value) | EffectExpr::Increase(fact, value) => {
+                fact.move_states(moved);
+                value.move_states(moved);
+            }
+            EffectExpr::Delete(fact) => fact.move_states(moved),
+            EffectExpr::ForEach { collection, effects, .. } => {
+                collection.move_states(moved);
+                effects.iter_mut().for_each(|effect| effect.move_states(moved));
+            }
+        }
+    }
+
     /// Calls `visit` for every expression in the effect and every part of it.
     pub fn visit<'a>(&'a self, visit: &mut dyn FnMut(&'a Expr)) {
         match self {

@@ -8,8 +8,12 @@ use crate::catalogue::Catalogue;
 use crate::expression::Expr;
 use crate::expression::parse::{NameError, Names};
 use crate::id::StateId;
+use crate::program::Program;
 use crate::value::Type;
 use std::collections::BTreeMap;
+
+/// The port of a region that says how it ended.
+const OUTCOME: &str = "outcome";
 
 /// The output ports of a state.
 #[derive(Debug, Clone, Default)]
@@ -27,6 +31,8 @@ pub(crate) struct Task<'a> {
     /// By [`StateId`].
     pub(crate) ports: Vec<Ports>,
     pub(crate) parameters: Vec<String>,
+    /// Libraries that states use, loaded, by state.
+    pub(crate) libraries: BTreeMap<StateId, Program>,
 }
 
 /// From where an expression sees the task.
@@ -34,7 +40,7 @@ pub(crate) struct Task<'a> {
 pub(crate) struct View {
     /// The state; `None` sees parameters only.
     pub(crate) state: Option<StateId>,
-    /// It sees the state's children (outputs of a hierarchy).
+    /// It sees the state's children and its scoped variables (outputs of a hierarchy).
     pub(crate) inside: bool,
     /// A bare word may be an output of the state itself (its effects).
     pub(crate) own_outputs: bool,
@@ -56,9 +62,19 @@ impl Task<'_> {
             .skip(1)
             .flat_map(|id| match &self.outline.step(id).form {
                 Form::ForEach { variable, index, .. } => [Some(variable.as_str()), index.as_deref()],
+                Form::While { index, .. } => [index.as_deref(), None],
                 _ => [None, None],
             })
             .flatten()
+    }
+
+    /// The scoped variables of the states around one, innermost first.
+    pub(crate) fn scoped_variables(&self, state: StateId, inside: bool) -> impl Iterator<Item = &str> {
+        let around = self.outline.around(state).skip(usize::from(!inside));
+        around.flat_map(|id| {
+            let declared = self.outline.step(id).body.get("variables");
+            declared.into_iter().flat_map(|node| node.entries()).map(|entry| entry.key.as_str())
+        })
     }
 }
 
@@ -84,6 +100,14 @@ impl Names for NamesFrom<'_, '_> {
     fn variable(&mut self, name: &str) -> Result<Expr, NameError> {
         let mut known: Vec<&str> = self.view.variables.iter().map(String::as_str).collect();
         known.extend(self.view.state.iter().flat_map(|state| self.task.loop_variables(*state)));
+        if let Some(state) = self.view.state {
+            if self.view.inside
+                && let Form::While { index: Some(index), .. } = &self.task.outline.step(state).form
+            {
+                known.push(index);
+            }
+            known.extend(self.task.scoped_variables(state, self.view.inside));
+        }
         known.extend(self.task.parameters.iter().map(String::as_str));
         if known.contains(&name) {
             return Ok(Expr::Variable(name.to_owned()));
@@ -91,7 +115,12 @@ impl Names for NamesFrom<'_, '_> {
         Err(NameError {
             rule: "unknown-variable",
             message: format!("there is no variable `${name}` here"),
-            help: suggestion(name, known.into_iter(), "$", "declare it under `parameters` or bind it in a loop"),
+            help: suggestion(
+                name,
+                known.into_iter(),
+                "$",
+                "declare it under `parameters` or `variables`, or bind it in a loop",
+            ),
         })
     }
 
@@ -117,10 +146,15 @@ impl Names for NamesFrom<'_, '_> {
             });
         };
         let ports = &self.task.ports[id.0 as usize];
+        let around = self.task.outline.step(id).parent.map(|parent| &self.task.outline.step(parent).form);
+        if port == OUTCOME && matches!(around, Some(Form::Concurrency { .. })) {
+            return Ok(Expr::Port { state: id, port: port.to_owned() });
+        }
         if !ports.open && !ports.types.contains_key(port) {
             let none = match self.task.outline.step(id).form {
                 Form::Action { .. } => "its action has no outputs",
-                Form::Sequence { .. } => "declare it under the state's `outputs`",
+                Form::Sequence { .. } | Form::Concurrency { .. } => "declare it under the state's `outputs`",
+                Form::Library { .. } => "declare it under the `outputs` of the library",
                 _ => "loops and conditions have no outputs",
             };
             return Err(NameError {

@@ -14,10 +14,8 @@ const MAX_STATES: usize = 10_000;
 const MAX_DEPTH: usize = 32;
 
 /// Keys that say what a step is.
-const FORMS: [&str; 4] = ["action", "for", "condition", "states"];
-/// Keys of kinds of states that are not there yet.
-const LATER_FORMS: [&str; 9] =
-    ["while", "do_while", "until", "concurrency", "parallel", "regions", "preemptive", "library", "barrier"];
+const FORMS: [&str; 9] =
+    ["action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library"];
 
 /// Every step, by [`StateId`]; the root is the task.
 #[derive(Debug)]
@@ -55,6 +53,20 @@ pub(crate) enum Form<'a> {
     Sequence { children: Vec<StateId> },
     ForEach { variable: String, collection: Header<'a>, index: Option<String>, body: Vec<StateId> },
     Condition { predicate: &'a Node, then: Vec<StateId>, otherwise: Vec<StateId> },
+    While { predicate: &'a Node, tests: Tests, index: Option<String>, body: Vec<StateId> },
+    Concurrency { kind: &'a Node, regions: Vec<StateId> },
+    Library { file: &'a Node },
+}
+
+/// When the predicate of a loop is looked at, and what ends the loop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Tests {
+    /// `while`: before each iteration; false ends it.
+    Before,
+    /// `do_while`: after each iteration; false ends it.
+    After,
+    /// `until`: after each iteration; true ends it.
+    Until,
 }
 
 /// `variable in collection`
@@ -93,9 +105,10 @@ impl Form<'_> {
     /// The children, or those of `then`.
     pub(crate) fn first_branch(&self) -> &[StateId] {
         match self {
-            Form::Action { .. } => &[],
+            Form::Action { .. } | Form::Library { .. } => &[],
             Form::Sequence { children } => children,
-            Form::ForEach { body, .. } => body,
+            Form::ForEach { body, .. } | Form::While { body, .. } => body,
+            Form::Concurrency { regions, .. } => regions,
             Form::Condition { then, .. } => then,
         }
     }
@@ -182,11 +195,12 @@ impl<'a> Builder<'a, '_> {
     /// The name of a step, if it has one, and its mapping.
     fn named(&mut self, item: &'a Node, path: &str) -> Option<(Option<String>, Location, &'a Node)> {
         let entries = item.entries();
-        let is_form = |entry: &Entry| FORMS.contains(&entry.key.as_str()) || LATER_FORMS.contains(&entry.key.as_str());
+        let is_form = |entry: &Entry| FORMS.contains(&entry.key.as_str());
         if let Some(form) = entries.iter().find(|e| is_form(e)) {
-            if form.key == "action" {
+            if matches!(form.key.as_str(), "action" | "library" | "concurrency") {
                 let message = "this state has no name";
-                self.findings.error("invalid-state", item.at, path, message, "write `- name: { action: … }`");
+                let help = format!("write `- name: {{ {}: … }}`", form.key);
+                self.findings.error("invalid-state", item.at, path, message, help);
                 return None;
             }
             return Some((None, item.at, item));
@@ -228,17 +242,6 @@ impl<'a> Builder<'a, '_> {
         branch: Branch,
         depth: usize,
     ) -> Option<StateId> {
-        if let Some(later) = body.entries().iter().find(|e| LATER_FORMS.contains(&e.key.as_str())) {
-            let message = format!("`{}` is not supported yet", later.key);
-            self.findings.error(
-                "not-supported-yet",
-                later.at,
-                &path,
-                message,
-                "states are action, for, condition or states",
-            );
-            return None;
-        }
         let forms: Vec<&Entry> = body.entries().iter().filter(|e| FORMS.contains(&e.key.as_str())).collect();
         let [form] = forms.as_slice() else {
             let message = match forms.as_slice() {
@@ -246,7 +249,8 @@ impl<'a> Builder<'a, '_> {
                 [a, b, ..] => format!("a state is `{}` or `{}`, not both", a.key, b.key),
                 [_] => String::new(),
             };
-            self.findings.error("invalid-state", at, &path, message, "give it one of action, for, condition or states");
+            let help = format!("give it one of {}", FORMS.join(", "));
+            self.findings.error("invalid-state", at, &path, message, help);
             return None;
         };
         let (variable, collection) = match form.key.as_str() {
@@ -259,6 +263,21 @@ impl<'a> Builder<'a, '_> {
         let form = match form.key.as_str() {
             "action" => Form::Action { action: &form.value },
             "states" => Form::Sequence { children: self.list(&form.value, id, Branch::First, depth + 1) },
+            "library" => Form::Library { file: &form.value },
+            "concurrency" => {
+                let regions = self.branch(body, "regions", id, Branch::First, depth, at);
+                Form::Concurrency { kind: &form.value, regions }
+            }
+            "while" | "do_while" | "until" => {
+                let tests = match form.key.as_str() {
+                    "while" => Tests::Before,
+                    "do_while" => Tests::After,
+                    _ => Tests::Until,
+                };
+                let index = body.get("index").and_then(|node| self.index(node, &path));
+                let list = self.branch(body, "do", id, Branch::First, depth, at);
+                Form::While { predicate: &form.value, tests, index, body: list }
+            }
             "for" => {
                 let index = body.get("index").and_then(|node| self.index(node, &path));
                 let body = self.branch(body, "do", id, Branch::First, depth, at);
@@ -310,11 +329,7 @@ fn default_name(body: &Node) -> String {
     match body.get("for").map(|node| &node.content) {
         Some(Content::Text(text)) => format!("for_{}", text.split_whitespace().next().unwrap_or("each")),
         _ => {
-            let form = body
-                .entries()
-                .iter()
-                .map(|e| e.key.as_str())
-                .find(|key| FORMS.contains(key) || LATER_FORMS.contains(key));
+            let form = body.entries().iter().map(|e| e.key.as_str()).find(|key| FORMS.contains(key));
             form.unwrap_or("state").to_owned()
         }
     }

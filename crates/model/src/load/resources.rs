@@ -53,8 +53,8 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
     };
     fields.keys(
         item,
-        &["block", "consume", "create", "delete", "exists", "class", "count", "where", "with"],
-        &["hold"],
+        &["block", "consume", "create", "delete", "exists", "class", "count", "where", "with", "hold", "unordered"],
+        &[],
     );
     let kind = fields.word(&entry.value, "a kind of resource")?.to_owned();
     let count = item.get("count").map_or(Some(1), |node| fields.count(node, "count", 1))?;
@@ -74,5 +74,6 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
     let attributes: Vec<(String, Option<Expr>)> =
         attributes.map(|attribute| (attribute.key.clone(), fields.expression(&attribute.value))).collect();
     let attributes = attributes.into_iter().filter_map(|(name, value)| Some((name, value?))).collect();
-    Some(ResourceExpr { operation: *operation, kind, class, attributes, count, unordered: false })
+    let unordered = item.get("unordered").is_some_and(|node| fields.flag(node));
+    Some(ResourceExpr { operation: *operation, kind, class, attributes, count, unordered })
 }

@@ -2,45 +2,28 @@
 
 use super::fields::{Fields, Output};
 use super::names::{Task, View};
-use super::outline::{Form, Step};
+use super::outline::{Form, Step, Tests};
 use super::yaml::{Content, Node};
-use super::{effects, resources};
+use super::{effects, flow, library, resources};
 use crate::expression::parse::parse_expression;
-use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::expression::{EffectExpr, Expr, FactExpr, UnaryOperator};
 use crate::fact::SCENE_PREDICATES;
 use crate::id::StateId;
 use crate::program::{ABORTED, Annotations, Nature, PREEMPTED, SUCCESS, State, StateKind, TaskOutput};
 use crate::value::{Type, Value};
 
 const ACTION_KEYS: [&str; 3] = ["action", "in", "out"];
-const SEQUENCE_KEYS: [&str; 2] = ["states", "outputs"];
+const SEQUENCE_KEYS: [&str; 3] = ["states", "outputs", "variables"];
 const LOOP_KEYS: [&str; 3] = ["for", "index", "do"];
+const WHILE_KEYS: [&str; 5] = ["while", "do_while", "until", "index", "do"];
 const CONDITION_KEYS: [&str; 3] = ["condition", "then", "else"];
-const NODE_KEYS: [&str; 5] = ["reads", "routine", "duration", "resources", "description"];
+const CONCURRENCY_KEYS: [&str; 4] = ["concurrency", "regions", "decide", "outputs"];
+const LIBRARY_KEYS: [&str; 2] = ["library", "with"];
+const NODE_KEYS: [&str; 9] =
+    ["reads", "routine", "duration", "resources", "description", "transitions", "exceptional", "assign", "shared"];
 const BOUNDARY_KEYS: [&str; 2] = ["requires", "effects"];
-const NATURE_KEYS: [&str; 4] = ["computes", "senses", "pia", "attempts"];
-const LATER_KEYS: [&str; 20] = [
-    "transitions",
-    "retry",
-    "on",
-    "outcomes",
-    "exceptional",
-    "exceptions",
-    "hold",
-    "deterministic",
-    "unordered",
-    "timeout",
-    "timeout_s",
-    "variables",
-    "scoped",
-    "shared",
-    "defaults",
-    "cancellable",
-    "priority",
-    "ports",
-    "next",
-    "backoff",
-];
+const NATURE_KEYS: [&str; 8] =
+    ["computes", "senses", "pia", "attempts", "retry", "timeout", "exceptions", "deterministic"];
 
 /// Reads one step.
 pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
@@ -52,30 +35,52 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
             Form::Action { .. } => &ACTION_KEYS,
             Form::Sequence { .. } => &SEQUENCE_KEYS,
             Form::ForEach { .. } => &LOOP_KEYS,
+            Form::While { .. } => &WHILE_KEYS,
             Form::Condition { .. } => &CONDITION_KEYS,
+            Form::Concurrency { .. } => &CONCURRENCY_KEYS,
+            Form::Library { .. } => &LIBRARY_KEYS,
         };
         let mut known = [own, &NODE_KEYS].concat();
-        if matches!(step.form, Form::Action { .. } | Form::Sequence { .. }) {
-            known.extend(BOUNDARY_KEYS);
+        match step.form {
+            Form::Action { .. } => known.extend(NATURE_KEYS.into_iter().chain(BOUNDARY_KEYS)),
+            Form::Library { .. } => known.extend(BOUNDARY_KEYS),
+            Form::Sequence { .. } | Form::Concurrency { .. } => {
+                known.extend(BOUNDARY_KEYS.into_iter().chain(["outcomes"]))
+            }
+            _ => known.push("outcomes"),
         }
-        if matches!(step.form, Form::Action { .. }) {
-            known.extend(NATURE_KEYS);
-        }
-        fields.keys(step.body, &known, &LATER_KEYS);
+        fields.keys(step.body, &known, &[]);
     }
     let kind = kind(&mut fields, step);
-    let annotations = if id.0 > 0 { annotations(&mut fields, step, &kind) } else { boundary(Vec::new()) };
+    let outcomes = flow::outcomes(&mut fields, id);
+    let transitions = flow::transitions(&mut fields, id, &outcomes);
+    let variables = match step.form {
+        Form::Library { .. } => library::parameters(&mut fields, id, step.body),
+        _ => flow::variables(&mut fields, id, step.body),
+    };
+    let assign = flow::assign(&mut fields, id, step.body);
+    let defaults = defaults(&mut fields, step.body);
+    let mut annotations = if id.0 > 0 { annotations(&mut fields, step, &kind) } else { boundary(Vec::new()) };
+    let boundary = variables.iter().chain(&assign);
+    let facts = boundary.flat_map(|(_, value)| value.fact_expressions());
+    if let Some(reads) = &mut annotations.reads {
+        for fact in facts {
+            if !reads.contains(fact) {
+                reads.push(fact.clone());
+            }
+        }
+    }
     State {
         id,
         name: step.name.clone(),
         path: step.path.clone(),
         parent: step.parent,
         kind,
-        outcomes: Vec::new(),
-        transitions: Default::default(),
-        variables: Vec::new(),
-        assign: Vec::new(),
-        defaults: Default::default(),
+        outcomes,
+        transitions,
+        variables,
+        assign,
+        defaults,
         annotations,
         location: step.at,
     }
@@ -125,6 +130,36 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
                 body: body.clone(),
             }
         }
+        Form::While { predicate, tests, index, body } => {
+            fields.note("while", predicate.at);
+            fields.view.inside = true;
+            let holds = fields.expression(predicate).unwrap_or_else(nothing);
+            fields.view.inside = false;
+            let predicate = match tests {
+                Tests::Until => Expr::Unary(UnaryOperator::Not, Box::new(holds)),
+                Tests::Before | Tests::After => holds,
+            };
+            let body_first = *tests != Tests::Before;
+            StateKind::While { predicate, body_first, index: index.clone(), body: body.clone() }
+        }
+        Form::Concurrency { kind, regions } => {
+            let preemptive = match &kind.content {
+                Content::Text(text) if text == "barrier" => false,
+                Content::Text(text) if text == "preemptive" => true,
+                _ => {
+                    fields.error("invalid-state", kind.at, "`concurrency` is `barrier` or `preemptive`", "");
+                    false
+                }
+            };
+            let decide = flow::decide(fields, step.body);
+            fields.view.inside = true;
+            let node = step.body.get("outputs");
+            let outputs = node.map(|node| task_outputs(fields, node)).unwrap_or_default();
+            fields.view.inside = false;
+            StateKind::Concurrency { regions: regions.clone(), preemptive, decide, outputs }
+        }
+        // Its states are put below it when all states are there.
+        Form::Library { .. } => StateKind::Sequence { children: Vec::new(), outputs: Vec::new() },
         Form::Condition { predicate, then, otherwise } => {
             fields.note("condition", predicate.at);
             let predicate = fields.expression(predicate).unwrap_or_else(nothing);
@@ -159,6 +194,24 @@ fn inputs(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String, Expr)> {
 fn outputs(fields: &Fields<'_, '_>) -> std::collections::BTreeMap<String, Type> {
     let own = fields.view.state.map(|id| fields.task.ports[id.0 as usize].types.clone());
     own.unwrap_or_default()
+}
+
+/// `out: {x: {type: int, default: 0}}`
+fn defaults(fields: &mut Fields<'_, '_>, body: &Node) -> std::collections::BTreeMap<String, Value> {
+    let mut defaults = std::collections::BTreeMap::new();
+    for entry in body.get("out").map(Node::entries).unwrap_or_default() {
+        if let Some(node) = entry.value.get("default").filter(|_| super::is_port_form(&entry.value))
+            && let Some(value) = super::constant(fields, node)
+        {
+            let own = fields.view.state.and_then(|id| fields.task.ports[id.0 as usize].types.get(&entry.key));
+            if let Some(ty) = own.filter(|ty| !ty.accepts(&value)) {
+                let message = format!("the default of `{}` is {}, not {ty}", entry.key, value.type_name());
+                fields.error("type-mismatch", node.at, message, "");
+            }
+            defaults.insert(entry.key.clone(), value);
+        }
+    }
+    defaults
 }
 
 /// `outputs: {name: expression}` or `{name: {type: int, value: expression}}`.
@@ -239,6 +292,16 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
                 "an estimated duration cannot look up facts",
                 "use a parameter",
             );
+        }
+    }
+    flow::annotate(fields, body, &mut annotations);
+    let holds = body.get("resources").into_iter().flat_map(Node::items).filter_map(|item| item.get("hold"));
+    for node in holds {
+        if is_action {
+            let help = "leave it out: an action holds what it blocks anyway";
+            fields.error("conflicting-annotations", node.at, "`hold` is for states that contain others", help);
+        } else {
+            annotations.routine |= fields.flag(node);
         }
     }
     annotations.attempts = body.get("attempts").and_then(|node| fields.count(node, "attempts", 1));

@@ -1,0 +1,173 @@
+//! What the control flow never comes to, what it never gets out of, loops that do not fit into the window, and regions that get in
+//! each other's way.
+
+use super::Subject;
+use super::graph::Point;
+use crate::diagnostic::Findings;
+use crate::expression::scope::NothingKnown;
+use crate::expression::{EffectExpr, FactExpr};
+use crate::fact::Footprint;
+use crate::program::{Nature, Program, State, StateKind};
+use std::collections::BTreeSet;
+
+pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
+    unreachable(subject, findings);
+    dead_ends(subject, findings);
+    horizons(subject, findings);
+    for state in &subject.program.states {
+        if let StateKind::Concurrency { regions, .. } = &state.kind {
+            let regions: Vec<&State> = regions.iter().map(|id| subject.program.state(*id)).collect();
+            conflicts(subject, &regions, findings);
+        }
+    }
+}
+
+fn unreachable(subject: &Subject<'_>, findings: &mut Findings) {
+    for state in &subject.program.states {
+        let reached = |id| subject.control.is_reached(Point::Begin(id));
+        // Of what is inside of an unreachable state nothing more is said.
+        if !reached(state.id) && state.parent.is_none_or(reached) {
+            let help = "let a transition lead here, or remove it";
+            findings.error("unreachable-state", state.location, &state.path, "nothing leads to this state", help);
+        }
+    }
+}
+
+fn dead_ends(subject: &Subject<'_>, findings: &mut Findings) {
+    let mut told = BTreeSet::new();
+    for point in subject.control.dead_ends() {
+        let (Point::Begin(id) | Point::Middle(id) | Point::End(id, _)) = point;
+        let state = subject.program.state(id);
+        if told.insert(id) && !matches!(state.parent, Some(parent) if told.contains(&parent)) {
+            let message = "from here no outcome of the task can be reached: its transitions go in circles";
+            findings.error("no-way-out", state.location, &state.path, message, "let one of them lead out");
+        }
+    }
+}
+
+/// How many states one iteration visits at least is what the window must hold to look beyond it.
+fn horizons(subject: &Subject<'_>, findings: &mut Findings) {
+    for state in &subject.program.states {
+        let (StateKind::ForEach { body, .. } | StateKind::While { body, .. }) = &state.kind else { continue };
+        let nodes: usize = body.iter().map(|id| nodes(subject.program, subject.program.state(*id))).sum();
+        if nodes > subject.program.horizon {
+            let message = format!(
+                "one iteration has {nodes} states and the horizon is {}: no iteration is seen whole",
+                subject.program.horizon
+            );
+            let help = format!("give the task a `horizon` of {} or more", 2 * nodes);
+            findings.error("horizon-too-small", state.location, &state.path, message, help);
+        }
+    }
+}
+
+fn nodes(program: &Program, state: &State) -> usize {
+    if state.annotations.routine || matches!(state.kind, StateKind::Action { .. }) {
+        return 1;
+    }
+    // Of a condition the longer branch.
+    let list =
+        |list: &[crate::id::StateId]| -> usize { list.iter().map(|id| nodes(program, program.state(*id))).sum() };
+    match &state.kind {
+        StateKind::Condition { then, otherwise, .. } => 1 + list(then).max(list(otherwise)),
+        _ => state.lists().into_iter().map(list).sum(),
+    }
+}
+
+/// What the states of a region touch.
+struct Touched {
+    reads: Footprint,
+    writes: Footprint,
+    shared: Vec<FactExpr>,
+    assigns: BTreeSet<String>,
+    operated: BTreeSet<String>,
+    unannotated: Option<String>,
+}
+
+fn touched(program: &Program, region: &State) -> Touched {
+    let mut touched = Touched {
+        reads: Footprint::NOTHING,
+        writes: Footprint::NOTHING,
+        shared: Vec::new(),
+        assigns: BTreeSet::new(),
+        operated: BTreeSet::new(),
+        unannotated: None,
+    };
+    let mut declared: BTreeSet<&String> = BTreeSet::new();
+    let mut open = vec![region];
+    while let Some(state) = open.pop() {
+        open.extend(state.children().map(|child| program.state(child)));
+        declared.extend(state.variables.iter().map(|(name, _)| name));
+        let annotations = &state.annotations;
+        touched.shared.extend(annotations.shared.iter().cloned());
+        touched.assigns.extend(state.assign.iter().map(|(name, _)| name.clone()));
+        let operations = annotations.resources.iter().filter(|r| {
+            !matches!(
+                r.operation,
+                crate::resource::ResourceOperation::Block | crate::resource::ResourceOperation::Exists
+            )
+        });
+        touched.operated.extend(operations.map(|r| r.kind.clone()));
+        let is_action = matches!(state.kind, StateKind::Action { .. });
+        let senses: &[FactExpr] = match &annotations.nature {
+            Nature::Senses(facts) => facts,
+            _ => &[],
+        };
+        let facts: Vec<FactExpr> = annotations.reads.iter().flatten().chain(senses).cloned().collect();
+        let open_reads = is_action && annotations.reads.is_none() && annotations.nature != Nature::Computes;
+        let open_writes = is_action
+            && annotations.nature != Nature::Computes
+            && !annotations.effects.contains_key(crate::program::SUCCESS);
+        if open_reads || open_writes {
+            touched.unannotated.get_or_insert_with(|| state.path.clone());
+        }
+        let all = |f: Footprint, more: Footprint| f.union(more);
+        touched.reads = all(touched.reads, FactExpr::footprint(&facts, &NothingKnown));
+        for effects in annotations.effects.values() {
+            touched.writes = all(touched.writes, EffectExpr::footprint(effects, &NothingKnown));
+        }
+    }
+    touched.assigns.retain(|name| !declared.contains(name));
+    touched
+}
+
+fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings) {
+    let all: Vec<Touched> = regions.iter().map(|region| touched(subject.program, region)).collect();
+    for (region, touched) in regions.iter().zip(&all) {
+        if let Some(path) = &touched.unannotated {
+            let message =
+                format!("`{path}` says neither what it reads nor what it changes, and runs beside other regions");
+            let help = "give it `reads` and `effects`: then check can tell whether the regions get in each other's way";
+            findings.warning("region-unannotated", region.location, &region.path, message, help);
+        }
+    }
+    for (i, first) in all.iter().enumerate() {
+        for (second, other) in all.iter().zip(regions).skip(i + 1) {
+            let shared: Vec<FactExpr> = first.shared.iter().chain(&second.shared).cloned().collect();
+            let shared = FactExpr::footprint(&shared, &NothingKnown);
+            let both = |a: &Footprint, b: &Footprint| -> Option<String> {
+                let (Footprint::Patterns(a), Footprint::Patterns(b)) = (a, b) else { return None };
+                let covered = |p: &crate::fact::FactPattern| match &shared {
+                    Footprint::Patterns(shared) => shared.iter().any(|s| s.covers(p)),
+                    Footprint::Everything => true,
+                };
+                let pair = a.iter().find_map(|x| b.iter().find(|y| x.overlaps(y) && !covered(x) && !covered(y)))?;
+                Some(format!("the fact `{pair}`"))
+            };
+            let fact = both(&first.writes, &second.writes)
+                .or_else(|| both(&first.writes, &second.reads))
+                .or_else(|| both(&second.writes, &first.reads));
+            let variable =
+                first.assigns.intersection(&second.assigns).next().map(|name| format!("the variable `${name}`"));
+            let resource =
+                first.operated.intersection(&second.operated).next().map(|kind| format!("the task resource {kind}"));
+            if let Some(what) = fact.or(variable).or(resource) {
+                let message =
+                    format!("this region and `{}` both touch {what}, and nothing says in which order", other.name);
+                let help = "put them into one region, or mark the facts as `shared` if the order does not matter";
+                let region = regions[i];
+                findings.error("region-conflict", region.location, &region.path, message, help);
+            }
+        }
+    }
+}

@@ -1,0 +1,215 @@
+//! How control and values flow between states: outcomes, transitions, scoped variables, retry, timeouts.
+
+use super::fields::Fields;
+use super::names::suggestion;
+use super::outline::{Form, Step};
+use super::yaml::{Content, Node};
+use crate::expression::Expr;
+use crate::id::StateId;
+use crate::program::{ABORTED, Annotations, Exceptions, PREEMPTED, Retry, SUCCESS, Target};
+use crate::value::Value;
+use std::collections::BTreeMap;
+
+/// More outcomes than this of one state are refused.
+const MAX_OUTCOMES: usize = 60;
+
+/// The custom outcomes of a state.
+pub(crate) fn outcomes(fields: &mut Fields<'_, '_>, id: StateId) -> Vec<String> {
+    let (task, step) = (fields.task, fields.task.outline.step(id));
+    let mut own: Vec<String> = match &step.form {
+        Form::Action { action } => {
+            let signature = super::state::action_name(action).and_then(|(p, a)| task.catalogue.action(&p, &a));
+            signature.map(|signature| signature.outcomes.clone()).unwrap_or_default()
+        }
+        Form::Library { .. } => task.libraries.get(&id).map(|l| l.states[0].outcomes.clone()).unwrap_or_default(),
+        Form::Concurrency { .. } => {
+            let decided = step.body.get("decide").map(Node::entries).unwrap_or_default();
+            decided.iter().map(|entry| entry.key.clone()).collect()
+        }
+        _ => Vec::new(),
+    };
+    let declared = step.body.get("outcomes");
+    for node in declared.into_iter().flat_map(Node::items) {
+        own.extend(fields.word(node, "an outcome").map(str::to_owned));
+    }
+    own.retain(|outcome| !is_common(outcome));
+    let mut seen = Vec::new();
+    own.retain(|outcome| {
+        !seen.contains(outcome) && {
+            seen.push(outcome.clone());
+            true
+        }
+    });
+    if own.len() > MAX_OUTCOMES {
+        let at = declared.map_or(step.at, |node| node.at);
+        fields.error("invalid-state", at, format!("a state has at most {MAX_OUTCOMES} outcomes"), "");
+    }
+    own
+}
+
+fn is_common(outcome: &str) -> bool {
+    matches!(outcome, SUCCESS | ABORTED | PREEMPTED)
+}
+
+/// `transitions: {aborted: give_up}`: to a sibling, else to an outcome of the state around.
+pub(crate) fn transitions(fields: &mut Fields<'_, '_>, id: StateId, own: &[String]) -> BTreeMap<String, Target> {
+    let mut transitions = BTreeMap::new();
+    let step = fields.task.outline.step(id);
+    let Some(node) = step.body.get("transitions") else { return transitions };
+    let parent = step.parent.map(|parent| (parent, fields.task.outline.step(parent)));
+    let Some((parent, around)) = parent.filter(|(_, p)| !matches!(p.form, Form::Concurrency { .. })) else {
+        let help = "use its outcome in `decide`";
+        fields.error("invalid-state", node.at, "a region has no transitions: all regions are waited for", help);
+        return transitions;
+    };
+    let siblings: Vec<(StateId, &str)> =
+        fields.task.outline.siblings(id).iter().map(|id| (*id, fields.task.outline.step(*id).name.as_str())).collect();
+    let leaving = leaving(fields, parent, around);
+    for entry in node.entries() {
+        fields.note(format!("transitions.{}", entry.key), entry.at);
+        if !is_common(&entry.key) && !own.contains(&entry.key) {
+            let known = own.iter().map(String::as_str).chain([SUCCESS, ABORTED, PREEMPTED]);
+            let help = suggestion(&entry.key, known, "", "declare it under `outcomes`");
+            fields.error("unknown-outcome", entry.at, format!("this state has no outcome `{}`", entry.key), help);
+            continue;
+        }
+        let Some(to) = fields.word(&entry.value, "a state or an outcome") else { continue };
+        let sibling = siblings.iter().find(|(_, name)| *name == to).map(|(id, _)| Target::State(*id));
+        let outcome = || leaving.iter().any(|outcome| outcome == to).then(|| Target::Outcome(to.to_owned()));
+        match sibling.or_else(outcome) {
+            Some(target) => {
+                transitions.insert(entry.key.clone(), target);
+            }
+            None => {
+                let known = siblings.iter().map(|(_, name)| *name).chain(leaving.iter().map(String::as_str));
+                let help =
+                    suggestion(to, known, "", "name a state beside this one, or an outcome of the state around it");
+                let message =
+                    format!("`{to}` is neither a state beside this one nor an outcome of the state around it");
+                fields.error("unknown-target", entry.value.at, message, help);
+            }
+        }
+    }
+    transitions
+}
+
+/// The outcomes by which a list may be left.
+fn leaving(fields: &Fields<'_, '_>, parent: StateId, around: &Step<'_>) -> Vec<String> {
+    let declared = around.body.get("outcomes").into_iter().flat_map(Node::items);
+    let declared = declared.filter_map(|node| match &node.content {
+        Content::Text(name) => Some(name.clone()),
+        _ => None,
+    });
+    let _ = (fields, parent);
+    [SUCCESS, ABORTED, PREEMPTED].map(str::to_owned).into_iter().chain(declared).collect()
+}
+
+/// `variables: {n: 0}`
+pub(crate) fn variables(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> Vec<(String, Expr)> {
+    let mut variables = Vec::new();
+    for entry in body.get("variables").map(Node::entries).unwrap_or_default() {
+        fields.note(format!("variables.{}", entry.key), entry.at);
+        let outer = fields.task.loop_variables(id).chain(fields.task.scoped_variables(id, false));
+        if outer.chain(fields.task.parameters.iter().map(String::as_str)).any(|other| other == entry.key) {
+            let message = format!("the variable `${}` exists already around this state", entry.key);
+            fields.error("duplicate-name", entry.at, message, "give it another name");
+        }
+        if !crate::expression::display::is_word(&entry.key) {
+            let help = "use letters, digits and _, beginning with a letter";
+            fields.error("invalid-name", entry.at, format!("`{}` cannot be a variable's name", entry.key), help);
+        }
+        if let Some(value) = fields.expression(&entry.value) {
+            variables.push((entry.key.clone(), value));
+        }
+    }
+    variables
+}
+
+/// `assign: {n: $n + 1}`: variables of the states around.
+pub(crate) fn assign(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> Vec<(String, Expr)> {
+    let mut assign = Vec::new();
+    let inside = fields.view.inside;
+    fields.view.own_outputs = true;
+    fields.view.inside = !matches!(fields.task.outline.step(id).form, Form::Action { .. });
+    for entry in body.get("assign").map(Node::entries).unwrap_or_default() {
+        fields.note(format!("assign.{}", entry.key), entry.at);
+        if !fields.task.scoped_variables(id, false).any(|known| known == entry.key) {
+            let known: Vec<&str> = fields.task.scoped_variables(id, false).collect();
+            let help = suggestion(&entry.key, known.into_iter(), "", "declare it under `variables` of a state around");
+            let message = format!("there is no scoped variable `{}` around this state", entry.key);
+            fields.error("unknown-variable", entry.at, message, help);
+            continue;
+        }
+        if let Some(value) = fields.expression(&entry.value) {
+            assign.push((entry.key.clone(), value));
+        }
+    }
+    fields.view.own_outputs = false;
+    fields.view.inside = inside;
+    assign
+}
+
+/// `decide: {failed: "left.outcome = aborted"}`
+pub(crate) fn decide(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String, Expr)> {
+    let mut decide = Vec::new();
+    fields.view.inside = true;
+    for entry in body.get("decide").map(Node::entries).unwrap_or_default() {
+        fields.note(format!("decide.{}", entry.key), entry.at);
+        if let Some(holds) = fields.expression(&entry.value) {
+            decide.push((entry.key.clone(), holds));
+        }
+    }
+    fields.view.inside = false;
+    decide
+}
+
+/// Retry, timeout, exceptions, determinism, shared facts.
+pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations) {
+    if let Some(node) = body.get("retry") {
+        let count = node.get("count").unwrap_or(node);
+        if node.get("count").is_some() {
+            fields.keys(node, &["count", "backoff"], &[]);
+        }
+        let backoff_s = node.get("backoff").map_or(Some(0.0), |node| seconds(fields, node, "backoff"));
+        if let (Some(count), Some(backoff_s)) = (fields.count(count, "retry", 1), backoff_s) {
+            annotations.retry = Some(Retry { count, backoff_s });
+        }
+    }
+    annotations.timeout_s = body.get("timeout").and_then(|node| seconds(fields, node, "timeout"));
+    annotations.exceptions = body.get("exceptions").and_then(|node| exceptions(fields, node));
+    annotations.deterministic = body.get("deterministic").is_some_and(|node| fields.flag(node));
+    for node in body.get("exceptional").into_iter().flat_map(Node::items) {
+        annotations.exceptional.extend(fields.word(node, "an outcome").map(str::to_owned));
+    }
+    for node in body.get("shared").into_iter().flat_map(Node::items) {
+        annotations.shared.extend(fields.fact(node));
+    }
+}
+
+/// A positive number of seconds.
+pub(crate) fn seconds(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> Option<f64> {
+    let seconds = match fields.expression(node)? {
+        Expr::Literal(value) => match value {
+            Value::Int(_) | Value::Float(_) => value.as_number(),
+            _ => None,
+        },
+        _ => None,
+    };
+    let seconds = seconds.filter(|s| s.is_finite() && *s >= 0.0);
+    if seconds.is_none() {
+        fields.error("type-mismatch", node.at, format!("`{what}` is a number of seconds, not below 0"), "");
+    }
+    seconds
+}
+
+/// `precise` or `imprecise`.
+pub(crate) fn exceptions(fields: &mut Fields<'_, '_>, node: &Node) -> Option<Exceptions> {
+    match &node.content {
+        Content::Text(text) if text == "precise" => Some(Exceptions::Precise),
+        Content::Text(text) if text == "imprecise" => Some(Exceptions::Imprecise),
+        _ => {
+            fields.error("type-mismatch", node.at, "`exceptions` is `precise` or `imprecise`", "");
+            None
+        }
+    }
+}

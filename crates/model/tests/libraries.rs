@@ -1,0 +1,107 @@
+//! A task file as a state of another.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_model::catalogue::Catalogue;
+use ratn_model::expression::Expr;
+use ratn_model::id::StateId;
+use ratn_model::load::{Files, Loaded, load_with};
+use ratn_model::program::{StateKind, Target};
+use ratn_model::value::Value;
+use std::collections::BTreeMap;
+
+/// Files by name.
+struct Shelf(BTreeMap<&'static str, &'static str>);
+
+impl Files for Shelf {
+    fn read(&self, _: &str, path: &str) -> Result<(String, String), String> {
+        let text = self.0.get(path).ok_or("there is no such file")?;
+        Ok((path.to_owned(), (*text).to_owned()))
+    }
+}
+
+const PART: &str = "
+task: part
+parameters: { times: 2, what: { type: string } }
+outcomes: [empty]
+outputs: { last: look.pan }
+states:
+  - look:
+      action: pan_tilt/look_at
+      in: { target: 'pose(1, 0, 0)' }
+      resources: [{ block: PanTilt }]
+      transitions: { aborted: give_up }
+  - for: i in range($times)
+    do:
+      - grasp: { action: gripper/grasp, in: { object: $what }, resources: [{ block: Gripper }, { block: Arm }] }
+    transitions: { success: success }
+  - give_up: { action: gripper/release, resources: [{ block: Gripper }], transitions: { success: empty } }
+";
+
+fn load(task: &str, part: &'static str) -> Result<Loaded, String> {
+    let shelf = Shelf(BTreeMap::from([
+        ("part.yaml", part),
+        ("self.yaml", "task: s\nstates:\n  - a: { library: self.yaml }\n"),
+    ]));
+    load_with(task, "task.yaml", &Catalogue::standard(), &shelf)
+        .map_err(|findings| findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))
+}
+
+#[test]
+fn the_states_of_a_library_stand_below_the_state_that_uses_it() {
+    let task = "
+task: whole
+states:
+  - first: { library: part.yaml, with: { what: cup }, transitions: { empty: second } }
+  - second: { library: part.yaml, with: { what: bowl, times: 1 }, transitions: { empty: success } }
+  - turn: { action: pan_tilt/look_at, in: { target: 'pose(second.last, 0, 0)' }, resources: [{ block: PanTilt }] }
+";
+    let program = load(task, PART).unwrap().program;
+    let paths: Vec<&str> = program.states.iter().map(|state| state.path.as_str()).collect();
+    assert!(paths.contains(&"first/look") && paths.contains(&"second/for_i/grasp"), "{paths:?}");
+    for (number, state) in program.states.iter().enumerate() {
+        assert_eq!(state.id, StateId(number as u64));
+        for child in state.children() {
+            assert_eq!(program.state(child).parent, Some(state.id), "{}", state.path);
+        }
+        for target in state.transitions.values() {
+            if let Target::State(to) = target {
+                assert_eq!(program.state(*to).parent, state.parent, "{}", state.path);
+            }
+        }
+    }
+    let second = &program.states[2];
+    assert_eq!(second.outcomes, ["empty"]);
+    let StateKind::Sequence { outputs, .. } = &second.kind else { panic!("a hierarchy") };
+    let Expr::Port { state, port } = &outputs[0].value else { panic!("an output of a state") };
+    assert_eq!((program.state(*state).path.as_str(), port.as_str()), ("second/look", "pan"));
+    let bound: Vec<_> = second.variables.iter().map(|(name, value)| (name.as_str(), value.clone())).collect();
+    let literal = |value| Expr::Literal(value);
+    assert_eq!(bound, [("times", literal(Value::Int(1))), ("what", literal(Value::String("bowl".into())))]);
+    let other = load(
+        task,
+        "task: part\nparameters: { times: 2, what: { type: string } }\noutputs: { last: 1 }\noutcomes: [empty]\nstates: []\n",
+    );
+    assert_ne!(other.unwrap().program.digest, program.digest, "a library's text is part of the task's");
+}
+
+#[test]
+fn what_is_wrong_in_a_library_is_said_with_its_own_name() {
+    let task = "task: t\nstates:\n  - a: { library: part.yaml, with: { what: cup } }\n";
+    let refusal =
+        load(task, "task: part\nparameters: { what: cup }\nstates:\n  - x: { action: arm/wave }\n").unwrap_err();
+    assert!(refusal.contains("part.yaml:4:") && refusal.contains("task.yaml:3:"), "{refusal}");
+}
+
+#[test]
+fn a_library_that_is_missing_or_uses_itself_or_lacks_a_parameter_is_refused() {
+    for (step, said) in [
+        ("library: nowhere.yaml", "there is no such file"),
+        ("library: self.yaml", "uses itself"),
+        ("library: part.yaml", "needs its parameter `what`"),
+        ("library: part.yaml, with: { what: cup, time: 3 }", "no parameter `time`"),
+    ] {
+        let refusal = load(&format!("task: t\nstates:\n  - a: {{ {step} }}\n"), PART).unwrap_err();
+        assert!(refusal.contains(said), "{step}: {refusal}");
+    }
+}
