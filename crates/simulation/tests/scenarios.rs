@@ -686,3 +686,148 @@ states:
         .map(|l| l.at.seconds());
     assert_eq!(asked.collect::<Vec<_>>(), [0.0, 0.0, 4.0]);
 }
+
+#[test]
+fn imprecise_motions_run_beside_younger_ones_that_touch_nothing_of_theirs() {
+    let task = "
+task: together
+states:
+  - turn: { action: head/turn, pia: true, reads: [], effects: ['head_at(h) = 1'], exceptions: imprecise, resources: [{ block: Head }], duration: 5 }
+  - move: { action: arm/move, pia: true, reads: [], effects: ['arm_at(a) = 1'], resources: [{ block: Arm }], duration: 3 }
+  - back: { action: arm/move, pia: true, reads: ['arm_at(a)'], effects: ['arm_at(a) = 2'], resources: [{ block: Arm }], duration: 1 }
+  - after: { action: arm/move, pia: true, reads: ['head_at(h)'], effects: ['arm_at(a) = 3'], resources: [{ block: Arm }], duration: 1 }
+";
+    let run = simulate(task, Mode::Cdtn, &mut Script::default());
+    assert_eq!((run.outcome.as_str(), run.end_s), ("success", 6.0));
+    for (what, when) in [("start turn", 0.0), ("start move", 0.0), ("start back", 3.0), ("start after", 5.0)] {
+        assert_eq!(at(&run, what), when, "{what}");
+    }
+    let precise = task.replace(" exceptions: imprecise,", "");
+    assert_eq!(simulate(&precise, Mode::Cdtn, &mut Script::default()).end_s, 10.0);
+    // One that fails does not undo the other.
+    let mut script = Script { outcomes: BTreeMap::from([("turn", "aborted")]), ..Script::default() };
+    let run = simulate(task, Mode::Cdtn, &mut script);
+    assert_eq!(run.outcome, "aborted");
+    assert_eq!(at(&run, "end back"), 4.0);
+    never(&run, "start after");
+}
+
+#[test]
+fn regions_run_beside_each_other_and_the_decider_says_how_they_ended() {
+    let task = "
+task: regions
+states:
+  - both:
+      concurrency: barrier
+      regions:
+        - turn: { action: head/turn, pia: true, reads: [], effects: ['head_at(h) = 1'], resources: [{ block: Head }], duration: 5 }
+        - move: { action: arm/move, pia: true, reads: [], effects: ['arm_at(a) = 1'], resources: [{ block: Arm }], duration: 3 }
+      decide: { blind: 'turn.outcome = aborted' }
+      transitions: { blind: repair }
+  - after: { action: arm/move, pia: true, reads: [], effects: [], resources: [{ block: Arm }], transitions: { success: success } }
+  - repair: { action: head/turn, pia: true, reads: [], effects: [], resources: [{ block: Head }], duration: 2 }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let run = simulate(task, mode, &mut Script::default());
+        assert_eq!((run.outcome.as_str(), run.end_s), ("success", 6.0));
+        never(&run, "start repair");
+        let mut script = Script { outcomes: BTreeMap::from([("both/turn", "aborted")]), ..Script::default() };
+        let run = simulate(task, mode, &mut script);
+        assert_eq!((run.outcome.as_str(), run.end_s, at(&run, "start repair")), ("success", 7.0, 5.0));
+        never(&run, "start after");
+    }
+}
+
+#[test]
+fn the_first_of_preemptive_regions_stops_the_others() {
+    let task = "
+task: race
+states:
+  - race:
+      concurrency: preemptive
+      regions:
+        - turn: { action: head/turn, pia: true, reads: [], effects: ['head_at(h) = 1'], resources: [{ block: Head }], duration: 5 }
+        - move: { action: arm/move, pia: true, reads: [], effects: ['arm_at(a) = 1'], resources: [{ block: Arm }], duration: 3 }
+  - next: { action: head/turn, pia: true, reads: [], effects: [], resources: [{ block: Head }] }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let run = simulate(task, mode, &mut Script::default());
+        assert_eq!((run.outcome.as_str(), run.end_s), ("success", 4.0), "{}", run.reason);
+        assert_eq!(run.world.len(), 1, "what was stopped has changed nothing");
+        never(&run, "end race/turn");
+    }
+}
+
+#[test]
+fn what_aborts_is_tried_again_after_growing_pauses_and_then_handled() {
+    let task = "
+task: again
+states:
+  - grasp: { action: arm/move, pia: true, reads: [], effects: [], resources: [{ block: Arm }], duration: 1, retry: { count: 2, backoff: 0.5 }, transitions: { aborted: give_up } }
+  - done: { action: arm/move, pia: true, reads: [], effects: [], resources: [{ block: Arm }], transitions: { success: success } }
+  - give_up: { action: head/turn, pia: true, reads: [], effects: [], resources: [{ block: Head }], duration: 1 }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let mut script = Script { outcomes: BTreeMap::from([("grasp", "aborted")]), ..Script::default() };
+        let run = simulate(task, mode, &mut script);
+        let starts: Vec<String> = transcript(&run).into_iter().filter(|line| line.contains("start")).collect();
+        assert_eq!(starts, ["0 start grasp", "1.5 start grasp", "3.5 start grasp", "4.5 start give_up"]);
+        assert_eq!(run.outcome, "success");
+    }
+}
+
+#[test]
+fn a_goal_that_takes_too_long_has_aborted_and_so_has_a_task() {
+    let task = "
+task: late
+deadline: 7
+states:
+  - think: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 10, timeout: 2, transitions: { aborted: act } }
+  - act: { action: arm/move, pia: true, reads: [], effects: [], resources: [{ block: Arm }], duration: 9 }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let run = simulate(task, mode, &mut Script::default());
+        assert_eq!(at(&run, "start act"), 2.0);
+        assert_eq!((run.outcome.as_str(), run.end_s), ("aborted", 7.0));
+        assert!(run.reason.contains("deadline"), "{}", run.reason);
+    }
+}
+
+#[test]
+fn the_same_visit_on_two_branches_is_computed_once() {
+    let task = "
+task: twins
+states:
+  - look: { action: eye/look, senses: ['light()'], effects: [], resources: [{ block: Eye }], duration: 5 }
+  - bright:
+      condition: look.x = 1
+      then:
+        - wave: { action: head/turn, pia: true, reads: [], effects: ['waved()'], resources: [{ block: Head }] }
+  - plan: { action: brain/think, computes: true, reads: ['table()'], resources: [{ block: Brain }], duration: 3 }
+";
+    let run = simulate(task, Mode::Cdtn, &mut Script::default());
+    let starts = transcript(&run).into_iter().filter(|line| line.ends_with("start plan")).count();
+    assert_eq!((starts, run.end_s), (1, 6.0), "{:#?}", transcript(&run));
+    assert!(run.log.iter().any(|l| matches!(l.entry, LogEntry::Command(Command::Note(Note::Reused { .. })))));
+}
+
+#[test]
+fn what_is_speculative_gives_way_to_what_is_needed() {
+    let task = "
+task: preempted
+states:
+  - pick: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 1 }
+  - look: { action: eye/look, in: { a: pick.x }, senses: ['light()'], effects: [], resources: [{ block: Eye }], duration: 2 }
+  - plan: { action: brain/think, in: { a: look.x }, computes: true, reads: [], resources: [{ block: Brain, count: 2 }], duration: 1 }
+  - bright:
+      condition: look.x = 2
+      then:
+        - deep: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 20 }
+        - go: { action: arm/move, in: { a: deep.x }, pia: true, reads: [], effects: [], resources: [{ block: Arm }] }
+  - end: { action: arm/move, in: { a: plan.x }, pia: true, reads: [], effects: [], resources: [{ block: Arm }] }
+";
+    let run = simulate(task, Mode::Cdtn, &mut Script::default());
+    assert_eq!(at(&run, "start bright/deep"), 0.0);
+    // Of two brains the speculative one gives its back.
+    assert_eq!((at(&run, "start plan"), run.end_s), (3.0, 5.0), "{:#?}", transcript(&run));
+}
