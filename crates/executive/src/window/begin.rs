@@ -1,6 +1,7 @@
 //! How a node begins: its resources, its projection, its goal.
 
 use super::Window;
+use super::environment::assigned;
 use super::instance::{Ended, Seen, Status, Wait};
 use super::ready::{Readiness, not_bound, senses_of};
 use crate::analysis::NodeNature;
@@ -8,6 +9,7 @@ use crate::binding::{self, Outputs};
 use crate::context::Context;
 use crate::interpreter::{Interpreter, Routine, Target};
 use crate::protocol::{Command, Goal, Note};
+use ratn_model::expression::Scope;
 use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, StateKind};
@@ -34,7 +36,20 @@ impl Window {
     /// It never began and never will.
     pub(super) fn fail(&mut self, context: &mut Context<'_>, id: InstanceId, reason: String) {
         context.note(Note::Finished { instance: id, outcome: ABORTED.to_owned() });
-        self.end_instance(id, Ended::aborted(reason));
+        let outputs = self.unassigned(context, id);
+        self.end_instance(id, Ended { outputs, ..Ended::aborted(reason) });
+    }
+
+    /// A routine that did not run leaves the variables that it would assign as they were.
+    fn unassigned(&self, context: &Context<'_>, id: InstanceId) -> Outputs {
+        let Some(instance) = self.instances.get(id) else { return Outputs::new() };
+        let own = self.plan.state(instance.state);
+        if !own.is_routine {
+            return Outputs::new();
+        }
+        let view = self.sight(context).view(instance, None);
+        let value = |name: &String| Some((assigned(name), view.variable(name)?.into_owned()));
+        own.assigns.iter().filter_map(value).collect()
     }
 
     fn acquire(
@@ -231,10 +246,7 @@ impl Window {
         let view = sight.view(instance, None);
         let names = environment.variables.iter().map(|(name, _)| name);
         let variables = names
-            .filter_map(|name| {
-                use ratn_model::expression::Scope;
-                Some((name.to_string(), view.variable(name)?.into_owned()))
-            })
+            .filter_map(|name| Some((name.to_string(), view.variable(name)?.into_owned())))
             .chain(
                 environment.loop_variables(context.program).map(|(name, value)| (name.to_owned(), value.into_owned())),
             )

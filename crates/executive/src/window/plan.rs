@@ -323,7 +323,14 @@ fn plan(
         operated: operated_kinds,
         flows: used_flows(program, state, is_node),
         assigns: assigned_variables(program, state, is_node).into_iter().collect(),
-        variables: used_variables(program, state, is_node).into_iter().collect(),
+        variables: {
+            let mut variables = used_variables(program, state, is_node);
+            if is_routine {
+                // What it does not assign in the end is as it was before.
+                variables.extend(assigned_variables(program, state, is_node));
+            }
+            variables.into_iter().collect()
+        },
         is_read: read.contains(&state.id),
         read_inside: Vec::new(),
         repeats,
