@@ -181,7 +181,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         library::graft(&mut states, *id, library);
     }
     let digest = hasher.finalize().to_hex().to_string();
-    Some(Program {
+    let mut program = Program {
         name,
         horizon,
         speculation_width: speculation_width.map_or(Program::DEFAULT_SPECULATION_WIDTH, |width| width as usize),
@@ -192,7 +192,10 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         initial,
         states,
         digest,
-    })
+    };
+    flow::inherit_exceptions(&mut program.states);
+    flow::outcomes_exist(&task, &program, out);
+    Some(program)
 }
 
 fn horizon(fields: &mut Fields<'_, '_>, node: &Node) -> usize {

@@ -3,14 +3,15 @@
 use super::Subject;
 use crate::diagnostic::Findings;
 use crate::load::suggestion;
-use crate::program::{ABORTED, PREEMPTED, SUCCESS, State, StateKind};
+use crate::program::{State, StateKind};
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
-    for state in &subject.program.states {
+    let all = subject.program.all_outcomes();
+    for (state, own) in subject.program.states.iter().zip(&all) {
         if let StateKind::Action { provider, action, inputs, .. } = &state.kind {
             ports(subject, state, provider, action, inputs.iter().map(|(port, _)| port.as_str()).collect(), findings);
         }
-        outcomes(subject, state, findings);
+        outcomes(subject, state, own, findings);
     }
 }
 
@@ -52,21 +53,16 @@ fn ports(
 }
 
 /// Effects may be declared only for outcomes that the state can have.
-fn outcomes(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
-    let custom = match &state.kind {
-        StateKind::Action { provider, action, .. } => match subject.catalogue.action(provider, action) {
-            Some(signature) => signature.outcomes.as_slice(),
-            // Complained of already.
-            None => return,
-        },
-        _ => &[],
-    };
-    let known = || [SUCCESS, ABORTED, PREEMPTED].into_iter().chain(custom.iter().map(String::as_str));
-    for outcome in state.annotations.effects.keys() {
-        if !known().any(|other| other == outcome) {
-            let at = subject.place(state, &format!("effects.{outcome}"));
-            let help = suggestion(outcome, known(), "", "");
-            findings.error("unknown-outcome", at, &state.path, format!("this state has no outcome `{outcome}`"), help);
-        }
+fn outcomes(subject: &Subject<'_>, state: &State, own: &[String], findings: &mut Findings) {
+    if let StateKind::Action { provider, action, .. } = &state.kind
+        && subject.catalogue.action(provider, action).is_none()
+    {
+        // Complained of already.
+        return;
+    }
+    for outcome in state.annotations.effects.keys().filter(|outcome| !own.contains(outcome)) {
+        let at = subject.place(state, &format!("effects.{outcome}"));
+        let help = suggestion(outcome, own.iter().map(String::as_str), "", "");
+        findings.error("unknown-outcome", at, &state.path, format!("this state has no outcome `{outcome}`"), help);
     }
 }

@@ -1,7 +1,7 @@
 //! Reading the fields of a mapping: expressions with their places, plain numbers and flags, unknown keys.
 
 use super::names::{NamesFrom, Task, View, suggestion};
-use super::yaml::{Content, Node};
+use super::yaml::{Content, Entry, Node};
 use crate::diagnostic::Findings;
 use crate::expression::parse::{Names, ParseError, parse_effect, parse_expression, parse_fact};
 use crate::expression::{EffectExpr, Expr, FactExpr};
@@ -129,6 +129,16 @@ impl<'t, 'a> Fields<'t, 'a> {
     pub(crate) fn effect(&mut self, node: &Node) -> Option<EffectExpr> {
         let text = self.text(node, "an effect", "\"set at(box) = x\"")?;
         self.parsed(node, text, 0, parse_effect)
+    }
+
+    /// The entries of a key that holds a mapping; anything else but nothing is refused.
+    pub(crate) fn mapping<'n>(&mut self, body: &'n Node, key: &str, example: &str) -> &'n [Entry] {
+        let Some(node) = body.get(key) else { return &[] };
+        if !matches!(node.content, Content::Map(_) | Content::Null) {
+            let message = format!("`{key}` is a mapping, found {}", node.described());
+            self.error("invalid-state", node.at, message, format!("write `{key}: {example}`"));
+        }
+        node.entries()
     }
 
     pub(crate) fn flag(&mut self, node: &Node) -> bool {

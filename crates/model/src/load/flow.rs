@@ -1,12 +1,14 @@
 //! How control and values flow between states: outcomes, transitions, scoped variables, retry, timeouts.
 
-use super::fields::Fields;
-use super::names::suggestion;
+use super::fields::{Fields, Output};
+use super::names::{Task, suggestion};
 use super::outline::{Form, Step};
 use super::yaml::{Content, Node};
 use crate::expression::Expr;
 use crate::id::StateId;
-use crate::program::{ABORTED, Annotations, Exceptions, PREEMPTED, Retry, SUCCESS, Target};
+use crate::program::{
+    ABORTED, Annotations, Exceptions, Location, PREEMPTED, Program, Retry, SUCCESS, State, StateKind, Target,
+};
 use crate::value::Value;
 use std::collections::BTreeMap;
 
@@ -52,27 +54,21 @@ fn is_common(outcome: &str) -> bool {
 }
 
 /// `transitions: {aborted: give_up}`: to a sibling, else to an outcome of the state around.
-pub(crate) fn transitions(fields: &mut Fields<'_, '_>, id: StateId, own: &[String]) -> BTreeMap<String, Target> {
+pub(crate) fn transitions(fields: &mut Fields<'_, '_>, id: StateId) -> BTreeMap<String, Target> {
     let mut transitions = BTreeMap::new();
     let step = fields.task.outline.step(id);
     let Some(node) = step.body.get("transitions") else { return transitions };
-    let parent = step.parent.map(|parent| (parent, fields.task.outline.step(parent)));
-    let Some((parent, around)) = parent.filter(|(_, p)| !matches!(p.form, Form::Concurrency { .. })) else {
+    let parent = step.parent.map(|parent| fields.task.outline.step(parent));
+    let Some(around) = parent.filter(|_| !fields.task.outline.is_region(id)) else {
         let help = "use its outcome in `decide`";
         fields.error("invalid-state", node.at, "a region has no transitions: all regions are waited for", help);
         return transitions;
     };
     let siblings: Vec<(StateId, &str)> =
         fields.task.outline.siblings(id).iter().map(|id| (*id, fields.task.outline.step(*id).name.as_str())).collect();
-    let leaving = leaving(fields, parent, around);
-    for entry in node.entries() {
+    let leaving = leaving(around);
+    for entry in fields.mapping(step.body, "transitions", "{ aborted: give_up }") {
         fields.note(format!("transitions.{}", entry.key), entry.at);
-        if !is_common(&entry.key) && !own.contains(&entry.key) {
-            let known = own.iter().map(String::as_str).chain([SUCCESS, ABORTED, PREEMPTED]);
-            let help = suggestion(&entry.key, known, "", "declare it under `outcomes`");
-            fields.error("unknown-outcome", entry.at, format!("this state has no outcome `{}`", entry.key), help);
-            continue;
-        }
         let Some(to) = fields.word(&entry.value, "a state or an outcome") else { continue };
         let sibling = siblings.iter().find(|(_, name)| *name == to).map(|(id, _)| Target::State(*id));
         let outcome = || leaving.iter().any(|outcome| outcome == to).then(|| Target::Outcome(to.to_owned()));
@@ -93,27 +89,74 @@ pub(crate) fn transitions(fields: &mut Fields<'_, '_>, id: StateId, own: &[Strin
     transitions
 }
 
+/// Refuses what is said of an outcome that a state cannot have; those by which what it contains leaves it are its own, too.
+pub(crate) fn outcomes_exist(task: &Task<'_>, program: &Program, out: &mut Output) {
+    let all = program.all_outcomes();
+    let mut open = vec![false; program.states.len()];
+    // What a state contains comes after it; an action that is not in the catalogue may have any outcome.
+    for state in program.states.iter().rev() {
+        let unknown = match &state.kind {
+            StateKind::Action { provider, action, .. } => task.catalogue.action(provider, action).is_none(),
+            _ => task.outline.steps.get(state.id.0 as usize).is_some_and(|step| {
+                matches!(step.form, Form::Library { .. }) && !task.libraries.contains_key(&state.id)
+            }),
+        };
+        open[state.id.0 as usize] = unknown || state.children().any(|child| open[child.0 as usize]);
+    }
+    for state in program.states.iter().filter(|state| !open[state.id.0 as usize]) {
+        let own = &all[state.id.0 as usize];
+        let connected = state.transitions.keys().map(|outcome| (outcome, format!("transitions.{outcome}")));
+        let marked = state.annotations.exceptional.iter().map(|outcome| (outcome, "exceptional".to_owned()));
+        for (outcome, part) in connected.chain(marked).filter(|(outcome, _)| !own.contains(outcome)) {
+            let at = out.places.of(state.id, &part, state.location);
+            let help = suggestion(outcome, own.iter().map(String::as_str), "", "declare it under `outcomes`");
+            out.findings.error(
+                "unknown-outcome",
+                at,
+                &state.path,
+                format!("this state has no outcome `{outcome}`"),
+                help,
+            );
+        }
+    }
+}
+
+/// What a state says of exceptions holds for what it contains, where that says nothing itself.
+pub(crate) fn inherit_exceptions(states: &mut [State]) {
+    // What a state contains comes after it.
+    for at in 1..states.len() {
+        let around = states[at].parent.and_then(|parent| states[parent.0 as usize].annotations.exceptions);
+        let own = &mut states[at].annotations.exceptions;
+        *own = own.or(around);
+    }
+}
+
 /// The outcomes by which a list may be left.
-fn leaving(fields: &Fields<'_, '_>, parent: StateId, around: &Step<'_>) -> Vec<String> {
+fn leaving(around: &Step<'_>) -> Vec<String> {
     let declared = around.body.get("outcomes").into_iter().flat_map(Node::items);
     let declared = declared.filter_map(|node| match &node.content {
         Content::Text(name) => Some(name.clone()),
         _ => None,
     });
-    let _ = (fields, parent);
     [SUCCESS, ABORTED, PREEMPTED].map(str::to_owned).into_iter().chain(declared).collect()
 }
 
+/// Complains of a name that a variable around the state, or a parameter, has already.
+pub(crate) fn named_once(fields: &mut Fields<'_, '_>, name: &str, at: Location) {
+    let Some(id) = fields.view.state else { return };
+    let outer = fields.task.loop_variables(id).chain(fields.task.scoped_variables(id, false));
+    if outer.chain(fields.task.parameters.iter().map(String::as_str)).any(|other| other == name) {
+        let message = format!("the variable `${name}` exists already around this state");
+        fields.error("duplicate-name", at, message, "give one of both another name");
+    }
+}
+
 /// `variables: {n: 0}`
-pub(crate) fn variables(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> Vec<(String, Expr)> {
+pub(crate) fn variables(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String, Expr)> {
     let mut variables = Vec::new();
-    for entry in body.get("variables").map(Node::entries).unwrap_or_default() {
+    for entry in fields.mapping(body, "variables", "{ tries: 0 }") {
         fields.note(format!("variables.{}", entry.key), entry.at);
-        let outer = fields.task.loop_variables(id).chain(fields.task.scoped_variables(id, false));
-        if outer.chain(fields.task.parameters.iter().map(String::as_str)).any(|other| other == entry.key) {
-            let message = format!("the variable `${}` exists already around this state", entry.key);
-            fields.error("duplicate-name", entry.at, message, "give it another name");
-        }
+        named_once(fields, &entry.key, entry.at);
         if !crate::expression::display::is_word(&entry.key) {
             let help = "use letters, digits and _, beginning with a letter";
             fields.error("invalid-name", entry.at, format!("`{}` cannot be a variable's name", entry.key), help);
@@ -131,7 +174,7 @@ pub(crate) fn assign(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> V
     let inside = fields.view.inside;
     fields.view.own_outputs = true;
     fields.view.inside = !matches!(fields.task.outline.step(id).form, Form::Action { .. });
-    for entry in body.get("assign").map(Node::entries).unwrap_or_default() {
+    for entry in fields.mapping(body, "assign", "{ tries: $tries + 1 }") {
         fields.note(format!("assign.{}", entry.key), entry.at);
         if !fields.task.scoped_variables(id, false).any(|known| known == entry.key) {
             let known: Vec<&str> = fields.task.scoped_variables(id, false).collect();
@@ -153,7 +196,7 @@ pub(crate) fn assign(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> V
 pub(crate) fn decide(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String, Expr)> {
     let mut decide = Vec::new();
     fields.view.inside = true;
-    for entry in body.get("decide").map(Node::entries).unwrap_or_default() {
+    for entry in fields.mapping(body, "decide", "{ failed: left.outcome = aborted }") {
         fields.note(format!("decide.{}", entry.key), entry.at);
         if let Some(holds) = fields.expression(&entry.value) {
             decide.push((entry.key.clone(), holds));
@@ -179,7 +222,13 @@ pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &m
     annotations.exceptions = body.get("exceptions").and_then(|node| exceptions(fields, node));
     annotations.deterministic = body.get("deterministic").is_some_and(|node| fields.flag(node));
     for node in body.get("exceptional").into_iter().flat_map(Node::items) {
+        fields.note("exceptional", node.at);
         annotations.exceptional.extend(fields.word(node, "an outcome").map(str::to_owned));
+    }
+    let is_region = fields.view.state.is_some_and(|id| fields.task.outline.is_region(id));
+    if let Some(node) = body.get("shared").filter(|_| !is_region) {
+        let help = "say it of a region of a `concurrency`";
+        fields.error("invalid-state", node.at, "`shared` is what two regions may both touch", help);
     }
     for node in body.get("shared").into_iter().flat_map(Node::items) {
         annotations.shared.extend(fields.fact(node));

@@ -95,6 +95,11 @@ impl Outline<'_> {
         }
     }
 
+    /// Whether a step is a region of a concurrency.
+    pub(crate) fn is_region(&self, id: StateId) -> bool {
+        self.step(id).parent.is_some_and(|parent| matches!(self.step(parent).form, Form::Concurrency { .. }))
+    }
+
     /// The step and those around it, innermost first.
     pub(crate) fn around(&self, id: StateId) -> impl Iterator<Item = StateId> + '_ {
         std::iter::successors(Some(id), |id| self.step(*id).parent)

@@ -56,6 +56,12 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
         &["block", "consume", "create", "delete", "exists", "class", "count", "where", "with", "hold", "unordered"],
         &[],
     );
+    for key in ["hold", "unordered"] {
+        if let Some(node) = item.get(key).filter(|_| *operation != ResourceOperation::Block) {
+            let help = "leave it out: nothing of it is held while the state runs";
+            fields.error("conflicting-annotations", node.at, format!("`{key}` is said of a `block`"), help);
+        }
+    }
     let kind = fields.word(&entry.value, "a kind of resource")?.to_owned();
     let count = item.get("count").map_or(Some(1), |node| fields.count(node, "count", 1))?;
     let class = match item.get("class") {

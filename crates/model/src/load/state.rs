@@ -19,11 +19,20 @@ const WHILE_KEYS: [&str; 5] = ["while", "do_while", "until", "index", "do"];
 const CONDITION_KEYS: [&str; 3] = ["condition", "then", "else"];
 const CONCURRENCY_KEYS: [&str; 4] = ["concurrency", "regions", "decide", "outputs"];
 const LIBRARY_KEYS: [&str; 2] = ["library", "with"];
-const NODE_KEYS: [&str; 9] =
-    ["reads", "routine", "duration", "resources", "description", "transitions", "exceptional", "assign", "shared"];
+const NODE_KEYS: [&str; 10] = [
+    "reads",
+    "routine",
+    "duration",
+    "resources",
+    "description",
+    "transitions",
+    "exceptional",
+    "exceptions",
+    "assign",
+    "shared",
+];
 const BOUNDARY_KEYS: [&str; 2] = ["requires", "effects"];
-const NATURE_KEYS: [&str; 8] =
-    ["computes", "senses", "pia", "attempts", "retry", "timeout", "exceptions", "deterministic"];
+const NATURE_KEYS: [&str; 7] = ["computes", "senses", "pia", "attempts", "retry", "timeout", "deterministic"];
 
 /// Reads one step.
 pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
@@ -53,10 +62,10 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
     }
     let kind = kind(&mut fields, step);
     let outcomes = flow::outcomes(&mut fields, id);
-    let transitions = flow::transitions(&mut fields, id, &outcomes);
+    let transitions = flow::transitions(&mut fields, id);
     let variables = match step.form {
         Form::Library { .. } => library::parameters(&mut fields, id, step.body),
-        _ => flow::variables(&mut fields, id, step.body),
+        _ => flow::variables(&mut fields, step.body),
     };
     let assign = flow::assign(&mut fields, id, step.body);
     let defaults = defaults(&mut fields, step.body);
@@ -107,16 +116,7 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
         }
         Form::ForEach { variable, collection, index, body } => {
             for name in std::iter::once(variable).chain(index) {
-                let outer = fields.view.state.into_iter().flat_map(|id| fields.task.loop_variables(id));
-                if outer.chain(fields.task.parameters.iter().map(String::as_str)).any(|other| other == name) {
-                    let message = format!("the variable `${name}` exists already around this loop");
-                    fields.error(
-                        "duplicate-name",
-                        collection.node.at,
-                        message,
-                        "give the loop's variable another name",
-                    );
-                }
+                flow::named_once(fields, name, collection.node.at);
             }
             if index.as_ref() == Some(variable) {
                 fields.error("duplicate-name", collection.node.at, "element and index have the same name", "");
@@ -131,6 +131,9 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
             }
         }
         Form::While { predicate, tests, index, body } => {
+            if let Some(name) = index {
+                flow::named_once(fields, name, predicate.at);
+            }
             fields.note("while", predicate.at);
             fields.view.inside = true;
             let holds = fields.expression(predicate).unwrap_or_else(nothing);
@@ -196,11 +199,14 @@ fn outputs(fields: &Fields<'_, '_>) -> std::collections::BTreeMap<String, Type> 
     own.unwrap_or_default()
 }
 
-/// `out: {x: {type: int, default: 0}}`
+/// `out: {x: {type: int, default: 0}}`, and of a hierarchy `outputs: {x: {value: plan.n, default: 0}}`.
 fn defaults(fields: &mut Fields<'_, '_>, body: &Node) -> std::collections::BTreeMap<String, Value> {
     let mut defaults = std::collections::BTreeMap::new();
-    for entry in body.get("out").map(Node::entries).unwrap_or_default() {
-        if let Some(node) = entry.value.get("default").filter(|_| super::is_port_form(&entry.value))
+    let of_action = body.get("out").map(Node::entries).unwrap_or_default();
+    let of_hierarchy = body.get("outputs").map(Node::entries).unwrap_or_default();
+    let long = of_action.iter().filter(|entry| super::is_port_form(&entry.value));
+    for entry in long.chain(of_hierarchy.iter().filter(|entry| entry.value.get("value").is_some())) {
+        if let Some(node) = entry.value.get("default")
             && let Some(value) = super::constant(fields, node)
         {
             let own = fields.view.state.and_then(|id| fields.task.ports[id.0 as usize].types.get(&entry.key));
@@ -225,7 +231,7 @@ pub(crate) fn task_outputs(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<Task
             _ => None,
         };
         if long {
-            fields.keys(&entry.value, &["type", "value", "description"], &[]);
+            fields.keys(&entry.value, &["type", "value", "default", "description"], &[]);
         }
         let value = if long { entry.value.get("value").unwrap_or(&entry.value) } else { &entry.value };
         if let Some(value) = fields.expression(value) {
@@ -271,9 +277,12 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         }
     }
     if let Some(node) = body.get("effects") {
+        // As it ends, what a hierarchy contains has written its outputs.
+        fields.view.inside = matches!(kind, StateKind::Sequence { .. } | StateKind::Concurrency { .. });
         fields.view.own_outputs = true;
         annotations.effects.extend(effects::by_outcome(fields, node));
         fields.view.own_outputs = false;
+        fields.view.inside = false;
     }
     if let Some(node) = body.get("resources") {
         // What is created may be named by what the state put out; blocks are checked against that.

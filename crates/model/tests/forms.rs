@@ -1,0 +1,317 @@
+//! Every form of state and every key of a task file becomes what it says in the program.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use insta::assert_snapshot;
+use ratn_model::catalogue::{ActionSignature, Catalogue};
+use ratn_model::load::load;
+use ratn_model::program::{Exceptions, Program, Retry, State, StateKind, Target};
+
+/// The standard system, with an eye that may see nothing.
+fn catalogue() -> Catalogue {
+    let mut catalogue = Catalogue::standard();
+    let outputs = [("found".to_owned(), "int".parse().unwrap())].into();
+    let look = ActionSignature { outputs, outcomes: vec!["empty".to_owned()], ..ActionSignature::default() };
+    let mut eye = catalogue.providers["gripper"].clone();
+    eye.actions = [("look".to_owned(), look)].into();
+    catalogue.providers.insert("eye".to_owned(), eye);
+    catalogue
+}
+
+fn program(source: &str) -> Program {
+    match load(source, "task.yaml", &catalogue()) {
+        Ok(loaded) => loaded.program,
+        Err(findings) => panic!("{}", findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n")),
+    }
+}
+
+fn state<'p>(program: &'p Program, path: &str) -> &'p State {
+    program.states.iter().find(|state| state.path == path).unwrap_or_else(|| panic!("no state {path}"))
+}
+
+/// What is found wrong, one line each.
+fn findings(source: &str) -> String {
+    let findings = load(source, "task.yaml", &catalogue()).map(|loaded| loaded.warnings);
+    findings.unwrap_or_else(|errors| errors).iter().map(ToString::to_string).collect::<Vec<_>>().join("\n")
+}
+
+/// `outcome → where it leads` of a state.
+fn transitions(program: &Program, path: &str) -> String {
+    let lead = |target: &Target| match target {
+        Target::State(id) => program.state(*id).path.clone(),
+        Target::Outcome(name) => format!("({name})"),
+    };
+    let all = state(program, path).transitions.iter().map(|(outcome, target)| format!("{outcome} → {}", lead(target)));
+    all.collect::<Vec<_>>().join(", ")
+}
+
+fn bound(variables: &[(String, ratn_model::expression::Expr)]) -> String {
+    variables.iter().map(|(name, value)| format!("{name}: {value}")).collect::<Vec<_>>().join(", ")
+}
+
+const LOOK: &str = "action: eye/look, resources: [{ block: Gripper }]";
+
+#[test]
+fn what_a_task_says_of_itself_is_in_the_program() {
+    let source = "
+task: t
+horizon: 40
+speculation_width: 3
+deadline: 600
+exceptions: imprecise
+outcomes: [nothing_there]
+parameters: { most: 3 }
+variables: { n: $most + 1 }
+states: []
+";
+    let program = program(source);
+    assert_eq!((program.horizon, program.speculation_width, program.deadline_s), (40, 3, Some(600.0)));
+    assert_eq!(program.exceptions, Exceptions::Imprecise);
+    assert_eq!(program.states[0].outcomes, ["nothing_there"]);
+    assert_eq!(bound(&program.states[0].variables), "n: $most + 1");
+    let plain = self::program("task: t\nstates: []\n");
+    assert_eq!((plain.speculation_width, plain.deadline_s), (Program::DEFAULT_SPECULATION_WIDTH, None));
+    assert_eq!(plain.exceptions, Exceptions::Precise);
+}
+
+#[test]
+fn transitions_lead_to_a_state_beside_or_out_by_an_outcome() {
+    let source = format!(
+        "
+task: t
+outcomes: [nothing_there]
+states:
+  - look: {{ {LOOK}, transitions: {{ aborted: tidy, empty: nothing_there, success: look }} }}
+  - tidy: {{ {LOOK}, transitions: {{ empty: success }} }}
+  - inner:
+      outcomes: [strange]
+      transitions: {{ strange: look, aborted: success }}
+      states:
+        - first: {{ {LOOK}, transitions: {{ empty: strange, preempted: aborted }} }}
+"
+    );
+    let program = program(&source);
+    assert_eq!(transitions(&program, "look"), "aborted → tidy, empty → (nothing_there), success → look");
+    assert_eq!(transitions(&program, "inner"), "aborted → (success), strange → look");
+    assert_eq!(transitions(&program, "inner/first"), "empty → (strange), preempted → (aborted)");
+    assert_eq!(state(&program, "look").outcomes, ["empty"]);
+}
+
+#[test]
+fn the_outcomes_by_which_a_state_is_left_are_its_own() {
+    let source = format!(
+        "
+task: t
+outcomes: [done]
+states:
+  - each:
+      for: box in [1, 2]
+      transitions: {{ empty: done }}
+      do:
+        - near: {{ condition: $box > 1, then: [{{ look: {{ {LOOK} }} }}] }}
+        - again: {{ {LOOK}, transitions: {{ empty: success }} }}
+"
+    );
+    let program = program(&source);
+    let all = program.all_outcomes();
+    let of = |path: &str| all[state(&program, path).id.0 as usize].join(" ");
+    assert_eq!(of("each/near"), "success empty aborted preempted");
+    assert_eq!(of("each"), "success empty aborted preempted");
+    assert_eq!(of(""), "success done aborted preempted");
+}
+
+#[test]
+fn what_leads_nowhere_or_cannot_happen_is_refused_with_what_there_is() {
+    let task = |states: &str| findings(&format!("task: t\noutcomes: [nothing]\nstates:\n{states}"));
+    let look = |transitions: &str| task(&format!("  - look: {{ {LOOK}, transitions: {{ {transitions} }} }}\n"));
+    assert_snapshot!(look("aborted: nothin"), @"task.yaml:4:88: error[unknown-target] in look: `nothin` is neither a state beside this one nor an outcome of the state around it. help: did you mean `nothing`?");
+    assert_snapshot!(look("emty: nothing"), @"task.yaml:4:79: error[unknown-outcome] in look: this state has no outcome `emty`. help: did you mean `empty`?");
+    assert_snapshot!(look("aborted: [a]"), @"task.yaml:4:88: error[invalid-name] in look: expected a state or an outcome, a name, found a list");
+    // An inner state sees the outcomes of what is around it, and no state of another list.
+    let inside = format!(
+        "  - when: {{ condition: true, then: [{{ look: {{ {LOOK}, transitions: {{ aborted: nothing }} }} }}] }}\n"
+    );
+    assert_snapshot!(task(&inside), @"task.yaml:4:122: error[unknown-target] in when/look: `nothing` is neither a state beside this one nor an outcome of the state around it. help: there is `aborted`, `look`, `preempted`, `success`");
+    let exceptional = format!("  - look: {{ {LOOK}, exceptional: [strange] }}\n");
+    assert_snapshot!(task(&exceptional), @"task.yaml:4:78: error[unknown-outcome] in look: this state has no outcome `strange`. help: there is `aborted`, `empty`, `preempted`, `success`");
+}
+
+#[test]
+fn loops_on_a_predicate_say_when_they_begin() {
+    let body = format!("index: i, do: [{{ look: {{ {LOOK} }} }}]");
+    let source = format!(
+        "
+task: t
+states:
+  - before: {{ while: $i < 3 and exists at(cup), {body} }}
+  - after: {{ do_while: look.found > $i, {body} }}
+  - until: look.found > 2
+    do: [{{ look: {{ {LOOK} }} }}]
+"
+    );
+    let program = program(&source);
+    let printed = |path: &str| {
+        let StateKind::While { predicate, body_first, index, body } = &state(&program, path).kind else {
+            panic!("a loop")
+        };
+        format!("{predicate} {body_first} {index:?} {}", program.state(body[0]).path)
+    };
+    assert_eq!(printed("before"), "$i < 3 and exists at(cup) false Some(\"i\") before/look");
+    assert_eq!(printed("after"), "s4.found > $i true Some(\"i\") after/look");
+    assert_eq!(printed("until"), "not s6.found > 2 true None until/look");
+    let reads = state(&program, "before").annotations.reads.as_ref().unwrap();
+    assert_eq!(reads.iter().map(ToString::to_string).collect::<Vec<_>>(), ["at(cup)"]);
+}
+
+#[test]
+fn regions_decide_by_their_outcomes() {
+    let source = format!(
+        "
+task: t
+outcomes: [lost]
+variables: {{ seen: 0 }}
+states:
+  - both:
+      concurrency: barrier
+      outcomes: [lost]
+      decide: {{ lost: left.outcome = empty and exists at(cup), success: 'right.outcome in [success, aborted]' }}
+      outputs: {{ found: {{ type: int, value: left.found, default: 0 }} }}
+      assign: {{ seen: found }}
+      effects: {{ success: ['seen() = found'], lost: [] }}
+      regions:
+        - left: {{ {LOOK}, shared: ['at(cup)'] }}
+        - right: {{ states: [{{ look: {{ {LOOK} }} }}] }}
+  - first: {{ concurrency: preemptive, regions: [{{ a: {{ {LOOK} }} }}, {{ b: {{ states: [] }} }}], transitions: {{ empty: lost }} }}
+"
+    );
+    let program = program(&source);
+    let both = state(&program, "both");
+    let StateKind::Concurrency { regions, preemptive, decide, outputs } = &both.kind else { panic!("a concurrency") };
+    assert_eq!((regions.len(), *preemptive, both.annotations.routine), (2, false, false));
+    assert_eq!(bound(decide), "lost: s2.outcome = empty and exists at(cup), success: s3.outcome in [success, aborted]");
+    assert_eq!((outputs[0].name.as_str(), both.defaults["found"].to_string().as_str()), ("found", "0"));
+    assert_eq!(bound(&both.assign), "seen: found");
+    assert_eq!(both.annotations.reads.as_ref().unwrap()[0].to_string(), "at(cup)");
+    assert_eq!(state(&program, "both/left").annotations.shared[0].to_string(), "at(cup)");
+    let first = state(&program, "first");
+    assert!(matches!(first.kind, StateKind::Concurrency { preemptive: true, .. }));
+    assert_eq!(transitions(&program, "first"), "empty → (lost)");
+}
+
+#[test]
+fn a_region_leads_nowhere_and_its_outcome_is_seen_where_all_have_ended() {
+    let both = |left: &str, more: &str| {
+        let regions = format!("[{{ left: {{ {LOOK}{left} }} }}, {{ right: {{ states: [] }} }}]");
+        findings(&format!("task: t\nstates:\n  - both: {{ concurrency: barrier, regions: {regions}, {more} }}\n"))
+    };
+    assert_snapshot!(both(", transitions: { empty: right }", ""), @"task.yaml:3:119: error[invalid-state] in both/left: a region has no transitions: all regions are waited for. help: use its outcome in `decide`");
+    assert_snapshot!(both("", "decide: { lost: true }"), @"task.yaml:3:47: warning[region-unannotated] in both/left: `both/left` says neither what it reads nor what it changes, and runs beside other regions. help: give it `reads` and `effects`: then check can tell whether the regions get in each other's way");
+    assert_snapshot!(both("", "requires: [left.outcome = aborted]"), @r#"
+    task.yaml:3:47: warning[region-unannotated] in both/left: `both/left` says neither what it reads nor what it changes, and runs beside other regions. help: give it `reads` and `effects`: then check can tell whether the regions get in each other's way
+    task.yaml:3:149: error[unservable-flow] in both: `left.outcome` is written inside of this state, which needs it to start. help: take it from a state before this one
+    "#);
+    assert_snapshot!(both("", "decide: { aborted: left.outcom = aborted }"), @"task.yaml:3:157: error[unknown-port] in both: state `left` has no output port `outcom`. help: there is `found`");
+    assert_snapshot!(findings("task: t\nstates:\n  - a: { concurrency: all, regions: [], decide: [a] }\n  - b: { states: [], shared: ['at(?)'] }\n"), @r#"
+    task.yaml:3:23: error[invalid-state] in a: `concurrency` is `barrier` or `preemptive`
+    task.yaml:3:49: error[invalid-state] in a: `decide` is a mapping, found a list. help: write `decide: { failed: left.outcome = aborted }`
+    task.yaml:4:30: error[invalid-state] in b: `shared` is what two regions may both touch. help: say it of a region of a `concurrency`
+    "#);
+}
+
+#[test]
+fn scoped_variables_are_bound_assigned_and_told_from_others() {
+    let source = format!(
+        "
+task: t
+parameters: {{ most: 2 }}
+variables: {{ n: 0 }}
+states:
+  - part:
+      variables: {{ m: $n + $most, near: exists at(cup) }}
+      outputs: {{ all: $m }}
+      assign: {{ n: all + $m }}
+      states:
+        - look: {{ {LOOK}, assign: {{ m: $m + found, n: look.found }}, reads: [] }}
+"
+    );
+    let program = program(&source);
+    let part = state(&program, "part");
+    assert_eq!(bound(&part.variables), "m: $n + $most, near: exists at(cup)");
+    assert_eq!(bound(&part.assign), "n: all + $m");
+    assert_eq!(part.annotations.reads.as_ref().unwrap()[0].to_string(), "at(cup)");
+    assert_eq!(bound(&state(&program, "part/look").assign), "m: $m + found, n: found");
+
+    let wrong = |what: &str| {
+        let look = format!("{{ {LOOK}, assign: {{ {what} }} }}");
+        findings(&format!(
+            "task: t\nparameters: {{ most: 2 }}\nvariables: {{ tries: 0 }}\nstates:\n  - for: b in [1]\n    do: [{{ look: {look} }}]\n"
+        ))
+    };
+    assert_snapshot!(wrong("trys: 1"), @"task.yaml:6:81: error[unknown-variable] in for_b/look: there is no scoped variable `trys` around this state. help: did you mean `tries`?");
+    assert_snapshot!(wrong("most: 1"), @"task.yaml:6:81: error[unknown-variable] in for_b/look: there is no scoped variable `most` around this state. help: there is `tries`");
+    assert_snapshot!(wrong("b: 1"), @"task.yaml:6:81: error[unknown-variable] in for_b/look: there is no scoped variable `b` around this state. help: there is `tries`");
+    assert_snapshot!(findings("task: t\nparameters: { n: 1 }\nvariables: { n: 2, 'a b': 4 }\nstates:\n  - { while: false, index: n, do: [] }\n  - a: { states: [], variables: [n] }\n"), @r#"
+    task.yaml:3:14: error[duplicate-name]: the variable `$n` exists already around this state. help: give one of both another name
+    task.yaml:3:20: error[invalid-name]: `a b` cannot be a variable's name. help: use letters, digits and _, beginning with a letter
+    task.yaml:5:14: error[duplicate-name] in while: the variable `$n` exists already around this state. help: give one of both another name
+    task.yaml:6:33: error[invalid-state] in a: `variables` is a mapping, found a list. help: write `variables: { tries: 0 }`
+    "#);
+}
+
+#[test]
+fn how_a_state_fails_and_is_tried_again_is_among_its_annotations() {
+    let source = format!(
+        "
+task: t
+states:
+  - one: {{ {LOOK}, retry: 2, timeout: 5, exceptional: [empty], deterministic: true, transitions: {{ empty: success }} }}
+  - two: {{ {LOOK}, retry: {{ count: 1, backoff: 0.5 }}, exceptions: precise, out: {{ found: {{ type: int, default: 7 }} }}, transitions: {{ empty: success }} }}
+  - three:
+      exceptions: imprecise
+      resources: [{{ block: Gripper, hold: true }}]
+      states:
+        - four: {{ action: eye/look, resources: [{{ block: Gripper, unordered: true }}], transitions: {{ empty: success }} }}
+"
+    );
+    let program = program(&source);
+    let annotations = |path: &str| &state(&program, path).annotations;
+    let one = annotations("one");
+    assert_eq!((one.retry, one.timeout_s), (Some(Retry { count: 2, backoff_s: 0.0 }), Some(5.0)));
+    assert_eq!((one.deterministic, one.exceptional.as_slice()), (true, &["empty".to_owned()][..]));
+    assert_eq!(one.exceptions, None);
+    assert_eq!(annotations("two").retry, Some(Retry { count: 1, backoff_s: 0.5 }));
+    assert_eq!(annotations("two").exceptions, Some(Exceptions::Precise));
+    assert_eq!(state(&program, "two").defaults["found"].to_string(), "7");
+    // Held throughout, it is a routine; what it says of exceptions holds for what it contains.
+    assert!(annotations("three").routine);
+    assert_eq!(annotations("three/four").exceptions, Some(Exceptions::Imprecise));
+    assert!(annotations("three/four").resources[0].unordered && !annotations("one").resources[0].unordered);
+}
+
+#[test]
+fn numbers_and_words_that_are_none_are_refused() {
+    let source = "
+task: t
+speculation_width: 0
+deadline: -1
+exceptions: sloppy
+outcomes: [success, a b, x, x]
+states:
+  - a: { action: gripper/release, retry: { backoff: 1 }, timeout: soon, resources: [{ block: Gripper }] }
+  - b: { action: gripper/release, retry: 0, deterministic: maybe, resources: [{ consume: Gripper, unordered: true }] }
+  - c: { states: [], outputs: { n: { type: int, value: 1, default: many } }, retry: 1 }
+";
+    assert_snapshot!(findings(source), @r#"
+    task.yaml:3:20: error[type-mismatch]: `speculation_width` is a whole number of at least 1
+    task.yaml:4:11: error[type-mismatch]: `deadline` is a number of seconds, not below 0
+    task.yaml:5:13: error[type-mismatch]: `exceptions` is `precise` or `imprecise`
+    task.yaml:6:21: error[invalid-name]: expected an outcome, a name, found text
+    task.yaml:8:42: error[type-mismatch] in a: `retry` is a whole number of at least 1
+    task.yaml:8:67: error[type-mismatch] in a: `timeout` is a number of seconds, not below 0
+    task.yaml:9:42: error[type-mismatch] in b: `retry` is a whole number of at least 1
+    task.yaml:9:60: error[type-mismatch] in b: expected true or false, found text
+    task.yaml:9:110: error[conflicting-annotations] in b: `unordered` is said of a `block`. help: leave it out: nothing of it is held while the state runs
+    task.yaml:10:68: error[type-mismatch] in c: the default of `n` is string, not int
+    task.yaml:10:78: error[unknown-key] in c: there is no key `retry` here. help: leave it out
+    "#);
+}
