@@ -26,9 +26,10 @@ impl ratn_model::load::Files for Libraries {
     fn read(&self, using: &str, path: &str) -> std::result::Result<(String, String), String> {
         let file = Path::new(using).parent().unwrap_or(Path::new("")).join(path);
         let text = read(&file).map_err(|error| error.to_string())?;
-        // Two ways to one file are one file.
+        // Two ways to one file are one file; its name is as short as it can be.
         let name = file.canonicalize().unwrap_or(file);
-        Ok((name.display().to_string(), text))
+        let here = std::env::current_dir().and_then(|here| here.canonicalize()).unwrap_or_default();
+        Ok((name.strip_prefix(here).unwrap_or(&name).display().to_string(), text))
     }
 }
 

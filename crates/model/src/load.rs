@@ -19,6 +19,7 @@
 mod effects;
 mod fields;
 mod flow;
+mod graft;
 mod library;
 mod names;
 mod outline;
@@ -33,7 +34,7 @@ pub use yaml::MAX_SOURCE;
 
 use crate::catalogue::Catalogue;
 use crate::check;
-use crate::diagnostic::{Diagnostic, Findings};
+use crate::diagnostic::{Diagnostic, Findings, Severity};
 use crate::expression::EffectExpr;
 use crate::expression::scope::NothingKnown;
 use crate::id::StateId;
@@ -91,7 +92,7 @@ pub fn load_with(
     catalogue: &Catalogue,
     files: &dyn Files,
 ) -> Result<Loaded, Vec<Diagnostic>> {
-    load_within(source, &Loading { file, catalogue, files, around: Vec::new() })
+    load_within(source, &Loading { file, catalogue, files, known: &library::Known::default(), around: Vec::new() })
 }
 
 /// What a file is loaded with.
@@ -101,6 +102,8 @@ pub(crate) struct Loading<'a> {
     pub(crate) file: &'a str,
     pub(crate) catalogue: &'a Catalogue,
     pub(crate) files: &'a dyn Files,
+    /// What has been loaded already.
+    pub(crate) known: &'a library::Known,
     /// The files that use it, outermost first.
     pub(crate) around: Vec<String>,
 }
@@ -115,7 +118,14 @@ pub(crate) fn load_within(source: &str, loading: &Loading<'_>) -> Result<Loaded,
         check::check(program, loading.catalogue, out.declares_world, &out.places, &mut out.findings);
     }
     let refused = out.findings.has_errors();
-    findings.extend(out.findings.in_file(loading.file));
+    // The warnings of a library have been given with its own name.
+    let own = |finding: &Diagnostic| {
+        let below = |path: &String| finding.path.strip_prefix(path.as_str()).is_some_and(|rest| rest.starts_with('/'));
+        finding.severity == Severity::Error
+            || library::depends_on_use(&finding.rule)
+            || !out.libraries.iter().any(below)
+    };
+    findings.extend(out.findings.in_file(loading.file).into_iter().filter(own));
     match program {
         Some(program) if !refused => Ok(Loaded { program, warnings: findings }),
         _ => Err(findings),
@@ -178,7 +188,8 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     hasher.update(source.as_bytes());
     for (id, library) in &task.libraries {
         hasher.update(library.digest.as_bytes());
-        library::graft(&mut states, *id, library);
+        graft::graft(&mut states, *id, library, &task.in_sight(*id));
+        out.libraries.push(task.outline.step(*id).path.clone());
     }
     let digest = hasher.finalize().to_hex().to_string();
     let mut program = Program {

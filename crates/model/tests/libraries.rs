@@ -105,3 +105,102 @@ fn a_library_that_is_missing_or_uses_itself_or_lacks_a_parameter_is_refused() {
         assert!(refusal.contains(said), "{step}: {refusal}");
     }
 }
+
+#[test]
+fn a_library_has_variables_of_its_own_whatever_they_are_called() {
+    let part = "
+task: part
+parameters: { box: 7 }
+variables: { twice: $box * 2 }
+states:
+  - for: n in range($twice)
+    do:
+      - grasp:
+          action: gripper/grasp
+          in: { object: 'concat($box, $n)' }
+          effects: [{ for: 'each in [1]', set: 'seen($each, $box)' }]
+          resources: [{ block: Gripper }, { block: Arm }]
+          assign: { twice: $n }
+";
+    let task = "
+task: whole
+parameters: { n: 3 }
+variables: { twice: 0 }
+states:
+  - for: box in range($n)
+    do:
+      - part: { library: part.yaml, with: { box: $box + $twice } }
+";
+    let program = load(task, part).unwrap().program;
+    let state = |path: &str| program.states.iter().find(|state| state.path == path).unwrap();
+    let part = state("for_box/part");
+    let bound: Vec<String> = part.variables.iter().map(|(name, value)| format!("{name}: {value}")).collect();
+    // What is given is read outside, and so is what begins with it.
+    assert_eq!(bound, ["for_box/part/box: $box + $twice", "for_box/part/twice: ($box + $twice) * 2"]);
+    let StateKind::ForEach { variable, collection, .. } = &state("for_box/part/for_n").kind else { panic!("a loop") };
+    assert_eq!(
+        (variable.as_str(), collection.to_string()),
+        ("for_box/part/n", "range($for_box/part/twice)".to_owned())
+    );
+    let grasp = state("for_box/part/for_n/grasp");
+    let StateKind::Action { inputs, .. } = &grasp.kind else { panic!("an action") };
+    assert_eq!(inputs[0].1.to_string(), "concat($for_box/part/box, $for_box/part/n)");
+    assert_eq!(
+        (grasp.assign[0].0.as_str(), grasp.assign[0].1.to_string()),
+        ("for_box/part/twice", "$for_box/part/n".into())
+    );
+    let effects = &grasp.annotations.effects["success"];
+    assert!(format!("{effects:?}").contains("for_box/part/box") && format!("{effects:?}").contains("\"each\""));
+}
+
+#[test]
+fn libraries_are_read_once_and_bounded() {
+    struct Nested(std::cell::Cell<u32>);
+    impl Files for Nested {
+        fn read(&self, _: &str, path: &str) -> Result<(String, String), String> {
+            self.0.set(self.0.get() + 1);
+            let level: u32 = path.trim_end_matches(".yaml").parse().unwrap();
+            let uses: String = (0..300).map(|i| format!("  - s{i}: {{ library: {}.yaml }}\n", level + 1)).collect();
+            Ok((path.to_owned(), format!("task: t\nstates:\n{uses}")))
+        }
+    }
+    let files = Nested(0.into());
+    let refused = load_with("task: t\nstates:\n  - a: { library: 0.yaml }\n", "t.yaml", &Catalogue::standard(), &files);
+    assert!(refused.unwrap_err().iter().any(|finding| finding.message.contains("at most 8 deep")));
+    assert!(files.0.get() < 300 * 10, "{} files were read", files.0.get());
+    let many: String = (0..200).map(|i| format!("  - s{i}: {{ library: part.yaml, with: {{ what: x }} }}\n")).collect();
+    let wide: String = (0..200).map(|i| format!("  - w{i}: {{ states: [] }}\n")).collect();
+    let wide: &'static str =
+        Box::leak(format!("task: part\nparameters: {{ what: {{ type: string }} }}\nstates:\n{wide}").into());
+    let refusal = load(&format!("task: t\nstates:\n{many}"), wide).unwrap_err();
+    assert!(refusal.contains("at most 20000 states of libraries"), "{refusal}");
+}
+
+#[test]
+fn what_a_library_is_given_is_of_the_type_it_says() {
+    let refusal = load("task: t\nstates:\n  - a: { library: part.yaml, with: { what: 3 } }\n", PART).unwrap_err();
+    assert!(
+        refusal.contains("error[type-mismatch] in a: the library's parameter `what` is string, not int"),
+        "{refusal}"
+    );
+}
+
+#[test]
+fn what_depends_on_where_a_library_is_used_is_said_there_and_all_else_once() {
+    let part = "
+task: part
+states:
+  - release: { action: gripper/release, requires: [ready(arm)], effects: [], resources: [{ block: Gripper }] }
+  - both:
+      concurrency: barrier
+      regions:
+        - arm: { action: arm/move_to, in: { joints: 'joints(0, 0, 0, 0, 0, 0, 0)' }, resources: [{ block: Arm }] }
+";
+    let task = |world: &str| format!("task: t\n{world}states:\n  - a: {{ library: part.yaml }}\n");
+    let warned: Vec<String> =
+        load(&task(""), part).unwrap().warnings.iter().map(|w| format!("{} {} {}", w.file, w.path, w.rule)).collect();
+    assert_eq!(warned, ["part.yaml both/arm region-unannotated", "task.yaml a/release unestablished-precondition"]);
+    let warned: Vec<String> =
+        load(&task("world: [ready(arm)]\n"), part).unwrap().warnings.into_iter().map(|w| w.rule).collect();
+    assert_eq!(warned, ["region-unannotated"]);
+}

@@ -34,7 +34,7 @@ pub(crate) fn run(arguments: &CheckArguments) -> Result<(), Failure> {
     let config = SystemConfig::load(arguments.config.as_deref())?;
     let file = arguments.task.display().to_string();
     let text = read(&arguments.task)?;
-    let loaded = match ratn_model::load::load(&text, &file, &config.catalogue) {
+    let loaded = match ratn_model::load::load_with(&text, &file, &config.catalogue, &input::Libraries) {
         Ok(loaded) => loaded,
         Err(findings) => {
             if arguments.json {

@@ -55,28 +55,36 @@ impl Expr {
     }
 }
 
+/// What puts the expressions of one program into another changes.
+pub(crate) trait Rewrite {
+    /// An expression whose parts have been rewritten.
+    fn expression(&mut self, expr: &mut Expr);
+    /// A name where it is bound.
+    fn variable(&mut self, name: &mut String);
+}
+
 impl Expr {
-    /// Names other states: where one program's states are put into another.
-    pub(crate) fn move_states(&mut self, moved: &dyn Fn(StateId) -> StateId) {
+    /// Rewrites every part of it, innermost first, and then itself.
+    pub(crate) fn rewrite(&mut self, rewrite: &mut dyn Rewrite) {
         match self {
-            Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) => {}
-            Expr::Port { state, .. } => *state = moved(*state),
-            Expr::Field(of, _) | Expr::Unary(_, of) => of.move_states(moved),
+            Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } => {}
+            Expr::Field(of, _) | Expr::Unary(_, of) => of.rewrite(rewrite),
             Expr::Index(a, b) | Expr::Binary(_, a, b) => {
-                a.move_states(moved);
-                b.move_states(moved);
+                a.rewrite(rewrite);
+                b.rewrite(rewrite);
             }
-            Expr::List(items) | Expr::Call(_, items) => items.iter_mut().for_each(|item| item.move_states(moved)),
-            Expr::Map(fields) => fields.iter_mut().for_each(|(_, item)| item.move_states(moved)),
-            Expr::Fact(fact) | Expr::Exists(fact) => fact.move_states(moved),
+            Expr::List(items) | Expr::Call(_, items) => items.iter_mut().for_each(|item| item.rewrite(rewrite)),
+            Expr::Map(fields) => fields.iter_mut().for_each(|(_, item)| item.rewrite(rewrite)),
+            Expr::Fact(fact) | Expr::Exists(fact) => fact.rewrite(rewrite),
         }
+        rewrite.expression(self);
     }
 }
 
 impl FactExpr {
-    /// As [`Expr::move_states`].
-    pub(crate) fn move_states(&mut self, moved: &dyn Fn(StateId) -> StateId) {
-        self.arguments.iter_mut().flatten().for_each(|argument| argument.move_states(moved));
+    /// As [`Expr::rewrite`].
+    pub(crate) fn rewrite(&mut self, rewrite: &mut dyn Rewrite) {
+        self.arguments.iter_mut().flatten().for_each(|argument| argument.rewrite(rewrite));
     }
 
     /// Calls `visit` for every argument and every part of it.
@@ -86,17 +94,18 @@ impl FactExpr {
 }
 
 impl EffectExpr {
-    /// As [`Expr::move_states`].
-    pub(crate) fn move_states(&mut self, moved: &dyn Fn(StateId) -> StateId) {
+    /// As [`Expr::rewrite`].
+    pub(crate) fn rewrite(&mut self, rewrite: &mut dyn Rewrite) {
         match self {
             EffectExpr::Set(fact, value) | EffectExpr::Increase(fact, value) => {
-                fact.move_states(moved);
-                value.move_states(moved);
+                fact.rewrite(rewrite);
+                value.rewrite(rewrite);
             }
-            EffectExpr::Delete(fact) => fact.move_states(moved),
-            EffectExpr::ForEach { collection, effects, .. } => {
-                collection.move_states(moved);
-                effects.iter_mut().for_each(|effect| effect.move_states(moved));
+            EffectExpr::Delete(fact) => fact.rewrite(rewrite),
+            EffectExpr::ForEach { variable, collection, effects } => {
+                rewrite.variable(variable);
+                collection.rewrite(rewrite);
+                effects.iter_mut().for_each(|effect| effect.rewrite(rewrite));
             }
         }
     }

@@ -34,6 +34,8 @@ pub(crate) struct Output {
     pub(crate) places: Places,
     /// The task says what holds at the start.
     pub(crate) declares_world: bool,
+    /// The paths of the states that use a library.
+    pub(crate) libraries: Vec<String>,
 }
 
 /// Reads fields on behalf of one state.

@@ -7,14 +7,19 @@ use super::fields::Fields;
 use super::outline::{Form, Outline};
 use super::yaml::{Content, Node};
 use super::{Loading, names::suggestion};
-use crate::diagnostic::{Diagnostic, Findings, Severity};
+use crate::diagnostic::{Diagnostic, Findings};
 use crate::expression::Expr;
+use crate::expression::scope::NothingKnown;
+use crate::expression::walk::Rewrite;
 use crate::id::StateId;
-use crate::program::{Program, State, StateKind, Target};
+use crate::program::Program;
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 /// Libraries may use libraries this deep.
 const MAX_DEPTH: usize = 8;
+/// A task has no more libraries.
+const MAX_LIBRARIES: usize = 64;
 /// A task may not have more states with those of its libraries.
 const MAX_STATES: usize = 20_000;
 
@@ -36,6 +41,9 @@ impl Files for NoFiles {
     }
 }
 
+/// Libraries by name, each loaded once; nothing where it was refused.
+pub(crate) type Known = RefCell<BTreeMap<String, Option<Program>>>;
+
 /// Loads the libraries that the steps of an outline use. A library that is refused is refused with its own findings.
 pub(crate) fn load_all(
     outline: &Outline<'_>,
@@ -44,6 +52,7 @@ pub(crate) fn load_all(
     inner: &mut Vec<Diagnostic>,
 ) -> BTreeMap<StateId, Program> {
     let mut libraries = BTreeMap::new();
+    let mut states = 0;
     for (index, step) in outline.steps.iter().enumerate() {
         let Form::Library { file } = &step.form else { continue };
         let Content::Text(path) = &file.content else {
@@ -51,49 +60,62 @@ pub(crate) fn load_all(
             findings.error("invalid-state", file.at, &step.path, "`library` is the name of a task file", help);
             continue;
         };
-        let refuse = |findings: &mut Findings, message: String, help: &str| {
-            findings.error("unknown-library", file.at, &step.path, message, help);
-        };
-        if loading.around.len() >= MAX_DEPTH {
-            refuse(findings, format!("libraries use libraries at most {MAX_DEPTH} deep"), "");
-            continue;
-        }
-        let (name, text) = match loading.files.read(loading.file, path) {
-            Ok(read) => read,
-            Err(why) => {
-                refuse(findings, format!("`{path}` cannot be read: {why}"), "the path is relative to this file");
-                continue;
+        match library(path, loading, inner) {
+            Ok(library) => {
+                states += library.states.len();
+                if states > MAX_STATES {
+                    let message = format!("a task has at most {MAX_STATES} states of libraries");
+                    findings.error("unknown-library", file.at, &step.path, message, "use it from a loop");
+                    break;
+                }
+                libraries.insert(StateId(index as u64), library);
             }
-        };
-        if loading.around.contains(&name) || name == loading.file {
-            refuse(findings, format!("`{path}` uses itself, directly or over others"), "break the circle");
-            continue;
-        }
-        let mut around = loading.around.clone();
-        around.push(loading.file.to_owned());
-        match super::load_within(&text, &Loading { file: &name, around, ..*loading }) {
-            Ok(loaded) => {
-                inner.extend(loaded.warnings);
-                libraries.insert(StateId(index as u64), loaded.program);
-            }
-            Err(diagnostics) => {
-                inner.extend(diagnostics);
-                refuse(findings, format!("the library `{path}` is refused"), "see what is said of it");
-            }
+            Err((message, help)) => findings.error("unknown-library", file.at, &step.path, message, help),
         }
     }
-    if libraries.values().map(|library| library.states.len()).sum::<usize>() > MAX_STATES {
-        findings.error(
-            "invalid-state",
-            Default::default(),
-            "",
-            format!("libraries bring more than {MAX_STATES} states"),
-            "",
-        );
-        libraries.clear();
-    }
-    inner.retain(|diagnostic| diagnostic.severity == Severity::Error || !diagnostic.message.is_empty());
     libraries
+}
+
+/// A library, or why there is none and what to do.
+fn library(path: &str, loading: &Loading<'_>, inner: &mut Vec<Diagnostic>) -> Result<Program, (String, &'static str)> {
+    if loading.around.len() >= MAX_DEPTH {
+        return Err((format!("libraries use libraries at most {MAX_DEPTH} deep"), ""));
+    }
+    let read = loading.files.read(loading.file, path);
+    let (name, text) = read.map_err(|why| {
+        let message = format!("`{path}` cannot be read: {why}");
+        (message, "the path is relative to this file")
+    })?;
+    if loading.around.contains(&name) || name == loading.file {
+        return Err((format!("`{path}` uses itself, directly or over others"), "break the circle"));
+    }
+    let refused = || (format!("the library `{path}` is refused"), "see what is said of it");
+    if let Some(known) = loading.known.borrow().get(&name) {
+        return known.clone().ok_or_else(refused);
+    }
+    if loading.known.borrow().len() >= MAX_LIBRARIES {
+        return Err((format!("a task has at most {MAX_LIBRARIES} libraries"), ""));
+    }
+    let mut around = loading.around.clone();
+    around.push(loading.file.to_owned());
+    let loaded = match super::load_within(&text, &Loading { file: &name, around, ..*loading }) {
+        Ok(loaded) => {
+            // What holds before it begins is said where it is used.
+            inner.extend(loaded.warnings.into_iter().filter(|warning| !depends_on_use(&warning.rule)));
+            Some(loaded.program)
+        }
+        Err(diagnostics) => {
+            inner.extend(diagnostics);
+            None
+        }
+    };
+    loading.known.borrow_mut().insert(name, loaded.clone());
+    loaded.ok_or_else(refused)
+}
+
+/// Whether a rule says of a library something else wherever it is used.
+pub(crate) fn depends_on_use(rule: &str) -> bool {
+    rule == "unestablished-precondition"
 }
 
 /// The parameters of a library as scoped variables: what `with` says, else their defaults.
@@ -112,7 +134,14 @@ pub(crate) fn parameters(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) 
         let value = match given.iter().find(|entry| entry.key == parameter.name) {
             Some(entry) => {
                 fields.note(format!("variables.{}", parameter.name), entry.at);
-                fields.expression(&entry.value)
+                let value = fields.expression(&entry.value);
+                let constant = value.as_ref().and_then(|value| value.evaluate(&NothingKnown).ok());
+                if let Some(constant) = constant.filter(|constant| !parameter.ty.accepts(constant)) {
+                    let (name, ty) = (&parameter.name, &parameter.ty);
+                    let message = format!("the library's parameter `{name}` is {ty}, not {}", constant.type_name());
+                    fields.error("type-mismatch", entry.value.at, message, "");
+                }
+                value
             }
             None => match &parameter.default {
                 Some(default) => Some(Expr::Literal(default.clone())),
@@ -125,71 +154,28 @@ pub(crate) fn parameters(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) 
         };
         bound.extend(value.map(|value| (parameter.name.clone(), value)));
     }
-    bound.extend(library.states[0].variables.iter().cloned());
+    // Its own variables begin with what its parameters give; all are evaluated outside of the state.
+    let own = library.states[0].variables.iter().map(|(name, value)| {
+        let mut value = value.clone();
+        value.rewrite(&mut Given(&bound));
+        (name.clone(), value)
+    });
+    let own: Vec<_> = own.collect();
+    bound.extend(own);
     bound
 }
 
-/// Puts the states of a library below the state that uses it.
-pub(crate) fn graft(states: &mut Vec<State>, at: StateId, library: &Program) {
-    // The root becomes the state itself; the others come behind all there are.
-    let offset = states.len() as u64;
-    let moved = |id: StateId| if id == Program::ROOT { at } else { StateId(id.0 - 1 + offset) };
-    let (path, location) = (states[at.0 as usize].path.clone(), states[at.0 as usize].location);
-    for state in library.states.iter().skip(1) {
-        let mut state = state.clone();
-        state.id = moved(state.id);
-        state.parent = state.parent.map(moved);
-        state.path = format!("{path}/{}", state.path);
-        state.location = location;
-        move_state(&mut state, &moved);
-        states.push(state);
-    }
-    let root = &mut states[at.0 as usize];
-    let mut outputs = library.outputs.clone();
-    outputs.iter_mut().for_each(|output| output.value.move_states(&moved));
-    let children = library.states[0].children().map(moved).collect();
-    root.kind = StateKind::Sequence { children, outputs };
-}
+/// Expressions in place of variables.
+struct Given<'a>(&'a [(String, Expr)]);
 
-fn move_state(state: &mut State, moved: &dyn Fn(StateId) -> StateId) {
-    let ids = |list: &mut Vec<StateId>| list.iter_mut().for_each(|id| *id = moved(*id));
-    match &mut state.kind {
-        StateKind::Action { inputs, .. } => inputs.iter_mut().for_each(|(_, e)| e.move_states(moved)),
-        StateKind::Sequence { children, outputs } => {
-            ids(children);
-            outputs.iter_mut().for_each(|o| o.value.move_states(moved));
-        }
-        StateKind::ForEach { collection, body, .. } => {
-            ids(body);
-            collection.move_states(moved);
-        }
-        StateKind::While { predicate, body, .. } => {
-            ids(body);
-            predicate.move_states(moved);
-        }
-        StateKind::Condition { predicate, then, otherwise } => {
-            ids(then);
-            ids(otherwise);
-            predicate.move_states(moved);
-        }
-        StateKind::Concurrency { regions, decide, outputs, .. } => {
-            ids(regions);
-            decide.iter_mut().for_each(|(_, e)| e.move_states(moved));
-            outputs.iter_mut().for_each(|o| o.value.move_states(moved));
+impl Rewrite for Given<'_> {
+    fn expression(&mut self, expr: &mut Expr) {
+        if let Expr::Variable(name) = expr
+            && let Some((_, value)) = self.0.iter().find(|(given, _)| given == name)
+        {
+            *expr = value.clone();
         }
     }
-    for target in state.transitions.values_mut() {
-        if let Target::State(id) = target {
-            *id = moved(*id);
-        }
-    }
-    state.variables.iter_mut().chain(&mut state.assign).for_each(|(_, e)| e.move_states(moved));
-    let annotations = &mut state.annotations;
-    if let crate::program::Nature::Senses(facts) = &mut annotations.nature {
-        facts.iter_mut().for_each(|fact| fact.move_states(moved));
-    }
-    annotations.reads.iter_mut().flatten().chain(&mut annotations.shared).for_each(|fact| fact.move_states(moved));
-    annotations.requires.iter_mut().chain(&mut annotations.duration_s).for_each(|e| e.move_states(moved));
-    annotations.effects.values_mut().flatten().for_each(|effect| effect.move_states(moved));
-    annotations.resources.iter_mut().flat_map(|r| &mut r.attributes).for_each(|(_, e)| e.move_states(moved));
+
+    fn variable(&mut self, _: &mut String) {}
 }

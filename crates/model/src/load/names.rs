@@ -10,7 +10,7 @@ use crate::expression::parse::{NameError, Names};
 use crate::id::StateId;
 use crate::program::Program;
 use crate::value::Type;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// The port of a region that says how it ended.
 const OUTCOME: &str = "outcome";
@@ -66,6 +66,12 @@ impl Task<'_> {
                 _ => [None, None],
             })
             .flatten()
+    }
+
+    /// Every variable that is in sight where a state stands.
+    pub(crate) fn in_sight(&self, state: StateId) -> BTreeSet<String> {
+        let around = self.loop_variables(state).chain(self.scoped_variables(state, false));
+        around.chain(self.parameters.iter().map(String::as_str)).map(str::to_owned).collect()
     }
 
     /// The scoped variables of the states around one, innermost first.

@@ -1,0 +1,132 @@
+//! Putting the states of a library below the state that uses it.
+//!
+//! States get other ids and paths. A variable of the library that is called like one in sight where it is used gets the path of
+//! that state before its name: the two have nothing to do with each other.
+
+use crate::expression::Expr;
+use crate::expression::walk::Rewrite;
+use crate::id::StateId;
+use crate::program::{Exceptions, Nature, Program, State, StateKind, Target};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Puts the states of a library below the state at this place, which is its root from then on; `in_sight` are the variables there.
+pub(crate) fn graft(states: &mut Vec<State>, at: StateId, library: &Program, in_sight: &BTreeSet<String>) {
+    let (path, location) = (states[at.0 as usize].path.clone(), states[at.0 as usize].location);
+    let taken = bound(library).into_iter().filter(|name| in_sight.contains(*name));
+    let renamed = taken.map(|name| (name.to_owned(), format!("{path}/{name}"))).collect();
+    // The root becomes the state itself; the others come behind all there are.
+    let mut moving = Moving { at, offset: states.len() as u64, renamed };
+    for state in library.states.iter().skip(1) {
+        let mut state = state.clone();
+        state.id = moving.moved(state.id);
+        state.parent = state.parent.map(|parent| moving.moved(parent));
+        state.path = format!("{path}/{}", state.path);
+        state.location = location;
+        if library.exceptions == Exceptions::Imprecise {
+            state.annotations.exceptions.get_or_insert(Exceptions::Imprecise);
+        }
+        moving.state(&mut state);
+        states.push(state);
+    }
+    let mut outputs = library.outputs.clone();
+    outputs.iter_mut().for_each(|output| output.value.rewrite(&mut moving));
+    let children = library.states[0].children().map(|child| moving.moved(child)).collect();
+    let root = &mut states[at.0 as usize];
+    root.variables.iter_mut().for_each(|(name, _)| moving.variable(name));
+    root.kind = StateKind::Sequence { children, outputs };
+}
+
+/// Every variable that something in the program binds, its parameters included.
+fn bound(program: &Program) -> BTreeSet<&str> {
+    let mut names: BTreeSet<&str> = program.parameters.iter().map(|parameter| parameter.name.as_str()).collect();
+    for state in &program.states {
+        names.extend(state.variables.iter().map(|(name, _)| name.as_str()));
+        match &state.kind {
+            StateKind::ForEach { variable, index, .. } => {
+                names.extend(std::iter::once(variable).chain(index).map(String::as_str));
+            }
+            StateKind::While { index, .. } => names.extend(index.iter().map(String::as_str)),
+            _ => {}
+        }
+    }
+    names
+}
+
+struct Moving {
+    at: StateId,
+    offset: u64,
+    renamed: BTreeMap<String, String>,
+}
+
+impl Rewrite for Moving {
+    fn expression(&mut self, expr: &mut Expr) {
+        match expr {
+            Expr::Port { state, .. } => *state = self.moved(*state),
+            Expr::Variable(name) => self.variable(name),
+            _ => {}
+        }
+    }
+
+    fn variable(&mut self, name: &mut String) {
+        if let Some(new) = self.renamed.get(name) {
+            name.clone_from(new);
+        }
+    }
+}
+
+impl Moving {
+    fn moved(&self, id: StateId) -> StateId {
+        if id == Program::ROOT { self.at } else { StateId(id.0 - 1 + self.offset) }
+    }
+
+    fn ids(&self, list: &mut [StateId]) {
+        list.iter_mut().for_each(|id| *id = self.moved(*id));
+    }
+
+    fn state(&mut self, state: &mut State) {
+        match &mut state.kind {
+            StateKind::Action { inputs, .. } => inputs.iter_mut().for_each(|(_, value)| value.rewrite(self)),
+            StateKind::Sequence { children, outputs } => {
+                self.ids(children);
+                outputs.iter_mut().for_each(|output| output.value.rewrite(self));
+            }
+            StateKind::ForEach { variable, index, collection, body } => {
+                self.ids(body);
+                collection.rewrite(self);
+                std::iter::once(variable).chain(index).for_each(|name| self.variable(name));
+            }
+            StateKind::While { predicate, index, body, .. } => {
+                self.ids(body);
+                predicate.rewrite(self);
+                index.iter_mut().for_each(|name| self.variable(name));
+            }
+            StateKind::Condition { predicate, then, otherwise } => {
+                self.ids(then);
+                self.ids(otherwise);
+                predicate.rewrite(self);
+            }
+            StateKind::Concurrency { regions, decide, outputs, .. } => {
+                self.ids(regions);
+                decide.iter_mut().for_each(|(_, holds)| holds.rewrite(self));
+                outputs.iter_mut().for_each(|output| output.value.rewrite(self));
+            }
+        }
+        for target in state.transitions.values_mut() {
+            if let Target::State(id) = target {
+                *id = self.moved(*id);
+            }
+        }
+        for (name, value) in state.variables.iter_mut().chain(&mut state.assign) {
+            self.variable(name);
+            value.rewrite(self);
+        }
+        let annotations = &mut state.annotations;
+        if let Nature::Senses(facts) = &mut annotations.nature {
+            facts.iter_mut().for_each(|fact| fact.rewrite(self));
+        }
+        annotations.reads.iter_mut().flatten().chain(&mut annotations.shared).for_each(|fact| fact.rewrite(self));
+        annotations.requires.iter_mut().chain(&mut annotations.duration_s).for_each(|e| e.rewrite(self));
+        annotations.effects.values_mut().flatten().for_each(|effect| effect.rewrite(self));
+        annotations.resources.iter_mut().flat_map(|r| &mut r.attributes).for_each(|(_, e)| e.rewrite(self));
+    }
+}
