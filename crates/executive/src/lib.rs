@@ -3,6 +3,23 @@
 //! A pure core. [`protocol::Event`]s come in, [`protocol::Command`]s come out, time is an argument. The shell performs
 //! commands (over gRPC in `ratn run`, in virtual time in `ratn-simulation`) and answers only with events, so the log of
 //! events and commands is the whole story of a run.
+//!
+//! # What it costs
+//!
+//! `cargo bench -p ratn-executive` prints it: a goal has ended in a full window, so that its instance finishes and retires, another
+//! begins and the window grows by one. Median microseconds per event, one core of a shared machine, the making of the event and
+//! the dropping of the commands included:
+//!
+//! | instances in the window | 10² | 10³ | 10⁴ | 10⁵ | 10⁶ |
+//! |---|---|---|---|---|---|
+//! | chain: each reads the one before it | 1.8 | 1.9 | 1.5 | 2.7 | 2.5 |
+//! | wide fan-out: all run | 1.2 | 1.2 | 1.2 | 1.3 | 1.2 |
+//! | random graph, four inputs each | 2.3 | 2.3 | 2.2 | 2.6 | 2.3 |
+//! | nested loops, pairs in a row | 1.5 | 1.5 | 2.1 | 1.2 | 1.3 |
+//!
+//! A million instances are expanded, executed and retired in 1.2 s; one takes 640 to 810 bytes; a state machine of 10,000 states
+//! becomes a window in 27 ms. What is left of an event is mostly allocation: 13 to 28 a piece, of which the strings and maps
+//! of goals, notes and outputs are the greater part.
 
 mod analysis;
 mod binding;
