@@ -172,7 +172,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         None => DEFAULT_HORIZON,
     };
     let speculation_width = root.get("speculation_width").and_then(|node| fields.count(node, "speculation_width", 1));
-    let deadline_s = root.get("deadline").and_then(|node| flow::seconds(&mut fields, node, "deadline"));
+    let deadline_s = root.get("deadline").and_then(|node| flow::positive(&mut fields, node, "deadline"));
     let exceptions = root.get("exceptions").and_then(|node| flow::exceptions(&mut fields, node));
     let parameters = read_parameters(&mut fields, &root);
     let initial = root.get("world").map(|node| world(&mut fields, node)).unwrap_or_default();

@@ -122,6 +122,37 @@ fn a_precondition_that_nothing_establishes_is_a_warning_when_the_world_is_not_de
 }
 
 #[test]
+fn what_would_end_at_once_or_decide_by_no_boolean_is_refused() {
+    let source = "
+task: t
+deadline: 0
+states:
+  - release: { action: gripper/release, timeout: 0, resources: [{ block: Gripper }] }
+";
+    assert_snapshot!(check(source), @r#"
+    task.yaml:3:11: error[type-mismatch]: `deadline` is a number of seconds above 0. help: leave it out
+    task.yaml:5:50: error[type-mismatch] in release: `timeout` is a number of seconds above 0. help: leave it out
+    "#);
+    let source = "
+task: t
+variables: { n: 0 }
+states:
+  - again:
+      while: $round + 1
+      index: round
+      do: []
+  - both:
+      concurrency: barrier
+      regions: []
+      decide: { failed: 1 + 1 }
+";
+    assert_snapshot!(check(source), @r#"
+    task.yaml:6:14: error[type-mismatch] in again: `while` is bool; `$round + 1` is int
+    task.yaml:12:17: error[type-mismatch] in both: `decide` is bool; `1 + 1` is int
+    "#);
+}
+
+#[test]
 fn what_is_no_yaml_is_said_with_its_place() {
     assert_snapshot!(check("task: t\nstates: [\n"), @"task.yaml:2:9: error[invalid-yaml]: unclosed bracket '['");
     assert_snapshot!(check("task: t\ntask: u\n"), @"task.yaml:2:1: error[invalid-yaml]: duplicate mapping key: task");

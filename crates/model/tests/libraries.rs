@@ -204,3 +204,9 @@ states:
         load(&task("world: [ready(arm)]\n"), part).unwrap().warnings.into_iter().map(|w| w.rule).collect();
     assert_eq!(warned, ["region-unannotated"]);
 }
+
+#[test]
+fn a_variable_of_a_library_has_nothing_to_do_with_the_task_s_parameter_of_that_name() {
+    let task = "task: t\nparameters: { what: 3 }\nstates:\n  - a: { library: part.yaml, with: { what: 'concat(cup, $what)' } }\n";
+    assert!(load(task, PART).is_ok());
+}

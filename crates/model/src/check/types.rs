@@ -88,14 +88,14 @@ fn wanted(subject: &Subject<'_>, state: &State, part: &str) -> Option<Type> {
             let signature = subject.catalogue.action(provider, action)?;
             signature.inputs.get(port).or_else(|| signature.optional.get(port)).cloned()
         }
-        (Some(("outputs", name)), StateKind::Sequence { outputs, .. }) => {
+        (Some(("outputs", name)), StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) => {
             let own = if state.id == Program::ROOT { &subject.program.outputs } else { outputs };
             own.iter().find(|output| output.name == name).map(|output| output.ty.clone())
         }
-        (Some(("requires", _)), _) => Some(Type::Bool),
+        (Some(("requires" | "decide", _)), _) => Some(Type::Bool),
         (None, _) => match part {
             "for" => Some(Type::List(Box::new(Type::Any))),
-            "condition" => Some(Type::Bool),
+            "condition" | "while" => Some(Type::Bool),
             "duration" => Some(Type::Float),
             _ => None,
         },
@@ -115,13 +115,19 @@ fn quantified(state: &State) -> Vec<&str> {
     names
 }
 
-/// The variables that a state sees: parameters, and those of the loops around it.
+/// The variables that a state sees: parameters, and those of the loops and hierarchies around it.
 fn variables(subject: &Subject<'_>, state: &State) -> Variables {
     let program = subject.program;
     let mut variables: Variables = program.parameters.iter().map(|p| (p.name.clone(), p.ty.clone())).collect();
-    let mut around: Vec<&State> = subject.around(state.id).skip(1).collect();
+    // What is evaluated at its end or between its iterations sees what it binds itself.
+    let mut around: Vec<&State> = subject.around(state.id).collect();
     around.reverse();
     for outer in around {
+        // A scoped variable may be assigned what is of another type than what it began with.
+        variables.extend(outer.variables.iter().map(|(name, _)| (name.clone(), Type::Any)));
+        if let StateKind::While { index: Some(index), .. } = &outer.kind {
+            variables.insert(index.clone(), Type::Int);
+        }
         if let StateKind::ForEach { variable, index, collection, .. } = &outer.kind {
             let types = Types { program, state: outer, variables: variables.clone(), indirection: 0 };
             let element = match types.of(collection) {
@@ -220,7 +226,7 @@ impl Types<'_> {
     fn port(&self, state: &State, port: &str) -> Type {
         match &state.kind {
             StateKind::Action { outputs, .. } => outputs.get(port).cloned().unwrap_or(Type::Any),
-            StateKind::Sequence { outputs, .. } => {
+            StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } => {
                 let output = outputs.iter().find(|output| output.name == port);
                 output.map_or(Type::Any, |output| self.output(state, output))
             }

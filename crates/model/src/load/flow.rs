@@ -9,7 +9,6 @@ use crate::id::StateId;
 use crate::program::{
     ABORTED, Annotations, Exceptions, Location, PREEMPTED, Program, Retry, SUCCESS, State, StateKind, Target,
 };
-use crate::value::Value;
 use std::collections::BTreeMap;
 
 /// More outcomes than this of one state are refused.
@@ -144,8 +143,7 @@ fn leaving(around: &Step<'_>) -> Vec<String> {
 /// Complains of a name that a variable around the state, or a parameter, has already.
 pub(crate) fn named_once(fields: &mut Fields<'_, '_>, name: &str, at: Location) {
     let Some(id) = fields.view.state else { return };
-    let outer = fields.task.loop_variables(id).chain(fields.task.scoped_variables(id, false));
-    if outer.chain(fields.task.parameters.iter().map(String::as_str)).any(|other| other == name) {
+    if fields.task.in_sight(id).contains(name) {
         let message = format!("the variable `${name}` exists already around this state");
         fields.error("duplicate-name", at, message, "give one of both another name");
     }
@@ -218,7 +216,7 @@ pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &m
             annotations.retry = Some(Retry { count, backoff_s });
         }
     }
-    annotations.timeout_s = body.get("timeout").and_then(|node| seconds(fields, node, "timeout"));
+    annotations.timeout_s = body.get("timeout").and_then(|node| positive(fields, node, "timeout"));
     annotations.exceptions = body.get("exceptions").and_then(|node| exceptions(fields, node));
     annotations.deterministic = body.get("deterministic").is_some_and(|node| fields.flag(node));
     for node in body.get("exceptional").into_iter().flat_map(Node::items) {
@@ -235,13 +233,21 @@ pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &m
     }
 }
 
-/// A positive number of seconds.
-pub(crate) fn seconds(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> Option<f64> {
-    let seconds = match fields.expression(node)? {
-        Expr::Literal(value) => match value {
-            Value::Int(_) | Value::Float(_) => value.as_number(),
-            _ => None,
-        },
+/// A number of seconds above 0.
+pub(crate) fn positive(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> Option<f64> {
+    let seconds = seconds(fields, node, what)?;
+    if seconds == 0.0 {
+        fields.error("type-mismatch", node.at, format!("`{what}` is a number of seconds above 0"), "leave it out");
+        return None;
+    }
+    Some(seconds)
+}
+
+/// A number of seconds, not below 0.
+fn seconds(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> Option<f64> {
+    let seconds = match node.content {
+        Content::Int(seconds) => Some(seconds as f64),
+        Content::Float(seconds) => Some(seconds),
         _ => None,
     };
     let seconds = seconds.filter(|s| s.is_finite() && *s >= 0.0);
