@@ -6,7 +6,7 @@ use crate::context::Context;
 use crate::effects;
 use ratn_model::fact::Change;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, State, StateKind};
+use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind};
 use ratn_model::value::Value;
 
 impl Interpreter {
@@ -24,7 +24,10 @@ impl Interpreter {
     ) {
         let state = context.program.state(id);
         let result = self.boundary(context, thread, state, variables, &outcome);
-        if let Some(thread) = self.threads.get_mut(&thread) {
+        // The task's own variables are seen by its outputs.
+        if id != Program::ROOT
+            && let Some(thread) = self.threads.get_mut(&thread)
+        {
             thread.variables.truncate(variables);
         }
         match result {
@@ -69,12 +72,7 @@ impl Interpreter {
             }
         }
         let assigned = if good { self.assigned(context, thread, state, &written)? } else { Vec::new() };
-        if let Some(declared) = state.annotations.effects.get(outcome) {
-            let changes = self
-                .with_scope(context, thread, Some(&written), |s| effects::actual(Some(declared), outcome, &[], s))
-                .map_err(|error| error.to_string())?;
-            self.apply(context, InstanceId(0), changes)?;
-        }
+        self.change(context, thread, state, outcome, &written)?;
         if outcome == SUCCESS {
             self.operate(context, thread, state, InstanceId(0), &written)?;
         }
@@ -82,6 +80,22 @@ impl Interpreter {
             self.outputs.insert(state.id, written);
         }
         Ok(assigned)
+    }
+
+    /// The effects that a composite state declares for an outcome happen.
+    pub(super) fn change(
+        &mut self,
+        context: &mut Context<'_>,
+        thread: u64,
+        state: &State,
+        outcome: &str,
+        outputs: &Outputs,
+    ) -> Result<(), String> {
+        let Some(declared) = state.annotations.effects.get(outcome) else { return Ok(()) };
+        let changes = self
+            .with_scope(context, thread, Some(outputs), |s| effects::actual(Some(declared), outcome, &[], s))
+            .map_err(|error| error.to_string())?;
+        self.apply(context, InstanceId(0), changes)
     }
 
     /// The values that a state assigns to variables.

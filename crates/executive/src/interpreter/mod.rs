@@ -6,17 +6,20 @@
 //! scheduling: the two check each other.
 //!
 //! A thread of control has a stack of frames (the lists it is in) and does one thing at a time: [`walk`] says what is next,
-//! [`node`] lives the life of one action, [`exit`] does what composite states do at their ends, [`regions`] forks and joins.
+//! [`node`] lives the life of one action, [`again`] tries it anew, [`exit`] does what composite states do at their ends,
+//! [`regions`] forks and joins, [`stop`] ends what is under way.
 
+mod again;
 mod exit;
 mod node;
 mod regions;
+mod stop;
 mod walk;
 
 use crate::binding::{Bindings, Names, Outputs};
 use crate::context::Context;
 use crate::hold::Hold;
-use crate::protocol::{Command, Event, Note};
+use crate::protocol::Event;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, Revision, StateId};
 use ratn_model::program::StateKind;
@@ -104,8 +107,10 @@ struct Thread {
 /// How far an action is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
-    /// The operator lets nothing begin.
+    /// The operator lets nothing begin; it may have its resources already.
     Held,
+    /// Its worker died: it waits until its routine has got all of its resources anew.
+    Stalled,
     /// It waits before its next try.
     Backoff(Timestamp),
     Acquiring,
@@ -286,38 +291,11 @@ impl Interpreter {
             }
             _ => {}
         }
-        self.advance(context)
-    }
-
-    /// Ends everything under way.
-    pub(crate) fn abort(&mut self, context: &mut Context<'_>) {
-        let all: Vec<u64> = self.threads.keys().copied().collect();
-        for thread in all {
-            self.stop(context, thread);
+        let progress = self.advance(context);
+        if progress == Progress::Busy {
+            self.renew_lease(context);
         }
-    }
-
-    /// Ends what a thread has under way; it does nothing any more.
-    fn stop(&mut self, context: &mut Context<'_>, id: u64) {
-        let Some(thread) = self.threads.get_mut(&id) else { return };
-        thread.frames.clear();
-        let stopped = Todo::Done { outcome: ratn_model::program::PREEMPTED.to_owned(), reason: String::new() };
-        if let Todo::Join { regions, .. } = std::mem::replace(&mut thread.todo, stopped) {
-            for region in regions {
-                self.stop(context, region);
-                self.threads.remove(&region);
-            }
-        }
-        let Some(current) = self.threads.get_mut(&id).and_then(|thread| thread.current.take()) else { return };
-        match current.phase {
-            Phase::Held | Phase::Backoff(_) => {}
-            Phase::Acquiring => context.commands.push(Command::Withdraw { instance: current.instance }),
-            Phase::Projecting | Phase::Running => {
-                context.commands.push(Command::Cancel { instance: current.instance, attempt: current.attempt });
-            }
-        }
-        self.give_back(context, &current);
-        context.note(Note::Squashed { instance: current.instance });
+        progress
     }
 
     fn current(&mut self, thread: u64) -> Option<&mut Current> {

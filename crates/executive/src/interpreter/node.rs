@@ -1,6 +1,7 @@
 //! One action: acquire, project, run, and what its end changes.
 
-use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase, Target};
+use super::again::duration;
+use super::{Current, Interpreter, Phase, Target};
 use crate::analysis::NodeNature;
 use crate::binding::{self, Outputs};
 use crate::context::Context;
@@ -12,7 +13,6 @@ use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, StateKind, WORLD_MODEL};
 use ratn_model::resource::Lease;
 use ratn_model::value::Value;
-use std::time::Duration;
 
 impl Interpreter {
     pub(super) fn begin(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: &str) {
@@ -42,15 +42,14 @@ impl Interpreter {
     }
 
     /// Begins a try, unless the operator holds it.
-    fn try_now(&mut self, context: &mut Context<'_>, thread: u64) {
+    pub(super) fn try_now(&mut self, context: &mut Context<'_>, thread: u64) {
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let (id, instance) = (current.state, current.instance);
-        let is_pia = context.analysis.state(id).nature == NodeNature::Irreversible;
-        if is_pia && self.routine.is_none() {
-            if !self.hold.lets_begin() {
-                return self.set_phase(thread, Phase::Held);
-            }
-            self.hold.has_begun();
+        if self.is_held(context, thread) {
+            return self.set_phase(thread, Phase::Held);
+        }
+        if self.routine.as_ref().is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty()) {
+            return self.set_phase(thread, Phase::Stalled);
         }
         let wanted = &context.analysis.state(id).requirements;
         if self.routine.is_some() || wanted.is_empty() {
@@ -71,8 +70,23 @@ impl Interpreter {
         let held: Vec<u64> =
             self.threads.keys().copied().filter(|thread| self.phase(*thread) == Some(Phase::Held)).collect();
         for thread in held {
-            self.try_now(context, thread);
+            let Some(current) = self.current(thread) else { continue };
+            match (&current.lease, &current.projection) {
+                (_, Some(_)) => self.run(context, thread),
+                (Some(_), None) => self.project_or_run(context, thread),
+                (None, None) => self.try_now(context, thread),
+            }
         }
+    }
+
+    /// Whether the operator lets a node not begin. A routine of the window is one PIA: what it contains is not held.
+    fn is_held(&self, context: &Context<'_>, thread: u64) -> bool {
+        self.routine.is_none() && self.is_pia(context, thread) && !self.hold.lets_begin()
+    }
+
+    fn is_pia(&self, context: &Context<'_>, thread: u64) -> bool {
+        let current = self.threads.get(&thread).and_then(|thread| thread.current.as_ref());
+        current.is_some_and(|c| context.analysis.state(c.state).nature == NodeNature::Irreversible)
     }
 
     pub(super) fn granted(&mut self, context: &mut Context<'_>, thread: u64, lease: Lease) {
@@ -81,19 +95,21 @@ impl Interpreter {
         }
         if let Some(routine) = &mut self.routine {
             routine.lease = Some(lease);
-        } else if let Some(current) = self.current(thread) {
+            return self.go_on_under_new_lease(context, thread);
+        }
+        if let Some(current) = self.current(thread) {
             current.lease = Some(lease);
         }
         self.project_or_run(context, thread);
     }
 
-    fn set_phase(&mut self, thread: u64, phase: Phase) {
+    pub(super) fn set_phase(&mut self, thread: u64, phase: Phase) {
         if let Some(current) = self.current(thread) {
             current.phase = phase;
         }
     }
 
-    fn project_or_run(&mut self, context: &mut Context<'_>, thread: u64) {
+    pub(super) fn project_or_run(&mut self, context: &mut Context<'_>, thread: u64) {
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let analysis = context.analysis.state(current.state);
         if !analysis.requirements.iter().any(|r| r.kind == WORLD_MODEL) {
@@ -115,6 +131,10 @@ impl Interpreter {
     }
 
     pub(super) fn run(&mut self, context: &mut Context<'_>, thread: u64) {
+        // The pause may have begun while it waited for its resources: it keeps them.
+        if self.is_held(context, thread) {
+            return self.set_phase(thread, Phase::Held);
+        }
         let program = context.program;
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let state = program.state(current.state);
@@ -136,6 +156,9 @@ impl Interpreter {
             timeout_s: state.annotations.timeout_s,
         };
         let timeout = state.annotations.timeout_s.map(|seconds| context.now + duration(seconds));
+        if self.routine.is_none() && self.is_pia(context, thread) {
+            self.hold.has_begun();
+        }
         if let Some(current) = self.current(thread) {
             current.phase = Phase::Running;
             current.timeout = timeout;
@@ -143,100 +166,6 @@ impl Interpreter {
         context.commands.extend(timeout.map(|at| Command::Wake { at }));
         context.note(Note::Running { instance, attempt });
         context.commands.push(Command::Start { instance, attempt, goal });
-    }
-
-    /// Pauses between tries that are over, and goals that have had their time.
-    pub(super) fn look_at_the_time(&mut self, context: &mut Context<'_>) {
-        let all: Vec<u64> = self.threads.keys().copied().collect();
-        for thread in all {
-            let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { continue };
-            let (instance, attempt) = (current.instance, current.attempt);
-            match current.phase {
-                Phase::Backoff(until) if until <= context.now => self.try_now(context, thread),
-                Phase::Running if current.timeout.is_some_and(|at| at <= context.now) => {
-                    let limit = context.program.state(current.state).annotations.timeout_s.unwrap_or_default();
-                    context.commands.push(Command::Cancel { instance, attempt });
-                    let reason = format!("it took longer than {limit} s");
-                    self.goal_ended(context, thread, ABORTED.to_owned(), Outputs::new(), &[], reason);
-                }
-                _ => {}
-            }
-        }
-    }
-
-    pub(super) fn crashed(&mut self, context: &mut Context<'_>, thread: u64, reason: &str) {
-        let alone = self.threads.values().filter(|thread| thread.current.is_some()).count() == 1;
-        let Some(current) = self.current(thread) else { return };
-        if !matches!(current.phase, Phase::Acquiring | Phase::Projecting | Phase::Running) {
-            return;
-        }
-        current.crashes += 1;
-        let (instance, attempt, id, crashes) = (current.instance, current.attempt, current.state, current.crashes);
-        let given = Current {
-            lease: current.lease.take(),
-            projection: current.projection.take(),
-            path: String::new(),
-            ..*current
-        };
-        self.give_back(context, &given);
-        let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
-        if context.analysis.state(id).nature == NodeNature::Irreversible || crashes >= limit {
-            return self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
-        }
-        if let Some(current) = self.current(thread) {
-            current.attempt += 1;
-        }
-        match &mut self.routine {
-            // Nothing else of it moves: it gives everything back and asks for all of it again.
-            Some(routine) if alone => {
-                let lease = routine.lease.take().map(|l| l.id);
-                let requirements = routine.requirements.clone();
-                if lease.is_some() {
-                    context.commands.push(Command::Release { instance, lease, projection: None });
-                }
-                if requirements.is_empty() {
-                    return self.project_or_run(context, thread);
-                }
-                self.set_phase(thread, Phase::Acquiring);
-                context.commands.push(Command::Acquire { instance, requirements, priority: i64::MAX });
-            }
-            Some(_) => self.project_or_run(context, thread),
-            None => self.try_now(context, thread),
-        }
-    }
-
-    /// A goal has ended: that is the result, unless it is tried again.
-    pub(super) fn goal_ended(
-        &mut self,
-        context: &mut Context<'_>,
-        thread: u64,
-        outcome: String,
-        outputs: Outputs,
-        measured: &[(FactKey, Value)],
-        reason: String,
-    ) {
-        let Some(current) = self.current(thread) else { return };
-        let retry = context.program.state(current.state).annotations.retry;
-        if let Some(retry) = retry.filter(|retry| outcome == ABORTED && current.tries <= retry.count) {
-            let pause = duration(retry.backoff_s * f64::from(2_u32.saturating_pow(current.tries - 1)));
-            let given = Current {
-                lease: current.lease.take(),
-                projection: current.projection.take(),
-                path: String::new(),
-                ..*current
-            };
-            current.tries += 1;
-            current.attempt += 1;
-            let until = context.now + pause;
-            current.phase = Phase::Backoff(until);
-            self.give_back(context, &given);
-            if pause.is_zero() {
-                return self.try_now(context, thread);
-            }
-            context.commands.push(Command::Wake { at: until });
-            return;
-        }
-        self.finish(context, thread, outcome, outputs, measured, reason);
     }
 
     /// It ends `aborted` without having done anything (more).
@@ -250,7 +179,7 @@ impl Interpreter {
         self.ended(thread, current.state, ABORTED, format!("{}: {reason}", current.path));
     }
 
-    fn finish(
+    pub(super) fn finish(
         &mut self,
         context: &mut Context<'_>,
         thread: u64,
@@ -321,8 +250,4 @@ impl Interpreter {
             context.commands.push(Command::Release { instance, lease, projection });
         }
     }
-}
-
-fn duration(seconds: f64) -> Duration {
-    Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(Duration::MAX)
 }

@@ -56,9 +56,9 @@ impl Interpreter {
         let mut reasons = Vec::new();
         for (region, state) in regions.iter().zip(states) {
             let end = self.region_end(*region).map(|(outcome, reason)| (outcome.to_owned(), reason.to_owned()));
-            let (outcome, reason) = end.unwrap_or_else(|| {
-                self.stop(context, *region);
-                (PREEMPTED.to_owned(), String::new())
+            let (outcome, reason) = end.unwrap_or_else(|| match self.preempt(context, *region) {
+                Ok(()) => (PREEMPTED.to_owned(), String::new()),
+                Err(problem) => (ABORTED.to_owned(), problem),
             });
             self.regions.insert(*state, outcome.clone());
             if !reason.is_empty() {
@@ -97,7 +97,7 @@ impl Interpreter {
     }
 
     /// What regions assigned to variables outside is seen from here on; where several did, the last region's.
-    fn merge_variables(&mut self, thread: u64, regions: &[u64]) {
+    pub(super) fn merge_variables(&mut self, thread: u64, regions: &[u64]) {
         let Some(before) = self.threads.get(&thread).map(|thread| thread.variables.clone()) else { return };
         for region in regions {
             let Some(theirs) = self.threads.get(region).map(|region| region.variables.clone()) else { continue };

@@ -361,11 +361,13 @@ impl Window {
     ) {
         let plan = self.plan.clone();
         let own = plan.state(id);
+        // The task's own variables are seen by its outputs.
+        let kept = if id == Program::ROOT { usize::MAX } else { variables };
         if own.exits & (1 << outcome) != 0 {
             let state = context.program.state(id);
             let instance = self.append(context, index, state, Role::Exit, visit, None, outcome);
             self.single_arm(index, instance);
-            self.cursors[index].environment.variables.truncate(variables);
+            self.cursors[index].environment.variables.truncate(kept);
             let links: Vec<Predicate> = own.effect_predicates[outcome]
                 .iter()
                 .chain(if outcome == 0 { &own.operated[..] } else { &[] })
@@ -374,7 +376,7 @@ impl Window {
             self.come_after(index, instance, id, outcome, false, &links);
         }
         let cursor = &mut self.cursors[index];
-        cursor.environment.variables.truncate(variables);
+        cursor.environment.variables.truncate(kept);
         cursor.todo = Todo::Leave(id, outcome);
     }
 

@@ -1,0 +1,144 @@
+//! What happens to an action that does not end at once as it should: tries and their pauses, timeouts, workers that die.
+//!
+//! A cancelled or crashed goal changes nothing: nobody knows how far it came.
+
+use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase};
+use crate::analysis::NodeNature;
+use crate::binding::Outputs;
+use crate::context::Context;
+use crate::protocol::Command;
+use ratn_model::fact::FactKey;
+use ratn_model::program::ABORTED;
+use ratn_model::value::Value;
+use std::time::Duration;
+
+impl Interpreter {
+    /// Pauses between tries that are over, and goals that have had their time.
+    pub(super) fn look_at_the_time(&mut self, context: &mut Context<'_>) {
+        let all: Vec<u64> = self.threads.keys().copied().collect();
+        for thread in all {
+            let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { continue };
+            let (instance, attempt) = (current.instance, current.attempt);
+            match current.phase {
+                Phase::Backoff(until) if until <= context.now => self.try_now(context, thread),
+                Phase::Running if current.timeout.is_some_and(|at| at <= context.now) => {
+                    let limit = context.program.state(current.state).annotations.timeout_s.unwrap_or_default();
+                    context.commands.push(Command::Cancel { instance, attempt });
+                    if !self.is_tried_again(context, thread) {
+                        self.end_node(context, thread, format!("it took longer than {limit} s"));
+                    }
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// A goal has ended: that is the result, unless it is tried again.
+    pub(super) fn goal_ended(
+        &mut self,
+        context: &mut Context<'_>,
+        thread: u64,
+        outcome: String,
+        outputs: Outputs,
+        measured: &[(FactKey, Value)],
+        reason: String,
+    ) {
+        if outcome != ABORTED || !self.is_tried_again(context, thread) {
+            self.finish(context, thread, outcome, outputs, measured, reason);
+        }
+    }
+
+    /// After a try that ended `aborted`: whether there is another one, which begins after its pause.
+    fn is_tried_again(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
+        let Some(current) = self.current(thread) else { return false };
+        let retry = context.program.state(current.state).annotations.retry;
+        let Some(retry) = retry.filter(|retry| current.tries <= retry.count) else { return false };
+        let pause = duration(retry.backoff_s * f64::from(2_u32.saturating_pow(current.tries - 1)));
+        let given = current.take_held();
+        let until = context.now + pause;
+        current.tries += 1;
+        current.attempt += 1;
+        current.phase = Phase::Backoff(until);
+        self.give_back(context, &given);
+        if pause.is_zero() {
+            self.try_now(context, thread);
+        } else {
+            context.commands.push(Command::Wake { at: until });
+        }
+        true
+    }
+
+    /// An attempt ended without an answer: a computing or sensing node is tried again, up to its limit.
+    pub(super) fn crashed(&mut self, context: &mut Context<'_>, thread: u64, reason: &str) {
+        let Some(current) = self.current(thread) else { return };
+        let (attempt, id, phase) = (current.attempt, current.state, current.phase);
+        match phase {
+            Phase::Held | Phase::Projecting | Phase::Running | Phase::Acquiring => {}
+            Phase::Backoff(_) | Phase::Stalled => return,
+        }
+        let given = current.take_held();
+        current.attempt += 1;
+        if phase == Phase::Held {
+            // It had not begun: what it held is gone, and it asks again when it may.
+            return self.give_back(context, &given);
+        }
+        current.crashes += 1;
+        let crashes = current.crashes;
+        self.give_back(context, &given);
+        let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
+        if context.analysis.state(id).nature == NodeNature::Irreversible || crashes >= limit {
+            return self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
+        }
+        match self.routine {
+            Some(_) => self.set_phase(thread, Phase::Stalled),
+            None => self.try_now(context, thread),
+        }
+    }
+
+    /// A worker of a routine has died and nothing of it moves under the old lease any more: it gives everything back and asks for
+    /// all of it again.
+    pub(super) fn renew_lease(&mut self, context: &mut Context<'_>) {
+        let in_use =
+            |thread: &u64| matches!(self.phase(*thread), Some(Phase::Acquiring | Phase::Projecting | Phase::Running));
+        if self.threads.keys().any(in_use) {
+            return;
+        }
+        let Some(thread) = self.stalled().first().copied() else { return };
+        let Some(instance) = self.current(thread).map(|current| current.instance) else { return };
+        let Some(routine) = &mut self.routine else { return };
+        if let Some(lease) = routine.lease.take() {
+            context.commands.push(Command::Release { instance, lease: Some(lease.id), projection: None });
+        }
+        let requirements = routine.requirements.clone();
+        if requirements.is_empty() {
+            return self.go_on_under_new_lease(context, thread);
+        }
+        self.set_phase(thread, Phase::Acquiring);
+        context.commands.push(Command::Acquire { instance, requirements, priority: i64::MAX });
+    }
+
+    /// Who has asked for the routine goes on, and whoever waited with it.
+    pub(super) fn go_on_under_new_lease(&mut self, context: &mut Context<'_>, thread: u64) {
+        self.project_or_run(context, thread);
+        for thread in self.stalled() {
+            self.project_or_run(context, thread);
+        }
+    }
+
+    fn stalled(&self) -> Vec<u64> {
+        self.threads.keys().copied().filter(|thread| self.phase(*thread) == Some(Phase::Stalled)).collect()
+    }
+}
+
+impl Current {
+    /// What it holds, to be given back.
+    fn take_held(&mut self) -> Current {
+        let (lease, projection) = (self.lease.take(), self.projection.take());
+        Current { lease, projection, path: String::new(), ..*self }
+    }
+}
+
+/// A span of the robot's time; what is no number is none.
+pub(super) fn duration(seconds: f64) -> Duration {
+    Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(Duration::MAX)
+}
