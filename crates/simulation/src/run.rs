@@ -1,6 +1,10 @@
 //! One run of one task in virtual time: the same loop as the real task control's (receive, handle, perform), with the cores
 //! called directly.
 
+mod circumstances;
+
+pub use circumstances::{Circumstances, MAX_EVENTS, Mischief, Trigger};
+
 use crate::random::Dice;
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::{Lookout, Problem, Search};
@@ -47,6 +51,8 @@ pub enum Answer {
     },
     /// Its worker died.
     Crashed,
+    /// What it works with vanished under it, and with it its lease; another of its kind takes its place.
+    LeaseLost,
 }
 
 /// A run to make.
@@ -112,8 +118,14 @@ pub enum RunError {
     },
 }
 
-/// More events than this is an endless run.
-const MAX_EVENTS: usize = 1_000_000;
+/// What is going to happen.
+#[expect(clippy::large_enum_variant, reason = "nearly all entries are events")]
+enum Entry {
+    /// This event.
+    Event(Event),
+    /// A resource of a lease vanishes, and the goal under it ends.
+    Loss { lease: LeaseId, instance: InstanceId, attempt: u32 },
+}
 
 struct Simulation<'a> {
     now: Timestamp,
@@ -125,11 +137,17 @@ struct Simulation<'a> {
     projections: BTreeMap<ProjectionId, World>,
     /// What projections were asked for: the world pool makes one per instance and attempt.
     projected: BTreeSet<(InstanceId, u32)>,
+    /// Projections that the executive knows of, and gives back itself.
+    told: BTreeSet<ProjectionId>,
     next_projection: u64,
     waiters: BTreeMap<InstanceId, WaiterId>,
     leases: BTreeMap<LeaseId, InstanceId>,
+    /// Leases that ended by themselves.
+    lost: BTreeSet<LeaseId>,
+    grants: BTreeMap<InstanceId, u32>,
+    circumstances: Circumstances,
     paths: BTreeMap<InstanceId, String>,
-    agenda: BTreeMap<(Timestamp, u64), Event>,
+    agenda: BTreeMap<(Timestamp, u64), Entry>,
     next_entry: u64,
     latency: Duration,
     dice: Dice,
@@ -152,6 +170,15 @@ pub fn run(setup: Setup, oracle: &mut dyn Oracle) -> Result<Run, RunError> {
 /// # Errors
 /// As [`run`].
 pub fn run_looking_ahead(setup: Setup, oracle: &mut dyn Oracle, orders: usize) -> Result<Run, RunError> {
+    run_under(setup, oracle, Circumstances { orders, ..Circumstances::default() })
+}
+
+/// As [`run`], with all that may happen beside what the providers do.
+///
+/// # Errors
+/// As [`run`].
+pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumstances) -> Result<Run, RunError> {
+    let (orders, max_events) = (circumstances.orders, circumstances.max_events);
     let mut root = World::default();
     let initial: Vec<Change> =
         setup.world.iter().map(|(fact, value)| Change::Set { fact: fact.clone(), value: value.clone() }).collect();
@@ -178,9 +205,13 @@ pub fn run_looking_ahead(setup: Setup, oracle: &mut dyn Oracle, orders: usize) -
         root,
         projections: BTreeMap::new(),
         projected: BTreeSet::new(),
+        told: BTreeSet::new(),
         next_projection: 0,
         waiters: BTreeMap::new(),
         leases: BTreeMap::new(),
+        lost: BTreeSet::new(),
+        grants: BTreeMap::new(),
+        circumstances,
         paths: BTreeMap::new(),
         agenda: BTreeMap::new(),
         next_entry: 0,
@@ -207,12 +238,16 @@ pub fn run_looking_ahead(setup: Setup, oracle: &mut dyn Oracle, orders: usize) -
             origin: Origin::default(),
         },
     );
-    for _ in 0..MAX_EVENTS {
-        let Some(((now, _), event)) = simulation.agenda.pop_first() else {
+    simulation.bring_from_outside(|trigger| match trigger {
+        Trigger::At(seconds) => Some(Duration::from_secs_f64(seconds.max(0.0))),
+        _ => None,
+    });
+    for _ in 0..max_events {
+        let Some(((now, _), entry)) = simulation.agenda.pop_first() else {
             return Err(RunError::Stuck { at_s: simulation.now.seconds(), waits: executive.explain() });
         };
         simulation.now = now;
-        let mut next = Some(event);
+        let mut next = simulation.happens(entry)?;
         while let Some(event) = next.take() {
             simulation.log.push(LogLine { at: now, entry: LogEntry::Event(event.clone()) });
             let commands = executive.handle(now, event);
@@ -234,7 +269,7 @@ pub fn run_looking_ahead(setup: Setup, oracle: &mut dyn Oracle, orders: usize) -
             return Ok(Run { end_s: now.seconds(), outcome, outputs, reason, log, world: simulation.root, units });
         }
     }
-    Err(RunError::Endless(MAX_EVENTS))
+    Err(RunError::Endless(max_events))
 }
 
 /// A better order than the executive's own, if so many tries find one.
@@ -249,7 +284,76 @@ fn advice(outlook: &Problem, orders: usize, seed: u64) -> Option<Event> {
 impl Simulation<'_> {
     fn at(&mut self, delay: Duration, event: Event) {
         self.next_entry += 1;
-        self.agenda.insert((self.now + delay, self.next_entry), event);
+        self.agenda.insert((self.now + delay, self.next_entry), Entry::Event(event));
+    }
+
+    /// A message about an attempt, which may come late or twice.
+    fn send(&mut self, delay: Duration, kind: &str, instance: InstanceId, attempt: u32, event: Event) {
+        let path = self.paths.get(&instance).map_or("", String::as_str);
+        let delivery = self.circumstances.mischief.delivery(kind, path, attempt);
+        let first = delay + Duration::from_secs_f64(delivery.late_s);
+        if let Some(again_s) = delivery.again_s {
+            self.at(first + Duration::from_secs_f64(again_s), event.clone());
+        }
+        self.at(first, event);
+    }
+
+    /// What comes from outside at this occasion is put on the agenda.
+    fn bring_from_outside(&mut self, due: impl Fn(&Trigger) -> Option<Duration>) {
+        let events = std::mem::take(&mut self.circumstances.events);
+        for (trigger, event) in events {
+            match due(&trigger) {
+                Some(delay) => self.at(delay, event),
+                None => self.circumstances.events.push((trigger, event)),
+            }
+        }
+    }
+
+    /// What comes of an entry of the agenda: the event that the executive hears of, if any.
+    fn happens(&mut self, entry: Entry) -> Result<Option<Event>, RunError> {
+        let event = match entry {
+            // The shell knows what it holds: word of what was given back meanwhile is none.
+            Entry::Event(Event::Granted { instance, lease }) if self.leases.get(&lease.id) != Some(&instance) => {
+                return Ok(None);
+            }
+            Entry::Event(Event::Projected { projection, .. }) if !self.projections.contains_key(&projection) => {
+                return Ok(None);
+            }
+            Entry::Event(event) => event,
+            Entry::Loss { lease, instance, attempt } => {
+                self.lose(lease)?;
+                Event::Crashed { instance, attempt, reason: "its lease was lost".to_owned() }
+            }
+        };
+        if let Event::Projected { projection, .. } = &event {
+            self.told.insert(*projection);
+        }
+        if let Event::Finished { instance, .. } | Event::Crashed { instance, .. } = &event
+            && let Some(path) = self.paths.get(instance).cloned()
+        {
+            self.bring_from_outside(|trigger| (*trigger == Trigger::Ends(path.clone())).then_some(Duration::ZERO));
+        }
+        Ok(Some(event))
+    }
+
+    /// A resource under a lease vanishes; another takes its place.
+    fn lose(&mut self, lease: LeaseId) -> Result<(), RunError> {
+        let held = self.pool.leases().into_iter().find(|held| held.id == lease);
+        let resources = held.map(|held| held.resources).unwrap_or_default();
+        let class = |id: &String| self.pool.get(id).map(|resource| resource.class);
+        let worker =
+            resources.iter().find(|id| matches!(class(id), Some(ResourceClass::Process | ResourceClass::Module)));
+        let Some(resource) = worker.and_then(|id| self.pool.get(id)) else { return Ok(()) };
+        self.pool.delete(self.now, None, &resource.id).map_err(|e| self.broken(e))?;
+        let spec = ResourceSpec::new(resource.class, resource.kind).id(resource.id).capacity(resource.capacity);
+        self.pool.create(self.now, None, spec).map_err(|e| self.broken(e))?;
+        // With whatever else is under it, it is still to be given back.
+        if !self.pool.leases().iter().any(|held| held.id == lease) {
+            self.leases.remove(&lease);
+            self.lost.insert(lease);
+        }
+        self.answers();
+        Ok(())
     }
 
     fn late(&mut self) -> Duration {
@@ -301,22 +405,33 @@ impl Simulation<'_> {
                 let projection = ProjectionId(self.next_projection);
                 self.projections.insert(projection, world);
                 let late = self.late();
-                self.at(late, Event::Projected { instance, attempt, projection });
+                self.send(late, "projected", instance, attempt, Event::Projected { instance, attempt, projection });
             }
             Command::Start { instance, attempt, goal } => self.start(instance, attempt, &goal),
             Command::Cancel { instance, attempt } => {
+                let path = self.paths.get(&instance).map_or("", String::as_str);
+                let crosses = self.circumstances.mischief.crosses(path, attempt);
                 let cancelled: Vec<_> =
                     self.agenda.iter().filter(|(_, e)| is_answer(e, instance, attempt)).map(|(at, _)| *at).collect();
                 for at in cancelled {
-                    if let Some(Event::Projected { projection, .. }) = self.agenda.remove(&at) {
-                        self.projections.remove(&projection);
+                    match self.agenda.remove(&at) {
+                        Some(Entry::Event(Event::Projected { projection, .. })) if !self.told.contains(&projection) => {
+                            self.projections.remove(&projection);
+                        }
+                        Some(Entry::Event(Event::Projected { .. })) => {}
+                        Some(answer @ Entry::Event(_)) if crosses => {
+                            self.agenda.insert(at, answer);
+                        }
+                        _ => {}
                     }
                 }
             }
             Command::Release { lease, projection, .. } => {
                 if let Some(lease) = lease {
                     self.leases.remove(&lease);
-                    self.pool.release(self.now, Some(&self.session), lease).map_err(|e| self.broken(e))?;
+                    if !self.lost.contains(&lease) {
+                        self.pool.release(self.now, Some(&self.session), lease).map_err(|e| self.broken(e))?;
+                    }
                 }
                 if let Some(projection) = projection
                     && self.projections.remove(&projection).is_none()
@@ -350,18 +465,19 @@ impl Simulation<'_> {
 
     /// A withdrawal that crossed its grant.
     fn take_back_grant(&mut self, instance: InstanceId) -> Result<(), RunError> {
-        let crossed = self.agenda.iter().find_map(|(at, event)| match event {
-            Event::Granted { instance: to, lease } if *to == instance => Some((*at, lease.id)),
+        let crossed = self.agenda.values().find_map(|entry| match entry {
+            Entry::Event(Event::Granted { instance: to, lease }) if *to == instance => Some(lease.id),
             _ => None,
         });
-        let Some((at, lease)) = crossed else { return Ok(()) };
-        self.agenda.remove(&at);
+        let Some(lease) = crossed.filter(|lease| self.leases.contains_key(lease)) else { return Ok(()) };
+        // Its message, or messages, will be of a lease that nobody holds.
         self.leases.remove(&lease);
         self.pool.release(self.now, Some(&self.session), lease).map_err(|e| self.broken(e))
     }
 
     fn start(&mut self, instance: InstanceId, attempt: u32, goal: &Goal) {
         let path = self.paths.get(&instance).cloned().unwrap_or_default();
+        self.bring_from_outside(|trigger| (*trigger == Trigger::Starts(path.clone())).then_some(Duration::ZERO));
         let world = goal.projection.and_then(|p| self.projections.get(&p)).unwrap_or(&self.root);
         let Performance { duration_s, answer } = self.oracle.perform(&path, attempt, goal, world);
         let event = match answer {
@@ -370,8 +486,21 @@ impl Simulation<'_> {
                 Event::Finished { instance, attempt, outcome, outputs, measured, reason }
             }
             Answer::Crashed => Event::Crashed { instance, attempt, reason: "the worker died".to_owned() },
+            Answer::LeaseLost => {
+                let lease = goal.lease.as_ref().map(|lease| lease.id);
+                match lease.filter(|lease| self.leases.get(lease) == Some(&instance)) {
+                    Some(lease) => {
+                        let at = self.now + Duration::from_secs_f64(duration_s.max(0.0));
+                        self.next_entry += 1;
+                        self.agenda.insert((at, self.next_entry), Entry::Loss { lease, instance, attempt });
+                        return;
+                    }
+                    // Of what is inside a routine only the worker dies.
+                    None => Event::Crashed { instance, attempt, reason: "the worker died".to_owned() },
+                }
+            }
         };
-        self.at(Duration::from_secs_f64(duration_s.max(0.0)), event);
+        self.send(Duration::from_secs_f64(duration_s.max(0.0)), "answer", instance, attempt, event);
     }
 
     fn task_resources(&self) -> BTreeMap<String, u64> {
@@ -395,7 +524,10 @@ impl Simulation<'_> {
             if let Some(lease) = lease {
                 self.leases.insert(lease.id, instance);
                 let late = self.late();
-                self.at(late, Event::Granted { instance, lease });
+                let grant = self.grants.entry(instance).or_default();
+                *grant += 1;
+                let grant = *grant;
+                self.send(late, "granted", instance, grant, Event::Granted { instance, lease });
             }
         }
     }
@@ -419,9 +551,10 @@ impl Simulation<'_> {
     }
 }
 
-fn is_answer(event: &Event, to: InstanceId, of: u32) -> bool {
-    matches!(event,
-        Event::Finished { instance, attempt, .. }
+fn is_answer(entry: &Entry, to: InstanceId, of: u32) -> bool {
+    matches!(entry,
+        Entry::Event(Event::Finished { instance, attempt, .. }
         | Event::Crashed { instance, attempt, .. }
-        | Event::Projected { instance, attempt, .. } if *instance == to && *attempt == of)
+        | Event::Projected { instance, attempt, .. })
+        | Entry::Loss { instance, attempt, .. } if *instance == to && *attempt == of)
 }

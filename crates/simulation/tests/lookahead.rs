@@ -5,7 +5,7 @@
 use ratn_executive::protocol::{Event, LogEntry, Mode};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::resource::ResourceClass;
-use ratn_simulation::random::{HashOracle, RESOURCES, program};
+use ratn_simulation::random::{Features, HashOracle, RESOURCES, program};
 use ratn_simulation::run::{Run, Setup, run, run_looking_ahead};
 use ratn_simulation::tables::{FETCH_BOXES, SET_TABLE};
 use ratn_simulation::timed::TimedProviders;
@@ -26,7 +26,7 @@ fn is_advised(run: &Run) -> bool {
 fn random_programs_come_to_the_same_with_and_without() {
     let mut advised = 0;
     for seed in 0..SEEDS {
-        let program = Arc::new(program(seed));
+        let program = Arc::new(program(seed, &Features::BASIC));
         let setup = |mode| Setup {
             program: program.clone(),
             mode,
@@ -37,7 +37,8 @@ fn random_programs_come_to_the_same_with_and_without() {
             tolerance: Tolerance::EXACT,
             latency: if seed.is_multiple_of(2) { Duration::ZERO } else { Duration::from_millis(1500) },
         };
-        let oracle = || HashOracle { program: &program, seed, failures_percent: 3, crashes_percent: 5 };
+        let oracle =
+            || HashOracle { program: &program, seed, failures_percent: 3, crashes_percent: 5, deviations_percent: 0 };
         let hsm = run(setup(Mode::Hsm), &mut oracle()).unwrap();
         let ahead = run_looking_ahead(setup(Mode::Cdtn), &mut oracle(), ORDERS);
         let ahead = ahead.unwrap_or_else(|error| unreachable!("seed {seed}: {error}"));

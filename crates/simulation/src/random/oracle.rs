@@ -1,0 +1,221 @@
+//! What the nodes of random programs do: a hash of what they are entitled to see, and nothing else.
+//!
+//! Faults are keyed by path and attempt, never by time. A PIA that crashes ends `aborted`, which is a result: its crashes are
+//! keyed by path and try, which are the same in both modes. Durations follow from path and try, too. Inside of a preemptive
+//! concurrency the actions of its two regions take multiples of [`LONG_S`] and, in the second, [`SHIFT_S`] more each: with at most
+//! three actions per region, whatever else may shift the end of an action (messages that are late, workers that die: some tens
+//! of seconds) never changes which ends first, so that the outcome is one function of the program in both modes.
+
+use super::dice::{Dice, Hash};
+use super::{AGAIN, ARGUMENTS, FOUND, PREDICATES, is_preemptive, plain, state_of};
+use crate::run::{Answer, Oracle, Performance};
+use ratn_executive::protocol::Goal;
+use ratn_model::expression::{EffectExpr, Expr, FactExpr, Lookup, Scope};
+use ratn_model::fact::{FactKey, FactPattern, Footprint, Term};
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, SUCCESS, State, StateKind};
+use ratn_model::value::Value;
+use ratn_world::world::World;
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+
+/// No goal of a random program takes as long, unless it never answers.
+pub(super) const TIMEOUT_S: f64 = 60.0;
+/// What the actions of a preemptive concurrency take, at least.
+const LONG_S: f64 = 10_000.0;
+/// And so much more in its second region.
+const SHIFT_S: f64 = 3_000.0;
+/// Attempts from this one on do not crash.
+const LAST_ATTEMPT: u32 = 3;
+/// Visits from this one on do not lead back.
+const LAST_VISIT: u64 = 3;
+
+/// What nodes of random programs do.
+pub struct HashOracle<'a> {
+    /// The program.
+    pub program: &'a Program,
+    /// What all hashes are derived from.
+    pub seed: u64,
+    /// How many of a hundred visits end `aborted`, or `preempted`, or not at all; and PIAs crash.
+    pub failures_percent: u64,
+    /// How many of a hundred attempts of computing and sensing nodes kill their worker, or lose their lease.
+    pub crashes_percent: u64,
+    /// How many of a hundred effects are not measured as they were predicted.
+    pub deviations_percent: u64,
+}
+
+impl Oracle for HashOracle<'_> {
+    fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, world: &World) -> Performance {
+        let Some(state) = state_of(self.program, path) else {
+            return Performance { duration_s: 0.0, answer: Answer::Crashed };
+        };
+        let duration_s = self.duration_s(path, state, goal);
+        if let Some(answer) = self.fault(path, attempt, state, goal) {
+            return Performance { duration_s: duration_s.min(3.0), answer };
+        }
+        let mut hash = Hash(self.seed);
+        if state.annotations.deterministic {
+            hash.add(&plain(path));
+        } else {
+            hash.add(path);
+            hash.add_number(goal.seed);
+        }
+        for (port, value) in &goal.inputs {
+            hash.add(port);
+            hash.add(&value.to_string());
+        }
+        for (fact, value) in self.seen(state, goal, world) {
+            hash.add(&fact);
+            hash.add(&value);
+        }
+        let mut dice = hash.dice();
+        if dice.percent(self.failures_percent) {
+            return match dice.below(4) {
+                0 if state.annotations.timeout_s.is_some() => Performance { duration_s: 1e6, answer: failed(ABORTED) },
+                1 => Performance { duration_s, answer: failed(PREEMPTED) },
+                _ => Performance { duration_s, answer: failed(ABORTED) },
+            };
+        }
+        let outcome = self.outcome(&mut dice, path, state);
+        let x = dice.below(3) as i64;
+        let list = (0..dice.below(4)).map(|_| Value::Int(dice.below(ARGUMENTS) as i64)).collect();
+        let outputs = BTreeMap::from([("x".to_owned(), Value::Int(x)), ("list".to_owned(), Value::List(list))]);
+        let measured = self.measured(&mut dice, state, goal, &outcome);
+        Performance { duration_s, answer: Answer::Finished { outcome, outputs, measured } }
+    }
+}
+
+fn failed(outcome: &str) -> Answer {
+    Answer::Finished { outcome: outcome.to_owned(), outputs: BTreeMap::new(), measured: Vec::new() }
+}
+
+impl HashOracle<'_> {
+    fn duration_s(&self, path: &str, state: &State, goal: &Goal) -> f64 {
+        let mut hash = Hash(self.seed);
+        hash.add("duration");
+        hash.add(path);
+        let chain: Vec<&State> = super::around(self.program, state).collect();
+        let region = chain.windows(2).find(|pair| is_preemptive(pair[1])).map(|pair| pair[0].id);
+        if let Some(region) = region {
+            let second = chain.iter().any(|s| s.children().position(|child| child == region) == Some(1));
+            let shift = if second { SHIFT_S } else { 0.0 };
+            return LONG_S * (1 + hash.dice().below(3)) as f64 + shift;
+        }
+        hash.add_number(goal.seed);
+        0.5 + hash.dice().below(40) as f64 / 10.0
+    }
+
+    fn fault(&self, path: &str, attempt: u32, state: &State, goal: &Goal) -> Option<Answer> {
+        let mut hash = Hash(self.seed);
+        hash.add("fault");
+        hash.add(path);
+        let chance = if state.annotations.nature == Nature::Irreversible {
+            hash.add_number(goal.seed);
+            self.failures_percent.div_ceil(3)
+        } else if attempt < LAST_ATTEMPT {
+            hash.add_number(u64::from(attempt));
+            self.crashes_percent
+        } else {
+            0
+        };
+        let mut dice = hash.dice();
+        let fails = dice.percent(chance);
+        fails.then(|| if dice.percent(50) { Answer::Crashed } else { Answer::LeaseLost })
+    }
+
+    fn outcome(&self, dice: &mut Dice, path: &str, state: &State) -> String {
+        if state.outcomes.is_empty() || dice.percent(45) {
+            return SUCCESS.to_owned();
+        }
+        let chosen = dice.one_of(&state.outcomes).map_or(SUCCESS, String::as_str);
+        // Cycles end.
+        let back = chosen == AGAIN && (state.annotations.deterministic || visits(path) >= LAST_VISIT);
+        if back { FOUND.to_owned() } else { chosen.to_owned() }
+    }
+
+    /// Facts that are not as the effects of this outcome say.
+    fn measured(&self, dice: &mut Dice, state: &State, goal: &Goal, outcome: &str) -> Vec<(FactKey, Value)> {
+        if self.deviations_percent == 0 {
+            return Vec::new();
+        }
+        let scope = InputScope { state, goal };
+        let mut measured: Vec<(FactKey, Value)> = Vec::new();
+        match state.annotations.effects.get(outcome) {
+            Some(effects) => {
+                for effect in effects {
+                    let EffectExpr::Set(fact, _) = effect else { continue };
+                    let Some(key) = key(fact, &scope) else { continue };
+                    if dice.percent(self.deviations_percent) && !measured.iter().any(|(known, _)| *known == key) {
+                        measured.push((key, Value::Int(dice.below(4) as i64)));
+                    }
+                }
+            }
+            // What it changes nobody could know before.
+            None if state.annotations.nature == Nature::Irreversible && dice.percent(self.deviations_percent) => {
+                let fact = super::generator::fact_at(dice.below(PREDICATES), dice.below(ARGUMENTS) as i64);
+                measured.extend(key(&fact, &scope).map(|key| (key, Value::Int(dice.below(4) as i64))));
+            }
+            None => {}
+        }
+        measured
+    }
+
+    /// The facts that the node declares to read, sense or require, as the world it was given shows them.
+    fn seen(&self, state: &State, goal: &Goal, world: &World) -> Vec<(String, String)> {
+        let scope = InputScope { state, goal };
+        let annotations = &state.annotations;
+        let mut declared: Vec<FactExpr> = match (&annotations.nature, &annotations.reads) {
+            (Nature::Senses(facts), _) => facts.clone(),
+            (_, Some(reads)) => reads.clone(),
+            (_, None) => {
+                return world.iter().map(|(k, f)| (k.to_string(), f.value.to_string())).collect();
+            }
+        };
+        if !matches!(annotations.nature, Nature::Senses(_)) {
+            declared.extend(annotations.requires.iter().flat_map(Expr::fact_expressions).cloned());
+        }
+        let Footprint::Patterns(patterns) = FactExpr::footprint(&declared, &scope) else { return Vec::new() };
+        let seen = |pattern: &FactPattern| -> Vec<(String, String)> {
+            world.matching(pattern).map(|(k, f)| (k.to_string(), f.value.to_string())).collect()
+        };
+        patterns.iter().flat_map(seen).collect()
+    }
+}
+
+/// The largest visit number on a path.
+fn visits(path: &str) -> u64 {
+    let number = |part: &str| part.split('#').nth(1)?.split('[').next()?.parse().ok();
+    path.split('/').filter_map(number).max().unwrap_or(1)
+}
+
+fn key(fact: &FactExpr, scope: &InputScope<'_>) -> Option<FactKey> {
+    let pattern = fact.bind(scope).ok()?;
+    let arguments = pattern.arguments.into_iter().collect::<Option<Vec<Term>>>()?;
+    Some(FactKey { predicate: pattern.predicate, arguments })
+}
+
+/// The variables of a node, which random programs always pass as inputs.
+pub(super) struct InputScope<'a> {
+    pub(super) state: &'a State,
+    pub(super) goal: &'a Goal,
+}
+
+impl Scope for InputScope<'_> {
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
+        let StateKind::Action { inputs, .. } = &self.state.kind else { return None };
+        let port = inputs.iter().find(|(_, e)| *e == Expr::Variable(name.to_owned())).map(|(port, _)| port)?;
+        self.goal.inputs.get(port).map(Cow::Borrowed)
+    }
+
+    fn output(&self, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+
+    fn port(&self, _: StateId, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+
+    fn fact(&self, _: &FactPattern) -> Lookup<'_> {
+        Lookup::Unknown
+    }
+}

@@ -1,0 +1,154 @@
+//! From a program that fails to a small one that still does: states are taken out and annotations simplified, one at a time, as
+//! long as anything can go.
+
+use super::rewrite::without;
+use super::trial::{Conditions, Verdict, trial};
+use super::{around, is_preemptive};
+use ratn_model::expression::Expr;
+use ratn_model::program::{Program, StateKind};
+use ratn_model::value::Value;
+use std::sync::Arc;
+
+/// No more programs than this are tried.
+const MAX_TRIALS: usize = 6_000;
+
+/// What is left.
+#[derive(Debug)]
+pub struct Shrunk {
+    /// The program.
+    pub program: Program,
+    /// What it needs to fail.
+    pub conditions: Conditions,
+    /// How it fails.
+    pub problem: String,
+}
+
+/// The smallest program found that still fails, maybe in another way.
+pub fn shrink(program: Program, conditions: Conditions, problem: String) -> Shrunk {
+    let mut best = Shrunk { program, conditions, problem };
+    let mut trials = 0;
+    loop {
+        let mut smaller = false;
+        let mut step = 0;
+        while trials < MAX_TRIALS {
+            let Some((program, conditions)) = candidate(&best, step) else { break };
+            step += 1;
+            if program == best.program && conditions == best.conditions {
+                continue;
+            }
+            trials += 1;
+            let program = Arc::new(program);
+            if let Verdict::Differs(problem) = trial(&program, &conditions) {
+                best = Shrunk { program: Arc::unwrap_or_clone(program), conditions, problem };
+                smaller = true;
+                // What was tried before this step is not tried again before the next round.
+                step -= 1;
+            }
+        }
+        if !smaller || trials >= MAX_TRIALS {
+            return best;
+        }
+    }
+}
+
+/// One thing less; steps are numbered, `None` after the last.
+fn candidate(best: &Shrunk, step: usize) -> Option<(Program, Conditions)> {
+    let states = best.program.states.len();
+    let (mut program, mut conditions) = (best.program.clone(), best.conditions.clone());
+    if step < states {
+        // From the last to the first, so that the innermost go early; state 0 stays.
+        let id = program.states[states - 1 - step].id;
+        // The regions of a preemptive concurrency go with it or stay: without actions they would end at one moment.
+        let held = around(&program, program.state(id)).skip(1).any(is_preemptive);
+        if id != Program::ROOT && !held {
+            program = without(&program, id);
+        }
+        return Some((program, conditions));
+    }
+    let step = step - states;
+    const SITUATIONS: usize = 10;
+    if step < SITUATIONS {
+        match step {
+            0 => conditions.crashes_percent = 0,
+            1 => conditions.failures_percent = 0,
+            2 => conditions.deviations_percent = 0,
+            3 => conditions.latency_s = 0.0,
+            4 => conditions.mischief_percent = 0,
+            5 => conditions.pauses = false,
+            6 => conditions.orders = 0,
+            7 => program.speculation_width = Program::DEFAULT_SPECULATION_WIDTH,
+            8 => program.horizon = 60,
+            _ => program.outputs.clear(),
+        }
+        return Some((program, conditions));
+    }
+    let (at, what) = ((step - SITUATIONS) / CHANGES, (step - SITUATIONS) % CHANGES);
+    if at >= states {
+        return None;
+    }
+    simplify(&mut program, at, what);
+    Some((program, conditions))
+}
+
+/// As many ways as there are to simplify a state.
+const CHANGES: usize = 26;
+
+fn simplify(program: &mut Program, at: usize, what: usize) {
+    let state = &mut program.states[at];
+    let a = &mut state.annotations;
+    match what {
+        0 => a.requires.clear(),
+        1 => a.routine = false,
+        2 => a.retry = None,
+        3 => a.timeout_s = None,
+        4 => a.deterministic = false,
+        5 => a.exceptional.clear(),
+        6 => a.reads = Some(Vec::new()),
+        7 => a.effects.values_mut().for_each(Vec::clear),
+        8 => a.effects.values_mut().for_each(|effects| effects.truncate(1)),
+        9 => {
+            a.effects.insert("success".to_owned(), Vec::new());
+        }
+        10 => a.resources.retain(|r| r.operation == ratn_model::resource::ResourceOperation::Block),
+        11 => a.resources.iter_mut().for_each(|r| r.count = 1),
+        12 => state.assign.clear(),
+        13 => state.defaults.clear(),
+        14..18 => {
+            if let Some(outcome) = state.transitions.keys().nth(what - 14).cloned() {
+                state.transitions.remove(&outcome);
+            }
+        }
+        18 | 19 => {
+            let literal = Expr::Literal(Value::Bool(what == 18));
+            match &mut state.kind {
+                StateKind::Condition { predicate, .. } => *predicate = literal,
+                StateKind::ForEach { collection, .. } => {
+                    let items = if what == 18 { vec![Expr::Literal(Value::Int(0))] } else { Vec::new() };
+                    *collection = Expr::List(items);
+                }
+                StateKind::Concurrency { decide, .. } => decide.clear(),
+                StateKind::Sequence { outputs, .. } => outputs.clear(),
+                _ => {}
+            }
+        }
+        20..24 => {
+            if let StateKind::Action { inputs, .. } = &mut state.kind
+                && what - 20 < inputs.len()
+                // The oracle learns the variables from the inputs.
+                && !matches!(inputs[what - 20].1, Expr::Variable(_))
+            {
+                inputs.remove(what - 20);
+            }
+        }
+        24 => {
+            if let ratn_model::program::Nature::Senses(facts) = &mut a.nature {
+                facts.clear();
+            }
+        }
+        _ => {
+            if let Some(reads) = &mut a.reads {
+                reads.truncate(1);
+            }
+        }
+    }
+}

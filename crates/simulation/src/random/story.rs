@@ -1,0 +1,182 @@
+//! What became of a run, in the terms of the safety theorem: which PIAs started and ended when, which instances retired with what,
+//! which changes became real.
+
+use super::{around, is_in_routine, is_preemptive, plain, state_of};
+use crate::run::Run;
+use ratn_executive::protocol::{Command, Event, LogEntry, Note};
+use ratn_model::fact::Change;
+use ratn_model::id::InstanceId;
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, State, StateKind};
+use ratn_model::value::Value;
+use std::collections::BTreeMap;
+
+/// One goal of a PIA.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Act {
+    pub(super) path: String,
+    /// Its try (as the seed derived from it) and its inputs.
+    pub(super) goal: String,
+    /// The acts that had not ended when it started.
+    pub(super) running: Vec<usize>,
+}
+
+/// An action that is real.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Real {
+    pub(super) outcome: String,
+    /// Inputs and outputs of the last attempt; `None` where it was taken from another's.
+    pub(super) data: Option<(BTreeMap<String, Value>, BTreeMap<String, Value>)>,
+}
+
+/// A run.
+#[derive(Debug, Default)]
+pub(super) struct Story {
+    /// The PIAs' goals, in the order in which they started.
+    pub(super) acts: Vec<Act>,
+    /// The actions that retired, by path; what is inside of routines is not told.
+    pub(super) retired: BTreeMap<String, Vec<Real>>,
+    /// What became real, by predicate.
+    pub(super) changes: BTreeMap<String, Vec<Change>>,
+    /// PIAs that were discarded, or computed again, after they had started.
+    pub(super) undone: Vec<String>,
+}
+
+#[derive(Default)]
+struct Life {
+    path: String,
+    tells: bool,
+    irreversible: bool,
+    is_kept: bool,
+    outcome: String,
+    started: Option<usize>,
+    attempt: u32,
+    inputs: Option<BTreeMap<String, Value>>,
+    outputs: BTreeMap<String, Value>,
+    reused: bool,
+}
+
+/// What the log of a run tells.
+pub(super) fn story(program: &Program, run: &Run) -> Story {
+    let mut lives: BTreeMap<InstanceId, Life> = BTreeMap::new();
+    let mut running: Vec<usize> = Vec::new();
+    let mut story = Story::default();
+    for line in &run.log {
+        match &line.entry {
+            LogEntry::Command(Command::Note(note)) => match note {
+                Note::Expanded { instance, state, path, .. } => {
+                    let state = program.state(*state);
+                    let life = Life {
+                        path: path.clone(),
+                        tells: matches!(state.kind, StateKind::Action { .. }) && !is_in_routine(program, state),
+                        irreversible: is_pia(state),
+                        is_kept: is_pia(state) && !around(program, state).any(is_preemptive),
+                        ..Life::default()
+                    };
+                    lives.insert(*instance, life);
+                }
+                Note::Finished { instance, outcome } => {
+                    if let Some(life) = lives.get_mut(instance) {
+                        life.outcome.clone_from(outcome);
+                        running.retain(|act| Some(*act) != life.started);
+                    }
+                }
+                Note::Reused { instance } => {
+                    if let Some(life) = lives.get_mut(instance) {
+                        life.reused = true;
+                    }
+                }
+                Note::Retired { instance } => {
+                    if let Some(life) = lives.get(instance).filter(|life| life.tells) {
+                        // Why something failed to begin, or to end, is not compared.
+                        let told = !life.reused && !matches!(life.outcome.as_str(), ABORTED | PREEMPTED);
+                        let data = told.then(|| (life.inputs.clone().unwrap_or_default(), life.outputs.clone()));
+                        let result = Real { outcome: life.outcome.clone(), data };
+                        story.retired.entry(life.path.clone()).or_default().push(result);
+                    }
+                }
+                Note::Squashed { instance } | Note::Invalidated { instance, .. } => {
+                    if let Some(life) = lives.get_mut(instance) {
+                        life.outcome.clear();
+                        life.reused = false;
+                    }
+                    // Only another region that ended first discards a PIA under way.
+                    if let Some(life) = lives.get(instance).filter(|life| life.is_kept && life.started.is_some()) {
+                        story.undone.push(life.path.clone());
+                    }
+                }
+                _ => {}
+            },
+            LogEntry::Command(Command::Start { instance, goal, attempt }) => {
+                let Some(life) = lives.get_mut(instance) else { continue };
+                life.attempt = *attempt;
+                life.outcome.clear();
+                life.inputs = Some(goal.inputs.clone());
+                life.outputs.clear();
+                life.reused = false;
+                if life.irreversible {
+                    // A try of its own that ended before it.
+                    running.retain(|act| Some(*act) != life.started);
+                    let goal = format!("{:x} {:?}", goal.seed, goal.inputs);
+                    story.acts.push(Act { path: life.path.clone(), goal, running: running.clone() });
+                    life.started = Some(story.acts.len() - 1);
+                    running.extend(life.started);
+                }
+            }
+            LogEntry::Command(Command::Cancel { instance, .. }) => {
+                if let Some(life) = lives.get(instance) {
+                    running.retain(|act| Some(*act) != life.started);
+                }
+            }
+            LogEntry::Command(Command::Commit { changes, .. }) => {
+                for change in changes {
+                    let predicate = match change {
+                        Change::Set { fact, .. } | Change::Increase { fact, .. } => &fact.predicate,
+                        Change::Delete { pattern } => &pattern.predicate,
+                    };
+                    story.changes.entry(predicate.clone()).or_default().push(change.clone());
+                }
+            }
+            LogEntry::Event(Event::Finished { instance, attempt, outputs, .. }) => {
+                let is_answer = |life: &&mut Life| life.attempt == *attempt && life.outcome.is_empty();
+                if let Some(life) = lives.get_mut(instance).filter(is_answer) {
+                    life.outputs.clone_from(outputs);
+                    running.retain(|act| Some(*act) != life.started);
+                }
+            }
+            LogEntry::Event(Event::Crashed { instance, .. }) => {
+                if let Some(life) = lives.get(instance) {
+                    running.retain(|act| Some(*act) != life.started);
+                }
+            }
+            _ => {}
+        }
+    }
+    story
+}
+
+fn is_pia(state: &State) -> bool {
+    matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature == Nature::Irreversible
+}
+
+/// Whether two places of the program are in no order: in different regions of one visit of a concurrency.
+pub(super) fn are_beside(program: &Program, a: &str, b: &str) -> bool {
+    let (mut a, mut b) = (a.split('/'), b.split('/'));
+    let mut common = String::new();
+    loop {
+        match (a.next(), b.next()) {
+            (Some(x), Some(y)) if x == y => {
+                if !common.is_empty() {
+                    common.push('/');
+                }
+                common.push_str(x);
+            }
+            (Some(x), Some(y)) => {
+                // Two iterations, or two visits, of one state are in order.
+                let both = state_of(program, &common);
+                return plain(x) != plain(y)
+                    && both.is_some_and(|state| matches!(state.kind, StateKind::Concurrency { .. }));
+            }
+            _ => return false,
+        }
+    }
+}

@@ -1,0 +1,89 @@
+//! What happens to a run beside what its providers do: what a user asks for, messages that come late or twice, answers that
+//! cross their cancellation.
+//!
+//! Which messages go wrong follows from a seed and from what they are about (path and attempt), never from the time: the same
+//! run has the same faults.
+
+use crate::random::Hash;
+use ratn_executive::protocol::Event;
+
+/// More events than this is an endless run.
+pub const MAX_EVENTS: usize = 1_000_000;
+
+/// What happens to a run beside what its providers do.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Circumstances {
+    /// So many orders of what is still to be done are simulated whenever much of the window has changed; 0 is plain dispatch.
+    pub orders: usize,
+    /// More events than this is an endless run.
+    pub max_events: usize,
+    /// What comes from outside, and when.
+    pub events: Vec<(Trigger, Event)>,
+    /// How messages go wrong.
+    pub mischief: Mischief,
+}
+
+impl Default for Circumstances {
+    fn default() -> Circumstances {
+        Circumstances { orders: 0, max_events: MAX_EVENTS, events: Vec::new(), mischief: Mischief::default() }
+    }
+}
+
+/// When something comes from outside.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Trigger {
+    /// So many seconds after the start.
+    At(f64),
+    /// When a goal of this path starts.
+    Starts(String),
+    /// When a goal of this path has ended.
+    Ends(String),
+}
+
+/// How messages go wrong: of a hundred, so many.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Mischief {
+    /// What the choices are derived from.
+    pub seed: u64,
+    /// Come twice.
+    pub twice_percent: u64,
+    /// Come up to two seconds late.
+    pub late_percent: u64,
+    /// Answers come although their goal was cancelled.
+    pub crossing_percent: u64,
+}
+
+/// How one message goes.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Delivery {
+    /// So many seconds late.
+    pub(super) late_s: f64,
+    /// Once more, so many seconds after that.
+    pub(super) again_s: Option<f64>,
+}
+
+impl Mischief {
+    /// How the message of this kind about an attempt goes.
+    pub(super) fn delivery(&self, kind: &str, path: &str, attempt: u32) -> Delivery {
+        if self.twice_percent == 0 && self.late_percent == 0 {
+            return Delivery::default();
+        }
+        let mut dice = self.dice(kind, path, attempt);
+        let late_s = if dice.percent(self.late_percent) { dice.below(20) as f64 / 10.0 } else { 0.0 };
+        let again_s = dice.percent(self.twice_percent).then(|| dice.below(80) as f64 / 10.0);
+        Delivery { late_s, again_s }
+    }
+
+    /// Whether the answer of a cancelled attempt comes all the same.
+    pub(super) fn crosses(&self, path: &str, attempt: u32) -> bool {
+        self.crossing_percent > 0 && self.dice("cancel", path, attempt).percent(self.crossing_percent)
+    }
+
+    fn dice(&self, kind: &str, path: &str, attempt: u32) -> crate::random::Dice {
+        let mut hash = Hash(self.seed);
+        hash.add(kind);
+        hash.add(path);
+        hash.add_number(u64::from(attempt));
+        hash.dice()
+    }
+}
