@@ -210,3 +210,29 @@ fn a_variable_of_a_library_has_nothing_to_do_with_the_task_s_parameter_of_that_n
     let task = "task: t\nparameters: { what: 3 }\nstates:\n  - a: { library: part.yaml, with: { what: 'concat(cup, $what)' } }\n";
     assert!(load(task, PART).is_ok());
 }
+
+#[test]
+fn what_of_a_library_is_not_applied_is_said_where_it_is_used() {
+    let part = "
+task: part
+deadline: 5
+world: [ready(arm)]
+outputs: { n: { type: int, value: 1, default: 0 } }
+states: []
+";
+    let loaded = load("task: t\nstates:\n  - a: { library: part.yaml }\n", part).unwrap();
+    let warned: Vec<String> = loaded.warnings.iter().map(|w| format!("{} {} {}", w.file, w.path, w.message)).collect();
+    assert_eq!(
+        warned,
+        ["world", "deadline"]
+            .map(|key| format!("task.yaml a the `{key}` of `part.yaml` counts only where that is run by itself"))
+    );
+    assert!(loaded.program.initial.is_empty() && loaded.program.deadline_s.is_none());
+    assert_eq!(loaded.program.states[1].defaults["n"], Value::Int(0));
+}
+
+#[test]
+fn what_a_library_is_given_is_a_mapping() {
+    let refusal = load("task: t\nstates:\n  - a: { library: part.yaml, with: 3 }\n", PART).unwrap_err();
+    assert!(refusal.contains("error[invalid-state] in a: `with` is a mapping, found a number"), "{refusal}");
+}

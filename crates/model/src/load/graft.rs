@@ -32,6 +32,7 @@ pub(crate) fn graft(states: &mut Vec<State>, at: StateId, library: &Program, in_
     outputs.iter_mut().for_each(|output| output.value.rewrite(&mut moving));
     let children = library.states[0].children().map(|child| moving.moved(child)).collect();
     let root = &mut states[at.0 as usize];
+    root.defaults.clone_from(&library.states[0].defaults);
     root.variables.iter_mut().for_each(|(name, _)| moving.variable(name));
     root.kind = StateKind::Sequence { children, outputs };
 }

@@ -68,6 +68,12 @@ pub(crate) fn load_all(
                     findings.error("unknown-library", file.at, &step.path, message, "use it from a loop");
                     break;
                 }
+                let ignored = [("world", !library.initial.is_empty()), ("deadline", library.deadline_s.is_some())];
+                for (key, _) in ignored.into_iter().filter(|(_, declared)| *declared) {
+                    let message = format!("the `{key}` of `{path}` counts only where that is run by itself");
+                    let help = format!("say it in the `{key}` of this task, if it is not said there already");
+                    findings.warning("ignored-in-library", file.at, &step.path, message, help);
+                }
                 libraries.insert(StateId(index as u64), library);
             }
             Err((message, help)) => findings.error("unknown-library", file.at, &step.path, message, help),
@@ -121,7 +127,7 @@ pub(crate) fn depends_on_use(rule: &str) -> bool {
 /// The parameters of a library as scoped variables: what `with` says, else their defaults.
 pub(crate) fn parameters(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> Vec<(String, Expr)> {
     let Some(library) = fields.task.libraries.get(&id) else { return Vec::new() };
-    let given = body.get("with").map(Node::entries).unwrap_or_default();
+    let given = fields.mapping(body, "with", "{ boxes: 2 }");
     for entry in given {
         if !library.parameters.iter().any(|parameter| parameter.name == entry.key) {
             let known = library.parameters.iter().map(|parameter| parameter.name.as_str());
