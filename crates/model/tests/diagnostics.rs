@@ -153,6 +153,29 @@ states:
 }
 
 #[test]
+fn what_a_later_state_establishes_holds_where_control_flow_leads_back() {
+    let source = "
+task: t
+world: []
+variables: { n: 0 }
+states:
+  - ready:
+      condition: $n > 0
+      then:
+        - open: { action: gripper/release, requires: [held(cup)], effects: [], resources: [{ block: Gripper }] }
+  - grasp:
+      action: gripper/grasp
+      in: { object: cup }
+      effects: [held(cup)]
+      resources: [{ block: Gripper }, { block: Arm }]
+      assign: { n: $n + 1 }
+";
+    let forwards = check(source);
+    assert_snapshot!(forwards, @"task.yaml:9:60: error[unestablished-precondition] in ready/open: `held(cup)` is required, and nothing before establishes `held(cup)`. help: add it to the `world` of the task, or to the effects of an older state");
+    assert_eq!(check(&format!("{source}      transitions: {{ success: ready, aborted: success }}\n")), "fine");
+}
+
+#[test]
 fn what_is_no_yaml_is_said_with_its_place() {
     assert_snapshot!(check("task: t\nstates: [\n"), @"task.yaml:2:9: error[invalid-yaml]: unclosed bracket '['");
     assert_snapshot!(check("task: t\ntask: u\n"), @"task.yaml:2:1: error[invalid-yaml]: duplicate mapping key: task");

@@ -33,19 +33,26 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
         let is_region =
             matches!(source.parent.map(|parent| &program.state(parent).kind), Some(StateKind::Concurrency { .. }));
         let (surely, maybe) = written(control, program, to, &part, from);
-        let hidden = hides(subject, to, &part, source);
-        if hidden.is_none() && (surely || source.defaults.contains_key(port) || (is_region && at_join(to, &part))) {
+        let relation = relation(subject, to, &part, source);
+        let hidden = matches!(relation, Relation::Hidden(_));
+        let beside = matches!(relation, Relation::Beside);
+        if !hidden && !beside && (surely || source.defaults.contains_key(port) || (is_region && at_join(to, &part))) {
             continue;
         }
-        if hidden.is_none() && maybe {
+        if !hidden && !beside && maybe {
             let message =
                 format!("{flow} may not have been written when this state needs it: not on every way that leads here");
             let help = "give the port a default, or use it only where it was written";
             findings.error("branch-may-not-have-written", at, &to.path, message, help);
             continue;
         }
-        match relation(subject, to, &part, source) {
+        match relation {
             Relation::Before => {}
+            Relation::Beside => {
+                let message = format!("{flow} is written in another region, which may come before or after this one");
+                let help = "put both into one region, or use it behind the concurrency, which puts it out";
+                findings.error("unservable-flow", at, &to.path, message, help);
+            }
             Relation::Itself => {
                 let message = format!("{flow} is an output of this state itself, which needs it to start");
                 findings.error("unservable-flow", at, &to.path, message, "take it from a state before this one");
@@ -94,6 +101,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
 /// How the source of a flow lies to its target in the program.
 enum Relation<'a> {
     Before,
+    Beside,
     Itself,
     Around,
     Inside,
@@ -124,6 +132,9 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, part: &str, from: &'a State) 
             return Relation::Inside;
         }
     } else {
+        if matches!(shared.kind, StateKind::Concurrency { .. }) {
+            return Relation::Beside;
+        }
         let own = up.iter().find(|state| state.parent == Some(shared.id)).map_or(to.id, |state| state.id);
         let [first, second] = branches(shared);
         let position = |id: StateId| {
@@ -180,14 +191,6 @@ fn written(control: &ControlFlow, program: &Program, to: &State, part: &str, fro
 fn at_join(to: &State, part: &str) -> bool {
     matches!(to.kind, StateKind::Concurrency { .. })
         && (part.starts_with("decide.") || part.starts_with("outputs.") || part.starts_with("effects."))
-}
-
-/// The hierarchy inside of which a source is not seen from the target.
-fn hides<'a>(subject: &Subject<'a>, to: &State, part: &str, from: &'a State) -> Option<&'a State> {
-    match relation(subject, to, part, from) {
-        Relation::Hidden(container) => Some(container),
-        _ => None,
-    }
 }
 
 fn ports(expr: &Expr) -> Vec<(StateId, &str)> {

@@ -8,7 +8,7 @@ use crate::expression::scope::NothingKnown;
 use crate::expression::{BinaryOperator, EffectExpr, Expr, FactExpr, UnaryOperator};
 use crate::fact::{FactPattern, Footprint};
 use crate::id::StateId;
-use crate::program::{Program, State, StateKind};
+use crate::program::{Program, State, StateKind, Target};
 use crate::value::Value;
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
@@ -42,9 +42,12 @@ impl Established {
 /// In program order; what any branch or visit may have written counts.
 fn walk(subject: &Subject<'_>, id: StateId, established: &mut Established, findings: &mut Findings) {
     let state = subject.program.state(id);
-    if let StateKind::ForEach { body, .. } = &state.kind {
-        // A later visit of the loop sees what its body wrote before.
-        body.iter().for_each(|child| establish_all(subject, *child, established));
+    let repeats = matches!(state.kind, StateKind::ForEach { .. } | StateKind::While { .. });
+    for list in state.lists() {
+        if repeats || leads_back(subject.program, list) {
+            // A later visit sees what was written before.
+            list.iter().for_each(|child| establish_all(subject, *child, established));
+        }
     }
     for (i, required) in state.annotations.requires.iter().enumerate() {
         if let Some(missing) = missing(required, established) {
@@ -62,6 +65,15 @@ fn walk(subject: &Subject<'_>, id: StateId, established: &mut Established, findi
     }
     branches(state).into_iter().flatten().for_each(|child| walk(subject, *child, established, findings));
     establish(state, established);
+}
+
+/// Whether a transition leads from a state of a list to itself or to one before it.
+fn leads_back(program: &Program, list: &[StateId]) -> bool {
+    let position = |id: &StateId| list.iter().position(|other| other == id);
+    list.iter().any(|from| {
+        let mut targets = program.state(*from).transitions.values();
+        targets.any(|target| matches!(target, Target::State(to) if position(to) <= position(from)))
+    })
 }
 
 fn establish_all(subject: &Subject<'_>, id: StateId, established: &mut Established) {

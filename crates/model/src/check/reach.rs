@@ -1,8 +1,8 @@
 //! What the control flow never comes to, what it never gets out of, loops that do not fit into the window, and regions that get in
 //! each other's way.
 
-use super::Subject;
 use super::graph::Point;
+use super::{Subject, expressions};
 use crate::diagnostic::Findings;
 use crate::expression::scope::NothingKnown;
 use crate::expression::{EffectExpr, FactExpr};
@@ -80,6 +80,7 @@ struct Touched {
     writes: Footprint,
     shared: Vec<FactExpr>,
     assigns: BTreeSet<String>,
+    uses: BTreeSet<String>,
     operated: BTreeSet<String>,
     unannotated: Option<String>,
 }
@@ -90,6 +91,7 @@ fn touched(program: &Program, region: &State) -> Touched {
         writes: Footprint::NOTHING,
         shared: Vec::new(),
         assigns: BTreeSet::new(),
+        uses: BTreeSet::new(),
         operated: BTreeSet::new(),
         unannotated: None,
     };
@@ -101,6 +103,8 @@ fn touched(program: &Program, region: &State) -> Touched {
         let annotations = &state.annotations;
         touched.shared.extend(annotations.shared.iter().cloned());
         touched.assigns.extend(state.assign.iter().map(|(name, _)| name.clone()));
+        let expressions = expressions(program, state);
+        touched.uses.extend(expressions.iter().flat_map(|(_, e)| e.variables()).map(str::to_owned));
         let operations = annotations.resources.iter().filter(|r| {
             !matches!(
                 r.operation,
@@ -157,8 +161,12 @@ fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings)
             let fact = both(&first.writes, &second.writes)
                 .or_else(|| both(&first.writes, &second.reads))
                 .or_else(|| both(&second.writes, &first.reads));
-            let variable =
-                first.assigns.intersection(&second.assigns).next().map(|name| format!("the variable `${name}`"));
+            let touches = |a: &Touched, b: &Touched| {
+                let mut assigned = a.assigns.iter();
+                assigned.find(|name| b.assigns.contains(*name) || b.uses.contains(*name)).cloned()
+            };
+            let variable = touches(first, second).or_else(|| touches(second, first));
+            let variable = variable.map(|name| format!("the variable `${name}`"));
             let resource =
                 first.operated.intersection(&second.operated).next().map(|kind| format!("the task resource {kind}"));
             if let Some(what) = fact.or(variable).or(resource) {
