@@ -171,7 +171,7 @@ states:
       assign: { n: $n + 1 }
 ";
     let forwards = check(source);
-    assert_snapshot!(forwards, @"task.yaml:9:60: error[unestablished-precondition] in ready/open: `held(cup)` is required, and nothing before establishes `held(cup)`. help: add it to the `world` of the task, or to the effects of an older state");
+    assert_snapshot!(forwards, @"task.yaml:9:55: error[unestablished-precondition] in ready/open: `held(cup)` is required, and nothing before establishes `held(cup)`. help: add it to the `world` of the task, or to the effects of an older state");
     assert_eq!(check(&format!("{source}      transitions: {{ success: ready, aborted: success }}\n")), "fine");
 }
 
