@@ -717,3 +717,20 @@ fn a_routine_whose_worker_died_asks_anew_when_none_of_its_regions_uses_its_lease
     bench.finish(4, 2);
     assert_eq!(bench.heard(), ["start 3.2 under 2", "start 4.2 under 2", "release 2", "end success"]);
 }
+
+#[test]
+fn in_a_race_a_region_whose_worker_died_does_not_wait_for_the_others() {
+    let text = "states:
+  - race:
+      concurrency: preemptive
+      regions:
+        - left: { THINK, computes: true, reads: [] }
+        - right: { THINK, computes: true, reads: [] }";
+    let mut bench = Bench::new(text, Mode::Cdtn);
+    bench.grant(1, 1);
+    assert_eq!(bench.heard(), ["acquire 1", "start 4.1 under 1", "start 5.1 under 1"]);
+    bench.crash(4, 1);
+    assert_eq!(bench.heard(), ["start 4.2 under 1"]);
+    bench.finish(4, 2);
+    assert_eq!(bench.heard(), ["release 1", "end success"]);
+}

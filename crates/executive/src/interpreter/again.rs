@@ -8,7 +8,8 @@ use crate::binding::Outputs;
 use crate::context::Context;
 use crate::protocol::Command;
 use ratn_model::fact::FactKey;
-use ratn_model::program::ABORTED;
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, Program, StateKind};
 use ratn_model::value::Value;
 use std::time::Duration;
 
@@ -83,6 +84,7 @@ impl Interpreter {
             return self.give_back(context, &given);
         }
         current.crashes += 1;
+        current.phase = Phase::Stalled;
         let crashes = current.crashes;
         self.give_back(context, &given);
         let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
@@ -90,7 +92,9 @@ impl Interpreter {
             return self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
         }
         match self.routine {
-            Some(_) => self.set_phase(thread, Phase::Stalled),
+            // In a race who waits loses: the others keep the lease, and what is left of it has to do.
+            Some(_) if self.uses_lease() && is_in_race(context.program, id) => self.project_or_run(context, thread),
+            Some(_) => {}
             None => self.try_now(context, thread),
         }
     }
@@ -125,6 +129,12 @@ impl Interpreter {
         }
     }
 
+    /// Whether anything of a routine moves under its lease, or asks for it.
+    fn uses_lease(&self) -> bool {
+        let uses = |phase| matches!(phase, Some(Phase::Acquiring | Phase::Projecting | Phase::Running));
+        self.threads.keys().any(|thread| uses(self.phase(*thread)))
+    }
+
     fn stalled(&self) -> Vec<u64> {
         self.threads.keys().copied().filter(|thread| self.phase(*thread) == Some(Phase::Stalled)).collect()
     }
@@ -136,6 +146,12 @@ impl Current {
         let (lease, projection) = (self.lease.take(), self.projection.take());
         Current { lease, projection, path: String::new(), ..*self }
     }
+}
+
+/// Whether a state is inside of a preemptive concurrency.
+fn is_in_race(program: &Program, state: StateId) -> bool {
+    std::iter::successors(program.state(state).parent, |id| program.state(*id).parent)
+        .any(|around| matches!(program.state(around).kind, StateKind::Concurrency { preemptive: true, .. }))
 }
 
 /// A span of the robot's time; what is no number is none.
