@@ -80,6 +80,15 @@ impl Window {
             self.wait(id, Wait::World(beside));
             return false;
         }
+        let mut beside = None;
+        if !self.detached.is_empty() {
+            beside = self.producers_of(instance).find(|producer| self.detached.contains(producer));
+        }
+        if let Some(beside) = beside {
+            // What it is made of is not there yet.
+            self.wait(id, Wait::Data(beside));
+            return false;
+        }
         let role = instance.role;
         let users = self.take_users(id);
         let (outcome, reason) = self.make_real(context, id);
