@@ -69,7 +69,6 @@ impl Window {
             return;
         }
         if is_pia {
-            self.hold.has_begun();
             self.clear_view(context, id);
         }
         let Some(instance) = self.instances.get(id) else { return };
@@ -169,6 +168,9 @@ impl Window {
     /// What it reads is as it was when it asked.
     fn launch(&mut self, context: &mut Context<'_>, id: InstanceId, known: Option<Outputs>) {
         let Some(instance) = self.instances.get(id) else { return };
+        if instance.is_pia() && instance.projection.is_none() {
+            self.hold.has_begun();
+        }
         let state = context.program.state(instance.state);
         let analysis = context.analysis.state(instance.state);
         let is_routine = !matches!(state.kind, StateKind::Action { .. });

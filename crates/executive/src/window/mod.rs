@@ -175,8 +175,11 @@ impl Window {
                 if let Some(waiting) = self.with_status(instance, Status::Acquiring) {
                     waiting.lease = Some(Box::new(lease));
                     waiting.began = context.now;
-                    self.set_status(instance, Status::Granted, Wait::Nothing);
-                    self.proceed(context, instance);
+                    let held = waiting.is_pia() && !self.hold.lets_begin();
+                    self.set_status(instance, Status::Granted, if held { Wait::Pause } else { Wait::Nothing });
+                    if !held {
+                        self.proceed(context, instance);
+                    }
                 } else {
                     self.in_routine(context, Event::Granted { instance, lease });
                 }
@@ -381,6 +384,11 @@ impl Window {
         let Some(instance) = self.instances.get(id) else { return };
         match (instance.role, instance.status) {
             (Role::Node, Status::Expanded) => self.begin(context, id),
+            // It got its resources during a pause, and keeps them.
+            (Role::Node, Status::Granted) if instance.wait == Wait::Pause && self.hold.lets_begin() => {
+                self.set_status(id, Status::Granted, Wait::Nothing);
+                self.proceed(context, id);
+            }
             (Role::Node, Status::Finished) if instance.is_undecided() => self.decide_by_outcome(context, id),
             (Role::Condition | Role::Test, Status::Expanded) => self.decide(context, id),
             (Role::Loop, Status::Expanded) => self.count(context, id),
