@@ -52,4 +52,19 @@ mod tests {
         std::fs::write(&file, vec![b'#'; MAX_SOURCE + 1]).unwrap();
         assert!(read(&file).unwrap_err().to_string().starts_with("longer than"));
     }
+
+    #[test]
+    fn a_library_is_found_from_the_file_that_uses_it_and_has_one_name() {
+        use ratn_model::load::Files;
+        let directory = tempfile::tempdir().unwrap();
+        std::fs::create_dir(directory.path().join("parts")).unwrap();
+        std::fs::write(directory.path().join("parts/a.yaml"), "task: a\n").unwrap();
+        let using = directory.path().join("main.yaml").display().to_string();
+        let (name, text) = Libraries.read(&using, "parts/a.yaml").unwrap();
+        assert_eq!(text, "task: a\n");
+        assert_eq!(Libraries.read(&using, "./parts/../parts/a.yaml").unwrap().0, name);
+        // And on from there.
+        assert_eq!(Libraries.read(&name, "a.yaml").unwrap().0, name);
+        assert!(Libraries.read(&using, "parts").unwrap_err().contains("not a regular file"));
+    }
 }

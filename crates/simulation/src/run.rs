@@ -465,11 +465,14 @@ impl Simulation<'_> {
 
     /// A withdrawal that crossed its grant.
     fn take_back_grant(&mut self, instance: InstanceId) -> Result<(), RunError> {
+        let held = |lease: &LeaseId| self.leases.get(lease) == Some(&instance);
         let crossed = self.agenda.values().find_map(|entry| match entry {
-            Entry::Event(Event::Granted { instance: to, lease }) if *to == instance => Some(lease.id),
+            Entry::Event(Event::Granted { instance: to, lease }) if *to == instance => {
+                Some(lease.id).filter(|lease| held(lease))
+            }
             _ => None,
         });
-        let Some(lease) = crossed.filter(|lease| self.leases.contains_key(lease)) else { return Ok(()) };
+        let Some(lease) = crossed else { return Ok(()) };
         // Its message, or messages, will be of a lease that nobody holds.
         self.leases.remove(&lease);
         self.pool.release(self.now, Some(&self.session), lease).map_err(|e| self.broken(e))

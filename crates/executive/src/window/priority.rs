@@ -124,6 +124,10 @@ impl Window {
         }
         let state = context.program.state(instance.state);
         let wanted = &context.analysis.state(instance.state).requirements;
+        if wanted.iter().any(|r| r.operation == ResourceOperation::Consume) {
+            // A grant that crosses the withdrawal has used it up already: asking twice would use it up twice.
+            return;
+        }
         let view = self.sight(context).view(instance, None);
         let Ok(requirements) = binding::requirements(state, wanted, &view) else { return };
         drop(view);

@@ -6,10 +6,10 @@
 //!
 //! | | |
 //! |---|---|
-//! | programs | [`generator`], [`annotations`], [`features`], [`listing`] |
-//! | their world | [`oracle`], [`dice`] |
-//! | both modes beside each other | [`trial`], [`story`], [`weak`] |
-//! | smaller programs that fail alike | [`shrink`], [`rewrite`] |
+//! | programs | `generator`, `annotations`, `features`, `listing` |
+//! | their world | `oracle`, `dice` |
+//! | both modes beside each other | `trial`, `story`, `weak` |
+//! | smaller programs that fail alike | `shrink`, `rewrite` |
 
 mod annotations;
 mod dice;
