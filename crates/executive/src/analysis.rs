@@ -33,7 +33,8 @@ pub(crate) struct StateAnalysis {
     pub(crate) flows: Vec<StateId>,
     /// What it senses, with that of what it contains.
     pub(crate) senses: Vec<FactExpr>,
-    /// What it reads, with that of the hierarchies around it and of what it contains; `None` is everything.
+    /// What it reads, with what its expressions look up, and with that of the hierarchies around it and of what it contains;
+    /// `None` is everything.
     pub(crate) reads: Option<Vec<FactExpr>>,
     /// What it may write, with that of what it contains, whatever the outcome; `None` is everything.
     pub(crate) writes: Option<Vec<EffectExpr>>,
@@ -191,7 +192,7 @@ fn reads(contained: &[&State], around: &[&State], requirements: &[ResourceExpr])
             _ => {}
         }
         let expressions: Vec<&Expr> = match &state.kind {
-            StateKind::Action { .. } => Vec::new(),
+            StateKind::Action { inputs, .. } => inputs.iter().map(|(_, e)| e).collect(),
             StateKind::Condition { predicate, .. } | StateKind::While { predicate, .. } => vec![predicate],
             StateKind::ForEach { collection, .. } => vec![collection],
             StateKind::Sequence { outputs, .. } => outputs.iter().map(|o| &o.value).collect(),
@@ -202,6 +203,13 @@ fn reads(contained: &[&State], around: &[&State], requirements: &[ResourceExpr])
         let boundary = state.variables.iter().chain(&state.assign).map(|(_, e)| e);
         all.extend(expressions.into_iter().chain(boundary).flat_map(Expr::fact_expressions).cloned());
         all.extend(state.annotations.requires.iter().flat_map(Expr::fact_expressions).cloned());
+        if contained.len() > 1 {
+            // It is one node: what happens at the ends of its parts happens within it.
+            let effects = state.annotations.effects.values();
+            all.extend(effects.flat_map(|effects| EffectExpr::fact_expressions(effects)).cloned());
+            let attributes = state.annotations.resources.iter().flat_map(|r| &r.attributes);
+            all.extend(attributes.flat_map(|(_, value)| value.fact_expressions()).cloned());
+        }
     }
     for state in around {
         all.extend(state.annotations.reads.iter().flatten().cloned());

@@ -2,11 +2,13 @@
 //! order, and with the inputs, of HSM mode.
 //!
 //! `RATN_PROGRAMS` is how many programs (2,000), `RATN_FIRST` the seed to begin with (0), `RATN_FEATURES` is `basic`, `all` (what
-//! it is unless given) or `weak`. A seed that fails is printed with the smallest program found that still does.
+//! it is unless given) or `weak`. A seed that fails is printed with the smallest program found that still does, and with the events
+//! of that one's CDTN run where `RATN_LOG` is set.
 
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "a test may panic and print its seed")]
 
-use ratn_simulation::random::{Conditions, Features, Verdict, listing, program, shrink, trial};
+use ratn_executive::protocol::Mode;
+use ratn_simulation::random::{Conditions, Features, Shrunk, Verdict, execute, listing, program, shrink, trial};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -24,6 +26,15 @@ struct Sum {
 
 fn number(name: &str, otherwise: u64) -> u64 {
     std::env::var(name).ok().map_or(otherwise, |n| n.parse().unwrap_or_else(|_| panic!("{name}: no number: {n}")))
+}
+
+/// The events of the CDTN run, for `RATN_LOG=1`.
+fn print_log(left: Shrunk) {
+    const MAX_EVENTS: usize = 100_000;
+    match execute(&Arc::new(left.program), &left.conditions, Mode::Cdtn, MAX_EVENTS) {
+        Ok(run) => run.log.iter().for_each(|line| eprintln!("{line:?}")),
+        Err(problem) => eprintln!("{problem}"),
+    }
 }
 
 /// Programs of the seeds from `first` on, on all processors. A few failures end it.
@@ -65,6 +76,9 @@ fn try_programs(first: u64, count: u64, features: &Features) -> Sum {
                         left.conditions,
                         listing(&left.program)
                     );
+                    if std::env::var_os("RATN_LOG").is_some() {
+                        print_log(left);
+                    }
                 }
             }
         }

@@ -117,7 +117,8 @@ fn touched(program: &Program, region: &State) -> Touched {
             Nature::Senses(facts) => facts,
             _ => &[],
         };
-        let facts: Vec<FactExpr> = annotations.reads.iter().flatten().chain(senses).cloned().collect();
+        let looked_up = expressions.iter().flat_map(|(_, e)| e.fact_expressions());
+        let facts: Vec<FactExpr> = annotations.reads.iter().flatten().chain(senses).chain(looked_up).cloned().collect();
         let open_reads = is_action && annotations.reads.is_none() && annotations.nature != Nature::Computes;
         let open_writes = is_action
             && annotations.nature != Nature::Computes

@@ -6,7 +6,7 @@ use super::outline::{Form, Step, Tests};
 use super::yaml::{Content, Node};
 use super::{effects, flow, library, resources};
 use crate::expression::parse::parse_expression;
-use crate::expression::{EffectExpr, Expr, FactExpr, UnaryOperator};
+use crate::expression::{Expr, FactExpr, UnaryOperator};
 use crate::fact::SCENE_PREDICATES;
 use crate::id::StateId;
 use crate::program::{ABORTED, Annotations, Nature, PREEMPTED, SUCCESS, State, StateKind, TaskOutput};
@@ -69,16 +69,7 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
     };
     let assign = flow::assign(&mut fields, id, step.body);
     let defaults = defaults(&mut fields, step.body);
-    let mut annotations = if id.0 > 0 { annotations(&mut fields, step, &kind) } else { boundary(Vec::new()) };
-    let boundary = variables.iter().chain(&assign);
-    let facts = boundary.flat_map(|(_, value)| value.fact_expressions());
-    if let Some(reads) = &mut annotations.reads {
-        for fact in facts {
-            if !reads.contains(fact) {
-                reads.push(fact.clone());
-            }
-        }
-    }
+    let annotations = if id.0 > 0 { annotations(&mut fields, step, &kind) } else { boundary(Vec::new()) };
     State {
         id,
         name: step.name.clone(),
@@ -314,9 +305,6 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         }
     }
     annotations.attempts = body.get("attempts").and_then(|node| fields.count(node, "attempts", 1));
-    if let Some(reads) = &mut annotations.reads {
-        add_used_facts(reads, kind, &annotations.effects);
-    }
     annotations
 }
 
@@ -348,26 +336,5 @@ fn reads(fields: &mut Fields<'_, '_>, item: &Node) -> Vec<FactExpr> {
             .map(|(predicate, arity)| FactExpr { predicate: (*predicate).to_owned(), arguments: vec![None; *arity] })
             .collect(),
         _ => fields.fact(item).into_iter().collect(),
-    }
-}
-
-/// Declared reads include the facts that the state's own expressions look up.
-fn add_used_facts(
-    reads: &mut Vec<FactExpr>,
-    kind: &StateKind,
-    effects: &std::collections::BTreeMap<String, Vec<EffectExpr>>,
-) {
-    let mut used: Vec<&FactExpr> = match kind {
-        StateKind::Action { inputs, .. } => inputs.iter().flat_map(|(_, value)| value.fact_expressions()).collect(),
-        StateKind::Sequence { .. } => Vec::new(),
-        StateKind::ForEach { collection, .. } => collection.fact_expressions(),
-        StateKind::Condition { predicate, .. } | StateKind::While { predicate, .. } => predicate.fact_expressions(),
-        StateKind::Concurrency { decide, .. } => decide.iter().flat_map(|(_, e)| e.fact_expressions()).collect(),
-    };
-    used.extend(effects.values().flat_map(|effects| EffectExpr::fact_expressions(effects)));
-    for fact in used {
-        if !reads.contains(fact) {
-            reads.push(fact.clone());
-        }
     }
 }

@@ -374,9 +374,6 @@ impl Maker {
                 annotations.effects.insert(outcome.to_owned(), vec![effect]);
             }
         }
-        // As the loader has it: what its effects look up it reads.
-        let used = annotations.effects.values().flat_map(|effects| EffectExpr::fact_expressions(effects));
-        annotations.reads = Some(used.cloned().collect());
         if !room.is_preemptive && self.dice.percent(15) {
             let required = self.required(room, visible);
             annotations.requires.push(required);

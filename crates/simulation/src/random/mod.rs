@@ -30,7 +30,7 @@ pub use generator::program;
 pub use listing::listing;
 pub use oracle::HashOracle;
 pub use shrink::{Shrunk, shrink};
-pub use trial::{Conditions, Verdict, trial};
+pub use trial::{Conditions, Verdict, execute, trial};
 
 use ratn_model::program::{Program, State, StateKind, WORLD_MODEL};
 use ratn_model::resource::ResourceClass;

@@ -97,7 +97,13 @@ pub fn trial(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
     }
 }
 
-fn execute(program: &Arc<Program>, conditions: &Conditions, mode: Mode, max_events: usize) -> Result<Run, RunError> {
+/// One mode's run, to look at.
+pub fn execute(
+    program: &Arc<Program>,
+    conditions: &Conditions,
+    mode: Mode,
+    max_events: usize,
+) -> Result<Run, RunError> {
     let seed = conditions.seed;
     let setup = Setup {
         program: program.clone(),
