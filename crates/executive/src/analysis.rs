@@ -1,9 +1,10 @@
 //! What follows from the program alone, per state, before anything runs: what kind of node it is, what it asks of the
 //! resource manager, and which states its inputs flow from. Hierarchies and routines are resolved here.
 
+use crate::effects;
 use ratn_model::expression::{EffectExpr, Expr, FactExpr};
 use ratn_model::id::StateId;
-use ratn_model::program::{Nature, Program, ResourceExpr, SUCCESS, State, StateKind, WORLD_MODEL};
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, ResourceExpr, State, StateKind, WORLD_MODEL};
 use ratn_model::resource::ResourceOperation;
 use std::collections::BTreeSet;
 
@@ -36,7 +37,7 @@ pub(crate) struct StateAnalysis {
     /// What it reads, with what its expressions look up, and with that of the hierarchies around it and of what it contains;
     /// `None` is everything.
     pub(crate) reads: Option<Vec<FactExpr>>,
-    /// What it may write, with that of what it contains, whatever the outcome; `None` is everything.
+    /// What it may write, with that of what it contains, unless it fails; `None` is everything.
     pub(crate) writes: Option<Vec<EffectExpr>>,
     /// Whether it works on a projection of the world model.
     pub(crate) needs_world: bool,
@@ -98,7 +99,11 @@ fn analyse(program: &Program, state: &State) -> StateAnalysis {
         needs_world: requirements.iter().any(|r| r.kind == WORLD_MODEL),
         operated: contained.iter().flat_map(|s| operated(s)).cloned().collect(),
         operations: operations(state),
-        writes: contained.iter().map(|s| own_writes(s)).collect::<Option<Vec<_>>>().map(|all| all.concat()),
+        writes: contained
+            .iter()
+            .map(|s| own_writes(program, state, s))
+            .collect::<Option<Vec<_>>>()
+            .map(|all| all.concat()),
         reads: reads(&contained, &around, &requirements),
         senses: contained
             .iter()
@@ -133,13 +138,31 @@ fn own_nature(state: &State) -> NodeNature {
     }
 }
 
-/// The effects of every outcome. A node that does not say what success changes may change everything, unless it computes.
-fn own_writes(state: &State) -> Option<Vec<EffectExpr>> {
-    let effects = &state.annotations.effects;
-    if own_nature(state) != NodeNature::Computes && !effects.contains_key(SUCCESS) {
-        return None;
+/// The effects of every outcome with which a node may end inside of `whole` and `whole` go on or end well: `None` where one of
+/// them may change everything.
+fn own_writes(program: &Program, whole: &State, state: &State) -> Option<Vec<EffectExpr>> {
+    if !is_action(state) {
+        return Some(state.annotations.effects.values().flatten().cloned().collect());
     }
-    Some(effects.values().flatten().cloned().collect())
+    let mut all = Vec::new();
+    for outcome in program.outcomes(state.id) {
+        match effects::declared(state, own_nature(state), outcome) {
+            Some(declared) => all.extend(declared.iter().cloned()),
+            None if matches!(outcome, ABORTED | PREEMPTED) && ends(program, whole, state, outcome) => {}
+            None => return None,
+        }
+    }
+    Some(all)
+}
+
+/// Whether `whole` ends by this outcome when a state inside of it does: nothing on the way is connected to something else.
+fn ends(program: &Program, whole: &State, state: &State, outcome: &str) -> bool {
+    let around = std::iter::successors(Some(state), |inner| {
+        inner.parent.filter(|_| inner.id != whole.id).map(|parent| program.state(parent))
+    });
+    around
+        .into_iter()
+        .all(|state| !matches!(state.kind, StateKind::Concurrency { .. }) && !state.transitions.contains_key(outcome))
 }
 
 /// Blocks merge by maximum; what an action consumes and what exists add up as they are, but only from within.

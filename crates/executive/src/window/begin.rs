@@ -64,7 +64,15 @@ impl Window {
         self.depend(id, used);
         let Some(instance) = self.instances.get_mut(id) else { return };
         let is_pia = instance.is_pia();
-        instance.seen = (!is_pia).then(|| Box::new(seen));
+        if is_pia {
+            instance.seen = None;
+        } else {
+            if !instance.seen.as_deref().is_some_and(|before| before.is_like(&seen)) {
+                // What failed before was made of something else: its tries begin again.
+                instance.tries = 1;
+            }
+            instance.seen = Some(Box::new(seen));
+        }
         if self.reuse(context, id) {
             return;
         }
@@ -135,7 +143,6 @@ impl Window {
         if let Some(instance) = self.instances.get_mut(id) {
             instance.status = Status::Expanded;
             instance.attempt += 1;
-            instance.seen = None;
         }
         self.wait(id, wait);
     }
@@ -156,9 +163,14 @@ impl Window {
             Some(Err(wait)) => return self.step_back(context, id, wait),
             Some(Ok((seen, used))) => {
                 self.depend(id, &used);
-                if let Some(old) = self.instances.get_mut(id).and_then(|instance| instance.seen.as_mut()) {
-                    old.facts = seen.facts;
-                    old.read = seen.read;
+                if let Some(instance) = self.instances.get_mut(id)
+                    && let Some(before) = &mut instance.seen
+                {
+                    if before.facts != seen.facts {
+                        instance.tries = 1;
+                    }
+                    before.facts = seen.facts;
+                    before.read = seen.read;
                 }
             }
         }

@@ -145,6 +145,13 @@ pub(crate) struct Seen {
     pub(crate) inputs: u128,
 }
 
+impl Seen {
+    /// Whether the same is computed of it.
+    pub(crate) fn is_like(&self, other: &Seen) -> bool {
+        self.inputs == other.inputs && self.facts == other.facts
+    }
+}
+
 /// One continuation.
 #[derive(Debug, Clone)]
 pub(crate) struct Arm {

@@ -482,7 +482,6 @@ impl Window {
             instance.attempt += 1;
             instance.status = Status::Expanded;
             instance.wait = Wait::Backoff;
-            instance.seen = None;
             instance.not_before = context.now + std::time::Duration::try_from_secs_f64(pause_s).unwrap_or_default();
             let due = instance.not_before <= context.now;
             self.is_idle(id);
@@ -559,7 +558,6 @@ impl Window {
         if let Some(instance) = self.instances.get_mut(id) {
             instance.attempt += 1;
             instance.status = Status::Expanded;
-            instance.seen = None;
         }
         self.enqueue(id);
     }

@@ -143,7 +143,8 @@ impl Window {
             (instance.line, instance.state, instance.position, instance.producer.clone());
         let is_node = instance.role == Role::Node;
         let because: Arc<str> = if reason.is_empty() { path.into() } else { format!("{path}: {reason}").into() };
-        let environment = instance.environment.clone();
+        let mut environment = instance.environment.clone();
+        environment.test = None;
         self.squash_behind(context, id);
         self.remove_retired(context, id);
         self.next_order += 1;

@@ -39,7 +39,7 @@ impl Window {
         let path = self.path(context.program, id);
         let seed = self.seed(context, instance, &path);
         let Some(seen) = instance.seen.as_deref() else { return false };
-        let same = |other: &Seen| other.inputs == seen.inputs && other.facts == seen.facts;
+        let same = |other: &Seen| other.is_like(seen);
         let known = self.twins.results.get(&seed).and_then(|all| all.iter().find(|(other, _)| same(other)));
         let mut found = known.map(|(_, ended)| ended.clone());
         let mut busy = None;
@@ -66,9 +66,6 @@ impl Window {
             return true;
         }
         if let Some(busy) = busy {
-            if let Some(instance) = self.instances.get_mut(id) {
-                instance.seen = None;
-            }
             self.wait(id, Wait::Twin(busy));
             return true;
         }
