@@ -122,6 +122,17 @@ fn random_programs_leave_the_same_world_in_both_modes() {
     );
 }
 
+/// Tries of a result that was invalidated, facts that a routine's effects look up, outcomes of a routine's parts that may change
+/// everything, the index of a loop whose test failed.
+#[test]
+fn programs_that_once_failed_leave_the_same_world() {
+    const ONCE_FAILED: [u64; 6] = [1_030_006, 1_000_548, 1_114_152, 2_003_452, 2_080_624, 2_031_869];
+    for seed in ONCE_FAILED {
+        let sum = try_programs(seed, 1, &Features::ALL);
+        assert!(sum.failed.is_empty(), "the program of seed {seed} fails");
+    }
+}
+
 #[test]
 fn without_the_theorem_s_assumptions_what_acts_is_still_decided_and_final() {
     let programs = number("RATN_PROGRAMS", 2000) / 4;
