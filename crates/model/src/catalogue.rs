@@ -58,6 +58,9 @@ impl Catalogue {
 pub struct Provider {
     /// The kind of resource that performs the actions; a state that uses one must block it.
     pub resource: String,
+    /// How many joint positions its inputs of type `joints` have; `None` is any number.
+    #[serde(default)]
+    pub joints: Option<u32>,
     /// By action name, the part after the slash.
     pub actions: BTreeMap<String, ActionSignature>,
 }

@@ -7,13 +7,19 @@
 //! |---|---|
 //! | [`actions`] | unknown-provider, unknown-action, unknown-port, missing-input, unknown-outcome |
 //! | [`types`] | type-mismatch |
+//! | [`constants`] | invalid-constant |
+//! | [`functions`] | unknown-function |
 //! | [`flows`] | unservable-flow, branch-may-not-have-written, unknown-state |
 //! | [`reach`] | unreachable-state, no-way-out, horizon-too-small, region-conflict, region-unannotated |
 //! | [`resources`] | unknown-resource, too-many-resources, provider-not-blocked, computes-actuates |
+//! | [`deadlock`] | may-deadlock |
 //! | [`preconditions`] | unestablished-precondition |
 
 mod actions;
+pub(crate) mod constants;
+mod deadlock;
 mod flows;
+mod functions;
 mod graph;
 mod preconditions;
 mod reach;
@@ -54,6 +60,8 @@ pub(crate) fn check(
     flows::check(&subject, findings);
     reach::check(&subject, findings);
     resources::check(&subject, findings);
+    deadlock::check(&subject, findings);
+    functions::check(&subject, findings);
     preconditions::check(&subject, findings);
 }
 
@@ -109,7 +117,7 @@ pub(crate) fn expressions<'a>(program: &'a Program, state: &'a State) -> Vec<(St
     all
 }
 
-fn effect_expressions<'a>(effect: &'a EffectExpr, part: &str, all: &mut Vec<(String, &'a Expr)>) {
+pub(crate) fn effect_expressions<'a>(effect: &'a EffectExpr, part: &str, all: &mut Vec<(String, &'a Expr)>) {
     let (fact, value) = match effect {
         EffectExpr::Set(fact, value) | EffectExpr::Increase(fact, value) => (Some(fact), Some(value)),
         EffectExpr::Delete(fact) => (Some(fact), None),

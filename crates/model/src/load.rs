@@ -29,7 +29,7 @@ mod yaml;
 
 pub(crate) use fields::Places;
 pub use library::Files;
-pub(crate) use names::suggestion;
+pub(crate) use names::{distance, suggestion};
 pub use yaml::MAX_SOURCE;
 
 use crate::catalogue::Catalogue;
@@ -232,6 +232,11 @@ fn world(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<EffectExpr> {
             let message = "the initial world cannot look up facts";
             fields.error("invalid-expression", item.at, message, "use constants and parameters");
         }
+        let mut parts = Vec::new();
+        effects.iter().for_each(|effect| check::effect_expressions(effect, "world", &mut parts));
+        if let Some(problem) = parts.iter().find_map(|(_, expr)| check::constants::problem(expr)) {
+            fields.error(check::constants::RULE, item.at, problem.to_string(), check::constants::HELP);
+        }
         initial.extend(effects);
     }
     initial
@@ -267,7 +272,8 @@ fn constant(fields: &mut Fields<'_, '_>, node: &Node) -> Option<Value> {
     match fields.expression(node)?.evaluate(&NothingKnown) {
         Ok(value) => Some(value),
         Err(error) => {
-            fields.error("invalid-expression", node.at, error.to_string(), "a default is a constant");
+            let rule = if error.is_not_yet_known() { "invalid-expression" } else { check::constants::RULE };
+            fields.error(rule, node.at, error.to_string(), "a default is a constant");
             None
         }
     }

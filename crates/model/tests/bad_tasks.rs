@@ -9,16 +9,18 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Rules that the folder must have a task for.
-const RULES: [&str; 29] = [
+const RULES: [&str; 32] = [
     "branch-may-not-have-written",
     "computes-actuates",
     "conflicting-annotations",
     "duplicate-name",
     "horizon-too-small",
+    "invalid-constant",
     "invalid-expression",
     "invalid-name",
     "invalid-state",
     "invalid-yaml",
+    "may-deadlock",
     "missing-input",
     "no-way-out",
     "not-supported-yet",
@@ -28,6 +30,7 @@ const RULES: [&str; 29] = [
     "type-mismatch",
     "unestablished-precondition",
     "unknown-action",
+    "unknown-function",
     "unknown-key",
     "unknown-library",
     "unknown-outcome",

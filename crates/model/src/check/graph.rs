@@ -4,7 +4,7 @@
 //! have. A state inside of a composite is forgotten when the composite is entered again.
 
 use crate::id::StateId;
-use crate::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind, Target};
+use crate::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind, Target};
 use petgraph::graph::{DiGraph, NodeIndex};
 use petgraph::visit::EdgeRef;
 use std::collections::{BTreeMap, VecDeque};
@@ -158,6 +158,58 @@ impl ControlFlow {
         let dead =
             self.graph.node_indices().filter(|place| !seen[place.index()] && self.surely[place.index()].is_some());
         dead.map(|place| self.graph[place]).collect()
+    }
+
+    /// What can be reached if only some states may begin. Any other ends at once, `aborted`, where it may fail before, and else
+    /// goes nowhere; the regions of a barrier are all waited for. By place: see [`ControlFlow::is_in`].
+    pub(crate) fn reached_when(
+        &self,
+        program: &Program,
+        may_begin: &dyn Fn(StateId) -> bool,
+        may_fail_first: &dyn Fn(&State) -> bool,
+    ) -> Vec<bool> {
+        let mut reached = vec![false; self.graph.node_count()];
+        let mut open: Vec<NodeIndex> = self.places.get(&Point::Begin(Program::ROOT)).copied().into_iter().collect();
+        while let Some(place) = open.pop() {
+            if reached[place.index()] {
+                continue;
+            }
+            let mut next: Vec<NodeIndex> = self.graph.neighbors(place).collect();
+            match self.graph[place] {
+                Point::Middle(id) => {
+                    if let StateKind::Concurrency { regions, preemptive: false, .. } = &program.state(id).kind {
+                        let mut ends = regions.iter().map(|region| {
+                            let of = 0..self.outcomes(*region).len();
+                            of.into_iter().any(|number| self.is_in(&reached, Point::End(*region, number)))
+                        });
+                        if !ends.all(|ended| ended) {
+                            continue;
+                        }
+                    }
+                }
+                Point::Begin(id) if !may_begin(id) => {
+                    let fails = may_fail_first(program.state(id)).then(|| self.end(id, ABORTED));
+                    next.retain(|to| Some(self.graph[*to]) == fails);
+                }
+                Point::Begin(_) | Point::End(..) => {}
+            }
+            reached[place.index()] = true;
+            open.extend(next);
+        }
+        reached
+    }
+
+    /// Whether a point is among those that were reached.
+    pub(crate) fn is_in(&self, reached: &[bool], point: Point) -> bool {
+        self.places.get(&point).is_some_and(|place| reached[place.index()])
+    }
+
+    /// Whether the control flow may come from one point to another.
+    pub(crate) fn leads_to(&self, from: Point, to: Point) -> bool {
+        match (self.places.get(&from), self.places.get(&to)) {
+            (Some(from), Some(to)) => petgraph::algo::has_path_connecting(&self.graph, *from, *to, None),
+            _ => false,
+        }
     }
 
     fn end(&self, id: StateId, outcome: &str) -> Point {

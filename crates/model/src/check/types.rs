@@ -1,6 +1,6 @@
 //! The types of expressions, as far as they are known before anything runs; `any` fits everywhere and is checked then.
 
-use super::{Subject, Variables, expressions, named};
+use super::{Subject, Variables, constants, expressions, named};
 use crate::diagnostic::Findings;
 use crate::expression::{BinaryOperator, EffectExpr, Expr, Function, UnaryOperator};
 use crate::program::{Program, State, StateKind, TaskOutput};
@@ -30,6 +30,8 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
                     {
                         let message = format!("`{}` is {wanted}; `{}` is {found}", what(&part), named(program, expr));
                         findings.error("type-mismatch", at, &state.path, message, "");
+                    } else {
+                        constants::check(subject, state, &part, expr, findings);
                     }
                 }
             }

@@ -202,7 +202,7 @@ pub(crate) fn suggestion<'n>(
 }
 
 /// Edits (insert, delete, replace) from one name to the other; names beyond a sane length count as far apart.
-fn distance(a: &str, b: &str) -> usize {
+pub(crate) fn distance(a: &str, b: &str) -> usize {
     const MAX_LENGTH: usize = 64;
     if a.len().max(b.len()) > MAX_LENGTH {
         return MAX_LENGTH;

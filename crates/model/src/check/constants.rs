@@ -1,0 +1,86 @@
+//! Constants that have no value: what needs neither variables, outputs nor facts is evaluated here and now, as it will be then.
+
+use super::{Subject, named};
+use crate::diagnostic::Findings;
+use crate::expression::scope::NothingKnown;
+use crate::expression::{EvaluateError, Expr, FactExpr, Function};
+use crate::program::{State, StateKind};
+use crate::value::Value;
+
+pub(crate) const RULE: &str = "invalid-constant";
+pub(crate) const HELP: &str = "it fails whenever it is evaluated: write a value that there is";
+
+pub(super) fn check(subject: &Subject<'_>, state: &State, part: &str, expr: &Expr, findings: &mut Findings) {
+    let problem = match problem(expr) {
+        Some(EvaluateError::Wrong { problem, .. }) => Some(problem),
+        Some(EvaluateError::NotYetKnown { .. }) | None => joints(subject, state, part, expr),
+    };
+    if let Some(problem) = problem {
+        let message = format!("`{}`: {problem}", named(subject.program, expr));
+        findings.error(RULE, subject.place(state, part), &state.path, message, HELP);
+    }
+}
+
+/// Joint positions of another number than the provider's.
+fn joints(subject: &Subject<'_>, state: &State, part: &str, expr: &Expr) -> Option<String> {
+    let StateKind::Action { provider, .. } = &state.kind else { return None };
+    let wanted = subject.catalogue.providers.get(provider)?.joints?;
+    let Ok(Value::Joints(found)) = expr.evaluate(&NothingKnown) else { return None };
+    let fits = !part.starts_with("in.") || usize::try_from(wanted).is_ok_and(|wanted| wanted == found.len());
+    (!fits).then(|| format!("`{provider}` has {wanted} joints, and these are the positions of {}", found.len()))
+}
+
+/// What is wrong with the first part that is a constant and has no value. A part that may be passed over (the branches of an `if`, the
+/// right of `and` and `or`) does not count unless the whole is a constant.
+pub(crate) fn problem(expr: &Expr) -> Option<EvaluateError> {
+    match expr.evaluate(&NothingKnown) {
+        Ok(_) => None,
+        Err(error @ EvaluateError::Wrong { .. }) => Some(error),
+        Err(EvaluateError::NotYetKnown { .. }) => parts(expr).into_iter().find_map(problem),
+    }
+}
+
+/// The parts that are evaluated whenever the whole is.
+fn parts(expr: &Expr) -> Vec<&Expr> {
+    use crate::expression::BinaryOperator::{And, Or};
+    match expr {
+        Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } => Vec::new(),
+        Expr::Field(of, _) | Expr::Unary(_, of) | Expr::Binary(And | Or, of, _) => vec![of],
+        Expr::Index(a, b) | Expr::Binary(_, a, b) => vec![a, b],
+        Expr::Call(Function::If, arguments) => arguments.iter().take(1).collect(),
+        Expr::List(items) | Expr::Call(_, items) => items.iter().collect(),
+        Expr::Map(fields) => fields.iter().map(|(_, item)| item).collect(),
+        Expr::Fact(fact) | Expr::Exists(fact) => of_fact(fact),
+    }
+}
+
+fn of_fact(fact: &FactExpr) -> Vec<&Expr> {
+    fact.arguments.iter().flatten().collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::expression::BinaryOperator;
+
+    fn broken() -> Expr {
+        let number = |i| Box::new(Expr::Literal(Value::Int(i)));
+        Expr::Binary(BinaryOperator::Divide, number(1), number(0))
+    }
+
+    #[test]
+    fn a_broken_constant_beside_what_is_not_known_is_found() {
+        let sum = Expr::Binary(BinaryOperator::Add, Box::new(Expr::Variable("n".into())), Box::new(broken()));
+        assert!(problem(&sum).is_some());
+        assert!(problem(&Expr::Variable("n".into())).is_none());
+    }
+
+    #[test]
+    fn a_broken_constant_that_may_be_passed_over_is_not_complained_of() {
+        let unknown = || Expr::Variable("sure".into());
+        let choice = Expr::Call(Function::If, vec![unknown(), Expr::Literal(Value::Int(1)), broken()]);
+        assert!(problem(&choice).is_none());
+        let either = Expr::Binary(BinaryOperator::Or, Box::new(unknown()), Box::new(broken()));
+        assert!(problem(&either).is_none());
+    }
+}
