@@ -9,6 +9,7 @@ use ratn_model::value::Value;
 use ratn_world::world::World;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
+use std::fmt;
 
 /// Output ports of one instance.
 pub(crate) type Outputs = BTreeMap<String, Value>;
@@ -70,9 +71,8 @@ pub(crate) struct BindError {
 
 impl BindError {
     /// Names the part of the state.
-    pub(crate) fn at(part: impl Into<String>, state: &State) -> impl FnOnce(EvaluateError) -> BindError {
-        let (part, path) = (part.into(), state.path.clone());
-        move |source| BindError { part, path, source }
+    pub(crate) fn at(part: impl fmt::Display, state: &State) -> impl FnOnce(EvaluateError) -> BindError {
+        move |source| BindError { part: part.to_string(), path: state.path.clone(), source }
     }
 
     /// The error and its cause on one line, as an outcome's reason.
@@ -85,7 +85,7 @@ impl BindError {
 pub(crate) fn inputs(state: &State, inputs: &[(String, Expr)], scope: &dyn Scope) -> Result<Outputs, BindError> {
     let mut bound = BTreeMap::new();
     for (port, expression) in inputs {
-        match expression.evaluate(scope).map_err(BindError::at(format!("input `{port}`"), state))? {
+        match expression.evaluate(scope).map_err(BindError::at(format_args!("input `{port}`"), state))? {
             Value::Null => {}
             value => {
                 bound.insert(port.clone(), value);
@@ -101,7 +101,7 @@ pub(crate) fn requirements(
     wanted: &[ResourceExpr],
     scope: &dyn Scope,
 ) -> Result<Vec<Requirement>, BindError> {
-    wanted.iter().map(|r| r.bind(scope).map_err(BindError::at(format!("resource `{}`", r.kind), state))).collect()
+    wanted.iter().map(|r| r.bind(scope).map_err(BindError::at(format_args!("resource `{}`", r.kind), state))).collect()
 }
 
 /// Why a state may not start: the first of its preconditions that does not hold; `Ok(None)` when all hold.
@@ -134,15 +134,32 @@ pub(crate) fn expected_s(state: &State, scope: &dyn Scope) -> Option<f64> {
     (seconds.is_finite() && seconds >= 0.0).then_some(seconds)
 }
 
-/// A seed for one try of one visit, the same in every mode and on every host (FNV-1a over the run's seed, the path and, from
-/// the second on, the number of the try).
-pub(crate) fn seed(run: u64, path: &str, try_number: u32) -> u64 {
-    let mut hash = 0xcbf2_9ce4_8422_2325_u64;
-    let again = (try_number > 1).then(|| try_number.to_le_bytes());
-    for byte in run.to_le_bytes().into_iter().chain(path.bytes()).chain(again.into_iter().flatten()) {
-        hash = (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
+/// A seed for one try of one visit, the same in every mode and on every host: FNV-1a over the run's seed, the path, part by
+/// part, and, from the second on, the number of the try.
+pub(crate) struct Seed(u64);
+
+impl Seed {
+    /// Of a run.
+    pub(crate) fn of(run: u64) -> Seed {
+        let mut seed = Seed(0xcbf2_9ce4_8422_2325);
+        seed.add(&run.to_le_bytes());
+        seed
     }
-    hash
+
+    /// Of a visit whose path goes on so.
+    pub(crate) fn add(&mut self, bytes: &[u8]) {
+        for byte in bytes {
+            self.0 = (self.0 ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3);
+        }
+    }
+
+    /// Of a try, counted from 1.
+    pub(crate) fn of_try(mut self, number: u32) -> u64 {
+        if number > 1 {
+            self.add(&number.to_le_bytes());
+        }
+        self.0
+    }
 }
 
 /// The path of a child below its parent's.

@@ -212,21 +212,22 @@ fn most_urgent_first(commands: Vec<Command>) -> Vec<Command> {
     if !commands.iter().any(asks) {
         return commands;
     }
-    let mut ordered: Vec<Command> = Vec::with_capacity(commands.len());
-    for command in commands {
-        let asked = match &command {
-            Command::Withdraw { instance } => ordered
-                .iter()
-                .position(|earlier| matches!(earlier, Command::Acquire { instance: asked, .. } if asked == instance)),
-            _ => None,
-        };
-        match asked {
-            Some(asked) => {
-                ordered.remove(asked);
+    let mut asked: BTreeMap<InstanceId, usize> = BTreeMap::new();
+    let mut needed = vec![true; commands.len()];
+    for (place, command) in commands.iter().enumerate() {
+        match command {
+            Command::Acquire { instance, .. } => drop(asked.insert(*instance, place)),
+            Command::Withdraw { instance } => {
+                if let Some(acquire) = asked.remove(instance) {
+                    (needed[acquire], needed[place]) = (false, false);
+                }
             }
-            None => ordered.push(command),
+            _ => {}
         }
     }
+    let mut needed = needed.into_iter();
+    let mut ordered = commands;
+    ordered.retain(|_| needed.next().unwrap_or(true));
     ordered.sort_by_key(|command| match command {
         Command::Acquire { priority, .. } => (1, Reverse(*priority)),
         Command::Release { .. } => (2, Reverse(0)),

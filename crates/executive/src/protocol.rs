@@ -7,6 +7,7 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// How a task is executed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -209,8 +210,8 @@ pub enum Command {
         instance: InstanceId,
         /// In which attempt, from 1. (run, instance, attempt) is the goal's idempotent id.
         attempt: u32,
-        /// What to do.
-        goal: Goal,
+        /// What to do. Apart, so that commands are small.
+        goal: Box<Goal>,
     },
     /// Stop a goal; its answer, if any, is ignored.
     Cancel {
@@ -297,7 +298,7 @@ pub enum Note {
         /// Its id.
         instance: InstanceId,
         /// Its outcome.
-        outcome: String,
+        outcome: Arc<str>,
     },
     /// Its result is real.
     Retired {
@@ -334,9 +335,9 @@ pub enum Note {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Goal {
     /// The provider of the catalogue, `path_planner`.
-    pub provider: String,
+    pub provider: Arc<str>,
     /// Its action, `plan`.
-    pub action: String,
+    pub action: Arc<str>,
     /// Its input ports.
     pub inputs: BTreeMap<String, Value>,
     /// What the action's random choices are derived from.

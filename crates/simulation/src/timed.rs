@@ -29,7 +29,7 @@ impl Oracle for TimedProviders {
 
 impl TimedProviders {
     pub(crate) fn outputs(&self, goal: &Goal) -> BTreeMap<String, Value> {
-        let outputs = match (goal.provider.as_str(), goal.action.as_str()) {
+        let outputs = match (&*goal.provider, &*goal.action) {
             ("detector", "segment") => {
                 vec![("boxes", Value::List((0..self.boxes).map(box_on_table).collect()))]
             }

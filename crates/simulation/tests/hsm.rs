@@ -57,7 +57,7 @@ struct Script {
 impl Oracle for Script {
     fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, _: &World) -> Performance {
         self.seeds.push((path.to_owned(), goal.seed));
-        if goal.provider == "pen" {
+        if &*goal.provider == "pen" {
             self.notes.push((path.to_owned(), goal.inputs["value"].clone()));
         }
         let all = self.outcomes.get(path).map_or(&[][..], Vec::as_slice);

@@ -35,7 +35,7 @@ struct Echo;
 impl Oracle for Echo {
     fn perform(&mut self, _: &str, _: u32, goal: &Goal, _: &World) -> Performance {
         let given = goal.inputs.get("a").cloned().unwrap_or(Value::Null);
-        let nothing = goal.action == "move" && given.as_number().is_some_and(|number| number >= 40.0);
+        let nothing = &*goal.action == "move" && given.as_number().is_some_and(|number| number >= 40.0);
         let outcome = if nothing { "empty" } else { "success" }.to_owned();
         let outputs = BTreeMap::from([("x".to_owned(), given)]);
         Performance { duration_s: 1.0, answer: Answer::Finished { outcome, outputs, measured: Vec::new() } }

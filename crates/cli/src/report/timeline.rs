@@ -264,8 +264,8 @@ impl Fold {
                     self.begins_beside(*instance);
                 }
                 let job = Job {
-                    provider: goal.provider.clone(),
-                    action: goal.action.clone(),
+                    provider: goal.provider.to_string(),
+                    action: goal.action.to_string(),
                     activity,
                     attempt: *attempt,
                     from_s: at,

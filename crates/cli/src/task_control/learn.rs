@@ -110,7 +110,7 @@ impl Fold {
                 self.decided.insert(path);
             }
             Command::Note(Note::Finished { instance, outcome }) => {
-                self.finished.insert(*instance, outcome.clone());
+                self.finished.insert(*instance, outcome.to_string());
             }
             Command::Note(Note::Retired { instance }) => drop(self.retired.insert(*instance)),
             _ => {}

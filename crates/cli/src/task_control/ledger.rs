@@ -132,7 +132,7 @@ impl Ledger {
                 self.projecting.insert(*instance, asked);
             }
             Command::Start { instance, attempt, goal } => {
-                self.goals.insert(*instance, (*attempt, goal.clone()));
+                self.goals.insert(*instance, (*attempt, (**goal).clone()));
             }
             Command::Cancel { instance, attempt } => {
                 self.goals.retain(|id, goal| id != instance || goal.0 != *attempt);
@@ -246,7 +246,7 @@ mod tests {
             timeout_s: None,
         };
         let mut ledger = Ledger::default();
-        ledger.command(&Command::Start { instance, attempt: 2, goal });
+        ledger.command(&Command::Start { instance, attempt: 2, goal: Box::new(goal) });
         ledger.command(&Command::Cancel { instance, attempt: 1 });
         assert_eq!(ledger.goals.len(), 1);
         ledger.event(Timestamp(1), &Event::Crashed { instance, attempt: 2, reason: String::new() });

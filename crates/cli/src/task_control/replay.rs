@@ -298,7 +298,7 @@ mod tests {
             let must_be = must_be_durable(&program, &states, std::slice::from_ref(command));
             match command {
                 Command::Start { goal, .. } => {
-                    let moves = ["arm", "gripper", "pan_tilt"].contains(&goal.provider.as_str());
+                    let moves = ["arm", "gripper", "pan_tilt"].contains(&&*goal.provider);
                     assert_eq!(must_be, moves, "{command:?}");
                     (durable, starts) = (durable + usize::from(must_be), starts + 1);
                 }

@@ -145,11 +145,13 @@ impl Interpreter {
         };
         let (instance, attempt) = (current.instance, current.attempt);
         let tries = if state.annotations.deterministic { 1 } else { current.tries };
+        let mut seed = binding::Seed::of(context.seed);
+        seed.add(current.path.as_bytes());
         let goal = Goal {
-            provider: provider.clone(),
-            action: action.clone(),
+            provider: provider.as_str().into(),
+            action: action.as_str().into(),
             inputs,
-            seed: binding::seed(context.seed, &current.path, tries),
+            seed: seed.of_try(tries),
             lease: self.routine.as_ref().map_or(&current.lease, |routine| &routine.lease).clone(),
             projection: current.projection,
             expected_s: self.with_scope(context, thread, None, |scope| binding::expected_s(state, scope)),
@@ -165,13 +167,13 @@ impl Interpreter {
         }
         context.commands.extend(timeout.map(|at| Command::Wake { at }));
         context.note(Note::Running { instance, attempt });
-        context.commands.push(Command::Start { instance, attempt, goal });
+        context.commands.push(Command::Start { instance, attempt, goal: Box::new(goal) });
     }
 
     /// It ends `aborted` without having done anything (more).
     pub(super) fn end_node(&mut self, context: &mut Context<'_>, thread: u64, reason: String) {
         let Some(current) = self.threads.get_mut(&thread).and_then(|thread| thread.current.take()) else { return };
-        context.note(Note::Finished { instance: current.instance, outcome: ABORTED.to_owned() });
+        context.note(Note::Finished { instance: current.instance, outcome: ABORTED.into() });
         self.give_back(context, &current);
         if matches!(self.target, Target::Actual) {
             context.note(Note::Retired { instance: current.instance });
@@ -218,7 +220,7 @@ impl Interpreter {
                 }
             }
         }
-        context.note(Note::Finished { instance, outcome: outcome.clone() });
+        context.note(Note::Finished { instance, outcome: outcome.as_str().into() });
         let nature = context.analysis.state(id).nature;
         let declared = effects::declared(state, nature, &outcome);
         let changes =

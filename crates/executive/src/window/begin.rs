@@ -35,7 +35,7 @@ impl Window {
 
     /// It never began and never will.
     pub(super) fn fail(&mut self, context: &mut Context<'_>, id: InstanceId, reason: String) {
-        context.note(Note::Finished { instance: id, outcome: ABORTED.to_owned() });
+        context.note(Note::Finished { instance: id, outcome: ABORTED.into() });
         let outputs = self.unassigned(context, id);
         self.end_instance(id, Ended { outputs, ..Ended::aborted(reason) });
     }
@@ -210,7 +210,8 @@ impl Window {
             self.set_status(id, Status::Running, Wait::Nothing);
             return self.start_routine(context, id);
         }
-        let StateKind::Action { provider, action, inputs, .. } = &state.kind else { return };
+        let StateKind::Action { inputs, .. } = &state.kind else { return };
+        let Some((provider, action)) = self.plan.state(instance.state).action.clone() else { return };
         let bound = match known {
             Some(inputs) => Ok(inputs),
             None => binding::inputs(state, inputs, &view),
@@ -224,12 +225,11 @@ impl Window {
                 };
             }
         };
-        let path = self.path(context.program, id);
         let goal = Goal {
-            provider: provider.clone(),
-            action: action.clone(),
+            provider,
+            action,
             inputs,
-            seed: self.seed(context, instance, &path),
+            seed: self.seed(context, instance),
             lease: instance.lease.as_deref().cloned(),
             projection: instance.projection,
             expected_s: binding::expected_s(state, &view),
@@ -241,7 +241,7 @@ impl Window {
         }
         self.set_status(id, Status::Running, Wait::Nothing);
         context.note(Note::Running { instance: id, attempt });
-        context.commands.push(Command::Start { instance: id, attempt, goal });
+        context.commands.push(Command::Start { instance: id, attempt, goal: Box::new(goal) });
     }
 
     fn start_routine(&mut self, context: &mut Context<'_>, id: InstanceId) {

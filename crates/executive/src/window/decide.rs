@@ -89,7 +89,7 @@ impl Window {
                 Ok(false) => {}
                 Ok(true) => decision = Some((outcome.clone(), None)),
                 Err(error) => {
-                    let reason = BindError::at(format!("`decide.{outcome}`"), state)(error).reason();
+                    let reason = BindError::at(format_args!("`decide.{outcome}`"), state)(error).reason();
                     decision = Some((ABORTED.to_owned(), Some(reason)));
                 }
             }

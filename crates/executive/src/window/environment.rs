@@ -9,7 +9,6 @@ use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
 use std::borrow::Cow;
-use std::fmt::Write;
 use std::sync::{Arc, OnceLock};
 
 /// A place's environment.
@@ -165,22 +164,63 @@ impl Environment {
 
     /// The path of a state visited here.
     pub(crate) fn path(&self, name: &str, visit: u32, iteration: Option<usize>) -> String {
+        let prefix = self.frames.as_ref().map_or(0, |frame| frame.path.len());
+        let mut path = String::with_capacity(prefix + name.len() + 16);
+        self.path_parts(name, visit, iteration, |part| path.push_str(part));
+        path
+    }
+
+    /// The path of a state visited here, part by part.
+    pub(crate) fn path_parts(&self, name: &str, visit: u32, iteration: Option<usize>, mut part: impl FnMut(&str)) {
         let prefix = self.frames.as_ref().map_or("", |frame| &*frame.path);
-        let mut path = String::with_capacity(prefix.len() + name.len() + 16);
-        path.push_str(prefix);
+        part(prefix);
         if let Some(iteration) = self.frames.as_ref().and_then(|frame| frame.iteration.as_ref()) {
-            let _ = write!(path, "[{}]", iteration.index);
+            number("[", iteration.index, "]", &mut part);
         }
         if !prefix.is_empty() && !name.is_empty() {
-            path.push('/');
+            part("/");
         }
-        path.push_str(name);
+        part(name);
         if visit > 1 {
-            let _ = write!(path, "#{visit}");
+            number("#", visit as usize, "", &mut part);
         }
         if let Some(index) = iteration {
-            let _ = write!(path, "[{index}]");
+            number("[", index, "]", &mut part);
         }
-        path
+    }
+}
+
+fn number(before: &str, number: usize, after: &str, part: &mut impl FnMut(&str)) {
+    part(before);
+    decimal(number, part);
+    part(after);
+}
+
+/// The digits of a number; formatting by the standard library takes several times as long, and paths are made per instance.
+fn decimal(mut number: usize, part: &mut impl FnMut(&str)) {
+    let mut digits = [b'0'; 20];
+    let mut at = digits.len();
+    loop {
+        at -= 1;
+        digits[at] += u8::try_from(number % 10).unwrap_or(0);
+        number /= 10;
+        if number == 0 {
+            break;
+        }
+    }
+    part(std::str::from_utf8(&digits[at..]).unwrap_or_default());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::decimal;
+
+    #[test]
+    fn numbers_of_paths_are_written_in_full() {
+        for number in [0, 7, 10, 90_909, usize::MAX] {
+            let mut written = String::new();
+            decimal(number, &mut |part: &str| written.push_str(part));
+            assert_eq!(written, number.to_string());
+        }
     }
 }

@@ -211,9 +211,9 @@ pub(crate) struct Instance {
     pub(crate) routine: Option<Box<Interpreter>>,
     pub(crate) seen: Option<Box<Seen>>,
     /// To be looked at again when this ends, settles, retires or is squashed.
-    pub(crate) waiters: Vec<InstanceId>,
+    pub(crate) waiters: SmallVec<[InstanceId; 2]>,
     /// Those whose results were made of this one's outputs or effects.
-    pub(crate) users: Vec<InstanceId>,
+    pub(crate) users: SmallVec<[InstanceId; 2]>,
     /// Estimated, in seconds.
     pub(crate) duration_s: f32,
     /// The longest estimated path from its start to the end of the window, or what a look ahead advised.

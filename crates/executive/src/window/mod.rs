@@ -513,7 +513,7 @@ impl Window {
             ended = Ended { changes: ended.changes, ..Ended::aborted(problem) };
         }
         let Some(instance) = self.instances.get_mut(id) else { return };
-        context.note(Note::Finished { instance: id, outcome: ended.outcome.to_string() });
+        context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
         give_back(context, instance);
         let detached = instance.detached;
         self.is_idle(id);
@@ -536,7 +536,7 @@ impl Window {
             let view = self.sight(context).view(instance, Some(&ended.outputs));
             let value = expression.evaluate(&view);
             let value =
-                value.map_err(|e| binding::BindError::at(format!("`assign` of `{name}`"), state)(e).reason())?;
+                value.map_err(|e| binding::BindError::at(format_args!("`assign` of `{name}`"), state)(e).reason())?;
             values.push((assigned(name), value));
         }
         ended.outputs.extend(values);

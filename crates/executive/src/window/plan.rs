@@ -58,6 +58,8 @@ pub(crate) struct StatePlan {
     pub(crate) flows: Vec<StateId>,
     /// The variables that any of its expressions reads; of a routine, those of what it contains, too.
     pub(crate) variables: Vec<String>,
+    /// Of an action: its provider and its name there.
+    pub(crate) action: Option<(Arc<str>, Arc<str>)>,
     /// The variables that it, or a routine's inside, gives new values.
     pub(crate) assigns: Vec<String>,
     /// Somebody reads its outputs.
@@ -322,6 +324,10 @@ fn plan(
         effect_predicates,
         operated: operated_kinds,
         flows: used_flows(program, state, is_node),
+        action: match &state.kind {
+            StateKind::Action { provider, action, .. } => Some((Arc::from(&**provider), Arc::from(&**action))),
+            _ => None,
+        },
         assigns: assigned_variables(program, state, is_node).into_iter().collect(),
         variables: {
             let mut variables = used_variables(program, state, is_node);

@@ -14,6 +14,7 @@ use crate::effects;
 use crate::protocol::{Command, Note};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, SUCCESS, StateKind};
+use smallvec::SmallVec;
 use std::sync::Arc;
 
 impl Window {
@@ -317,7 +318,7 @@ impl Window {
         }
     }
 
-    fn take_users(&mut self, id: InstanceId) -> Vec<InstanceId> {
+    fn take_users(&mut self, id: InstanceId) -> SmallVec<[InstanceId; 2]> {
         let mut users = self.instances.get_mut(id).map(|i| std::mem::take(&mut i.users)).unwrap_or_default();
         users.sort_unstable();
         users.dedup();
@@ -325,7 +326,7 @@ impl Window {
     }
 
     /// What was made of predicted effects is compared with what they came to.
-    fn compare(&mut self, context: &mut Context<'_>, users: Vec<InstanceId>) {
+    fn compare(&mut self, context: &mut Context<'_>, users: SmallVec<[InstanceId; 2]>) {
         for user in users {
             self.revalidate(context, user);
         }

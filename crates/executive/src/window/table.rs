@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-const BITS: usize = 4;
+const BITS: usize = 3;
 const WIDTH: usize = 1 << BITS;
 
 /// A persistent map from indices below a fixed bound to values.

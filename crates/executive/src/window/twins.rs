@@ -7,7 +7,7 @@ use super::Window;
 use super::environment::ASSIGNED;
 use super::instance::{Ended, Instance, Seen, Status, Wait};
 use crate::analysis::NodeNature;
-use crate::binding::{self, Outputs};
+use crate::binding::{Outputs, Seed};
 use crate::context::Context;
 use crate::protocol::Note;
 use ratn_model::id::InstanceId;
@@ -36,8 +36,7 @@ impl Window {
         if !is_cacheable(context, instance) || (!speculative && self.twins.order.is_empty()) {
             return false;
         }
-        let path = self.path(context.program, id);
-        let seed = self.seed(context, instance, &path);
+        let seed = self.seed(context, instance);
         let Some(seen) = instance.seen.as_deref() else { return false };
         let same = |other: &Seen| other.is_like(seen);
         let known = self.twins.results.get(&seed).and_then(|all| all.iter().find(|(other, _)| same(other)));
@@ -61,7 +60,7 @@ impl Window {
                 ended = Ended { changes: ended.changes, ..Ended::aborted(problem) };
             }
             context.note(Note::Reused { instance: id });
-            context.note(Note::Finished { instance: id, outcome: ended.outcome.to_string() });
+            context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
             self.end_instance(id, ended);
             return true;
         }
@@ -87,8 +86,7 @@ impl Window {
         if !is_cacheable(context, instance) || self.is_ending || !ended.reason.is_empty() && ended.outputs.is_empty() {
             return;
         }
-        let path = self.path(context.program, id);
-        let seed = self.seed(context, instance, &path);
+        let seed = self.seed(context, instance);
         let result = ((**seen).clone(), (**ended).clone());
         self.twins.results.entry(seed).or_default().push(result);
         self.twins.order.push_back(seed);
@@ -104,9 +102,12 @@ impl Window {
     }
 
     /// What a visit's random choices are derived from.
-    pub(super) fn seed(&self, context: &Context<'_>, instance: &Instance, path: &str) -> u64 {
+    pub(super) fn seed(&self, context: &Context<'_>, instance: &Instance) -> u64 {
         let state = context.program.state(instance.state);
-        binding::seed(context.seed, path, if state.annotations.deterministic { 1 } else { instance.tries })
+        let mut seed = Seed::of(context.seed);
+        let environment = &instance.environment;
+        environment.path_parts(&state.name, instance.visit, instance.iteration, |part| seed.add(part.as_bytes()));
+        seed.of_try(if state.annotations.deterministic { 1 } else { instance.tries })
     }
 }
 

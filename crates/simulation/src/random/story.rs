@@ -76,7 +76,7 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
                 }
                 Note::Finished { instance, outcome } => {
                     if let Some(life) = lives.get_mut(instance) {
-                        life.outcome.clone_from(outcome);
+                        life.outcome = outcome.to_string();
                         running.retain(|act| Some(*act) != life.started);
                     }
                 }

@@ -21,7 +21,7 @@ pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run) -> Option<String
         let fails = [hsm, cdtn].iter().any(|run| {
             run.log.iter().any(|line| {
                 matches!(&line.entry, LogEntry::Command(Command::Note(Note::Finished { outcome, .. }))
-                    if matches!(outcome.as_str(), ABORTED | PREEMPTED))
+                    if matches!(&**outcome, ABORTED | PREEMPTED))
             })
         });
         (!fails && !shares(program)).then(|| same_end(hsm, cdtn)).flatten()

@@ -163,7 +163,7 @@ impl Performer {
             Command::Project { instance, attempt, base, changes, reads, lease } => {
                 self.record(Record::Project { instance, attempt, base, changes, reads, lease })?;
             }
-            Command::Start { instance, attempt, goal } => self.start(instance, attempt, goal, Given::Now),
+            Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now),
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
                 Some(job) if job.attempt == attempt => job.stop.cancel(),
                 _ => {
@@ -286,7 +286,7 @@ impl Performer {
             stop: stop.clone(),
             goal: types::Goal {
                 id: format!("{}/{instance}/{attempt}", self.run),
-                action: goal.action,
+                action: goal.action.to_string(),
                 inputs: goal.inputs,
                 seed: goal.seed,
                 lease: goal.lease,
@@ -302,7 +302,7 @@ impl Performer {
 
     /// Where the provider of a goal is: the leased resource of its kind.
     fn endpoint_of(&self, goal: &Goal) -> Result<Endpoint, String> {
-        let Some(provider) = self.catalogue.providers.get(&goal.provider) else {
+        let Some(provider) = self.catalogue.providers.get(&*goal.provider) else {
             return Err(format!("the system's catalogue has no provider `{}`", goal.provider));
         };
         let leased = goal.lease.as_ref().and_then(|lease| lease.resource(&provider.resource));
