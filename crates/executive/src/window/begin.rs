@@ -156,7 +156,7 @@ impl Window {
             None
         } else {
             let view = sight.view(instance, None);
-            Some(self.look(context, instance, &view).map(|seen| (seen, view.into_used())))
+            Some(self.look(context, instance, &view).map(|seen| (seen, view.used())))
         };
         match looked {
             None => {}

@@ -152,15 +152,14 @@ impl Window {
             // Assignments may be made of the outputs.
             let view = self.sight(context).view(instance, Some(&outputs));
             let facts = facts_of(std::slice::from_ref(*expression), &view);
-            match expression.evaluate(&view) {
-                Ok(value) => {
-                    if !facts.is_nothing() {
-                        seen.facts.extend(view.facts(&facts).unwrap_or_default());
-                        seen.read.push(facts);
-                    }
-                    used.extend(view.into_used());
-                    outputs.insert(name.clone(), value);
-                }
+            let value = expression.evaluate(&view);
+            if !facts.is_nothing() {
+                seen.facts.extend(view.facts(&facts).unwrap_or_default());
+                seen.read.push(facts);
+            }
+            used.extend(view.used());
+            match value {
+                Ok(value) => drop(outputs.insert(name.clone(), value)),
                 Err(error) => {
                     // Left by an outcome of its own, before it was written: there is nobody to wait for.
                     let missing = error.is_not_yet_known() && view.blocker().is_none();
@@ -173,11 +172,10 @@ impl Window {
                 }
             }
         }
-        match failed {
-            Some(super::ready::Readiness::Waits(wait)) => return self.wait(id, wait),
-            Some(super::ready::Readiness::Failed(reason)) => return self.end_instance(id, Ended::aborted(reason)),
-            _ => {}
+        if let Some(super::ready::Readiness::Waits(wait)) = failed {
+            return self.wait(id, wait);
         }
+        // What made it fail may come out otherwise, too.
         if !parts.is_empty() {
             used.extend(self.producers_of(instance));
             used.sort_unstable();
@@ -188,12 +186,14 @@ impl Window {
                 }
             }
         }
-        let outcome =
-            if self.instances.get(id).is_some_and(|i| i.role == Role::Entry) { "success".into() } else { leaves_by };
-        if let Some(instance) = self.instances.get_mut(id) {
-            instance.seen = Some(Box::new(seen));
-        }
-        self.end_instance(id, Ended::with(outcome, outputs));
+        let Some(instance) = self.instances.get_mut(id) else { return };
+        instance.seen = Some(Box::new(seen));
+        let outcome = if instance.role == Role::Entry { SUCCESS.into() } else { leaves_by };
+        let ended = match failed {
+            Some(super::ready::Readiness::Failed(reason)) => Ended::aborted(reason),
+            _ => Ended::with(outcome, outputs),
+        };
+        self.end_instance(id, ended);
     }
 
     /// Everything older has retired: the task is over.

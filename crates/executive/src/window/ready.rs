@@ -55,7 +55,7 @@ impl Window {
         };
         let view = self.sight(context).view(instance, None);
         let readiness = self.examine_node(context, instance, &view, &mut seen);
-        (readiness, seen, view.into_used())
+        (readiness, seen, view.used())
     }
 
     fn examine_node(&self, context: &Context<'_>, instance: &Instance, view: &View<'_>, seen: &mut Seen) -> Readiness {

@@ -77,9 +77,9 @@ impl<'a> View<'a> {
         self.blocker.get()
     }
 
-    /// The older instances whose effects were used so far.
-    pub(crate) fn into_used(self) -> Vec<InstanceId> {
-        self.used.into_inner()
+    /// The older instances whose effects were used since it was asked last.
+    pub(crate) fn used(&self) -> Vec<InstanceId> {
+        self.used.take()
     }
 
     fn produced(&self, producer: &'a Producer) -> Option<&'a Outputs> {
@@ -309,13 +309,17 @@ impl<'a> View<'a> {
                 };
                 let mut undeclared = Vec::new();
                 for (key, value) in measured {
-                    let set = changes.iter_mut().find_map(|change| match change {
-                        Change::Set { fact, value } if fact == key => Some(value),
-                        _ => None,
-                    });
-                    match set {
-                        Some(predicted) => *predicted = value.clone(),
-                        None => undeclared.push(Change::Set { fact: key.clone(), value: value.clone() }),
+                    let mut declared = false;
+                    for change in &mut changes {
+                        if let Change::Set { fact, value: predicted } = change
+                            && fact == key
+                        {
+                            *predicted = value.clone();
+                            declared = true;
+                        }
+                    }
+                    if !declared {
+                        undeclared.push(Change::Set { fact: key.clone(), value: value.clone() });
                     }
                 }
                 changes.extend(undeclared.into_iter().filter(touches));
@@ -362,7 +366,7 @@ impl<'a> View<'a> {
                 Err(EvaluateError::Wrong { .. }) => return Err(blocked),
             }
             // What its effects were made of is used, too.
-            self.used.borrow_mut().extend(view.into_used());
+            self.used.borrow_mut().extend(view.used());
         }
         Ok(changes)
     }
