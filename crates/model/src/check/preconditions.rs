@@ -10,6 +10,7 @@ use crate::fact::{FactPattern, Footprint};
 use crate::id::StateId;
 use crate::program::{Program, State, StateKind, Target};
 use crate::value::Value;
+use std::collections::BTreeSet;
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let mut established = Established::default();
@@ -22,12 +23,13 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
 struct Established {
     everything: bool,
     patterns: Vec<FactPattern>,
+    known: BTreeSet<FactPattern>,
 }
 
 impl Established {
     fn add(&mut self, patterns: Vec<FactPattern>) {
         for pattern in patterns {
-            if !self.patterns.contains(&pattern) {
+            if self.known.insert(pattern.clone()) {
                 self.patterns.push(pattern);
             }
         }
