@@ -184,17 +184,16 @@ impl<'a> View<'a> {
         Ok(())
     }
 
-    /// The youngest older instance that has not retired and may write one of these facts.
+    /// The youngest older instance that has not retired and may write one of these facts, or was predicted to: who believed that
+    /// is compared when it retires.
     pub(crate) fn writer_of(&self, footprint: &Footprint) -> Option<InstanceId> {
         let mut found = None;
         self.walk(footprint, |writer, link| {
             let may = match &writer.ended {
-                Some(_) => match self.effects(writer, link, footprint, &[]) {
-                    Ok(changes) => !changes.is_empty(),
-                    Err(_) => true,
-                },
-                None => self.may_write(writer, link).overlaps(footprint),
+                Some(_) => self.effects(writer, link, footprint, &[]).map_or(true, |changes| !changes.is_empty()),
+                None => false,
             };
+            let may = may || self.may_write(writer, link).overlaps(footprint);
             if may {
                 found = Some(writer.id);
             }
