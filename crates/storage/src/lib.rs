@@ -1,0 +1,66 @@
+//! A durable log: append with group commit, snapshots, recovery. What daemons keep their state in.
+//!
+//! ```text
+//!   append ──▶ buffer ──▶ one thread: write, sync, "durable through 4711", again ──▶ answers that waited for it leave
+//! ```
+//! [`Store`] and [`Writer`] are what is promised, wherever the log is: append, read, compact, one guarded writer. [`Log`] keeps it in
+//! files. Payloads are bytes; what they mean, and in which version, is their owner's.
+//!
+//! ```
+//! use ratn_storage::{Log, Options, Store};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! # let directory = tempfile::tempdir()?;
+//! let log = Log::new(directory.path(), Options::default());
+//! let (recovered, mut writer) = log.open()?;
+//! assert!(recovered.records.is_empty());
+//! let position = writer.append(b"the arm is blocked")?; // only buffered
+//! writer.durable().wait_blocking(position)?; // on the disk: now it may be acknowledged
+//! writer.close()?;
+//! assert_eq!(log.read()?.records[0].payload, "the arm is blocked");
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! # What is promised
+//!
+//! - **Acknowledged is on the disk.** [`Durable`] never shows a position that a loss of power could take away (with
+//!   [`Durability::None`] it does: nothing waits then). What is recovered is what was acknowledged, and perhaps records behind it.
+//! - **A torn end is cut, damage is refused.** Frames are synced one after the other, so a wrong one is a torn end only if no right
+//!   one follows it. Anything else may have been acknowledged: it is an error that names the file and the byte.
+//! - **After the first error of a write or a sync nothing is accepted any more**, and no sync is tried again: the system may have
+//!   thrown away what it could not write. Reading goes on. A new start reads what is there, writes the last segment anew and syncs it.
+//! - **One writer.** A second one is refused with who has the place. One that was got past, lock and all, acknowledges nothing more.
+//! - **Bounds**: a record, what waits to be written, a segment: [`Options`]. An append beyond them is refused and never waits.
+//! - A snapshot stands for the records before it, and is written beside appends. Formats have a version; an unknown newer
+//!   one is refused before anything is touched. [`backup()`] copies a running log, [`restore()`] overwrites nothing.
+//!
+//! # Why a log and not a store
+//!
+//! Daemons keep their state in memory and only need it back after a restart: no query goes to the disk. Stores bring a tree, its
+//! compactions and its transactions for that, and the commit of a single writer costs up to twice the sync that it waits for: on a
+//! machine whose plain append and fdatasync takes 60 to 83 µs, three small puts took durably (p50) with fjall 44 µs, rusqlite
+//! (WAL) 64, heed 151, redb 166. What decides is the group commit, with one actor for many callers: which answers may leave now
+//! has to be known without a thread for each. That, and faults that can be injected one by one, is this much code.
+//!
+//! # What it costs
+//!
+//! `cargo run --release -p ratn-storage --example commit [DIRECTORY]`, records of 200 bytes, 2 cores; medians of one run each:
+//!
+//! | | a disk whose fdatasync takes 4 ms | memory, where it takes nothing |
+//! |---|---|---|
+//! | plain append and fdatasync, p50 | 3 999 µs | 0.8 µs |
+//! | commit of one writer, p50 | 3 998 µs (ratio 1.00) | 34 µs: two threads wake each other |
+//! | append, without waiting | 0.4 µs | 0.4 µs |
+//! | 64 writers, each waits for every record | 12 400 records/s (plain: 250) | 726 000 records/s |
+//! | 64 writers, each 64 records ahead | 686 000 records/s | 2 213 000 records/s |
+
+pub mod durable;
+mod error;
+pub mod log;
+pub mod store;
+
+pub use durable::{Durable, Progress};
+pub use error::{AppendError, CompactError, CompactionFailure, CopyError, Fault, OpenError, ReadError};
+pub use log::{Copied, Durability, Log, Options, backup, restore};
+pub use store::{Epoch, MakeSnapshot, Position, Record, Recovered, Snapshot, Store, TornEnd, Writer};

@@ -1,0 +1,106 @@
+//! A consistent copy of a log, made while it is written; and a log from such a copy.
+//!
+//! What is copied is read and checked as a recovery reads it. The copy is made under another name beside the target, read again, and
+//! only then gets the target's name: there is a whole backup, or none.
+
+use super::contents::{self, Contents};
+use super::files::{Disk, Files};
+use super::syncer;
+use super::{directory, make_directory, snapshot};
+use crate::error::CopyError;
+use crate::store::Position;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::{fs, io};
+
+/// What a copy holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Copied {
+    /// The last record.
+    pub through: Position,
+    /// The snapshot stands for records through this one; 0 where there is none.
+    pub snapshot: Position,
+}
+
+/// Copies a log into a directory that is empty or not there yet. Contains at least what was durable when it began. Holds the
+/// whole log in memory. Blocks.
+///
+/// # Errors
+/// Where there is no log, where it is damaged, where the target has something in it, or where the system refuses.
+pub fn backup(log: &Path, target: &Path) -> Result<Copied, CopyError> {
+    copy(log, target)
+}
+
+/// Makes a log of a backup, in a directory that is empty or not there yet: a log that exists is never overwritten. Its epochs
+/// go on from the backup's, so a writer of the log that is replaced has to be ended first. Blocks.
+///
+/// # Errors
+/// As of [`backup`].
+pub fn restore(backup: &Path, target: &Path) -> Result<Copied, CopyError> {
+    copy(backup, target)
+}
+
+fn copy(source: &Path, target: &Path) -> Result<Copied, CopyError> {
+    let contents = contents::read(source)?;
+    if contents.store.is_none() {
+        return Err(CopyError::Nothing { place: source.display().to_string() });
+    }
+    refuse_what_is_not_empty(target)?;
+    let unfinished = unfinished(target)?;
+    let written = write(&contents, &unfinished).and_then(|()| {
+        let copied = contents::read(&unfinished)?;
+        debug_assert_eq!(copied.recovered().records.len(), contents.recovered().records.len(), "a copy is the same");
+        let parent = parent(target);
+        fs::rename(&unfinished, target).map_err(failed("rename", &unfinished))?;
+        Disk.sync_directory(parent).map_err(failed("sync", parent))
+    });
+    if written.is_err() {
+        let _ = fs::remove_dir_all(&unfinished);
+    }
+    written?;
+    Ok(Copied { through: contents.last(), snapshot: contents.through() })
+}
+
+fn write(contents: &Contents, target: &Path) -> Result<(), CopyError> {
+    make_directory(&Disk, parent(target)).map_err(failed("make", parent(target)))?;
+    fs::create_dir(target).map_err(failed("make", target))?;
+    if let (Some(store), Some(taken)) = (contents.store, &contents.snapshot) {
+        snapshot::write(&Disk, target, store, taken)
+            .map_err(|(action, source)| failed(action, &directory::snapshot(target, taken.through))(source))?;
+    }
+    for segment in &contents.segments {
+        syncer::begin(&Disk, target, segment.header, &segment.frames)
+            .map_err(|(action, path, source)| failed(action, &path)(source))?;
+    }
+    Ok(())
+}
+
+fn refuse_what_is_not_empty(target: &Path) -> Result<(), CopyError> {
+    let place = || target.display().to_string();
+    match fs::read_dir(target) {
+        Ok(mut entries) => match entries.next() {
+            None => Ok(()),
+            Some(_) => Err(CopyError::NotEmpty { place: place() }),
+        },
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        Err(source) => Err(CopyError::Io { action: "list", place: place(), source }),
+    }
+}
+
+/// A name beside the target's.
+fn unfinished(target: &Path) -> Result<PathBuf, CopyError> {
+    let name = target.file_name().ok_or_else(|| CopyError::NotEmpty { place: target.display().to_string() })?;
+    let mut unfinished = OsString::from(".");
+    unfinished.push(name);
+    unfinished.push(format!(".{}.unfinished", std::process::id()));
+    Ok(parent(target).join(unfinished))
+}
+
+fn parent(path: &Path) -> &Path {
+    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+fn failed(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> CopyError {
+    let place = path.display().to_string();
+    move |source| CopyError::Io { action, place, source }
+}

@@ -1,0 +1,64 @@
+//! One writer: an advisory lock on a file that is never removed.
+//!
+//! A lock can be got past (the file is removed by hand, a copy of the directory is put in its place). The writer notices: before
+//! it acknowledges anything it looks whether the name still leads to the file that it holds. Whoever took the place later did so
+//! before reading the log, so what was acknowledged before is read by them.
+
+use super::directory;
+use crate::error::{Fault, OpenError};
+use crate::store::Epoch;
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::{Read, Write};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+/// At most so much of what a holder wrote about itself is read.
+const HOLDER_BYTES: u64 = 256;
+
+#[derive(Debug)]
+pub(super) struct Lock {
+    /// Holds the lock for as long as it is open.
+    file: File,
+    path: PathBuf,
+    inode: (u64, u64),
+}
+
+impl Lock {
+    /// Takes the writer's place.
+    pub(super) fn take(directory: &Path) -> Result<Lock, OpenError> {
+        let path = directory.join(directory::LOCK);
+        let failed = |action| {
+            let place = path.display().to_string();
+            move |source| OpenError::Io { action, place, source }
+        };
+        let mut options = OpenOptions::new();
+        let mut file =
+            options.create(true).read(true).write(true).truncate(false).open(&path).map_err(failed("open"))?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                let mut holder = String::new();
+                let read = Read::by_ref(&mut file).take(HOLDER_BYTES).read_to_string(&mut holder);
+                let known = read.is_ok() && !holder.trim().is_empty();
+                let holder = if known { holder.trim().to_owned() } else { "which one is not known".to_owned() };
+                return Err(OpenError::Held { place: directory.display().to_string(), holder });
+            }
+            Err(TryLockError::Error(source)) => return Err(failed("lock")(source)),
+        }
+        let metadata = file.metadata().map_err(failed("look at"))?;
+        Ok(Lock { file, path: path.clone(), inode: (metadata.dev(), metadata.ino()) })
+    }
+
+    /// Says to others who holds it. Only for their messages: nothing depends on it.
+    pub(super) fn describe(&mut self, epoch: Epoch) {
+        let about = format!("process {}, writer {epoch}\n", std::process::id());
+        let _ = self.file.set_len(0).and_then(|()| self.file.write_all(about.as_bytes()));
+    }
+
+    /// Whether the place is still this one's.
+    pub(super) fn check(&self) -> Result<(), Fault> {
+        let held = fs::metadata(&self.path).is_ok_and(|metadata| (metadata.dev(), metadata.ino()) == self.inode);
+        let place = || self.path.parent().unwrap_or(Path::new(".")).display().to_string();
+        if held { Ok(()) } else { Err(Fault::Fenced { place: place() }) }
+    }
+}

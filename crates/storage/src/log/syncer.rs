@@ -1,0 +1,168 @@
+//! The one thread that writes: takes all that waits, one write and one sync, says how far it is, and again.
+//!
+//! The slower the disk, the more records share a sync. After the first error nothing is written any more: a sync that failed may
+//! have thrown away what it was to write, and one that then succeeds says nothing about it.
+
+use super::Durability;
+use super::directory;
+use super::files::{Files, LogFile};
+use super::format::{FRAME_HEADER, FrameHeader, RECORD_HEADER, SEGMENT_HEADER, SegmentHeader, u32_at};
+use super::lock::Lock;
+use super::shared::{Batch, Shared};
+use crate::error::Fault;
+use crate::store::Position;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// The segment that is written.
+#[derive(Debug)]
+pub(super) struct Active {
+    pub(super) header: SegmentHeader,
+    pub(super) file: Box<dyn LogFile>,
+    pub(super) length: u64,
+}
+
+#[derive(Debug)]
+pub(super) struct Syncer {
+    pub(super) shared: Arc<Shared>,
+    pub(super) files: Arc<dyn Files>,
+    pub(super) lock: Lock,
+    pub(super) active: Active,
+    pub(super) durability: Durability,
+    pub(super) segment_bytes: u64,
+}
+
+/// Says that nobody writes any more, however the thread ended.
+struct Ended(Arc<Shared>);
+
+impl Drop for Ended {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            self.0.stop(&Fault::Ended { place: self.0.directory.display().to_string() });
+        }
+    }
+}
+
+impl Syncer {
+    pub(super) fn run(mut self) {
+        let shared = self.shared.clone();
+        let _ended = Ended(shared.clone());
+        while let Some((mut batch, rotate)) = shared.take() {
+            if let Err(fault) = self.commit(&mut batch, rotate) {
+                shared.stop(&fault);
+                return;
+            }
+            shared.give_back(batch);
+        }
+    }
+
+    fn commit(&mut self, batch: &mut Batch, rotate: bool) -> Result<(), Fault> {
+        let empty = self.active.length == SEGMENT_HEADER as u64;
+        if !empty && (rotate || self.active.length >= self.segment_bytes) {
+            self.begin_segment(batch.first)?;
+        }
+        match self.durability {
+            Durability::None => self.write(&mut batch.bytes, batch.first, batch.count),
+            Durability::Group => {
+                self.write(&mut batch.bytes, batch.first, batch.count)?;
+                self.sync(batch.last())
+            }
+            Durability::Each => self.write_each(batch),
+        }
+    }
+
+    fn write_each(&mut self, batch: &Batch) -> Result<(), Fault> {
+        let mut frame = Vec::new();
+        let mut at = FRAME_HEADER;
+        for index in 0..u64::from(batch.count) {
+            let end = at + RECORD_HEADER + u32_at(&batch.bytes, at) as usize;
+            let position = Position(batch.first.0 + index);
+            frame.clear();
+            frame.resize(FRAME_HEADER, 0);
+            frame.extend_from_slice(&batch.bytes[at..end]);
+            self.write(&mut frame, position, 1)?;
+            self.sync(position)?;
+            at = end;
+        }
+        Ok(())
+    }
+
+    /// Completes the frame, and puts it behind the others.
+    fn write(&mut self, frame: &mut [u8], first: Position, count: u32) -> Result<(), Fault> {
+        let active = &mut self.active;
+        let (header, body) = frame.split_at_mut(FRAME_HEADER);
+        let crc = active.header.checksum(active.length, first, count, body);
+        // Checked against a bound below 4 GiB when the records were appended.
+        let length = u32::try_from(body.len()).unwrap_or(u32::MAX);
+        header.copy_from_slice(&FrameHeader { length, crc, first, count }.encode());
+        active.file.write(frame).map_err(|error| self.fault("write", error))?;
+        self.active.length += frame.len() as u64;
+        Ok(())
+    }
+
+    /// What was written is acknowledged when it is on the disk and the place is still this writer's.
+    fn sync(&mut self, through: Position) -> Result<(), Fault> {
+        self.active.file.sync().map_err(|error| self.fault("sync", error))?;
+        self.lock.check()?;
+        self.shared.synced(through);
+        Ok(())
+    }
+
+    fn begin_segment(&mut self, first: Position) -> Result<(), Fault> {
+        // Only the last segment may have a torn end, however records are made durable.
+        self.active.file.sync().map_err(|error| self.fault("sync", error))?;
+        self.lock.check()?;
+        let header = SegmentHeader { number: self.active.header.number + 1, first, ..self.active.header };
+        self.active = begin(&*self.files, &self.shared.directory, header, &[])
+            .map_err(|(action, path, error)| fault(action, path, error))?;
+        self.shared.segment_begun(header.number, first);
+        Ok(())
+    }
+
+    fn fault(&self, action: &'static str, error: io::Error) -> Fault {
+        fault(action, directory::segment(&self.shared.directory, self.active.header.number), error)
+    }
+}
+
+fn fault(action: &'static str, path: PathBuf, error: io::Error) -> Fault {
+    Fault::Io { action, place: path.display().to_string(), source: Arc::new(error) }
+}
+
+/// What failed, on which file, and how.
+pub(super) type Failed = (&'static str, PathBuf, io::Error);
+
+/// Makes a segment that holds these frames. It gets its name when it is on the disk, in place of what had the name.
+pub(super) fn begin(
+    files: &dyn Files,
+    directory: &Path,
+    header: SegmentHeader,
+    frames: &[u8],
+) -> Result<Active, Failed> {
+    let path = directory::segment(directory, header.number);
+    let temporary = directory::temporary(&path);
+    let written = write_anew(files, &temporary, &header, frames)
+        .and_then(|file| files.rename(&temporary, &path).map(|()| file).map_err(|error| ("rename", error)));
+    if written.is_err() {
+        // It would keep the space that a full disk lacks.
+        let _ = files.remove(&temporary);
+    }
+    let synced = |file| {
+        files.sync_directory(directory).map_err(|error| ("sync the directory of", error))?;
+        Ok(Active { header, file, length: (SEGMENT_HEADER + frames.len()) as u64 })
+    };
+    written.and_then(synced).map_err(|(action, error)| (action, path, error))
+}
+
+fn write_anew(
+    files: &dyn Files,
+    path: &Path,
+    header: &SegmentHeader,
+    frames: &[u8],
+) -> Result<Box<dyn LogFile>, (&'static str, io::Error)> {
+    let mut file = files.create(path).map_err(|error| ("create", error))?;
+    file.write(&header.encode()).map_err(|error| ("write", error))?;
+    file.write(frames).map_err(|error| ("write", error))?;
+    file.sync().map_err(|error| ("sync", error))?;
+    Ok(file)
+}

@@ -1,0 +1,98 @@
+//! The writer's side of a log in files.
+
+use super::compaction::Compaction;
+use super::files::Files;
+use super::format::StoreId;
+use super::shared::Shared;
+use super::syncer::Syncer;
+use super::{Durability, Options};
+use crate::durable::Durable;
+use crate::error::{AppendError, CompactError, Fault};
+use crate::store::{MakeSnapshot, Position, Writer};
+use std::io;
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+
+#[derive(Debug)]
+pub(super) struct LogWriter {
+    shared: Arc<Shared>,
+    files: Arc<dyn Files>,
+    store: StoreId,
+    options: Options,
+    syncer: Option<JoinHandle<()>>,
+    compaction: Option<JoinHandle<()>>,
+}
+
+impl LogWriter {
+    pub(super) fn start(syncer: Syncer, store: StoreId, options: Options) -> io::Result<LogWriter> {
+        let (shared, files) = (syncer.shared.clone(), syncer.files.clone());
+        let syncer = thread::Builder::new().name("log-syncer".to_owned()).spawn(move || syncer.run())?;
+        Ok(LogWriter { shared, files, store, options, syncer: Some(syncer), compaction: None })
+    }
+
+    /// Writes what waits, and ends both threads.
+    fn end(&mut self) {
+        self.shared.close();
+        for thread in [self.syncer.take(), self.compaction.take()].into_iter().flatten() {
+            // Its panic has stopped the log already, with a fault.
+            let _ = thread.join();
+        }
+        self.shared.stop(&Fault::Closed);
+    }
+}
+
+impl Writer for LogWriter {
+    fn append(&mut self, record: &[u8]) -> Result<Position, AppendError> {
+        let most = self.options.record_bytes;
+        if record.len() > most {
+            return Err(AppendError::TooLarge { bytes: record.len(), most });
+        }
+        let at_once = self.options.durability == Durability::None;
+        self.shared.append(record, self.options.buffered_bytes, at_once)
+    }
+
+    fn durable(&self) -> Durable {
+        Durable::new(self.shared.watch())
+    }
+
+    fn compact(&mut self, through: Position, snapshot: MakeSnapshot) -> Result<(), CompactError> {
+        self.shared.begin_compaction(through)?;
+        if let Some(ended) = self.compaction.take() {
+            // It has said that it ended, so this waits for no more than its last instructions.
+            let _ = ended.join();
+        }
+        let (shared, files) = (self.shared.clone(), self.files.clone());
+        let compaction = Compaction { shared, files, store: self.store, through };
+        let started = thread::Builder::new().name("log-compaction".to_owned()).spawn(move || compaction.run(snapshot));
+        match started {
+            Ok(thread) => self.compaction = Some(thread),
+            Err(error) => {
+                let failure = crate::error::CompactionFailure {
+                    through,
+                    action: "start a thread for",
+                    place: self.shared.directory.display().to_string(),
+                    source: Arc::new(error),
+                };
+                self.shared.end_compaction(Err(Some(failure)));
+            }
+        }
+        Ok(())
+    }
+
+    fn close(mut self: Box<Self>) -> Result<Position, Fault> {
+        let appended = self.shared.appended();
+        self.shared.close();
+        if let Some(syncer) = self.syncer.take() {
+            let _ = syncer.join();
+        }
+        let fault = self.shared.fault();
+        self.end();
+        fault.map_or(Ok(appended), Err)
+    }
+}
+
+impl Drop for LogWriter {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
