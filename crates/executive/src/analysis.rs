@@ -165,30 +165,33 @@ fn ends(program: &Program, whole: &State, state: &State, outcome: &str) -> bool 
         .all(|state| !matches!(state.kind, StateKind::Concurrency { .. }) && !state.transitions.contains_key(outcome))
 }
 
-/// Blocks merge by maximum; what an action consumes and what exists add up as they are, but only from within.
+/// Blocks of one state add up, those of states inside of each other merge by maximum; what an action consumes and what exists
+/// add up as they are, but only from within.
 fn requirements(contained: &[&State], around: &[&State]) -> Vec<ResourceExpr> {
     let mut merged: Vec<ResourceExpr> = Vec::new();
     for (state, within) in contained.iter().map(|s| (s, true)).chain(around.iter().map(|s| (s, false))) {
+        let mut blocked: Vec<ResourceExpr> = Vec::new();
         for wanted in &state.annotations.resources {
             match wanted.operation {
-                ResourceOperation::Block => {
-                    let same = merged.iter_mut().find(|m| {
-                        m.operation == ResourceOperation::Block
-                            && m.kind == wanted.kind
-                            && m.attributes == wanted.attributes
-                    });
-                    match same {
-                        Some(have) => have.count = have.count.max(wanted.count),
-                        None => merged.push(wanted.clone()),
-                    }
-                }
+                ResourceOperation::Block => merge(&mut blocked, wanted, |have, more| have + more),
                 ResourceOperation::Exists if within => merged.push(wanted.clone()),
                 ResourceOperation::Consume if is_action(state) => merged.push(wanted.clone()),
                 _ => {}
             }
         }
+        blocked.iter().for_each(|wanted| merge(&mut merged, wanted, u32::max));
     }
     merged
+}
+
+fn merge(into: &mut Vec<ResourceExpr>, wanted: &ResourceExpr, counts: impl FnOnce(u32, u32) -> u32) {
+    let same = |have: &&mut ResourceExpr| {
+        have.operation == wanted.operation && have.kind == wanted.kind && have.attributes == wanted.attributes
+    };
+    match into.iter_mut().find(same) {
+        Some(have) => have.count = counts(have.count, wanted.count),
+        None => into.push(wanted.clone()),
+    }
 }
 
 fn is_action(state: &State) -> bool {

@@ -352,6 +352,15 @@ impl Program {
 }
 
 impl State {
+    /// Whether it is executed as one node although it contains others: what is marked so, and every preemptive concurrency.
+    pub fn is_routine(&self) -> bool {
+        match self.kind {
+            StateKind::Action { .. } => false,
+            StateKind::Concurrency { preemptive: true, .. } => true,
+            _ => self.annotations.routine,
+        }
+    }
+
     /// The lists of states that it contains: one, or one per branch, or one per region.
     pub fn lists(&self) -> Vec<&[StateId]> {
         match &self.kind {

@@ -91,9 +91,11 @@ impl Interpreter {
         if context.analysis.state(id).nature == NodeNature::Irreversible || crashes >= limit {
             return self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
         }
-        match self.routine {
+        match self.threads.get(&thread).and_then(|thread| thread.routine) {
             // In a race who waits loses: the others keep the lease, and what is left of it has to do.
-            Some(_) if self.uses_lease() && is_in_race(context.program, id) => self.project_or_run(context, thread),
+            Some(routine) if self.uses_lease(routine) && is_in_race(context.program, id) => {
+                self.project_or_run(context, thread);
+            }
             Some(_) => {}
             None => self.try_now(context, thread),
         }
@@ -101,15 +103,20 @@ impl Interpreter {
 
     /// A worker of a routine has died and nothing of it moves under the old lease any more: it gives everything back and asks for
     /// all of it again.
-    pub(super) fn renew_lease(&mut self, context: &mut Context<'_>) {
-        let in_use =
-            |thread: &u64| matches!(self.phase(*thread), Some(Phase::Acquiring | Phase::Projecting | Phase::Running));
-        if self.threads.keys().any(in_use) {
+    pub(super) fn renew_leases(&mut self, context: &mut Context<'_>) {
+        let all: Vec<u64> = self.routines.keys().copied().collect();
+        for routine in all {
+            self.renew_lease(context, routine);
+        }
+    }
+
+    fn renew_lease(&mut self, context: &mut Context<'_>, routine: u64) {
+        if self.uses_lease(routine) {
             return;
         }
-        let Some(thread) = self.stalled().first().copied() else { return };
+        let Some(thread) = self.stalled(routine).first().copied() else { return };
         let Some(instance) = self.current(thread).map(|current| current.instance) else { return };
-        let Some(routine) = &mut self.routine else { return };
+        let Some(routine) = self.routines.get_mut(&routine) else { return };
         if let Some(lease) = routine.lease.take() {
             context.commands.push(Command::Release { instance, lease: Some(lease.id), projection: None });
         }
@@ -124,19 +131,24 @@ impl Interpreter {
     /// Who has asked for the routine goes on, and whoever waited with it.
     pub(super) fn go_on_under_new_lease(&mut self, context: &mut Context<'_>, thread: u64) {
         self.project_or_run(context, thread);
-        for thread in self.stalled() {
+        let Some(routine) = self.threads.get(&thread).and_then(|thread| thread.routine) else { return };
+        for thread in self.stalled(routine) {
             self.project_or_run(context, thread);
         }
     }
 
     /// Whether anything of a routine moves under its lease, or asks for it.
-    fn uses_lease(&self) -> bool {
+    fn uses_lease(&self, routine: u64) -> bool {
         let uses = |phase| matches!(phase, Some(Phase::Acquiring | Phase::Projecting | Phase::Running));
-        self.threads.keys().any(|thread| uses(self.phase(*thread)))
+        self.threads_of(routine).any(|thread| uses(self.phase(thread)))
     }
 
-    fn stalled(&self) -> Vec<u64> {
-        self.threads.keys().copied().filter(|thread| self.phase(*thread) == Some(Phase::Stalled)).collect()
+    fn stalled(&self, routine: u64) -> Vec<u64> {
+        self.threads_of(routine).filter(|thread| self.phase(*thread) == Some(Phase::Stalled)).collect()
+    }
+
+    fn threads_of(&self, routine: u64) -> impl Iterator<Item = u64> + '_ {
+        self.threads.iter().filter(move |(_, thread)| thread.routine == Some(routine)).map(|(id, _)| *id)
     }
 }
 

@@ -7,12 +7,13 @@
 //!
 //! A thread of control has a stack of frames (the lists it is in) and does one thing at a time: [`walk`] says what is next,
 //! [`node`] lives the life of one action, [`again`] tries it anew, [`exit`] does what composite states do at their ends,
-//! [`regions`] forks and joins, [`stop`] ends what is under way.
+//! [`routine`] holds what a routine needs from its entry to its end, [`regions`] forks and joins, [`stop`] ends what is under way.
 
 mod again;
 mod exit;
 mod node;
 mod regions;
+mod routine;
 mod stop;
 mod walk;
 
@@ -23,12 +24,14 @@ use crate::protocol::Event;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, Revision, StateId};
 use ratn_model::program::StateKind;
-use ratn_model::resource::{Lease, Requirement};
+use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_world::world::World;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
+
+pub(crate) use routine::Routine;
 
 /// How often a computing or sensing node is tried when its worker dies, unless the state says otherwise.
 pub(crate) const DEFAULT_ATTEMPTS: u32 = 3;
@@ -102,6 +105,8 @@ struct Thread {
     variables: Vec<(String, Value)>,
     todo: Todo,
     current: Option<Current>,
+    /// The routine that it is in.
+    routine: Option<u64>,
 }
 
 /// How far an action is.
@@ -118,7 +123,7 @@ enum Phase {
     Running,
 }
 
-/// An action under way.
+/// An action under way, or a routine that waits for what it needs.
 struct Current {
     instance: InstanceId,
     state: StateId,
@@ -140,20 +145,13 @@ pub(crate) struct Interpreter {
     outputs: BTreeMap<StateId, Outputs>,
     /// How regions ended.
     regions: BTreeMap<StateId, String>,
-    routine: Option<Routine>,
+    routines: BTreeMap<u64, Routine>,
+    last_routine: u64,
     target: Target,
     hold: Hold,
 }
 
-/// What a routine holds for everything it contains.
-pub(crate) struct Routine {
-    /// What it asks for.
-    pub(crate) requirements: Vec<Requirement>,
-    /// What it was granted; `None` while it asks again because a worker of it died.
-    pub(crate) lease: Option<Lease>,
-}
-
-/// The thread of the state itself.
+/// The thread of the state itself, and the routine of the window that it executes.
 const MAIN: u64 = 0;
 
 impl Interpreter {
@@ -180,21 +178,23 @@ impl Interpreter {
         target: Target,
     ) -> Interpreter {
         let todo = Todo::Done { outcome: String::new(), reason: String::new() };
-        let main = Thread { frames: Vec::new(), variables, todo, current: None };
+        let main =
+            Thread { frames: Vec::new(), variables, todo, current: None, routine: routine.as_ref().map(|_| MAIN) };
         Interpreter {
             threads: BTreeMap::from([(MAIN, main)]),
             last_thread: MAIN,
             outputs,
             regions: BTreeMap::new(),
-            routine,
+            routines: routine.map(|routine| (MAIN, routine)).into_iter().collect(),
+            last_routine: MAIN,
             target,
             hold: Hold::default(),
         }
     }
 
-    /// What a routine holds now.
+    /// What the window's routine holds now.
     pub(crate) fn lease(&self) -> Option<&Lease> {
-        self.routine.as_ref()?.lease.as_ref()
+        self.routines.get(&MAIN)?.lease.as_ref()
     }
 
     /// Begins with `state`, visited at `path`.
@@ -293,7 +293,7 @@ impl Interpreter {
         }
         let progress = self.advance(context);
         if progress == Progress::Busy {
-            self.renew_lease(context);
+            self.renew_leases(context);
         }
         progress
     }
@@ -318,7 +318,7 @@ impl Interpreter {
             Target::Actual => &*context.root,
             Target::Projection { world, .. } => world,
         };
-        let none = Thread { frames: Vec::new(), variables: Vec::new(), todo: Todo::Busy, current: None };
+        let none = Thread { frames: Vec::new(), variables: Vec::new(), todo: Todo::Busy, current: None, routine: None };
         let thread = self.threads.get(&thread).unwrap_or(&none);
         let names = Scoped { interpreter: self, thread, program: context.program };
         use_scope(&Bindings { names: &names, outputs, world, unknown: &Footprint::NOTHING })

@@ -1,4 +1,4 @@
-//! One action: acquire, project, run, and what its end changes.
+//! One action: acquire, project, run, and what its end changes. A routine begins as an action does.
 
 use super::again::duration;
 use super::{Current, Interpreter, Phase, Target};
@@ -34,6 +34,9 @@ impl Interpreter {
             thread.current = Some(current);
         }
         let state = context.program.state(id);
+        if state.is_routine() {
+            return self.try_now(context, thread);
+        }
         match self.with_scope(context, thread, None, |scope| binding::unmet(state, scope)) {
             Ok(None) => self.try_now(context, thread),
             Ok(Some(reason)) => self.end_node(context, thread, reason),
@@ -48,12 +51,12 @@ impl Interpreter {
         if self.is_held(context, thread) {
             return self.set_phase(thread, Phase::Held);
         }
-        if self.routine.as_ref().is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty()) {
+        if self.routine_of(thread).is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty()) {
             return self.set_phase(thread, Phase::Stalled);
         }
         let wanted = &context.analysis.state(id).requirements;
-        if self.routine.is_some() || wanted.is_empty() {
-            return self.project_or_run(context, thread);
+        if self.routine_of(thread).is_some() || wanted.is_empty() {
+            return self.go_on(context, thread);
         }
         let state = context.program.state(id);
         match self.with_scope(context, thread, None, |scope| binding::requirements(state, wanted, scope)) {
@@ -73,18 +76,18 @@ impl Interpreter {
             let Some(current) = self.current(thread) else { continue };
             match (&current.lease, &current.projection) {
                 (_, Some(_)) => self.run(context, thread),
-                (Some(_), None) => self.project_or_run(context, thread),
+                (Some(_), None) => self.go_on(context, thread),
                 (None, None) => self.try_now(context, thread),
             }
         }
     }
 
-    /// Whether the operator lets a node not begin. A routine of the window is one PIA: what it contains is not held.
-    fn is_held(&self, context: &Context<'_>, thread: u64) -> bool {
-        self.routine.is_none() && self.is_pia(context, thread) && !self.hold.lets_begin()
+    /// Whether the operator lets a node not begin. A routine is one PIA: what it contains is not held.
+    pub(super) fn is_held(&self, context: &Context<'_>, thread: u64) -> bool {
+        self.routine_of(thread).is_none() && self.is_pia(context, thread) && !self.hold.lets_begin()
     }
 
-    fn is_pia(&self, context: &Context<'_>, thread: u64) -> bool {
+    pub(super) fn is_pia(&self, context: &Context<'_>, thread: u64) -> bool {
         let current = self.threads.get(&thread).and_then(|thread| thread.current.as_ref());
         current.is_some_and(|c| context.analysis.state(c.state).nature == NodeNature::Irreversible)
     }
@@ -93,14 +96,24 @@ impl Interpreter {
         if self.phase(thread) != Some(Phase::Acquiring) {
             return;
         }
-        if let Some(routine) = &mut self.routine {
+        if let Some(routine) = self.routine_of_mut(thread) {
             routine.lease = Some(lease);
             return self.go_on_under_new_lease(context, thread);
         }
         if let Some(current) = self.current(thread) {
             current.lease = Some(lease);
         }
-        self.project_or_run(context, thread);
+        self.go_on(context, thread);
+    }
+
+    /// It has its resources.
+    fn go_on(&mut self, context: &mut Context<'_>, thread: u64) {
+        let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
+        if context.program.state(current.state).is_routine() {
+            self.begin_routine(context, thread);
+        } else {
+            self.project_or_run(context, thread);
+        }
     }
 
     pub(super) fn set_phase(&mut self, thread: u64, phase: Phase) {
@@ -115,7 +128,7 @@ impl Interpreter {
         if !analysis.requirements.iter().any(|r| r.kind == WORLD_MODEL) {
             return self.run(context, thread);
         }
-        let lease = self.routine.as_ref().map_or(&current.lease, |routine| &routine.lease);
+        let lease = self.routine_of(thread).map_or(&current.lease, |routine| &routine.lease);
         let lease = lease.as_ref().map(|l| (l.id, l.token));
         let (instance, attempt) = (current.instance, current.attempt);
         let reads = match &analysis.reads {
@@ -152,13 +165,13 @@ impl Interpreter {
             action: action.as_str().into(),
             inputs,
             seed: seed.of_try(tries),
-            lease: self.routine.as_ref().map_or(&current.lease, |routine| &routine.lease).clone(),
+            lease: self.routine_of(thread).map_or(&current.lease, |routine| &routine.lease).clone(),
             projection: current.projection,
             expected_s: self.with_scope(context, thread, None, |scope| binding::expected_s(state, scope)),
             timeout_s: state.annotations.timeout_s,
         };
         let timeout = state.annotations.timeout_s.map(|seconds| context.now + duration(seconds));
-        if self.routine.is_none() && self.is_pia(context, thread) {
+        if self.routine_of(thread).is_none() && self.is_pia(context, thread) {
             self.hold.has_begun();
         }
         if let Some(current) = self.current(thread) {

@@ -8,7 +8,8 @@ use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind};
 impl Interpreter {
     /// Every region begins, each with its own copy of the variables.
     pub(super) fn fork(&mut self, thread: u64, state: StateId, path: String, regions: &[StateId]) {
-        let Some(variables) = self.threads.get(&thread).map(|thread| thread.variables.clone()) else { return };
+        let Some(around) = self.threads.get(&thread) else { return };
+        let (variables, routine) = (around.variables.clone(), around.routine);
         let mut threads = Vec::new();
         for region in regions {
             self.last_thread += 1;
@@ -22,7 +23,7 @@ impl Interpreter {
                 iteration: None,
                 variables: variables.len(),
             };
-            let region = Thread { frames: vec![frame], variables: variables.clone(), todo, current: None };
+            let region = Thread { frames: vec![frame], variables: variables.clone(), todo, current: None, routine };
             self.threads.insert(self.last_thread, region);
         }
         self.set(thread, Todo::Join { state, path, regions: threads });

@@ -15,6 +15,7 @@ impl Interpreter {
             self.cancel(context, thread);
             self.set(thread, Todo::Done { outcome: PREEMPTED.to_owned(), reason: String::new() });
         }
+        self.give_up_routines(context);
     }
 
     /// Another region was first: what this one has under way is cancelled, and the composite states in which it is end

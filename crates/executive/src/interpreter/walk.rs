@@ -57,6 +57,16 @@ impl Interpreter {
             Ok(Some(reason)) => return self.ended(thread, id, ABORTED, format!("{path}: {reason}")),
             Err(error) => return self.ended(thread, id, ABORTED, format!("{path}: {}", error.reason())),
         }
+        if state.is_routine() && self.routine_of(thread).is_none() {
+            return self.begin(context, thread, id, &path);
+        }
+        self.enter_composite(context, thread, id, path);
+    }
+
+    /// A composite state is entered; what it requires holds.
+    pub(super) fn enter_composite(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: String) {
+        let program = context.program;
+        let state = program.state(id);
         self.forget_inside(program, id);
         let base = self.threads.get(&thread).map_or(0, |thread| thread.variables.len());
         let mut bound = Vec::new();
@@ -249,6 +259,7 @@ impl Interpreter {
 
     /// Follows the outcome of a state that has ended.
     fn follow(&mut self, context: &mut Context<'_>, id: u64, state: StateId, outcome: String, reason: String) {
+        self.end_routine(context, id, state, &outcome);
         let Some(frame) = self.threads.get(&id).and_then(|thread| thread.frames.last()) else {
             return self.set(id, Todo::Done { outcome, reason });
         };

@@ -281,7 +281,7 @@ impl Window {
             Ok(requirements) => requirements,
             Err(error) => return self.finish(context, id, Ended::aborted(error.reason())),
         };
-        let routine = Routine { requirements, lease: instance.lease.as_deref().cloned() };
+        let routine = Routine { requirements, lease: instance.lease.as_deref().cloned(), visit: None };
         drop(view);
         let mut interpreter = Box::new(Interpreter::of_routine(variables, outputs, routine, target));
         let (state, path) = (instance.state, self.path(context.program, id));

@@ -207,8 +207,7 @@ fn plan(
     operated: &BTreeSet<&str>,
     names: &mut Names,
 ) -> StatePlan {
-    let preemptive = matches!(state.kind, StateKind::Concurrency { preemptive: true, .. });
-    let is_node = matches!(state.kind, StateKind::Action { .. }) || preemptive || state.annotations.routine;
+    let is_node = matches!(state.kind, StateKind::Action { .. }) || state.is_routine();
     let outcomes: Vec<&str> = outcomes.iter().map(String::as_str).collect();
     let target = |outcome: &str| match (state.transitions.get(outcome), outcome, next) {
         (Some(target), _, _) => target.clone(),

@@ -31,8 +31,7 @@ fn nodes(program: &Program) -> Vec<&State> {
     let (mut nodes, mut open) = (Vec::new(), vec![Program::ROOT]);
     while let Some(id) = open.pop() {
         let state = program.state(id);
-        let one = matches!(state.kind, StateKind::Action { .. } | StateKind::Concurrency { preemptive: true, .. });
-        if one || state.annotations.routine {
+        if matches!(state.kind, StateKind::Action { .. }) || state.is_routine() {
             nodes.push(state);
         } else {
             open.extend(state.children());

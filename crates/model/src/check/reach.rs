@@ -62,7 +62,7 @@ fn horizons(subject: &Subject<'_>, findings: &mut Findings) {
 }
 
 fn nodes(program: &Program, state: &State) -> usize {
-    if state.annotations.routine || matches!(state.kind, StateKind::Action { .. }) {
+    if state.is_routine() || matches!(state.kind, StateKind::Action { .. }) {
         return 1;
     }
     // Of a condition the longer branch.

@@ -107,7 +107,7 @@ fn deletes_what_it_holds(subject: &Subject<'_>, state: &State, findings: &mut Fi
 
 /// Only nodes ask the resource manager.
 fn exists_of_a_composite(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
-    if matches!(state.kind, StateKind::Action { .. }) || state.annotations.routine {
+    if matches!(state.kind, StateKind::Action { .. }) || state.is_routine() {
         return;
     }
     for (i, resource) in state.annotations.resources.iter().enumerate() {

@@ -79,7 +79,7 @@ fn around<'a>(program: &'a Program, state: &'a State) -> impl Iterator<Item = &'
 
 /// Whether the state is, or is inside of, something that the window executes as one node.
 fn is_in_routine(program: &Program, state: &State) -> bool {
-    around(program, state).any(|s| s.annotations.routine || is_preemptive(s))
+    around(program, state).any(State::is_routine)
 }
 
 fn is_preemptive(state: &State) -> bool {

@@ -1,0 +1,91 @@
+//! A routine of HSM mode: it asks for all that it contains at its entry, as one PIA if any of it is one, and holds it to its end,
+//! so that nobody comes in between. Routines and preemptive concurrencies inside of it are part of it.
+//!
+//! A routine of the window has its lease from there; it is the one that everything in its interpreter is in.
+
+use super::{Interpreter, Target};
+use crate::binding;
+use crate::context::Context;
+use crate::protocol::{Command, Note};
+use ratn_model::id::{InstanceId, StateId};
+use ratn_model::resource::{Lease, Requirement};
+
+/// What a routine holds for everything it contains.
+pub(crate) struct Routine {
+    /// What it asks for.
+    pub(crate) requirements: Vec<Requirement>,
+    /// What it was granted; `None` while it asks again because a worker of it died.
+    pub(crate) lease: Option<Lease>,
+    /// The thread that entered it, and its visit; `None` of a routine of the window.
+    pub(crate) visit: Option<(u64, StateId, InstanceId)>,
+}
+
+impl Interpreter {
+    pub(super) fn routine_of(&self, thread: u64) -> Option<&Routine> {
+        self.routines.get(&self.threads.get(&thread)?.routine?)
+    }
+
+    pub(super) fn routine_of_mut(&mut self, thread: u64) -> Option<&mut Routine> {
+        self.routines.get_mut(&self.threads.get(&thread)?.routine?)
+    }
+
+    /// It has got its resources, and what it contains begins.
+    pub(super) fn begin_routine(&mut self, context: &mut Context<'_>, thread: u64) {
+        // The pause may have begun while it waited for its resources: it keeps them.
+        if self.is_held(context, thread) {
+            return self.set_phase(thread, super::Phase::Held);
+        }
+        if self.is_pia(context, thread) {
+            self.hold.has_begun();
+        }
+        let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
+        let (id, instance, attempt, path) = (current.state, current.instance, current.attempt, current.path.clone());
+        let state = context.program.state(id);
+        let wanted = &context.analysis.state(id).requirements;
+        let requirements = self.with_scope(context, thread, None, |scope| binding::requirements(state, wanted, scope));
+        let requirements = match requirements {
+            Ok(requirements) => requirements,
+            Err(error) => return self.end_node(context, thread, error.reason()),
+        };
+        context.note(Note::Running { instance, attempt });
+        self.last_routine += 1;
+        let number = self.last_routine;
+        let Some(begun) = self.threads.get_mut(&thread) else { return };
+        let lease = begun.current.take().and_then(|current| current.lease);
+        begun.routine = Some(number);
+        self.routines.insert(number, Routine { requirements, lease, visit: Some((thread, id, instance)) });
+        self.enter_composite(context, thread, id, path);
+    }
+
+    /// A state has ended; if it is a routine, it gives back what it held.
+    pub(super) fn end_routine(&mut self, context: &mut Context<'_>, thread: u64, state: StateId, outcome: &str) {
+        let Some(of) = self.threads.get_mut(&thread) else { return };
+        let Some(number) = of.routine else { return };
+        let Some(routine) = self.routines.get(&number) else { return };
+        let Some((_, _, instance)) = routine.visit.filter(|visit| (visit.0, visit.1) == (thread, state)) else {
+            return;
+        };
+        of.routine = None;
+        context.note(Note::Finished { instance, outcome: outcome.into() });
+        self.give_up(context, number);
+        debug_assert!(matches!(self.target, Target::Actual), "a routine on a projection is the window's");
+        context.note(Note::Retired { instance });
+    }
+
+    /// The run ends: every routine under way gives back what it holds.
+    pub(super) fn give_up_routines(&mut self, context: &mut Context<'_>) {
+        let entered = self.routines.iter().filter_map(|(number, routine)| Some((*number, routine.visit?.2)));
+        for (number, instance) in entered.collect::<Vec<_>>() {
+            self.give_up(context, number);
+            context.note(Note::Squashed { instance });
+        }
+    }
+
+    fn give_up(&mut self, context: &mut Context<'_>, number: u64) {
+        let Some(routine) = self.routines.remove(&number) else { return };
+        let Some((_, _, instance)) = routine.visit else { return };
+        if let Some(lease) = routine.lease {
+            context.commands.push(Command::Release { instance, lease: Some(lease.id), projection: None });
+        }
+    }
+}
