@@ -1,28 +1,28 @@
-//! Which units serve which requirement: a maximum assignment, so that a request that can be served is.
+//! Which resources serve which requirement: a maximum assignment, so that a request that can be served is.
 //!
-//! Requirements take units greedily; where that falls short and several requirements share a kind (`PathPlanner` beside
-//! `PathPlanner{host: a}`), units are moved between them along augmenting paths (Kuhn's algorithm).
+//! Requirements take greedily; where that falls short and several requirements fit the same resources (`PathPlanner` beside
+//! `PathPlanner{host: a}`), amounts are moved between them along augmenting paths (Ford and Fulkerson).
+//! A requirement of whole units takes whole units of each resource; only of divisible ones it may be less.
 
-use crate::resource::Resources;
-use ratn_model::resource::{Requirement, ResourceOperation};
-use std::collections::{BTreeMap, BTreeSet};
-
-/// Units by resource id.
-pub(crate) type Units = BTreeMap<String, u32>;
+use crate::id::Slot;
+use crate::resource::{Resource, Units};
+use crate::resources::Resources;
+use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
+use std::collections::BTreeSet;
 
 /// How far the requirements of one request can be served.
 #[derive(Debug)]
 pub(crate) struct Assignment {
-    /// Per requirement, the units it gets (empty for `exists`).
+    /// Per requirement, what it gets (nothing for `exists`).
     pub(crate) taken: Vec<Units>,
     /// Per requirement, what is missing.
-    pub(crate) missing: Vec<u32>,
+    pub(crate) missing: Vec<Quantity>,
 }
 
 /// What counts as available.
 #[derive(Clone, Copy)]
 pub(crate) enum Available<'a> {
-    /// Free units without those that are reserved.
+    /// What is free without what is reserved.
     Free(&'a Units),
     /// Everything that exists and is not consumed, whoever holds it.
     Existing,
@@ -30,7 +30,7 @@ pub(crate) enum Available<'a> {
 
 impl Assignment {
     pub(crate) fn is_complete(&self) -> bool {
-        self.missing.iter().all(|units| *units == 0)
+        self.missing.iter().all(|amount| amount.is_zero())
     }
 
     /// The maximum assignment of what is available to the requirements.
@@ -42,21 +42,21 @@ impl Assignment {
             taken: vec![Units::new(); requirements.len()],
             used: Units::new(),
         };
-        let mut missing = vec![0; requirements.len()];
+        let mut missing = vec![Quantity::ZERO; requirements.len()];
         for (index, requirement) in requirements.iter().enumerate() {
             missing[index] = match requirement.operation {
-                ResourceOperation::Exists => {
-                    let found = u32::try_from(resources.quantity(requirement)).unwrap_or(u32::MAX);
-                    requirement.count.saturating_sub(found)
-                }
+                ResourceOperation::Exists => requirement.amount().saturating_sub(resources.quantity(requirement)),
                 _ => search.greedy(index),
             };
         }
-        for (index, units) in missing.iter_mut().enumerate() {
-            let shared = |other: &Requirement| takes(other) && other.kind == requirements[index].kind;
-            if takes(&requirements[index]) && requirements.iter().filter(|r| shared(r)).count() > 1 {
-                while *units > 0 && search.augment(index, &mut BTreeSet::new()) {
-                    *units -= 1;
+        for (index, amount) in missing.iter_mut().enumerate() {
+            if takes(&requirements[index]) && requirements.iter().filter(|other| takes(other)).count() > 1 {
+                while !amount.is_zero() {
+                    let moved = search.augment(index, *amount, grain(&requirements[index]), &mut BTreeSet::new());
+                    if moved.is_zero() {
+                        break;
+                    }
+                    *amount = amount.saturating_sub(moved);
                 }
             }
         }
@@ -73,74 +73,99 @@ struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    fn left(&self, id: &str) -> u32 {
-        let Some(resource) = self.resources.get(id) else { return 0 };
-        let used = self.used.get(id).copied().unwrap_or(0);
-        match self.available {
-            Available::Existing => resource.quantity().saturating_sub(used),
+    /// What is left of a resource, in multiples of `grain`.
+    fn left(&self, slot: Slot, resource: &Resource, grain: Quantity) -> Quantity {
+        let used = self.used.get(&slot).copied().unwrap_or_default();
+        let left = match self.available {
+            Available::Existing => resource.quantity(),
             Available::Free(reserved) => {
-                resource.free().saturating_sub(reserved.get(id).copied().unwrap_or(0)).saturating_sub(used)
+                resource.free().saturating_sub(reserved.get(&slot).copied().unwrap_or_default())
             }
-        }
+        };
+        left.saturating_sub(used).floor_to(grain)
     }
 
-    fn take(&mut self, index: usize, id: &str, units: u32) {
-        *self.used.entry(id.to_owned()).or_insert(0) += units;
-        *self.taken[index].entry(id.to_owned()).or_insert(0) += units;
+    fn take(&mut self, index: usize, slot: Slot, amount: Quantity) {
+        *self.used.entry(slot).or_default() += amount;
+        *self.taken[index].entry(slot).or_default() += amount;
     }
 
-    fn give_back(&mut self, index: usize, id: &str) {
+    fn give_back(&mut self, index: usize, slot: Slot, amount: Quantity) {
         for units in [&mut self.used, &mut self.taken[index]] {
-            if let Some(count) = units.get_mut(id) {
-                *count -= 1;
-                if *count == 0 {
-                    units.remove(id);
+            if let Some(left) = units.get_mut(&slot) {
+                *left = left.saturating_sub(amount);
+                if left.is_zero() {
+                    units.remove(&slot);
                 }
             }
         }
     }
 
+    fn candidates(&self, index: usize) -> Box<dyn Iterator<Item = (Slot, &'a Resource)> + 'a> {
+        let requirements: &'a [Requirement] = self.requirements;
+        match self.available {
+            Available::Existing => Box::new(self.resources.fitting(&requirements[index])),
+            Available::Free(_) => Box::new(self.resources.free(&requirements[index])),
+        }
+    }
+
     /// Takes what is there; returns what is missing.
-    fn greedy(&mut self, index: usize) -> u32 {
-        let resources = self.resources;
+    fn greedy(&mut self, index: usize) -> Quantity {
         let requirement = &self.requirements[index];
-        let mut wanted = requirement.count;
-        for (id, _) in resources.fitting(requirement) {
-            if wanted == 0 {
+        let (mut wanted, grain) = (requirement.amount(), grain(requirement));
+        for (slot, resource) in self.candidates(index) {
+            if wanted.is_zero() {
                 break;
             }
-            let units = self.left(id).min(wanted);
-            if units > 0 {
-                self.take(index, id, units);
-                wanted -= units;
+            if grain < Quantity::ONE && !resource.description.divisible {
+                continue;
+            }
+            let amount = self.left(slot, resource, grain).min(wanted);
+            if !amount.is_zero() {
+                self.take(index, slot, amount);
+                wanted = wanted.saturating_sub(amount);
             }
         }
         wanted
     }
 
-    /// One more unit for a requirement, if need be by moving another requirement to another resource.
-    fn augment(&mut self, index: usize, visited: &mut BTreeSet<String>) -> bool {
-        let resources = self.resources;
-        let requirement = &self.requirements[index];
-        let fitting: Vec<&str> = resources.fitting(requirement).map(|(id, _)| id).collect();
-        if let Some(id) = fitting.iter().find(|id| self.left(id) > 0) {
-            self.take(index, id, 1);
-            return true;
+    /// Up to `wanted` more for a requirement, if need be by moving another requirement to another resource. Returns how much.
+    fn augment(&mut self, index: usize, wanted: Quantity, grain: Quantity, visited: &mut BTreeSet<Slot>) -> Quantity {
+        let fitting: Vec<(Slot, &Resource)> = self
+            .candidates(index)
+            .filter(|(_, resource)| {
+                self::grain(&self.requirements[index]) == Quantity::ONE || resource.description.divisible
+            })
+            .collect();
+        for (slot, resource) in &fitting {
+            let amount = self.left(*slot, resource, grain).min(wanted).floor_to(grain);
+            if !amount.is_zero() {
+                self.take(index, *slot, amount);
+                return amount;
+            }
         }
-        for id in fitting {
-            if !visited.insert(id.to_owned()) {
+        for (slot, _) in fitting {
+            if !visited.insert(slot) {
                 continue;
             }
             for other in 0..self.requirements.len() {
-                if other != index && self.taken[other].contains_key(id) && self.augment(other, visited) {
-                    self.give_back(other, id);
-                    self.take(index, id, 1);
-                    return true;
+                let Some(held) = self.taken[other].get(&slot).copied().filter(|_| other != index) else { continue };
+                let grain = grain.max(self::grain(&self.requirements[other]));
+                let moved = self.augment(other, held.min(wanted).floor_to(grain), grain, visited);
+                if !moved.is_zero() {
+                    self.give_back(other, slot, moved);
+                    self.take(index, slot, moved);
+                    return moved;
                 }
             }
         }
-        false
+        Quantity::ZERO
     }
+}
+
+/// Whole units, unless a part of one is asked for.
+fn grain(requirement: &Requirement) -> Quantity {
+    if requirement.amount().is_whole() { Quantity::ONE } else { Quantity::from_thousandths(1) }
 }
 
 fn takes(requirement: &Requirement) -> bool {

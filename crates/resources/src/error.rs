@@ -2,6 +2,7 @@
 
 use crate::id::{SessionId, WaiterId};
 use ratn_model::id::LeaseId;
+use ratn_model::resource::Quantity;
 
 /// A refused request; the pool is as it was before.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -49,12 +50,12 @@ pub enum PoolError {
         caller: SessionId,
     },
     /// Fewer resources match than the operation takes.
-    #[error("{wanted} wanted, but {found} units of it exist")]
+    #[error("{wanted} wanted, but {found} units of it are free")]
     NotEnough {
         /// What was asked.
         wanted: String,
         /// How much there is.
-        found: u64,
+        found: Quantity,
     },
     /// A request that no pool could perform.
     #[error("{what}: {rule}")]
@@ -78,4 +79,19 @@ pub enum PoolError {
         /// Which.
         id: String,
     },
+}
+
+pub(crate) fn check_owner(
+    what: impl FnOnce() -> String,
+    owner: &SessionId,
+    caller: &SessionId,
+) -> Result<(), PoolError> {
+    if owner == caller {
+        return Ok(());
+    }
+    Err(PoolError::NotYours { what: what(), owner: owner.clone(), caller: caller.clone() })
+}
+
+pub(crate) fn malformed(what: &str, rule: &str) -> PoolError {
+    PoolError::Malformed { what: what.to_owned(), rule: rule.to_owned() }
 }

@@ -4,7 +4,9 @@ use crate::id::{SessionId, WaiterId};
 use crate::resource::ResourceView;
 use ratn_model::id::{FencingToken, LeaseId, Revision};
 use ratn_model::resource::Lease;
+use serde::{Deserialize, Serialize};
 use std::fmt;
+use std::sync::Arc;
 
 /// Something that happened while a request was handled or time went on.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,7 +26,7 @@ pub enum Notice {
         refusal: Refusal,
     },
     /// A change that watchers see.
-    Event(WatchEvent),
+    Event(Arc<WatchEvent>),
 }
 
 /// Why a waiter left the queue without a lease.
@@ -102,7 +104,7 @@ pub enum Change {
 }
 
 /// Why a lease or a resource ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum EndReason {
     /// Its holder released it, its owner deleted it.
     Asked,

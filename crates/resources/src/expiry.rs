@@ -6,6 +6,7 @@
 use crate::event::{EndReason, Refusal};
 use crate::id::{SessionId, WaiterId};
 use crate::pool::Pool;
+use crate::record::Effect;
 use ratn_model::id::LeaseId;
 use ratn_model::time::Timestamp;
 
@@ -33,7 +34,7 @@ impl Pool {
             ended = true;
             match timer {
                 Timer::Session(id) => self.end_session(&id, EndReason::SessionExpired),
-                Timer::Lease(id) => self.end_lease(id, EndReason::HeldTooLong),
+                Timer::Lease(lease) => self.commit(Effect::LeaseEnded { lease, reason: EndReason::HeldTooLong }),
                 Timer::Waiter(id) => {
                     let waited_for = self.explain(id).map(|e| e.to_string()).unwrap_or_default();
                     self.refuse(id, Refusal::Deadline { waited_for });

@@ -1,11 +1,12 @@
 //! What a waiter waits for, and whom.
 
-use crate::assignment::{Assignment, Available, Units};
+use crate::assignment::{Assignment, Available};
 use crate::id::{SessionId, WaiterId};
 use crate::pool::Pool;
 use crate::queue::Waiter;
+use crate::resource::Units;
 use ratn_model::id::LeaseId;
-use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use std::fmt;
 
 /// How many holders and waiters ahead an obstacle names at the most.
@@ -37,7 +38,7 @@ pub enum Obstacle {
         /// The requirement.
         requirement: String,
         /// How many units fit.
-        exist: u64,
+        exist: Quantity,
     },
     /// Enough is there, but others hold it.
     Held {
@@ -66,8 +67,8 @@ impl Pool {
         let obstacles = requirements
             .iter()
             .zip(free.missing.iter().zip(unreserved.missing))
-            .filter(|(_, (missing, _))| **missing > 0)
-            .map(|(requirement, (_, without_queue))| self.obstacle(id, requirement, without_queue > 0))
+            .filter(|(_, (missing, _))| !missing.is_zero())
+            .map(|(requirement, (_, without_queue))| self.obstacle(id, requirement, !without_queue.is_zero()))
             .collect();
         Some(Explanation { waiter: id, ahead, obstacles })
     }
@@ -77,14 +78,16 @@ impl Pool {
         let exist = self.resources.quantity(requirement);
         if !self.resources.has_kind(&requirement.kind) {
             Obstacle::MissingKind { requirement: text, kind: requirement.kind.clone() }
-        } else if exist < u64::from(requirement.count) {
+        } else if exist < requirement.amount() {
             Obstacle::TooFew { requirement: text, exist }
         } else if held {
             let holders = self
                 .resources
                 .fitting(requirement)
-                .flat_map(|(_, resource)| resource.holders.keys())
-                .filter_map(|lease| self.leases.get(lease).map(|r| (*lease, r.session.clone(), r.purpose.clone())))
+                .flat_map(|(_, resource)| resource.holders.iter())
+                .filter_map(|(lease, _)| {
+                    self.leases.get(lease).map(|r| (*lease, r.session.clone(), r.purpose.to_string()))
+                })
                 .take(MAX_NAMED)
                 .collect();
             Obstacle::Held { requirement: text, holders }

@@ -11,24 +11,25 @@ impl Pool {
     /// # Errors
     /// The first invariant that does not hold, in words.
     pub fn check_invariants(&self) -> Result<(), String> {
-        for (id, resource) in self.resources.iter() {
-            let held: u64 = resource.holders.values().map(|units| u64::from(*units)).sum();
-            let consumed = u64::from(resource.consumed());
+        for (slot, resource) in self.resources.iter() {
+            let id = &resource.description.id;
+            let (held, consumed, free) = (resource.held(), resource.consumed(), resource.free());
             // A provider may shrink a capacity below what is given out; then nothing more is free.
-            if resource.free() > 0 && held + consumed + u64::from(resource.free()) != u64::from(resource.spec.capacity)
-            {
-                return Err(format!("{id}: held {held} + consumed {consumed} + free is not its capacity"));
+            let capacity = resource.description.capacity;
+            ensure(free.is_zero() || held + consumed + free == capacity, || {
+                format!("{id}: held {held} + consumed {consumed} + free {free} is not its capacity {capacity}")
+            })?;
+            for (lease, amount) in &resource.holders {
+                let listed = self.leases.get(lease).map(|record| record.held.iter().filter(|(held, _)| *held == slot));
+                let listed = listed.map(|amounts| amounts.map(|(_, amount)| *amount).sum());
+                ensure(listed == Some(*amount), || format!("{id}: {lease} holds {amount} of it and lists {listed:?}"))?;
             }
-            for lease in resource.holders.keys() {
-                let known = self.leases.get(lease).is_some_and(|record| record.resources.contains(id));
-                ensure(known, || format!("{id} is held by {lease}, which does not list it"))?;
-            }
-            for session in resource.consumers.keys() {
-                let known = self.sessions.get(session).is_some_and(|s| s.consumed.contains(id));
+            for (session, _) in &resource.consumers {
+                let known = self.sessions.get(session).is_some_and(|s| s.consumed.contains(&slot));
                 ensure(known, || format!("{id} is consumed by {session}, which does not know it"))?;
             }
             if let Some(owner) = &resource.owner {
-                let known = self.sessions.get(owner).is_some_and(|s| s.provides.contains(id));
+                let known = self.sessions.get(owner).is_some_and(|s| s.provides.contains(&slot));
                 ensure(known, || format!("{id} belongs to {owner}, which does not provide it"))?;
             }
         }
@@ -40,9 +41,9 @@ impl Pool {
             ensure(self.sessions.get(&record.session).is_some_and(|s| s.leases.contains(id)), || {
                 format!("{id} belongs to {}, which does not know it", record.session)
             })?;
-            for resource in &record.resources {
-                let holds = self.resources.get(resource).is_some_and(|r| r.holders.contains_key(id));
-                ensure(holds, || format!("{id} lists {resource}, which it does not hold"))?;
+            for slot in record.slots() {
+                let holds = self.resources.get(slot).is_some_and(|r| r.holders.iter().any(|(lease, _)| lease == id));
+                ensure(holds, || format!("{id} lists {slot}, which it does not hold"))?;
             }
         }
         ensure(tokens <= self.last_token, || "a token is ahead of the counter".to_owned())?;
@@ -66,7 +67,10 @@ impl Pool {
         let owned = self.resources.iter().filter(|(_, resource)| resource.owner.is_some()).count();
         ensure(provided == owned, || "a session provides a resource that is gone".to_owned())?;
         ensure(self.timers == self.expected_timers(), || "the timers do not agree with what they are for".to_owned())?;
-        ensure(self.memory.len() <= self.limits.remembered_requests, || "the request memory is too long".to_owned())
+        ensure(self.memory.len() <= self.limits.remembered_requests, || "the request memory is too long".to_owned())?;
+        ensure(self.memory.order_agrees(), || "the order of the request memory does not agree".to_owned())?;
+        let waiting = self.queue.iter().filter(|(_, waiter)| !waiter.request_id.is_empty()).count();
+        ensure(self.memory.waiting() == waiting, || "a request id waits without a waiter".to_owned())
     }
 
     fn expected_timers(&self) -> BTreeSet<(Timestamp, Timer)> {

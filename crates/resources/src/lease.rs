@@ -1,23 +1,30 @@
-//! Live leases. How many units of each resource a lease holds is written at the resources, and only there.
+//! Live leases.
 
-use crate::id::SessionId;
+use crate::id::{SessionId, Slot};
 use crate::resource::Holding;
 use ratn_model::id::{FencingToken, LeaseId};
+use ratn_model::resource::Quantity;
 use ratn_model::time::Timestamp;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
 
 /// By id.
 pub(crate) type Leases = BTreeMap<LeaseId, LeaseRecord>;
 
-/// A live lease.
-#[derive(Debug, Clone)]
+/// A live lease. The resources know it too (as a holder), so that what is free is found without looking at every lease.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct LeaseRecord {
     pub(crate) token: FencingToken,
     pub(crate) session: SessionId,
-    /// The ids of the resources held, in order.
-    pub(crate) resources: Vec<String>,
+    /// What it holds, in the order of the requirements.
+    pub(crate) held: Vec<(Slot, Quantity)>,
+    pub(crate) hold_for: Option<Duration>,
+    pub(crate) purpose: Arc<str>,
+    /// When it ends by itself; counted anew after a restart.
+    #[serde(skip)]
     pub(crate) expires: Option<Timestamp>,
-    pub(crate) purpose: String,
 }
 
 /// A live lease as others see it.
@@ -29,27 +36,24 @@ pub struct LeaseView {
     pub token: FencingToken,
     /// Whose it is.
     pub session: SessionId,
-    /// The ids of the resources held.
+    /// The ids of the resources held, in order.
     pub resources: Vec<String>,
     /// When it ends by itself.
     pub expires: Option<Timestamp>,
     /// What it was acquired for.
-    pub purpose: String,
+    pub purpose: Arc<str>,
 }
 
 impl LeaseRecord {
-    pub(crate) fn view(&self, id: LeaseId) -> LeaseView {
-        LeaseView {
-            id,
-            token: self.token,
-            session: self.session.clone(),
-            resources: self.resources.clone(),
-            expires: self.expires,
-            purpose: self.purpose.clone(),
-        }
+    /// The slots held, each once, in order.
+    pub(crate) fn slots(&self) -> Vec<Slot> {
+        let mut slots: Vec<Slot> = self.held.iter().map(|(slot, _)| *slot).collect();
+        slots.sort_unstable();
+        slots.dedup();
+        slots
     }
 
-    pub(crate) fn holding(&self, lease: LeaseId, units: u32) -> Holding {
+    pub(crate) fn holding(&self, lease: LeaseId, units: Quantity) -> Holding {
         Holding { lease, token: self.token, session: self.session.clone(), units, purpose: self.purpose.clone() }
     }
 }

@@ -6,38 +6,56 @@
 //!   session ──keep alive──▶ session          waiter: queued ──▶ granted (a lease) ──▶ released | expired
 //!      │ no keep alive for its TTL                      └─────▶ refused (deadline, cancelled, session gone)
 //!      └▶ its resources vanish, its leases end, its waiters leave, its consumption returns
+//!
+//!   call ──▶ Pool decides ──▶ Record ──▶ apply (the only thing that changes what is durable) ──▶ events
+//!                                └──▶ log ──▶ restore: the same apply
 //! ```
 //!
-//! Pure: time comes in as an argument, whatever happens besides the direct answer comes out of [`Pool::take_notices`].
-//! What is free is computed from the live leases of a resource; nothing is counted beside them. Grants are made in
+//! Pure: time comes in as an argument, whatever happens besides the direct answer comes out of [`Pool::take_notices`], and
+//! what has to survive of it out of [`Pool::take_records`]. What is free is computed from the live leases of a resource;
+//! nothing is counted beside them. Grants are made in
 //! strict order of priority, then arrival: a waiter that cannot be served yet reserves every free unit it can use, so a
 //! later one never takes a unit that it waits for, and waiters for other kinds pass. It deliberately knows no socket,
-//! no clock and no process; who starts what a waiter lacks is the providers' business.
+//! no clock, no file and no process; who starts what a waiter lacks is the providers' business.
 
+mod acquisition;
+mod apply;
 mod assignment;
+mod consumption;
+mod creation;
 mod error;
 mod event;
 mod expiry;
 mod explain;
+mod history;
 mod id;
 mod invariants;
 mod lease;
 mod limits;
+mod memory;
 mod pool;
 mod queue;
+mod record;
 mod request;
 mod resource;
+mod resources;
 mod schedule;
 mod session;
+mod snapshot;
+mod validation;
 
 pub use error::PoolError;
 pub use event::{Change, EndReason, Notice, Refusal, WatchEvent};
 pub use explain::{Explanation, Obstacle};
+pub use history::Compacted;
 pub use id::{SessionId, WaiterId};
 pub use lease::LeaseView;
 pub use limits::Limits;
 pub use pool::Pool;
 pub use queue::AcquireRequest;
+pub use ratn_model::resource::Quantity;
+pub use record::{DecodeError, FORMAT, Record, decode, encode};
 pub use request::{Reply, Request};
-pub use resource::{ENDPOINT_ATTRIBUTE, Holding, ResourceSpec, ResourceView};
+pub use resource::{Attributes, Description, ENDPOINT_ATTRIBUTE, Holding, ResourceSpec, ResourceView};
 pub use session::SessionView;
+pub use snapshot::{RestoreError, Snapshot};

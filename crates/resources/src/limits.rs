@@ -17,7 +17,7 @@ pub struct Limits {
     pub waiters_per_session: usize,
     /// Live leases in all.
     pub leases: usize,
-    /// Requirements of one acquire, and operations of one operate.
+    /// Requirements of one acquire.
     pub requirements: usize,
     /// Units that one requirement may ask for.
     pub units: u32,
@@ -27,6 +27,10 @@ pub struct Limits {
     pub attributes: usize,
     /// Answers remembered so that a repeated request id is not performed twice; the oldest is forgotten first.
     pub remembered_requests: usize,
+    /// And for so long at the most, in milliseconds (forgotten when the next one is remembered).
+    pub remember_for_ms: u64,
+    /// Watch events kept for those who watch from an earlier revision.
+    pub history: usize,
 }
 
 impl Default for Limits {
@@ -42,6 +46,8 @@ impl Default for Limits {
             name_length: 128,
             attributes: 32,
             remembered_requests: 65_536,
+            remember_for_ms: 3_600_000,
+            history: 4_096,
         }
     }
 }

@@ -3,12 +3,13 @@
 use crate::id::{SessionId, WaiterId};
 use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
+use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 /// What an acquire asks for: all of it, or to wait.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AcquireRequest {
     /// Who asks; the lease ends with this session.
     pub session: SessionId,

@@ -1,15 +1,14 @@
 //! Mutations as values, so that each can carry a request id: the same id twice is performed once.
 
-use crate::error::PoolError;
 use crate::id::{SessionId, WaiterId};
 use crate::queue::AcquireRequest;
-use crate::resource::{ResourceSpec, ResourceView};
-use ratn_model::id::LeaseId;
+use crate::resource::ResourceSpec;
+use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Lease, Requirement};
-use std::collections::{BTreeMap, VecDeque};
+use serde::{Deserialize, Serialize};
 
 /// A mutation of the pool; each does what the method of the same name on [`crate::Pool`] does.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum Request {
     /// See [`crate::Pool::create`].
     Create {
@@ -39,13 +38,6 @@ pub enum Request {
         /// What.
         requirement: Requirement,
     },
-    /// See [`crate::Pool::operate`].
-    Operate {
-        /// Who asks.
-        session: SessionId,
-        /// Creates and deletes.
-        operations: Vec<Requirement>,
-    },
     /// See [`crate::Pool::acquire`].
     Acquire(AcquireRequest),
     /// See [`crate::Pool::release`].
@@ -65,10 +57,14 @@ pub enum Request {
 /// The answer to a [`Request`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum Reply {
-    /// To a create.
-    Created(ResourceView),
-    /// To an operate: the ids of the resources created, in order.
-    Operated(Vec<String>),
+    /// To a create: the resource's id, and the pool's revision with it. It may have changed or gone since, where the
+    /// request is a repeated one.
+    Created {
+        /// Its id.
+        id: String,
+        /// The revision.
+        revision: Revision,
+    },
     /// To an acquire: it is in the queue; a [`crate::Notice`] will tell how it ends.
     Queued(WaiterId),
     /// To an acquire repeated after it was granted.
@@ -77,61 +73,4 @@ pub enum Reply {
     Touched(Vec<String>),
     /// To the rest.
     Done,
-}
-
-/// The answers given, by request id; bounded, the oldest forgotten first.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct RequestMemory {
-    answers: BTreeMap<String, (Request, Reply)>,
-    order: VecDeque<String>,
-}
-
-impl RequestMemory {
-    /// The answer given to this request before.
-    pub(crate) fn recall(&self, id: &str, request: &Request) -> Result<Option<Reply>, PoolError> {
-        match self.answers.get(id) {
-            None => Ok(None),
-            Some((before, reply)) if *before == identity(request.clone()) => Ok(Some(reply.clone())),
-            Some(_) => Err(PoolError::RequestIdReused { id: id.to_owned() }),
-        }
-    }
-
-    pub(crate) fn reply(&self, id: &str) -> Option<Reply> {
-        self.answers.get(id).map(|(_, reply)| reply.clone())
-    }
-
-    pub(crate) fn remember(&mut self, id: String, request: Request, reply: Reply, limit: usize) {
-        if self.answers.insert(id.clone(), (identity(request), reply)).is_none() {
-            self.order.push_back(id);
-        }
-        while self.order.len() > limit {
-            if let Some(oldest) = self.order.pop_front() {
-                self.answers.remove(&oldest);
-            }
-        }
-    }
-
-    pub(crate) fn granted(&mut self, id: &str, lease: Lease) {
-        if let Some((_, reply)) = self.answers.get_mut(id) {
-            *reply = Reply::Granted(lease);
-        }
-    }
-
-    pub(crate) fn forget(&mut self, id: &str) {
-        if !id.is_empty() && self.answers.remove(id).is_some() {
-            self.order.retain(|other| other != id);
-        }
-    }
-
-    pub(crate) fn len(&self) -> usize {
-        self.order.len()
-    }
-}
-
-/// What makes two requests the same one: a repeated acquire has another deadline.
-fn identity(mut request: Request) -> Request {
-    if let Request::Acquire(acquire) = &mut request {
-        acquire.deadline = None;
-    }
-    request
 }

@@ -1,12 +1,14 @@
 //! A resource: its description, who has how much of it, and therefore what is free.
 
-use crate::id::SessionId;
+use crate::id::{SessionId, Slot};
 use crate::lease::Leases;
 use ratn_model::id::{FencingToken, LeaseId, Revision};
-use ratn_model::resource::{LeasedResource, Requirement, ResourceClass};
+use ratn_model::resource::{LeasedResource, Quantity, Requirement, ResourceClass};
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
+use std::ops::Deref;
+use std::sync::Arc;
 
 /// The attribute that says where a resource's action service is.
 pub const ENDPOINT_ATTRIBUTE: &str = "endpoint";
@@ -22,17 +24,19 @@ pub struct ResourceSpec {
     pub kind: String,
     /// Attributes; `endpoint` says where its action service is.
     pub attributes: BTreeMap<String, Value>,
-    /// How many units it has: how many may hold one at once.
-    pub capacity: u32,
+    /// How much of it there is: how many units may be held at once.
+    pub capacity: Quantity,
+    /// Whether parts of a unit can be had (battery charge), not only whole ones.
+    pub divisible: bool,
     /// Whether what a task consumed returns when the task ends.
     pub renewable: bool,
     /// The host that it is on; may be empty.
     pub host: String,
 }
 
-/// A resource as others see it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ResourceView {
+/// What a resource is; shared by everybody who looks at it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Description {
     /// Its id.
     pub id: String,
     /// Its class.
@@ -40,26 +44,39 @@ pub struct ResourceView {
     /// Its kind.
     pub kind: String,
     /// Its attributes.
-    pub attributes: BTreeMap<String, Value>,
-    /// Units in all, those consumed included.
-    pub capacity: u32,
-    /// Units that nobody holds and nobody has consumed.
-    pub free: u32,
-    /// Units consumed.
-    pub consumed: u32,
+    pub attributes: Attributes,
+    /// How much of it there is in all, what is consumed included.
+    pub capacity: Quantity,
+    /// Whether parts of a unit can be had.
+    pub divisible: bool,
     /// Whether what a task consumed returns when the task ends.
     pub renewable: bool,
     /// The host that it is on; may be empty.
     pub host: String,
+}
+
+/// Attributes by name, in order; as small as they can be.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Attributes(Box<[(Box<str>, Value)]>);
+
+/// A resource as others see it: its description (by `Deref`) and what is going on with it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ResourceView {
+    /// What it is.
+    pub description: Arc<Description>,
+    /// What nobody holds and nobody has consumed.
+    pub free: Quantity,
+    /// What is consumed.
+    pub consumed: Quantity,
     /// The session with which it vanishes.
     pub owner: Option<SessionId>,
-    /// Who has units of it now, in the order of leases.
+    /// Who holds some of it now, in the order of leases.
     pub holdings: Vec<Holding>,
     /// The pool's revision when it was created or updated.
     pub revision: Revision,
 }
 
-/// Units of a resource under a lease.
+/// An amount of a resource under a lease.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Holding {
     /// The lease.
@@ -68,30 +85,24 @@ pub struct Holding {
     pub token: FencingToken,
     /// Whose lease.
     pub session: SessionId,
-    /// How many units.
-    pub units: u32,
+    /// How much.
+    pub units: Quantity,
     /// What the lease is for.
-    pub purpose: String,
+    pub purpose: Arc<str>,
 }
 
-/// A resource in the pool. `holders` is the only record of who holds how much.
-#[derive(Debug, Clone)]
+/// A resource in the pool. `holders` is what the live leases hold of it, and there is no other count of what is taken.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Resource {
-    pub(crate) spec: ResourceSpec,
+    pub(crate) description: Arc<Description>,
     pub(crate) owner: Option<SessionId>,
     pub(crate) revision: Revision,
-    pub(crate) holders: BTreeMap<LeaseId, u32>,
-    /// What sessions have consumed of it until their task ends.
-    pub(crate) consumers: BTreeMap<SessionId, u32>,
+    /// In the order of leases.
+    pub(crate) holders: Vec<(LeaseId, Quantity)>,
+    /// What sessions have consumed of it until their task ends, in the order of sessions.
+    pub(crate) consumers: Vec<(SessionId, Quantity)>,
     /// What was consumed for good.
-    pub(crate) spent: u32,
-}
-
-/// Every resource, by id, and the ids of each kind.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Resources {
-    by_id: BTreeMap<String, Resource>,
-    by_kind: BTreeMap<String, BTreeSet<String>>,
+    pub(crate) spent: Quantity,
 }
 
 impl ResourceSpec {
@@ -102,7 +113,8 @@ impl ResourceSpec {
             class,
             kind: kind.into(),
             attributes: BTreeMap::new(),
-            capacity: 1,
+            capacity: Quantity::ONE,
+            divisible: false,
             renewable: true,
             host: String::new(),
         }
@@ -115,10 +127,24 @@ impl ResourceSpec {
         self
     }
 
-    /// With this many units.
+    /// With so much of it.
     #[must_use]
-    pub fn capacity(mut self, capacity: u32) -> ResourceSpec {
-        self.capacity = capacity;
+    pub fn capacity(mut self, capacity: impl Into<Quantity>) -> ResourceSpec {
+        self.capacity = capacity.into();
+        self
+    }
+
+    /// Of which parts of a unit can be had.
+    #[must_use]
+    pub fn divisible(mut self) -> ResourceSpec {
+        self.divisible = true;
+        self
+    }
+
+    /// On this host.
+    #[must_use]
+    pub fn host(mut self, host: impl Into<String>) -> ResourceSpec {
+        self.host = host.into();
         self
     }
 
@@ -128,51 +154,91 @@ impl ResourceSpec {
         self.attributes.insert(name.into(), value);
         self
     }
+
+    pub(crate) fn described(self, id: String) -> Description {
+        let attributes = self.attributes.into_iter().map(|(name, value)| (name.into(), value)).collect();
+        Description {
+            id,
+            class: self.class,
+            kind: self.kind,
+            attributes: Attributes(attributes),
+            capacity: self.capacity,
+            divisible: self.divisible,
+            renewable: self.renewable,
+            host: self.host,
+        }
+    }
 }
 
-impl Resource {
-    pub(crate) fn consumed(&self) -> u32 {
-        self.consumers.values().fold(self.spent, |sum, units| sum.saturating_add(*units))
+impl Attributes {
+    /// The value of an attribute.
+    pub fn get(&self, name: &str) -> Option<&Value> {
+        self.0.binary_search_by(|(known, _)| (**known).cmp(name)).ok().map(|at| &self.0[at].1)
     }
 
-    /// Units that exist and are not consumed, held or not.
-    pub(crate) fn quantity(&self) -> u32 {
-        self.spec.capacity.saturating_sub(self.consumed())
+    /// In the order of names.
+    pub fn iter(&self) -> impl ExactSizeIterator<Item = (&str, &Value)> {
+        self.0.iter().map(|(name, value)| (&**name, value))
     }
+}
 
-    /// Units that can be given away now.
-    pub(crate) fn free(&self) -> u32 {
-        self.holders.values().fold(self.quantity(), |free, units| free.saturating_sub(*units))
+impl Deref for ResourceView {
+    type Target = Description;
+
+    fn deref(&self) -> &Description {
+        &self.description
     }
+}
 
+impl Description {
+    /// Whether a requirement can be met with it.
     pub(crate) fn fits(&self, requirement: &Requirement) -> bool {
-        self.spec.kind == requirement.kind
-            && requirement.class.is_none_or(|class| class == self.spec.class)
+        self.kind == requirement.kind
+            && requirement.class.is_none_or(|class| class == self.class)
             && requirement
                 .attributes
                 .iter()
-                .all(|(name, want)| self.spec.attributes.get(name).is_some_and(|have| same(have, want)))
+                .all(|(name, want)| self.attributes.get(name).is_some_and(|have| same(have, want)))
     }
 
-    pub(crate) fn leased(&self, id: &str) -> LeasedResource {
-        let endpoint = match self.spec.attributes.get(ENDPOINT_ATTRIBUTE) {
+    pub(crate) fn leased(&self) -> LeasedResource {
+        let endpoint = match self.attributes.get(ENDPOINT_ATTRIBUTE) {
             Some(Value::String(endpoint)) => endpoint.clone(),
             _ => String::new(),
         };
-        LeasedResource { id: id.to_owned(), kind: self.spec.kind.clone(), endpoint }
+        LeasedResource { id: self.id.clone(), kind: self.kind.clone(), endpoint }
+    }
+}
+
+impl Resource {
+    pub(crate) fn new(description: Arc<Description>, owner: Option<SessionId>, revision: Revision) -> Resource {
+        let (holders, consumers, spent) = (Vec::new(), Vec::new(), Quantity::ZERO);
+        Resource { description, owner, revision, holders, consumers, spent }
     }
 
-    pub(crate) fn view(&self, id: &str, leases: &Leases) -> ResourceView {
+    pub(crate) fn consumed(&self) -> Quantity {
+        self.spent + self.consumers.iter().map(|(_, amount)| *amount).sum()
+    }
+
+    /// What exists and is not consumed, held or not.
+    pub(crate) fn quantity(&self) -> Quantity {
+        self.description.capacity.saturating_sub(self.consumed())
+    }
+
+    pub(crate) fn held(&self) -> Quantity {
+        self.holders.iter().map(|(_, amount)| *amount).sum()
+    }
+
+    /// What can be given away now.
+    pub(crate) fn free(&self) -> Quantity {
+        self.quantity().saturating_sub(self.held())
+    }
+
+    pub(crate) fn view(&self, leases: &Leases) -> ResourceView {
         ResourceView {
-            id: id.to_owned(),
-            class: self.spec.class,
-            kind: self.spec.kind.clone(),
-            attributes: self.spec.attributes.clone(),
-            capacity: self.spec.capacity,
+            description: self.description.clone(),
             free: self.free(),
             consumed: self.consumed(),
-            renewable: self.spec.renewable,
-            host: self.spec.host.clone(),
             owner: self.owner.clone(),
             holdings: self
                 .holders
@@ -184,74 +250,30 @@ impl Resource {
     }
 }
 
-impl Resources {
-    pub(crate) fn len(&self) -> usize {
-        self.by_id.len()
-    }
-
-    pub(crate) fn get(&self, id: &str) -> Option<&Resource> {
-        self.by_id.get(id)
-    }
-
-    pub(crate) fn get_mut(&mut self, id: &str) -> Option<&mut Resource> {
-        self.by_id.get_mut(id)
-    }
-
-    pub(crate) fn insert(&mut self, id: String, resource: Resource) {
-        self.by_kind.entry(resource.spec.kind.clone()).or_default().insert(id.clone());
-        self.by_id.insert(id, resource);
-    }
-
-    pub(crate) fn remove(&mut self, id: &str) -> Option<Resource> {
-        let resource = self.by_id.remove(id)?;
-        if let Some(ids) = self.by_kind.get_mut(&resource.spec.kind) {
-            ids.remove(id);
-            if ids.is_empty() {
-                self.by_kind.remove(&resource.spec.kind);
+/// Adds to an amount in a list that is ordered by its keys.
+pub(crate) fn add_to<K: Ord + Clone>(amounts: &mut Vec<(K, Quantity)>, key: &K, amount: Quantity) {
+    match amounts.binary_search_by(|(other, _)| other.cmp(key)) {
+        Ok(at) => amounts[at].1 += amount,
+        Err(at) => {
+            if amounts.is_empty() {
+                amounts.reserve_exact(1);
             }
+            amounts.insert(at, (key.clone(), amount));
         }
-        Some(resource)
-    }
-
-    /// In the order of ids.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (&String, &Resource)> {
-        self.by_id.iter()
-    }
-
-    pub(crate) fn has_kind(&self, kind: &str) -> bool {
-        self.by_kind.contains_key(kind)
-    }
-
-    /// Those that a requirement can be met with, in the order of ids.
-    pub(crate) fn fitting<'a>(
-        &'a self,
-        requirement: &'a Requirement,
-    ) -> impl Iterator<Item = (&'a str, &'a Resource)> + 'a {
-        self.by_kind
-            .get(&requirement.kind)
-            .into_iter()
-            .flatten()
-            .filter_map(|id| self.by_id.get(id).map(|resource| (id.as_str(), resource)))
-            .filter(|(_, resource)| resource.fits(requirement))
-    }
-
-    /// How many units of what fits exist, held or not, consumed ones excluded.
-    pub(crate) fn quantity(&self, requirement: &Requirement) -> u64 {
-        self.fitting(requirement).map(|(_, resource)| u64::from(resource.quantity())).sum()
-    }
-
-    /// Whether the kind index says the same as the resources do.
-    pub(crate) fn index_agrees(&self) -> bool {
-        self.by_kind.values().map(BTreeSet::len).sum::<usize>() == self.by_id.len()
-            && self
-                .by_id
-                .iter()
-                .all(|(id, resource)| self.by_kind.get(&resource.spec.kind).is_some_and(|ids| ids.contains(id)))
     }
 }
 
+/// Takes an amount out of such a list, whole.
+pub(crate) fn remove_from<K: Ord>(amounts: &mut Vec<(K, Quantity)>, key: &K) -> Option<Quantity> {
+    let at = amounts.binary_search_by(|(other, _)| other.cmp(key)).ok()?;
+    Some(amounts.remove(at).1)
+}
+
+/// By slot, which is what everything else in the pool names them by.
+pub(crate) type Units = BTreeMap<Slot, Quantity>;
+
 /// Equal, with `1` and `1.0` the same number.
-fn same(have: &Value, want: &Value) -> bool {
+pub(crate) fn same(have: &Value, want: &Value) -> bool {
     match (have.as_number(), want.as_number()) {
         (Some(a), Some(b)) => a == b,
         _ => have == want,

@@ -4,16 +4,11 @@
 //! reserves every free unit it would take: nobody behind it gets those, so it is never overtaken for what it waits for.
 //! One that asks for more than exists reserves nothing, or a missing kind would hold up everybody else.
 
-use crate::assignment::{Assignment, Available, Units};
-use crate::event::{Change, Notice};
-use crate::expiry::Timer;
+use crate::assignment::{Assignment, Available};
 use crate::id::WaiterId;
-use crate::lease::LeaseRecord;
 use crate::pool::Pool;
 use crate::queue::Waiter;
-use ratn_model::id::{FencingToken, LeaseId};
-use ratn_model::resource::{Lease, ResourceOperation};
-use std::collections::BTreeSet;
+use crate::resource::Units;
 
 impl Pool {
     /// Grants whatever can be granted.
@@ -59,60 +54,10 @@ impl Pool {
     fn satisfiable(&self, waiter: &Waiter) -> bool {
         Assignment::of(&self.resources, Available::Existing, &waiter.request.requirements).is_complete()
     }
-
-    fn grant(&mut self, id: WaiterId, assignment: Assignment) {
-        let Some(waiter) = self.queue.remove(id) else { return };
-        let session = waiter.request.session;
-        self.next_lease += 1;
-        self.last_token += 1;
-        let (lease_id, token) = (LeaseId(self.next_lease), FencingToken(self.last_token));
-        let mut leased = Vec::new();
-        let mut held: BTreeSet<String> = BTreeSet::new();
-        for (requirement, taken) in waiter.request.requirements.iter().zip(assignment.taken) {
-            if requirement.operation == ResourceOperation::Consume {
-                self.take_consumed(&session, taken);
-                continue;
-            }
-            for (resource_id, units) in taken {
-                let Some(resource) = self.resources.get_mut(&resource_id) else { continue };
-                *resource.holders.entry(lease_id).or_insert(0) += units;
-                let one = resource.leased(&resource_id);
-                leased.extend(std::iter::repeat_n(one, units as usize));
-                held.insert(resource_id);
-            }
-        }
-        if let Some(deadline) = waiter.request.deadline {
-            self.timers.remove(&(deadline, Timer::Waiter(id)));
-        }
-        let expires = waiter.request.hold_for.map(|hold_for| self.now + hold_for);
-        if let Some(expires) = expires {
-            self.timers.insert((expires, Timer::Lease(lease_id)));
-        }
-        let resources: Vec<String> = held.into_iter().collect();
-        self.leases.insert(
-            lease_id,
-            LeaseRecord {
-                token,
-                session: session.clone(),
-                resources: resources.clone(),
-                expires,
-                purpose: waiter.request.purpose,
-            },
-        );
-        if let Some(session) = self.sessions.get_mut(&session) {
-            session.waiters.remove(&id);
-            session.leases.insert(lease_id);
-        }
-        let resources = resources.iter().filter_map(|id| self.get(id)).collect();
-        let lease = Lease { id: lease_id, token, resources: leased };
-        self.memory.granted(&waiter.request_id, lease.clone());
-        self.publish(Change::LeaseGranted { lease: lease_id, token, session, resources });
-        self.notices.push(Notice::Granted { waiter: id, lease });
-    }
 }
 
 fn add(reserved: &mut Units, assignment: &Assignment) {
     for (id, units) in assignment.taken.iter().flatten() {
-        *reserved.entry(id.clone()).or_insert(0) += units;
+        *reserved.entry(*id).or_default() += *units;
     }
 }

@@ -1,6 +1,11 @@
 //! Sessions: everything that a client provides, holds, waits for or has consumed hangs on one.
 
-use crate::id::{SessionId, WaiterId};
+use crate::error::{PoolError, malformed};
+use crate::event::{EndReason, Refusal};
+use crate::expiry::Timer;
+use crate::id::{SessionId, Slot, WaiterId};
+use crate::pool::Pool;
+use crate::record::Effect;
 use ratn_model::id::LeaseId;
 use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, BTreeSet};
@@ -16,13 +21,13 @@ pub(crate) struct Session {
     /// When it expires unless kept alive.
     pub(crate) expires: Timestamp,
     /// The resources that vanish with it.
-    pub(crate) provides: BTreeSet<String>,
+    pub(crate) provides: BTreeSet<Slot>,
     /// Its leases.
     pub(crate) leases: BTreeSet<LeaseId>,
     /// Its queued acquires.
     pub(crate) waiters: BTreeSet<WaiterId>,
     /// The resources of which it has consumed something that returns at its task's end.
-    pub(crate) consumed: BTreeSet<String>,
+    pub(crate) consumed: BTreeSet<Slot>,
 }
 
 /// A session as others see it.
@@ -38,6 +43,8 @@ pub struct SessionView {
     pub expires: Timestamp,
     /// Its live leases.
     pub leases: Vec<LeaseId>,
+    /// Its queued acquires.
+    pub waiters: Vec<WaiterId>,
     /// Ids of the resources that it provides, in order.
     pub provides: Vec<String>,
 }
@@ -57,15 +64,99 @@ impl Session {
             consumed: BTreeSet::new(),
         }
     }
+}
 
-    pub(crate) fn view(&self, id: &SessionId) -> SessionView {
-        SessionView {
-            id: id.clone(),
-            name: self.name.clone(),
-            ttl: self.ttl,
-            expires: self.expires,
-            leases: self.leases.iter().copied().collect(),
-            provides: self.provides.iter().cloned().collect(),
+impl Pool {
+    /// The session lives for `ttl` from now. An unknown or expired one is opened (anew: nothing of an earlier one is left),
+    /// and the answer is true. `client` says who that is, for people. Only a new session or another `ttl` is written down.
+    ///
+    /// # Errors
+    /// A malformed name, no time to live, or too many sessions.
+    pub fn keep_alive(
+        &mut self,
+        now: Timestamp,
+        id: &SessionId,
+        client: &str,
+        ttl: Duration,
+    ) -> Result<bool, PoolError> {
+        self.advance(now);
+        if ttl.is_zero() {
+            return Err(malformed("session time to live 0", "a session lives for more than 0 seconds"));
         }
+        let kept = Effect::SessionKept { session: id.clone(), client: client.to_owned(), ttl };
+        match self.sessions.get_mut(id) {
+            Some(session) if session.ttl == ttl => {
+                self.timers.remove(&(session.expires, Timer::Session(id.clone())));
+                session.expires = self.now + ttl;
+                self.timers.insert((session.expires, Timer::Session(id.clone())));
+                Ok(false)
+            }
+            Some(_) => {
+                self.check_name("client name", client)?;
+                self.commit(kept);
+                Ok(false)
+            }
+            None => {
+                self.check_name("session id", id.as_str())?;
+                self.check_name("client name", client)?;
+                if self.sessions.len() >= self.limits.sessions {
+                    return Err(PoolError::TooMany { what: "sessions", limit: self.limits.sessions });
+                }
+                self.commit(kept);
+                Ok(true)
+            }
+        }
+    }
+
+    /// Ends a session and everything that hangs on it.
+    ///
+    /// # Errors
+    /// An unknown or expired session.
+    pub fn close_session(&mut self, now: Timestamp, id: &SessionId) -> Result<(), PoolError> {
+        self.advance(now);
+        self.session(id)?;
+        self.end_session(id, EndReason::SessionClosed);
+        self.schedule();
+        Ok(())
+    }
+
+    /// Every session, in the order of ids.
+    pub fn sessions(&self) -> Vec<SessionView> {
+        let ids = |slots: &BTreeSet<Slot>| {
+            let mut ids: Vec<String> = slots.iter().filter_map(|slot| self.id_of(*slot)).collect();
+            ids.sort_unstable();
+            ids
+        };
+        let view = |(id, session): (&SessionId, &Session)| SessionView {
+            id: id.clone(),
+            name: session.name.clone(),
+            ttl: session.ttl,
+            expires: session.expires,
+            leases: session.leases.iter().copied().collect(),
+            waiters: session.waiters.iter().copied().collect(),
+            provides: ids(&session.provides),
+        };
+        self.sessions.iter().map(view).collect()
+    }
+
+    pub(crate) fn session(&self, id: &SessionId) -> Result<&Session, PoolError> {
+        self.sessions.get(id).ok_or_else(|| PoolError::UnknownSession { session: id.clone() })
+    }
+
+    pub(crate) fn end_session(&mut self, id: &SessionId, reason: EndReason) {
+        let Some(session) = self.sessions.get(id).cloned() else { return };
+        for waiter in session.waiters {
+            self.refuse(waiter, Refusal::SessionEnded);
+        }
+        for lease in session.leases {
+            self.commit(Effect::LeaseEnded { lease, reason });
+        }
+        if !session.consumed.is_empty() {
+            self.commit(Effect::TaskEnded { session: id.clone() });
+        }
+        for slot in session.provides {
+            self.commit(Effect::ResourceDeleted { slot, reason });
+        }
+        self.commit(Effect::SessionEnded { session: id.clone() });
     }
 }

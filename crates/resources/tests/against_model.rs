@@ -218,7 +218,7 @@ fn compare(pool: &mut Pool, model: &mut Model, last_token: &mut FencingToken) ->
     let mut free = [0; 3];
     for resource in pool.list() {
         let kind = KINDS.iter().position(|kind| *kind == resource.kind).unwrap();
-        free[kind] += resource.free;
+        free[kind] += resource.free.units();
     }
     prop_assert_eq!(free, [model.free(0), model.free(1), model.free(2)]);
     prop_assert_eq!(pool.waiters().len(), model.queue.len());

@@ -37,7 +37,7 @@ impl Bench {
     }
 
     fn create(&mut self, owner: &str, spec: ResourceSpec) -> String {
-        self.pool.create(self.now, Some(&session(owner)), spec).unwrap().id
+        self.pool.create(self.now, Some(&session(owner)), spec).unwrap().id.clone()
     }
 
     fn at(&mut self, seconds: f64) -> Vec<Notice> {
@@ -292,7 +292,7 @@ fn what_is_consumed_returns_when_the_task_ends() {
     bench.pool.release(bench.now, None, lease.id).unwrap();
     assert_eq!(bench.pool.get("Slot-1").unwrap().free, 1);
     let refused = bench.pool.consume(bench.now, &session("b"), &consume);
-    assert_eq!(refused, Err(PoolError::NotEnough { wanted: "consume Slot × 2".into(), found: 1 }));
+    assert_eq!(refused, Err(PoolError::NotEnough { wanted: "consume Slot × 2".into(), found: 1.into() }));
     bench.pool.end_task(bench.now, &session("b")).unwrap();
     assert_eq!(bench.pool.get("Slot-1").unwrap().free, 3);
 }
@@ -307,7 +307,7 @@ fn what_is_consumed_of_something_not_renewable_is_gone() {
     assert!(bench.pool.get(&id).is_none(), "it went with its provider's session");
     let mut bench = Bench::new();
     let spec = ResourceSpec { renewable: false, ..ResourceSpec::new(ResourceClass::System, "Battery").capacity(100) };
-    let id = bench.pool.create(bench.now, None, spec).unwrap().id;
+    let id = bench.pool.create(bench.now, None, spec).unwrap().id.clone();
     bench.granted("b", &[requirement(ResourceOperation::Consume, "Battery", 30)]);
     bench.at(11.0);
     assert_eq!(bench.pool.get(&id).unwrap().free, 70);
@@ -349,17 +349,19 @@ fn a_deleted_resource_is_lost_to_its_holder_and_the_rest_of_the_lease_stays() {
 }
 
 #[test]
-fn creates_and_deletes_of_a_state_happen_together_or_not_at_all() {
+fn units_are_deleted_all_or_none_and_a_resource_without_units_is_gone() {
     let mut bench = Bench::new();
-    let create = requirement(ResourceOperation::Create, "box_delivered", 3);
     let delete = |count| requirement(ResourceOperation::Delete, "box_delivered", count);
-    assert_eq!(bench.pool.operate(bench.now, &session("b"), &[create.clone(), delete(1)]).unwrap().len(), 1);
-    assert_eq!(bench.pool.exists(&requirement(ResourceOperation::Exists, "box_delivered", 1)), 2);
+    for count in [2, 3] {
+        bench.create("b", ResourceSpec::new(ResourceClass::Task, "box_delivered").capacity(count));
+    }
     bench.notices();
-    let refused = bench.pool.operate(bench.now, &session("b"), &[create, delete(6)]);
-    assert_eq!(refused, Err(PoolError::NotEnough { wanted: "delete box_delivered × 6".into(), found: 5 }));
-    assert!(bench.notices().is_empty(), "no trace of it");
+    let refused = bench.pool.delete_units(bench.now, &session("b"), &delete(6));
+    assert_eq!(refused, Err(PoolError::NotEnough { wanted: "delete box_delivered × 6".into(), found: 5.into() }));
+    assert!(bench.notices().is_empty() && bench.pool.take_records().len() == 4, "no trace of it");
     assert_eq!(bench.pool.delete_units(bench.now, &session("b"), &delete(2)).unwrap(), ["box_delivered-1"]);
+    assert_eq!(bench.pool.exists(&requirement(ResourceOperation::Exists, "box_delivered", 1)), 3);
+    assert_eq!(bench.pool.delete_units(bench.now, &session("b"), &delete(3)).unwrap(), ["box_delivered-2"]);
     assert!(bench.pool.list().is_empty(), "a resource without units is gone");
 }
 

@@ -345,7 +345,7 @@ impl Simulation<'_> {
             resources.iter().find(|id| matches!(class(id), Some(ResourceClass::Process | ResourceClass::Module)));
         let Some(resource) = worker.and_then(|id| self.pool.get(id)) else { return Ok(()) };
         self.pool.delete(self.now, None, &resource.id).map_err(|e| self.broken(e))?;
-        let spec = ResourceSpec::new(resource.class, resource.kind).id(resource.id).capacity(resource.capacity);
+        let spec = ResourceSpec::new(resource.class, &resource.kind).id(&resource.id).capacity(resource.capacity);
         self.pool.create(self.now, None, spec).map_err(|e| self.broken(e))?;
         // With whatever else is under it, it is still to be given back.
         if !self.pool.leases().iter().any(|held| held.id == lease) {
@@ -450,8 +450,14 @@ impl Simulation<'_> {
             Command::Operate { operations, .. } => {
                 for operation in &operations {
                     let done = match operation.operation {
-                        ResourceOperation::Consume => self.pool.consume(self.now, &self.session, operation),
-                        _ => self.pool.operate(self.now, &self.session, std::slice::from_ref(operation)),
+                        ResourceOperation::Consume => self.pool.consume(self.now, &self.session, operation).map(drop),
+                        ResourceOperation::Create => {
+                            let class = operation.class.unwrap_or(ResourceClass::Task);
+                            let mut spec = ResourceSpec::new(class, &operation.kind).capacity(operation.count);
+                            spec.attributes = operation.attributes.clone();
+                            self.pool.create(self.now, Some(&self.session), spec).map(drop)
+                        }
+                        _ => self.pool.delete_units(self.now, &self.session, operation).map(drop),
                     };
                     done.map_err(|e| self.broken(e))?;
                 }
@@ -509,13 +515,16 @@ impl Simulation<'_> {
     fn task_resources(&self) -> BTreeMap<String, u64> {
         let mut units = BTreeMap::new();
         for resource in self.pool.list().into_iter().filter(|r| r.class == ResourceClass::Task) {
-            *units.entry(resource.kind).or_default() += u64::from(resource.capacity - resource.consumed);
+            let left = resource.capacity.saturating_sub(resource.consumed);
+            *units.entry(resource.kind.clone()).or_default() += u64::from(left.units());
         }
         units
     }
 
     /// The pool's answers become events.
     fn answers(&mut self) {
+        // Nothing of a simulated pool is kept.
+        drop(self.pool.take_records());
         for notice in self.pool.take_notices() {
             let (waiter, lease) = match notice {
                 Notice::Granted { waiter, lease } => (waiter, Some(lease)),

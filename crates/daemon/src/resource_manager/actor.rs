@@ -12,7 +12,7 @@ use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{ResourceEvent, ResourceUpdate};
 use ratn_resources::{
-    AcquireRequest, Change, Notice, Pool, PoolError, Reply, Request, ResourceView, SessionId, WaiterId,
+    AcquireRequest, Change, Notice, Pool, PoolError, Quantity, Reply, Request, ResourceView, SessionId, WaiterId,
 };
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -80,7 +80,11 @@ pub(super) enum Message {
     },
     Find {
         requirement: Requirement,
-        answer: oneshot::Sender<(u64, Vec<String>)>,
+        answer: oneshot::Sender<(Quantity, Vec<String>)>,
+    },
+    Get {
+        id: String,
+        answer: oneshot::Sender<Option<ResourceView>>,
     },
     List {
         answer: oneshot::Sender<(Vec<ResourceView>, Revision)>,
@@ -246,6 +250,7 @@ impl Actor {
                 let fitting = self.pool.fitting(&requirement);
                 let _ = answer.send((self.pool.exists(&requirement), fitting));
             }
+            Message::Get { id, answer } => drop(answer.send(self.pool.get(&id))),
             Message::List { answer } => drop(answer.send((self.pool.list(), self.pool.revision()))),
             Message::Watch { answer } => drop(answer.send(self.watch())),
         }
@@ -295,7 +300,7 @@ impl Actor {
             return Err(retry_later(Code::ResourceExhausted, "TOO_MANY", message, Duration::from_secs(1)));
         }
         let (sender, updates) = mpsc::channel(WATCH_BUFFER);
-        let resources = self.pool.list().into_iter().map(wire::resource).collect();
+        let resources = self.pool.list().iter().map(wire::resource).collect();
         let (revision, youngest) = (self.pool.revision(), self.pool.youngest_lease());
         let snapshot = ResourceUpdate::Snapshot { revision, resources, youngest };
         sender
@@ -309,6 +314,8 @@ impl Actor {
     fn deliver(&mut self) {
         loop {
             let notices = self.pool.take_notices();
+            // Nothing is kept over a restart yet.
+            drop(self.pool.take_records());
             if notices.is_empty() {
                 return;
             }
@@ -318,7 +325,7 @@ impl Actor {
                         if let Change::LeaseEnded { lease, .. } = &event.change {
                             self.shared.remove(lease);
                         }
-                        wire::events(event).into_iter().for_each(|event| self.publish(event));
+                        wire::events(&event).into_iter().for_each(|event| self.publish(event));
                     }
                     Notice::Granted { waiter, lease } => {
                         let id = lease.id;

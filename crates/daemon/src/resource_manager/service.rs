@@ -101,14 +101,19 @@ impl v1::resource_service_server::ResourceService for Service {
             class: resource.class,
             kind: resource.kind,
             attributes: resource.attributes,
-            capacity: resource.capacity,
+            capacity: resource.capacity.into(),
+            divisible: false,
             renewable: true,
             host: resource.host,
         };
         let session = optional_session(&request.session_id)?;
         let (reply, _) = self.perform(request.request_id, PoolRequest::Create { session, spec }).await?;
-        let Reply::Created(view) = reply else { return Err(odd_reply(&reply)) };
-        Ok(Response::new(v1::CreateResponse { resource: Some(wire::resource(view).into()) }))
+        let Reply::Created { id, .. } = reply else { return Err(odd_reply(&reply)) };
+        let Some(view) = self.actor.ask(|answer| Message::Get { id: id.clone(), answer }).await? else {
+            let message = format!("`{id}` was created by this request and is gone since");
+            return Err(status(Code::NotFound, "RESOURCE_UNKNOWN", message));
+        };
+        Ok(Response::new(v1::CreateResponse { resource: Some(wire::resource(&view).into()) }))
     }
 
     async fn consume(&self, request: Request<v1::ConsumeRequest>) -> Result<Response<v1::ConsumeResponse>, Status> {
@@ -201,7 +206,7 @@ impl v1::resource_service_server::ResourceService for Service {
 
     async fn exists(&self, request: Request<v1::ExistsRequest>) -> Result<Response<v1::ExistsResponse>, Status> {
         let requirement: Requirement = required(request.into_inner().requirement, "requirement")?;
-        let wanted = u64::from(requirement.count);
+        let wanted = requirement.amount();
         let (units, resource_ids) = self.actor.ask(|answer| Message::Find { requirement, answer }).await?;
         Ok(Response::new(v1::ExistsResponse { exists: units >= wanted, resource_ids }))
     }
@@ -209,7 +214,7 @@ impl v1::resource_service_server::ResourceService for Service {
     async fn list(&self, request: Request<v1::ListRequest>) -> Result<Response<v1::ListResponse>, Status> {
         let kinds: BTreeSet<String> = request.into_inner().kinds.into_iter().collect();
         let (views, revision) = self.actor.ask(|answer| Message::List { answer }).await?;
-        let wanted = views.into_iter().filter(|view| kinds.is_empty() || kinds.contains(&view.kind));
+        let wanted = views.iter().filter(|view| kinds.is_empty() || kinds.contains(&view.kind));
         let resources = all(wanted.map(wire::resource));
         Ok(Response::new(v1::ListResponse { resources, revision: revision.0 }))
     }

@@ -1,0 +1,180 @@
+//! Acquire, and how one ends: granted, refused, withdrawn, released.
+
+use crate::assignment::{Assignment, Available};
+use crate::error::{PoolError, check_owner, malformed};
+use crate::event::{EndReason, Notice, Refusal};
+use crate::expiry::Timer;
+use crate::id::{SessionId, WaiterId};
+use crate::lease::LeaseRecord;
+use crate::memory::{Recalled, Remembered};
+use crate::pool::Pool;
+use crate::queue::{AcquireRequest, Waiter};
+use crate::record::Effect;
+use crate::resource::Units;
+use ratn_model::id::{FencingToken, LeaseId};
+use ratn_model::resource::{Lease, ResourceOperation};
+use ratn_model::time::Timestamp;
+
+impl Pool {
+    /// Asks for several resources, all or nothing. How it ends comes as a [`Notice`], at once where it can be granted.
+    ///
+    /// # Errors
+    /// An unknown session, other operations than block, consume and exists, a passed deadline, a full queue.
+    pub fn acquire(&mut self, now: Timestamp, request: AcquireRequest) -> Result<WaiterId, PoolError> {
+        self.advance(now);
+        self.enqueue(request, "", 0)
+    }
+
+    /// Takes a waiter out of the queue.
+    ///
+    /// # Errors
+    /// A waiter that has been answered already.
+    pub fn cancel(&mut self, now: Timestamp, id: WaiterId) -> Result<(), PoolError> {
+        self.advance(now);
+        self.queue.get(id).ok_or(PoolError::UnknownWaiter { waiter: id })?;
+        self.refuse(id, Refusal::Cancelled);
+        self.schedule();
+        Ok(())
+    }
+
+    /// Undoes an acquire by its request id: takes it out of the queue, or ends the lease that it was granted. False when
+    /// there is nothing to undo.
+    ///
+    /// # Errors
+    /// An acquire of another session.
+    pub fn withdraw(&mut self, now: Timestamp, caller: &SessionId, request_id: &str) -> Result<bool, PoolError> {
+        self.advance(now);
+        match self.memory.reply(request_id) {
+            Some(Recalled::Waiting(id)) => {
+                let Some(waiter) = self.queue.get(id) else { return Ok(false) };
+                check_owner(|| id.to_string(), &waiter.request.session, caller)?;
+                self.refuse(id, Refusal::Cancelled);
+            }
+            Some(Recalled::Answered(Remembered::Granted(lease))) => {
+                let Some(record) = self.leases.get(&lease) else { return Ok(false) };
+                check_owner(|| lease.to_string(), &record.session, caller)?;
+                self.commit(Effect::LeaseEnded { lease, reason: EndReason::Asked });
+            }
+            _ => return Ok(false),
+        }
+        self.schedule();
+        Ok(true)
+    }
+
+    /// Ends a lease. `None` as session may release anything.
+    ///
+    /// # Errors
+    /// An unknown or ended lease, or one of another session.
+    pub fn release(&mut self, now: Timestamp, session: Option<&SessionId>, id: LeaseId) -> Result<(), PoolError> {
+        self.advance(now);
+        let record = self.leases.get(&id).ok_or(PoolError::UnknownLease { lease: id })?;
+        if let Some(caller) = session {
+            check_owner(|| id.to_string(), &record.session, caller)?;
+        }
+        self.commit(Effect::LeaseEnded { lease: id, reason: EndReason::Asked });
+        self.schedule();
+        Ok(())
+    }
+
+    pub(crate) fn enqueue(
+        &mut self,
+        request: AcquireRequest,
+        request_id: &str,
+        fingerprint: u128,
+    ) -> Result<WaiterId, PoolError> {
+        use ResourceOperation::{Block, Consume, Exists};
+        let session = self.session(&request.session)?;
+        if session.waiters.len() >= self.limits.waiters_per_session {
+            return Err(PoolError::TooMany { what: "waiters of one session", limit: self.limits.waiters_per_session });
+        }
+        if self.queue.len() >= self.limits.waiters {
+            return Err(PoolError::TooMany { what: "waiters", limit: self.limits.waiters });
+        }
+        self.check_requirements(&request.requirements, &[Block, Consume, Exists])?;
+        if request.purpose.chars().count() > self.limits.name_length {
+            return Err(malformed("purpose", &format!("at most {} characters", self.limits.name_length)));
+        }
+        if request.deadline.is_some_and(|deadline| deadline <= self.now) {
+            return Err(malformed("deadline", "it lies in the future"));
+        }
+        self.next_waiter += 1;
+        let id = WaiterId(self.next_waiter);
+        if let Some(deadline) = request.deadline {
+            self.timers.insert((deadline, Timer::Waiter(id)));
+        }
+        if let Some(session) = self.sessions.get_mut(&request.session) {
+            session.waiters.insert(id);
+        }
+        if !request_id.is_empty() {
+            self.memory.wait(request_id, fingerprint, id);
+        }
+        // Nothing became free: only the new one can be served, and only if there is enough for it beside what is held.
+        let available = Available::Free(&Units::new());
+        let may_be_served = Assignment::of(&self.resources, available, &request.requirements).is_complete();
+        self.queue.insert(id, Waiter { request, request_id: request_id.to_owned() });
+        if may_be_served {
+            self.schedule();
+        }
+        Ok(id)
+    }
+
+    /// Gives a waiter what was found for it.
+    pub(crate) fn grant(&mut self, id: WaiterId, assignment: Assignment) {
+        let Some((waiter, fingerprint)) = self.leave(id) else { return };
+        let request = waiter.request;
+        let mut held = Vec::new();
+        for (requirement, taken) in request.requirements.iter().zip(assignment.taken) {
+            if requirement.operation == ResourceOperation::Consume {
+                self.commit_consumed(&request.session, taken);
+            } else {
+                taken.into_iter().for_each(|(slot, amount)| crate::apply::join(&mut held, slot, amount));
+            }
+        }
+        held.shrink_to_fit();
+        let (lease, token) = (LeaseId(self.last_lease + 1), FencingToken(self.last_token + 1));
+        let granted = LeaseRecord {
+            token,
+            session: request.session,
+            held,
+            hold_for: request.hold_for,
+            purpose: request.purpose.into(),
+            expires: None,
+        };
+        self.commit(Effect::LeaseGranted { lease, granted });
+        self.remember(waiter.request_id, fingerprint, Remembered::Granted(lease));
+        if let Some(lease) = self.lease(lease) {
+            self.notices.push(Notice::Granted { waiter: id, lease });
+        }
+    }
+
+    pub(crate) fn refuse(&mut self, id: WaiterId, refusal: Refusal) {
+        if self.leave(id).is_some() {
+            self.notices.push(Notice::Refused { waiter: id, refusal });
+        }
+    }
+
+    /// The lease as its holder gets it; without what it has lost since.
+    pub(crate) fn lease(&self, id: LeaseId) -> Option<Lease> {
+        let record = self.leases.get(&id)?;
+        let mut resources = Vec::new();
+        for (slot, amount) in &record.held {
+            let Some(resource) = self.resources.get(*slot) else { continue };
+            let units = if amount.is_whole() && !resource.description.divisible { amount.units() } else { 1 };
+            resources.extend(std::iter::repeat_n(resource.description.leased(), units as usize));
+        }
+        Some(Lease { id, token: record.token, resources })
+    }
+
+    /// Takes a waiter from everywhere; with the fingerprint of its request.
+    fn leave(&mut self, id: WaiterId) -> Option<(Waiter, u128)> {
+        let waiter = self.queue.remove(id)?;
+        if let Some(deadline) = waiter.request.deadline {
+            self.timers.remove(&(deadline, Timer::Waiter(id)));
+        }
+        if let Some(session) = self.sessions.get_mut(&waiter.request.session) {
+            session.waiters.remove(&id);
+        }
+        let fingerprint = self.memory.waited(&waiter.request_id).unwrap_or_default();
+        Some((waiter, fingerprint))
+    }
+}

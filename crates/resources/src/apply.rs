@@ -1,0 +1,200 @@
+//! The only place where what is durable changes: an effect is applied, when it happens as when its record is read back.
+//!
+//! [`Pool::commit`] applies and writes down; restoring applies alone. So what is restored cannot differ from what was.
+//! Each effect also tells the watchers, which makes the revision a function of the records.
+
+use crate::event::{Change, Notice, WatchEvent};
+use crate::expiry::Timer;
+use crate::id::{SessionId, Slot};
+use crate::lease::LeaseRecord;
+use crate::pool::Pool;
+use crate::record::{Effect, Record};
+use crate::resource::{Resource, ResourceView, add_to, remove_from};
+use crate::session::Session;
+use ratn_model::id::{LeaseId, Revision};
+use ratn_model::resource::Quantity;
+use std::sync::Arc;
+
+/// An effect that does not fit the pool: a record was lost, or is not of this pool.
+pub(crate) type Misfit = String;
+
+impl Pool {
+    /// Makes a change and writes it down.
+    pub(crate) fn commit(&mut self, effect: Effect) {
+        let applied = self.apply(&effect);
+        debug_assert_eq!(applied, Ok(()), "the pool made an effect that does not fit it: {effect:?}");
+        self.records.push(Record(effect));
+    }
+
+    /// Makes a change.
+    pub(crate) fn apply(&mut self, effect: &Effect) -> Result<(), Misfit> {
+        match effect {
+            Effect::SessionKept { session, client, ttl } => {
+                let expires = self.now + *ttl;
+                if let Some(known) = self.sessions.get_mut(session) {
+                    self.timers.remove(&(known.expires, Timer::Session(session.clone())));
+                    (known.ttl, known.expires) = (*ttl, expires);
+                    known.name.clone_from(client);
+                } else {
+                    self.sessions.insert(session.clone(), Session::new(client.clone(), *ttl, expires));
+                }
+                self.timers.insert((expires, Timer::Session(session.clone())));
+                Ok(())
+            }
+            Effect::SessionEnded { session } => {
+                let known = self.sessions.remove(session).ok_or_else(|| format!("{session} is not there"))?;
+                self.timers.remove(&(known.expires, Timer::Session(session.clone())));
+                Ok(())
+            }
+            Effect::ResourceCreated { slot, description, owner, numbered } => {
+                let revision = Revision(self.revision.0 + 1);
+                let resource = Resource::new(description.clone(), owner.clone(), revision);
+                if !self.resources.insert(*slot, resource) {
+                    return Err(format!("`{}` or {slot} is there already", description.id));
+                }
+                self.last_number = (*numbered).max(self.last_number);
+                if let Some(owner) = owner {
+                    self.session_mut(owner)?.provides.insert(*slot);
+                }
+                let view = self.view(*slot)?;
+                self.publish(Change::ResourceCreated(view));
+                Ok(())
+            }
+            Effect::ResourceUpdated { slot, description } => {
+                let revision = Revision(self.revision.0 + 1);
+                let changed = self.resources.change(*slot, |resource| {
+                    resource.description = description.clone();
+                    resource.revision = revision;
+                });
+                changed.ok_or_else(|| missing(*slot))?;
+                self.updated(*slot)
+            }
+            Effect::ResourceDeleted { slot, reason } => {
+                let view = self.view(*slot)?;
+                let resource = self.resources.remove(*slot).ok_or_else(|| missing(*slot))?;
+                if let Some(owner) = &resource.owner {
+                    self.session_mut(owner)?.provides.remove(slot);
+                }
+                for (session, _) in &resource.consumers {
+                    self.session_mut(session)?.consumed.remove(slot);
+                }
+                for (lease, _) in resource.holders {
+                    let record = self.leases.get_mut(&lease).ok_or_else(|| format!("{lease} is not there"))?;
+                    record.held.retain(|(held, _)| held != slot);
+                    let (token, session) = (record.token, record.session.clone());
+                    self.publish(Change::ResourceLost { lease, token, session, resource: view.clone() });
+                }
+                self.publish(Change::ResourceDeleted { resource: view, reason: *reason });
+                Ok(())
+            }
+            Effect::Consumed { session, slot, amount } => {
+                let renewable = self.resources.change(*slot, |resource| {
+                    if resource.description.renewable {
+                        add_to(&mut resource.consumers, session, *amount);
+                    } else {
+                        resource.spent += *amount;
+                    }
+                    resource.description.renewable
+                });
+                if renewable.ok_or_else(|| missing(*slot))? {
+                    self.session_mut(session)?.consumed.insert(*slot);
+                }
+                self.updated(*slot)
+            }
+            Effect::TaskEnded { session } => {
+                for slot in std::mem::take(&mut self.session_mut(session)?.consumed) {
+                    self.resources.change(slot, |resource| remove_from(&mut resource.consumers, session));
+                    self.updated(slot)?;
+                }
+                Ok(())
+            }
+            Effect::LeaseGranted { lease, granted } => self.begin_lease(*lease, granted),
+            Effect::LeaseEnded { lease, reason } => {
+                let record = self.leases.remove(lease).ok_or_else(|| format!("{lease} is not there"))?;
+                if let Some(expires) = record.expires {
+                    self.timers.remove(&(expires, Timer::Lease(*lease)));
+                }
+                let slots = record.slots();
+                for slot in &slots {
+                    self.resources.change(*slot, |resource| remove_from(&mut resource.holders, lease));
+                }
+                self.session_mut(&record.session)?.leases.remove(lease);
+                let resources = self.views(&slots)?;
+                let LeaseRecord { token, session, .. } = record;
+                self.publish(Change::LeaseEnded { lease: *lease, token, session, resources, reason: *reason });
+                Ok(())
+            }
+            Effect::Answered { request_id, fingerprint, reply, forget } => {
+                self.memory.remember(request_id.clone(), *fingerprint, reply.clone(), *forget, self.now);
+                Ok(())
+            }
+        }
+    }
+
+    fn begin_lease(&mut self, lease: LeaseId, granted: &LeaseRecord) -> Result<(), Misfit> {
+        for (slot, amount) in &granted.held {
+            let held = self.resources.change(*slot, |resource| {
+                let enough = resource.free() >= *amount;
+                add_to(&mut resource.holders, &lease, *amount);
+                enough
+            });
+            match held {
+                None => return Err(missing(*slot)),
+                Some(false) => return Err(format!("{slot} has not got {amount} free")),
+                Some(true) => {}
+            }
+        }
+        if lease.0 <= self.last_lease || granted.token.0 <= self.last_token {
+            return Err(format!("{lease} with {} is not younger than what was granted before", granted.token));
+        }
+        (self.last_lease, self.last_token) = (lease.0, granted.token.0);
+        let expires = granted.hold_for.map(|hold_for| self.now + hold_for);
+        if let Some(expires) = expires {
+            self.timers.insert((expires, Timer::Lease(lease)));
+        }
+        self.session_mut(&granted.session)?.leases.insert(lease);
+        let slots = granted.slots();
+        self.leases.insert(lease, LeaseRecord { expires, ..granted.clone() });
+        let resources = self.views(&slots)?;
+        let (token, session) = (granted.token, granted.session.clone());
+        self.publish(Change::LeaseGranted { lease, token, session, resources });
+        Ok(())
+    }
+
+    fn updated(&mut self, slot: Slot) -> Result<(), Misfit> {
+        let view = self.view(slot)?;
+        self.publish(Change::ResourceUpdated(view));
+        Ok(())
+    }
+
+    fn view(&self, slot: Slot) -> Result<ResourceView, Misfit> {
+        self.resources.get(slot).map(|resource| resource.view(&self.leases)).ok_or_else(|| missing(slot))
+    }
+
+    fn views(&self, slots: &[Slot]) -> Result<Vec<ResourceView>, Misfit> {
+        slots.iter().map(|slot| self.view(*slot)).collect()
+    }
+
+    fn session_mut(&mut self, id: &SessionId) -> Result<&mut Session, Misfit> {
+        self.sessions.get_mut(id).ok_or_else(|| format!("{id} is not there"))
+    }
+
+    fn publish(&mut self, change: Change) {
+        self.revision.0 += 1;
+        let event = Arc::new(WatchEvent { revision: self.revision, change });
+        self.history.push(event.clone(), self.limits.history);
+        self.notices.push(Notice::Event(event));
+    }
+}
+
+fn missing(slot: Slot) -> Misfit {
+    format!("{slot} is empty")
+}
+
+/// How much of a resource a lease has under it, in its order; adjacent amounts of one resource together.
+pub(crate) fn join(held: &mut Vec<(Slot, Quantity)>, slot: Slot, amount: Quantity) {
+    match held.last_mut() {
+        Some((last, sum)) if *last == slot => *sum += amount,
+        _ => held.push((slot, amount)),
+    }
+}

@@ -1,0 +1,156 @@
+//! Create and delete: what is in the pool.
+
+use crate::error::{PoolError, check_owner, malformed};
+use crate::event::EndReason;
+use crate::id::{SessionId, Slot};
+use crate::pool::Pool;
+use crate::record::Effect;
+use crate::resource::{Description, ResourceSpec, ResourceView};
+use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
+use ratn_model::time::Timestamp;
+use std::sync::Arc;
+
+impl Pool {
+    /// Adds a resource, bound to a session if one is given. A resource of the same id and owner is updated: the kind
+    /// stays, its attributes and capacity are replaced (holders keep what they hold).
+    ///
+    /// # Errors
+    /// An unknown session, an id that another owner's resource has, a malformed or too large description.
+    pub fn create(
+        &mut self,
+        now: Timestamp,
+        session: Option<&SessionId>,
+        spec: ResourceSpec,
+    ) -> Result<ResourceView, PoolError> {
+        self.advance(now);
+        session.map(|id| self.session(id)).transpose()?;
+        self.check_spec(&spec)?;
+        let mut numbered = self.last_number;
+        let id = match &spec.id {
+            Some(id) => id.clone(),
+            None => self.numbered_id(&spec.kind, &mut numbered),
+        };
+        let known = self.resources.find(&id);
+        let before = known.and_then(|slot| Some((slot, self.resources.get(slot)?)));
+        match before {
+            Some((_, resource)) if resource.owner.as_ref() != session || resource.description.kind != spec.kind => {
+                let owner = resource.owner.as_ref().map_or_else(|| "no session".to_owned(), ToString::to_string);
+                return Err(PoolError::ResourceTaken { id, owner });
+            }
+            Some((slot, _)) => {
+                let description = Arc::new(spec.described(id.clone()));
+                self.commit(Effect::ResourceUpdated { slot, description });
+            }
+            None if self.resources.len() >= self.limits.resources => {
+                return Err(PoolError::TooMany { what: "resources", limit: self.limits.resources });
+            }
+            None => {
+                let (slot, owner) = (self.resources.next_slot(), session.cloned());
+                let description = Arc::new(spec.described(id.clone()));
+                self.commit(Effect::ResourceCreated { slot, description, owner, numbered });
+            }
+        }
+        self.schedule();
+        self.get(&id).ok_or(PoolError::UnknownResource { id })
+    }
+
+    /// Removes a resource; holders hear [`crate::Change::ResourceLost`]. `None` as session may delete anything.
+    ///
+    /// # Errors
+    /// An unknown resource, or one that belongs to another session.
+    pub fn delete(&mut self, now: Timestamp, session: Option<&SessionId>, id: &str) -> Result<(), PoolError> {
+        self.advance(now);
+        let found = self.resources.find(id).and_then(|slot| Some((slot, self.resources.get(slot)?)));
+        let (slot, resource) = found.ok_or_else(|| PoolError::UnknownResource { id: id.to_owned() })?;
+        if let (Some(owner), Some(caller)) = (&resource.owner, session) {
+            check_owner(|| format!("resource `{id}`"), owner, caller)?;
+        }
+        self.commit(Effect::ResourceDeleted { slot, reason: EndReason::Asked });
+        self.schedule();
+        Ok(())
+    }
+
+    /// Removes so much in all of what is free and fits, for good; a resource of which nothing is left vanishes. Returns the
+    /// ids of the resources touched.
+    ///
+    /// # Errors
+    /// An unknown session, another operation than delete, or too little to delete.
+    pub fn delete_units(
+        &mut self,
+        now: Timestamp,
+        session: &SessionId,
+        requirement: &Requirement,
+    ) -> Result<Vec<String>, PoolError> {
+        self.advance(now);
+        self.session(session)?;
+        self.check_requirements(std::slice::from_ref(requirement), &[ResourceOperation::Delete])?;
+        let whole = requirement.amount().is_whole();
+        let amount = |resource: &crate::resource::Resource| match whole {
+            true => resource.free().floor_to(Quantity::ONE),
+            false if resource.description.divisible => resource.free(),
+            false => Quantity::ZERO,
+        };
+        let free: Vec<(Slot, Quantity)> =
+            self.resources.free(requirement).map(|(slot, resource)| (slot, amount(resource))).collect();
+        let found: Quantity = free.iter().map(|(_, free)| *free).sum();
+        let mut wanted = requirement.amount();
+        if found < wanted {
+            return Err(PoolError::NotEnough { wanted: requirement.to_string(), found });
+        }
+        let mut touched = Vec::new();
+        for (slot, free) in free {
+            let amount = free.min(wanted);
+            if amount.is_zero() {
+                continue;
+            }
+            wanted = wanted.saturating_sub(amount);
+            touched.extend(self.id_of(slot));
+            self.shrink(slot, amount);
+        }
+        self.schedule();
+        Ok(touched)
+    }
+
+    fn shrink(&mut self, slot: Slot, amount: Quantity) {
+        let Some(resource) = self.resources.get(slot) else { return };
+        let capacity = resource.description.capacity.saturating_sub(amount);
+        let effect = if capacity.is_zero() {
+            Effect::ResourceDeleted { slot, reason: EndReason::UsedUp }
+        } else {
+            let description = Arc::new(Description { capacity, ..(*resource.description).clone() });
+            Effect::ResourceUpdated { slot, description }
+        };
+        self.commit(effect);
+    }
+
+    fn numbered_id(&self, kind: &str, number: &mut u64) -> String {
+        loop {
+            *number += 1;
+            let id = format!("{kind}-{number}");
+            if self.resources.find(&id).is_none() {
+                return id;
+            }
+        }
+    }
+
+    fn check_spec(&self, spec: &ResourceSpec) -> Result<(), PoolError> {
+        self.check_name("kind", &spec.kind)?;
+        if let Some(id) = &spec.id {
+            self.check_name("resource id", id)?;
+        }
+        if !spec.host.is_empty() {
+            self.check_name("host", &spec.host)?;
+        }
+        if spec.capacity.is_zero() {
+            return Err(malformed(
+                &format!("capacity 0 of {}", spec.kind),
+                "there is at least something of a resource",
+            ));
+        }
+        if !spec.divisible && !spec.capacity.is_whole() {
+            let what = format!("capacity {} of {}", spec.capacity, spec.kind);
+            return Err(malformed(&what, "what is not divisible has whole units"));
+        }
+        self.check_attributes(spec.attributes.keys())
+    }
+}

@@ -1,0 +1,60 @@
+//! The last events, for who watches from a revision that is not the newest.
+
+use crate::event::WatchEvent;
+use ratn_model::id::Revision;
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+/// The newest events, the oldest first; without a gap.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct History {
+    events: VecDeque<Arc<WatchEvent>>,
+}
+
+/// The events after a revision are not all there any more.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}", self.text())]
+pub struct Compacted {
+    /// From where was asked.
+    pub after: Revision,
+    /// The oldest revision after which everything is known.
+    pub oldest: Revision,
+    /// The newest.
+    pub newest: Revision,
+}
+
+impl History {
+    pub(crate) fn push(&mut self, event: Arc<WatchEvent>, limit: usize) {
+        self.events.push_back(event);
+        while self.events.len() > limit {
+            self.events.pop_front();
+        }
+    }
+
+    /// What happened after a revision, in order, when `newest` is the pool's.
+    pub(crate) fn after(&self, after: Revision, newest: Revision) -> Result<Vec<Arc<WatchEvent>>, Compacted> {
+        let oldest = Revision(newest.0 - self.events.len() as u64);
+        if after < oldest || after > newest {
+            return Err(Compacted { after, oldest, newest });
+        }
+        let skipped = usize::try_from(after.0 - oldest.0).unwrap_or(usize::MAX);
+        Ok(self.events.iter().skip(skipped).cloned().collect())
+    }
+}
+
+impl Compacted {
+    fn text(&self) -> String {
+        let Compacted { after, oldest, newest } = self;
+        if after > newest {
+            format!(
+                "revision {} lies ahead of the pool's {}: watch without a revision, for a snapshot",
+                after.0, newest.0
+            )
+        } else {
+            format!(
+                "the changes after revision {} are forgotten (known are those after {}): watch without a revision, for a snapshot",
+                after.0, oldest.0
+            )
+        }
+    }
+}

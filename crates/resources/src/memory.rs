@@ -1,0 +1,128 @@
+//! The answers given, by request id: the same id twice is performed once. Bounded by number and by age; the oldest is
+//! forgotten first. An answer is durable together with its effect; who is still in the queue is not.
+
+use crate::error::PoolError;
+use crate::id::WaiterId;
+use crate::request::Request;
+use ratn_model::id::{LeaseId, Revision};
+use ratn_model::time::Timestamp;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+/// An answer as it is kept: small, with ids instead of what they name.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum Remembered {
+    Created { id: String, revision: Revision },
+    Granted(LeaseId),
+    Touched(Vec<String>),
+    Done,
+}
+
+/// What a request id leads to.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Recalled {
+    Waiting(WaiterId),
+    Answered(Remembered),
+}
+
+#[derive(Debug, Clone)]
+struct Answer {
+    number: u64,
+    fingerprint: u128,
+    reply: Remembered,
+    at: Timestamp,
+}
+
+/// See the module.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct RequestMemory {
+    answers: BTreeMap<String, Answer>,
+    order: BTreeMap<u64, String>,
+    next: u64,
+    waiting: BTreeMap<String, (u128, WaiterId)>,
+}
+
+impl RequestMemory {
+    /// What this request led to before.
+    pub(crate) fn recall(&self, id: &str, fingerprint: u128) -> Result<Option<Recalled>, PoolError> {
+        let known = self.waiting.get(id).map(|(print, waiter)| (*print, Recalled::Waiting(*waiter)));
+        let known = known.or_else(|| {
+            self.answers.get(id).map(|answer| (answer.fingerprint, Recalled::Answered(answer.reply.clone())))
+        });
+        match known {
+            Some((print, _)) if print != fingerprint => Err(PoolError::RequestIdReused { id: id.to_owned() }),
+            known => Ok(known.map(|(_, recalled)| recalled)),
+        }
+    }
+
+    /// The same, whatever the request was.
+    pub(crate) fn reply(&self, id: &str) -> Option<Recalled> {
+        let waiting = self.waiting.get(id).map(|(_, waiter)| Recalled::Waiting(*waiter));
+        waiting.or_else(|| self.answers.get(id).map(|answer| Recalled::Answered(answer.reply.clone())))
+    }
+
+    pub(crate) fn wait(&mut self, id: &str, fingerprint: u128, waiter: WaiterId) {
+        self.waiting.insert(id.to_owned(), (fingerprint, waiter));
+    }
+
+    /// Who waited under this id waits no longer.
+    pub(crate) fn waited(&mut self, id: &str) -> Option<u128> {
+        self.waiting.remove(id).map(|(fingerprint, _)| fingerprint)
+    }
+
+    /// How many of the oldest have to go before one more is remembered.
+    pub(crate) fn too_many(&self, now: Timestamp, limit: usize, for_at_most: Duration) -> usize {
+        let by_number = (self.order.len() + 1).saturating_sub(limit.max(1));
+        let old = |id: &&String| self.answers.get(*id).is_some_and(|answer| answer.at + for_at_most <= now);
+        self.order.values().enumerate().take_while(|(i, id)| *i < by_number || old(id)).count()
+    }
+
+    pub(crate) fn remember(&mut self, id: String, fingerprint: u128, reply: Remembered, forget: usize, now: Timestamp) {
+        for _ in 0..forget {
+            if let Some((_, oldest)) = self.order.pop_first() {
+                self.answers.remove(&oldest);
+            }
+        }
+        let number = self.next;
+        self.next += 1;
+        self.order.insert(number, id.clone());
+        let answer = Answer { number, fingerprint, reply, at: now };
+        if let Some(before) = self.answers.insert(id, answer) {
+            self.order.remove(&before.number);
+        }
+    }
+
+    /// The answers, the oldest first.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (&String, u128, &Remembered)> {
+        self.order.values().filter_map(|id| self.answers.get(id).map(|answer| (id, answer.fingerprint, &answer.reply)))
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.order.len()
+    }
+
+    pub(crate) fn waiting(&self) -> usize {
+        self.waiting.len()
+    }
+
+    pub(crate) fn order_agrees(&self) -> bool {
+        self.order.len() == self.answers.len()
+            && self.order.iter().all(|(number, id)| self.answers.get(id).is_some_and(|a| a.number == *number))
+    }
+}
+
+/// What makes two requests the same one: everything but the deadline of an acquire, which a repeated one has later.
+/// FNV-1a over 128 bits of its record; clients are not adversaries of themselves.
+pub(crate) fn fingerprint(request: &Request) -> u128 {
+    const OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
+    const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
+    let bytes = match request {
+        Request::Acquire(acquire) if acquire.deadline.is_some() => {
+            let acquire = crate::queue::AcquireRequest { deadline: None, ..acquire.clone() };
+            crate::record::to_bytes(&Request::Acquire(acquire))
+        }
+        request => crate::record::to_bytes(request),
+    };
+    bytes.iter().fold(OFFSET, |hash, byte| (hash ^ u128::from(*byte)).wrapping_mul(PRIME))
+}

@@ -1,0 +1,96 @@
+//! What changes in a pool, as it is written down: every durable change is one of these records, applied by
+//! `apply.rs`, both when it happens and when it is read back.
+//!
+//! Records are physical (which slot, which amount, which token), never "what was asked": nothing is decided again when they
+//! are read. The records of one call belong together, the answer remembered for its request id among them:
+//! [`encode`] makes them one entry of a log. Waiters are not in them; their clients ask again with the same request id.
+
+use crate::event::EndReason;
+use crate::id::{SessionId, Slot};
+use crate::lease::LeaseRecord;
+use crate::memory::Remembered;
+use crate::resource::Description;
+use ratn_model::id::LeaseId;
+use ratn_model::resource::Quantity;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+use std::time::Duration;
+
+/// The version that [`encode`] writes, its first byte. Variants and fields are only ever added at the end; whatever else
+/// changes takes a new number.
+pub const FORMAT: u8 = 1;
+
+/// One durable change of a pool.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Record(pub(crate) Effect);
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum Effect {
+    /// A session is there, or lives for another time from now on.
+    SessionKept { session: SessionId, client: String, ttl: Duration },
+    /// A session is gone; what hung on it went before.
+    SessionEnded { session: SessionId },
+    /// A resource is new. `numbered` is the last number given to a resource without an id of its own.
+    ResourceCreated { slot: Slot, description: Arc<Description>, owner: Option<SessionId>, numbered: u64 },
+    /// A resource has another description.
+    ResourceUpdated { slot: Slot, description: Arc<Description> },
+    /// A resource is gone; its holders have lost it.
+    ResourceDeleted { slot: Slot, reason: EndReason },
+    /// A session has consumed some of a resource.
+    Consumed { session: SessionId, slot: Slot, amount: Quantity },
+    /// What a session has consumed of what is renewable returned.
+    TaskEnded { session: SessionId },
+    /// A lease began.
+    LeaseGranted { lease: LeaseId, granted: LeaseRecord },
+    /// A lease ended.
+    LeaseEnded { lease: LeaseId, reason: EndReason },
+    /// A request id has its answer; the oldest `forget` answers were forgotten for it.
+    Answered { request_id: String, fingerprint: u128, reply: Remembered, forget: usize },
+}
+
+/// Bytes that are no records, or of a version that is not known here.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DecodeError {
+    /// Written by another version.
+    #[error(
+        "format {found} of the resource pool's records is not known (this is {FORMAT}): use the version that wrote it"
+    )]
+    Version {
+        /// The first byte.
+        found: u8,
+    },
+    /// Not what [`encode`] writes.
+    #[error("these are no records of a resource pool: {reason}")]
+    Broken {
+        /// What is wrong.
+        reason: String,
+    },
+}
+
+/// The records of one call, as one entry of a log.
+pub fn encode(records: &[Record]) -> Vec<u8> {
+    to_bytes(&records)
+}
+
+/// Reads what [`encode`] wrote.
+///
+/// # Errors
+/// Bytes that it did not write, or another version did.
+pub fn decode(bytes: &[u8]) -> Result<Vec<Record>, DecodeError> {
+    from_bytes(bytes)
+}
+
+pub(crate) fn to_bytes<T: Serialize>(value: &T) -> Vec<u8> {
+    // Nothing that is written here can fail to serialise: no maps of unknown length, no foreign types.
+    postcard::to_extend(value, vec![FORMAT]).unwrap_or_default()
+}
+
+pub(crate) fn from_bytes<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<T, DecodeError> {
+    let broken = |reason: String| DecodeError::Broken { reason };
+    let (version, rest) = bytes.split_first().ok_or_else(|| broken("no bytes".to_owned()))?;
+    if *version != FORMAT {
+        return Err(DecodeError::Version { found: *version });
+    }
+    let (value, rest) = postcard::take_from_bytes(rest).map_err(|error| broken(error.to_string()))?;
+    if rest.is_empty() { Ok(value) } else { Err(broken(format!("{} bytes too many", rest.len()))) }
+}

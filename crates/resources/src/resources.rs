@@ -1,0 +1,160 @@
+//! Every resource by its slot, and what finds them: by id, by kind, the free ones of a kind.
+//!
+//! A slot is a small number that a resource keeps for its life; the lowest vacant one is given next, so the same history
+//! gives the same slots. Every change of a resource goes through [`Resources::change`], which keeps the indices right.
+
+use crate::id::Slot;
+use crate::resource::Resource;
+use ratn_model::resource::{Quantity, Requirement};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// See the module.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Resources {
+    slots: Vec<Option<Resource>>,
+    vacant: BTreeSet<Slot>,
+    by_id: BTreeMap<Box<str>, Slot>,
+    by_kind: BTreeMap<Box<str>, OfKind>,
+}
+
+/// The resources of one kind.
+#[derive(Debug, Clone, Default)]
+struct OfKind {
+    all: BTreeSet<Slot>,
+    /// Those of which something is free.
+    free: BTreeSet<Slot>,
+}
+
+impl Resources {
+    pub(crate) fn len(&self) -> usize {
+        self.by_id.len()
+    }
+
+    pub(crate) fn get(&self, slot: Slot) -> Option<&Resource> {
+        self.slots.get(slot.index()).and_then(Option::as_ref)
+    }
+
+    pub(crate) fn find(&self, id: &str) -> Option<Slot> {
+        self.by_id.get(id).copied()
+    }
+
+    /// The slot that the next new resource gets.
+    pub(crate) fn next_slot(&self) -> Slot {
+        self.vacant.first().copied().unwrap_or_else(|| Slot::new(self.slots.len()))
+    }
+
+    /// False where the slot or the id is taken already.
+    pub(crate) fn insert(&mut self, slot: Slot, resource: Resource) -> bool {
+        if self.get(slot).is_some() || self.by_id.contains_key(resource.description.id.as_str()) {
+            return false;
+        }
+        while self.slots.len() <= slot.index() {
+            self.vacant.insert(Slot::new(self.slots.len()));
+            self.slots.push(None);
+        }
+        self.vacant.remove(&slot);
+        self.by_id.insert(resource.description.id.as_str().into(), slot);
+        let kind = resource.description.kind.as_str();
+        if !self.by_kind.contains_key(kind) {
+            self.by_kind.insert(kind.into(), OfKind::default());
+        }
+        if let Some(of_kind) = self.by_kind.get_mut(kind) {
+            of_kind.all.insert(slot);
+            if !resource.free().is_zero() {
+                of_kind.free.insert(slot);
+            }
+        }
+        self.slots[slot.index()] = Some(resource);
+        true
+    }
+
+    pub(crate) fn remove(&mut self, slot: Slot) -> Option<Resource> {
+        let resource = self.slots.get_mut(slot.index())?.take()?;
+        self.vacant.insert(slot);
+        self.by_id.remove(resource.description.id.as_str());
+        let kind = resource.description.kind.as_str();
+        if let Some(of_kind) = self.by_kind.get_mut(kind) {
+            of_kind.all.remove(&slot);
+            of_kind.free.remove(&slot);
+            if of_kind.all.is_empty() {
+                self.by_kind.remove(kind);
+            }
+        }
+        Some(resource)
+    }
+
+    /// Changes a resource; its kind and id stay.
+    pub(crate) fn change<T>(&mut self, slot: Slot, change: impl FnOnce(&mut Resource) -> T) -> Option<T> {
+        let resource = self.slots.get_mut(slot.index())?.as_mut()?;
+        let before = !resource.free().is_zero();
+        let changed = change(resource);
+        let after = !resource.free().is_zero();
+        if before != after
+            && let Some(of_kind) = self.by_kind.get_mut(resource.description.kind.as_str())
+        {
+            if after {
+                of_kind.free.insert(slot);
+            } else {
+                of_kind.free.remove(&slot);
+            }
+        }
+        Some(changed)
+    }
+
+    /// In the order of ids.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (Slot, &Resource)> {
+        self.by_id.values().filter_map(|slot| self.get(*slot).map(|resource| (*slot, resource)))
+    }
+
+    pub(crate) fn has_kind(&self, kind: &str) -> bool {
+        self.by_kind.contains_key(kind)
+    }
+
+    /// Those that a requirement can be met with, in the order of slots.
+    pub(crate) fn fitting<'a>(
+        &'a self,
+        requirement: &'a Requirement,
+    ) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
+        self.chosen(requirement, |of_kind| &of_kind.all)
+    }
+
+    /// Those of them of which something is free.
+    pub(crate) fn free<'a>(&'a self, requirement: &'a Requirement) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
+        self.chosen(requirement, |of_kind| &of_kind.free)
+    }
+
+    fn chosen<'a>(
+        &'a self,
+        requirement: &'a Requirement,
+        index: impl Fn(&'a OfKind) -> &'a BTreeSet<Slot> + 'a,
+    ) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
+        self.by_kind
+            .get(requirement.kind.as_str())
+            .into_iter()
+            .flat_map(index)
+            .filter_map(|slot| self.get(*slot).map(|resource| (*slot, resource)))
+            .filter(|(_, resource)| resource.description.fits(requirement))
+    }
+
+    /// How much of what fits exists, held or not, what is consumed excluded.
+    pub(crate) fn quantity(&self, requirement: &Requirement) -> Quantity {
+        self.fitting(requirement).map(|(_, resource)| resource.quantity()).sum()
+    }
+
+    /// Whether the indices say the same as the resources do.
+    pub(crate) fn index_agrees(&self) -> bool {
+        let indexed: usize = self.by_kind.values().map(|of_kind| of_kind.all.len()).sum();
+        let free: usize = self.by_kind.values().map(|of_kind| of_kind.free.len()).sum();
+        let present = self.slots.iter().filter(|slot| slot.is_some()).count();
+        let really_free = self.slots.iter().flatten().filter(|resource| !resource.free().is_zero()).count();
+        present == self.by_id.len()
+            && present == indexed
+            && free == really_free
+            && self.vacant.len() + present == self.slots.len()
+            && self.iter().all(|(slot, resource)| {
+                self.by_kind.get(resource.description.kind.as_str()).is_some_and(|of_kind| {
+                    of_kind.all.contains(&slot) && of_kind.free.contains(&slot) != resource.free().is_zero()
+                })
+            })
+    }
+}

@@ -1,0 +1,158 @@
+//! A pool as bytes, and a pool from a snapshot and the records after it.
+//!
+//! ```text
+//!   pool ──take_records──▶ log            snapshot + records after it ──restore──▶ the same pool
+//!     └──── snapshot ────▶ file             (waiters ask again, sessions have their whole TTL once more)
+//! ```
+
+use crate::expiry::Timer;
+use crate::id::{SessionId, Slot};
+use crate::lease::LeaseRecord;
+use crate::limits::Limits;
+use crate::memory::Remembered;
+use crate::pool::Pool;
+use crate::record::{DecodeError, Record, from_bytes, to_bytes};
+use crate::resource::Resource;
+use crate::session::Session;
+use ratn_model::id::{LeaseId, Revision};
+use ratn_model::time::Timestamp;
+use serde::{Deserialize, Serialize};
+use std::time::Duration;
+
+/// Everything durable of a pool at one moment. Taking one shares the descriptions of the resources and copies the rest.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Snapshot {
+    revision: Revision,
+    last_lease: u64,
+    last_token: u64,
+    last_number: u64,
+    sessions: Vec<(SessionId, String, Duration)>,
+    resources: Vec<(Slot, Resource)>,
+    leases: Vec<(LeaseId, LeaseRecord)>,
+    /// The oldest first.
+    answers: Vec<(String, u128, Remembered)>,
+}
+
+/// A snapshot or a record that does not fit: the log has a gap, or is of another pool.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RestoreError {
+    /// The snapshot contradicts itself.
+    #[error("the snapshot of revision {revision} contradicts itself: {reason}; restore a backup")]
+    Snapshot {
+        /// Of which revision it is.
+        revision: u64,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A record does not follow from what is before it.
+    #[error("record {number} after the snapshot does not fit (revision {revision}): {reason}; restore a backup")]
+    Record {
+        /// Which, from 0.
+        number: usize,
+        /// The pool's revision before it.
+        revision: u64,
+        /// What is wrong.
+        reason: String,
+    },
+}
+
+impl Snapshot {
+    /// For a file.
+    pub fn encode(&self) -> Vec<u8> {
+        to_bytes(self)
+    }
+
+    /// Reads what [`Snapshot::encode`] wrote.
+    ///
+    /// # Errors
+    /// Bytes that it did not write, or another version did.
+    pub fn decode(bytes: &[u8]) -> Result<Snapshot, DecodeError> {
+        from_bytes(bytes)
+    }
+
+    /// The pool's revision in it.
+    pub fn revision(&self) -> Revision {
+        self.revision
+    }
+}
+
+impl Pool {
+    /// What the pool is now. The records taken after this continue it; take those before it first.
+    pub fn snapshot(&self) -> Snapshot {
+        Snapshot {
+            revision: self.revision,
+            last_lease: self.last_lease,
+            last_token: self.last_token,
+            last_number: self.last_number,
+            sessions: self.sessions.iter().map(|(id, s)| (id.clone(), s.name.clone(), s.ttl)).collect(),
+            resources: self.resources.iter().map(|(slot, resource)| (slot, resource.clone())).collect(),
+            leases: self
+                .leases
+                .iter()
+                .map(|(id, lease)| (*id, LeaseRecord { expires: None, ..lease.clone() }))
+                .collect(),
+            answers: self.memory.iter().map(|(id, print, reply)| (id.clone(), print, reply.clone())).collect(),
+        }
+    }
+
+    /// The pool of a snapshot (`None`: an empty one) and the records since, at `now` of a clock that need not be that of
+    /// before. Every session and every lease with a time of its own has that time once more; the queue is empty.
+    ///
+    /// # Errors
+    /// A snapshot or a record that does not fit.
+    pub fn restore(
+        limits: Limits,
+        now: Timestamp,
+        snapshot: Option<Snapshot>,
+        records: impl IntoIterator<Item = Record>,
+    ) -> Result<Pool, RestoreError> {
+        let mut pool = Pool { now, ..Pool::new(limits) };
+        if let Some(snapshot) = snapshot {
+            let revision = snapshot.revision.0;
+            pool.fill(snapshot).map_err(|reason| RestoreError::Snapshot { revision, reason })?;
+        }
+        for (number, record) in records.into_iter().enumerate() {
+            let revision = pool.revision.0;
+            pool.apply(&record.0).map_err(|reason| RestoreError::Record { number, revision, reason })?;
+            // Nobody hears of it, and a long log's events would pile up.
+            pool.notices.clear();
+        }
+        Ok(pool)
+    }
+
+    fn fill(&mut self, snapshot: Snapshot) -> Result<(), String> {
+        (self.revision, self.last_number) = (snapshot.revision, snapshot.last_number);
+        (self.last_lease, self.last_token) = (snapshot.last_lease, snapshot.last_token);
+        for (id, client, ttl) in snapshot.sessions {
+            let expires = self.now + ttl;
+            self.timers.insert((expires, Timer::Session(id.clone())));
+            self.sessions.insert(id, Session::new(client, ttl, expires));
+        }
+        for (slot, resource) in snapshot.resources {
+            let consumers = resource.consumers.iter().map(|(session, _)| (session, false));
+            for (session, owns) in resource.owner.iter().map(|owner| (owner, true)).chain(consumers) {
+                let session = self.sessions.get_mut(session).ok_or_else(|| format!("{session} is not there"))?;
+                let slots = if owns { &mut session.provides } else { &mut session.consumed };
+                slots.insert(slot);
+            }
+            let id = resource.description.id.clone();
+            if !self.resources.insert(slot, resource) {
+                return Err(format!("`{id}` or {slot} is there twice"));
+            }
+        }
+        for (id, mut lease) in snapshot.leases {
+            lease.expires = lease.hold_for.map(|hold_for| self.now + hold_for);
+            if let Some(expires) = lease.expires {
+                self.timers.insert((expires, Timer::Lease(id)));
+            }
+            let session =
+                self.sessions.get_mut(&lease.session).ok_or_else(|| format!("{} is not there", lease.session))?;
+            session.leases.insert(id);
+            self.leases.insert(id, lease);
+        }
+        for (id, fingerprint, reply) in snapshot.answers {
+            self.memory.remember(id, fingerprint, reply, 0, self.now);
+        }
+        Ok(())
+    }
+}

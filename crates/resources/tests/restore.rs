@@ -1,0 +1,255 @@
+//! What is written down is everything: after every step of random histories, the pool of an earlier snapshot and the records
+//! since is the pool, in its state and in what it does next.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use proptest::prelude::*;
+use ratn_model::id::LeaseId;
+use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
+use ratn_resources::{
+    AcquireRequest, DecodeError, FORMAT, Limits, Pool, Record, Request, ResourceSpec, RestoreError, SessionId,
+    Snapshot, decode, encode,
+};
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+const KINDS: [&str; 3] = ["Arm", "Battery", "PathPlanner"];
+const SESSIONS: [&str; 3] = ["a", "b", "c"];
+
+#[derive(Debug, Clone)]
+enum Step {
+    Wait(u64),
+    KeepAlive(usize, u64),
+    Close(usize),
+    Create { owner: Option<usize>, kind: usize, capacity: u32, renewable: bool, named: bool },
+    Delete(usize),
+    DeleteUnits { session: usize, kind: usize, count: u32 },
+    Consume { session: usize, kind: usize, count: u32 },
+    Acquire { session: usize, kinds: Vec<(usize, u32)>, hold_for: Option<u64>, consume: bool },
+    Release(usize),
+    Withdraw(u8),
+    EndTask(usize),
+}
+
+fn step() -> impl Strategy<Value = (Step, u8)> {
+    let session = 0..SESSIONS.len();
+    let kind = 0..KINDS.len();
+    let acquire = (
+        session.clone(),
+        prop::collection::vec((kind.clone(), 1..3u32), 1..3),
+        prop::option::of(1..20u64),
+        prop::bool::weighted(0.2),
+    )
+        .prop_map(|(session, kinds, hold_for, consume)| Step::Acquire { session, kinds, hold_for, consume });
+    let create = (prop::option::of(session.clone()), kind.clone(), 1..4u32, any::<bool>(), prop::bool::weighted(0.3))
+        .prop_map(|(owner, kind, capacity, renewable, named)| Step::Create { owner, kind, capacity, renewable, named });
+    let step = prop_oneof![
+        2 => (1..12u64).prop_map(Step::Wait),
+        4 => (session.clone(), 10..40u64).prop_map(|(session, ttl)| Step::KeepAlive(session, ttl)),
+        1 => session.clone().prop_map(Step::Close),
+        4 => create,
+        1 => (0..8usize).prop_map(Step::Delete),
+        1 => (session.clone(), kind.clone(), 1..3u32)
+            .prop_map(|(session, kind, count)| Step::DeleteUnits { session, kind, count }),
+        2 => (session.clone(), kind.clone(), 1..3u32)
+            .prop_map(|(session, kind, count)| Step::Consume { session, kind, count }),
+        8 => acquire,
+        4 => (0..8usize).prop_map(Step::Release),
+        1 => (0..30u8).prop_map(Step::Withdraw),
+        1 => session.prop_map(Step::EndTask),
+    ];
+    // Request ids repeat now and then; 0 is none.
+    (step, 0..30u8)
+}
+
+fn requirement(operation: ResourceOperation, kind: usize, count: u32) -> Requirement {
+    Requirement { operation, kind: KINDS[kind].into(), class: None, attributes: BTreeMap::new(), count }
+}
+
+fn perform(pool: &mut Pool, now: u64, step: &Step, id: u8) -> String {
+    let at = Timestamp(now);
+    let session = |index: usize| SessionId::from(SESSIONS[index]);
+    let request = match step {
+        Step::Wait(_) => {
+            pool.advance(at);
+            return String::new();
+        }
+        Step::KeepAlive(index, ttl) => {
+            return format!("{:?}", pool.keep_alive(at, &session(*index), "test", Duration::from_nanos(*ttl)));
+        }
+        Step::Close(index) => return format!("{:?}", pool.close_session(at, &session(*index))),
+        Step::Withdraw(other) => return format!("{:?}", pool.withdraw(at, &session(0), &other.to_string())),
+        Step::Create { owner, kind, capacity, renewable, named } => {
+            let mut spec = ResourceSpec::new(ResourceClass::Module, KINDS[*kind]).capacity(*capacity);
+            spec.renewable = *renewable;
+            spec.id = named.then(|| format!("the-{}", KINDS[*kind]));
+            let spec = spec.attribute("level", Value::Float(0.5));
+            Request::Create { session: owner.map(session), spec }
+        }
+        Step::Delete(index) => {
+            let id = pool.list().get(*index).map_or_else(|| "none".to_owned(), |view| view.id.clone());
+            Request::Delete { session: None, id }
+        }
+        Step::DeleteUnits { session: index, kind, count } => Request::DeleteUnits {
+            session: session(*index),
+            requirement: requirement(ResourceOperation::Delete, *kind, *count),
+        },
+        Step::Consume { session: index, kind, count } => Request::Consume {
+            session: session(*index),
+            requirement: requirement(ResourceOperation::Consume, *kind, *count),
+        },
+        Step::Acquire { session: index, kinds, hold_for, consume } => {
+            let operation = if *consume { ResourceOperation::Consume } else { ResourceOperation::Block };
+            let requirements = kinds.iter().map(|(kind, count)| requirement(operation, *kind, *count)).collect();
+            let mut request = AcquireRequest::new(session(*index), requirements).deadline(Timestamp(now + 25));
+            request.hold_for = hold_for.map(Duration::from_nanos);
+            Request::Acquire(request)
+        }
+        Step::Release(index) => {
+            let lease = pool.leases().get(*index).map_or(LeaseId(0), |lease| lease.id);
+            Request::Release { session: None, lease }
+        }
+        Step::EndTask(index) => Request::EndTask { session: session(*index) },
+    };
+    let id = if id == 0 { String::new() } else { id.to_string() };
+    format!("{:?}", pool.handle(at, &id, request))
+}
+
+fn limits() -> Limits {
+    Limits { remembered_requests: 12, remember_for_ms: 1, ..Limits::default() }
+}
+
+fn restored(now: u64, snapshot: &[u8], entries: &[Vec<u8>]) -> Pool {
+    let records: Vec<Record> = entries.iter().flat_map(|entry| decode(entry).unwrap()).collect();
+    Pool::restore(limits(), Timestamp(now), Some(Snapshot::decode(snapshot).unwrap()), records).unwrap()
+}
+
+/// The same state after the queue is gone and every session has been kept alive.
+fn settle(pool: &mut Pool, now: u64) {
+    // From the back, so that nobody is granted for it.
+    for (waiter, _) in pool.waiters().into_iter().rev() {
+        pool.cancel(Timestamp(now), waiter).unwrap();
+    }
+    for session in pool.sessions() {
+        pool.keep_alive(Timestamp(now), &session.id, &session.name, session.ttl).unwrap();
+    }
+    pool.take_notices();
+    assert!(pool.take_records().is_empty(), "nothing durable has changed");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
+
+    #[test]
+    fn a_restored_pool_is_the_pool_and_goes_on_as_it_does(
+        steps in prop::collection::vec(step(), 1..60),
+        cuts in prop::collection::vec(any::<prop::sample::Index>(), 60),
+        next in prop::collection::vec(step(), 6),
+    ) {
+        let mut pool = Pool::new(limits());
+        let mut now = 0;
+        let mut snapshots = vec![pool.snapshot().encode()];
+        let mut log: Vec<Vec<u8>> = Vec::new();
+        for ((step, id), cut) in steps.iter().zip(cuts) {
+            if let Step::Wait(time) = step {
+                now += time;
+            }
+            perform(&mut pool, now, step, *id);
+            pool.check_invariants().map_err(TestCaseError::fail)?;
+            log.push(encode(&pool.take_records()));
+            snapshots.push(pool.snapshot().encode());
+
+            let cut = cut.index(snapshots.len());
+            let mut again = restored(now, &snapshots[cut], &log[cut..]);
+            again.check_invariants().map_err(TestCaseError::fail)?;
+            prop_assert_eq!(again.snapshot(), pool.snapshot());
+            prop_assert_eq!(again.list(), pool.list());
+            prop_assert_eq!(again.youngest_lease(), pool.youngest_lease());
+            let known = again.changes_after(pool.revision()).unwrap();
+            prop_assert!(known.is_empty() && again.take_notices().is_empty());
+
+            let mut pool = pool.clone();
+            let holds = pool.leases().iter().any(|lease| lease.expires.is_some());
+            settle(&mut pool, now);
+            settle(&mut again, now);
+            for (step, id) in next.iter().filter(|(step, _)| !(holds && matches!(step, Step::Wait(_)))) {
+                let later = if let Step::Wait(time) = step { now + time } else { now };
+                let (answer, answer_again) = (perform(&mut pool, later, step, *id), perform(&mut again, later, step, *id));
+                // Waiters are numbered anew.
+                if !answer.contains("Queued") && !answer.contains("waiter-") {
+                    prop_assert_eq!(answer, answer_again);
+                }
+                prop_assert_eq!(pool.take_records(), again.take_records());
+                prop_assert_eq!(pool.leases().len(), again.leases().len());
+            }
+        }
+    }
+}
+
+#[test]
+fn tokens_grow_over_a_restart_and_a_repeated_request_is_not_performed_again() {
+    let mut pool = Pool::new(Limits::default());
+    let (now, session) = (Timestamp(0), SessionId::from("a"));
+    pool.keep_alive(now, &session, "a", Duration::from_secs(10)).unwrap();
+    pool.create(now, None, ResourceSpec::new(ResourceClass::Module, "Arm").id("arm").capacity(2)).unwrap();
+    let acquire =
+        Request::Acquire(AcquireRequest::new(session.clone(), vec![requirement(ResourceOperation::Block, 0, 1)]));
+    pool.handle(now, "q1", acquire.clone()).unwrap();
+    let first = pool.leases().remove(0);
+    let mut again = Pool::restore(Limits::default(), now, None, pool.take_records()).unwrap();
+    let repeated = again.handle(now, "q1", acquire.clone()).unwrap();
+    assert!(
+        matches!(repeated, ratn_resources::Reply::Granted(lease) if lease.id == first.id && lease.token == first.token)
+    );
+    again.handle(now, "q2", acquire).unwrap();
+    assert!(again.leases()[1].token > first.token);
+    assert_eq!(again.sessions()[0].expires, Timestamp(0) + Duration::from_secs(10));
+}
+
+#[test]
+fn the_events_since_the_snapshot_are_known_again_after_a_restart() {
+    let mut pool = Pool::new(Limits { history: 2, ..Limits::default() });
+    for id in ["a", "b", "c"] {
+        pool.create(Timestamp(0), None, ResourceSpec::new(ResourceClass::Module, "Arm").id(id)).unwrap();
+    }
+    let again = Pool::restore(Limits { history: 2, ..Limits::default() }, Timestamp(0), None, pool.take_records());
+    let again = again.unwrap();
+    for pool in [&pool, &again] {
+        let revisions = |after| {
+            let events = pool.changes_after(ratn_model::id::Revision(after));
+            events.map(|events| events.iter().map(|event| event.revision.0).collect::<Vec<_>>())
+        };
+        assert_eq!(revisions(1), Ok(vec![2, 3]));
+        assert_eq!(revisions(3), Ok(vec![]));
+        assert_eq!(revisions(0).unwrap_err().oldest.0, 1);
+        assert!(revisions(4).unwrap_err().to_string().contains("lies ahead"));
+    }
+}
+
+#[test]
+fn a_record_that_does_not_follow_is_refused_with_its_number() {
+    let mut pool = Pool::new(Limits::default());
+    for id in ["a", "b"] {
+        pool.create(Timestamp(0), None, ResourceSpec::new(ResourceClass::Module, "Arm").id(id)).unwrap();
+    }
+    pool.delete(Timestamp(0), None, "a").unwrap();
+    let mut records = pool.take_records();
+    records.remove(0);
+    let refused = Pool::restore(Limits::default(), Timestamp(0), None, records);
+    assert!(matches!(refused, Err(RestoreError::Record { number: 1, .. })), "{:?}", refused.err());
+}
+
+#[test]
+fn bytes_of_another_version_or_cut_short_are_refused() {
+    let mut pool = Pool::new(Limits::default());
+    pool.create(Timestamp(0), None, ResourceSpec::new(ResourceClass::Module, "Arm").id("a")).unwrap();
+    let bytes = encode(&pool.take_records());
+    assert_eq!(bytes[0], FORMAT);
+    for end in 0..bytes.len() {
+        assert!(matches!(decode(&bytes[..end]), Err(DecodeError::Broken { .. })));
+    }
+    assert!(matches!(decode(&[&bytes[..], &[0]].concat()), Err(DecodeError::Broken { .. })));
+    let other = [&[FORMAT + 1], &bytes[1..]].concat();
+    assert_eq!(decode(&other), Err(DecodeError::Version { found: FORMAT + 1 }));
+}
