@@ -2,6 +2,7 @@
 //!
 //! ```text
 //!   gRPC call ──▶ service.rs ──message──▶ actor.rs (Pool of ratn-resources, a clock) ──answer, event──▶ service.rs
+//!   session's stream ──▶ stream.rs, whose every message is such a call
 //! ```
 //! In memory: after a restart sessions are opened anew and providers offer their resources again; only fencing tokens
 //! keep growing.
@@ -10,6 +11,7 @@ mod actor;
 mod config;
 mod service;
 mod status;
+mod stream;
 mod wire;
 
 pub use config::ResourceManagerConfig;

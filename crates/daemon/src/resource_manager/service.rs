@@ -29,7 +29,7 @@ const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
 /// The service; clones share the actor.
 #[derive(Debug, Clone)]
 pub(super) struct Service {
-    actor: Handle,
+    pub(super) actor: Handle,
     shutdown: CancellationToken,
     next_ticket: Arc<AtomicU64>,
 }
@@ -92,6 +92,7 @@ impl Drop for WaitingCall {
 impl v1::resource_service_server::ResourceService for Service {
     type WatchStream = Streamed<v1::ResourceServiceWatchResponse>;
     type KeepAliveStream = Streamed<v1::KeepAliveResponse>;
+    type SessionStream = super::stream::SessionStream;
 
     async fn create(&self, request: Request<v1::CreateRequest>) -> Result<Response<v1::CreateResponse>, Status> {
         let request = request.into_inner();
@@ -260,9 +261,17 @@ impl v1::resource_service_server::ResourceService for Service {
         });
         Ok(Response::new(Box::pin(tokio_stream::wrappers::ReceiverStream::new(answers))))
     }
+
+    async fn session(
+        &self,
+        request: Request<Streaming<v1::SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let stream = super::stream::SessionStream::new(self.clone(), request.into_inner(), self.shutdown.clone());
+        Ok(Response::new(stream))
+    }
 }
 
-async fn kept_alive(actor: &Handle, ping: v1::KeepAliveRequest) -> Result<v1::KeepAliveResponse, Status> {
+pub(super) async fn kept_alive(actor: &Handle, ping: v1::KeepAliveRequest) -> Result<v1::KeepAliveResponse, Status> {
     let session = session(&ping.session_id)?;
     label(&ping.client, "client")?;
     let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };

@@ -1,0 +1,140 @@
+//! A session's stream: many calls over one stream.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod support;
+
+use ratn_model::resource::ResourceClass;
+use ratn_proto::types::Resource;
+use ratn_proto::v1::resource_service_client::ResourceServiceClient;
+use ratn_proto::v1::session_request::Kind as Asked;
+use ratn_proto::v1::session_response::Kind;
+use ratn_proto::v1::{self, SessionRequest};
+use std::collections::BTreeMap;
+use support::{TestSystem, block, in_time};
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Code, Streaming};
+
+/// The client's end.
+struct Line {
+    questions: mpsc::Sender<SessionRequest>,
+    answers: Streaming<v1::SessionResponse>,
+}
+
+impl Line {
+    async fn open(system: &TestSystem, manager: &support::Daemon, session: &str) -> Line {
+        let channel = system.channels.get(&manager.endpoint).unwrap();
+        let (questions, outgoing) = mpsc::channel(64);
+        let ping = v1::KeepAliveRequest { session_id: session.to_owned(), ttl_ms: 60_000, client: session.to_owned() };
+        questions.send(SessionRequest { id: 1, kind: Some(Asked::KeepAlive(ping)) }).await.unwrap();
+        let call = ResourceServiceClient::new(channel).session(ReceiverStream::new(outgoing)).await;
+        let mut line = Line { questions, answers: call.unwrap().into_inner() };
+        let (id, Kind::KeepAlive(kept)) = line.hear().await else { panic!("it is kept alive") };
+        assert!(id == 1 && kept.created);
+        line
+    }
+
+    async fn ask(&self, id: u64, kind: Option<Asked>) {
+        self.questions.send(SessionRequest { id, kind }).await.unwrap();
+    }
+
+    async fn hear(&mut self) -> (u64, Kind) {
+        let answer = in_time(self.answers.message()).await.unwrap().unwrap();
+        (answer.id, answer.kind.unwrap())
+    }
+
+    async fn failure(&mut self) -> (u64, Code) {
+        match self.hear().await {
+            (id, Kind::Failure(failure)) => (id, Code::from(failure.code)),
+            (_, other) => panic!("no failure but {other:?}"),
+        }
+    }
+}
+
+fn acquire(session: &str, request: &str) -> Option<Asked> {
+    Some(Asked::Acquire(v1::AcquireRequest {
+        request_id: request.to_owned(),
+        session_id: session.to_owned(),
+        requirements: vec![block("Arm").into()],
+        deadline_ms: 60_000,
+        ..Default::default()
+    }))
+}
+
+#[tokio::test]
+async fn answers_come_as_they_are_there_and_not_in_the_order_of_questions() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let mut line = Line::open(&system, &manager, "b").await;
+    line.ask(2, acquire("b", "first")).await;
+    let (2, Kind::Acquire(first)) = line.hear().await else { panic!("the arm is free") };
+    // It waits, while what comes after it is answered.
+    line.ask(3, acquire("b", "second")).await;
+    let lease_id = first.lease.unwrap().id;
+    let give_back =
+        v1::ResourceServiceReleaseRequest { request_id: "give back".to_owned(), session_id: "b".to_owned(), lease_id };
+    line.ask(4, Some(Asked::Release(give_back))).await;
+    let mut answers = BTreeMap::new();
+    for _ in 0..2 {
+        let (id, kind) = line.hear().await;
+        answers.insert(id, kind);
+    }
+    assert!(matches!(&answers[&4], Kind::Release(ended) if ended.released));
+    let Kind::Acquire(second) = &answers[&3] else { panic!("granted after the release") };
+    assert!(second.lease.as_ref().unwrap().token > lease_id);
+    manager.end().await;
+}
+
+#[tokio::test]
+async fn a_call_that_fails_leaves_the_stream_as_it_is() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut line = Line::open(&system, &manager, "a").await;
+    line.ask(2, None).await;
+    assert_eq!(line.failure().await, (2, Code::InvalidArgument));
+    line.ask(3, acquire("nobody", "x")).await;
+    assert_eq!(line.failure().await, (3, Code::FailedPrecondition));
+    let undo = v1::WithdrawRequest { request_id: "never asked".to_owned(), session_id: "a".to_owned() };
+    line.ask(4, Some(Asked::Withdraw(undo))).await;
+    assert!(matches!(line.hear().await, (4, Kind::Withdraw(undone)) if !undone.withdrawn));
+    manager.end().await;
+}
+
+#[tokio::test]
+async fn what_waits_on_a_stream_that_breaks_leaves_the_queue() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let held = a.resources.acquire(vec![block("Arm")], Default::default()).await.unwrap();
+    let mut line = Line::open(&system, &manager, "b").await;
+    line.ask(2, acquire("b", "waits")).await;
+    // It has arrived when a later question is answered.
+    line.ask(3, None).await;
+    assert_eq!(line.failure().await, (3, Code::InvalidArgument));
+    drop(line);
+    a.resources.release(held.id).await.unwrap();
+    let again = in_time(a.resources.acquire(vec![block("Arm")], Default::default())).await;
+    again.unwrap();
+    manager.end().await;
+}
+
+#[tokio::test]
+async fn more_calls_than_a_stream_may_have_are_refused_and_the_others_go_on() {
+    const CALLS: u64 = 4_200;
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut line = Line::open(&system, &manager, "a").await;
+    let questions = line.questions.clone();
+    tokio::spawn(async move {
+        for number in 0..CALLS {
+            let kind = acquire("a", &format!("waits {number}"));
+            let _ = questions.send(SessionRequest { id: 10 + number, kind }).await;
+        }
+    });
+    let (id, code) = line.failure().await;
+    assert!(code == Code::ResourceExhausted && id > 10, "{id}: {code:?}");
+    manager.end().await;
+}
