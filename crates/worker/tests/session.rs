@@ -119,6 +119,15 @@ impl ResourceService for Manager {
         Err(Status::unimplemented("not under test"))
     }
 
+    type SessionStream = BoxStream<'static, Result<ratn_proto::v1::SessionResponse, Status>>;
+
+    async fn session(
+        &self,
+        _: Request<Streaming<ratn_proto::v1::SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
     type WatchStream = BoxStream<'static, Result<ResourceServiceWatchResponse, Status>>;
 
     async fn watch(&self, _: Request<ResourceServiceWatchRequest>) -> Result<Response<Self::WatchStream>, Status> {
