@@ -9,7 +9,7 @@ use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_worker::client::AcquireOptions;
 use ratn_worker::session::Session;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use support::{DEADLINE, TestSystem, block, in_time};
 use tonic::Code;
 
@@ -169,22 +169,28 @@ async fn a_session_is_kept_alive_however_much_there_is_to_do() {
     let system = TestSystem::new();
     let manager = system.resource_manager().await;
     let a = system.client(&manager, "a").await;
-    let short = Session::open(&system.channels, &manager.endpoint, "short", Duration::from_millis(500));
+    let ttl = Duration::from_millis(1_500);
+    let short = Session::open(&system.channels, &manager.endpoint, "short", ttl);
     short.alive(DEADLINE).await.unwrap();
-    // Every change has all of these looked at.
+    // Every change has these looked at.
     let waits = |_| {
         let a = a.resources.clone();
         tokio::spawn(async move { a.acquire(vec![block("Arm"), block("Nothing")], AcquireOptions::default()).await })
     };
     let _waiting: Vec<_> = (0..3_000).map(waits).collect();
+    let began = Instant::now();
     let changes = |_| {
         let a = a.resources.clone();
-        tokio::spawn(async move { a.create(Resource::new("", ResourceClass::Module, "Arm")).await })
+        tokio::spawn(async move {
+            while began.elapsed() < 2 * ttl {
+                a.create(Resource::new("", ResourceClass::Module, "Arm")).await.unwrap();
+            }
+        })
     };
-    let changing: Vec<_> = (0..300).map(changes).collect();
+    let changing: Vec<_> = (0..100).map(changes).collect();
     let changed = async {
         for one in changing {
-            one.await.unwrap().unwrap();
+            one.await.unwrap();
         }
     };
     tokio::select! {
