@@ -1,9 +1,9 @@
 //! Acquire, and how one ends: granted, refused, withdrawn, released.
 
-use crate::assignment::{Assignment, Available};
 use crate::error::{PoolError, check_owner, malformed};
 use crate::event::{EndReason, Notice, Refusal};
 use crate::expiry::Timer;
+use crate::group::{Key, key};
 use crate::id::{SessionId, WaiterId};
 use crate::lease::LeaseRecord;
 use crate::memory::{Recalled, Remembered};
@@ -14,6 +14,7 @@ use crate::resource::Units;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::{Lease, ResourceOperation};
 use ratn_model::time::Timestamp;
+use std::cmp::Reverse;
 
 impl Pool {
     /// Asks for several resources, all or nothing. How it ends comes as a [`Notice`], at once where it can be granted.
@@ -99,6 +100,16 @@ impl Pool {
         }
         self.next_waiter += 1;
         let id = WaiterId(self.next_waiter);
+        if let Some(taken) = self.at_once((Reverse(request.priority), id), &request.requirements) {
+            self.give(id, request, request_id.to_owned(), fingerprint, taken);
+            self.schedule();
+            return Ok(id);
+        }
+        let groups: Vec<Key> = request.requirements.iter().map(key).collect();
+        let new = groups.iter().filter(|key| !self.queue.groups.contains_key(*key)).count();
+        if self.queue.groups.len() + new > self.limits.selectors {
+            return Err(PoolError::TooMany { what: "different selectors waited for", limit: self.limits.selectors });
+        }
         if let Some(deadline) = request.deadline {
             self.timers.insert((deadline, Timer::Waiter(id)));
         }
@@ -108,22 +119,32 @@ impl Pool {
         if !request_id.is_empty() {
             self.memory.wait(request_id, fingerprint, id);
         }
-        // Nothing became free: only the new one can be served, and only if there is enough for it beside what is held.
-        let available = Available::Free(&Units::new());
-        let may_be_served = Assignment::of(&self.resources, available, &request.requirements).is_complete();
-        self.queue.insert(id, Waiter { request, request_id: request_id.to_owned() });
-        if may_be_served {
-            self.schedule();
-        }
+        let reserved = vec![Units::new(); request.requirements.len()];
+        let request_id = request_id.to_owned();
+        let (hopeful, lacks, overtaken) = Default::default();
+        self.join(id, Waiter { request, request_id, groups, hopeful, reserved, lacks, overtaken });
+        self.schedule();
         Ok(id)
     }
 
     /// Gives a waiter what was found for it.
-    pub(crate) fn grant(&mut self, id: WaiterId, assignment: Assignment) {
+    pub(crate) fn grant(&mut self, id: WaiterId, taken: Vec<Units>) {
         let Some((waiter, fingerprint)) = self.leave(id) else { return };
-        let request = waiter.request;
+        self.give(id, waiter.request, waiter.request_id, fingerprint, taken);
+    }
+
+    fn give(
+        &mut self,
+        id: WaiterId,
+        request: AcquireRequest,
+        request_id: String,
+        fingerprint: u128,
+        taken: Vec<Units>,
+    ) {
+        self.overtake((Reverse(request.priority), id), &taken);
+        self.granting = true;
         let mut held = Vec::new();
-        for (requirement, taken) in request.requirements.iter().zip(assignment.taken) {
+        for (requirement, taken) in request.requirements.iter().zip(taken) {
             if requirement.operation == ResourceOperation::Consume {
                 self.commit_consumed(&request.session, taken);
             } else {
@@ -141,7 +162,8 @@ impl Pool {
             expires: None,
         };
         self.commit(Effect::LeaseGranted { lease, granted });
-        self.remember(waiter.request_id, fingerprint, Remembered::Granted(lease));
+        self.granting = false;
+        self.remember(request_id, fingerprint, Remembered::Granted(lease));
         if let Some(lease) = self.lease(lease) {
             self.notices.push(Notice::Granted { waiter: id, lease });
         }
@@ -154,7 +176,7 @@ impl Pool {
     }
 
     /// The lease as its holder gets it; without what it has lost since.
-    pub(crate) fn lease(&self, id: LeaseId) -> Option<Lease> {
+    pub fn lease(&self, id: LeaseId) -> Option<Lease> {
         let record = self.leases.get(&id)?;
         let mut resources = Vec::new();
         for (slot, amount) in &record.held {
@@ -167,7 +189,7 @@ impl Pool {
 
     /// Takes a waiter from everywhere; with the fingerprint of its request.
     fn leave(&mut self, id: WaiterId) -> Option<(Waiter, u128)> {
-        let waiter = self.queue.remove(id)?;
+        let waiter = self.part(id)?;
         if let Some(deadline) = waiter.request.deadline {
             self.timers.remove(&(deadline, Timer::Waiter(id)));
         }

@@ -5,6 +5,7 @@
 
 use crate::event::{Change, Notice, WatchEvent};
 use crate::expiry::Timer;
+use crate::group::Seen;
 use crate::id::{SessionId, Slot};
 use crate::lease::LeaseRecord;
 use crate::pool::Pool;
@@ -49,9 +50,11 @@ impl Pool {
             Effect::ResourceCreated { slot, description, owner, numbered } => {
                 let revision = Revision(self.revision.0 + 1);
                 let resource = Resource::new(description.clone(), owner.clone(), revision);
+                let seen = Seen::of(&resource);
                 if !self.resources.insert(*slot, resource) {
                     return Err(format!("`{}` or {slot} is there already", description.id));
                 }
+                self.queue.touched(&self.resources, *slot, None, Some(&seen), false);
                 self.last_number = (*numbered).max(self.last_number);
                 if let Some(owner) = owner {
                     self.session_mut(owner)?.provides.insert(*slot);
@@ -62,7 +65,7 @@ impl Pool {
             }
             Effect::ResourceUpdated { slot, description } => {
                 let revision = Revision(self.revision.0 + 1);
-                let changed = self.resources.change(*slot, |resource| {
+                let changed = self.change(*slot, |resource| {
                     resource.description = description.clone();
                     resource.revision = revision;
                 });
@@ -72,6 +75,7 @@ impl Pool {
             Effect::ResourceDeleted { slot, reason } => {
                 let view = self.view(*slot)?;
                 let resource = self.resources.remove(*slot).ok_or_else(|| missing(*slot))?;
+                self.queue.touched(&self.resources, *slot, Some(&Seen::of(&resource)), None, false);
                 if let Some(owner) = &resource.owner {
                     self.session_mut(owner)?.provides.remove(slot);
                 }
@@ -88,7 +92,7 @@ impl Pool {
                 Ok(())
             }
             Effect::Consumed { session, slot, amount } => {
-                let renewable = self.resources.change(*slot, |resource| {
+                let renewable = self.change(*slot, |resource| {
                     if resource.description.renewable {
                         add_to(&mut resource.consumers, session, *amount);
                     } else {
@@ -103,7 +107,7 @@ impl Pool {
             }
             Effect::TaskEnded { session } => {
                 for slot in std::mem::take(&mut self.session_mut(session)?.consumed) {
-                    self.resources.change(slot, |resource| remove_from(&mut resource.consumers, session));
+                    self.change(slot, |resource| remove_from(&mut resource.consumers, session));
                     self.updated(slot)?;
                 }
                 Ok(())
@@ -116,7 +120,7 @@ impl Pool {
                 }
                 let slots = record.slots();
                 for slot in &slots {
-                    self.resources.change(*slot, |resource| remove_from(&mut resource.holders, lease));
+                    self.change(*slot, |resource| remove_from(&mut resource.holders, lease));
                 }
                 self.session_mut(&record.session)?.leases.remove(lease);
                 let resources = self.views(&slots)?;
@@ -133,7 +137,7 @@ impl Pool {
 
     fn begin_lease(&mut self, lease: LeaseId, granted: &LeaseRecord) -> Result<(), Misfit> {
         for (slot, amount) in &granted.held {
-            let held = self.resources.change(*slot, |resource| {
+            let held = self.change(*slot, |resource| {
                 let enough = resource.free() >= *amount;
                 add_to(&mut resource.holders, &lease, *amount);
                 enough
@@ -159,6 +163,18 @@ impl Pool {
         let (token, session) = (granted.token, granted.session.clone());
         self.publish(Change::LeaseGranted { lease, token, session, resources });
         Ok(())
+    }
+
+    /// Changes a resource, and tells the queue.
+    fn change<T>(&mut self, slot: Slot, change: impl FnOnce(&mut Resource) -> T) -> Option<T> {
+        if self.queue.families.is_empty() {
+            return self.resources.change(slot, change);
+        }
+        let before = Seen::of(self.resources.get(slot)?);
+        let changed = self.resources.change(slot, change)?;
+        let after = Seen::of(self.resources.get(slot)?);
+        self.queue.touched(&self.resources, slot, Some(&before), Some(&after), self.granting);
+        Some(changed)
     }
 
     fn updated(&mut self, slot: Slot) -> Result<(), Misfit> {

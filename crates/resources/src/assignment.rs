@@ -4,6 +4,7 @@
 //! `PathPlanner{host: a}`), amounts are moved between them along augmenting paths (Ford and Fulkerson).
 //! A requirement of whole units takes whole units of each resource; only of divisible ones it may be less.
 
+use crate::group::takes;
 use crate::id::Slot;
 use crate::resource::{Resource, Units};
 use crate::resources::Resources;
@@ -34,7 +35,7 @@ impl Assignment {
     }
 
     /// The maximum assignment of what is available to the requirements.
-    pub(crate) fn of(resources: &Resources, available: Available<'_>, requirements: &[Requirement]) -> Assignment {
+    pub(crate) fn of(resources: &Resources, available: Available<'_>, requirements: &[&Requirement]) -> Assignment {
         let mut search = Search {
             resources,
             available,
@@ -50,9 +51,9 @@ impl Assignment {
             };
         }
         for (index, amount) in missing.iter_mut().enumerate() {
-            if takes(&requirements[index]) && requirements.iter().filter(|other| takes(other)).count() > 1 {
+            if takes(requirements[index]) && requirements.iter().filter(|other| takes(other)).count() > 1 {
                 while !amount.is_zero() {
-                    let moved = search.augment(index, *amount, grain(&requirements[index]), &mut BTreeSet::new());
+                    let moved = search.augment(index, *amount, grain(requirements[index]), &mut BTreeSet::new());
                     if moved.is_zero() {
                         break;
                     }
@@ -67,7 +68,7 @@ impl Assignment {
 struct Search<'a> {
     resources: &'a Resources,
     available: Available<'a>,
-    requirements: &'a [Requirement],
+    requirements: &'a [&'a Requirement],
     taken: Vec<Units>,
     used: Units,
 }
@@ -102,16 +103,16 @@ impl<'a> Search<'a> {
     }
 
     fn candidates(&self, index: usize) -> Box<dyn Iterator<Item = (Slot, &'a Resource)> + 'a> {
-        let requirements: &'a [Requirement] = self.requirements;
+        let requirements: &'a [&'a Requirement] = self.requirements;
         match self.available {
-            Available::Existing => Box::new(self.resources.fitting(&requirements[index])),
-            Available::Free(_) => Box::new(self.resources.free(&requirements[index])),
+            Available::Existing => Box::new(self.resources.fitting(requirements[index])),
+            Available::Free(_) => Box::new(self.resources.free(requirements[index])),
         }
     }
 
     /// Takes what is there; returns what is missing.
     fn greedy(&mut self, index: usize) -> Quantity {
-        let requirement = &self.requirements[index];
+        let requirement = self.requirements[index];
         let (mut wanted, grain) = (requirement.amount(), grain(requirement));
         for (slot, resource) in self.candidates(index) {
             if wanted.is_zero() {
@@ -134,7 +135,7 @@ impl<'a> Search<'a> {
         let fitting: Vec<(Slot, &Resource)> = self
             .candidates(index)
             .filter(|(_, resource)| {
-                self::grain(&self.requirements[index]) == Quantity::ONE || resource.description.divisible
+                self::grain(self.requirements[index]) == Quantity::ONE || resource.description.divisible
             })
             .collect();
         for (slot, resource) in &fitting {
@@ -150,7 +151,7 @@ impl<'a> Search<'a> {
             }
             for other in 0..self.requirements.len() {
                 let Some(held) = self.taken[other].get(&slot).copied().filter(|_| other != index) else { continue };
-                let grain = grain.max(self::grain(&self.requirements[other]));
+                let grain = grain.max(self::grain(self.requirements[other]));
                 let moved = self.augment(other, held.min(wanted).floor_to(grain), grain, visited);
                 if !moved.is_zero() {
                     self.give_back(other, slot, moved);
@@ -166,8 +167,4 @@ impl<'a> Search<'a> {
 /// Whole units, unless a part of one is asked for.
 fn grain(requirement: &Requirement) -> Quantity {
     if requirement.amount().is_whole() { Quantity::ONE } else { Quantity::from_thousandths(1) }
-}
-
-fn takes(requirement: &Requirement) -> bool {
-    matches!(requirement.operation, ResourceOperation::Block | ResourceOperation::Consume)
 }

@@ -23,13 +23,12 @@ impl Pool {
     ) -> Result<Vec<String>, PoolError> {
         self.advance(now);
         self.session(session)?;
-        let requirement = std::slice::from_ref(requirement);
-        self.check_requirements(requirement, &[ResourceOperation::Consume])?;
-        let assignment = Assignment::of(&self.resources, Available::Free(&self.reserved()), requirement);
+        self.check_requirements(std::slice::from_ref(requirement), &[ResourceOperation::Consume])?;
+        let assignment = Assignment::of(&self.resources, Available::Free(&self.queue.reserved), &[requirement]);
         if !assignment.is_complete() {
             let missing = assignment.missing.into_iter().sum();
-            let found = requirement[0].amount().saturating_sub(missing);
-            return Err(PoolError::NotEnough { wanted: requirement[0].to_string(), found });
+            let found = requirement.amount().saturating_sub(missing);
+            return Err(PoolError::NotEnough { wanted: requirement.to_string(), found });
         }
         let taken: Units = assignment.taken.into_iter().flatten().collect();
         let ids = taken.keys().filter_map(|slot| self.id_of(*slot)).collect();

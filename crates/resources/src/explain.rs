@@ -60,12 +60,17 @@ impl Pool {
     /// What a waiter waits for; `None` if it is not in the queue.
     pub fn explain(&self, id: WaiterId) -> Option<Explanation> {
         let waiter = self.queue.get(id)?;
-        let ahead = self.queue.iter().take_while(|(other, _)| *other != id).count();
-        let requirements = &waiter.request.requirements;
-        let free = Assignment::of(&self.resources, Available::Free(&self.reserved_before(id)), requirements);
-        let unreserved = Assignment::of(&self.resources, Available::Free(&Units::new()), requirements);
+        let ahead = self.queue.order.range(..waiter.place(id)).count();
+        let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
+        // What others have reserved: nobody behind it has anything that it wants.
+        let mut reserved = self.queue.reserved.clone();
+        for (slot, own) in waiter.reserved.iter().flatten() {
+            reserved.entry(*slot).and_modify(|amount| *amount = amount.saturating_sub(*own));
+        }
+        let free = Assignment::of(&self.resources, Available::Free(&reserved), &requirements);
+        let unreserved = Assignment::of(&self.resources, Available::Free(&Units::new()), &requirements);
         let obstacles = requirements
-            .iter()
+            .into_iter()
             .zip(free.missing.iter().zip(unreserved.missing))
             .filter(|(_, (missing, _))| !missing.is_zero())
             .map(|(requirement, (_, without_queue))| self.obstacle(id, requirement, !without_queue.is_zero()))

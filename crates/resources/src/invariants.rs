@@ -47,7 +47,11 @@ impl Pool {
             }
         }
         ensure(tokens <= self.last_token, || "a token is ahead of the counter".to_owned())?;
-        ensure(self.queue.order_agrees(), || "the order of the queue does not agree with its waiters".to_owned())?;
+        self.queue.index_agrees()?;
+        for (slot, amount) in &self.queue.reserved {
+            let free = self.resources.get(*slot).map(|resource| resource.free()).unwrap_or_default();
+            ensure(free >= *amount, || format!("{slot}: {amount} is reserved and only {free} free"))?;
+        }
         for (id, waiter) in self.queue.iter() {
             ensure(self.sessions.get(&waiter.request.session).is_some_and(|s| s.waiters.contains(&id)), || {
                 format!("{id} waits for {}, which does not know it", waiter.request.session)

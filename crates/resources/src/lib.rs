@@ -17,6 +17,17 @@
 //! strict order of priority, then arrival: a waiter that cannot be served yet reserves every free unit it can use, so a
 //! later one never takes a unit that it waits for, and waiters for other kinds pass. It deliberately knows no socket,
 //! no clock, no file and no process; who starts what a waiter lacks is the providers' business.
+//!
+//! Waiters that select the same form a group (`group.rs`); a change of a resource touches the groups that it fits, and what
+//! became free goes to the first who lacks it (`schedule.rs`). `cargo bench -p ratn-resources`, medians on a busy machine with two
+//! cores (compare them with each other):
+//!
+//! | call | empty pool | 100,000 resources | and 10,000 waiters |
+//! |---|---|---|---|
+//! | block and release of something free | 1.0 µs | 1.35 µs | 1.8 µs |
+//! | explain the last waiter | | 0.8 µs (10 waiters) | 14 µs |
+//! | restart | | 0.28 s from a snapshot, 0.24 s from records | |
+//! | memory | | 840 bytes a resource with three attributes | |
 
 mod acquisition;
 mod apply;
@@ -27,6 +38,7 @@ mod error;
 mod event;
 mod expiry;
 mod explain;
+mod group;
 mod history;
 mod id;
 mod invariants;

@@ -15,6 +15,10 @@ pub struct Limits {
     pub waiters: usize,
     /// Queued acquires of one session.
     pub waiters_per_session: usize,
+    /// Different selectors (kind, class, attributes) that are waited for.
+    pub selectors: usize,
+    /// How often a waiter may be overtaken (a later one gets what it waits for) before what it waits for is kept for it.
+    pub overtaken: u32,
     /// Live leases in all.
     pub leases: usize,
     /// Requirements of one acquire.
@@ -40,6 +44,8 @@ impl Default for Limits {
             sessions: 10_000,
             waiters: 10_000,
             waiters_per_session: 4_096,
+            selectors: 10_000,
+            overtaken: 0,
             leases: 100_000,
             requirements: 32,
             units: 100_000,

@@ -38,6 +38,8 @@ pub struct Pool {
     pub(crate) history: History,
     // What is not.
     pub(crate) queue: Queue,
+    /// What is taken now was reserved, or free for whom it is taken.
+    pub(crate) granting: bool,
     pub(crate) timers: BTreeSet<(Timestamp, Timer)>,
     pub(crate) next_waiter: u64,
     pub(crate) notices: Vec<Notice>,

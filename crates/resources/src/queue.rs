@@ -1,11 +1,14 @@
-//! The queue of acquires: larger priority first, then first come, first served.
+//! The queue of acquires: larger priority first, then first come, first served; and what each waiter has reserved.
 
-use crate::id::{SessionId, WaiterId};
-use ratn_model::resource::Requirement;
+use crate::group::{Family, Group, Key};
+use crate::id::{SessionId, Slot, WaiterId};
+use crate::resource::Units;
+use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 /// What an acquire asks for: all of it, or to wait.
@@ -25,19 +28,42 @@ pub struct AcquireRequest {
     pub purpose: String,
 }
 
+/// Where a waiter stands: it is served before those with a larger place.
+pub(crate) type Place = (Reverse<i64>, WaiterId);
+
 /// A queued acquire.
 #[derive(Debug, Clone)]
 pub(crate) struct Waiter {
     pub(crate) request: AcquireRequest,
     /// Forgotten again when it leaves without a lease, so that the client can ask once more.
     pub(crate) request_id: String,
+    /// Per requirement, the group that it waits in.
+    pub(crate) groups: Vec<Key>,
+    /// Whether what exists would do if nobody held any of it. Only then it reserves.
+    pub(crate) hopeful: bool,
+    /// Per requirement, what it has reserved: free, and for nobody else.
+    pub(crate) reserved: Vec<Units>,
+    /// The families of which it lacks something.
+    pub(crate) lacks: BTreeSet<Arc<str>>,
+    /// How many times a later one was served with what this one waits for.
+    pub(crate) overtaken: u32,
 }
 
-/// Waiters in the order in which they are served.
+/// Waiters in the order in which they are served, and by what they wait for.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Queue {
-    waiters: BTreeMap<WaiterId, Waiter>,
-    order: BTreeSet<(Reverse<i64>, WaiterId)>,
+    pub(crate) waiters: BTreeMap<WaiterId, Waiter>,
+    pub(crate) order: BTreeSet<Place>,
+    pub(crate) groups: BTreeMap<Key, Group>,
+    pub(crate) families: BTreeMap<Arc<str>, Family>,
+    /// What all waiters together have reserved.
+    pub(crate) reserved: Units,
+    /// Those that lack nothing.
+    pub(crate) ready: BTreeSet<Place>,
+    /// Families in which something became free; true where what is reserved has to be shared out anew.
+    pub(crate) changed: BTreeMap<Arc<str>, bool>,
+    /// Those of whom it is to be found out anew whether what exists would do.
+    pub(crate) doubtful: BTreeSet<Place>,
 }
 
 impl AcquireRequest {
@@ -61,6 +87,12 @@ impl AcquireRequest {
     }
 }
 
+impl Waiter {
+    pub(crate) fn place(&self, id: WaiterId) -> Place {
+        (Reverse(self.request.priority), id)
+    }
+}
+
 impl Queue {
     pub(crate) fn len(&self) -> usize {
         self.waiters.len()
@@ -70,24 +102,44 @@ impl Queue {
         self.waiters.get(&id)
     }
 
-    pub(crate) fn insert(&mut self, id: WaiterId, waiter: Waiter) {
-        self.order.insert((Reverse(waiter.request.priority), id));
-        self.waiters.insert(id, waiter);
-    }
-
-    pub(crate) fn remove(&mut self, id: WaiterId) -> Option<Waiter> {
-        let waiter = self.waiters.remove(&id)?;
-        self.order.remove(&(Reverse(waiter.request.priority), id));
-        Some(waiter)
-    }
-
     /// In the order in which they are served.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (WaiterId, &Waiter)> {
         self.order.iter().filter_map(|(_, id)| self.waiters.get(id).map(|waiter| (*id, waiter)))
     }
 
-    pub(crate) fn order_agrees(&self) -> bool {
-        self.order.len() == self.waiters.len()
-            && self.waiters.iter().all(|(id, w)| self.order.contains(&(Reverse(w.request.priority), *id)))
+    pub(crate) fn unreserve(&mut self, slot: Slot, amount: Quantity) {
+        if let Some(reserved) = self.reserved.get_mut(&slot) {
+            *reserved = reserved.saturating_sub(amount);
+            if reserved.is_zero() {
+                self.reserved.remove(&slot);
+            }
+        }
+    }
+
+    pub(crate) fn mark(&mut self, family: &Arc<str>, anew: bool) {
+        *self.changed.entry(family.clone()).or_default() |= anew;
+    }
+
+    /// Whether the indices say the same as the waiters do.
+    pub(crate) fn index_agrees(&self) -> Result<(), String> {
+        let ensure = |holds: bool, what: &str| if holds { Ok(()) } else { Err(what.to_owned()) };
+        ensure(self.order.len() == self.waiters.len(), "the order of the queue has another length")?;
+        ensure(self.changed.is_empty() && self.doubtful.is_empty(), "the queue has something left to do")?;
+        let mut reserved = Units::new();
+        let mut members = 0;
+        for (id, waiter) in &self.waiters {
+            let place = waiter.place(*id);
+            ensure(self.order.contains(&place), "a waiter has no place in the order")?;
+            members += waiter.groups.len();
+            for units in &waiter.reserved {
+                units.iter().for_each(|(slot, amount)| *reserved.entry(*slot).or_default() += *amount);
+            }
+            ensure(waiter.hopeful || waiter.reserved.iter().all(BTreeMap::is_empty), "a hopeless waiter reserves")?;
+            let ready = waiter.hopeful && waiter.lacks.is_empty();
+            ensure(self.ready.contains(&place) == ready, "who is ready is not among them")?;
+        }
+        ensure(reserved == self.reserved, "what is reserved is not what waiters have reserved")?;
+        ensure(self.groups.values().map(|group| group.members).sum::<usize>() == members, "a group miscounts")?;
+        ensure(self.groups.is_empty() == self.families.is_empty(), "a family without a group")
     }
 }

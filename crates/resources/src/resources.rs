@@ -4,7 +4,7 @@
 //! gives the same slots. Every change of a resource goes through [`Resources::change`], which keeps the indices right.
 
 use crate::id::Slot;
-use crate::resource::Resource;
+use crate::resource::{Description, Resource};
 use ratn_model::resource::{Quantity, Requirement};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -23,6 +23,8 @@ struct OfKind {
     all: BTreeSet<Slot>,
     /// Those of which something is free.
     free: BTreeSet<Slot>,
+    /// How much of them there is, held or not.
+    quantity: Quantity,
 }
 
 impl Resources {
@@ -60,6 +62,7 @@ impl Resources {
         }
         if let Some(of_kind) = self.by_kind.get_mut(kind) {
             of_kind.all.insert(slot);
+            of_kind.quantity += resource.quantity();
             if !resource.free().is_zero() {
                 of_kind.free.insert(slot);
             }
@@ -75,6 +78,7 @@ impl Resources {
         let kind = resource.description.kind.as_str();
         if let Some(of_kind) = self.by_kind.get_mut(kind) {
             of_kind.all.remove(&slot);
+            of_kind.quantity = of_kind.quantity.saturating_sub(resource.quantity());
             of_kind.free.remove(&slot);
             if of_kind.all.is_empty() {
                 self.by_kind.remove(kind);
@@ -86,12 +90,13 @@ impl Resources {
     /// Changes a resource; its kind and id stay.
     pub(crate) fn change<T>(&mut self, slot: Slot, change: impl FnOnce(&mut Resource) -> T) -> Option<T> {
         let resource = self.slots.get_mut(slot.index())?.as_mut()?;
-        let before = !resource.free().is_zero();
+        let (before, was) = (!resource.free().is_zero(), resource.quantity());
         let changed = change(resource);
-        let after = !resource.free().is_zero();
-        if before != after
+        let (after, is) = (!resource.free().is_zero(), resource.quantity());
+        if (before != after || was != is)
             && let Some(of_kind) = self.by_kind.get_mut(resource.description.kind.as_str())
         {
+            of_kind.quantity = of_kind.quantity.saturating_sub(was) + is;
             if after {
                 of_kind.free.insert(slot);
             } else {
@@ -136,8 +141,26 @@ impl Resources {
             .filter(|(_, resource)| resource.description.fits(requirement))
     }
 
+    /// The family of a kind: kinds of different families have no resource in common.
+    pub(crate) fn family<'a>(&'a self, kind: &'a str) -> &'a str {
+        kind
+    }
+
+    /// Whether a requirement can be met with a resource of that description.
+    pub(crate) fn fits(&self, description: &Description, requirement: &Requirement) -> bool {
+        description.kind == requirement.kind && description.fits(requirement)
+    }
+
+    /// Whether every resource of the kind fits.
+    pub(crate) fn fits_every(&self, requirement: &Requirement) -> bool {
+        requirement.class.is_none() && requirement.attributes.is_empty()
+    }
+
     /// How much of what fits exists, held or not, what is consumed excluded.
     pub(crate) fn quantity(&self, requirement: &Requirement) -> Quantity {
+        if self.fits_every(requirement) {
+            return self.by_kind.get(requirement.kind.as_str()).map(|of_kind| of_kind.quantity).unwrap_or_default();
+        }
         self.fitting(requirement).map(|(_, resource)| resource.quantity()).sum()
     }
 
@@ -147,7 +170,9 @@ impl Resources {
         let free: usize = self.by_kind.values().map(|of_kind| of_kind.free.len()).sum();
         let present = self.slots.iter().filter(|slot| slot.is_some()).count();
         let really_free = self.slots.iter().flatten().filter(|resource| !resource.free().is_zero()).count();
+        let quantity: Quantity = self.by_kind.values().map(|of_kind| of_kind.quantity).sum();
         present == self.by_id.len()
+            && quantity == self.slots.iter().flatten().map(Resource::quantity).sum::<Quantity>()
             && present == indexed
             && free == really_free
             && self.vacant.len() + present == self.slots.len()

@@ -1,63 +1,198 @@
-//! The grant pass: who in the queue can be served now.
+//! Who in the queue can be served now.
 //!
-//! Waiters are visited in order. One that can be served is granted; one that cannot, but could be if the holders let go,
-//! reserves every free unit it would take: nobody behind it gets those, so it is never overtaken for what it waits for.
-//! One that asks for more than exists reserves nothing, or a missing kind would hold up everybody else.
+//! Waiters are served in order. One that cannot be yet, but could be if the holders let go, reserves every free unit that it
+//! would take: nobody behind it gets those, so it is not overtaken for what it waits for more often than
+//! [`crate::Limits::overtaken`] says (until then it reserves nothing). One that asks for more than exists reserves nothing, or
+//! a missing kind would hold up everybody else.
+//!
+//! Families do not touch each other, so what a waiter reserves in one is independent of the rest: when something became free,
+//! it goes to the first in its family that lacks it. Only where the order is disturbed (a more urgent one arrives, something
+//! that was reserved is gone) is a family shared out anew. The work is that for those who get something.
 
 use crate::assignment::{Assignment, Available};
-use crate::id::WaiterId;
+use crate::group::{Key, takes};
 use crate::pool::Pool;
-use crate::queue::Waiter;
+use crate::queue::Place;
 use crate::resource::Units;
+use ratn_model::resource::Requirement;
+use std::collections::BTreeSet;
+use std::ops::Bound;
+use std::sync::Arc;
 
 impl Pool {
     /// Grants whatever can be granted.
     pub(crate) fn schedule(&mut self) {
-        let mut reserved = Units::new();
-        let order: Vec<WaiterId> = self.queue.iter().map(|(id, _)| id).collect();
-        for id in order {
-            let Some(waiter) = self.queue.get(id) else { continue };
+        loop {
+            while let Some(place) = self.queue.doubtful.pop_first() {
+                self.reconsider(place);
+            }
+            if let Some((family, anew)) = self.queue.changed.pop_first() {
+                self.share_out(&family, anew);
+                continue;
+            }
             if self.leases.len() >= self.limits.leases {
                 return;
             }
-            let requirements = &waiter.request.requirements;
-            let assignment = Assignment::of(&self.resources, Available::Free(&reserved), requirements);
-            if assignment.is_complete() {
-                self.grant(id, assignment);
-            } else if self.satisfiable(waiter) {
-                add(&mut reserved, &assignment);
+            let Some((_, id)) = self.queue.ready.first().copied() else { return };
+            let Some(waiter) = self.queue.get(id) else { return };
+            let taken = waiter.reserved.clone();
+            self.grant(id, taken);
+        }
+    }
+
+    /// What a request can have at once: all of it, or `None`. Nobody waits before it for any of it.
+    pub(crate) fn at_once(&self, place: Place, requirements: &[Requirement]) -> Option<Vec<Units>> {
+        let last = |requirement: &Requirement| {
+            let family = self.queue.families.get(self.resources.family(&requirement.kind));
+            family.and_then(|family| family.takers.last()).is_none_or(|taker| *taker < place)
+        };
+        if self.leases.len() >= self.limits.leases || !requirements.iter().filter(|r| takes(r)).all(last) {
+            return None;
+        }
+        let requirements: Vec<&Requirement> = requirements.iter().collect();
+        let assignment = Assignment::of(&self.resources, Available::Free(&self.queue.reserved), &requirements);
+        assignment.is_complete().then_some(assignment.taken)
+    }
+
+    /// Whether what exists would do for a waiter.
+    fn reconsider(&mut self, place: Place) {
+        let Some(waiter) = self.queue.waiters.get(&place.1) else { return };
+        let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
+        let hopeful = Assignment::of(&self.resources, Available::Existing, &requirements).is_complete();
+        if hopeful == waiter.hopeful {
+            return;
+        }
+        if !hopeful {
+            self.give_up(place.1);
+            return;
+        }
+        let taken: Vec<bool> = waiter.request.requirements.iter().map(takes).collect();
+        let groups = waiter.groups.clone();
+        let mut lacks = BTreeSet::new();
+        for (key, _) in groups.iter().zip(taken).filter(|(_, takes)| *takes) {
+            let Some(group) = self.queue.groups.get_mut(key) else { continue };
+            group.wanting.insert(place);
+            let name = group.family.clone();
+            if let Some(family) = self.queue.families.get_mut(&name) {
+                family.takers.insert(place);
+                let disturbs = family.reserving.last().is_some_and(|behind| *behind > place);
+                self.queue.mark(&name, disturbs);
+            }
+            lacks.insert(name);
+        }
+        if lacks.is_empty() {
+            self.queue.ready.insert(place);
+        }
+        if let Some(waiter) = self.queue.waiters.get_mut(&place.1) {
+            (waiter.hopeful, waiter.lacks) = (true, lacks);
+        }
+    }
+
+    /// Gives what is free in a family to those who lack it, in order.
+    fn share_out(&mut self, family: &Arc<str>, anew: bool) {
+        let Some(known) = self.queue.families.get_mut(family) else { return };
+        if anew {
+            for place in std::mem::take(&mut known.reserving) {
+                self.take_back(place, family);
+            }
+        }
+        let Some(known) = self.queue.families.get(family) else { return };
+        let first = |key: &Key| self.queue.groups.get(key)?.wanting.first().map(|place| (*place, key.clone()));
+        let mut heads: BTreeSet<(Place, Key)> = known.groups.iter().filter_map(first).collect();
+        let mut before = None;
+        while let Some((place, key)) = heads.pop_first() {
+            let Some(group) = self.queue.groups.get(&key) else { continue };
+            if group.exhausted(&self.resources, &self.queue.reserved) {
+                continue;
+            }
+            let next = group.wanting.range((Bound::Excluded(place), Bound::Unbounded)).next();
+            heads.extend(next.map(|next| (*next, key)));
+            if before != Some(place) {
+                self.attempt(place, family);
+                before = Some(place);
             }
         }
     }
 
-    /// The units that the queue reserves.
-    pub(crate) fn reserved(&self) -> Units {
-        self.reserved_by(self.queue.iter())
-    }
-
-    /// The units that the waiters before `id` reserve.
-    pub(crate) fn reserved_before(&self, id: WaiterId) -> Units {
-        self.reserved_by(self.queue.iter().take_while(|(other, _)| *other != id))
-    }
-
-    fn reserved_by<'a>(&'a self, waiters: impl Iterator<Item = (WaiterId, &'a Waiter)>) -> Units {
-        let mut reserved = Units::new();
-        for (_, waiter) in waiters.filter(|(_, waiter)| self.satisfiable(waiter)) {
-            let requirements = &waiter.request.requirements;
-            let assignment = Assignment::of(&self.resources, Available::Free(&reserved), requirements);
-            add(&mut reserved, &assignment);
+    /// What a waiter had reserved in a family is anybody's, and it lacks it.
+    fn take_back(&mut self, place: Place, family: &Arc<str>) {
+        let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
+        let mut freed = Vec::new();
+        for (index, key) in waiter.groups.iter().enumerate() {
+            let Some(group) = self.queue.groups.get_mut(key).filter(|group| group.family == *family) else { continue };
+            if takes(&waiter.request.requirements[index]) {
+                group.wanting.insert(place);
+                freed.extend(std::mem::take(&mut waiter.reserved[index]));
+            }
         }
-        reserved
+        waiter.lacks.insert(family.clone());
+        self.queue.ready.remove(&place);
+        freed.into_iter().for_each(|(slot, amount)| self.queue.unreserve(slot, amount));
     }
 
-    /// Whether what exists would do if nobody held any of it.
-    fn satisfiable(&self, waiter: &Waiter) -> bool {
-        Assignment::of(&self.resources, Available::Existing, &waiter.request.requirements).is_complete()
+    /// Reserves for a waiter what it lacks in a family, as far as that is free.
+    fn attempt(&mut self, place: Place, family: &Arc<str>) {
+        self.take_back(place, family);
+        if let Some(family) = self.queue.families.get_mut(family) {
+            family.reserving.remove(&place);
+        }
+        let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
+        let of_family = |key: &Key| self.queue.groups.get(key).is_some_and(|group| group.family == *family);
+        let indices: Vec<usize> = (0..waiter.groups.len())
+            .filter(|index| takes(&waiter.request.requirements[*index]) && of_family(&waiter.groups[*index]))
+            .collect();
+        let requirements: Vec<&Requirement> =
+            indices.iter().map(|index| &waiter.request.requirements[*index]).collect();
+        let available = Available::Free(&self.queue.reserved);
+        let assignment = Assignment::of(&self.resources, available, &requirements);
+        let complete = assignment.is_complete();
+        if !complete && waiter.overtaken < self.limits.overtaken {
+            return;
+        }
+        let mut some = false;
+        for (index, units) in indices.iter().zip(assignment.taken) {
+            for (slot, amount) in &units {
+                *self.queue.reserved.entry(*slot).or_default() += *amount;
+                some = true;
+            }
+            waiter.reserved[*index] = units;
+            if complete && let Some(group) = self.queue.groups.get_mut(&waiter.groups[*index]) {
+                group.wanting.remove(&place);
+            }
+        }
+        if some && let Some(family) = self.queue.families.get_mut(family) {
+            family.reserving.insert(place);
+        }
+        if complete {
+            waiter.lacks.remove(family);
+            if waiter.lacks.is_empty() {
+                self.queue.ready.insert(place);
+            }
+        }
     }
-}
 
-fn add(reserved: &mut Units, assignment: &Assignment) {
-    for (id, units) in assignment.taken.iter().flatten() {
-        *reserved.entry(*id).or_default() += *units;
+    /// Counts, for those before `place` that lack what is now taken, that they were overtaken.
+    pub(crate) fn overtake(&mut self, place: Place, taken: &[Units]) {
+        if self.limits.overtaken == 0 || self.queue.families.is_empty() {
+            return;
+        }
+        let mut passed = BTreeSet::new();
+        for slot in taken.iter().flat_map(|units| units.keys()) {
+            let Some(resource) = self.resources.get(*slot) else { continue };
+            let family = self.resources.family(&resource.description.kind);
+            for key in self.queue.families.get(family).into_iter().flat_map(|family| &family.groups) {
+                let Some(group) = self.queue.groups.get(key) else { continue };
+                if group.fits(&self.resources, &resource.description) {
+                    passed.extend(group.wanting.range(..place).map(|place| (*place, group.family.clone())));
+                }
+            }
+        }
+        for (place, family) in passed {
+            let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { continue };
+            waiter.overtaken = waiter.overtaken.saturating_add(1);
+            if waiter.overtaken == self.limits.overtaken {
+                self.queue.mark(&family, true);
+            }
+        }
     }
 }
