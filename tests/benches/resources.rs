@@ -56,7 +56,7 @@ fn start_echo() -> (Process, String) {
 
 async fn start_manager(directory: &std::path::Path, more: &[&str]) -> (Process, String) {
     let child = Command::new(env!("CARGO_BIN_EXE_ratn-under-test"))
-        .args(["resource-manager", "--runtime-dir"])
+        .args(["resource-manager", "--listen", "127.0.0.1:0", "--runtime-dir"])
         .arg(directory)
         .args(more)
         .env("RUST_LOG", "warn")

@@ -12,7 +12,7 @@ pub const MAX_BOXES: usize = 9;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CellConfig {
-    /// Where to listen: `127.0.0.1:0` or `unix:/path`.
+    /// Where to listen: `local` (a Unix socket in the runtime directory), `127.0.0.1:0` or `unix:/path`.
     pub listen: Endpoint,
     /// Where the resource manager is; without it, where the runtime directory says.
     pub resource_manager: Option<Endpoint>,
@@ -164,7 +164,7 @@ impl CellConfig {
 impl Default for CellConfig {
     fn default() -> CellConfig {
         CellConfig {
-            listen: Endpoint::loopback(),
+            listen: Endpoint::local(),
             resource_manager: None,
             host: "sim".to_owned(),
             boxes: 3,

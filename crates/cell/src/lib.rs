@@ -9,4 +9,4 @@ pub mod config;
 pub mod core;
 mod shell;
 
-pub use shell::{ROLE, run};
+pub use shell::{ROLE, run, run_as};

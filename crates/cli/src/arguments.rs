@@ -55,9 +55,12 @@ pub(crate) struct RoleArguments {
     /// Where endpoint files are; $RATN_RUNTIME_DIR, $XDG_RUNTIME_DIR/ratn or /tmp/ratn-UID unless given
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
-    /// Where to listen: `127.0.0.1:0`, `unix:/path`; the config's unless given
+    /// Where to listen: `local` (a Unix socket beside the endpoint file), `127.0.0.1:0`, `unix:/path`; the config's unless given
     #[arg(long, value_name = "ADDRESS")]
     pub(crate) listen: Option<Endpoint>,
+    /// Serve addresses beyond loopback also without TLS: the network itself is trusted
+    #[arg(long)]
+    pub(crate) insecure: bool,
     /// End when standard input ends: whoever started this is gone
     #[arg(long)]
     pub(crate) exit_with_parent: bool,
@@ -98,6 +101,9 @@ pub(crate) struct WorkerArguments {
     /// End when standard input ends: whoever started this is gone
     #[arg(long)]
     pub(crate) exit_with_parent: bool,
+    /// Serve addresses beyond loopback also without TLS: the network itself is trusted
+    #[arg(long)]
+    pub(crate) insecure: bool,
     /// Robot's seconds per second
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
     pub(crate) speed: f64,

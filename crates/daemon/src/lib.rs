@@ -2,14 +2,20 @@
 //! (the one task that owns the state; everything else sends it messages), `service.rs` (the gRPC adapter) and `status.rs`
 //! (errors as gRPC statuses).
 //!
-//! Every daemon is one `run(config, directory, shutdown)`: it listens, publishes `<role>.endpoint` in the runtime directory
+//! What all of them share: [`service`] (who may connect and do what: [`access`], [`audit`]), [`telemetry`], [`config`].
+//!
+//! Every daemon is one `run(config, directory, shutdown)`, or `run_as` with a [`ratn_worker::server::Serving`]: it listens, publishes `<role>.endpoint` in the runtime directory
 //! once it is ready, serves until the token is cancelled, and withdraws. Signals, the parent's end and command lines are
 //! the caller's business. Decisions are made in cores (`ratn-resources`, `ratn-world`, [`process_manager::pool`]), never here.
 
+pub mod access;
+pub mod audit;
 pub mod config;
 mod details;
 mod link;
+mod owners;
 pub mod process_manager;
 pub mod resource_manager;
+pub mod service;
 pub mod telemetry;
 pub mod world_pool;

@@ -1,4 +1,5 @@
-//! Where a server is: a TCP address or a Unix socket. Written `http://host:port`, `host:port` or `unix:/path`.
+//! Where a server is: a TCP address, with TLS or without, or a Unix socket. Written `http://host:port`, `host:port`,
+//! `https://host:port` or `unix:/path`.
 
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -17,6 +18,9 @@ pub const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 /// A socket path has to fit into `sockaddr_un`, with its final zero.
 const MAX_SOCKET_PATH_BYTES: usize = 107;
 
+/// [`Endpoint::local`] as text.
+const LOCAL: &str = "local";
+
 /// Where a server listens, or is to be reached.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(into = "String", try_from = "String")]
@@ -28,13 +32,22 @@ pub enum Endpoint {
         /// The port; 0 lets the system choose, for listening only.
         port: u16,
     },
+    /// Over TCP with TLS; both as above.
+    Tls {
+        /// What the server's certificate is for.
+        host: String,
+        /// The port.
+        port: u16,
+    },
     /// At a path of the file system.
     Unix(PathBuf),
 }
 
 /// Text that is no endpoint.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{text}` is not an endpoint: {problem}; expected http://host:port, host:port or unix:/path")]
+#[error(
+    "`{text}` is not an endpoint: {problem}; expected http://host:port, https://host:port, host:port or unix:/path"
+)]
 pub struct EndpointError {
     /// What was written.
     pub text: String,
@@ -58,6 +71,16 @@ impl Endpoint {
     pub fn loopback() -> Endpoint {
         Endpoint::Tcp { host: "127.0.0.1".to_owned(), port: 0 }
     }
+
+    /// For listening: a socket in the runtime directory, named as its server. Written `local`.
+    pub fn local() -> Endpoint {
+        Endpoint::Unix(PathBuf::new())
+    }
+
+    /// Whether it is [`Endpoint::local`].
+    pub fn is_local(&self) -> bool {
+        *self == Endpoint::local()
+    }
 }
 
 impl fmt::Display for Endpoint {
@@ -65,6 +88,9 @@ impl fmt::Display for Endpoint {
         match self {
             Endpoint::Tcp { host, port } if host.contains(':') => write!(f, "http://[{host}]:{port}"),
             Endpoint::Tcp { host, port } => write!(f, "http://{host}:{port}"),
+            Endpoint::Tls { host, port } if host.contains(':') => write!(f, "https://[{host}]:{port}"),
+            Endpoint::Tls { host, port } => write!(f, "https://{host}:{port}"),
+            Endpoint::Unix(_) if self.is_local() => f.write_str(LOCAL),
             Endpoint::Unix(path) => write!(f, "unix:{}", path.display()),
         }
     }
@@ -75,6 +101,9 @@ impl FromStr for Endpoint {
 
     fn from_str(text: &str) -> Result<Endpoint, EndpointError> {
         let refuse = |problem: String| EndpointError { text: text.to_owned(), problem };
+        if text == LOCAL {
+            return Ok(Endpoint::local());
+        }
         if let Some(path) = text.strip_prefix("unix:") {
             let path = path.strip_prefix("//").unwrap_or(path);
             if !path.starts_with('/') {
@@ -86,7 +115,10 @@ impl FromStr for Endpoint {
             }
             return Ok(Endpoint::Unix(PathBuf::from(path)));
         }
-        let address = text.strip_prefix("http://").unwrap_or(text);
+        let (tls, address) = match text.strip_prefix("https://") {
+            Some(address) => (true, address),
+            None => (false, text.strip_prefix("http://").unwrap_or(text)),
+        };
         let address = address.strip_suffix('/').unwrap_or(address);
         let (host, port) = address.rsplit_once(':').ok_or_else(|| refuse("no port is given".to_owned()))?;
         let port = port.parse().map_err(|_| refuse(format!("`{port}` is no port")))?;
@@ -94,7 +126,8 @@ impl FromStr for Endpoint {
         if host.is_empty() || host.contains(['/', '@', ' ']) {
             return Err(refuse(format!("`{host}` is no host")));
         }
-        Ok(Endpoint::Tcp { host: host.to_owned(), port })
+        let host = host.to_owned();
+        Ok(if tls { Endpoint::Tls { host, port } } else { Endpoint::Tcp { host, port } })
     }
 }
 
@@ -130,8 +163,11 @@ pub async fn connect(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
 }
 
 fn configured(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, ConnectError> {
-    let configured = tonic::transport::Endpoint::from_shared(endpoint.to_string())
-        .map_err(|source| ConnectError { endpoint: endpoint.clone(), source })?;
+    let failed = |source| ConnectError { endpoint: endpoint.clone(), source };
+    let mut configured = tonic::transport::Endpoint::from_shared(endpoint.to_string()).map_err(failed)?;
+    if let Endpoint::Tls { host, .. } = endpoint {
+        configured = configured.tls_config(crate::tls::of_client(host)).map_err(failed)?;
+    }
     Ok(configured
         .connect_timeout(CONNECT_TIMEOUT)
         .tcp_nodelay(true)
@@ -150,7 +186,9 @@ mod tests {
         for (text, printed) in [
             ("127.0.0.1:0", "http://127.0.0.1:0"),
             ("http://compute:4000", "http://compute:4000"),
+            ("https://compute:4000", "https://compute:4000"),
             ("http://[::1]:4000/", "http://[::1]:4000"),
+            ("local", "local"),
             ("unix:/run/ratn/x.sock", "unix:/run/ratn/x.sock"),
             ("unix:///run/ratn/x.sock", "unix:/run/ratn/x.sock"),
         ] {

@@ -1,11 +1,13 @@
 //! The worker SDK: what a process links that takes part in a ratn system. Light: no planner, no store, no clap.
 //!
 //! # Serving
-//! - [`endpoint::Endpoint`]: `http://host:port`, `host:port` or `unix:/path`; parse, print, [`endpoint::connect`].
+//! - [`endpoint::Endpoint`]: `http://host:port`, `https://…`, `host:port` or `unix:/path`; parse, print, [`endpoint::connect`].
 //! - [`runtime_directory::RuntimeDirectory`]: `create`, `publish(role, &endpoint) -> Published` (a guard), `find(role)`,
 //!   `wait_for(role, deadline)`.
 //! - [`server`]: `bind(&endpoint) -> Bound` (port 0 and Unix sockets too), `Services::new().with(service)`,
 //!   `bound.serve(services, shutdown_token)`: adds gRPC health and reflection, drains with a hard deadline.
+//! - [`gate::Gate`] sees every call with the [`gate::Identity`] of its caller; [`tls`] says what is shown and trusted; [`trace`] carries
+//!   a W3C trace context from call to call.
 //! - [`shutdown`]: `on_signals(&token)`, `exit_with_parent(&token)`.
 //!
 //! # Performing actions
@@ -27,10 +29,13 @@
 pub mod action;
 pub mod client;
 pub mod endpoint;
+pub mod gate;
 pub mod provider;
 pub mod robot_clock;
 pub mod runtime_directory;
 pub mod server;
 pub mod session;
 pub mod shutdown;
+pub mod tls;
+pub mod trace;
 pub mod worker;

@@ -106,6 +106,17 @@ impl RuntimeDirectory {
         Endpoint::Unix(self.path.join(format!("{name}.sock")))
     }
 
+    /// Where `role` listens: at its socket in here, where `listen` is [`Endpoint::local`].
+    ///
+    /// # Errors
+    /// Where the directory is relative and the current one is gone.
+    pub fn listen(&self, listen: &Endpoint, role: &str) -> io::Result<Endpoint> {
+        if !listen.is_local() {
+            return Ok(listen.clone());
+        }
+        Ok(Endpoint::Unix(std::path::absolute(self.path.join(format!("{role}.sock")))?))
+    }
+
     /// Lets others find `role` at `endpoint` until the guard is dropped.
     ///
     /// # Errors

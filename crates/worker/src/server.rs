@@ -1,10 +1,13 @@
 //! One way to serve: bind, add health and reflection, serve until a token is cancelled, drain with a hard deadline.
 
 use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
+use crate::gate::{Gate, Gated, Open};
+use crate::tls::{ServerTls, TlsError};
 use std::convert::Infallible;
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpListener, UnixListener, UnixStream};
 use tokio_stream::wrappers::UnixListenerStream;
@@ -13,17 +16,32 @@ use tonic::body::Body;
 use tonic::codegen::{Service, http};
 use tonic::server::NamedService;
 use tonic::service::Routes;
+use tonic::transport::ServerTlsConfig;
 use tonic::transport::server::TcpIncoming;
 use tonic_health::ServingStatus;
 
 /// Calls that have not ended this long after the shutdown began are dropped.
 pub const DRAIN_DEADLINE: Duration = Duration::from_millis(500);
+/// The metadata of one call has at most this many bytes.
+const MAX_METADATA_BYTES: u32 = 16 * 1024;
+
+/// How calls are let in, and how serving ends.
+#[derive(Clone)]
+pub struct Serving {
+    /// What may be listened on.
+    pub exposure: Exposure,
+    /// Every call passes it.
+    pub gate: Arc<dyn Gate>,
+    /// Instead of [`DRAIN_DEADLINE`].
+    pub drain: Duration,
+}
 
 /// A listener that nobody is served on yet.
 #[derive(Debug)]
 pub struct Bound {
     listener: Listener,
     endpoint: Endpoint,
+    tls: Option<ServerTlsConfig>,
 }
 
 #[derive(Debug)]
@@ -42,13 +60,43 @@ struct SocketFile {
 
 /// An address that cannot be listened on.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot listen on {endpoint}")]
-pub struct BindError {
-    /// Which.
-    pub endpoint: Endpoint,
-    /// Why.
-    #[source]
-    pub source: io::Error,
+pub enum BindError {
+    /// The system does not give it.
+    #[error("cannot listen on {endpoint}")]
+    Refused {
+        /// Which.
+        endpoint: Endpoint,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+    /// Other machines could reach it, and nothing would say who they are.
+    #[error(
+        "{endpoint} can be reached from other machines and has no TLS: give `[service.tls]` in the config, listen on a Unix \
+         socket or on loopback, or say --insecure where the network itself is trusted"
+    )]
+    Exposed {
+        /// Which.
+        endpoint: Endpoint,
+    },
+    /// `https` without a certificate.
+    #[error("{endpoint} is to be served with TLS, and no certificate is given")]
+    NoCertificate {
+        /// Which.
+        endpoint: Endpoint,
+    },
+    /// A TLS file cannot be read.
+    #[error(transparent)]
+    Tls(#[from] TlsError),
+}
+
+/// What a server may listen on.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Exposure {
+    /// With it every TCP address is served with TLS.
+    pub tls: Option<ServerTls>,
+    /// Without TLS, addresses beyond loopback are served all the same.
+    pub insecure: bool,
 }
 
 /// Serving ended before its time.
@@ -102,15 +150,31 @@ impl Services {
 /// Binds `listen`; what is bound has the real port. A Unix socket that nobody listens on any more is replaced.
 ///
 /// # Errors
-/// [`BindError`] where the address cannot be had.
+/// [`BindError`] where the address cannot be had, or is beyond loopback.
 pub async fn bind(listen: &Endpoint) -> Result<Bound, BindError> {
-    let failed = |source| BindError { endpoint: listen.clone(), source };
+    bind_as(listen, &Exposure::default()).await
+}
+
+/// As [`bind`], with TLS or where other machines reach it.
+///
+/// # Errors
+/// [`BindError`] where the address cannot be had, or may not be as `exposure` is.
+pub async fn bind_as(listen: &Endpoint, exposure: &Exposure) -> Result<Bound, BindError> {
+    let failed = |source| BindError::Refused { endpoint: listen.clone(), source };
     match listen {
-        Endpoint::Tcp { host, port } => {
+        Endpoint::Tcp { host, port } | Endpoint::Tls { host, port } => {
+            let tls = exposure.tls.as_ref().map(ServerTls::read).transpose()?;
+            if tls.is_none() && matches!(listen, Endpoint::Tls { .. }) {
+                return Err(BindError::NoCertificate { endpoint: listen.clone() });
+            }
             let listener = TcpListener::bind((host.as_str(), *port)).await.map_err(failed)?;
-            let port = listener.local_addr().map_err(failed)?.port();
-            let endpoint = Endpoint::Tcp { host: host.clone(), port };
-            Ok(Bound { listener: Listener::Tcp(listener), endpoint })
+            let address = listener.local_addr().map_err(failed)?;
+            if tls.is_none() && !address.ip().is_loopback() && !exposure.insecure {
+                return Err(BindError::Exposed { endpoint: listen.clone() });
+            }
+            let (host, port) = (host.clone(), address.port());
+            let endpoint = if tls.is_some() { Endpoint::Tls { host, port } } else { Endpoint::Tcp { host, port } };
+            Ok(Bound { listener: Listener::Tcp(listener), endpoint, tls })
         }
         Endpoint::Unix(path) => {
             if let Some(parent) = path.parent() {
@@ -122,8 +186,14 @@ pub async fn bind(listen: &Endpoint) -> Result<Bound, BindError> {
             let listener = UnixListener::bind(path).map_err(failed)?;
             let file = SocketFile { path: path.clone(), identity: identity(path).map_err(failed)? };
             let listener = Listener::Unix(listener, file);
-            Ok(Bound { listener, endpoint: listen.clone() })
+            Ok(Bound { listener, endpoint: listen.clone(), tls: None })
         }
+    }
+}
+
+impl Default for Serving {
+    fn default() -> Serving {
+        Serving { exposure: Exposure::default(), gate: Arc::new(Open), drain: DRAIN_DEADLINE }
     }
 }
 
@@ -140,6 +210,19 @@ impl Bound {
     /// # Errors
     /// [`ServeError`] where the transport fails.
     pub async fn serve(self, services: Services, shutdown: CancellationToken) -> Result<(), ServeError> {
+        self.serve_as(services, Serving::default(), shutdown).await
+    }
+
+    /// As [`Bound::serve`], through a gate and with a drain of one's own.
+    ///
+    /// # Errors
+    /// [`ServeError`] where the transport fails, or the TLS files hold nothing usable.
+    pub async fn serve_as(
+        self,
+        services: Services,
+        serving: Serving,
+        shutdown: CancellationToken,
+    ) -> Result<(), ServeError> {
         let (health, health_service) = tonic_health::server::health_reporter();
         for name in services.names.iter().chain(&[""]) {
             health.set_service_status(name, ServingStatus::Serving).await;
@@ -149,12 +232,19 @@ impl Bound {
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
             .build_v1()
             .map_err(ServeError::Reflection)?;
-        let router = tonic::transport::Server::builder()
+        let mut server = tonic::transport::Server::builder();
+        if let Some(tls) = self.tls {
+            let failed = |source| ServeError::Transport { endpoint: self.endpoint.clone(), source };
+            server = server.tls_config(tls).map_err(failed)?;
+        }
+        let router = server
+            .http2_max_header_list_size(MAX_METADATA_BYTES)
+            .layer(Gated(serving.gate))
             .http2_keepalive_interval(Some(KEEPALIVE_INTERVAL))
             .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
             .add_routes(services.routes.add_service(health_service).add_service(reflection));
 
-        let serving = {
+        let served = {
             let stop = shutdown.clone().cancelled_owned();
             async move {
                 match self.listener {
@@ -179,11 +269,11 @@ impl Bound {
             for name in services.names.iter().chain(&[""]) {
                 health.set_service_status(name, ServingStatus::NotServing).await;
             }
-            tokio::time::sleep(DRAIN_DEADLINE).await;
+            tokio::time::sleep(serving.drain).await;
         };
         let endpoint = self.endpoint;
         tokio::select! {
-            served = serving => served.map_err(|source| ServeError::Transport { endpoint, source }),
+            served = served => served.map_err(|source| ServeError::Transport { endpoint, source }),
             () = drained => {
                 tracing::debug!(%endpoint, "calls were still under way at the end of the drain");
                 Ok(())

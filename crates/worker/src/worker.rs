@@ -9,7 +9,7 @@ use crate::client::{CallError, Channels};
 use crate::endpoint::Endpoint;
 use crate::provider::Provider;
 use crate::runtime_directory::publish_file;
-use crate::server::{BindError, ServeError, Services, bind};
+use crate::server::{BindError, Exposure, ServeError, Services, bind_as};
 use crate::session::{DEFAULT_TTL, Session};
 use crate::shutdown;
 use ratn_model::resource::ResourceClass;
@@ -35,6 +35,8 @@ pub struct WorkerOptions {
     pub resource_manager: Option<Endpoint>,
     /// The host that it says it is on, when it offers its resource.
     pub host: String,
+    /// What it may listen on.
+    pub exposure: Exposure,
 }
 
 impl Default for WorkerOptions {
@@ -47,6 +49,7 @@ impl Default for WorkerOptions {
             exit_with_parent: false,
             resource_manager: None,
             host: String::new(),
+            exposure: Exposure::default(),
         }
     }
 }
@@ -119,7 +122,7 @@ impl Worker {
         }
         let channels = Channels::new();
         let server = actions.channels(channels.clone()).build();
-        let bound = bind(&options.listen).await?;
+        let bound = bind_as(&options.listen, &options.exposure).await?;
         let endpoint = bound.endpoint().clone();
         let services = Services::new().with(server.clone().into_service());
         let ends = shutdown.clone();

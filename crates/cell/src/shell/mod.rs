@@ -20,7 +20,7 @@ use ratn_proto::v1::cell_service_server::CellServiceServer;
 use ratn_worker::client::Channels;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::server::{Services, bind};
+use ratn_worker::server::{Services, Serving, bind_as};
 use tokio_util::sync::CancellationToken;
 
 /// The role's name: of its endpoint file, its command and its section of a config.
@@ -31,12 +31,25 @@ pub const ROLE: &str = "cell";
 /// # Errors
 /// Where the config is none, where it cannot listen or publish its endpoint, or where serving fails.
 pub async fn run(config: CellConfig, directory: RuntimeDirectory, shutdown: CancellationToken) -> anyhow::Result<()> {
+    run_as(config, directory, Serving::default(), shutdown).await
+}
+
+/// As [`run`], served as its host wants it.
+///
+/// # Errors
+/// As [`run`].
+pub async fn run_as(
+    config: CellConfig,
+    directory: RuntimeDirectory,
+    serving: Serving,
+    shutdown: CancellationToken,
+) -> anyhow::Result<()> {
     config.check()?;
     let laid = config.clone();
     let cell = tokio::task::spawn_blocking(move || Cell::new(laid)).await.context("cannot lay the table")??;
     let keeper = keeper::start(cell, RobotClock::start(config.speed)).context("cannot start the cell")?;
 
-    let bound = bind(&config.listen).await?;
+    let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let channels = Channels::new();
     let server = actions::server(&keeper, &config, channels.clone());
@@ -48,7 +61,7 @@ pub async fn run(config: CellConfig, directory: RuntimeDirectory, shutdown: Canc
     let linked = tokio::spawn(link.keep(shutdown.clone()));
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
-    let served = bound.serve(services, shutdown.clone()).await;
+    let served = bound.serve_as(services, serving, shutdown.clone()).await;
     drop(published);
     shutdown.cancel();
     linked.await.context("the link to the resource manager")?;

@@ -23,6 +23,7 @@ const LAST_WORK: Duration = Duration::from_millis(200);
 
 /// Runs one command to its end.
 pub(crate) fn run(command: Command) -> Result<(), Failure> {
+    ratn_worker::tls::install_from_environment()?;
     match command {
         Command::Demo(arguments) => demo::run(&arguments),
         Command::Up(arguments) => up::run(&arguments),

@@ -7,40 +7,54 @@ use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::public_directory;
 use anyhow::Context;
+use ratn_daemon::service::ServiceConfig;
 use ratn_daemon::{process_manager, resource_manager, telemetry, world_pool};
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::shutdown;
+use ratn_worker::server::{Exposure, Serving};
 use ratn_worker::worker::WorkerOptions;
+use ratn_worker::{shutdown, tls};
 use tokio_util::sync::CancellationToken;
 
 /// `ratn resource-manager`
 pub(super) fn resource_manager(arguments: &RoleArguments) -> Result<(), Failure> {
-    let mut config = SystemConfig::load(arguments.config.as_deref())?.resource_manager;
+    let system = SystemConfig::load(arguments.config.as_deref())?;
+    let mut config = system.resource_manager.clone();
     config.listen = arguments.listen.clone().unwrap_or(config.listen);
     // On one thread requests are handled in the order in which they arrive; task control sends the most urgent first.
     let runtime = tokio::runtime::Builder::new_current_thread();
-    daemon_on(runtime, arguments, async |directory, token| resource_manager::run(config, directory, token).await)
+    daemon_on(runtime, arguments, &system.service, async |host| {
+        resource_manager::run_as(config, host.directory, host.serving, host.shutdown).await
+    })
 }
 
 /// `ratn world-pool`
 pub(super) fn world_pool(arguments: &RoleArguments) -> Result<(), Failure> {
-    let mut config = SystemConfig::load(arguments.config.as_deref())?.world_pool;
+    let system = SystemConfig::load(arguments.config.as_deref())?;
+    let mut config = system.world_pool.clone();
     config.listen = arguments.listen.clone().unwrap_or(config.listen);
-    daemon(arguments, async |directory, token| world_pool::run(config, directory, token).await)
+    daemon(arguments, &system.service, async |host| {
+        world_pool::run_as(config, host.directory, host.serving, host.shutdown).await
+    })
 }
 
 /// `ratn process-manager`
 pub(super) fn process_manager(arguments: &RoleArguments) -> Result<(), Failure> {
-    let mut config = SystemConfig::load(arguments.config.as_deref())?.process_manager_config();
+    let system = SystemConfig::load(arguments.config.as_deref())?;
+    let mut config = system.process_manager_config();
     config.listen = arguments.listen.clone().unwrap_or(config.listen);
-    daemon(arguments, async |directory, token| process_manager::run(config, directory, token).await)
+    daemon(arguments, &system.service, async |host| {
+        process_manager::run_as(config, host.directory, host.serving, host.shutdown).await
+    })
 }
 
 /// `ratn cell`
 pub(super) fn cell(arguments: &RoleArguments) -> Result<(), Failure> {
-    let mut config = SystemConfig::load(arguments.config.as_deref())?.cell;
+    let system = SystemConfig::load(arguments.config.as_deref())?;
+    let mut config = system.cell.clone();
     config.listen = arguments.listen.clone().unwrap_or(config.listen);
-    daemon(arguments, async |directory, token| ratn_cell::run(config, directory, token).await)
+    daemon(arguments, &system.service, async |host| {
+        ratn_cell::run_as(config, host.directory, host.serving, host.shutdown).await
+    })
 }
 
 /// `ratn worker …`
@@ -54,6 +68,7 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
         exit_with_parent: arguments.exit_with_parent,
         resource_manager: arguments.resource_manager.clone(),
         host: arguments.host.clone(),
+        exposure: Exposure { tls: tls::server_from_environment(), insecure: arguments.insecure },
     };
     let speed = arguments.speed;
     blocking(async {
@@ -65,33 +80,45 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
     })
 }
 
+/// What a daemon finds where it runs.
+struct Host {
+    directory: RuntimeDirectory,
+    serving: Serving,
+    shutdown: CancellationToken,
+}
+
 fn daemon(
     arguments: &RoleArguments,
-    run: impl AsyncFnOnce(RuntimeDirectory, CancellationToken) -> anyhow::Result<()>,
+    service: &ServiceConfig,
+    run: impl AsyncFnOnce(Host) -> anyhow::Result<()>,
 ) -> Result<(), Failure> {
-    daemon_on(tokio::runtime::Builder::new_multi_thread(), arguments, run)
+    daemon_on(tokio::runtime::Builder::new_multi_thread(), arguments, service, run)
 }
 
 /// What every daemon does around its own work.
 fn daemon_on(
     runtime: tokio::runtime::Builder,
     arguments: &RoleArguments,
-    run: impl AsyncFnOnce(RuntimeDirectory, CancellationToken) -> anyhow::Result<()>,
+    service: &ServiceConfig,
+    run: impl AsyncFnOnce(Host) -> anyhow::Result<()>,
 ) -> Result<(), Failure> {
     if arguments.check_config {
         output::progress("the config is good");
         return Ok(());
     }
-    telemetry::start();
+    let mut service = service.clone();
+    service.insecure |= arguments.insecure;
+    service.trust().context("[service.tls]")?;
+    let _logs = telemetry::start_as(&service.log, service.audit_file.as_deref())?;
     blocking_on(runtime, async {
-        let token = CancellationToken::new();
-        shutdown::on_signals(&token).context("cannot catch signals")?;
+        let shutdown = CancellationToken::new();
+        shutdown::on_signals(&shutdown).context("cannot catch signals")?;
         if arguments.exit_with_parent {
-            shutdown::exit_with_parent(&token).context("cannot watch standard input")?;
+            shutdown::exit_with_parent(&shutdown).context("cannot watch standard input")?;
         }
         let directory = public_directory(arguments.runtime_dir.as_deref());
         let directory = RuntimeDirectory::create(&directory)
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
-        Ok(run(directory, token).await?)
+        Ok(run(Host { directory, serving: service.serving(), shutdown }).await?)
     })
 }

@@ -8,6 +8,7 @@ use ratn_cell::config::CellConfig;
 use ratn_daemon::config::Check;
 use ratn_daemon::process_manager::ProcessManagerConfig;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
+use ratn_daemon::service::ServiceConfig;
 use ratn_daemon::world_pool::WorldPoolConfig;
 use ratn_model::catalogue::Catalogue;
 use ratn_model::resource::ResourceClass;
@@ -32,6 +33,8 @@ const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=1000.0;
 pub(crate) struct SystemConfig {
     /// Robot's seconds per second, for all roles.
     pub(crate) speed: f64,
+    /// What surrounds every daemon.
+    pub(crate) service: ServiceConfig,
     pub(crate) resource_manager: ResourceManagerConfig,
     pub(crate) world_pool: WorldPoolConfig,
     pub(crate) process_manager: ProcessManagerConfig,
@@ -44,6 +47,7 @@ impl Default for SystemConfig {
     fn default() -> Self {
         SystemConfig {
             speed: 1.0,
+            service: ServiceConfig::default(),
             resource_manager: ResourceManagerConfig::default(),
             world_pool: WorldPoolConfig::default(),
             process_manager: ProcessManagerConfig::default(),
@@ -87,6 +91,7 @@ impl SystemConfig {
             self.cell.speed,
             self.speed
         );
+        self.service.check().context("[service]")?;
         self.resource_manager.check().context("[resource-manager]")?;
         self.world_pool.check().context("[world-pool]")?;
         self.process_manager.check().context("[process-manager]")?;

@@ -16,7 +16,7 @@ const MAX_WORKERS: u32 = 1_000;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProcessManagerConfig {
-    /// Where to listen.
+    /// Where to listen; `local` is a Unix socket in the runtime directory.
     pub listen: Endpoint,
     /// The name of this host: the end of every worker's id, `path-planner-1@compute`.
     pub host: String,
@@ -80,7 +80,7 @@ pub struct Template {
 impl Default for ProcessManagerConfig {
     fn default() -> Self {
         ProcessManagerConfig {
-            listen: Endpoint::loopback(),
+            listen: Endpoint::local(),
             host: "localhost".to_owned(),
             resource_manager: None,
             session_ttl_ms: 3_000,

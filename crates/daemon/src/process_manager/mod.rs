@@ -23,7 +23,7 @@ use crate::link::{Link, Manager, Wanted};
 use anyhow::Context;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::server::{Services, bind};
+use ratn_worker::server::{Services, Serving, bind_as};
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
@@ -42,7 +42,20 @@ pub async fn run(
     directory: RuntimeDirectory,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    let bound = bind(&config.listen).await?;
+    run_as(config, directory, Serving::default(), shutdown).await
+}
+
+/// As [`run`], served as its host wants it.
+///
+/// # Errors
+/// As [`run`].
+pub async fn run_as(
+    config: ProcessManagerConfig,
+    directory: RuntimeDirectory,
+    serving: Serving,
+    shutdown: CancellationToken,
+) -> anyhow::Result<()> {
+    let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let (wanted, to_offer) = watch::channel(Wanted::new());
     let (offered, there) = mpsc::channel(THERE);
@@ -60,7 +73,7 @@ pub async fn run(
     let service = ProcessServiceServer::new(service::Service { actor, host, shutdown: shutdown.clone() });
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
-    let served = bound.serve(Services::new().with(service), shutdown.clone()).await;
+    let served = bound.serve_as(Services::new().with(service), serving, shutdown.clone()).await;
     drop(published);
     shutdown.cancel();
     let _ = tokio::join!(linked, ended);

@@ -10,7 +10,7 @@ use std::time::Duration;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ResourceManagerConfig {
-    /// Where to listen.
+    /// Where to listen; `local` is a Unix socket in the runtime directory.
     pub listen: Endpoint,
     /// A session may ask for at most so long without a keep-alive, in milliseconds; more is shortened to this.
     pub max_session_ttl_ms: u64,
@@ -25,7 +25,7 @@ pub struct ResourceManagerConfig {
 impl Default for ResourceManagerConfig {
     fn default() -> Self {
         ResourceManagerConfig {
-            listen: Endpoint::loopback(),
+            listen: Endpoint::local(),
             max_session_ttl_ms: 60_000,
             max_wait_ms: 24 * 3_600_000,
             max_watchers: 1_024,

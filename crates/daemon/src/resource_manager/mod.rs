@@ -20,7 +20,7 @@ use anyhow::Context;
 use ratn_model::resource::Lease;
 use ratn_proto::v1::resource_service_server::ResourceServiceServer;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::server::{Services, bind};
+use ratn_worker::server::{Services, Serving, bind_as};
 use tokio_util::sync::CancellationToken;
 
 /// The role's name: of its endpoint file, its command and its section of a config.
@@ -38,7 +38,20 @@ pub async fn run(
     directory: RuntimeDirectory,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    let bound = bind(&config.listen).await?;
+    run_as(config, directory, Serving::default(), shutdown).await
+}
+
+/// As [`run`], served as its host wants it.
+///
+/// # Errors
+/// As [`run`].
+pub async fn run_as(
+    config: ResourceManagerConfig,
+    directory: RuntimeDirectory,
+    serving: Serving,
+    shutdown: CancellationToken,
+) -> anyhow::Result<()> {
+    let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let actor = actor::start(config, shutdown.clone());
     let service = ResourceServiceServer::new(service::Service::new(actor, shutdown.clone()))
@@ -46,7 +59,7 @@ pub async fn run(
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
-    let served = bound.serve(Services::new().with(service), shutdown).await;
+    let served = bound.serve_as(Services::new().with(service), serving, shutdown).await;
     drop(published);
     Ok(served?)
 }

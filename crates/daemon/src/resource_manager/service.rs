@@ -2,7 +2,10 @@
 
 use super::actor::{Handle, Message};
 use super::{Granted, wire};
+use crate::access::Caller;
+use crate::audit::{self, Mutation};
 use crate::details::{ending, retry_later, status};
+use crate::owners::Owners;
 use futures::{Stream, StreamExt};
 use ratn_model::id::LeaseId;
 use ratn_model::resource::{Lease, Requirement, ResourceOperation};
@@ -14,7 +17,7 @@ use std::collections::BTreeSet;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Request, Response, Status, Streaming};
@@ -23,6 +26,8 @@ use tonic::{Code, Request, Response, Status, Streaming};
 const KEEP_ALIVE_BUFFER: usize = 16;
 /// What the pool's own answer at a deadline is given to arrive.
 const GRACE: Duration = Duration::from_millis(20);
+/// No session is believed to live longer than this without a ping.
+const LONGEST_OWNED: Duration = Duration::from_secs(24 * 3_600);
 /// When a watcher that was cut off may come back.
 const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
 
@@ -30,6 +35,7 @@ const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
 #[derive(Debug, Clone)]
 pub(super) struct Service {
     pub(super) actor: Handle,
+    pub(super) owners: Owners,
     shutdown: CancellationToken,
     next_ticket: Arc<AtomicU64>,
 }
@@ -38,16 +44,57 @@ type Streamed<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 impl Service {
     pub(super) fn new(actor: Handle, shutdown: CancellationToken) -> Service {
-        Service { actor, shutdown, next_ticket: Arc::default() }
+        Service { actor, owners: Owners::default(), shutdown, next_ticket: Arc::default() }
     }
 
-    async fn perform(&self, request_id: String, request: PoolRequest) -> Result<(Reply, u64), Status> {
+    async fn perform(&self, caller: &Caller, request_id: String, request: PoolRequest) -> Result<(Reply, u64), Status> {
         label(&request_id, "request_id")?;
-        let performed = self.actor.ask(|answer| Message::Perform { request_id, request, answer }).await??;
-        Ok((performed.0, performed.1.0))
+        let operation = match &request {
+            PoolRequest::Create { .. } => "create",
+            PoolRequest::Consume { .. } => "consume",
+            PoolRequest::Delete { .. } | PoolRequest::DeleteUnits { .. } => "delete",
+            PoolRequest::Release { .. } => "release",
+            _ => "operate",
+        };
+        let (request_name, what) = written_down(&request_id, &request);
+        let performed = self.actor.ask(|answer| Message::Perform { request_id, request, answer }).await?;
+        let mutation = Mutation { caller, operation, request: &request_name, what };
+        mutation.ended(performed.as_ref().map(|_| None));
+        let (reply, revision) = performed?;
+        Ok((reply, revision.0))
     }
 
-    async fn wait_for_grant(&self, request_id: String, request: AcquireRequest, wait_ms: u64) -> Result<Lease, Status> {
+    /// The session of a request, which has to be the caller's.
+    fn session(&self, caller: &Caller, id: &str) -> Result<SessionId, Status> {
+        let session = session(id)?;
+        self.owners.check(caller, id, Instant::now())?;
+        Ok(session)
+    }
+
+    /// Without a session a call speaks for the operator.
+    fn optional_session(&self, caller: &Caller, id: &str) -> Result<Option<SessionId>, Status> {
+        if !id.is_empty() {
+            return self.session(caller, id).map(Some);
+        }
+        self.owners.check(caller, id, Instant::now())?;
+        Ok(None)
+    }
+
+    async fn wait_for_grant(
+        &self,
+        caller: &Caller,
+        request_id: String,
+        request: AcquireRequest,
+        wait_ms: u64,
+    ) -> Result<Lease, Status> {
+        let (request_name, what) = written_down(&request_id, &request);
+        let granted = self.granted(request_id, request, wait_ms).await;
+        let mutation = Mutation { caller, operation: "acquire", request: &request_name, what };
+        mutation.ended(granted.as_ref().map(|lease| Some(lease.token)));
+        granted
+    }
+
+    async fn granted(&self, request_id: String, request: AcquireRequest, wait_ms: u64) -> Result<Lease, Status> {
         label(&request_id, "request_id")?;
         label(&request.purpose, "holder")?;
         if wait_ms == 0 {
@@ -95,8 +142,12 @@ impl v1::resource_service_server::ResourceService for Service {
     type SessionStream = super::stream::SessionStream;
 
     async fn create(&self, request: Request<v1::CreateRequest>) -> Result<Response<v1::CreateResponse>, Status> {
-        let request = request.into_inner();
+        let (caller, request) = (Caller::of(&request), request.into_inner());
         let resource: Resource = required(request.resource, "resource")?;
+        if !caller.may_create(resource.class) {
+            let message = format!("{caller} may not create resources of the class {}", resource.class);
+            return Err(status(Code::PermissionDenied, "ROLE_MISSING", message));
+        }
         let spec = ResourceSpec {
             id: Some(resource.id).filter(|id| !id.is_empty()),
             class: resource.class,
@@ -107,8 +158,8 @@ impl v1::resource_service_server::ResourceService for Service {
             renewable: true,
             host: resource.host,
         };
-        let session = optional_session(&request.session_id)?;
-        let (reply, _) = self.perform(request.request_id, PoolRequest::Create { session, spec }).await?;
+        let session = self.optional_session(&caller, &request.session_id)?;
+        let (reply, _) = self.perform(&caller, request.request_id, PoolRequest::Create { session, spec }).await?;
         let Reply::Created { id, .. } = reply else { return Err(odd_reply(&reply)) };
         let Some(view) = self.actor.ask(|answer| Message::Get { id: id.clone(), answer }).await? else {
             let message = format!("`{id}` was created by this request and is gone since");
@@ -118,32 +169,34 @@ impl v1::resource_service_server::ResourceService for Service {
     }
 
     async fn consume(&self, request: Request<v1::ConsumeRequest>) -> Result<Response<v1::ConsumeResponse>, Status> {
-        let request = request.into_inner();
+        let (caller, request) = (Caller::of(&request), request.into_inner());
         let requirement: Requirement = required(request.requirement, "requirement")?;
-        let session = session(&request.session_id)?;
-        let (reply, revision) = self.perform(request.request_id, PoolRequest::Consume { session, requirement }).await?;
+        let session = self.session(&caller, &request.session_id)?;
+        let (reply, revision) =
+            self.perform(&caller, request.request_id, PoolRequest::Consume { session, requirement }).await?;
         let Reply::Touched(resource_ids) = reply else { return Err(odd_reply(&reply)) };
         Ok(Response::new(v1::ConsumeResponse { resource_ids, revision }))
     }
 
     async fn delete(&self, request: Request<v1::DeleteRequest>) -> Result<Response<v1::DeleteResponse>, Status> {
         use v1::delete_request::Target;
-        let request = request.into_inner();
+        let (caller, request) = (Caller::of(&request), request.into_inner());
         let target = request.target.ok_or_else(|| {
             status(Code::InvalidArgument, "MALFORMED", "target: resource_id or requirement is missing")
         })?;
         let (resource_ids, revision) = match target {
             Target::ResourceId(id) => {
                 name(&id, "resource_id")?;
-                let session = optional_session(&request.session_id)?;
+                let session = self.optional_session(&caller, &request.session_id)?;
                 let delete = PoolRequest::Delete { session, id: id.clone() };
-                let (_, revision) = self.perform(request.request_id, delete).await?;
+                let (_, revision) = self.perform(&caller, request.request_id, delete).await?;
                 (vec![id], revision)
             }
             Target::Requirement(requirement) => {
                 let requirement = Requirement::try_from(requirement).map_err(|m| m.within("requirement"))?;
-                let delete = PoolRequest::DeleteUnits { session: session(&request.session_id)?, requirement };
-                let (reply, revision) = self.perform(request.request_id, delete).await?;
+                let delete =
+                    PoolRequest::DeleteUnits { session: self.session(&caller, &request.session_id)?, requirement };
+                let (reply, revision) = self.perform(&caller, request.request_id, delete).await?;
                 let Reply::Touched(ids) = reply else { return Err(odd_reply(&reply)) };
                 (ids, revision)
             }
@@ -152,7 +205,7 @@ impl v1::resource_service_server::ResourceService for Service {
     }
 
     async fn block(&self, request: Request<v1::BlockRequest>) -> Result<Response<v1::BlockResponse>, Status> {
-        let request = request.into_inner();
+        let (caller, request) = (Caller::of(&request), request.into_inner());
         let requirement: Requirement = required(request.requirement, "requirement")?;
         if requirement.operation != ResourceOperation::Block {
             let message = format!("requirement.operation: is {}, not block", requirement.operation);
@@ -161,29 +214,34 @@ impl v1::resource_service_server::ResourceService for Service {
         let acquire = AcquireRequest {
             priority: request.priority,
             purpose: request.holder,
-            ..AcquireRequest::new(session(&request.session_id)?, vec![requirement])
+            ..AcquireRequest::new(self.session(&caller, &request.session_id)?, vec![requirement])
         };
-        let lease = self.wait_for_grant(request.request_id, acquire, request.deadline_ms).await?;
+        let lease = self.wait_for_grant(&caller, request.request_id, acquire, request.deadline_ms).await?;
         Ok(Response::new(v1::BlockResponse { lease: Some(lease.into()) }))
     }
 
     async fn acquire(&self, request: Request<v1::AcquireRequest>) -> Result<Response<v1::AcquireResponse>, Status> {
-        let request = request.into_inner();
+        let (caller, request) = (Caller::of(&request), request.into_inner());
         let requirements = each(request.requirements, "requirements")?;
         let acquire = AcquireRequest {
             priority: request.priority,
             purpose: request.holder,
-            ..AcquireRequest::new(session(&request.session_id)?, requirements)
+            ..AcquireRequest::new(self.session(&caller, &request.session_id)?, requirements)
         };
-        let lease = self.wait_for_grant(request.request_id, acquire, request.deadline_ms).await?;
+        let lease = self.wait_for_grant(&caller, request.request_id, acquire, request.deadline_ms).await?;
         Ok(Response::new(v1::AcquireResponse { lease: Some(lease.into()) }))
     }
 
     async fn withdraw(&self, request: Request<v1::WithdrawRequest>) -> Result<Response<v1::WithdrawResponse>, Status> {
+        let caller = Caller::of(&request);
         let v1::WithdrawRequest { request_id, session_id } = request.into_inner();
         name(&request_id, "request_id")?;
-        let session = session(&session_id)?;
-        let withdrawn = self.actor.ask(|answer| Message::Withdraw { session, request_id, answer }).await??;
+        let session = self.session(&caller, &session_id)?;
+        let (request_name, what) = written_down(&request_id, &session);
+        let withdrawn = self.actor.ask(|answer| Message::Withdraw { session, request_id, answer }).await?;
+        let mutation = Mutation { caller: &caller, operation: "withdraw", request: &request_name, what };
+        mutation.ended(withdrawn.as_ref().map(|_| None));
+        let withdrawn = withdrawn?;
         Ok(Response::new(v1::WithdrawResponse { withdrawn }))
     }
 
@@ -191,10 +249,10 @@ impl v1::resource_service_server::ResourceService for Service {
         &self,
         request: Request<v1::ResourceServiceReleaseRequest>,
     ) -> Result<Response<v1::ResourceServiceReleaseResponse>, Status> {
-        let request = request.into_inner();
-        let session = optional_session(&request.session_id)?;
+        let (caller, request) = (Caller::of(&request), request.into_inner());
+        let session = self.optional_session(&caller, &request.session_id)?;
         let release = PoolRequest::Release { session, lease: LeaseId(request.lease_id) };
-        let (released, revision) = match self.perform(request.request_id, release).await {
+        let (released, revision) = match self.perform(&caller, request.request_id, release).await {
             Ok((_, revision)) => (true, revision),
             Err(status) if status.code() == Code::NotFound => {
                 let (_, revision) = self.actor.ask(|answer| Message::List { answer }).await?;
@@ -241,6 +299,8 @@ impl v1::resource_service_server::ResourceService for Service {
         &self,
         request: Request<Streaming<v1::KeepAliveRequest>>,
     ) -> Result<Response<Self::KeepAliveStream>, Status> {
+        let caller = Caller::of(&request);
+        let owners = self.owners.clone();
         let mut pings = request.into_inner();
         let (sender, answers) = mpsc::channel(KEEP_ALIVE_BUFFER);
         let actor = self.actor.clone();
@@ -252,7 +312,7 @@ impl v1::resource_service_server::ResourceService for Service {
                     () = shutdown.cancelled() => return,
                 };
                 let Ok(Some(ping)) = ping else { return };
-                let answer = kept_alive(&actor, ping).await;
+                let answer = kept_alive(&actor, &owners, &caller, ping).await;
                 let failed = answer.is_err();
                 if sender.send(answer).await.is_err() || failed {
                     return;
@@ -266,16 +326,24 @@ impl v1::resource_service_server::ResourceService for Service {
         &self,
         request: Request<Streaming<v1::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let stream = super::stream::SessionStream::new(self.clone(), request.into_inner(), self.shutdown.clone());
+        let caller = Caller::of(&request);
+        let stream =
+            super::stream::SessionStream::new(self.clone(), caller, request.into_inner(), self.shutdown.clone());
         Ok(Response::new(stream))
     }
 }
 
-pub(super) async fn kept_alive(actor: &Handle, ping: v1::KeepAliveRequest) -> Result<v1::KeepAliveResponse, Status> {
+pub(super) async fn kept_alive(
+    actor: &Handle,
+    owners: &Owners,
+    caller: &Caller,
+    ping: v1::KeepAliveRequest,
+) -> Result<v1::KeepAliveResponse, Status> {
     let session = session(&ping.session_id)?;
     label(&ping.client, "client")?;
     let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };
     let ttl = Duration::from_millis(ping.ttl_ms);
+    owners.ping(caller, &ping.session_id, ttl.min(LONGEST_OWNED), Instant::now())?;
     let kept = actor.keep_alive(session, client, ttl).await?;
     Ok(v1::KeepAliveResponse {
         session_id: ping.session_id,
@@ -302,9 +370,9 @@ fn session(id: &str) -> Result<SessionId, Status> {
     Ok(SessionId::from(id))
 }
 
-/// Without a session a call speaks for the operator.
-fn optional_session(id: &str) -> Result<Option<SessionId>, Status> {
-    if id.is_empty() { Ok(None) } else { session(id).map(Some) }
+/// What the audit log says of a request; nothing where there is none.
+fn written_down(request_id: &str, request: &impl std::fmt::Debug) -> (String, String) {
+    if audit::enabled() { (request_id.to_owned(), format!("{request:?}")) } else { Default::default() }
 }
 
 fn odd_reply(reply: &Reply) -> Status {

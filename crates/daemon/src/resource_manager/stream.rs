@@ -5,6 +5,7 @@
 //! calls under way, which leave the queue as unary calls do. A client that does not read its answers is not read from either.
 
 use super::service::{Service, kept_alive};
+use crate::access::{Caller, Operation};
 use crate::details::{retry_later, status};
 use futures::stream::FuturesUnordered;
 use futures::{FutureExt, Stream, StreamExt};
@@ -15,7 +16,7 @@ use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::Duration;
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
-use tonic::{Code, Request, Status, Streaming};
+use tonic::{Code, Status, Streaming};
 
 /// Calls under way of one stream; more are refused.
 const MAX_CALLS: usize = 4_096;
@@ -29,6 +30,7 @@ type Call = Pin<Box<dyn Future<Output = v1::SessionResponse> + Send>>;
 /// The answers of one stream.
 pub(super) struct SessionStream {
     service: Service,
+    caller: Caller,
     questions: Option<Streaming<v1::SessionRequest>>,
     calls: FuturesUnordered<Call>,
     shutdown: Pin<Box<WaitForCancellationFutureOwned>>,
@@ -37,11 +39,12 @@ pub(super) struct SessionStream {
 impl SessionStream {
     pub(super) fn new(
         service: Service,
+        caller: Caller,
         questions: Streaming<v1::SessionRequest>,
         shutdown: CancellationToken,
     ) -> SessionStream {
         let shutdown = Box::pin(shutdown.cancelled_owned());
-        SessionStream { service, questions: Some(questions), calls: FuturesUnordered::new(), shutdown }
+        SessionStream { service, caller, questions: Some(questions), calls: FuturesUnordered::new(), shutdown }
     }
 }
 
@@ -63,7 +66,9 @@ impl Stream for SessionStream {
                 Poll::Ready(Some(Ok(question))) if this.calls.len() >= MAX_CALLS => {
                     return Poll::Ready(Some(Ok(answer(question.id, Err(too_many())))));
                 }
-                Poll::Ready(Some(Ok(question))) => this.calls.push(call(this.service.clone(), question)),
+                Poll::Ready(Some(Ok(question))) => {
+                    this.calls.push(call(this.service.clone(), this.caller.clone(), question))
+                }
                 Poll::Ready(None) => this.questions = None,
                 // Nobody is there to read an answer.
                 Poll::Ready(Some(Err(_))) => return Poll::Ready(None),
@@ -84,25 +89,35 @@ impl Stream for SessionStream {
     }
 }
 
-/// One call, as if it had come on its own.
-fn call(service: Service, question: v1::SessionRequest) -> Call {
+/// One call, as if it had come on its own, from the stream's caller.
+fn call(service: Service, caller: Caller, question: v1::SessionRequest) -> Call {
     use session_request::Kind as Asked;
     use session_response::Kind;
     let id = question.id;
     Box::pin(async move {
+        let operation = match question.kind {
+            Some(Asked::Block(_) | Asked::Acquire(_) | Asked::Withdraw(_)) => Operation::Acquire,
+            Some(Asked::Release(_)) => Operation::Release,
+            Some(Asked::KeepAlive(_)) | None => Operation::Session,
+        };
+        if let Err(refused) = caller.admit(operation) {
+            return answer(id, Err(refused));
+        }
         let answered = match question.kind {
-            Some(Asked::KeepAlive(ping)) => kept_alive(&service.actor, ping).await.map(Kind::KeepAlive),
+            Some(Asked::KeepAlive(ping)) => {
+                kept_alive(&service.actor, &service.owners, &caller, ping).await.map(Kind::KeepAlive)
+            }
             Some(Asked::Block(block)) => {
-                service.block(Request::new(block)).await.map(|lease| Kind::Block(lease.into_inner()))
+                service.block(caller.request(block)).await.map(|lease| Kind::Block(lease.into_inner()))
             }
             Some(Asked::Acquire(acquire)) => {
-                service.acquire(Request::new(acquire)).await.map(|lease| Kind::Acquire(lease.into_inner()))
+                service.acquire(caller.request(acquire)).await.map(|lease| Kind::Acquire(lease.into_inner()))
             }
             Some(Asked::Release(release)) => {
-                service.release(Request::new(release)).await.map(|ended| Kind::Release(ended.into_inner()))
+                service.release(caller.request(release)).await.map(|ended| Kind::Release(ended.into_inner()))
             }
             Some(Asked::Withdraw(withdraw)) => {
-                service.withdraw(Request::new(withdraw)).await.map(|undone| Kind::Withdraw(undone.into_inner()))
+                service.withdraw(caller.request(withdraw)).await.map(|undone| Kind::Withdraw(undone.into_inner()))
             }
             None => Err(status(Code::InvalidArgument, "MALFORMED", "kind: is missing: set one of the calls")),
         };

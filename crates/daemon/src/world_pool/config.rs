@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct WorldPoolConfig {
-    /// Where to listen.
+    /// Where to listen; `local` is a Unix socket in the runtime directory.
     pub listen: Endpoint,
     /// The name of this host: the end of its resource's id, `world-model@compute`.
     pub host: String,
@@ -33,7 +33,7 @@ pub struct WorldPoolConfig {
 impl Default for WorldPoolConfig {
     fn default() -> Self {
         WorldPoolConfig {
-            listen: Endpoint::loopback(),
+            listen: Endpoint::local(),
             host: "localhost".to_owned(),
             resource_manager: None,
             session_ttl_ms: 3_000,

@@ -21,7 +21,7 @@ use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
 use ratn_proto::v1::world_pool_service_server::WorldPoolServiceServer;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::server::{Services, bind};
+use ratn_worker::server::{Services, Serving, bind_as};
 use std::time::Duration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -38,7 +38,20 @@ pub async fn run(
     directory: RuntimeDirectory,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    let bound = bind(&config.listen).await?;
+    run_as(config, directory, Serving::default(), shutdown).await
+}
+
+/// As [`run`], served as its host wants it.
+///
+/// # Errors
+/// As [`run`].
+pub async fn run_as(
+    config: WorldPoolConfig,
+    directory: RuntimeDirectory,
+    serving: Serving,
+    shutdown: CancellationToken,
+) -> anyhow::Result<()> {
+    let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let manager = Manager { configured: config.resource_manager.clone(), directory: directory.clone() };
     let room = Resource::new(format!("world-model@{}", config.host), ResourceClass::World, &config.kind)
@@ -61,7 +74,7 @@ pub async fn run(
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
-    let served = bound.serve(Services::new().with(service), shutdown.clone()).await;
+    let served = bound.serve_as(Services::new().with(service), serving, shutdown.clone()).await;
     drop(published);
     shutdown.cancel();
     let _ = linked.await;

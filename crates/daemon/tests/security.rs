@@ -1,0 +1,220 @@
+//! Who may connect, and who may do what: over a Unix socket by uid, over TCP by certificate.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod support;
+
+use ratn_daemon::access::{AccessConfig, CertificateAccess, Role, UserAccess};
+use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
+use ratn_daemon::service::ServiceConfig;
+use ratn_proto::v1;
+use ratn_proto::v1::resource_service_client::ResourceServiceClient;
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::tls::ServerTls;
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, ExtendedKeyUsagePurpose, IsCa, KeyPair};
+use support::{TestSystem, in_time};
+use tokio_util::sync::CancellationToken;
+use tonic::Code;
+use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity};
+
+type Raw = ResourceServiceClient<Channel>;
+
+fn create(session: &str, class: v1::ResourceClass) -> v1::CreateRequest {
+    let resource = v1::Resource { class: class.into(), kind: "Thing".into(), capacity: 1, ..Default::default() };
+    v1::CreateRequest { request_id: String::new(), session_id: session.into(), resource: Some(resource) }
+}
+
+async fn ping(client: &mut Raw, session: &str, ttl_ms: u64) -> Result<v1::KeepAliveResponse, tonic::Status> {
+    let ping = v1::KeepAliveRequest { session_id: session.into(), ttl_ms, client: "test".into() };
+    let mut answers = client.keep_alive(tokio_stream::once(ping)).await?.into_inner();
+    answers.message().await.map(|answer| answer.unwrap())
+}
+
+async fn manager(system: &TestSystem, listen: Endpoint, service: &ServiceConfig) -> Endpoint {
+    let config = ResourceManagerConfig { listen, ..Default::default() };
+    let run = resource_manager::run_as(config, system.directory.clone(), service.serving(), CancellationToken::new());
+    tokio::spawn(run);
+    system.directory.wait_for(resource_manager::ROLE, support::DEADLINE).await.unwrap()
+}
+
+#[tokio::test]
+async fn by_default_a_manager_is_at_a_socket_of_its_directory_and_its_user_is_the_operator() {
+    let system = TestSystem::new();
+    let endpoint = manager(&system, ResourceManagerConfig::default().listen, &ServiceConfig::default()).await;
+    assert!(matches!(&endpoint, Endpoint::Unix(path) if path.ends_with("resource-manager.sock")), "{endpoint}");
+    let mut client = Raw::new(system.channels.get(&endpoint).unwrap());
+    in_time(client.create(create("", v1::ResourceClass::Module))).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_user_who_may_only_look_changes_nothing() {
+    let system = TestSystem::new();
+    let viewer = UserAccess { uid: nix::unistd::geteuid().as_raw(), roles: vec![Role::Viewer] };
+    let access = AccessConfig { users: vec![viewer], ..AccessConfig::default() };
+    let service = ServiceConfig { access, ..ServiceConfig::default() };
+    let endpoint = manager(&system, Endpoint::local(), &service).await;
+    let mut client = Raw::new(system.channels.get(&endpoint).unwrap());
+    in_time(client.list(v1::ListRequest::default())).await.unwrap();
+    let refused = in_time(client.create(create("", v1::ResourceClass::Module))).await.unwrap_err();
+    assert_eq!(refused.code(), Code::PermissionDenied);
+    assert!(refused.message().contains("may not Create"), "{refused}");
+    assert_eq!(in_time(ping(&mut client, "s", 1000)).await.unwrap_err().code(), Code::PermissionDenied);
+    let list = in_time(client.list(v1::ListRequest::default())).await.unwrap().into_inner();
+    assert_eq!(list.resources, []);
+}
+
+#[tokio::test]
+async fn who_proves_nothing_is_no_operator() {
+    let system = TestSystem::new();
+    let endpoint = manager(&system, Endpoint::loopback(), &ServiceConfig::default()).await;
+    let mut client = Raw::new(system.channels.get(&endpoint).unwrap());
+    let refused = in_time(client.create(create("", v1::ResourceClass::Module))).await.unwrap_err();
+    assert_eq!(refused.code(), Code::PermissionDenied);
+    in_time(ping(&mut client, "s", 10_000)).await.unwrap();
+    in_time(client.create(create("s", v1::ResourceClass::Module))).await.unwrap();
+}
+
+#[tokio::test]
+async fn an_address_beyond_loopback_is_not_served_without_tls_unless_it_is_said() {
+    let system = TestSystem::new();
+    let listen: Endpoint = "0.0.0.0:0".parse().unwrap();
+    let config = ResourceManagerConfig { listen: listen.clone(), ..Default::default() };
+    let run = resource_manager::run(config, system.directory.clone(), CancellationToken::new());
+    let refused = in_time(run).await.unwrap_err().to_string();
+    assert!(refused.contains("--insecure") && refused.contains("[service.tls]"), "{refused}");
+    let service = ServiceConfig { insecure: true, ..ServiceConfig::default() };
+    assert!(matches!(manager(&system, listen, &service).await, Endpoint::Tcp { .. }));
+}
+
+/// An authority and what it signs.
+struct Authority(CertifiedIssuer<'static, KeyPair>);
+
+struct Signed {
+    pem: String,
+    key: String,
+    fingerprint: String,
+}
+
+impl Authority {
+    fn new() -> Authority {
+        let mut params = CertificateParams::new([]).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        Authority(CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap())
+    }
+
+    fn sign(&self) -> Signed {
+        let key = KeyPair::generate().unwrap();
+        let mut params = CertificateParams::new(["localhost".to_owned()]).unwrap();
+        params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
+        let certificate = params.signed_by(&key, &self.0).unwrap();
+        let digest = ring::digest::digest(&ring::digest::SHA256, certificate.der());
+        let fingerprint = digest.as_ref().iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().join(":");
+        Signed { pem: certificate.pem(), key: key.serialize_pem(), fingerprint }
+    }
+
+    fn client(&self, endpoint: &Endpoint, shown: Option<&Signed>) -> Raw {
+        let mut tls =
+            ClientTlsConfig::new().domain_name("localhost").ca_certificate(Certificate::from_pem(self.0.pem()));
+        if let Some(shown) = shown {
+            tls = tls.identity(Identity::from_pem(&shown.pem, &shown.key));
+        }
+        Raw::new(Channel::from_shared(endpoint.to_string()).unwrap().tls_config(tls).unwrap().connect_lazy())
+    }
+}
+
+#[tokio::test]
+async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_anothers() {
+    let system = TestSystem::new();
+    let files = tempfile::tempdir().unwrap();
+    let authority = Authority::new();
+    let (own, first, second, stranger) = (authority.sign(), authority.sign(), authority.sign(), authority.sign());
+    let file = |name: &str, text: &str| {
+        let path = files.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path
+    };
+    let tls = ServerTls {
+        cert: file("cert.pem", &own.pem),
+        key: file("key.pem", &own.key),
+        client_ca: file("ca.pem", &authority.0.pem()),
+    };
+    let known = |signed: &Signed, name: &str| CertificateAccess {
+        fingerprint: signed.fingerprint.clone(),
+        name: name.to_owned(),
+        roles: vec![Role::Task],
+    };
+    let access =
+        AccessConfig { certificates: vec![known(&first, "first"), known(&second, "second")], ..Default::default() };
+    let service = ServiceConfig { tls: Some(tls), access, ..ServiceConfig::default() };
+    let endpoint = manager(&system, "localhost:0".parse().unwrap(), &service).await;
+    assert!(matches!(endpoint, Endpoint::Tls { .. }), "{endpoint}");
+
+    // Without a certificate nobody gets in; with one of the authority's that is not named one may look.
+    assert!(in_time(authority.client(&endpoint, None).list(v1::ListRequest::default())).await.is_err());
+    let other = Authority::new();
+    let foreign = other.sign();
+    assert!(in_time(authority.client(&endpoint, Some(&foreign)).list(v1::ListRequest::default())).await.is_err());
+    let mut client = authority.client(&endpoint, Some(&stranger));
+    in_time(client.list(v1::ListRequest::default())).await.unwrap();
+    assert_eq!(in_time(ping(&mut client, "x", 1000)).await.unwrap_err().code(), Code::PermissionDenied);
+
+    // The first has a session; the second can neither speak for it, nor prolong it, nor end it.
+    let (mut first, mut second) =
+        (authority.client(&endpoint, Some(&first)), authority.client(&endpoint, Some(&second)));
+    in_time(ping(&mut first, "s", 60_000)).await.unwrap();
+    in_time(first.create(create("s", v1::ResourceClass::Task))).await.unwrap();
+    let lease = v1::BlockRequest {
+        session_id: "s".into(),
+        requirement: Some(v1::Requirement {
+            operation: v1::ResourceOperation::Block.into(),
+            kind: "Thing".into(),
+            count: 1,
+            ..Default::default()
+        }),
+        deadline_ms: 10_000,
+        ..Default::default()
+    };
+    let lease = in_time(first.block(lease)).await.unwrap().into_inner().lease.unwrap();
+    let release =
+        v1::ResourceServiceReleaseRequest { request_id: String::new(), session_id: "s".into(), lease_id: lease.id };
+    let sessionless = v1::ResourceServiceReleaseRequest { session_id: String::new(), ..release.clone() };
+    for refused in [
+        in_time(second.release(release.clone())).await.unwrap_err(),
+        in_time(second.release(sessionless)).await.unwrap_err(),
+        in_time(ping(&mut second, "s", 60_000)).await.unwrap_err(),
+        in_time(ping(&mut second, "s", 0)).await.unwrap_err(),
+    ] {
+        assert_eq!(refused.code(), Code::PermissionDenied, "{refused}");
+    }
+    let refused = in_time(first.create(create("s", v1::ResourceClass::Module))).await.unwrap_err();
+    assert!(refused.message().contains("first (certificate) may not create"), "{refused}");
+    assert!(in_time(first.release(release)).await.unwrap().into_inner().released);
+}
+
+#[tokio::test]
+async fn names_with_control_characters_and_without_end_are_refused() {
+    let system = TestSystem::new();
+    let endpoint = manager(&system, Endpoint::local(), &ServiceConfig::default()).await;
+    let mut client = Raw::new(system.channels.get(&endpoint).unwrap());
+    let spoiled: [fn(&mut v1::CreateRequest, String); 6] = [
+        |request, name| request.request_id = name,
+        |request, name| request.session_id = name,
+        |request, name| request.resource.as_mut().unwrap().id = name,
+        |request, name| request.resource.as_mut().unwrap().kind = name,
+        |request, name| request.resource.as_mut().unwrap().host = name,
+        |request, name| {
+            let value = v1::Value { kind: Some(v1::value::Kind::Boolean(true)) };
+            request.resource.as_mut().unwrap().attributes.insert(name, value);
+        },
+    ];
+    for (i, spoil) in spoiled.iter().enumerate() {
+        for name in ["a\u{1b}[2Jb".to_owned(), "line\nfeed".to_owned(), "x".repeat(5_000)] {
+            let mut request = create("", v1::ResourceClass::Module);
+            spoil(&mut request, name);
+            let refused = in_time(client.create(request)).await.unwrap_err();
+            assert_eq!(refused.code(), Code::InvalidArgument, "{i}: {refused}");
+            assert!(!refused.message().contains(char::is_control), "{i}: {refused:?}");
+        }
+    }
+    let large = v1::ListRequest { kinds: vec!["x".repeat(32 * 1024 * 1024)] };
+    assert_eq!(in_time(client.list(large)).await.unwrap_err().code(), Code::OutOfRange);
+}

@@ -1,0 +1,149 @@
+//! W3C trace context (www.w3.org/TR/trace-context, level 1): taken from the metadata of a call, put into those made for it.
+//!
+//! ```text
+//!   traceparent: 00-<trace id, 32 hex digits>-<span id of the caller, 16>-<flags, 2>
+//! ```
+//! A task's context ([`within`]) goes into every call that it makes over [`crate::client::Channels`]. Nothing is exported: the ids
+//! are in the logs, for whoever puts them together.
+
+use rand::RngExt;
+use std::fmt;
+use std::future::Future;
+use std::str::FromStr;
+use tonic::codegen::http;
+
+/// The header and metadata key.
+pub const HEADER: &str = "traceparent";
+
+/// A place in a trace.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TraceContext {
+    trace: u128,
+    span: u64,
+    flags: u8,
+}
+
+/// Text that is no trace context.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("is no traceparent: expected 00-<32 hex digits>-<16 hex digits>-<2 hex digits>, neither id zero")]
+pub struct TraceContextError;
+
+tokio::task_local! {
+    static CURRENT: TraceContext;
+}
+
+impl TraceContext {
+    /// A new trace.
+    pub fn fresh() -> TraceContext {
+        let mut random = rand::rng();
+        TraceContext { trace: random.random::<u128>().max(1), span: random.random::<u64>().max(1), flags: 1 }
+    }
+
+    /// Another span of the same trace.
+    #[must_use]
+    pub fn child(self) -> TraceContext {
+        TraceContext { span: rand::rng().random::<u64>().max(1), ..self }
+    }
+
+    /// That of a request, if it carries one; one that is none is as good as absent, as the standard wants it.
+    pub fn from_headers(headers: &http::HeaderMap) -> Option<TraceContext> {
+        headers.get(HEADER)?.to_str().ok()?.parse().ok()
+    }
+
+    /// Names the whole trace: 32 hex digits.
+    pub fn trace_id(self) -> impl fmt::Display {
+        Hex(self.trace, 32)
+    }
+
+    /// Names this place in it: 16 hex digits.
+    pub fn span_id(self) -> impl fmt::Display {
+        Hex(self.span.into(), 16)
+    }
+}
+
+impl fmt::Display for TraceContext {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "00-{:032x}-{:016x}-{:02x}", self.trace, self.span, self.flags)
+    }
+}
+
+impl FromStr for TraceContext {
+    type Err = TraceContextError;
+
+    fn from_str(text: &str) -> Result<TraceContext, TraceContextError> {
+        let lower_hex = |part: &str| part.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
+        let mut parts = text.split('-');
+        let mut part = |length: usize| {
+            parts.next().filter(|part| part.len() == length && lower_hex(part)).ok_or(TraceContextError)
+        };
+        let (version, trace, span, flags) = (part(2)?, part(32)?, part(16)?, part(2)?);
+        // Later versions may append parts; this one may not.
+        if version == "ff" || (version == "00" && parts.next().is_some()) {
+            return Err(TraceContextError);
+        }
+        let context = TraceContext {
+            trace: u128::from_str_radix(trace, 16).map_err(|_| TraceContextError)?,
+            span: u64::from_str_radix(span, 16).map_err(|_| TraceContextError)?,
+            flags: u8::from_str_radix(flags, 16).map_err(|_| TraceContextError)?,
+        };
+        if context.trace == 0 || context.span == 0 { Err(TraceContextError) } else { Ok(context) }
+    }
+}
+
+struct Hex(u128, usize);
+
+impl fmt::Display for Hex {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:0width$x}", self.0, width = self.1)
+    }
+}
+
+/// Does something as a part of a trace.
+pub fn within<F: Future>(context: TraceContext, future: F) -> impl Future<Output = F::Output> {
+    CURRENT.scope(context, future)
+}
+
+/// That of the task that runs now, if it is a part of one.
+pub fn current() -> Option<TraceContext> {
+    CURRENT.try_with(|context| *context).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn a_context_reads_back_as_written_and_a_child_stays_in_its_trace() {
+        let text = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
+        let context: TraceContext = text.parse().unwrap();
+        assert_eq!(context.to_string(), text);
+        let child = context.child();
+        assert_eq!(child.trace_id().to_string(), context.trace_id().to_string());
+        assert_ne!(child.span_id().to_string(), context.span_id().to_string());
+        assert_eq!(TraceContext::fresh().to_string().parse::<TraceContext>().unwrap().to_string().len(), text.len());
+    }
+
+    #[test]
+    fn what_is_no_context_is_none() {
+        for text in [
+            "",
+            "00",
+            "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331",
+            "00-00000000000000000000000000000000-b7ad6b7169203331-01",
+            "00-0af7651916cd43dd8448eb211c80319c-0000000000000000-01",
+            "00-0AF7651916CD43DD8448EB211C80319C-b7ad6b7169203331-01",
+            "ff-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01",
+            "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01-more",
+        ] {
+            assert_eq!(text.parse::<TraceContext>(), Err(TraceContextError), "{text}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_task_has_the_context_that_it_is_within() {
+        let context = TraceContext::fresh();
+        assert_eq!(current(), None);
+        assert_eq!(within(context, async { current() }).await, Some(context));
+    }
+}
