@@ -2,6 +2,7 @@
 
 use crate::task_control::control::Word;
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use ratn_daemon::resource_manager::Durability;
 use ratn_worker::endpoint::Endpoint;
 use std::path::PathBuf;
 
@@ -32,7 +33,7 @@ pub(crate) enum Command {
     /// Run a scheduling problem of the literature in virtual time, as a task, and compare with the best known schedule
     Simulate(SimulateArguments),
     /// Own the resources: who has what, and who waits (host compute)
-    ResourceManager(RoleArguments),
+    ResourceManager(ResourceManagerArguments),
     /// Hold the root world model and its projections (host compute)
     WorldPool(RoleArguments),
     /// Spawn and watch this host's worker processes
@@ -64,6 +65,21 @@ pub(crate) struct RoleArguments {
     /// End when standard input ends: whoever started this is gone
     #[arg(long)]
     pub(crate) exit_with_parent: bool,
+}
+
+/// What the resource manager takes beside that.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ResourceManagerArguments {
+    #[command(flatten)]
+    pub(crate) role: RoleArguments,
+    /// When an answer may leave: `none` at once, `group` when it is on the disk, `each` likewise with a sync for every change; the
+    /// config's unless given
+    #[arg(long, value_name = "WHEN")]
+    pub(crate) durability: Option<Durability>,
+    /// Where its state is kept, in a folder of its name; the config's, $RATN_STATE_DIR, $STATE_DIRECTORY or `state` in the runtime
+    /// directory unless given
+    #[arg(long, value_name = "DIR")]
+    pub(crate) state_dir: Option<PathBuf>,
 }
 
 /// How tasks are executed, on the command line.

@@ -52,10 +52,14 @@ impl Pool {
         Pool { limits, ..Pool::default() }
     }
 
-    /// An empty pool whose tokens and ids are all above `floor`: a restarted manager that keeps nothing passes a number
-    /// that has grown since (the time), so that its leases are not refused as old ones.
-    pub fn starting_above(limits: Limits, floor: u64) -> Pool {
-        Pool { limits, last_lease: floor, last_token: floor, next_waiter: floor, ..Pool::default() }
+    /// The same pool; what it grants from now on has ids and tokens above `floor` too. A restarted manager passes a number that
+    /// has grown since (the time), so that its leases are not refused as old ones, whatever was lost of what it kept.
+    #[must_use]
+    pub fn above(mut self, floor: u64) -> Pool {
+        for last in [&mut self.last_lease, &mut self.last_token, &mut self.next_waiter] {
+            *last = floor.max(*last);
+        }
+        self
     }
 
     /// Performs a mutation. With a request id, an equal request of that id answered before is not performed again: its

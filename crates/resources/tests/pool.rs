@@ -447,7 +447,7 @@ fn requests_beyond_a_bound_are_refused() {
 
 #[test]
 fn tokens_of_a_restarted_pool_are_above_those_of_the_old_one() {
-    let mut pool = Pool::starting_above(Limits::default(), 1_000);
+    let mut pool = Pool::new(Limits::default()).above(1_000);
     let now = Timestamp(0);
     pool.keep_alive(now, &session("a"), "a", Duration::from_secs(1)).unwrap();
     pool.acquire(now, AcquireRequest::new(session("a"), vec![])).unwrap();

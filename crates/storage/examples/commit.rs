@@ -33,11 +33,12 @@ fn main() {
     }
     let (plain, log) = (median(plain), median(log));
     let append = append_only(&place.path().join("none"));
+    let recovery = recovery(&place.path().join("none"));
     let together = together(&place.path().join("together"), 1);
     let ahead = self::together(&place.path().join("ahead"), 64);
     println!(
         "{{\"plain_append_fdatasync_p50_us\": {plain:.1}, \"log_commit_p50_us\": {log:.1}, \"ratio\": {:.2}, \
-         \"append_ns\": {append:.0}, \"writers_64_records_s\": {together:.0}, \"writers_64_each_64_ahead_records_s\": {ahead:.0}}}",
+         \"append_ns\": {append:.0}, \"recovery_100000_ms\": {recovery:.1}, \"writers_64_records_s\": {together:.0}, \"writers_64_each_64_ahead_records_s\": {ahead:.0}}}",
         log / plain
     );
 }
@@ -83,6 +84,15 @@ fn append_only(path: &Path) -> f64 {
         writer.append(&RECORD).unwrap();
     }
     microseconds(begin) * 1e3 / APPENDS as f64
+}
+
+/// Milliseconds until a log of so many records can be written again.
+fn recovery(path: &Path) -> f64 {
+    let begin = Instant::now();
+    let (recovered, _writer) = Log::new(path, Options::default()).open().unwrap();
+    let milliseconds = microseconds(begin) / 1e3;
+    assert_eq!(recovered.records.len(), APPENDS);
+    milliseconds
 }
 
 /// Records per second of many writers behind one log, each of which waits when it has so many that are not durable.

@@ -1,11 +1,11 @@
 //! The daemons and workers: this binary as something else.
 
 use super::{blocking, blocking_on};
-use crate::arguments::{RoleArguments, WorkerArguments, WorkerKind};
+use crate::arguments::{ResourceManagerArguments, RoleArguments, WorkerArguments, WorkerKind};
 use crate::failure::Failure;
 use crate::output;
 use crate::system::config::SystemConfig;
-use crate::system::public_directory;
+use crate::system::{public_directory, variable};
 use anyhow::Context;
 use ratn_daemon::service::ServiceConfig;
 use ratn_daemon::{process_manager, resource_manager, telemetry, world_pool};
@@ -13,13 +13,23 @@ use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Exposure, Serving};
 use ratn_worker::worker::WorkerOptions;
 use ratn_worker::{shutdown, tls};
+use std::path::PathBuf;
 use tokio_util::sync::CancellationToken;
 
+/// The environment variables that say where state is kept; the second is systemd's.
+const STATE_VARIABLES: [&str; 2] = ["RATN_STATE_DIR", "STATE_DIRECTORY"];
+
 /// `ratn resource-manager`
-pub(super) fn resource_manager(arguments: &RoleArguments) -> Result<(), Failure> {
+pub(super) fn resource_manager(arguments: &ResourceManagerArguments) -> Result<(), Failure> {
+    let ResourceManagerArguments { role: arguments, durability, state_dir } = arguments;
     let system = SystemConfig::load(arguments.config.as_deref())?;
     let mut config = system.resource_manager.clone();
     config.listen = arguments.listen.clone().unwrap_or(config.listen);
+    let storage = &mut config.storage;
+    storage.durability = durability.unwrap_or(storage.durability);
+    let of_this_role = |directory: PathBuf| directory.join(resource_manager::ROLE);
+    let elsewhere = || STATE_VARIABLES.iter().find_map(|name| variable(name)).map(of_this_role);
+    storage.directory = state_dir.clone().map(of_this_role).or(storage.directory.take()).or_else(elsewhere);
     // On one thread requests are handled in the order in which they arrive; task control sends the most urgent first.
     let runtime = tokio::runtime::Builder::new_current_thread();
     daemon_on(runtime, arguments, &system.service, async |host| {

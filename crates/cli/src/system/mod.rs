@@ -8,6 +8,7 @@ use crate::task_control::shell::Place;
 use anyhow::Context;
 use config::SystemConfig;
 use launch::Processes;
+use ratn_daemon::resource_manager::{self, Durability};
 use ratn_proto::v1::GetGroundTruthRequest;
 use ratn_proto::v1::cell_service_client::CellServiceClient;
 use ratn_worker::client::{Channels, ResourceClient};
@@ -56,6 +57,12 @@ impl System {
     ) -> anyhow::Result<System> {
         let directory = RuntimeDirectory::create(directory)
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
+        let mut config = config;
+        if config.resource_manager.storage.directory.is_none() {
+            // All of it starts and ends together: whose resources these were is gone with the last system that was here.
+            forget_state(&directory)?;
+            config.resource_manager.storage.durability = Durability::None;
+        }
         let file = directory.path().join(CONFIG_FILE);
         std::fs::write(&file, config.to_toml()?).with_context(|| format!("cannot write {}", file.display()))?;
         let mut processes = Processes::start(&ROLES, &file, directory.path())?;
@@ -116,6 +123,16 @@ impl System {
     }
 }
 
+fn forget_state(directory: &RuntimeDirectory) -> anyhow::Result<()> {
+    let state = resource_manager::state_directory(directory.path());
+    match std::fs::remove_dir_all(&state) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("cannot remove {}", state.display()))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// Where the system that runs in `directory` is reached, if one does. The files of a system that was killed do not count.
 pub(crate) async fn running(directory: &Path) -> Option<Endpoints> {
     let directory = RuntimeDirectory::at(directory);
@@ -157,8 +174,12 @@ pub(crate) fn public_directory(given: Option<&Path>) -> PathBuf {
     if let Some(path) = given {
         return path.to_owned();
     }
-    let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     variable(DIRECTORY_VARIABLE)
         .or_else(|| variable("XDG_RUNTIME_DIR").map(|dir| dir.join("ratn")))
         .unwrap_or_else(|| std::env::temp_dir().join(format!("ratn-{}", nix::unistd::getuid())))
+}
+
+/// A path that the environment says.
+pub(crate) fn variable(name: &str) -> Option<PathBuf> {
+    std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from)
 }

@@ -3,7 +3,13 @@
 //! A grant that nobody takes any more (the call was dropped in the same moment) is released at once; a watcher that does
 //! not keep up is cut off rather than waited for. Pings of sessions come first: a session does not expire because there is
 //! much to do.
+//!
+//! Whatever leaves (answers, grants, events) goes through the outbox, and waits there until the records of what it tells of
+//! are on the disk. When they cannot be written, every change is refused from then on; what can be read is the state that is
+//! on the disk.
 
+use super::journal::Journal;
+use super::outbox::{Outbox, Outgoing};
 use super::wire;
 use super::{Granted, ResourceManagerConfig, status};
 use crate::details::{retry_later, status as status_with};
@@ -14,10 +20,11 @@ use ratn_proto::types::{ResourceEvent, ResourceUpdate};
 use ratn_resources::{
     AcquireRequest, Change, Notice, Pool, PoolError, Quantity, Reply, Request, ResourceView, SessionId, WaiterId,
 };
+use ratn_storage::{Fault, Progress};
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status};
@@ -26,6 +33,8 @@ use tonic::{Code, Status};
 const INBOX: usize = 1_024;
 /// Messages that are put into an order of urgency together.
 const AT_ONCE: usize = 64;
+/// What came together is written down together, and nothing else is looked at meanwhile, unless that takes longer than this.
+const TURN: Duration = Duration::from_millis(1);
 /// Pings that wait for the actor.
 const PINGS: usize = 1_024;
 /// Updates that wait for a watcher; one that has more to catch up with is cut off.
@@ -107,6 +116,12 @@ pub(super) struct Handle {
 struct Actor {
     config: ResourceManagerConfig,
     pool: Pool,
+    journal: Journal,
+    /// What came up since the last look at the pool's records, in order.
+    outgoing: Vec<Outgoing>,
+    outbox: Outbox,
+    /// Why nothing changes any more.
+    stopped: Option<Status>,
     start: Instant,
     /// Who waits for the answer of which waiter; a repeated request joins.
     calls: BTreeMap<WaiterId, Vec<(u64, oneshot::Sender<Granted>)>>,
@@ -116,15 +131,20 @@ struct Actor {
     watchers: Vec<mpsc::Sender<Arc<ResourceUpdate>>>,
 }
 
-/// Starts the actor; it ends with the token.
-pub(super) fn start(config: ResourceManagerConfig, shutdown: CancellationToken) -> Handle {
+/// Starts the actor on what was kept; it ends with the token.
+pub(super) fn start(
+    config: ResourceManagerConfig,
+    (pool, journal): (Pool, Journal),
+    shutdown: CancellationToken,
+) -> Handle {
     let (inbox, messages) = mpsc::channel(INBOX);
     let (pings, pinged) = mpsc::channel(PINGS);
-    // Nothing is kept over a restart: tokens have to be above those of before all the same.
-    let milliseconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis());
-    let floor = u64::try_from(milliseconds).unwrap_or(0);
     let actor = Actor {
-        pool: Pool::starting_above(config.limits.clone(), floor),
+        pool,
+        journal,
+        outgoing: Vec::new(),
+        outbox: Outbox::default(),
+        stopped: None,
         config,
         start: Instant::now(),
         calls: BTreeMap::new(),
@@ -187,26 +207,46 @@ impl Actor {
     ) {
         let mut arrived = Vec::new();
         loop {
-            let deadline = self.pool.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
+            let running = self.stopped.is_none();
+            let deadline = self.pool.next_deadline().filter(|_| running);
+            let deadline = deadline.map(|at| self.start + Duration::from_nanos(at.0));
+            let room = !self.outbox.is_full();
             tokio::select! {
                 biased;
-                () = shutdown.cancelled() => return,
+                () = shutdown.cancelled() => return self.end(),
                 Some(ping) = pinged.recv() => self.pinged(ping),
+                progress = self.journal.changed(), if running => self.written(progress),
                 () = sleep_until(deadline) => self.pool.advance(self.now()),
-                count = messages.recv_many(&mut arrived, AT_ONCE) => {
+                count = messages.recv_many(&mut arrived, AT_ONCE), if room => {
                     if count == 0 {
-                        return;
+                        return self.end();
                     }
                     most_urgent_first(&mut arrived);
+                    let mut turn = Instant::now();
                     for message in arrived.drain(..) {
                         while let Ok(ping) = pinged.try_recv() {
                             self.pinged(ping);
                         }
                         self.receive(message);
+                        if turn.elapsed() > TURN {
+                            self.deliver();
+                            // So that pings that came meanwhile are read.
+                            tokio::task::yield_now().await;
+                            turn = Instant::now();
+                        }
                     }
                 }
             }
             self.deliver();
+        }
+    }
+
+    /// Lets out what is on the disk by now, and what the rest of it was waiting for.
+    fn end(mut self) {
+        self.deliver();
+        match self.journal.close() {
+            Ok(()) => self.deliver(),
+            Err(fault) => self.stop(&fault),
         }
     }
 
@@ -215,17 +255,24 @@ impl Actor {
     }
 
     fn pinged(&mut self, Ping { session, client, ttl, answer }: Ping) {
-        let kept = self.keep_alive(&session, &client, ttl).map_err(|error| status::of_error(&error));
-        let _ = answer.send(kept);
+        let kept = match &self.stopped {
+            Some(stopped) => Err(stopped.clone()),
+            None => self.keep_alive(&session, &client, ttl).map_err(|error| status::of_error(&error)),
+        };
+        self.reply(answer, kept);
+        self.collect();
     }
 
     fn receive(&mut self, message: Message) {
+        if let Some(stopped) = self.stopped.clone() {
+            return self.receive_stopped(message, stopped);
+        }
         let now = self.now();
         match message {
             Message::Perform { request_id, request, answer } => {
                 let reply = self.pool.handle(now, &request_id, request);
                 let revision = self.pool.revision();
-                let _ = answer.send(reply.map(|reply| (reply, revision)).map_err(|error| status::of_error(&error)));
+                self.reply(answer, reply.map(|reply| (reply, revision)).map_err(|error| status::of_error(&error)));
             }
             Message::Acquire { ticket, request_id, mut request, wait, answer } => {
                 request.deadline = Some(now + wait.min(self.config.max_wait()));
@@ -235,17 +282,39 @@ impl Actor {
                         self.calls.entry(waiter).or_default().push((ticket, answer));
                     }
                     // Repeated after the grant: whoever asks again has it already, so a dropped call keeps it.
-                    Ok(Reply::Granted(lease)) => drop(answer.send(Ok(lease))),
+                    Ok(Reply::Granted(lease)) => self.reply(answer, Ok(lease)),
                     Ok(reply) => debug_assert!(false, "an acquire is queued or granted, not {reply:?}"),
-                    Err(error) => drop(answer.send(Err(status::of_error(&error)))),
+                    Err(error) => self.reply(answer, Err(status::of_error(&error))),
                 }
             }
             Message::Abandon { ticket } => self.abandon(ticket),
             Message::Withdraw { session, request_id, answer } => {
                 let withdrawn = self.pool.withdraw(now, &session, &request_id);
-                let _ = answer.send(withdrawn.map_err(|error| status::of_error(&error)));
+                self.reply(answer, withdrawn.map_err(|error| status::of_error(&error)));
             }
             Message::Return { lease } => self.give_back(lease),
+            Message::Find { requirement, answer } => {
+                let fitting = self.pool.fitting(&requirement);
+                let found = (self.pool.exists(&requirement), fitting);
+                self.tell(answer, found);
+            }
+            Message::Get { id, answer } => self.tell(answer, self.pool.get(&id)),
+            Message::List { answer } => self.tell(answer, (self.pool.list(), self.pool.revision())),
+            Message::Watch { answer } => {
+                let watch = self.watch();
+                self.reply(answer, watch);
+            }
+        }
+        self.collect();
+    }
+
+    /// Reads go on, of what is on the disk.
+    fn receive_stopped(&mut self, message: Message, stopped: Status) {
+        match message {
+            Message::Perform { answer, .. } => drop(answer.send(Err(stopped))),
+            Message::Acquire { answer, .. } => drop(answer.send(Err(stopped))),
+            Message::Withdraw { answer, .. } => drop(answer.send(Err(stopped))),
+            Message::Abandon { .. } | Message::Return { .. } => {}
             Message::Find { requirement, answer } => {
                 let fitting = self.pool.fitting(&requirement);
                 let _ = answer.send((self.pool.exists(&requirement), fitting));
@@ -254,6 +323,22 @@ impl Actor {
             Message::List { answer } => drop(answer.send((self.pool.list(), self.pool.revision()))),
             Message::Watch { answer } => drop(answer.send(self.watch())),
         }
+    }
+
+    /// Answers when what the answer tells of is on the disk.
+    fn reply<T: Send + 'static>(&mut self, answer: Answer<T>, result: Result<T, Status>) {
+        self.outgoing.push(Outgoing::Answer(Box::new(move |stopped| {
+            let _ = answer.send(stopped.map_or(result, |stopped| Err(stopped.clone())));
+        })));
+    }
+
+    /// As [`Actor::reply`], to one who only looks; without an answer they ask again.
+    fn tell<T: Send + 'static>(&mut self, answer: oneshot::Sender<T>, told: T) {
+        self.outgoing.push(Outgoing::Answer(Box::new(move |stopped| {
+            if stopped.is_none() {
+                let _ = answer.send(told);
+            }
+        })));
     }
 
     fn keep_alive(&mut self, session: &SessionId, client: &str, ttl: Duration) -> Result<KeptAlive, PoolError> {
@@ -306,41 +391,104 @@ impl Actor {
         sender
             .try_send(Arc::new(snapshot))
             .map_err(|_| status_with(Code::Internal, "BROKEN", "a new watch took no snapshot"))?;
-        self.watchers.push(sender);
+        // Events of before that wait for the disk are in the snapshot.
+        self.outgoing.push(Outgoing::Watcher(sender));
         Ok(updates)
     }
 
-    /// Hands out what the pool has to say, including what that in turn leads to.
+    /// What the pool has to say goes behind what was to be said before.
+    fn collect(&mut self) {
+        self.outgoing.extend(self.pool.take_notices().into_iter().map(Outgoing::Notice));
+    }
+
+    /// Writes down what has changed, and hands out what is on the disk, including what that in turn leads to.
     fn deliver(&mut self) {
-        loop {
-            let notices = self.pool.take_notices();
-            // Nothing is kept over a restart yet.
-            drop(self.pool.take_records());
-            if notices.is_empty() {
-                return;
+        while self.stopped.is_none() {
+            self.collect();
+            if let Err(error) = self.journal.write(&mut self.pool) {
+                return self.stop(&error);
             }
-            for notice in notices {
-                match notice {
-                    Notice::Event(event) => {
-                        if let Change::LeaseEnded { lease, .. } = &event.change {
-                            self.shared.remove(lease);
-                        }
-                        wire::events(&event).into_iter().for_each(|event| self.publish(event));
-                    }
-                    Notice::Granted { waiter, lease } => {
-                        let id = lease.id;
-                        match self.answer(waiter, Ok(lease)) {
-                            0 => self.give_back(id),
-                            1 => {}
-                            calls => drop(self.shared.insert(id, calls)),
-                        }
-                    }
-                    Notice::Refused { waiter, refusal } => {
-                        self.answer(waiter, Err(status::of_refusal(&refusal)));
-                    }
+            let position = self.journal.last();
+            for outgoing in self.outgoing.drain(..) {
+                self.outbox.hold(position, outgoing);
+            }
+            let reached = |position| self.journal.reached(position);
+            let Some(outgoing) = self.outbox.waits_for().filter(|at| reached(*at)).and_then(|_| self.outbox.take())
+            else {
+                return;
+            };
+            self.hand_out(outgoing);
+        }
+        for outgoing in std::mem::take(&mut self.outgoing) {
+            self.hand_out(outgoing);
+        }
+    }
+
+    fn hand_out(&mut self, outgoing: Outgoing) {
+        match outgoing {
+            Outgoing::Answer(answer) => answer(None),
+            Outgoing::Watcher(watcher) => self.watchers.push(watcher),
+            Outgoing::Notice(Notice::Event(event)) => {
+                if let Change::LeaseEnded { lease, .. } = &event.change {
+                    self.shared.remove(lease);
+                }
+                wire::events(&event).into_iter().for_each(|event| self.publish(event));
+            }
+            Outgoing::Notice(Notice::Granted { waiter, lease }) => {
+                let id = lease.id;
+                match self.answer(waiter, Ok(lease)) {
+                    0 => self.give_back(id),
+                    1 => {}
+                    calls => drop(self.shared.insert(id, calls)),
                 }
             }
+            Outgoing::Notice(Notice::Refused { waiter, refusal }) => {
+                self.answer(waiter, Err(status::of_refusal(&refusal)));
+            }
         }
+    }
+
+    /// More is on the disk, or something went wrong.
+    fn written(&mut self, progress: Result<Progress, Fault>) {
+        match progress {
+            Ok(Progress { fault: Some(fault), .. }) | Err(fault) => self.stop(&fault),
+            Ok(Progress { compaction_failure: Some(failure), compacting: false, .. }) => {
+                tracing::warn!(%failure, "the log grows on; the next snapshot is tried later");
+            }
+            Ok(_) => {}
+        }
+    }
+
+    /// Nothing changes any more. What was not on the disk has not happened.
+    fn stop(&mut self, fault: &dyn std::error::Error) {
+        let stopped = status::of_fault(fault);
+        tracing::error!(fault = stopped.message(), "changes are refused from now on");
+        // What was let out before was on the disk.
+        let mut refused = std::mem::take(&mut self.outgoing);
+        while let Some(outgoing) = self.outbox.take() {
+            refused.push(outgoing);
+        }
+        for outgoing in refused {
+            if let Outgoing::Answer(answer) = outgoing {
+                answer(Some(&stopped));
+            }
+        }
+        for (_, call) in std::mem::take(&mut self.calls).into_values().flatten() {
+            let _ = call.send(Err(stopped.clone()));
+        }
+        self.tickets.clear();
+        self.shared.clear();
+        // They find a state that may be behind the one they saw coming, and watch again.
+        self.watchers.clear();
+        match self.journal.read(self.config.limits.clone()) {
+            Ok(pool) => self.pool = pool,
+            Err(error) => {
+                let error = anyhow::Error::new(error);
+                tracing::error!(error = format!("{error:#}"), "what is on the disk cannot be read either");
+                self.pool = Pool::new(self.config.limits.clone());
+            }
+        }
+        self.stopped = Some(stopped);
     }
 
     /// How many calls took it.

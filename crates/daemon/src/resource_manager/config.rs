@@ -2,8 +2,10 @@
 
 use crate::config::{Check, ConfigError, rule};
 use ratn_resources::Limits;
+use ratn_storage::Durability;
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
 use std::time::Duration;
 
 /// All keys are optional.
@@ -20,6 +22,21 @@ pub struct ResourceManagerConfig {
     pub max_watchers: usize,
     /// Bounds of everything that a client can make grow.
     pub limits: Limits,
+    /// What is kept over a restart.
+    pub storage: StorageConfig,
+}
+
+/// Where and how the state is kept. All keys are optional.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StorageConfig {
+    /// A directory of its own; `state/resource-manager` in the runtime directory unless given.
+    pub directory: Option<PathBuf>,
+    /// When an answer may leave: `none` at once, `group` when what it tells of is on the disk (many share a sync), `each` likewise,
+    /// with a sync for every change.
+    pub durability: Durability,
+    /// After so many bytes of changes (and twice as many as the last snapshot had) a snapshot takes their place.
+    pub compact_bytes: u64,
 }
 
 impl Default for ResourceManagerConfig {
@@ -30,7 +47,14 @@ impl Default for ResourceManagerConfig {
             max_wait_ms: 24 * 3_600_000,
             max_watchers: 1_024,
             limits: Limits::default(),
+            storage: StorageConfig::default(),
         }
+    }
+}
+
+impl Default for StorageConfig {
+    fn default() -> Self {
+        StorageConfig { directory: None, durability: Durability::default(), compact_bytes: 16 << 20 }
     }
 }
 
@@ -48,6 +72,7 @@ impl Check for ResourceManagerConfig {
     fn check(&self) -> Result<(), ConfigError> {
         rule("max_session_ttl_ms", self.max_session_ttl_ms >= 100, "at least 100 ms")?;
         rule("max_wait_ms", self.max_wait_ms >= 1, "at least 1 ms")?;
-        rule("max_watchers", self.max_watchers >= 1, "at least 1")
+        rule("max_watchers", self.max_watchers >= 1, "at least 1")?;
+        rule("storage.compact_bytes", self.storage.compact_bytes >= 1 << 16, "at least 65536")
     }
 }

@@ -3,24 +3,29 @@
 //! ```text
 //!   gRPC call ──▶ service.rs ──message──▶ actor.rs (Pool of ratn-resources, a clock) ──answer, event──▶ service.rs
 //!   session's stream ──▶ stream.rs, whose every message is such a call
+//!   actor.rs ──records──▶ journal.rs (ratn-storage) ──durable──▶ outbox.rs ──▶ what tells of them leaves
 //! ```
-//! In memory: after a restart sessions are opened anew and providers offer their resources again; only fencing tokens
-//! keep growing.
+//! After a restart everything that was acknowledged is as it was: resources, leases with their tokens, what was consumed,
+//! answers by request id; sessions and leases with a time of their own have it once more. Who was in the queue asks again.
 
 mod actor;
 mod config;
+mod journal;
+mod outbox;
 mod service;
 mod status;
 mod stream;
 mod wire;
 
-pub use config::ResourceManagerConfig;
+pub use config::{ResourceManagerConfig, StorageConfig};
+pub use ratn_storage::Durability;
 
 use anyhow::Context;
 use ratn_model::resource::Lease;
 use ratn_proto::v1::resource_service_server::ResourceServiceServer;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
+use std::path::{Path, PathBuf};
 use tokio_util::sync::CancellationToken;
 
 /// The role's name: of its endpoint file, its command and its section of a config.
@@ -29,10 +34,15 @@ pub const ROLE: &str = "resource-manager";
 /// How an acquire ends.
 type Granted = Result<Lease, tonic::Status>;
 
+/// Where state is kept unless said otherwise: in a runtime directory.
+pub fn state_directory(runtime_directory: &Path) -> PathBuf {
+    runtime_directory.join("state")
+}
+
 /// Serves until `shutdown` is cancelled.
 ///
 /// # Errors
-/// Where it cannot listen or publish its endpoint, or where serving fails.
+/// Where its state cannot be had, where it cannot listen or publish its endpoint, or where serving fails.
 pub async fn run(
     config: ResourceManagerConfig,
     directory: RuntimeDirectory,
@@ -51,9 +61,11 @@ pub async fn run_as(
     serving: Serving,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
+    let storage = config.storage.directory.clone().unwrap_or_else(|| state_directory(directory.path()).join(ROLE));
+    let kept = journal::Journal::open(&config.storage, &storage, config.limits.clone())?;
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
-    let actor = actor::start(config, shutdown.clone());
+    let actor = actor::start(config, kept, shutdown.clone());
     let service = ResourceServiceServer::new(service::Service::new(actor, shutdown.clone()))
         .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);

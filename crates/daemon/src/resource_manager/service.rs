@@ -382,13 +382,16 @@ fn odd_reply(reply: &Reply) -> Status {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::super::journal::Journal;
     use super::super::{ResourceManagerConfig, actor};
     use super::*;
     use ratn_model::resource::ResourceClass;
 
     #[tokio::test]
     async fn a_lease_that_two_calls_of_one_request_got_goes_back_when_both_are_dropped() {
-        let actor = actor::start(ResourceManagerConfig::default(), CancellationToken::new());
+        let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
+        let kept = Journal::open(&config.storage, directory.path(), config.limits.clone()).unwrap();
+        let actor = actor::start(config, kept, CancellationToken::new());
         let session = SessionId::from("s");
         actor.keep_alive(session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
         let requirement = Requirement {

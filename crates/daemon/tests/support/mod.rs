@@ -49,7 +49,10 @@ impl TestSystem {
     }
 
     pub(crate) async fn resource_manager_at(&self, listen: Endpoint) -> Daemon {
-        let config = resource_manager::ResourceManagerConfig { listen, ..Default::default() };
+        self.resource_manager_with(resource_manager::ResourceManagerConfig { listen, ..Default::default() }).await
+    }
+
+    pub(crate) async fn resource_manager_with(&self, config: resource_manager::ResourceManagerConfig) -> Daemon {
         let shutdown = CancellationToken::new();
         let run = resource_manager::run(config, self.directory.clone(), shutdown.clone());
         self.started(resource_manager::ROLE, shutdown, run).await

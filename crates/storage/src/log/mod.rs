@@ -27,6 +27,7 @@ use contents::Contents;
 use files::{Disk, Files};
 use format::{SegmentHeader, StoreId};
 use lock::Lock;
+use serde::{Deserialize, Serialize};
 use shared::Shared;
 use std::fmt;
 use std::fs::{self, File};
@@ -41,7 +42,8 @@ use writer::LogWriter;
 const MOST_BUFFERED_BYTES: usize = 1 << 30;
 
 /// When a record counts as durable.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Durability {
     /// When it was appended: it is written soon, and the system puts it on the disk when it likes. Survives neither a loss of power
     /// nor, for the last moments, the death of the process.

@@ -118,7 +118,11 @@ impl Shared {
             self.work.notify_one();
         }
         if at_once {
-            self.progress.send_modify(|progress| progress.durable = position);
+            // Who asks finds it so; nobody has to be woken to hear it.
+            self.progress.send_if_modified(|progress| {
+                progress.durable = position;
+                false
+            });
         }
         Ok(position)
     }
