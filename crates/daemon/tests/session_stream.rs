@@ -138,3 +138,47 @@ async fn more_calls_than_a_stream_may_have_are_refused_and_the_others_go_on() {
     assert!(code == Code::ResourceExhausted && id > 10, "{id}: {code:?}");
     manager.end().await;
 }
+
+#[tokio::test]
+async fn a_dropped_call_leaves_the_queue_and_the_stream_goes_on() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let held = a.resources.acquire(vec![block("Arm")], Default::default()).await.unwrap();
+    let waits = b.resources.acquire(vec![block("Arm")], Default::default());
+    assert!(tokio::time::timeout(std::time::Duration::from_millis(50), waits).await.is_err(), "it waits");
+    // Asked after the dropped one on the same stream, and so answered after it left.
+    assert!(!b.resources.release(held.id).await.unwrap_or(false), "it is another's");
+    a.resources.release(held.id).await.unwrap();
+    let next = in_time(a.resources.acquire(vec![block("Arm")], Default::default())).await.unwrap();
+    assert!(next.token > held.token);
+    manager.end().await;
+}
+
+#[tokio::test]
+async fn a_stream_that_broke_fails_its_calls_and_the_next_call_opens_another() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let held = a.resources.acquire(vec![block("Arm")], Default::default()).await.unwrap();
+    let waits = a.resources.acquire(vec![block("Arm")], Default::default());
+    let (waited, ()) = tokio::join!(waits, async {
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        manager.end().await;
+    });
+    assert!(waited.unwrap_err().is_crash(), "nobody decided");
+    let manager = system.resource_manager().await;
+    // The session goes on or is made anew; either way the stream is there again.
+    let asked = in_time(async {
+        loop {
+            match a.resources.release(held.id).await {
+                Err(error) if error.is_crash() => tokio::time::sleep(std::time::Duration::from_millis(20)).await,
+                answered => return answered,
+            }
+        }
+    });
+    assert!(asked.await.is_ok());
+    manager.end().await;
+}

@@ -3,6 +3,7 @@
 mod action;
 mod error;
 mod health;
+mod line;
 mod process;
 mod resource;
 mod world;

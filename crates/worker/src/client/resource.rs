@@ -1,5 +1,6 @@
-//! The client of the resource manager.
+//! The client of the resource manager. What is asked for again and again while a task runs goes over the session's stream.
 
+use super::line::Line;
 use super::{CallError, Channels, fresh_id};
 use crate::endpoint::Endpoint;
 use ratn_model::id::LeaseId;
@@ -9,6 +10,8 @@ use ratn_proto::convert::{Malformed, all, each, required};
 use ratn_proto::types::{Resource, ResourceUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
+use ratn_proto::v1::session_request::Kind as Asked;
+use ratn_proto::v1::session_response::Kind as Answered;
 use std::time::Duration;
 use tonic::Streaming;
 use tonic::transport::Channel;
@@ -19,6 +22,7 @@ pub struct ResourceClient {
     endpoint: Endpoint,
     session: String,
     client: ResourceServiceClient<Channel>,
+    line: Line,
 }
 
 /// How an acquire waits.
@@ -62,7 +66,7 @@ impl ResourceClient {
         let client = ResourceServiceClient::new(channels.get(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
-        Ok(ResourceClient { endpoint: endpoint.clone(), session: session.to_owned(), client })
+        Ok(ResourceClient { endpoint: endpoint.clone(), session: session.to_owned(), client, line: Line::default() })
     }
 
     /// Where the resource manager is.
@@ -157,8 +161,10 @@ impl ResourceClient {
             deadline_ms: milliseconds(options.deadline),
             holder: options.holder,
         };
-        let answer = self.client.clone().block(question).await.map_err(|status| self.failed(&status))?;
-        self.field(answer.into_inner().lease, "lease")
+        match self.ask(Asked::Block(question)).await? {
+            Answered::Block(granted) => self.field(granted.lease, "lease"),
+            _ => Err(self.another("a block")),
+        }
     }
 
     /// Waits until all requirements can be met at once and takes them under one lease. Dropping the future leaves the queue;
@@ -176,8 +182,10 @@ impl ResourceClient {
             deadline_ms: milliseconds(options.deadline),
             holder: options.holder,
         };
-        let answer = self.client.clone().acquire(question).await.map_err(|status| self.failed(&status))?;
-        self.field(answer.into_inner().lease, "lease")
+        match self.ask(Asked::Acquire(question)).await? {
+            Answered::Acquire(granted) => self.field(granted.lease, "lease"),
+            _ => Err(self.another("an acquire")),
+        }
     }
 
     /// Undoes an acquire or a block by its request id, where the call was dropped and a grant may have crossed with that:
@@ -187,8 +195,10 @@ impl ResourceClient {
     /// [`CallError`].
     pub async fn withdraw(&self, request: &str) -> Result<bool, CallError> {
         let question = v1::WithdrawRequest { request_id: request.to_owned(), session_id: self.session.clone() };
-        let answer = self.client.clone().withdraw(question).await.map_err(|status| self.failed(&status))?;
-        Ok(answer.into_inner().withdrawn)
+        match self.ask(Asked::Withdraw(question)).await? {
+            Answered::Withdraw(undone) => Ok(undone.withdrawn),
+            _ => Err(self.another("a withdraw")),
+        }
     }
 
     /// Gives a lease back; false when it had ended before.
@@ -198,8 +208,10 @@ impl ResourceClient {
     pub async fn release(&self, lease: LeaseId) -> Result<bool, CallError> {
         let (request_id, session_id) = self.mutation("");
         let question = v1::ResourceServiceReleaseRequest { request_id, session_id, lease_id: lease.0 };
-        let answer = self.client.clone().release(question).await.map_err(|status| self.failed(&status))?;
-        Ok(answer.into_inner().released)
+        match self.ask(Asked::Release(question)).await? {
+            Answered::Release(ended) => Ok(ended.released),
+            _ => Err(self.another("a release")),
+        }
     }
 
     /// Whether what is required is there, blocked or not.
@@ -230,6 +242,16 @@ impl ResourceClient {
         let question = v1::ResourceServiceWatchRequest { kinds: owned(kinds) };
         let answer = self.client.clone().watch(question).await.map_err(|status| self.failed(&status))?;
         Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
+    }
+
+    /// Over the session's stream.
+    async fn ask(&self, question: Asked) -> Result<Answered, CallError> {
+        self.line.ask(&self.client, question).await.map_err(|status| self.failed(&status))
+    }
+
+    /// The answer is that of another call.
+    fn another(&self, asked: &str) -> CallError {
+        self.malformed(Malformed::new("kind", format!("is not that of an answer to {asked}")))
     }
 
     /// A request's id, a fresh one where it has none, and the session's.
