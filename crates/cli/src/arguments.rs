@@ -1,5 +1,6 @@
 //! The command line.
 
+use crate::command::resource::ResourceArguments;
 use crate::task_control::control::Word;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use ratn_daemon::resource_manager::Durability;
@@ -32,6 +33,8 @@ pub(crate) enum Command {
     Tables(TablesArguments),
     /// Run a scheduling problem of the literature in virtual time, as a task, and compare with the best known schedule
     Simulate(SimulateArguments),
+    /// Look at the resources of a running system and change them
+    Resource(ResourceArguments),
     /// Own the resources: who has what, and who waits (host compute)
     ResourceManager(ResourceManagerArguments),
     /// Hold the root world model and its projections (host compute)

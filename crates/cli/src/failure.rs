@@ -10,14 +10,17 @@ pub(crate) enum Failure {
     Refused(String),
     /// Something went wrong on the way.
     Failed(anyhow::Error),
+    /// A program that was run for the user ended with this code, which is then the command's.
+    Program(u8),
 }
 
 impl Failure {
-    /// 2 for what was refused, 1 for what failed.
+    /// 2 for what was refused, 1 for what failed, the program's where one was run.
     pub(crate) fn exit_code(&self) -> ExitCode {
         match self {
             Failure::Refused(_) => ExitCode::from(2),
             Failure::Failed(_) => ExitCode::FAILURE,
+            Failure::Program(code) => ExitCode::from(*code),
         }
     }
 }
@@ -27,6 +30,7 @@ impl fmt::Display for Failure {
         match self {
             Failure::Refused(message) => f.write_str(message),
             Failure::Failed(error) => write!(f, "ratn: {error:#}"),
+            Failure::Program(code) => write!(f, "ratn: the program ended with exit code {code}"),
         }
     }
 }

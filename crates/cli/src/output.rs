@@ -23,6 +23,19 @@ pub(crate) fn result(text: impl Display) -> anyhow::Result<()> {
     write(&mut io::stdout().lock(), &text)
 }
 
+/// As [`result`], for one of many lines: false once nobody reads them any more.
+///
+/// # Errors
+/// When it cannot be written.
+pub(crate) fn line(text: impl Display) -> anyhow::Result<bool> {
+    let mut out = io::stdout().lock();
+    match out.write_all(format!("{text}\n").as_bytes()).and_then(|()| out.flush()) {
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
+        Err(error) => Err(anyhow::Error::from(error).context("cannot write the result to standard output")),
+        Ok(()) => Ok(true),
+    }
+}
+
 /// Says whether a file could be written, before there is something to write to it; it is not made.
 pub(crate) fn check_writable(path: &Path) -> Result<(), Failure> {
     // `.` in it makes a file that is no directory an error, and is the folder of a bare name.

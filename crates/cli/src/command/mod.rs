@@ -4,6 +4,7 @@ mod check;
 mod control;
 mod demo;
 mod report;
+pub(crate) mod resource;
 mod roles;
 mod run;
 mod simulate;
@@ -30,6 +31,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Run(arguments) => run::run(&arguments),
         Command::Control(arguments) => control::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
+        Command::Resource(arguments) => resource::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Tables(arguments) => tables::run(&arguments),

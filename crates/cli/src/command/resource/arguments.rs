@@ -1,0 +1,151 @@
+//! The command line of `ratn resource`.
+
+use clap::{Args, Subcommand};
+use ratn_model::resource::ResourceClass;
+use ratn_model::value::Value;
+use ratn_worker::endpoint::Endpoint;
+use std::path::PathBuf;
+use std::time::Duration;
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ResourceArguments {
+    #[command(subcommand)]
+    pub(super) command: ResourceCommand,
+    /// Where endpoint files are; $RATN_RUNTIME_DIR, $XDG_RUNTIME_DIR/ratn or /tmp/ratn-UID unless given
+    #[arg(long, value_name = "DIR", global = true)]
+    pub(super) runtime_dir: Option<PathBuf>,
+    /// Where the resource manager is, instead: `unix:/path`, `https://host:port`
+    #[arg(long, value_name = "ADDRESS", global = true)]
+    pub(super) manager: Option<Endpoint>,
+    /// Print JSON on standard output: one document, or with `watch` one a line
+    #[arg(long, global = true)]
+    pub(super) json: bool,
+}
+
+#[derive(Debug, Clone, Subcommand)]
+pub(super) enum ResourceCommand {
+    /// Add a resource; it stays until it is deleted
+    Create(CreateArguments),
+    /// Use capacity up for as long as this command runs
+    Consume(HoldArguments),
+    /// Remove resources: whoever holds them loses them
+    Delete {
+        /// Their ids
+        #[arg(value_name = "ID", required_unless_present = "kind", conflicts_with = "kind")]
+        ids: Vec<String>,
+        /// One of this kind instead
+        #[arg(long, value_name = "KIND")]
+        kind: Option<String>,
+    },
+    /// Wait for resources and hold them for as long as this command runs
+    Block(HoldArguments),
+    /// End a lease, whoever holds it
+    Release {
+        /// Its number, as `list` shows it
+        #[arg(value_name = "LEASE")]
+        lease: u64,
+    },
+    /// Say whether resources are there, blocked or not; exit code 1 when not
+    Exists(Selector),
+    /// Show the resources and who has them
+    List {
+        /// Only of these kinds
+        #[arg(value_name = "KIND")]
+        kinds: Vec<String>,
+    },
+    /// Show everything about one resource
+    Get {
+        /// Its id
+        #[arg(value_name = "ID")]
+        id: String,
+    },
+    /// Show the resources, then every change
+    Watch {
+        /// Only of these kinds
+        #[arg(value_name = "KIND")]
+        kinds: Vec<String>,
+    },
+}
+
+#[derive(Debug, Clone, Args)]
+pub(super) struct CreateArguments {
+    /// Its kind, `Fixture`
+    #[arg(value_name = "KIND")]
+    pub(super) kind: String,
+    /// system, process, module, world or task
+    #[arg(long, value_name = "CLASS", default_value = "module", value_parser = class)]
+    pub(super) class: ResourceClass,
+    /// Its id; the resource manager gives one unless given
+    #[arg(long, value_name = "ID", default_value = "")]
+    pub(super) id: String,
+    /// Units of it
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) capacity: u32,
+    /// The host that it is on
+    #[arg(long, value_name = "NAME", default_value = "")]
+    pub(super) host: String,
+    /// An attribute, `reach=1.2`; may be repeated
+    #[arg(long = "attribute", value_name = "NAME=VALUE", value_parser = attribute)]
+    pub(super) attributes: Vec<(String, Value)>,
+}
+
+/// Which resources.
+#[derive(Debug, Clone, Default, Args)]
+pub(super) struct Selector {
+    /// Their kind
+    #[arg(value_name = "KIND")]
+    pub(super) kind: String,
+    /// How many
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) count: u32,
+    /// Their class
+    #[arg(long, value_name = "CLASS", value_parser = class)]
+    pub(super) class: Option<ResourceClass>,
+    /// An attribute that they have, `reach=1.2`; may be repeated
+    #[arg(long = "attribute", value_name = "NAME=VALUE", value_parser = attribute)]
+    pub(super) attributes: Vec<(String, Value)>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(super) struct HoldArguments {
+    #[command(flatten)]
+    pub(super) selector: Selector,
+    /// Wait at most so long for the resources, in seconds
+    #[arg(long, value_name = "S", default_value = "600", value_parser = seconds)]
+    pub(super) wait: Duration,
+    /// Larger goes first
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    pub(super) priority: i64,
+    /// Give them back after so long, in seconds; else at Ctrl-C or at the end of the program
+    #[arg(long, value_name = "S", value_parser = seconds)]
+    pub(super) ttl: Option<Duration>,
+    /// A program to run meanwhile; RATN_LEASE and RATN_TOKEN tell it what it has
+    #[arg(value_name = "PROGRAM", last = true)]
+    pub(super) program: Vec<String>,
+}
+
+fn class(text: &str) -> Result<ResourceClass, String> {
+    use ResourceClass::{Module, Process, System, Task, World};
+    let known = [System, Process, Module, World, Task].into_iter().find(|class| class.to_string() == text);
+    known.ok_or_else(|| "expected system, process, module, world or task".to_owned())
+}
+
+/// A number or a truth value where it reads as one, else text.
+fn attribute(text: &str) -> Result<(String, Value), String> {
+    let (name, value) = text.split_once('=').ok_or("expected NAME=VALUE")?;
+    let value = match value {
+        "true" => Value::Bool(true),
+        "false" => Value::Bool(false),
+        _ => match (value.parse(), value.parse::<f64>()) {
+            (Ok(whole), _) => Value::Int(whole),
+            (_, Ok(number)) if number.is_finite() => Value::Float(number),
+            _ => Value::String(value.to_owned()),
+        },
+    };
+    Ok((name.to_owned(), value))
+}
+
+fn seconds(text: &str) -> Result<Duration, String> {
+    let seconds = text.parse::<f64>().ok().filter(|s| (0.001..=1e9).contains(s));
+    seconds.map(Duration::from_secs_f64).ok_or_else(|| "expected seconds, at least 0.001".to_owned())
+}

@@ -1,0 +1,198 @@
+//! `ratn resource …`: the operations of the resource manager for people and scripts.
+//!
+//! Each is one call in the name of the user that types it. What needs a session (`block`, `consume`) has one for as long as the
+//! command runs; what is created without one stays until it is deleted. Tables go to standard output, or one JSON document each.
+
+mod arguments;
+mod hold;
+mod show;
+
+pub(crate) use arguments::ResourceArguments;
+
+use super::blocking_on;
+use crate::failure::Failure;
+use crate::output;
+use crate::system::public_directory;
+use anyhow::Context;
+use arguments::{ResourceCommand, Selector};
+use ratn_model::id::LeaseId;
+use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_proto::types::{Resource, ResourceUpdate};
+use ratn_worker::client::{CallError, Channels, ResourceClient};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::session::Session;
+use ratn_worker::trace::{self, TraceContext};
+use std::time::Duration;
+
+const ROLE: &str = ratn_daemon::resource_manager::ROLE;
+/// A session that is not there by then will not come.
+const SESSION_DEADLINE: Duration = Duration::from_secs(5);
+const SESSION_TTL: Duration = Duration::from_secs(3);
+
+/// Where the resource manager is, and how its answers are shown.
+struct Asking {
+    channels: Channels,
+    endpoint: Endpoint,
+    client: ResourceClient,
+    json: bool,
+}
+
+/// Performs one operation.
+pub(super) fn run(arguments: &ResourceArguments) -> Result<(), Failure> {
+    blocking_on(tokio::runtime::Builder::new_current_thread(), async {
+        let endpoint = match &arguments.manager {
+            Some(endpoint) => endpoint.clone(),
+            None => RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()))
+                .find(ROLE)
+                .map_err(|error| Failure::Refused(format!("ratn: {error}")))?,
+        };
+        let channels = Channels::new();
+        let client = ResourceClient::new(&channels, &endpoint, "")?;
+        let asking = Asking { channels, endpoint, client, json: arguments.json };
+        let performed = trace::within(TraceContext::fresh(), asking.perform(&arguments.command)).await;
+        performed.map_err(unanswered)
+    })
+}
+
+/// A script can tell a manager that says no from one that is not there.
+fn unanswered(failure: Failure) -> Failure {
+    let Failure::Failed(error) = failure else { return failure };
+    if error.downcast_ref::<CallError>().is_some_and(CallError::is_crash) {
+        return Failure::Refused(format!("ratn: {error:#}"));
+    }
+    Failure::Failed(error)
+}
+
+impl Asking {
+    async fn perform(&self, command: &ResourceCommand) -> Result<(), Failure> {
+        let client = &self.client;
+        match command {
+            ResourceCommand::Create(create) => {
+                let created = client.create(create.resource()).await.context("not created")?;
+                self.show(&show::resource_json(&created), || created.id.clone())?;
+            }
+            ResourceCommand::Delete { ids, kind: None } => {
+                for id in ids {
+                    client.delete(id).await.with_context(|| format!("`{id}` is not deleted"))?;
+                }
+                self.show(&ids.as_slice().into(), || lines(ids))?;
+            }
+            ResourceCommand::Delete { kind: Some(kind), .. } => {
+                let requirement = Selector { kind: kind.clone(), ..Selector::default() };
+                let (session, client) = self.session("delete").await?;
+                let deleted = client.delete_matching(requirement.requirement(ResourceOperation::Delete)).await;
+                session.close().await;
+                let deleted = deleted.context("not deleted")?;
+                self.show(&deleted.as_slice().into(), || lines(&deleted))?;
+            }
+            ResourceCommand::Block(held) => return hold::block(self, held).await,
+            ResourceCommand::Consume(held) => return hold::consume(self, held).await,
+            ResourceCommand::Release { lease } => {
+                let released = client.release(LeaseId(*lease)).await.context("not released")?;
+                if !released {
+                    return Err(anyhow::anyhow!("lease {lease} had ended before, or never was").into());
+                }
+                self.show(&serde_json::json!({ "released": lease }), || format!("lease {lease} is released"))?;
+            }
+            ResourceCommand::Exists(selector) => {
+                let requirement = selector.requirement(ResourceOperation::Exists);
+                let exists = client.exists(requirement.clone()).await;
+                let exists = exists.map_err(|error| Failure::Refused(format!("ratn: {error}")))?;
+                let word = if exists { "yes" } else { "no" };
+                self.show(&serde_json::json!({ "exists": exists }), || word.to_owned())?;
+                if !exists {
+                    return Err(anyhow::anyhow!("there is not what would satisfy `{requirement}`").into());
+                }
+            }
+            ResourceCommand::List { kinds } => {
+                let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
+                let resources = client.list(&kinds).await?;
+                self.show(&resources.iter().map(show::resource_json).collect(), || show::table(&resources))?;
+            }
+            ResourceCommand::Get { id } => {
+                let all = client.list(&[]).await?;
+                let found = all.into_iter().find(|resource| resource.id == *id);
+                let found =
+                    found.with_context(|| format!("there is no resource `{id}`; `ratn resource list` shows all"))?;
+                self.show(&show::resource_json(&found), || show::in_full(&found))?;
+            }
+            ResourceCommand::Watch { kinds } => {
+                let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
+                self.watch(&kinds).await?;
+            }
+        }
+        Ok(())
+    }
+
+    /// A session for as long as it is kept, and a client in its name.
+    async fn session(&self, what: &str) -> anyhow::Result<(Session, ResourceClient)> {
+        let name = format!("ratn resource {what}");
+        let session = Session::open(&self.channels, &self.endpoint, &name, SESSION_TTL);
+        if let Err(error) = session.alive(SESSION_DEADLINE).await {
+            // What the manager says to a plain question tells more than its silence.
+            self.client.list(&["-"]).await?;
+            return Err(
+                anyhow::Error::from(error).context("it opens no session: `block` and `consume` need the role `task`")
+            );
+        }
+        let client = ResourceClient::new(&self.channels, &self.endpoint, session.id())?;
+        Ok((session, client))
+    }
+
+    /// Until the reader has had enough, or the manager ends.
+    async fn watch(&self, kinds: &[&str]) -> anyhow::Result<()> {
+        let mut watch = self.client.watch(kinds).await?;
+        let mut ended: Result<(), CallError> = Ok(());
+        loop {
+            let update = match watch.next().await {
+                Ok(Some(update)) => update,
+                Ok(None) => break,
+                Err(error) => {
+                    ended = Err(error);
+                    break;
+                }
+            };
+            let shown = match (&update, self.json) {
+                (update, true) => output::line(show::update_json(update))?,
+                (ResourceUpdate::Snapshot { resources, .. }, false) => output::line(show::table(resources))?,
+                (ResourceUpdate::Event(event), false) => output::line(show::event(event))?,
+            };
+            if !shown {
+                return Ok(());
+            }
+        }
+        ended.context("the watch ended")?;
+        anyhow::bail!("the resource manager ended the watch")
+    }
+
+    fn show(&self, json: &serde_json::Value, text: impl FnOnce() -> String) -> anyhow::Result<()> {
+        if self.json { output::result(serde_json::to_string_pretty(json)?) } else { output::result(text()) }
+    }
+}
+
+fn lines(ids: &[String]) -> String {
+    ids.join("\n")
+}
+
+impl arguments::CreateArguments {
+    fn resource(&self) -> Resource {
+        Resource {
+            attributes: self.attributes.iter().cloned().collect(),
+            host: self.host.clone(),
+            ..Resource::new(&self.id, self.class, &self.kind).with_capacity(self.capacity)
+        }
+    }
+}
+
+impl Selector {
+    fn requirement(&self, operation: ResourceOperation) -> Requirement {
+        Requirement {
+            operation,
+            kind: self.kind.clone(),
+            class: self.class,
+            attributes: self.attributes.iter().cloned().collect(),
+            count: self.count,
+        }
+    }
+}

@@ -1,0 +1,231 @@
+//! Resources, leases and events as tables for people and as JSON for programs.
+
+use ratn_model::resource::Lease;
+use ratn_model::value::Value;
+use ratn_proto::types::{Resource, ResourceEvent, ResourceEventKind, ResourceState, ResourceUpdate};
+use serde_json::json;
+
+/// One line each: what it is, how much of it is free, who has the rest.
+pub(super) fn table(resources: &[Resource]) -> String {
+    let rows = resources.iter().map(|resource| {
+        [
+            resource.id.clone(),
+            resource.kind.clone(),
+            resource.class.to_string(),
+            resource.host.clone(),
+            format!("{}/{}", resource.free, resource.capacity),
+            holders(resource),
+        ]
+    });
+    columns(&["ID", "KIND", "CLASS", "HOST", "FREE", "HELD BY"], rows.collect())
+}
+
+/// Everything of one.
+pub(super) fn in_full(resource: &Resource) -> String {
+    let mut rows = vec![
+        ["id".to_owned(), resource.id.clone()],
+        ["kind".to_owned(), resource.kind.clone()],
+        ["class".to_owned(), resource.class.to_string()],
+        ["host".to_owned(), resource.host.clone()],
+        ["state".to_owned(), state(resource.state).to_owned()],
+        ["free".to_owned(), format!("{} of {}", resource.free, resource.capacity)],
+        [
+            "owner".to_owned(),
+            if resource.session.is_empty() { "nobody: it stays".into() } else { resource.session.clone() },
+        ],
+        ["revision".to_owned(), resource.revision.0.to_string()],
+    ];
+    rows.extend(resource.attributes.iter().map(|(name, value)| [format!("attribute {name}"), value.to_string()]));
+    rows.extend(resource.holdings.iter().map(|holding| {
+        let what =
+            format!("{} units, token {}, by {} ({})", holding.units, holding.token.0, holding.holder, holding.session);
+        [format!("lease {}", holding.lease.0), what]
+    }));
+    aligned(&rows).join("\n")
+}
+
+/// One change in a line.
+pub(super) fn event(event: &ResourceEvent) -> String {
+    let resource = &event.resource;
+    let mut line = format!(
+        "{} {} {} ({}) free {}/{}",
+        event.revision.0,
+        change(event.kind),
+        resource.id,
+        resource.kind,
+        resource.free,
+        resource.capacity
+    );
+    if let Some((lease, token)) = event.lease {
+        line += &format!(" lease {} token {}", lease.0, token.0);
+    }
+    if !event.reason.is_empty() {
+        line += &format!(": {}", event.reason);
+    }
+    line
+}
+
+/// What was granted.
+pub(super) fn lease(lease: &Lease) -> String {
+    let ids: Vec<&str> = lease.resources.iter().map(|resource| resource.id.as_str()).collect();
+    format!("lease {} token {}: {}", lease.id.0, lease.token.0, ids.join(" "))
+}
+
+pub(super) fn lease_json(lease: &Lease) -> serde_json::Value {
+    let resources = lease
+        .resources
+        .iter()
+        .map(|resource| json!({ "id": resource.id, "kind": resource.kind, "endpoint": resource.endpoint }));
+    json!({ "lease": lease.id.0, "token": lease.token.0, "resources": resources.collect::<Vec<_>>() })
+}
+
+pub(super) fn resource_json(resource: &Resource) -> serde_json::Value {
+    let holdings = resource.holdings.iter().map(|holding| {
+        json!({
+            "lease": holding.lease.0, "token": holding.token.0, "units": holding.units,
+            "session": holding.session, "holder": holding.holder,
+        })
+    });
+    let attributes: serde_json::Map<_, _> =
+        resource.attributes.iter().map(|(name, value)| (name.clone(), plain(value))).collect();
+    json!({
+        "id": resource.id, "kind": resource.kind, "class": resource.class.to_string(), "host": resource.host,
+        "state": state(resource.state), "free": resource.free, "capacity": resource.capacity,
+        "session": resource.session, "revision": resource.revision.0, "attributes": attributes,
+        "holdings": holdings.collect::<Vec<_>>(),
+    })
+}
+
+pub(super) fn update_json(update: &ResourceUpdate) -> serde_json::Value {
+    match update {
+        ResourceUpdate::Snapshot { revision, resources, .. } => {
+            let resources: Vec<_> = resources.iter().map(resource_json).collect();
+            json!({ "revision": revision.0, "snapshot": resources })
+        }
+        ResourceUpdate::Event(event) => {
+            let (lease, token) = event.lease.map_or((0, 0), |(lease, token)| (lease.0, token.0));
+            json!({
+                "revision": event.revision.0, "event": change(event.kind), "resource": resource_json(&event.resource),
+                "lease": lease, "token": token, "reason": event.reason,
+            })
+        }
+    }
+}
+
+/// Simple values as JSON has them, others as they are printed.
+fn plain(value: &Value) -> serde_json::Value {
+    match value {
+        Value::Null => serde_json::Value::Null,
+        Value::Bool(truth) => json!(truth),
+        Value::Int(whole) => json!(whole),
+        Value::Float(number) => json!(number),
+        Value::String(text) => json!(text),
+        other => json!(other.to_string()),
+    }
+}
+
+fn holders(resource: &Resource) -> String {
+    let one = |holding: &ratn_proto::types::Holding| format!("{} (lease {})", holding.holder, holding.lease.0);
+    let mut holders: Vec<String> = resource.holdings.iter().map(one).collect();
+    if holders.is_empty() && resource.state == ResourceState::Exhausted {
+        holders.push("(consumed)".to_owned());
+    }
+    holders.join(", ")
+}
+
+fn state(state: ResourceState) -> &'static str {
+    match state {
+        ResourceState::Free => "free",
+        ResourceState::Leased => "leased",
+        ResourceState::Exhausted => "exhausted",
+    }
+}
+
+fn change(kind: ResourceEventKind) -> &'static str {
+    match kind {
+        ResourceEventKind::Created => "created",
+        ResourceEventKind::Updated => "updated",
+        ResourceEventKind::Deleted => "deleted",
+        ResourceEventKind::Leased => "leased",
+        ResourceEventKind::Released => "released",
+    }
+}
+
+fn columns<const N: usize>(head: &[&str; N], mut rows: Vec<[String; N]>) -> String {
+    rows.insert(0, head.map(str::to_owned));
+    aligned(&rows).join("\n")
+}
+
+/// Columns as wide as their widest cell, two spaces apart; the last is as long as it is.
+fn aligned<const N: usize>(rows: &[[String; N]]) -> Vec<String> {
+    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+    let widths: Vec<usize> = (0..N).map(width).collect();
+    let line = |row: &[String; N]| {
+        let cells: Vec<String> = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}")).collect();
+        cells.join("  ").trim_end().to_owned()
+    };
+    rows.iter().map(line).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use insta::assert_snapshot;
+    use ratn_model::id::{FencingToken, LeaseId, Revision};
+    use ratn_model::resource::ResourceClass;
+    use ratn_proto::types::Holding;
+
+    fn arm() -> Resource {
+        let mut arm = Resource::new("arm", ResourceClass::Module, "Arm")
+            .with_attribute("reach", Value::Float(1.2))
+            .on_host("sim");
+        arm.free = 0;
+        arm.state = ResourceState::Leased;
+        arm.holdings = vec![Holding {
+            lease: LeaseId(7),
+            token: FencingToken(12),
+            units: 1,
+            session: "s".to_owned(),
+            holder: "fetch/approach".to_owned(),
+        }];
+        arm
+    }
+
+    #[test]
+    fn a_table_says_who_has_what() {
+        let room = Resource::new("world-model@compute", ResourceClass::World, "WorldModel").with_capacity(64);
+        assert_snapshot!(table(&[arm(), room]), @r"
+        ID                   KIND        CLASS   HOST  FREE   HELD BY
+        arm                  Arm         module  sim   0/1    fetch/approach (lease 7)
+        world-model@compute  WorldModel  world         64/64
+        ");
+    }
+
+    #[test]
+    fn one_resource_is_shown_in_full() {
+        assert_snapshot!(in_full(&arm()), @r"
+        id               arm
+        kind             Arm
+        class            module
+        host             sim
+        state            leased
+        free             0 of 1
+        owner            nobody: it stays
+        revision         0
+        attribute reach  1.2
+        lease 7          1 units, token 12, by fetch/approach (s)
+        ");
+    }
+
+    #[test]
+    fn an_event_is_one_line() {
+        let event = ResourceEvent {
+            revision: Revision(3),
+            kind: ResourceEventKind::Released,
+            resource: arm(),
+            lease: Some((LeaseId(7), FencingToken(12))),
+            reason: "session expired".to_owned(),
+        };
+        assert_snapshot!(super::event(&event), @"3 released arm (Arm) free 0/1 lease 7 token 12: session expired");
+    }
+}

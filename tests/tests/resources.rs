@@ -1,0 +1,157 @@
+//! `ratn resource …` on a real resource manager: what it says, what it holds, what it writes down.
+
+mod support;
+
+use anyhow::{Context, ensure};
+use nix::sys::signal::Signal;
+use serde_json::Value;
+use std::path::PathBuf;
+use support::{Place, Started, texts, wait_for};
+
+/// A resource manager with an audit log.
+struct Manager {
+    place: Place,
+    process: Started,
+    audit: PathBuf,
+}
+
+impl Manager {
+    fn start() -> anyhow::Result<Manager> {
+        let place = Place::new()?;
+        let (config, audit) = (place.path().join("ratn.toml"), place.path().join("audit.jsonl"));
+        std::fs::write(&config, format!("[service]\naudit_file = \"{}\"\n", audit.display()))?;
+        let arguments = ["resource-manager", "--config", config.to_str().context("a path")?];
+        let process = place.start_as("manager", &arguments)?;
+        let endpoint = place.path().join("run/resource-manager.endpoint");
+        wait_for("the manager", || Ok(endpoint.exists().then_some(()))).with_context(|| process.said())?;
+        Ok(Manager { place, process, audit })
+    }
+
+    /// Exit code, standard output, standard error.
+    fn resource(&self, arguments: &[&str]) -> anyhow::Result<(Option<i32>, String, String)> {
+        let output = self.place.ratn(&[&["resource"], arguments].concat()).output()?;
+        let (out, err) = texts(&output);
+        Ok((output.status.code(), out, err))
+    }
+
+    fn json(&self, arguments: &[&str]) -> anyhow::Result<Value> {
+        let (code, out, err) = self.resource(&[arguments, &["--json"]].concat())?;
+        ensure!(code == Some(0), "{code:?}\n{out}\n{err}");
+        Ok(serde_json::from_str(&out)?)
+    }
+
+    fn free(&self, id: &str) -> anyhow::Result<u64> {
+        self.json(&["get", id])?["free"].as_u64().context("no number of free units")
+    }
+}
+
+#[test]
+fn resources_are_created_shown_and_deleted() -> anyhow::Result<()> {
+    let manager = Manager::start()?;
+    let create = ["create", "Fixture", "--id", "f1", "--capacity", "3", "--attribute", "reach=1.5"];
+    ensure!(manager.json(&create)?["attributes"]["reach"] == 1.5);
+    let (_, table, _) = manager.resource(&["list"])?;
+    ensure!(table.starts_with("ID") && table.contains("f1  Fixture  module        3/3"), "{table}");
+    ensure!(manager.json(&["list", "Fixture"])?.as_array().map(Vec::len) == Some(1));
+    ensure!(manager.resource(&["exists", "Fixture"])?.0 == Some(0));
+    let (code, out, err) = manager.resource(&["exists", "Lathe"])?;
+    ensure!(code == Some(1) && out == "no\n" && err.contains("Lathe"), "{code:?} {out} {err}");
+    ensure!(manager.resource(&["delete", "f1"])?.1 == "f1\n");
+    let (code, _, err) = manager.resource(&["delete", "f1"])?;
+    ensure!(code == Some(1) && err.contains("there is no resource `f1`"), "{err}");
+    let (code, _, err) = manager.resource(&["get", "f1"])?;
+    ensure!(code == Some(1) && err.contains("there is no resource `f1`"), "{err}");
+    Ok(())
+}
+
+#[test]
+fn a_block_holds_for_as_long_as_its_command_runs() -> anyhow::Result<()> {
+    let manager = Manager::start()?;
+    manager.json(&["create", "Fixture", "--id", "f1"])?;
+    // In a program of its own, which is told what it has, and whose end ends it.
+    let program = ["block", "Fixture", "--", "sh", "-c", "test $RATN_TOKEN -gt 0 && test $RATN_LEASE -gt 0"];
+    let (code, out, err) = manager.resource(&program)?;
+    ensure!(code == Some(0) && out.starts_with("lease "), "{code:?} {out} {err}");
+    ensure!(manager.resource(&["block", "Fixture", "--", "sh", "-c", "exit 7"])?.0 == Some(7));
+    ensure!(manager.resource(&["block", "Fixture", "--", "sh", "-c", "kill -9 $$"])?.0 == Some(128 + 9));
+    ensure!(manager.resource(&["block", "Fixture", "--ttl", "0.01"])?.0 == Some(0));
+    ensure!(manager.free("f1")? == 1);
+
+    let mut holder = manager.place.start_as("holder", &["resource", "block", "Fixture"])?;
+    wait_for("the block", || Ok((manager.free("f1")? == 0).then_some(()))).with_context(|| holder.said())?;
+    let (code, _, err) = manager.resource(&["block", "Fixture", "--wait", "0.05"])?;
+    ensure!(code == Some(1) && err.contains("not blocked: not granted"), "{err}");
+    holder.signal(Signal::SIGINT)?;
+    let (code, _, said) = holder.finish()?;
+    ensure!(code == Some(0), "{code:?} {said}");
+    ensure!(manager.free("f1")? == 1);
+
+    // However it ends: a killed one is free once its session has expired.
+    let holder = manager.place.start_as("killed", &["resource", "block", "Fixture"])?;
+    wait_for("the block", || Ok((manager.free("f1")? == 0).then_some(()))).with_context(|| holder.said())?;
+    holder.process()?.kill()?;
+    wait_for("the lease to expire", || Ok((manager.free("f1")? == 1).then_some(())))
+}
+
+#[test]
+fn a_release_by_the_operator_and_every_other_mutation_is_in_the_audit_log() -> anyhow::Result<()> {
+    let mut manager = Manager::start()?;
+    manager.json(&["create", "Fixture", "--id", "f1"])?;
+    let mut holder = manager.place.start_as("holder", &["resource", "block", "Fixture"])?;
+    let lease = wait_for("the block", || Ok(manager.json(&["get", "f1"])?["holdings"][0]["lease"].as_u64()))?;
+    ensure!(manager.resource(&["release", &lease.to_string()])?.0 == Some(0));
+    let (code, _, err) = manager.resource(&["release", &lease.to_string()])?;
+    ensure!(code == Some(1) && err.contains("had ended before"), "{err}");
+    ensure!(manager.resource(&["delete", "nothing"])?.0 == Some(1));
+    holder.signal(Signal::SIGINT)?;
+    holder.finish()?;
+    manager.process.signal(Signal::SIGTERM)?;
+    let (code, _, said) = manager.process.finish()?;
+    ensure!(code == Some(0) && !said.contains("f1"), "{code:?} {said}");
+
+    let lines = std::fs::read_to_string(&manager.audit)?;
+    let lines: Vec<Value> = lines.lines().map(serde_json::from_str).collect::<Result<_, _>>()?;
+    let who = format!("uid {}", nix::unistd::geteuid());
+    ensure!(lines.iter().all(|line| line["who"] == *who), "{lines:?}");
+    let told: Vec<(&str, &str)> =
+        lines.iter().filter_map(|line| Some((line["operation"].as_str()?, line["code"].as_str()?))).collect();
+    let expected =
+        [("create", "Ok"), ("acquire", "Ok"), ("release", "Ok"), ("release", "NotFound"), ("delete", "NotFound")];
+    ensure!(told == expected, "{lines:?}");
+    ensure!(lines[1]["token"].as_u64() > Some(0) && lines[0]["what"].as_str().is_some_and(|what| what.contains("f1")));
+    Ok(())
+}
+
+#[test]
+fn a_watch_shows_what_is_there_and_what_happens() -> anyhow::Result<()> {
+    let manager = Manager::start()?;
+    let mut watch = manager.place.start_as("watch", &["resource", "watch", "--json"])?;
+    let said = |name: &str| std::fs::read_to_string(manager.place.path().join(name)).unwrap_or_default();
+    wait_for("the snapshot", || Ok(said("watchout").contains("snapshot").then_some(())))?;
+    manager.json(&["create", "Fixture", "--id", "f1"])?;
+    wait_for("the event", || {
+        let out = said("watchout");
+        let event = out.lines().nth(1).and_then(|line| serde_json::from_str::<Value>(line).ok());
+        Ok(event.filter(|event| event["event"] == "created" && event["resource"]["id"] == "f1").map(|_| ()))
+    })?;
+    watch.child.kill()?;
+    Ok(())
+}
+
+#[test]
+fn without_a_manager_every_command_says_so() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    for arguments in [["resource", "list"].as_slice(), &["resource", "block", "Arm"], &["resource", "watch"]] {
+        let output = place.ratn(arguments).output()?;
+        let err = texts(&output).1;
+        ensure!(output.status.code() == Some(2) && err.contains("no resource-manager is running"), "{err}");
+    }
+    // Nor where an address is given and nobody listens.
+    let nobody = format!("unix:{}", place.path().join("nobody.sock").display());
+    for arguments in [["resource", "list"].as_slice(), &["resource", "exists", "Arm"]] {
+        let output = place.ratn(&[arguments, &["--manager", &nobody]].concat()).output()?;
+        let err = texts(&output).1;
+        ensure!(output.status.code() == Some(2) && err.contains("does not answer"), "{:?} {err}", output.status);
+    }
+    Ok(())
+}
