@@ -86,10 +86,10 @@ const METHODS: [(&str, &[Row]); 5] = [
     (
         "ratn.v1.ResourceService",
         &[
-            (Look, &["Exists", "List", "Watch"]),
+            (Look, &["Exists", "Explain", "Get", "List", "ListSessions", "Watch"]),
             (Session, &["KeepAlive", "Session"]),
             (Create, &["Create"]),
-            (Consume, &["Consume"]),
+            (Consume, &["Consume", "EndTask"]),
             (Delete, &["Delete"]),
             (Acquire, &["Acquire", "Block", "Withdraw"]),
             (Release, &["Release"]),

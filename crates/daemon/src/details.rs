@@ -13,6 +13,17 @@ pub(crate) fn status(code: Code, reason: &str, message: impl Into<String>) -> St
     Status::with_error_details(code, message, details)
 }
 
+/// The same, with what programs want to know of it, by name.
+pub(crate) fn status_about<const N: usize>(
+    code: Code,
+    reason: &str,
+    message: impl Into<String>,
+    about: [(&str, String); N],
+) -> Status {
+    let details = ErrorDetails::with_error_info(reason, DOMAIN, about.map(|(name, value)| (name.to_owned(), value)));
+    Status::with_error_details(code, message, details)
+}
+
 /// A status of something that may go better after a while.
 pub(crate) fn retry_later(code: Code, reason: &str, message: impl Into<String>, after: Duration) -> Status {
     let mut details = ErrorDetails::with_error_info(reason, DOMAIN, []);

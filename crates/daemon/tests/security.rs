@@ -215,6 +215,6 @@ async fn names_with_control_characters_and_without_end_are_refused() {
             assert!(!refused.message().contains(char::is_control), "{i}: {refused:?}");
         }
     }
-    let large = v1::ListRequest { kinds: vec!["x".repeat(32 * 1024 * 1024)] };
+    let large = v1::ListRequest { kinds: vec!["x".repeat(32 * 1024 * 1024)], ..Default::default() };
     assert_eq!(in_time(client.list(large)).await.unwrap_err().code(), Code::OutOfRange);
 }

@@ -119,6 +119,57 @@ impl Resource {
     }
 }
 
+/// An acquire in the queue.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct WaitingAcquire {
+    /// Its request id; may be empty.
+    pub request: String,
+    /// Who asks.
+    pub session: String,
+    /// What the holder is to be, for people.
+    pub holder: String,
+    /// Larger first.
+    pub priority: i64,
+    /// How many are served before it.
+    pub ahead: u32,
+    /// What is in the way, for people.
+    pub obstacles: Vec<String>,
+}
+
+/// A session as the resource manager lists it.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct SessionStatus {
+    /// Its id.
+    pub id: String,
+    /// Who that is, for people.
+    pub client: String,
+    /// How long it lives without a ping, in milliseconds.
+    pub ttl_ms: u64,
+    /// In how many milliseconds it ends unless pinged.
+    pub expires_in_ms: u64,
+    /// Its leases.
+    pub leases: Vec<LeaseId>,
+    /// How many of its acquires wait.
+    pub waiting: u32,
+    /// The resources that it provides.
+    pub resources: Vec<String>,
+}
+
+/// Which resources a list is of; the default is all of them.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ResourceFilter {
+    /// Only of these kinds; empty for every kind.
+    pub kinds: Vec<String>,
+    /// Only of this class.
+    pub class: Option<ResourceClass>,
+    /// Only on this host; empty for every host.
+    pub host: String,
+    /// Only those that have these attributes.
+    pub attributes: BTreeMap<String, Value>,
+    /// Only those that this session provides; empty for everybody's.
+    pub session: String,
+}
+
 /// What happened to a resource.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ResourceEventKind {
@@ -147,6 +198,30 @@ pub struct ResourceEvent {
     pub lease: Option<(LeaseId, FencingToken)>,
     /// Why, where there is something to say.
     pub reason: String,
+    /// Which of the events of its revision it is, from 0.
+    pub part: u32,
+}
+
+/// From where a watch goes on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct WatchPosition {
+    /// After this revision.
+    pub revision: Revision,
+    /// And of the events of that revision after this one; `None` after all of them.
+    pub part: Option<u32>,
+}
+
+impl ResourceEvent {
+    /// Where a watch goes on that has seen this event last.
+    pub fn position(&self) -> WatchPosition {
+        WatchPosition { revision: self.revision, part: Some(self.part) }
+    }
+}
+
+impl From<Revision> for WatchPosition {
+    fn from(revision: Revision) -> WatchPosition {
+        WatchPosition { revision, part: None }
+    }
 }
 
 /// What a watch of resources tells: the snapshot first, once.

@@ -144,6 +144,29 @@ impl Pool {
         self.queue.iter().map(|(id, waiter)| (id, waiter.request.clone())).collect()
     }
 
+    /// The waiter of a request id, if it waits.
+    pub fn waiter_of(&self, request_id: &str) -> Option<WaiterId> {
+        match self.memory.reply(request_id) {
+            Some(Recalled::Waiting(waiter)) => Some(waiter),
+            _ => None,
+        }
+    }
+
+    /// The request id of a waiter, empty where it has none, and what it asked for.
+    pub fn waiter(&self, id: WaiterId) -> Option<(&str, &AcquireRequest)> {
+        self.queue.get(id).map(|waiter| (waiter.request_id.as_str(), &waiter.request))
+    }
+
+    /// The first of the queue, in the order in which it is served.
+    pub fn first_waiters(&self, count: usize) -> Vec<WaiterId> {
+        self.queue.iter().take(count).map(|(id, _)| id).collect()
+    }
+
+    /// How many wait.
+    pub fn waiting(&self) -> usize {
+        self.queue.len()
+    }
+
     /// How many events there were so far; the next one has this revision plus one.
     pub fn revision(&self) -> Revision {
         self.revision

@@ -128,6 +128,34 @@ impl ResourceService for Manager {
         Err(Status::unimplemented("not under test"))
     }
 
+    async fn get(
+        &self,
+        _: Request<ratn_proto::v1::ResourceServiceGetRequest>,
+    ) -> Result<Response<ratn_proto::v1::ResourceServiceGetResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    async fn explain(
+        &self,
+        _: Request<ratn_proto::v1::ExplainRequest>,
+    ) -> Result<Response<ratn_proto::v1::ExplainResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    async fn list_sessions(
+        &self,
+        _: Request<ratn_proto::v1::ListSessionsRequest>,
+    ) -> Result<Response<ratn_proto::v1::ListSessionsResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    async fn end_task(
+        &self,
+        _: Request<ratn_proto::v1::EndTaskRequest>,
+    ) -> Result<Response<ratn_proto::v1::EndTaskResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
     type WatchStream = BoxStream<'static, Result<ResourceServiceWatchResponse, Status>>;
 
     async fn watch(&self, _: Request<ResourceServiceWatchRequest>) -> Result<Response<Self::WatchStream>, Status> {

@@ -16,7 +16,7 @@ use crate::details::{retry_later, status as status_with};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
-use ratn_proto::types::{ResourceEvent, ResourceUpdate};
+use ratn_proto::types::{ResourceEvent, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition};
 use ratn_resources::{
     AcquireRequest, Change, Notice, Pool, PoolError, Quantity, Reply, Request, ResourceView, SessionId, WaiterId,
 };
@@ -39,6 +39,8 @@ const TURN: Duration = Duration::from_millis(1);
 const PINGS: usize = 1_024;
 /// Updates that wait for a watcher; one that has more to catch up with is cut off.
 const WATCH_BUFFER: usize = 4_096;
+/// Waiters that are explained together at the most.
+const EXPLAINED: usize = 100;
 /// A session lives at least this long.
 const MIN_SESSION_TTL: Duration = Duration::from_millis(50);
 
@@ -98,7 +100,17 @@ pub(super) enum Message {
     List {
         answer: oneshot::Sender<(Vec<ResourceView>, Revision)>,
     },
+    Sessions {
+        answer: oneshot::Sender<Vec<SessionStatus>>,
+    },
+    /// Why the acquire of a request id waits, or the first of the queue; and how many wait.
+    Explain {
+        request_id: String,
+        answer: Answer<(Vec<WaitingAcquire>, usize)>,
+    },
     Watch {
+        /// Without a snapshot: what happened after this.
+        after: Option<WatchPosition>,
         answer: Answer<mpsc::Receiver<Arc<ResourceUpdate>>>,
     },
 }
@@ -300,8 +312,13 @@ impl Actor {
             }
             Message::Get { id, answer } => self.tell(answer, self.pool.get(&id)),
             Message::List { answer } => self.tell(answer, (self.pool.list(), self.pool.revision())),
-            Message::Watch { answer } => {
-                let watch = self.watch();
+            Message::Sessions { answer } => self.tell(answer, self.sessions()),
+            Message::Explain { request_id, answer } => {
+                let explained = self.explain(&request_id);
+                self.reply(answer, explained);
+            }
+            Message::Watch { after, answer } => {
+                let watch = self.watch(after);
                 self.reply(answer, watch);
             }
         }
@@ -321,7 +338,9 @@ impl Actor {
             }
             Message::Get { id, answer } => drop(answer.send(self.pool.get(&id))),
             Message::List { answer } => drop(answer.send((self.pool.list(), self.pool.revision()))),
-            Message::Watch { answer } => drop(answer.send(self.watch())),
+            Message::Sessions { answer } => drop(answer.send(self.sessions())),
+            Message::Explain { request_id, answer } => drop(answer.send(self.explain(&request_id))),
+            Message::Watch { after, answer } => drop(answer.send(self.watch(after))),
         }
     }
 
@@ -378,11 +397,50 @@ impl Actor {
         let _ = self.pool.release(self.now(), None, lease);
     }
 
-    fn watch(&mut self) -> Result<mpsc::Receiver<Arc<ResourceUpdate>>, Status> {
+    fn sessions(&self) -> Vec<SessionStatus> {
+        let now = self.now();
+        self.pool.sessions().into_iter().map(|session| wire::session(session, now)).collect()
+    }
+
+    fn explain(&self, request_id: &str) -> Result<(Vec<WaitingAcquire>, usize), Status> {
+        let waiters = if request_id.is_empty() {
+            self.pool.first_waiters(EXPLAINED)
+        } else {
+            let waiter = self.pool.waiter_of(request_id).ok_or_else(|| {
+                let message = format!("no acquire of request id `{request_id}` waits: it was answered, or never asked");
+                status_with(Code::NotFound, "WAITER_UNKNOWN", message)
+            })?;
+            vec![waiter]
+        };
+        let explained = |id: WaiterId| {
+            let (request_id, request) = self.pool.waiter(id)?;
+            Some(wire::waiting(request_id, request, &self.pool.explain(id)?))
+        };
+        Ok((waiters.into_iter().filter_map(explained).collect(), self.pool.waiting()))
+    }
+
+    fn watch(&mut self, after: Option<WatchPosition>) -> Result<mpsc::Receiver<Arc<ResourceUpdate>>, Status> {
         self.watchers.retain(|watcher| !watcher.is_closed());
         if self.watchers.len() >= self.config.max_watchers {
             let message = format!("{} clients watch already", self.watchers.len());
             return Err(retry_later(Code::ResourceExhausted, "TOO_MANY", message, Duration::from_secs(1)));
+        }
+        if let Some(after) = after {
+            // Some of this revision may have been seen.
+            let before = Revision(after.revision.0.saturating_sub(u64::from(after.part.is_some())));
+            let events = self.pool.changes_after(before).map_err(|compacted| status::of_compacted(&compacted))?;
+            let events = events.iter().flat_map(|event| wire::events(event));
+            let unseen = |event: &ResourceEvent| event.revision > after.revision || Some(event.part) > after.part;
+            let events: Vec<ResourceEvent> = events.filter(unseen).collect();
+            let (sender, updates) = mpsc::channel(WATCH_BUFFER + events.len());
+            for event in events {
+                sender
+                    .try_send(Arc::new(ResourceUpdate::Event(event)))
+                    .map_err(|_| status_with(Code::Internal, "BROKEN", "a new watch took no event"))?;
+            }
+            // Events of before that wait for the disk are in the history.
+            self.outgoing.push(Outgoing::Watcher(sender));
+            return Ok(updates);
         }
         let (sender, updates) = mpsc::channel(WATCH_BUFFER);
         let resources = self.pool.list().iter().map(wire::resource).collect();

@@ -7,10 +7,10 @@ use crate::audit::{self, Mutation};
 use crate::details::{ending, retry_later, status};
 use crate::owners::Owners;
 use futures::{Stream, StreamExt};
-use ratn_model::id::LeaseId;
+use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Lease, Requirement, ResourceOperation};
 use ratn_proto::convert::{all, each, label, name, required};
-use ratn_proto::types::{Resource, ResourceUpdate};
+use ratn_proto::types::{Resource, ResourceFilter, ResourceUpdate, WatchPosition};
 use ratn_proto::v1;
 use ratn_resources::{AcquireRequest, Reply, Request as PoolRequest, ResourceSpec, SessionId};
 use std::collections::BTreeSet;
@@ -54,6 +54,7 @@ impl Service {
             PoolRequest::Consume { .. } => "consume",
             PoolRequest::Delete { .. } | PoolRequest::DeleteUnits { .. } => "delete",
             PoolRequest::Release { .. } => "release",
+            PoolRequest::EndTask { .. } => "end_task",
             _ => "operate",
         };
         let (request_name, what) = written_down(&request_id, &request);
@@ -270,11 +271,45 @@ impl v1::resource_service_server::ResourceService for Service {
         Ok(Response::new(v1::ExistsResponse { exists: units >= wanted, resource_ids }))
     }
 
+    async fn get(
+        &self,
+        request: Request<v1::ResourceServiceGetRequest>,
+    ) -> Result<Response<v1::ResourceServiceGetResponse>, Status> {
+        let id = request.into_inner().resource_id;
+        name(&id, "resource_id")?;
+        let Some(view) = self.actor.ask(|answer| Message::Get { id: id.clone(), answer }).await? else {
+            return Err(status(Code::NotFound, "RESOURCE_UNKNOWN", format!("there is no resource `{id}`")));
+        };
+        Ok(Response::new(v1::ResourceServiceGetResponse { resource: Some(wire::resource(&view).into()) }))
+    }
+
+    async fn explain(&self, request: Request<v1::ExplainRequest>) -> Result<Response<v1::ExplainResponse>, Status> {
+        let request_id = request.into_inner().request_id;
+        label(&request_id, "request_id")?;
+        let (waiting, total) = self.actor.ask(|answer| Message::Explain { request_id, answer }).await??;
+        let total = u32::try_from(total).unwrap_or(u32::MAX);
+        Ok(Response::new(v1::ExplainResponse { waiting: all(waiting), total }))
+    }
+
+    async fn list_sessions(
+        &self,
+        _: Request<v1::ListSessionsRequest>,
+    ) -> Result<Response<v1::ListSessionsResponse>, Status> {
+        let sessions = self.actor.ask(|answer| Message::Sessions { answer }).await?;
+        Ok(Response::new(v1::ListSessionsResponse { sessions: all(sessions) }))
+    }
+
+    async fn end_task(&self, request: Request<v1::EndTaskRequest>) -> Result<Response<v1::EndTaskResponse>, Status> {
+        let (caller, request) = (Caller::of(&request), request.into_inner());
+        let end = PoolRequest::EndTask { session: self.session(&caller, &request.session_id)? };
+        let (_, revision) = self.perform(&caller, request.request_id, end).await?;
+        Ok(Response::new(v1::EndTaskResponse { revision }))
+    }
+
     async fn list(&self, request: Request<v1::ListRequest>) -> Result<Response<v1::ListResponse>, Status> {
-        let kinds: BTreeSet<String> = request.into_inner().kinds.into_iter().collect();
+        let filter = ResourceFilter::try_from(request.into_inner())?;
         let (views, revision) = self.actor.ask(|answer| Message::List { answer }).await?;
-        let wanted = views.iter().filter(|view| kinds.is_empty() || kinds.contains(&view.kind));
-        let resources = all(wanted.map(wire::resource));
+        let resources = all(views.iter().filter(|view| wire::passes(view, &filter)).map(wire::resource));
         Ok(Response::new(v1::ListResponse { resources, revision: revision.0 }))
     }
 
@@ -282,8 +317,11 @@ impl v1::resource_service_server::ResourceService for Service {
         &self,
         request: Request<v1::ResourceServiceWatchRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
-        let kinds: BTreeSet<String> = request.into_inner().kinds.into_iter().collect();
-        let updates = self.actor.ask(|answer| Message::Watch { answer }).await??;
+        let request = request.into_inner();
+        let part = request.after_part;
+        let after = request.after_revision.map(|revision| WatchPosition { revision: Revision(revision), part });
+        let kinds: BTreeSet<String> = request.kinds.into_iter().collect();
+        let updates = self.actor.ask(|answer| Message::Watch { after, answer }).await??;
         let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
             .filter_map(move |update| futures::future::ready(filtered(&update, &kinds)))
             .map(|update| Ok(update.into()));

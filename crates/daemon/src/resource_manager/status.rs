@@ -1,7 +1,7 @@
 //! The pool's errors as gRPC statuses.
 
-use crate::details::{retry_later, status};
-use ratn_resources::{PoolError, Refusal};
+use crate::details::{retry_later, status, status_about};
+use ratn_resources::{Compacted, PoolError, Refusal};
 use std::time::Duration;
 use tonic::{Code, Status};
 
@@ -42,4 +42,11 @@ pub(super) fn of_fault(fault: &dyn std::error::Error) -> Status {
         message = format!("{message} ({source})");
     }
     status(Code::Unavailable, "STORAGE_FAILED", message)
+}
+
+/// For programs `oldest_revision` and `newest_revision`: from between them a watch can go on.
+pub(super) fn of_compacted(compacted: &Compacted) -> Status {
+    let known = [("oldest_revision", compacted.oldest), ("newest_revision", compacted.newest)];
+    let known = known.map(|(name, revision)| (name, revision.0.to_string()));
+    status_about(Code::OutOfRange, "COMPACTED", compacted.to_string(), known)
 }

@@ -1,7 +1,11 @@
 //! The pool's views and events as the wire's.
 
-use ratn_proto::types::{Holding, Resource, ResourceEvent, ResourceEventKind, ResourceState};
-use ratn_resources::{Change, ResourceView, WatchEvent};
+use ratn_model::time::Timestamp;
+use ratn_proto::types::{
+    Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState, SessionStatus, WaitingAcquire,
+};
+use ratn_resources::{AcquireRequest, Change, Explanation, ResourceView, SessionView, WatchEvent};
+use std::time::Duration;
 
 pub(super) fn resource(view: &ResourceView) -> Resource {
     let state = if !view.free.is_zero() {
@@ -38,25 +42,60 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
 pub(super) fn events(event: &WatchEvent) -> Vec<ResourceEvent> {
     use ResourceEventKind::{Created, Deleted, Leased, Released, Updated};
     let revision = event.revision;
-    let of = |kind, view: &ResourceView, lease, reason: String| ResourceEvent {
+    let of = |part, kind, view: &ResourceView, lease, reason: String| ResourceEvent {
         revision,
         kind,
         resource: resource(view),
         lease,
         reason,
+        part,
+    };
+    let each = |kind, views: &[ResourceView], lease, reason: &str| {
+        (0..).zip(views).map(|(part, view)| of(part, kind, view, lease, reason.to_owned())).collect()
     };
     match &event.change {
-        Change::ResourceCreated(view) => vec![of(Created, view, None, String::new())],
-        Change::ResourceUpdated(view) => vec![of(Updated, view, None, String::new())],
-        Change::ResourceDeleted { resource, reason } => vec![of(Deleted, resource, None, reason.to_string())],
+        Change::ResourceCreated(view) => vec![of(0, Created, view, None, String::new())],
+        Change::ResourceUpdated(view) => vec![of(0, Updated, view, None, String::new())],
+        Change::ResourceDeleted { resource, reason } => vec![of(0, Deleted, resource, None, reason.to_string())],
         Change::ResourceLost { lease, token, resource, .. } => {
-            vec![of(Released, resource, Some((*lease, *token)), "the resource is gone".to_owned())]
+            vec![of(0, Released, resource, Some((*lease, *token)), "the resource is gone".to_owned())]
         }
-        Change::LeaseGranted { lease, token, resources, .. } => {
-            resources.iter().map(|view| of(Leased, view, Some((*lease, *token)), String::new())).collect()
-        }
+        Change::LeaseGranted { lease, token, resources, .. } => each(Leased, resources, Some((*lease, *token)), ""),
         Change::LeaseEnded { lease, token, resources, reason, .. } => {
-            resources.iter().map(|view| of(Released, view, Some((*lease, *token)), reason.to_string())).collect()
+            each(Released, resources, Some((*lease, *token)), &reason.to_string())
         }
+    }
+}
+
+pub(super) fn passes(view: &ResourceView, filter: &ResourceFilter) -> bool {
+    let owner = view.owner.as_ref().map_or("", |owner| owner.as_str());
+    (filter.kinds.is_empty() || filter.kinds.contains(&view.kind))
+        && filter.class.is_none_or(|class| class == view.class)
+        && (filter.host.is_empty() || filter.host == view.host)
+        && (filter.session.is_empty() || filter.session == owner)
+        && filter.attributes.iter().all(|(name, value)| view.attributes.get(name) == Some(value))
+}
+
+pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
+    let milliseconds = |time: Duration| u64::try_from(time.as_millis()).unwrap_or(u64::MAX);
+    SessionStatus {
+        id: view.id.as_str().to_owned(),
+        client: view.name,
+        ttl_ms: milliseconds(view.ttl),
+        expires_in_ms: milliseconds(Duration::from_nanos(view.expires.0.saturating_sub(now.0))),
+        leases: view.leases,
+        waiting: u32::try_from(view.waiters.len()).unwrap_or(u32::MAX),
+        resources: view.provides,
+    }
+}
+
+pub(super) fn waiting(request_id: &str, request: &AcquireRequest, why: &Explanation) -> WaitingAcquire {
+    WaitingAcquire {
+        request: request_id.to_owned(),
+        session: request.session.as_str().to_owned(),
+        holder: request.purpose.clone(),
+        priority: request.priority,
+        ahead: u32::try_from(why.ahead).unwrap_or(u32::MAX),
+        obstacles: why.obstacles.iter().map(ToString::to_string).collect(),
     }
 }

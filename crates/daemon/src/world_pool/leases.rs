@@ -118,6 +118,7 @@ mod tests {
 
     fn event(kind: ResourceEventKind, resource: &str, lease: u64) -> ResourceUpdate {
         ResourceUpdate::Event(ResourceEvent {
+            part: 0,
             revision: Revision(1),
             kind,
             resource: Resource::new(resource, ResourceClass::World, "WorldModel"),

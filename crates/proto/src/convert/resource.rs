@@ -1,7 +1,10 @@
 //! Resources, requirements, leases, events of the pool.
 
 use super::{Malformed, all, each, label, missing_choice, name, ports, required, wire_ports};
-use crate::types::{Holding, Resource, ResourceEvent, ResourceEventKind, ResourceState, ResourceUpdate};
+use crate::types::{
+    Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState, ResourceUpdate, SessionStatus,
+    WaitingAcquire,
+};
 use crate::v1;
 use ratn_model::id::{FencingToken, LeaseId, Revision};
 use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceClass, ResourceOperation};
@@ -219,6 +222,7 @@ impl From<ResourceEvent> for v1::ResourceEvent {
             lease_id: lease.0,
             token: token.0,
             reason: event.reason,
+            part: event.part,
         }
     }
 }
@@ -243,6 +247,7 @@ impl TryFrom<v1::ResourceEvent> for ResourceEvent {
             lease: matches!(kind, ResourceEventKind::Leased | ResourceEventKind::Released)
                 .then_some((LeaseId(event.lease_id), FencingToken(event.token))),
             reason: event.reason,
+            part: event.part,
         })
     }
 }
@@ -277,5 +282,91 @@ impl TryFrom<v1::ResourceServiceWatchResponse> for ResourceUpdate {
                 ResourceEvent::try_from(event).map(ResourceUpdate::Event).map_err(|m| m.within("event"))
             }
         }
+    }
+}
+
+impl From<WaitingAcquire> for v1::WaitingAcquire {
+    fn from(waiting: WaitingAcquire) -> v1::WaitingAcquire {
+        v1::WaitingAcquire {
+            request_id: waiting.request,
+            session_id: waiting.session,
+            holder: waiting.holder,
+            priority: waiting.priority,
+            ahead: waiting.ahead,
+            obstacles: waiting.obstacles,
+        }
+    }
+}
+
+impl TryFrom<v1::WaitingAcquire> for WaitingAcquire {
+    type Error = Malformed;
+
+    fn try_from(waiting: v1::WaitingAcquire) -> Result<WaitingAcquire, Malformed> {
+        Ok(WaitingAcquire {
+            request: waiting.request_id,
+            session: waiting.session_id,
+            holder: waiting.holder,
+            priority: waiting.priority,
+            ahead: waiting.ahead,
+            obstacles: waiting.obstacles,
+        })
+    }
+}
+
+impl From<SessionStatus> for v1::SessionStatus {
+    fn from(session: SessionStatus) -> v1::SessionStatus {
+        v1::SessionStatus {
+            session_id: session.id,
+            client: session.client,
+            ttl_ms: session.ttl_ms,
+            expires_in_ms: session.expires_in_ms,
+            lease_ids: session.leases.into_iter().map(|lease| lease.0).collect(),
+            waiting: session.waiting,
+            resource_ids: session.resources,
+        }
+    }
+}
+
+impl TryFrom<v1::SessionStatus> for SessionStatus {
+    type Error = Malformed;
+
+    fn try_from(session: v1::SessionStatus) -> Result<SessionStatus, Malformed> {
+        Ok(SessionStatus {
+            id: session.session_id,
+            client: session.client,
+            ttl_ms: session.ttl_ms,
+            expires_in_ms: session.expires_in_ms,
+            leases: session.lease_ids.into_iter().map(LeaseId).collect(),
+            waiting: session.waiting,
+            resources: session.resource_ids,
+        })
+    }
+}
+
+impl From<ResourceFilter> for v1::ListRequest {
+    fn from(filter: ResourceFilter) -> v1::ListRequest {
+        v1::ListRequest {
+            kinds: filter.kinds,
+            class: filter.class.map_or(v1::ResourceClass::Unspecified, v1::ResourceClass::from).into(),
+            host: filter.host,
+            attributes: wire_ports(filter.attributes),
+            session_id: filter.session,
+        }
+    }
+}
+
+impl TryFrom<v1::ListRequest> for ResourceFilter {
+    type Error = Malformed;
+
+    fn try_from(request: v1::ListRequest) -> Result<ResourceFilter, Malformed> {
+        label(&request.host, "host")?;
+        label(&request.session_id, "session_id")?;
+        Ok(ResourceFilter {
+            kinds: request.kinds,
+            class: class(request.class)?,
+            host: request.host,
+            attributes: ports(request.attributes, "attributes")?,
+            session: request.session_id,
+        })
     }
 }

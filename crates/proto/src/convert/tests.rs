@@ -147,6 +147,7 @@ fn update() -> impl Strategy<Value = ResourceUpdate> {
     let kind = prop::sample::select(vec![Created, Updated, Deleted, Leased, Released]);
     let event = (any::<u64>(), kind, resource(), any::<u64>()).prop_map(|(revision, kind, resource, lease)| {
         ResourceUpdate::Event(ResourceEvent {
+            part: 2,
             revision: Revision(revision),
             kind,
             resource,

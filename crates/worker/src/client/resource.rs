@@ -7,7 +7,7 @@ use ratn_model::id::LeaseId;
 use ratn_model::resource::{Lease, Requirement};
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::{Malformed, all, each, required};
-use ratn_proto::types::{Resource, ResourceUpdate};
+use ratn_proto::types::{Resource, ResourceFilter, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition};
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_proto::v1::session_request::Kind as Asked;
@@ -229,9 +229,57 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn list(&self, kinds: &[&str]) -> Result<Vec<Resource>, CallError> {
-        let question = v1::ListRequest { kinds: owned(kinds) };
+        self.list_where(ResourceFilter { kinds: owned(kinds), ..ResourceFilter::default() }).await
+    }
+
+    /// The resources that pass a filter, in the order of ids.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn list_where(&self, filter: ResourceFilter) -> Result<Vec<Resource>, CallError> {
+        let question = v1::ListRequest::from(filter);
         let answer = self.client.clone().list(question).await.map_err(|status| self.failed(&status))?;
         each(answer.into_inner().resources, "resources").map_err(|m| self.malformed(m))
+    }
+
+    /// One resource.
+    ///
+    /// # Errors
+    /// [`CallError`], also where it is not there.
+    pub async fn get(&self, resource: &str) -> Result<Resource, CallError> {
+        let question = v1::ResourceServiceGetRequest { resource_id: resource.to_owned() };
+        let answer = self.client.clone().get(question).await.map_err(|status| self.failed(&status))?;
+        self.field(answer.into_inner().resource, "resource")
+    }
+
+    /// Why the acquire of a request id waits; with an empty one, why the first hundred of the queue wait.
+    ///
+    /// # Errors
+    /// [`CallError`], also where the one asked for does not wait.
+    pub async fn explain(&self, request: &str) -> Result<Vec<WaitingAcquire>, CallError> {
+        let question = v1::ExplainRequest { request_id: request.to_owned() };
+        let answer = self.client.clone().explain(question).await.map_err(|status| self.failed(&status))?;
+        each(answer.into_inner().waiting, "waiting").map_err(|m| self.malformed(m))
+    }
+
+    /// Every session, in the order of ids.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn sessions(&self) -> Result<Vec<SessionStatus>, CallError> {
+        let question = v1::ListSessionsRequest {};
+        let answer = self.client.clone().list_sessions(question).await.map_err(|status| self.failed(&status))?;
+        each(answer.into_inner().sessions, "sessions").map_err(|m| self.malformed(m))
+    }
+
+    /// The session's task is over: what it consumed of what is renewable returns.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn end_task(&self) -> Result<(), CallError> {
+        let (request_id, session_id) = self.mutation("");
+        let question = v1::EndTaskRequest { request_id, session_id };
+        self.client.clone().end_task(question).await.map(drop).map_err(|status| self.failed(&status))
     }
 
     /// Tells of the resources of these kinds (of every kind, when none is named) and of every change.
@@ -239,7 +287,18 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn watch(&self, kinds: &[&str]) -> Result<ResourceWatch, CallError> {
-        let question = v1::ResourceServiceWatchRequest { kinds: owned(kinds) };
+        self.watch_from(kinds, None).await
+    }
+
+    /// Tells of every change after a revision or an event ([`ratn_proto::types::ResourceEvent::position`]), without a snapshot;
+    /// with one, when no position is given.
+    ///
+    /// # Errors
+    /// [`CallError`], also where the changes after it are not all known any more.
+    pub async fn watch_from(&self, kinds: &[&str], after: Option<WatchPosition>) -> Result<ResourceWatch, CallError> {
+        let after_revision = after.map(|after| after.revision.0);
+        let after_part = after.and_then(|after| after.part);
+        let question = v1::ResourceServiceWatchRequest { kinds: owned(kinds), after_revision, after_part };
         let answer = self.client.clone().watch(question).await.map_err(|status| self.failed(&status))?;
         Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }

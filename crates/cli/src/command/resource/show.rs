@@ -220,6 +220,7 @@ mod tests {
     #[test]
     fn an_event_is_one_line() {
         let event = ResourceEvent {
+            part: 0,
             revision: Revision(3),
             kind: ResourceEventKind::Released,
             resource: arm(),

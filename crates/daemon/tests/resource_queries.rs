@@ -1,0 +1,195 @@
+//! What can be asked of the resource manager: one resource, a filtered list, who waits for what, who is there, what changed.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod support;
+
+use ratn_daemon::resource_manager::ResourceManagerConfig;
+use ratn_model::id::Revision;
+use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+use ratn_model::value::Value;
+use ratn_proto::types::{Resource, ResourceEvent, ResourceFilter, ResourceUpdate};
+use ratn_proto::v1;
+use ratn_proto::v1::resource_service_client::ResourceServiceClient;
+use ratn_resources::Limits;
+use ratn_worker::client::{AcquireOptions, ResourceWatch};
+use support::{TestSystem, block, in_time};
+use tonic::Code;
+use tonic_types::StatusExt;
+
+fn gripper(id: &str, payload: f64) -> Resource {
+    let gripper = Resource::new(id, ResourceClass::Module, "Gripper").on_host("compute");
+    gripper.with_attribute("payload", Value::Float(payload))
+}
+
+#[tokio::test]
+async fn a_list_is_filtered_and_one_resource_is_got() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(gripper("small", 1.0)).await.unwrap();
+    a.resources.create(gripper("large", 5.0)).await.unwrap();
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let ids = async |filter: ResourceFilter| -> Vec<String> {
+        a.resources.list_where(filter).await.unwrap().into_iter().map(|resource| resource.id).collect()
+    };
+    assert_eq!(ids(ResourceFilter { host: "compute".into(), ..Default::default() }).await, ["large", "small"]);
+    let attributes = [("payload".to_owned(), Value::Float(5.0))].into();
+    assert_eq!(ids(ResourceFilter { attributes, ..Default::default() }).await, ["large"]);
+    assert!(ids(ResourceFilter { class: Some(ResourceClass::World), ..Default::default() }).await.is_empty());
+    assert!(ids(ResourceFilter { session: "nobody".into(), ..Default::default() }).await.is_empty());
+    assert_eq!(a.resources.get("small").await.unwrap().attributes["payload"], Value::Float(1.0));
+    let missing = a.resources.get("middle").await.unwrap_err().to_string();
+    assert!(missing.contains("there is no resource `middle`"), "{missing}");
+}
+
+#[tokio::test]
+async fn who_waits_is_told_for_whom_and_sessions_are_listed() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let options = AcquireOptions { holder: "fetch/move".into(), ..Default::default() };
+    let lease = a.resources.acquire(vec![block("Arm")], options).await.unwrap();
+    let waits = {
+        let b = b.resources.clone();
+        let options = AcquireOptions { request: "run/i1".into(), ..Default::default() };
+        tokio::spawn(async move { b.acquire(vec![block("Arm")], options).await })
+    };
+    let explained = in_time(async {
+        loop {
+            match b.resources.explain("run/i1").await {
+                Ok(explained) => return explained,
+                Err(_) => tokio::task::yield_now().await,
+            }
+        }
+    })
+    .await;
+    let expected = format!("`block Arm`: held by {} of session {} for fetch/move", lease.id, a.session.id());
+    assert_eq!(explained[0].obstacles, [expected]);
+    assert_eq!(b.resources.explain("").await.unwrap(), explained);
+    let sessions = b.resources.sessions().await.unwrap();
+    let of = |id: &str| sessions.iter().find(|session| session.id == id).unwrap();
+    assert_eq!((of(a.session.id()).leases.as_slice(), of(a.session.id()).resources.len()), ([lease.id].as_slice(), 1));
+    assert_eq!(of(b.session.id()).waiting, 1);
+    assert!(a.resources.release(lease.id).await.unwrap());
+    in_time(waits).await.unwrap().unwrap();
+    let told = b.resources.explain("run/i1").await.unwrap_err().to_string();
+    assert!(told.contains("no acquire of request id `run/i1` waits"), "{told}");
+}
+
+#[tokio::test]
+async fn what_a_task_consumed_returns_when_it_ends() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(Resource::new("slots", ResourceClass::System, "Slot").with_capacity(3)).await.unwrap();
+    let consume = Requirement { operation: ResourceOperation::Consume, count: 2, ..block("Slot") };
+    a.resources.consume(consume).await.unwrap();
+    assert_eq!(a.resources.get("slots").await.unwrap().free, 1);
+    a.resources.end_task().await.unwrap();
+    assert_eq!(a.resources.get("slots").await.unwrap().free, 3);
+}
+
+#[tokio::test]
+async fn a_watch_goes_on_from_a_revision_without_a_gap_or_is_told_that_it_cannot() {
+    let system = TestSystem::new();
+    let limits = Limits { history: 16, ..Limits::default() };
+    let config = ResourceManagerConfig { listen: system.directory.socket("rm"), limits, ..Default::default() };
+    let manager = system.resource_manager_with(config.clone()).await;
+    let a = system.client(&manager, "a").await;
+    for i in 0..20 {
+        a.resources.create(gripper(&format!("gripper-{i}"), 1.0)).await.unwrap();
+    }
+    for after in [5, 7, 20] {
+        let mut watch = a.resources.watch_from(&[], Some(Revision(after).into())).await.unwrap();
+        if after < 20 {
+            assert_eq!(next_event(&mut watch).await.revision, Revision(after + 1));
+            continue;
+        }
+        a.resources.create(gripper("last", 2.0)).await.unwrap();
+        assert_eq!(next_event(&mut watch).await.resource.id, "last");
+    }
+    let mut raw = ResourceServiceClient::new(system.channels.get(&manager.endpoint).unwrap());
+    for (after, told) in [(4, "forgotten (known are those after 5)"), (1_000, "lies ahead of the pool's 21")] {
+        let request = v1::ResourceServiceWatchRequest { after_revision: Some(after), ..Default::default() };
+        let refused = in_time(raw.watch(request)).await.unwrap_err();
+        assert_eq!(refused.code(), Code::OutOfRange);
+        assert!(refused.message().contains(told), "{}", refused.message());
+        assert!(refused.message().contains("watch without a revision"), "{}", refused.message());
+        let about = refused.get_details_error_info().unwrap();
+        assert_eq!((about.reason.as_str(), about.metadata["oldest_revision"].as_str()), ("COMPACTED", "5"));
+    }
+
+    // Over a restart as well: the log has what happened.
+    manager.end().await;
+    let manager = system.resource_manager_with(config).await;
+    let a = system.client(&manager, "a").await;
+    let mut watch = a.resources.watch_from(&[], Some(Revision(18).into())).await.unwrap();
+    let ids = [next_event(&mut watch).await, next_event(&mut watch).await, next_event(&mut watch).await];
+    assert_eq!(ids.map(|event| event.resource.id), ["gripper-18", "gripper-19", "last"]);
+}
+
+#[tokio::test]
+async fn a_watch_that_broke_within_a_revision_goes_on_within_it() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    for id in ["a", "b", "c"] {
+        a.resources.create(gripper(id, 1.0)).await.unwrap();
+    }
+    let mut watch = a.resources.watch_from(&[], Some(Revision(3).into())).await.unwrap();
+    let three = Requirement { count: 3, ..block("Gripper") };
+    let lease = a.resources.acquire(vec![three], AcquireOptions::default()).await.unwrap();
+    a.resources.release(lease.id).await.unwrap();
+    let mut whole = Vec::new();
+    while whole.len() < 6 {
+        whole.push(next_event(&mut watch).await);
+    }
+    let positions: Vec<(u64, u32)> = whole.iter().map(|event| (event.revision.0, event.part)).collect();
+    assert_eq!(positions, [(4, 0), (4, 1), (4, 2), (5, 0), (5, 1), (5, 2)]);
+    for seen in 0..5 {
+        let mut watch = a.resources.watch_from(&[], Some(whole[seen].position())).await.unwrap();
+        for expected in &whole[seen + 1..] {
+            assert_eq!(&next_event(&mut watch).await, expected);
+        }
+    }
+}
+
+#[tokio::test]
+async fn watches_that_begin_anywhere_in_a_busy_pool_see_every_change_once_and_in_order() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(gripper("gripper", 1.0)).await.unwrap();
+    let busy = {
+        let a = a.resources.clone();
+        tokio::spawn(async move {
+            for _ in 0..150 {
+                let lease = a.acquire(vec![block("Gripper")], AcquireOptions::default()).await.unwrap();
+                a.release(lease.id).await.unwrap();
+            }
+        })
+    };
+    let mut after = Revision(1);
+    let mut watches = Vec::new();
+    while after.0 < 250 {
+        let mut watch = a.resources.watch_from(&[], Some(after.into())).await.unwrap();
+        let first = next_event(&mut watch).await;
+        assert_eq!(first.revision.0, after.0 + 1);
+        after = Revision(after.0 + 20).min(a.resources.get("gripper").await.unwrap().revision).max(first.revision);
+        watches.push((first.revision, watch));
+    }
+    in_time(busy).await.unwrap();
+    for (first, mut watch) in watches {
+        for revision in first.0 + 1..=301 {
+            assert_eq!(next_event(&mut watch).await.revision.0, revision);
+        }
+    }
+}
+
+async fn next_event(watch: &mut ResourceWatch) -> ResourceEvent {
+    match in_time(watch.next()).await.unwrap() {
+        Some(ResourceUpdate::Event(event)) => event,
+        other => panic!("{other:?} is no event"),
+    }
+}
