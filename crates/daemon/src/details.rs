@@ -1,5 +1,6 @@
 //! Statuses with `google.rpc` details: a machine-readable reason, and when to try again.
 
+pub(crate) use ratn_worker::gate::ending;
 use std::time::Duration;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
@@ -29,9 +30,4 @@ pub(crate) fn retry_later(code: Code, reason: &str, message: impl Into<String>, 
     let mut details = ErrorDetails::with_error_info(reason, DOMAIN, []);
     details.set_retry_info(Some(after));
     Status::with_error_details(code, message, details)
-}
-
-/// The daemon is ending.
-pub(crate) fn ending() -> Status {
-    retry_later(Code::Unavailable, "ENDING", "the daemon is ending", Duration::from_millis(500))
 }

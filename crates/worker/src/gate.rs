@@ -6,19 +6,30 @@
 //!                            Gate::answered(path, code, duration) ◀─ answer
 //! ```
 //! The trace of a call that carries one (`traceparent`) is that of everything done for it. What is admitted is the gate's business.
+//!
+//! A server that drains refuses what is new ([`ending`]), and knows what is still under way: a call is over when its last byte of
+//! answer is. Health and reflection are answered to the end, and nobody waits for them.
 
 use crate::trace::{self, TraceContext};
+use http_body::{Frame, SizeHint};
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+use tokio_util::task::task_tracker::TaskTrackerToken;
 use tonic::body::Body;
 use tonic::codegen::{Service, http};
 use tonic::transport::server::{TcpConnectInfo, TlsConnectInfo, UdsConnectInfo};
 use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
 use tower_layer::Layer;
 use tracing::Instrument;
+
+/// When whoever was refused because a process ends should ask again.
+const ENDING_RETRY: Duration = Duration::from_millis(500);
 
 /// Who is at the other end of a connection, as far as the connection itself proves it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -78,12 +89,85 @@ pub fn identity_of(extensions: &http::Extensions) -> Identity {
     }
 }
 
+/// What a process that ends says to whoever asks it for something new.
+pub fn ending() -> Status {
+    let mut details = ErrorDetails::with_error_info("ENDING", "ratn", []);
+    details.set_retry_info(Some(ENDING_RETRY));
+    Status::with_error_details(Code::Unavailable, "the process is ending: ask its successor", details)
+}
+
+/// The calls of a server.
+#[derive(Debug, Clone)]
+pub(crate) struct Calls {
+    under_way: TaskTracker,
+    draining: CancellationToken,
+}
+
+impl Calls {
+    /// Those of a server that drains with the token.
+    pub(crate) fn until(draining: CancellationToken) -> Calls {
+        let under_way = TaskTracker::new();
+        // Whoever waits while there are none does not wait for a first one.
+        under_way.close();
+        Calls { under_way, draining }
+    }
+
+    /// Returns when none is under way.
+    pub(crate) async fn ended(&self) {
+        self.under_way.wait().await;
+    }
+
+    /// One more, which is nobody's where `counted` is false.
+    fn begin(&self, counted: bool) -> Result<Option<TaskTrackerToken>, Status> {
+        if !counted {
+            return Ok(None);
+        }
+        // Counted first: either it is waited for, or it sees that it comes too late.
+        let call = self.under_way.token();
+        if self.draining.is_cancelled() { Err(ending()) } else { Ok(Some(call)) }
+    }
+}
+
+/// Whether a call is one of the daemon's own services.
+fn is_counted(path: &str) -> bool {
+    !path.starts_with("/grpc.")
+}
+
+/// The body of an answer whose call is under way until it has been sent, or nobody wants it any more.
+struct Answer {
+    body: Body,
+    _call: TaskTrackerToken,
+}
+
+impl http_body::Body for Answer {
+    type Data = <Body as http_body::Body>::Data;
+    type Error = Status;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Self::Data>, Status>>> {
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
 #[derive(Clone)]
-pub(crate) struct Gated(pub(crate) Arc<dyn Gate>);
+pub(crate) struct Gated {
+    pub(crate) gate: Arc<dyn Gate>,
+    pub(crate) calls: Calls,
+}
 
 #[derive(Clone)]
 pub(crate) struct GatedService<S> {
-    gate: Arc<dyn Gate>,
+    gated: Gated,
     inner: S,
 }
 
@@ -91,7 +175,7 @@ impl<S> Layer<S> for Gated {
     type Service = GatedService<S>;
 
     fn layer(&self, inner: S) -> GatedService<S> {
-        GatedService { gate: self.0.clone(), inner }
+        GatedService { gated: self.clone(), inner }
     }
 }
 
@@ -113,11 +197,15 @@ where
         let began = Instant::now();
         let path = request.uri().clone();
         let identity = identity_of(request.extensions());
-        let gate = self.gate.clone();
-        if let Err(status) = gate.admit(&identity, path.path(), request.extensions_mut()) {
-            gate.answered(path.path(), status.code(), began.elapsed());
-            return Box::pin(std::future::ready(Ok(status.into_http())));
-        }
+        let Gated { gate, calls } = self.gated.clone();
+        let admitted = gate.admit(&identity, path.path(), request.extensions_mut());
+        let call = match admitted.and_then(|()| calls.begin(is_counted(path.path()))) {
+            Ok(call) => call,
+            Err(status) => {
+                gate.answered(path.path(), status.code(), began.elapsed());
+                return Box::pin(std::future::ready(Ok(status.into_http())));
+            }
+        };
         let context = TraceContext::from_headers(request.headers());
         let answer = self.inner.call(request);
         let answered = async move {
@@ -125,7 +213,10 @@ where
             if let Ok(answer) = &answer {
                 gate.answered(path.path(), code_of(answer), began.elapsed());
             }
-            answer
+            match (answer, call) {
+                (Ok(answer), Some(call)) => Ok(answer.map(|body| Body::new(Answer { body, _call: call }))),
+                (answer, _) => answer,
+            }
         };
         match context {
             None => Box::pin(answered),

@@ -1,7 +1,12 @@
 //! One way to serve: bind, add health and reflection, serve until a token is cancelled, drain with a hard deadline.
+//!
+//! ```text
+//!   serving ─ token cancelled ─▶ draining ─ no call under way, or the deadline ─▶ connections told to go away ─▶ over
+//!                                NOT_SERVING, new calls: UNAVAILABLE, when to come back
+//! ```
 
 use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
-use crate::gate::{Gate, Gated, Open};
+use crate::gate::{Calls, Gate, Gated, Open};
 use crate::tls::{ServerTls, TlsError};
 use std::convert::Infallible;
 use std::io;
@@ -22,6 +27,8 @@ use tonic_health::ServingStatus;
 
 /// Calls that have not ended this long after the shutdown began are dropped.
 pub const DRAIN_DEADLINE: Duration = Duration::from_millis(500);
+/// After the last call connections have this long to be closed in order.
+const CLOSE_PATIENCE: Duration = Duration::from_millis(100);
 /// The metadata of one call has at most this many bytes.
 const MAX_METADATA_BYTES: u32 = 16 * 1024;
 
@@ -203,9 +210,9 @@ impl Bound {
         &self.endpoint
     }
 
-    /// Serves until `shutdown` is cancelled, then lets calls under way end within [`DRAIN_DEADLINE`]. Health is SERVING
-    /// from the first answer on, for the server (the empty name) and for each service, and NOT_SERVING once it drains.
-    /// Services with endless streams must end them on the same token.
+    /// Serves until `shutdown` is cancelled, then lets calls under way end within [`DRAIN_DEADLINE`] and refuses new ones with
+    /// [`crate::gate::ending`]. Health is SERVING from the first answer on, for the server (the empty name) and for each service,
+    /// and NOT_SERVING once it drains. Services must end endless streams, and calls that wait for something, on the same token.
     ///
     /// # Errors
     /// [`ServeError`] where the transport fails.
@@ -232,6 +239,8 @@ impl Bound {
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
             .build_v1()
             .map_err(ServeError::Reflection)?;
+        let calls = Calls::until(shutdown.clone());
+        let closing = CancellationToken::new();
         let mut server = tonic::transport::Server::builder();
         if let Some(tls) = self.tls {
             let failed = |source| ServeError::Transport { endpoint: self.endpoint.clone(), source };
@@ -239,13 +248,13 @@ impl Bound {
         }
         let router = server
             .http2_max_header_list_size(MAX_METADATA_BYTES)
-            .layer(Gated(serving.gate))
+            .layer(Gated { gate: serving.gate, calls: calls.clone() })
             .http2_keepalive_interval(Some(KEEPALIVE_INTERVAL))
             .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
             .add_routes(services.routes.add_service(health_service).add_service(reflection));
 
         let served = {
-            let stop = shutdown.clone().cancelled_owned();
+            let stop = closing.clone().cancelled_owned();
             async move {
                 match self.listener {
                     Listener::Tcp(listener) => {
@@ -269,15 +278,18 @@ impl Bound {
             for name in services.names.iter().chain(&[""]) {
                 health.set_service_status(name, ServingStatus::NotServing).await;
             }
-            tokio::time::sleep(serving.drain).await;
+            if tokio::time::timeout(serving.drain, calls.ended()).await.is_err() {
+                let drain_ms = u64::try_from(serving.drain.as_millis()).unwrap_or(u64::MAX);
+                tracing::warn!(drain_ms, "calls were still under way at the end of the drain: they are dropped");
+            }
+            closing.cancel();
+            // Who watches health would keep a connection open for ever.
+            tokio::time::sleep(CLOSE_PATIENCE).await;
         };
         let endpoint = self.endpoint;
         tokio::select! {
             served = served => served.map_err(|source| ServeError::Transport { endpoint, source }),
-            () = drained => {
-                tracing::debug!(%endpoint, "calls were still under way at the end of the drain");
-                Ok(())
-            }
+            () = drained => Ok(()),
         }
     }
 }

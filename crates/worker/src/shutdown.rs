@@ -8,8 +8,8 @@ use tokio_util::sync::CancellationToken;
 
 /// After its parent's end a process lives at most this much longer.
 pub const EXIT_GRACE: Duration = Duration::from_millis(900);
-/// The exit code of a process that outlived its parent and did not drain.
-const EXIT_CODE_ORPHAN: i32 = 3;
+/// The exit code of a process that did not drain in time after a signal or its parent's end.
+const EXIT_CODE_OVERDUE: i32 = 3;
 /// The exit code after a second signal: 128 + SIGINT.
 const EXIT_CODE_INTERRUPTED: i32 = 130;
 
@@ -27,6 +27,34 @@ pub fn on_signals(token: &CancellationToken) -> io::Result<()> {
         next().await;
         std::process::exit(EXIT_CODE_INTERRUPTED);
     });
+    Ok(())
+}
+
+/// As [`on_signals`], for a process that drains: what has not ended `patience` after the first signal is ended all the same. In a
+/// thread of its own, so that a runtime that hangs (a disk that does not answer) cannot keep the process.
+///
+/// # Errors
+/// Where the signals cannot be caught or the thread cannot be started.
+pub fn on_signals_within(token: &CancellationToken, patience: Duration) -> io::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let entered = runtime.enter();
+    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    drop(entered);
+    let token = token.clone();
+    let watch = move || {
+        let mut next = async || tokio::select! { _ = terminate.recv() => {}, _ = interrupt.recv() => {} };
+        runtime.block_on(async {
+            next().await;
+            token.cancel();
+            if tokio::time::timeout(patience, next()).await.is_ok() {
+                std::process::exit(EXIT_CODE_INTERRUPTED);
+            }
+            let patience_ms = u64::try_from(patience.as_millis()).unwrap_or(u64::MAX);
+            tracing::error!(patience_ms, "the process did not end in time and is ended");
+            std::process::exit(EXIT_CODE_OVERDUE);
+        });
+    };
+    std::thread::Builder::new().name("signals".to_owned()).spawn(watch)?;
     Ok(())
 }
 
@@ -50,7 +78,7 @@ pub fn exit_with_parent(token: &CancellationToken) -> io::Result<()> {
         }
         token.cancel();
         std::thread::sleep(EXIT_GRACE);
-        std::process::exit(EXIT_CODE_ORPHAN);
+        std::process::exit(EXIT_CODE_OVERDUE);
     };
     std::thread::Builder::new().name("exit-with-parent".to_owned()).spawn(watch)?;
     Ok(())

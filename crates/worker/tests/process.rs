@@ -4,10 +4,13 @@
 mod common;
 
 use common::{Wait, goal};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 use ratn_worker::client::{ActionClient, Channels, wait_until_serving};
 use ratn_worker::endpoint::Endpoint;
-use ratn_worker::shutdown::{EXIT_GRACE, exit_with_parent};
+use ratn_worker::shutdown::{EXIT_GRACE, exit_with_parent, on_signals_within};
 use ratn_worker::worker::{Worker, WorkerOptions};
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
@@ -15,6 +18,9 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 const LONG: Duration = Duration::from_secs(20);
+/// Instead of a socket.
+const HANGS: &str = "hangs";
+const HANG_PATIENCE: Duration = Duration::from_millis(200);
 const SOCKET: &str = "RATN_TEST_SOCKET";
 
 /// The role of the worker; as a test it does nothing.
@@ -22,6 +28,14 @@ const SOCKET: &str = "RATN_TEST_SOCKET";
 fn child() {
     let Some(socket) = std::env::var_os(SOCKET) else { return };
     let runtime = tokio::runtime::Runtime::new().unwrap();
+    if socket == HANGS {
+        // One whose runtime does nothing any more.
+        on_signals_within(&CancellationToken::new(), HANG_PATIENCE).unwrap();
+        runtime.block_on(async {
+            println!("ready");
+            std::thread::sleep(LONG);
+        });
+    }
     if socket.is_empty() {
         // One that never drains.
         exit_with_parent(&CancellationToken::new()).unwrap();
@@ -42,7 +56,7 @@ fn spawn(socket: &Path) -> Child {
         .args(["--exact", "child", "--nocapture"])
         .env(SOCKET, socket)
         .stdin(Stdio::piped())
-        .stdout(Stdio::null())
+        .stdout(Stdio::piped())
         .spawn()
         .unwrap()
 }
@@ -70,6 +84,19 @@ async fn a_process_that_does_not_drain_ends_all_the_same() {
     drop(child.stdin.take());
     assert_eq!(exit_of(child).await.code(), Some(3));
     assert!(ended.elapsed() >= EXIT_GRACE);
+}
+
+#[tokio::test]
+async fn a_process_whose_runtime_hangs_ends_after_its_patience() {
+    let mut child = spawn(Path::new(HANGS));
+    let mut said = BufReader::new(child.stdout.take().unwrap()).lines();
+    // The harness of tests has words of its own.
+    assert!(said.any(|line| line.unwrap().ends_with("ready")));
+    let told = Instant::now();
+    let pid = Pid::from_raw(child.id().try_into().unwrap());
+    kill(pid, Signal::SIGTERM).unwrap();
+    assert_eq!(exit_of(child).await.code(), Some(3));
+    assert!(told.elapsed() >= HANG_PATIENCE);
 }
 
 #[tokio::test]

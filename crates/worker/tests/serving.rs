@@ -3,19 +3,26 @@
 
 mod common;
 
-use common::{Double, goal, provider};
+use common::{Double, begin, goal, provider, provider_with};
 use ratn_proto::types::GoalOutcome;
+use ratn_proto::v1::DescribeRequest;
+use ratn_proto::v1::action_service_client::ActionServiceClient;
 use ratn_worker::client::{ActionClient, Channels, wait_until_serving};
 use ratn_worker::endpoint::{Endpoint, connect};
 use ratn_worker::runtime_directory::wait_for_file;
 use ratn_worker::server::bind;
 use ratn_worker::worker::{Worker, WorkerOptions};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio_util::sync::CancellationToken;
+use tonic::Code;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
 use tonic_reflection::pb::v1::ServerReflectionRequest;
 use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
 use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
 use tonic_reflection::pb::v1::server_reflection_response::MessageResponse;
+use tonic_types::StatusExt;
 
 /// Nothing here takes this long.
 const LONG: Duration = Duration::from_secs(20);
@@ -85,6 +92,59 @@ async fn a_server_that_ends_leaves_the_socket_of_its_successor_alone() {
     let _second = bind(&endpoint).await.unwrap();
     drop(first);
     assert!(path.exists());
+}
+
+/// Its name, reason and delay, as a refusal of a process that ends has them.
+fn ending(status: &tonic::Status) -> (Code, String, Option<Duration>) {
+    let details = status.get_error_details();
+    let delay = details.retry_info().and_then(|info| info.retry_delay);
+    (status.code(), details.error_info().map(|info| info.reason.clone()).unwrap_or_default(), delay)
+}
+
+#[tokio::test]
+async fn a_server_that_drains_ends_what_is_under_way_and_refuses_what_is_new() {
+    let provider = provider_with(None, LONG).await;
+    let channel = connect(&provider.endpoint).await.unwrap();
+    let mut health = HealthClient::new(channel.clone());
+    let ask = |service: &str| HealthCheckRequest { service: service.to_owned() };
+    let mut watched = health.watch(ask("ratn.v1.ActionService")).await.unwrap().into_inner();
+    assert_eq!(watched.message().await.unwrap().unwrap().status(), ServingStatus::Serving);
+    let under_way = begin(&provider, goal("a", "wait", 1)).await;
+
+    provider.shutdown.cancel();
+    assert_eq!(watched.message().await.unwrap().unwrap().status(), ServingStatus::NotServing);
+    assert_eq!(health.check(ask("")).await.unwrap().into_inner().status(), ServingStatus::NotServing);
+    let mut client = ActionServiceClient::new(channel);
+    let refused = client.describe(DescribeRequest {}).await.unwrap_err();
+    let (code, reason, delay) = ending(&refused);
+    assert!(code == Code::Unavailable && reason == "ENDING" && delay.is_some(), "{refused:?}");
+    assert!(!provider.serving.is_finished());
+
+    // What was under way is heard to its end, and with it the server ends, long before the deadline.
+    assert!(provider.server.cancel("a"));
+    assert_eq!(under_way.await.unwrap().unwrap().outcome.as_str(), "preempted");
+    tokio::time::timeout(LONG / 2, provider.serving).await.unwrap().unwrap();
+}
+
+#[tokio::test]
+async fn a_call_that_goes_on_is_dropped_at_the_deadline() {
+    let drain = Duration::from_millis(100);
+    let provider = provider_with(None, drain).await;
+    let under_way = begin(&provider, goal("a", "stay", 1)).await;
+    let told = Instant::now();
+    provider.shutdown.cancel();
+    provider.serving.await.unwrap();
+    assert!(told.elapsed() >= drain);
+    assert_eq!(provider.server.running(), 1);
+    under_way.abort();
+}
+
+#[tokio::test]
+async fn an_idle_server_ends_at_once() {
+    let provider = provider_with(None, LONG).await;
+    let _connection = connect(&provider.endpoint).await.unwrap();
+    provider.shutdown.cancel();
+    tokio::time::timeout(LONG / 2, provider.serving).await.unwrap().unwrap();
 }
 
 #[tokio::test]

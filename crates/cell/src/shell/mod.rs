@@ -58,12 +58,15 @@ pub async fn run_as(
         .with(CellServiceServer::new(service::Service::new(keeper.clone())));
     let link =
         link::Link { config, directory: directory.clone(), channels, endpoint: endpoint.clone(), keeper, server };
-    let linked = tokio::spawn(link.keep(shutdown.clone()));
+    // Motions under way have their leases until the last has ended.
+    let over = CancellationToken::new();
+    let _over = over.clone().drop_guard();
+    let linked = tokio::spawn(link.keep(over.clone()));
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
-    let served = bound.serve_as(services, serving, shutdown.clone()).await;
+    let served = bound.serve_as(services, serving, shutdown).await;
     drop(published);
-    shutdown.cancel();
+    over.cancel();
     linked.await.context("the link to the resource manager")?;
     Ok(served?)
 }

@@ -14,10 +14,14 @@ use ratn_worker::server::{Exposure, Serving};
 use ratn_worker::worker::WorkerOptions;
 use ratn_worker::{shutdown, tls};
 use std::path::PathBuf;
+use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
 /// The environment variables that say where state is kept; the second is systemd's.
 const STATE_VARIABLES: [&str; 2] = ["RATN_STATE_DIR", "STATE_DIRECTORY"];
+
+/// After the drain a daemon has this long to end what it owns: workers, a session, what is still to be written.
+const EXIT_PATIENCE: Duration = Duration::from_secs(2);
 
 /// `ratn resource-manager`
 pub(super) fn resource_manager(arguments: &ResourceManagerArguments) -> Result<(), Failure> {
@@ -122,7 +126,8 @@ fn daemon_on(
     let _logs = telemetry::start_as(&service.log, service.audit_file.as_deref())?;
     blocking_on(runtime, async {
         let shutdown = CancellationToken::new();
-        shutdown::on_signals(&shutdown).context("cannot catch signals")?;
+        let patience = Duration::from_millis(service.drain_ms) + EXIT_PATIENCE;
+        shutdown::on_signals_within(&shutdown, patience).context("cannot catch signals")?;
         if arguments.exit_with_parent {
             shutdown::exit_with_parent(&shutdown).context("cannot watch standard input")?;
         }

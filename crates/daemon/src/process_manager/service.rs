@@ -60,7 +60,7 @@ impl v1::process_service_server::ProcessService for Service {
         let updates = ReceiverStream::new(updates)
             .map(|worker| Ok(v1::ProcessServiceWatchResponse { worker: Some(worker.into()) }));
         let last = futures::stream::once(async { Err(ending()) });
-        let stream = updates.chain(last).take_until(self.shutdown.clone().cancelled_owned());
+        let stream = updates.take_until(self.shutdown.clone().cancelled_owned()).chain(last);
         Ok(Response::new(Box::pin(stream)))
     }
 }

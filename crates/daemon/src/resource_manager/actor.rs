@@ -12,7 +12,7 @@ use super::journal::Journal;
 use super::outbox::{Outbox, Outgoing};
 use super::wire;
 use super::{Granted, ResourceManagerConfig, status};
-use crate::details::{retry_later, status as status_with};
+use crate::details::{ending, retry_later, status as status_with};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
@@ -26,6 +26,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status};
 
@@ -134,6 +135,8 @@ struct Actor {
     outbox: Outbox,
     /// Why nothing changes any more.
     stopped: Option<Status>,
+    /// Nobody waits in the queue any more.
+    draining: bool,
     start: Instant,
     /// Who waits for the answer of which waiter; a repeated request joins.
     calls: BTreeMap<WaiterId, Vec<(u64, oneshot::Sender<Granted>)>>,
@@ -143,12 +146,13 @@ struct Actor {
     watchers: Vec<mpsc::Sender<Arc<ResourceUpdate>>>,
 }
 
-/// Starts the actor on what was kept; it ends with the token.
+/// Starts the actor on what was kept. With `draining` everybody who waits is told to ask the successor; with `over` it ends.
 pub(super) fn start(
     config: ResourceManagerConfig,
     (pool, journal): (Pool, Journal),
-    shutdown: CancellationToken,
-) -> Handle {
+    draining: CancellationToken,
+    over: CancellationToken,
+) -> (Handle, JoinHandle<()>) {
     let (inbox, messages) = mpsc::channel(INBOX);
     let (pings, pinged) = mpsc::channel(PINGS);
     let actor = Actor {
@@ -157,6 +161,7 @@ pub(super) fn start(
         outgoing: Vec::new(),
         outbox: Outbox::default(),
         stopped: None,
+        draining: false,
         config,
         start: Instant::now(),
         calls: BTreeMap::new(),
@@ -164,8 +169,8 @@ pub(super) fn start(
         shared: BTreeMap::new(),
         watchers: Vec::new(),
     };
-    tokio::spawn(actor.run(messages, pinged, shutdown));
-    Handle { inbox, pings }
+    let running = tokio::spawn(actor.run(messages, pinged, draining, over));
+    (Handle { inbox, pings }, running)
 }
 
 impl Handle {
@@ -173,7 +178,7 @@ impl Handle {
     pub(super) async fn ask<T>(&self, message: impl FnOnce(oneshot::Sender<T>) -> Message) -> Result<T, Status> {
         let (answer, answered) = oneshot::channel();
         self.send(message(answer)).await?;
-        answered.await.map_err(|_| crate::details::ending())
+        answered.await.map_err(|_| ending())
     }
 
     pub(super) async fn keep_alive(
@@ -184,12 +189,12 @@ impl Handle {
     ) -> Result<KeptAlive, Status> {
         let (answer, answered) = oneshot::channel();
         let ping = Ping { session, client, ttl, answer };
-        self.pings.send(ping).await.map_err(|_| crate::details::ending())?;
-        answered.await.map_err(|_| crate::details::ending())?
+        self.pings.send(ping).await.map_err(|_| ending())?;
+        answered.await.map_err(|_| ending())?
     }
 
     pub(super) async fn send(&self, message: Message) -> Result<(), Status> {
-        self.inbox.send(message).await.map_err(|_| crate::details::ending())
+        self.inbox.send(message).await.map_err(|_| ending())
     }
 
     /// Sends a message from where nothing can be waited for.
@@ -215,7 +220,8 @@ impl Actor {
         mut self,
         mut messages: mpsc::Receiver<Message>,
         mut pinged: mpsc::Receiver<Ping>,
-        shutdown: CancellationToken,
+        draining: CancellationToken,
+        over: CancellationToken,
     ) {
         let mut arrived = Vec::new();
         loop {
@@ -225,7 +231,8 @@ impl Actor {
             let room = !self.outbox.is_full();
             tokio::select! {
                 biased;
-                () = shutdown.cancelled() => return self.end(),
+                () = over.cancelled() => return self.end(),
+                () = draining.cancelled(), if !self.draining => self.drain(),
                 Some(ping) = pinged.recv() => self.pinged(ping),
                 progress = self.journal.changed(), if running => self.written(progress),
                 () = sleep_until(deadline) => self.pool.advance(self.now()),
@@ -251,6 +258,23 @@ impl Actor {
             }
             self.deliver();
         }
+    }
+
+    /// Whoever waits is told, and leaves the queue.
+    fn drain(&mut self) {
+        self.draining = true;
+        self.tickets.clear();
+        let calls = std::mem::take(&mut self.calls);
+        tracing::info!(waiting = calls.len(), "draining: nobody is granted anything any more");
+        let now = self.now();
+        for (waiter, calls) in calls {
+            // Unknown when it was answered in this moment: then the grant finds nobody, and goes back.
+            let _ = self.pool.cancel(now, waiter);
+            for (_, call) in calls {
+                let _ = call.send(Err(ending()));
+            }
+        }
+        self.collect();
     }
 
     /// Lets out what is on the disk by now, and what the rest of it was waiting for.
@@ -286,6 +310,7 @@ impl Actor {
                 let revision = self.pool.revision();
                 self.reply(answer, reply.map(|reply| (reply, revision)).map_err(|error| status::of_error(&error)));
             }
+            Message::Acquire { answer, .. } if self.draining => drop(answer.send(Err(ending()))),
             Message::Acquire { ticket, request_id, mut request, wait, answer } => {
                 request.deadline = Some(now + wait.min(self.config.max_wait()));
                 match self.pool.handle(now, &request_id, Request::Acquire(request)) {

@@ -65,7 +65,9 @@ pub async fn run_as(
     let kept = journal::Journal::open(&config.storage, &storage, config.limits.clone())?;
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
-    let actor = actor::start(config, kept, shutdown.clone());
+    let over = CancellationToken::new();
+    let _over = over.clone().drop_guard();
+    let (actor, ended) = actor::start(config, kept, shutdown.clone(), over.clone());
     let service = ResourceServiceServer::new(service::Service::new(actor, shutdown.clone()))
         .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
@@ -73,5 +75,8 @@ pub async fn run_as(
     tracing::info!(%endpoint, "{ROLE} is ready");
     let served = bound.serve_as(Services::new().with(service), serving, shutdown).await;
     drop(published);
+    // What was still to be written is on the disk when this has ended.
+    over.cancel();
+    let _ = ended.await;
     Ok(served?)
 }

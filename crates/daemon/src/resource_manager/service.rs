@@ -325,11 +325,15 @@ impl v1::resource_service_server::ResourceService for Service {
         let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
             .filter_map(move |update| futures::future::ready(filtered(&update, &kinds)))
             .map(|update| Ok(update.into()));
-        let last = futures::stream::once(async {
-            let message = "the watch has ended (too slow, or the resource manager ends): watch again";
+        let shutdown = self.shutdown.clone();
+        let last = futures::stream::once(async move {
+            if shutdown.is_cancelled() {
+                return Err(ending());
+            }
+            let message = "the watch has ended, for it was too slow: watch again";
             Err(retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER))
         });
-        let stream = updates.chain(last).take_until(self.shutdown.clone().cancelled_owned());
+        let stream = updates.take_until(self.shutdown.clone().cancelled_owned()).chain(last);
         Ok(Response::new(Box::pin(stream)))
     }
 
@@ -429,7 +433,7 @@ mod tests {
     async fn a_lease_that_two_calls_of_one_request_got_goes_back_when_both_are_dropped() {
         let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
         let kept = Journal::open(&config.storage, directory.path(), config.limits.clone()).unwrap();
-        let actor = actor::start(config, kept, CancellationToken::new());
+        let (actor, _) = actor::start(config, kept, CancellationToken::new(), CancellationToken::new());
         let session = SessionId::from("s");
         actor.keep_alive(session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
         let requirement = Requirement {

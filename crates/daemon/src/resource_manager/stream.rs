@@ -3,6 +3,7 @@
 //! The stream of answers is what is polled: it takes questions from the connection, keeps the calls under way and hands out their
 //! answers, all in the connection's task, so that a question costs one hop to the actor and one back. Dropped, it drops the
 //! calls under way, which leave the queue as unary calls do. A client that does not read its answers is not read from either.
+//! When the manager drains, no more questions are taken; what is under way is answered, then the stream ends.
 
 use super::service::{Service, kept_alive};
 use crate::access::{Caller, Operation};
@@ -34,6 +35,7 @@ pub(super) struct SessionStream {
     questions: Option<Streaming<v1::SessionRequest>>,
     calls: FuturesUnordered<Call>,
     shutdown: Pin<Box<WaitForCancellationFutureOwned>>,
+    draining: bool,
 }
 
 impl SessionStream {
@@ -44,7 +46,14 @@ impl SessionStream {
         shutdown: CancellationToken,
     ) -> SessionStream {
         let shutdown = Box::pin(shutdown.cancelled_owned());
-        SessionStream { service, caller, questions: Some(questions), calls: FuturesUnordered::new(), shutdown }
+        SessionStream {
+            service,
+            caller,
+            questions: Some(questions),
+            calls: FuturesUnordered::new(),
+            shutdown,
+            draining: false,
+        }
     }
 }
 
@@ -53,12 +62,12 @@ impl Stream for SessionStream {
 
     fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         let this = self.get_mut();
-        if this.shutdown.poll_unpin(context).is_ready() {
-            return Poll::Ready(Some(Err(crate::details::ending())));
+        if !this.draining && this.shutdown.poll_unpin(context).is_ready() {
+            this.draining = true;
         }
         let mut may_be_more = true;
         for _ in 0..AT_ONCE {
-            let Some(questions) = &mut this.questions else {
+            let Some(questions) = this.questions.as_mut().filter(|_| !this.draining) else {
                 may_be_more = false;
                 break;
             };
@@ -83,6 +92,7 @@ impl Stream for SessionStream {
         }
         match this.calls.poll_next_unpin(context) {
             Poll::Ready(Some(answer)) => Poll::Ready(Some(Ok(answer))),
+            Poll::Ready(None) if this.draining => Poll::Ready(Some(Err(crate::details::ending()))),
             Poll::Ready(None) if this.questions.is_none() => Poll::Ready(None),
             Poll::Ready(None) | Poll::Pending => Poll::Pending,
         }

@@ -65,18 +65,21 @@ pub async fn run_as(
         wanted,
         there: None,
     };
-    let linked = tokio::spawn(link.keep(shutdown.clone()));
+    // Calls under way need all of it until the last has ended.
+    let over = CancellationToken::new();
+    let _over = over.clone().drop_guard();
+    let linked = tokio::spawn(link.keep(over.clone()));
     let (live, leases) = watch::channel(leases::LiveLeases::default());
-    tokio::spawn(shutdown.clone().run_until_cancelled_owned(leases::follow(manager, live)));
-    let actor = actor::start(config, leases.clone(), shutdown.clone());
+    tokio::spawn(over.clone().run_until_cancelled_owned(leases::follow(manager, live)));
+    let actor = actor::start(config, leases.clone(), over.clone());
     let service = WorldPoolServiceServer::new(service::Service { actor, leases })
         .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
-    let served = bound.serve_as(Services::new().with(service), serving, shutdown.clone()).await;
+    let served = bound.serve_as(Services::new().with(service), serving, shutdown).await;
     drop(published);
-    shutdown.cancel();
+    over.cancel();
     let _ = linked.await;
     Ok(served?)
 }

@@ -8,9 +8,10 @@ use ratn_proto::types::Goal;
 use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext, GoalOutcome};
 use ratn_worker::client::{ActionClient, Channels};
 use ratn_worker::endpoint::Endpoint;
-use ratn_worker::server::{Services, bind};
+use ratn_worker::server::{DRAIN_DEADLINE, Services, Serving, bind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -109,6 +110,11 @@ pub struct Provider {
 
 /// Serves the actions at `listen`, or at a fresh Unix socket.
 pub async fn provider(listen: Option<Endpoint>) -> Provider {
+    provider_with(listen, DRAIN_DEADLINE).await
+}
+
+/// As [`provider`], with a drain of its own.
+pub async fn provider_with(listen: Option<Endpoint>, drain: Duration) -> Provider {
     let directory = tempfile::tempdir().unwrap();
     let listen = listen.unwrap_or_else(|| Endpoint::Unix(directory.path().join("workers/one.sock")));
     let (runs, ended) = (Arc::new(AtomicUsize::new(0)), Arc::new(Notify::new()));
@@ -125,7 +131,7 @@ pub async fn provider(listen: Option<Endpoint>) -> Provider {
     let endpoint = bound.endpoint().clone();
     let shutdown = CancellationToken::new();
     let services = Services::new().with(server.clone().into_service());
-    let serve = bound.serve(services, shutdown.clone());
+    let serve = bound.serve_as(services, Serving { drain, ..Serving::default() }, shutdown.clone());
     let serving = tokio::spawn(async move { serve.await.unwrap() });
     let client = ActionClient::new(Channels::new());
     Provider { endpoint, client, server, runs, ended, shutdown, serving, _directory: directory }
