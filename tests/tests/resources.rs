@@ -60,7 +60,7 @@ fn resources_are_created_shown_and_deleted() -> anyhow::Result<()> {
     let (code, _, err) = manager.resource(&["delete", "f1"])?;
     ensure!(code == Some(1) && err.contains("there is no resource `f1`"), "{err}");
     let (code, _, err) = manager.resource(&["get", "f1"])?;
-    ensure!(code == Some(1) && err.contains("there is no resource `f1`"), "{err}");
+    ensure!(code == Some(1) && err.contains("f1"), "{err}");
     Ok(())
 }
 
@@ -81,6 +81,23 @@ fn a_block_holds_for_as_long_as_its_command_runs() -> anyhow::Result<()> {
     wait_for("the block", || Ok((manager.free("f1")? == 0).then_some(()))).with_context(|| holder.said())?;
     let (code, _, err) = manager.resource(&["block", "Fixture", "--wait", "0.05"])?;
     ensure!(code == Some(1) && err.contains("not blocked: not granted"), "{err}");
+    // Who waits behind it is explained.
+    let waiter = manager.place.start_as("waiter", &["resource", "block", "Fixture"])?;
+    let waiting = wait_for("the waiter", || {
+        let waiting = manager.json(&["explain"])?;
+        Ok(waiting.as_array().is_some_and(|all| all.len() == 1).then_some(waiting))
+    })
+    .with_context(|| waiter.said())?;
+    ensure!(waiting[0]["obstacles"][0].as_str().is_some_and(|obstacle| obstacle.contains("Fixture")), "{waiting}");
+    let (_, table, _) = manager.resource(&["explain"])?;
+    ensure!(table.starts_with("AHEAD") && table.contains("Fixture"), "{table}");
+    ensure!(manager.json(&["sessions"])?.as_array().map(Vec::len) == Some(2));
+    let (code, _, err) = manager.resource(&["explain", "nobody"])?;
+    ensure!(code == Some(1) && err.contains("nobody"), "{err}");
+    waiter.process()?.kill()?;
+    wait_for("the waiter to be gone", || {
+        Ok(manager.json(&["explain"])?.as_array().is_some_and(Vec::is_empty).then_some(()))
+    })?;
     holder.signal(Signal::SIGINT)?;
     let (code, _, said) = holder.finish()?;
     ensure!(code == Some(0), "{code:?} {said}");

@@ -59,6 +59,14 @@ pub(super) enum ResourceCommand {
         #[arg(value_name = "ID")]
         id: String,
     },
+    /// Say what waits for resources, and what is in its way
+    Explain {
+        /// The request id of one; the first hundred of the queue unless given
+        #[arg(value_name = "REQUEST", default_value = "")]
+        request: String,
+    },
+    /// Show who is there: sessions, what they hold and provide
+    Sessions,
     /// Show the resources, then every change
     Watch {
         /// Only of these kinds

@@ -111,11 +111,16 @@ impl Asking {
                 self.show(&resources.iter().map(show::resource_json).collect(), || show::table(&resources))?;
             }
             ResourceCommand::Get { id } => {
-                let all = client.list(&[]).await?;
-                let found = all.into_iter().find(|resource| resource.id == *id);
-                let found =
-                    found.with_context(|| format!("there is no resource `{id}`; `ratn resource list` shows all"))?;
+                let found = client.get(id).await?;
                 self.show(&show::resource_json(&found), || show::in_full(&found))?;
+            }
+            ResourceCommand::Explain { request } => {
+                let waiting = client.explain(request).await?;
+                self.show(&waiting.iter().map(show::waiting_json).collect(), || show::waiting(&waiting))?;
+            }
+            ResourceCommand::Sessions => {
+                let sessions = client.sessions().await?;
+                self.show(&sessions.iter().map(show::session_json).collect(), || show::sessions(&sessions))?;
             }
             ResourceCommand::Watch { kinds } => {
                 let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();

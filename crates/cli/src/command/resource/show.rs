@@ -2,8 +2,11 @@
 
 use ratn_model::resource::Lease;
 use ratn_model::value::Value;
-use ratn_proto::types::{Resource, ResourceEvent, ResourceEventKind, ResourceState, ResourceUpdate};
+use ratn_proto::types::{
+    Resource, ResourceEvent, ResourceEventKind, ResourceState, ResourceUpdate, SessionStatus, WaitingAcquire,
+};
 use serde_json::json;
+use std::time::Duration;
 
 /// One line each: what it is, how much of it is free, who has the rest.
 pub(super) fn table(resources: &[Resource]) -> String {
@@ -63,6 +66,55 @@ pub(super) fn event(event: &ResourceEvent) -> String {
         line += &format!(": {}", event.reason);
     }
     line
+}
+
+/// What waits, in the order in which it is served, and under each what is in its way.
+pub(super) fn waiting(waiting: &[WaitingAcquire]) -> String {
+    let rows = waiting.iter().map(|one| {
+        let (request, holder, session) = (one.request.clone(), one.holder.clone(), one.session.clone());
+        [one.ahead.to_string(), one.priority.to_string(), request, holder, session]
+    });
+    let mut rows: Vec<[String; 5]> = rows.collect();
+    rows.insert(0, ["AHEAD", "PRIORITY", "REQUEST", "HOLDER", "SESSION"].map(str::to_owned));
+    let mut lines = aligned(&rows).into_iter();
+    let mut shown: Vec<String> = lines.next().into_iter().collect();
+    for (line, one) in lines.zip(waiting) {
+        shown.push(line);
+        shown.extend(one.obstacles.iter().map(|obstacle| format!("  {obstacle}")));
+    }
+    shown.join("\n")
+}
+
+pub(super) fn waiting_json(waiting: &WaitingAcquire) -> serde_json::Value {
+    let WaitingAcquire { request, session, holder, priority, ahead, obstacles } = waiting;
+    json!({
+        "request": request, "session": session, "holder": holder, "priority": priority, "ahead": ahead,
+        "obstacles": obstacles,
+    })
+}
+
+/// Who is there.
+pub(super) fn sessions(sessions: &[SessionStatus]) -> String {
+    let rows = sessions.iter().map(|session| {
+        [
+            session.id.clone(),
+            session.client.clone(),
+            format!("{:.1} s", Duration::from_millis(session.expires_in_ms).as_secs_f64()),
+            session.leases.len().to_string(),
+            session.waiting.to_string(),
+            session.resources.len().to_string(),
+        ]
+    });
+    columns(&["SESSION", "CLIENT", "ENDS IN", "LEASES", "WAITING", "RESOURCES"], rows.collect())
+}
+
+pub(super) fn session_json(session: &SessionStatus) -> serde_json::Value {
+    let SessionStatus { id, client, ttl_ms, expires_in_ms, leases, waiting, resources } = session;
+    let leases: Vec<u64> = leases.iter().map(|lease| lease.0).collect();
+    json!({
+        "session": id, "client": client, "ttl_ms": ttl_ms, "expires_in_ms": expires_in_ms, "leases": leases,
+        "waiting": waiting, "resources": resources,
+    })
 }
 
 /// What was granted.
@@ -214,6 +266,25 @@ mod tests {
         revision         0
         attribute reach  1.2
         lease 7          1 units, token 12, by fetch/approach (s)
+        ");
+    }
+
+    #[test]
+    fn what_waits_says_what_is_in_its_way() {
+        let one = WaitingAcquire {
+            request: "run/7/1".to_owned(),
+            session: "s".to_owned(),
+            holder: "fetch/approach".to_owned(),
+            priority: 5,
+            ahead: 0,
+            obstacles: vec!["`block Arm`: held by lease 7 of session t".to_owned()],
+        };
+        let other = WaitingAcquire { ahead: 1, request: "run/8/1".to_owned(), obstacles: Vec::new(), ..one.clone() };
+        assert_snapshot!(waiting(&[one, other]), @r"
+        AHEAD  PRIORITY  REQUEST  HOLDER          SESSION
+        0      5         run/7/1  fetch/approach  s
+          `block Arm`: held by lease 7 of session t
+        1      5         run/8/1  fetch/approach  s
         ");
     }
 
