@@ -17,7 +17,9 @@ pub struct Limits {
     pub waiters_per_session: usize,
     /// Different selectors (kind, class, attributes) that are waited for.
     pub selectors: usize,
-    /// How often a waiter may be overtaken (a later one gets what it waits for) before what it waits for is kept for it.
+    /// How often a waiter may be overtaken (a later one gets what it waits for) before what it waits for is kept for it. Never
+    /// (0) is the default: the most urgent request is not made later by less urgent ones, and units may be idle until the rest
+    /// of what it waits for comes. A larger number uses them meanwhile.
     pub overtaken: u32,
     /// Live leases in all.
     pub leases: usize,

@@ -1,0 +1,175 @@
+//! The queue of the resource manager over gRPC: its order, its bounds, and how one leaves it.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod support;
+
+use ratn_daemon::resource_manager::ResourceManagerConfig;
+use ratn_model::resource::{Lease, Requirement, ResourceClass};
+use ratn_proto::types::Resource;
+use ratn_proto::v1;
+use ratn_proto::v1::resource_service_client::ResourceServiceClient;
+use ratn_resources::Limits;
+use ratn_worker::client::{AcquireOptions, CallError};
+use std::time::Duration;
+use support::{Client, Daemon, TestSystem, block, in_time};
+use tokio::task::JoinHandle;
+use tonic::transport::Channel;
+use tonic::{Code, Status};
+use tonic_types::StatusExt;
+
+type Waiting = JoinHandle<Result<Lease, CallError>>;
+
+async fn manager_with(system: &TestSystem, limits: Limits) -> Daemon {
+    let config = ResourceManagerConfig { listen: system.directory.socket("rm"), limits, ..Default::default() };
+    system.resource_manager_with(config).await
+}
+
+/// Asks under a request id, and returns when that waits (or was answered).
+async fn ask(client: &Client, request: &str, count: u32) -> Waiting {
+    let (resources, requirement) = (client.resources.clone(), Requirement { count, ..block("Planner") });
+    let options = AcquireOptions { request: request.to_owned(), ..Default::default() };
+    let asked = tokio::spawn(async move { resources.acquire(vec![requirement], options).await });
+    in_time(async {
+        while !asked.is_finished() && client.resources.explain(request).await.is_err() {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+    asked
+}
+
+async fn waiting(client: &Client) -> u32 {
+    client.resources.sessions().await.unwrap().iter().map(|session| session.waiting).sum()
+}
+
+async fn until_waiting(client: &Client, count: u32) {
+    in_time(async {
+        while waiting(client).await != count {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+}
+
+/// A client with two planners of which it holds one.
+async fn half_held(system: &TestSystem, manager: &Daemon) -> (Client, Lease) {
+    let a = system.client(manager, "a").await;
+    for id in ["p1", "p2"] {
+        a.resources.create(Resource::new(id, ResourceClass::Module, "Planner")).await.unwrap();
+    }
+    let held = a.resources.acquire(vec![block("Planner")], AcquireOptions::default()).await.unwrap();
+    (a, held)
+}
+
+#[tokio::test]
+async fn a_large_request_is_not_overtaken_unless_that_is_configured() {
+    let system = TestSystem::new();
+    let manager = manager_with(&system, Limits::default()).await;
+    let (a, held) = half_held(&system, &manager).await;
+    let large = ask(&a, "large", 2).await;
+    let small = ask(&a, "small", 1).await;
+    assert!(!small.is_finished(), "a planner is free, and kept for the large request");
+    a.resources.release(held.id).await.unwrap();
+    let large = in_time(large).await.unwrap().unwrap();
+    assert!(!small.is_finished());
+    a.resources.release(large.id).await.unwrap();
+    in_time(small).await.unwrap().unwrap();
+}
+
+#[tokio::test]
+async fn a_large_request_is_overtaken_as_often_as_configured_and_no_more() {
+    let system = TestSystem::new();
+    let manager = manager_with(&system, Limits { overtaken: 2, ..Limits::default() }).await;
+    let (a, held) = half_held(&system, &manager).await;
+    let large = ask(&a, "large", 2).await;
+    for i in 0..2 {
+        let small = in_time(ask(&a, &format!("small-{i}"), 1).await).await.unwrap().unwrap();
+        a.resources.release(small.id).await.unwrap();
+    }
+    let third = ask(&a, "small-2", 1).await;
+    assert!(!large.is_finished() && !third.is_finished(), "the free planner is kept for the large request now");
+    a.resources.release(held.id).await.unwrap();
+    let large = in_time(large).await.unwrap().unwrap();
+    assert!(!third.is_finished());
+    a.resources.release(large.id).await.unwrap();
+    in_time(third).await.unwrap().unwrap();
+}
+
+fn raw(system: &TestSystem, manager: &Daemon) -> ResourceServiceClient<Channel> {
+    ResourceServiceClient::new(system.channels.get(&manager.endpoint).unwrap())
+}
+
+fn acquire(client: &Client, request: &str, deadline_ms: u64) -> v1::AcquireRequest {
+    v1::AcquireRequest {
+        request_id: request.to_owned(),
+        session_id: client.session.id().to_owned(),
+        requirements: vec![block("Planner").into()],
+        deadline_ms,
+        ..Default::default()
+    }
+}
+
+fn refused_for_their_number(refused: &Status, words: &str) {
+    assert_eq!(refused.code(), Code::ResourceExhausted);
+    assert!(refused.message().contains(words), "{}", refused.message());
+    let delay = refused.get_details_retry_info().unwrap().retry_delay.unwrap();
+    assert!(delay > Duration::ZERO && delay < Duration::from_secs(10), "{delay:?}");
+}
+
+#[tokio::test]
+async fn beyond_the_bounds_on_waiters_a_request_is_refused_with_a_delay_to_try_again_after() {
+    let system = TestSystem::new();
+    let limits = Limits { waiters_per_session: 2, waiters: 3, ..Limits::default() };
+    let manager = manager_with(&system, limits).await;
+    let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
+    let queued = [ask(&a, "a1", 1).await, ask(&a, "a2", 1).await];
+    let mut raw = raw(&system, &manager);
+    let refused = in_time(raw.acquire(acquire(&a, "a3", 60_000))).await.unwrap_err();
+    refused_for_their_number(&refused, "waiters of one session");
+    let last = ask(&b, "b1", 1).await;
+    let refused = in_time(raw.acquire(acquire(&b, "b2", 60_000))).await.unwrap_err();
+    refused_for_their_number(&refused, "waiters");
+    // A place that is left can be taken.
+    assert!(a.resources.withdraw("a1").await.unwrap());
+    let taken = ask(&b, "b2", 1).await;
+    assert_eq!(waiting(&a).await, 3);
+    for waits in queued.into_iter().chain([last, taken]) {
+        waits.abort();
+    }
+}
+
+#[tokio::test]
+async fn an_acquire_or_a_block_without_a_deadline_is_refused() {
+    let system = TestSystem::new();
+    let manager = manager_with(&system, Limits::default()).await;
+    let a = system.client(&manager, "a").await;
+    let mut raw = raw(&system, &manager);
+    let refused = in_time(raw.acquire(acquire(&a, "", 0))).await.unwrap_err();
+    assert_eq!(refused.code(), Code::InvalidArgument);
+    assert!(refused.message().contains("deadline_ms: is 0"), "{}", refused.message());
+    let session_id = a.session.id().to_owned();
+    let request = v1::BlockRequest { session_id, requirement: Some(block("Planner").into()), ..Default::default() };
+    assert_eq!(in_time(raw.block(request)).await.unwrap_err().code(), Code::InvalidArgument);
+    assert_eq!(waiting(&a).await, 0);
+}
+
+#[tokio::test]
+async fn a_cancelled_call_leaves_the_queue_and_whoever_it_held_up_is_served() {
+    let system = TestSystem::new();
+    let manager = manager_with(&system, Limits::default()).await;
+    let (a, _held) = half_held(&system, &manager).await;
+    // Over the session's stream.
+    let large = ask(&a, "large", 2).await;
+    let small = ask(&a, "small", 1).await;
+    assert_eq!(waiting(&a).await, 2);
+    large.abort();
+    in_time(small).await.unwrap().unwrap();
+    until_waiting(&a, 0).await;
+    // And on its own: the client resets the HTTP/2 stream.
+    let mut raw = raw(&system, &manager);
+    let request = acquire(&a, "alone", 60_000);
+    let call = tokio::spawn(async move { raw.acquire(request).await });
+    until_waiting(&a, 1).await;
+    call.abort();
+    until_waiting(&a, 0).await;
+}
