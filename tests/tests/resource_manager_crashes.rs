@@ -15,7 +15,7 @@ use ratn_worker::client::{AcquireOptions, CallError, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::Session;
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::Write;
+use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -132,7 +132,10 @@ impl Manager {
         let segments = entries.into_iter().filter(|path| path.extension().is_some_and(|extension| extension == "log"));
         let last = segments.max().context("a segment")?;
         let torn: Vec<u8> = (0..=random.below(300)).map(|_| random.below(256) as u8).collect();
-        Ok(std::fs::OpenOptions::new().append(true).open(last)?.write_all(&torn)?)
+        let written = std::fs::read(&last)?.iter().rposition(|byte| *byte != 0).map_or(0, |at| at + 1);
+        // Not right behind it: the last record may end in zeros of its own.
+        let file = std::fs::OpenOptions::new().write(true).open(last)?;
+        Ok(file.write_all_at(&torn, (written + 64) as u64)?)
     }
 
     fn said(&self) -> String {

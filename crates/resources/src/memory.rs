@@ -31,14 +31,14 @@ struct Answer {
     number: u64,
     fingerprint: u128,
     reply: Remembered,
-    at: Timestamp,
 }
 
 /// See the module.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct RequestMemory {
     answers: BTreeMap<String, Answer>,
-    order: BTreeMap<u64, String>,
+    /// When each was given, the oldest first.
+    order: BTreeMap<u64, (Timestamp, String)>,
     next: u64,
     waiting: BTreeMap<String, (u128, WaiterId)>,
 }
@@ -74,20 +74,20 @@ impl RequestMemory {
     /// How many of the oldest have to go before one more is remembered.
     pub(crate) fn too_many(&self, now: Timestamp, limit: usize, for_at_most: Duration) -> usize {
         let by_number = (self.order.len() + 1).saturating_sub(limit.max(1));
-        let old = |id: &&String| self.answers.get(*id).is_some_and(|answer| answer.at + for_at_most <= now);
-        self.order.values().enumerate().take_while(|(i, id)| *i < by_number || old(id)).count()
+        let old = |at: Timestamp| at + for_at_most <= now;
+        self.order.values().enumerate().take_while(|(i, (at, _))| *i < by_number || old(*at)).count()
     }
 
     pub(crate) fn remember(&mut self, id: String, fingerprint: u128, reply: Remembered, forget: usize, now: Timestamp) {
         for _ in 0..forget {
-            if let Some((_, oldest)) = self.order.pop_first() {
+            if let Some((_, (_, oldest))) = self.order.pop_first() {
                 self.answers.remove(&oldest);
             }
         }
         let number = self.next;
         self.next += 1;
-        self.order.insert(number, id.clone());
-        let answer = Answer { number, fingerprint, reply, at: now };
+        self.order.insert(number, (now, id.clone()));
+        let answer = Answer { number, fingerprint, reply };
         if let Some(before) = self.answers.insert(id, answer) {
             self.order.remove(&before.number);
         }
@@ -95,7 +95,9 @@ impl RequestMemory {
 
     /// The answers, the oldest first.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (&String, u128, &Remembered)> {
-        self.order.values().filter_map(|id| self.answers.get(id).map(|answer| (id, answer.fingerprint, &answer.reply)))
+        self.order
+            .values()
+            .filter_map(|(_, id)| self.answers.get(id).map(|answer| (id, answer.fingerprint, &answer.reply)))
     }
 
     pub(crate) fn len(&self) -> usize {
@@ -108,7 +110,7 @@ impl RequestMemory {
 
     pub(crate) fn order_agrees(&self) -> bool {
         self.order.len() == self.answers.len()
-            && self.order.iter().all(|(number, id)| self.answers.get(id).is_some_and(|a| a.number == *number))
+            && self.order.iter().all(|(number, (_, id))| self.answers.get(id).is_some_and(|a| a.number == *number))
     }
 }
 

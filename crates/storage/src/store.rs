@@ -40,7 +40,7 @@ pub struct TornEnd {
     pub place: String,
     /// The byte from which on it is left out.
     pub offset: u64,
-    /// How many bytes are left out.
+    /// How many bytes are left out, without zeros behind them.
     pub bytes: u64,
 }
 

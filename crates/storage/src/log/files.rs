@@ -2,13 +2,19 @@
 
 use std::fmt;
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
+use std::io::{self, Seek, Write};
+use std::os::unix::fs::FileExt;
 use std::path::Path;
 
 /// A file that is being written.
 pub(super) trait LogFile: fmt::Debug + Send {
-    /// Puts bytes behind those that are there.
+    /// Puts bytes behind those that were written.
     fn write(&mut self, bytes: &[u8]) -> io::Result<()>;
+    /// Puts so many zeros where the next bytes will go. A sync of bytes that come in the place of others has less to do than one of a
+    /// file that grew.
+    fn reserve(&mut self, bytes: usize) -> io::Result<()>;
+    /// Takes away what was reserved and not written.
+    fn cut(&mut self) -> io::Result<()>;
     /// Returns when what was written is on the disk.
     fn sync(&mut self) -> io::Result<()>;
 }
@@ -48,6 +54,16 @@ impl Files for Disk {
 impl LogFile for File {
     fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.write_all(bytes)
+    }
+
+    fn reserve(&mut self, bytes: usize) -> io::Result<()> {
+        let end = self.stream_position()?;
+        self.write_all_at(&vec![0; bytes], end)
+    }
+
+    fn cut(&mut self) -> io::Result<()> {
+        let end = self.stream_position()?;
+        self.set_len(end)
     }
 
     fn sync(&mut self) -> io::Result<()> {

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!   segment   header 48: "ratn-log" | version u32 | store u64 | number u64 | first u64 | epoch u64 | crc32c u32
-//!             frame, frame, …
+//!             frame, frame, …; in the last segment then zeros, for frames to come
 //!   frame     length u32 | crc32c u32 | first u64 | count u32 | count × ( length u32 | payload )
 //!   snapshot  header 44: "ratn-snp" | version u32 | store u64 | through u64 | length u64 | crc32c u32, of payload u32
 //!             payload

@@ -1,7 +1,8 @@
 //! Reads a segment: its header, its frames, and where they end.
 //!
 //! Every frame was synced before the next was begun. So a frame that is wrong was torn by a crash only if no right one follows it,
-//! and only in the last segment; anything else is damage to what may have been acknowledged.
+//! and only in the last segment; anything else is damage to what may have been acknowledged. Behind the last frame of the last segment
+//! there may be zeros, for frames that did not come.
 
 use super::format::{FRAME_HEADER, FrameHeader, RECORD_HEADER, SEGMENT_HEADER, SEGMENT_MAGIC, SegmentHeader, VERSION};
 use super::format::{u32_at, version};
@@ -68,8 +69,9 @@ pub(super) fn read(place: &str, bytes: &Bytes, last: bool) -> Result<Segment, Re
                     return Err(damaged(offset, what));
                 }
                 None => {
-                    let bytes = (bytes.len() - offset) as u64;
-                    torn = Some(TornEnd { place: place.to_owned(), offset: offset as u64, bytes });
+                    let written = bytes[offset..].iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
+                    let end = || TornEnd { place: place.to_owned(), offset: offset as u64, bytes: written as u64 };
+                    torn = (written > 0).then(end);
                     break;
                 }
             },

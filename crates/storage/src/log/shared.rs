@@ -12,8 +12,11 @@ use crate::error::{AppendError, CompactError, Fault};
 use crate::store::Position;
 use std::path::PathBuf;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 use tokio::sync::watch;
 
+/// Where nobody waits for the disk, what comes within this time is written together: waking a thread costs more than an append.
+const LINGER: Duration = Duration::from_millis(5);
 /// A buffer that was larger gives the rest back.
 const KEEP_BYTES: usize = 1 << 20;
 
@@ -112,7 +115,9 @@ impl Shared {
         batch.bytes.extend_from_slice(&length.to_le_bytes());
         batch.bytes.extend_from_slice(record);
         batch.count += 1;
-        let wake = std::mem::take(&mut state.idle);
+        let before = buffered..batch.bytes.len();
+        // Idle: there was nothing. Lingering: now there is enough.
+        let wake = std::mem::take(&mut state.idle) || (at_once && before.contains(&KEEP_BYTES));
         drop(state);
         if wake {
             self.work.notify_one();
@@ -132,9 +137,9 @@ impl Shared {
         Position(self.lock().next.0 - 1)
     }
 
-    /// For the syncer: waits for records, and says whether they go to a new segment. Nothing when all are written and the
-    /// writer is closing.
-    pub(super) fn take(&self) -> Option<(Batch, bool)> {
+    /// For the syncer: waits for records, where there is time for more of them, and says whether they go to a new segment. Nothing
+    /// when all are written and the writer is closing.
+    pub(super) fn take(&self, there_is_time: bool) -> Option<(Batch, bool)> {
         let mut state = self.lock();
         while state.batch.count == 0 {
             if state.closing {
@@ -144,6 +149,11 @@ impl Shared {
             state = self.work.wait(state).unwrap_or_else(PoisonError::into_inner);
         }
         state.idle = false;
+        if there_is_time {
+            let waits = |state: &mut State| !state.closing && state.batch.bytes.len() < KEEP_BYTES;
+            let waited = self.work.wait_timeout_while(state, LINGER, waits);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
         let spare = state.spare.take().unwrap_or_else(Batch::new);
         let batch = std::mem::replace(&mut state.batch, spare);
         Some((batch, std::mem::take(&mut state.rotate)))

@@ -15,12 +15,18 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+/// So many bytes are reserved at once. Reserving costs about as much as a sync, and is to be rare.
+const RESERVE: u64 = 1 << 20;
+
 /// The segment that is written.
 #[derive(Debug)]
 pub(super) struct Active {
     pub(super) header: SegmentHeader,
     pub(super) file: Box<dyn LogFile>,
+    /// Of what was written.
     pub(super) length: u64,
+    /// Zeros behind it.
+    pub(super) reserved: u64,
 }
 
 #[derive(Debug)]
@@ -48,13 +54,15 @@ impl Syncer {
     pub(super) fn run(mut self) {
         let shared = self.shared.clone();
         let _ended = Ended(shared.clone());
-        while let Some((mut batch, rotate)) = shared.take() {
+        while let Some((mut batch, rotate)) = shared.take(self.durability == Durability::None) {
             if let Err(fault) = self.commit(&mut batch, rotate) {
                 shared.stop(&fault);
                 return;
             }
             shared.give_back(batch);
         }
+        // Everything is acknowledged. Zeros that stay are no harm.
+        let _ = self.active.file.cut();
     }
 
     fn commit(&mut self, batch: &mut Batch, rotate: bool) -> Result<(), Fault> {
@@ -98,19 +106,31 @@ impl Syncer {
         header.copy_from_slice(&FrameHeader { length, crc, first, count }.encode());
         active.file.write(frame).map_err(|error| self.fault("write", error))?;
         self.active.length += frame.len() as u64;
+        self.active.reserved = self.active.reserved.saturating_sub(frame.len() as u64);
         Ok(())
     }
 
     /// What was written is acknowledged when it is on the disk and the place is still this writer's.
     fn sync(&mut self, through: Position) -> Result<(), Fault> {
+        self.reserve();
         self.active.file.sync().map_err(|error| self.fault("sync", error))?;
         self.lock.check()?;
         self.shared.synced(through);
         Ok(())
     }
 
+    /// For the syncs after the next one. Where the disk has no room for it, it may still have room for records.
+    fn reserve(&mut self) {
+        let active = &mut self.active;
+        let bytes = RESERVE.min(self.segment_bytes.saturating_sub(active.length));
+        if active.reserved == 0 && active.file.reserve(bytes as usize).is_ok() {
+            active.reserved = bytes;
+        }
+    }
+
     fn begin_segment(&mut self, first: Position) -> Result<(), Fault> {
-        // Only the last segment may have a torn end, however records are made durable.
+        // Only the last segment may have an end that is no record, however records are made durable.
+        self.active.file.cut().map_err(|error| self.fault("cut", error))?;
         self.active.file.sync().map_err(|error| self.fault("sync", error))?;
         self.lock.check()?;
         let header = SegmentHeader { number: self.active.header.number + 1, first, ..self.active.header };
@@ -149,7 +169,7 @@ pub(super) fn begin(
     }
     let synced = |file| {
         files.sync_directory(directory).map_err(|error| ("sync the directory of", error))?;
-        Ok(Active { header, file, length: (SEGMENT_HEADER + frames.len()) as u64 })
+        Ok(Active { header, file, length: (SEGMENT_HEADER + frames.len()) as u64, reserved: 0 })
     };
     written.and_then(synced).map_err(|(action, error)| (action, path, error))
 }

@@ -64,6 +64,18 @@ impl LogFile for FaultyFile {
         self.file.write(bytes)
     }
 
+    fn reserve(&mut self, bytes: usize) -> io::Result<()> {
+        let count = self.faults.writes.load(Ordering::SeqCst);
+        if self.concerned && self.faults.fail_write_at.is_some_and(|at| count >= at) {
+            return Err(io::ErrorKind::StorageFull.into());
+        }
+        self.file.reserve(bytes)
+    }
+
+    fn cut(&mut self) -> io::Result<()> {
+        self.file.cut()
+    }
+
     /// Does not sync: nothing here takes the power away.
     fn sync(&mut self) -> io::Result<()> {
         drop(self.faults.busy.lock().unwrap());
@@ -94,6 +106,35 @@ fn compacted(writer: &dyn Writer) -> crate::Progress {
         std::thread::yield_now();
     }
     durable.progress()
+}
+
+#[test]
+fn zeros_wait_behind_the_last_record_and_a_log_that_is_left_with_them_is_whole() {
+    let directory = tempfile::tempdir().unwrap();
+    let killed = tempfile::tempdir().unwrap();
+    let segment = |place: &Path| super::directory::segment(place, 1);
+    let (_, mut writer) = Log::new(directory.path(), Options::default()).open().unwrap();
+    for number in 0..100 {
+        let position = writer.append(&[number; 10]).unwrap();
+        writer.durable().wait_blocking(position).unwrap();
+    }
+    fs::copy(segment(directory.path()), segment(killed.path())).unwrap();
+    let bytes = fs::read(segment(killed.path())).unwrap();
+    writer.close().unwrap();
+    let written = fs::read(segment(directory.path())).unwrap();
+    assert_eq!(bytes.len() % (1 << 20), SEGMENT_HEADER + 34, "reserved with the first record's sync");
+    assert_eq!(bytes[..written.len()], written[..], "records went over the zeros");
+    assert!(bytes[written.len()..].iter().all(|byte| *byte == 0));
+    let (recovered, mut writer) = Log::new(killed.path(), Options::default()).open().unwrap();
+    assert_eq!((recovered.records.len(), recovered.torn), (100, None));
+    assert_eq!(writer.append(b"next").unwrap(), Position(101));
+    writer.close().unwrap();
+    // A torn record where the zeros were is as one at the end of the file.
+    let mut torn = bytes;
+    torn[written.len() + 5] = 1;
+    fs::write(segment(killed.path()), torn).unwrap();
+    let read = Log::new(killed.path(), Options::default()).read().unwrap();
+    assert_eq!((read.records.len(), read.torn.map(|torn| torn.bytes)), (100, Some(6)));
 }
 
 #[test]
