@@ -5,7 +5,7 @@ mod common;
 
 use bytes::Bytes;
 use common::{append_durably, compacted, log, payloads, segments, write};
-use ratn_storage::{CopyError, Durability, Log, OpenError, Options, Position, Store, backup, restore};
+use ratn_storage::{CopyError, Log, OpenError, Options, Position, Store, backup, restore};
 use std::fs;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
