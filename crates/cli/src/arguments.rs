@@ -35,6 +35,8 @@ pub(crate) enum Command {
     Simulate(SimulateArguments),
     /// Look at the resources of a running system and change them
     Resource(ResourceArguments),
+    /// Copy what a daemon keeps on the disk, put a copy back, or look at it
+    State(StateArguments),
     /// Own the resources: who has what, and who waits (host compute)
     ResourceManager(ResourceManagerArguments),
     /// Hold the root world model and its projections (host compute)
@@ -83,6 +85,38 @@ pub(crate) struct ResourceManagerArguments {
     /// directory unless given
     #[arg(long, value_name = "DIR")]
     pub(crate) state_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct StateArguments {
+    #[command(subcommand)]
+    pub(crate) command: StateCommand,
+    /// One JSON document on standard output
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Clone, Subcommand)]
+pub(crate) enum StateCommand {
+    /// Copy a state, also while its daemon runs; holds at least what was acknowledged when it began
+    Backup {
+        /// The folder that the daemon keeps it in, as `…/state/resource-manager`
+        state: PathBuf,
+        /// Where the copy goes: a folder that is empty or not there yet
+        target: PathBuf,
+    },
+    /// Make a state of a copy; end the daemon first whose state it takes the place of
+    Restore {
+        /// What `backup` made
+        backup: PathBuf,
+        /// A folder that is empty or not there yet: nothing is overwritten
+        target: PathBuf,
+    },
+    /// Say what is in a state or a copy, and whether it is whole
+    Show {
+        /// The folder
+        state: PathBuf,
+    },
 }
 
 /// How tasks are executed, on the command line.

@@ -8,6 +8,7 @@ pub(crate) mod resource;
 mod roles;
 mod run;
 mod simulate;
+mod state;
 mod tables;
 mod up;
 
@@ -32,6 +33,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Control(arguments) => control::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Resource(arguments) => resource::run(&arguments),
+        Command::State(arguments) => state::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Tables(arguments) => tables::run(&arguments),
