@@ -23,11 +23,14 @@ fn copied(copied: Result<Copied, CopyError>, as_json: bool, target: &Path) -> Re
         CopyError::Nothing { .. } | CopyError::NotEmpty { .. } => Failure::Refused(format!("ratn: {error}")),
         other => Failure::Failed(other.into()),
     })?;
-    let place = target.display();
-    Ok(match as_json {
+    match as_json {
         true => output::result(json!({ "target": target, "through": through.0, "snapshot": snapshot.0 }))?,
-        false => output::result(format!("{place}: records through {through}, of them {snapshot} in a snapshot"))?,
-    })
+        false => output::result(format!(
+            "{}: records through {through}, those through {snapshot} in a snapshot",
+            target.display()
+        ))?,
+    }
+    Ok(())
 }
 
 fn show(state: &Path, as_json: bool) -> Result<(), Failure> {
@@ -42,13 +45,14 @@ fn show(state: &Path, as_json: bool) -> Result<(), Failure> {
     if as_json {
         let torn =
             found.torn.as_ref().map(|torn| json!({ "file": torn.place, "offset": torn.offset, "bytes": torn.bytes }));
-        return Ok(output::result(json!({
+        output::result(json!({
             "epoch": found.epoch.0,
             "through": last.0,
             "snapshot": { "through": snapshot.0.0, "bytes": snapshot.1 },
             "records": { "count": found.records.len(), "bytes": records },
             "torn": torn,
-        }))?);
+        }))?;
+        return Ok(());
     }
     let mut lines = vec![
         format!("writers so far   {}", found.epoch.0),
@@ -64,5 +68,6 @@ fn show(state: &Path, as_json: bool) -> Result<(), Failure> {
             torn.bytes, torn.offset, torn.place
         ));
     }
-    Ok(output::result(lines.join("\n"))?)
+    output::result(lines.join("\n"))?;
+    Ok(())
 }
