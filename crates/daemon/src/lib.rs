@@ -2,7 +2,8 @@
 //! (the one task that owns the state; everything else sends it messages), `service.rs` (the gRPC adapter) and `status.rs`
 //! (errors as gRPC statuses).
 //!
-//! What all of them share: [`service`] (who may connect and do what: [`access`], [`audit`]), [`telemetry`], [`config`].
+//! What all of them share: [`service`] (who may connect and do what: [`access`], [`audit`]), [`telemetry`], [`config`], [`supervisor`] and
+//! [`reload`].
 //!
 //! Every daemon is one `run(config, directory, shutdown)`, or `run_as` with a [`ratn_worker::server::Serving`]: it listens, publishes `<role>.endpoint` in the runtime directory
 //! once it is ready, serves until the token is cancelled, and withdraws. Signals, the parent's end and command lines are
@@ -15,7 +16,9 @@ mod details;
 mod link;
 mod owners;
 pub mod process_manager;
+pub mod reload;
 pub mod resource_manager;
 pub mod service;
+pub mod supervisor;
 pub mod telemetry;
 pub mod world_pool;

@@ -12,7 +12,7 @@ use ratn_worker::server::{Exposure, Serving};
 use ratn_worker::tls::{self, ClientTls, ServerTls, TlsError};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError, RwLock};
 use std::time::Duration;
 use tonic::codegen::http;
 use tonic::{Code, Status};
@@ -71,23 +71,47 @@ impl ServiceConfig {
 
     /// How a daemon serves.
     pub fn serving(&self) -> Serving {
+        self.serving_with(&LiveAccess::new(self.access.clone()))
+    }
+
+    /// As [`ServiceConfig::serving`], with roles that may change meanwhile.
+    pub fn serving_with(&self, access: &LiveAccess) -> Serving {
         Serving {
             exposure: Exposure { tls: self.tls.clone(), insecure: self.insecure },
-            gate: Arc::new(RoleGate { access: self.access.clone(), own_uid: nix::unistd::geteuid().as_raw() }),
+            gate: Arc::new(RoleGate { access: access.clone(), own_uid: nix::unistd::geteuid().as_raw() }),
             drain: Duration::from_millis(self.drain_ms),
+            ..Serving::default()
         }
+    }
+}
+
+/// Who has which roles, as of now.
+#[derive(Debug, Clone)]
+pub struct LiveAccess(Arc<RwLock<AccessConfig>>);
+
+impl LiveAccess {
+    /// As a config says.
+    pub fn new(access: AccessConfig) -> LiveAccess {
+        LiveAccess(Arc::new(RwLock::new(access)))
+    }
+
+    /// From the next call on, and the next stream of calls.
+    pub fn replace(&self, access: AccessConfig) {
+        *self.0.write().unwrap_or_else(PoisonError::into_inner) = access;
     }
 }
 
 /// Admits by the table of [`crate::access`], and leaves the [`Caller`] in the request.
 struct RoleGate {
-    access: AccessConfig,
+    access: LiveAccess,
     own_uid: u32,
 }
 
 impl Gate for RoleGate {
     fn admit(&self, identity: &Identity, path: &str, extensions: &mut http::Extensions) -> Result<(), Status> {
-        let caller = self.access.caller(identity, self.own_uid);
+        let access = self.access.0.read().unwrap_or_else(PoisonError::into_inner);
+        let caller = access.caller(identity, self.own_uid);
+        drop(access);
         caller.admit(Operation::of_path(path))?;
         extensions.insert(caller);
         Ok(())

@@ -31,7 +31,12 @@ async fn ping(client: &mut Raw, session: &str, ttl_ms: u64) -> Result<v1::KeepAl
 
 async fn manager(system: &TestSystem, listen: Endpoint, service: &ServiceConfig) -> Endpoint {
     let config = ResourceManagerConfig { listen, ..Default::default() };
-    let run = resource_manager::run_as(config, system.directory.clone(), service.serving(), CancellationToken::new());
+    let run = resource_manager::run_as(
+        tokio::sync::watch::Sender::new(config).subscribe(),
+        system.directory.clone(),
+        service.serving(),
+        CancellationToken::new(),
+    );
     tokio::spawn(run);
     system.directory.wait_for(resource_manager::ROLE, support::DEADLINE).await.unwrap()
 }

@@ -62,6 +62,11 @@ impl Pool {
         self
     }
 
+    /// From now on other bounds hold; what is there beyond them stays.
+    pub fn set_limits(&mut self, limits: Limits) {
+        self.limits = limits;
+    }
+
     /// Performs a mutation. With a request id, an equal request of that id answered before is not performed again: its
     /// answer is given once more.
     ///

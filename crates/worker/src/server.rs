@@ -15,6 +15,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpListener, UnixListener, UnixStream};
+use tokio::sync::watch;
 use tokio_stream::wrappers::UnixListenerStream;
 use tokio_util::sync::CancellationToken;
 use tonic::body::Body;
@@ -41,6 +42,19 @@ pub struct Serving {
     pub gate: Arc<dyn Gate>,
     /// Instead of [`DRAIN_DEADLINE`].
     pub drain: Duration,
+    /// Says how far it is.
+    pub phase: watch::Sender<Phase>,
+}
+
+/// How far a server is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Phase {
+    /// Nobody is served yet.
+    Starting,
+    /// Everybody is.
+    Serving,
+    /// Only what is under way.
+    Draining,
 }
 
 /// A listener that nobody is served on yet.
@@ -200,7 +214,12 @@ pub async fn bind_as(listen: &Endpoint, exposure: &Exposure) -> Result<Bound, Bi
 
 impl Default for Serving {
     fn default() -> Serving {
-        Serving { exposure: Exposure::default(), gate: Arc::new(Open), drain: DRAIN_DEADLINE }
+        Serving {
+            exposure: Exposure::default(),
+            gate: Arc::new(Open),
+            drain: DRAIN_DEADLINE,
+            phase: watch::Sender::new(Phase::Starting),
+        }
     }
 }
 
@@ -273,8 +292,10 @@ impl Bound {
                 }
             }
         };
+        serving.phase.send_replace(Phase::Serving);
         let drained = async {
             shutdown.cancelled().await;
+            serving.phase.send_replace(Phase::Draining);
             for name in services.names.iter().chain(&[""]) {
                 health.set_service_status(name, ServingStatus::NotServing).await;
             }

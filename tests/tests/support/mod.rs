@@ -41,9 +41,19 @@ impl Place {
 
     /// As [`Place::start`], beside others: what it says goes to files of this name.
     pub(crate) fn start_as(&self, name: &str, arguments: &[&str]) -> anyhow::Result<Started> {
+        self.start_with(name, arguments, &[("RATN_LOG", "info,ratn_worker=debug")])
+    }
+
+    /// As [`Place::start_as`], with an environment of its own.
+    pub(crate) fn start_with(
+        &self,
+        name: &str,
+        arguments: &[&str],
+        environment: &[(&str, &str)],
+    ) -> anyhow::Result<Started> {
         let (out, err) = (self.path().join(format!("{name}out")), self.path().join(format!("{name}err")));
         let mut command = self.ratn(arguments);
-        command.env("RATN_LOG", "info,ratn_worker=debug");
+        command.envs(environment.iter().copied());
         command.stdout(std::fs::File::create(&out)?).stderr(std::fs::File::create(&err)?);
         Ok(Started { child: command.spawn()?, out, err })
     }

@@ -3,6 +3,7 @@
 mod check;
 mod control;
 mod demo;
+mod reload;
 mod report;
 pub(crate) mod resource;
 mod roles;

@@ -1,5 +1,6 @@
 //! The daemons and workers: this binary as something else.
 
+use super::reload::Reloading;
 use super::{blocking, blocking_on};
 use crate::arguments::{ResourceManagerArguments, RoleArguments, WorkerArguments, WorkerKind};
 use crate::failure::Failure;
@@ -7,14 +8,18 @@ use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::{public_directory, variable};
 use anyhow::Context;
-use ratn_daemon::service::ServiceConfig;
+use ratn_daemon::resource_manager::ResourceManagerConfig;
+use ratn_daemon::service::LiveAccess;
+use ratn_daemon::supervisor::Supervisor;
 use ratn_daemon::{process_manager, resource_manager, telemetry, world_pool};
+use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Exposure, Serving};
 use ratn_worker::worker::WorkerOptions;
 use ratn_worker::{shutdown, tls};
 use std::path::PathBuf;
 use std::time::Duration;
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 /// The environment variables that say where state is kept; the second is systemd's.
@@ -26,9 +31,9 @@ const EXIT_PATIENCE: Duration = Duration::from_secs(2);
 /// `ratn resource-manager`
 pub(super) fn resource_manager(arguments: &ResourceManagerArguments) -> Result<(), Failure> {
     let ResourceManagerArguments { role: arguments, durability, state_dir } = arguments;
-    let system = SystemConfig::load(arguments.config.as_deref())?;
-    let mut config = system.resource_manager.clone();
-    config.listen = arguments.listen.clone().unwrap_or(config.listen);
+    let mut system = SystemConfig::load(arguments.config.as_deref())?;
+    let config = &mut system.resource_manager;
+    config.listen = arguments.listen.clone().unwrap_or(config.listen.clone());
     let storage = &mut config.storage;
     storage.durability = durability.unwrap_or(storage.durability);
     let of_this_role = |directory: PathBuf| directory.join(resource_manager::ROLE);
@@ -36,37 +41,34 @@ pub(super) fn resource_manager(arguments: &ResourceManagerArguments) -> Result<(
     storage.directory = state_dir.clone().map(of_this_role).or(storage.directory.take()).or_else(elsewhere);
     // On one thread requests are handled in the order in which they arrive; task control sends the most urgent first.
     let runtime = tokio::runtime::Builder::new_current_thread();
-    daemon_on(runtime, arguments, &system.service, async |host| {
-        resource_manager::run_as(config, host.directory, host.serving, host.shutdown).await
+    daemon_on(runtime, arguments, system, resource_manager::ROLE, async |_, host| {
+        resource_manager::run_as(host.bounds, host.directory, host.serving, host.shutdown).await
     })
 }
 
 /// `ratn world-pool`
 pub(super) fn world_pool(arguments: &RoleArguments) -> Result<(), Failure> {
-    let system = SystemConfig::load(arguments.config.as_deref())?;
-    let mut config = system.world_pool.clone();
-    config.listen = arguments.listen.clone().unwrap_or(config.listen);
-    daemon(arguments, &system.service, async |host| {
+    daemon(arguments, world_pool::ROLE, async |system, host| {
+        let mut config = system.world_pool;
+        config.listen = host.listen.unwrap_or(config.listen);
         world_pool::run_as(config, host.directory, host.serving, host.shutdown).await
     })
 }
 
 /// `ratn process-manager`
 pub(super) fn process_manager(arguments: &RoleArguments) -> Result<(), Failure> {
-    let system = SystemConfig::load(arguments.config.as_deref())?;
-    let mut config = system.process_manager_config();
-    config.listen = arguments.listen.clone().unwrap_or(config.listen);
-    daemon(arguments, &system.service, async |host| {
+    daemon(arguments, process_manager::ROLE, async |system, host| {
+        let mut config = system.process_manager_config();
+        config.listen = host.listen.unwrap_or(config.listen);
         process_manager::run_as(config, host.directory, host.serving, host.shutdown).await
     })
 }
 
 /// `ratn cell`
 pub(super) fn cell(arguments: &RoleArguments) -> Result<(), Failure> {
-    let system = SystemConfig::load(arguments.config.as_deref())?;
-    let mut config = system.cell.clone();
-    config.listen = arguments.listen.clone().unwrap_or(config.listen);
-    daemon(arguments, &system.service, async |host| {
+    daemon(arguments, ratn_cell::ROLE, async |system, host| {
+        let mut config = system.cell;
+        config.listen = host.listen.unwrap_or(config.listen);
         ratn_cell::run_as(config, host.directory, host.serving, host.shutdown).await
     })
 }
@@ -96,44 +98,62 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
 
 /// What a daemon finds where it runs.
 struct Host {
+    /// Instead of its config's.
+    listen: Option<Endpoint>,
     directory: RuntimeDirectory,
     serving: Serving,
     shutdown: CancellationToken,
+    /// The resource manager's section, as it changes.
+    bounds: watch::Receiver<ResourceManagerConfig>,
 }
 
 fn daemon(
     arguments: &RoleArguments,
-    service: &ServiceConfig,
-    run: impl AsyncFnOnce(Host) -> anyhow::Result<()>,
+    role: &'static str,
+    run: impl AsyncFnOnce(SystemConfig, Host) -> anyhow::Result<()>,
 ) -> Result<(), Failure> {
-    daemon_on(tokio::runtime::Builder::new_multi_thread(), arguments, service, run)
+    let system = SystemConfig::load(arguments.config.as_deref())?;
+    daemon_on(tokio::runtime::Builder::new_multi_thread(), arguments, system, role, run)
 }
 
 /// What every daemon does around its own work.
 fn daemon_on(
     runtime: tokio::runtime::Builder,
     arguments: &RoleArguments,
-    service: &ServiceConfig,
-    run: impl AsyncFnOnce(Host) -> anyhow::Result<()>,
+    system: SystemConfig,
+    role: &'static str,
+    run: impl AsyncFnOnce(SystemConfig, Host) -> anyhow::Result<()>,
 ) -> Result<(), Failure> {
     if arguments.check_config {
         output::progress("the config is good");
         return Ok(());
     }
-    let mut service = service.clone();
+    // As the file has it: what the command line says holds until the end.
+    let running = SystemConfig::load(arguments.config.as_deref())?;
+    let mut service = system.service.clone();
     service.insecure |= arguments.insecure;
     service.trust().context("[service.tls]")?;
-    let _logs = telemetry::start_as(&service.log, service.audit_file.as_deref())?;
+    let logs = telemetry::start_as(&service.log, service.audit_file.as_deref())?;
     blocking_on(runtime, async {
         let shutdown = CancellationToken::new();
         let patience = Duration::from_millis(service.drain_ms) + EXIT_PATIENCE;
         shutdown::on_signals_within(&shutdown, patience).context("cannot catch signals")?;
+        let supervisor = Supervisor::start().context("cannot catch SIGHUP")?;
         if arguments.exit_with_parent {
             shutdown::exit_with_parent(&shutdown).context("cannot watch standard input")?;
         }
         let directory = public_directory(arguments.runtime_dir.as_deref());
         let directory = RuntimeDirectory::create(&directory)
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
-        Ok(run(Host { directory, serving: service.serving(), shutdown }).await?)
+        let (access, bounds) =
+            (LiveAccess::new(service.access.clone()), watch::Sender::new(system.resource_manager.clone()));
+        let serving = service.serving_with(&access);
+        let host = Host { listen: arguments.listen.clone(), directory, shutdown, bounds: bounds.subscribe(), serving };
+        let reloading = Reloading { file: arguments.config.clone(), running, role, logs, access, bounds };
+        let followed = supervisor.follow(host.serving.phase.subscribe(), move || reloading.reload());
+        let followed = tokio::spawn(followed);
+        let ended = run(system, host).await;
+        let _ = followed.await;
+        Ok(ended?)
     })
 }

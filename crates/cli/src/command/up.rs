@@ -7,6 +7,7 @@ use crate::interrupt::Interrupt;
 use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::{System, public_directory, running};
+use ratn_daemon::supervisor;
 
 /// Starts it and keeps it running until the user or one of its processes ends it.
 pub(crate) fn run(arguments: &UpArguments) -> Result<(), Failure> {
@@ -23,10 +24,12 @@ pub(crate) fn run(arguments: &UpArguments) -> Result<(), Failure> {
             "the system is ready in {}; Ctrl-C ends it",
             system.directory().path().display()
         ));
+        supervisor::ready();
         let ended = tokio::select! {
             () = interrupt.asked_times(1) => Ok(()),
             error = system.one_ended() => Err(error.into()),
         };
+        supervisor::stopping();
         system.stop().await;
         ended
     })

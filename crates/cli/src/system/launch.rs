@@ -7,13 +7,14 @@
 
 use crate::output;
 use anyhow::{Context, bail};
+use ratn_daemon::supervisor::command_of;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant};
-use tokio::process::{Child, Command};
+use tokio::process::Child;
 
 /// From the start of the processes to the last resource.
 const READY_DEADLINE: Duration = Duration::from_secs(30);
@@ -37,7 +38,7 @@ impl RoleProcess {
         let log = directory.join(format!("{role}.log"));
         let output = File::create(&log).with_context(|| format!("cannot create {}", log.display()))?;
         let binary = std::env::current_exe().context("cannot find this program's own file")?;
-        let child = Command::new(&binary)
+        let child = command_of(&binary)
             .arg(role)
             .arg("--config")
             .arg(config)

@@ -4,6 +4,7 @@
 //! pipe that nobody writes to: it ends with the process manager, however that ends. Nothing runs in the child before exec.
 
 use super::log::Log;
+use crate::supervisor::command_of;
 use nix::errno::Errno;
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
@@ -13,7 +14,7 @@ use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
-use tokio::process::{Child, Command};
+use tokio::process::Child;
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 
@@ -82,7 +83,7 @@ pub(super) fn signal(pid: u32, signal: Signal) {
 
 fn spawn(job: &Job) -> io::Result<(Child, Log)> {
     let log = Log::create(&job.log, job.max_log_bytes)?;
-    let child = Command::new(&job.program)
+    let child = command_of(&job.program)
         .args(&job.args)
         .envs(&job.env)
         .stdin(Stdio::piped())

@@ -25,7 +25,7 @@ use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status};
@@ -125,6 +125,13 @@ pub(super) struct Handle {
     pings: mpsc::Sender<Ping>,
 }
 
+/// What the actor hears.
+struct Inputs {
+    messages: mpsc::Receiver<Message>,
+    pinged: mpsc::Receiver<Ping>,
+    live: watch::Receiver<ResourceManagerConfig>,
+}
+
 #[derive(Debug)]
 struct Actor {
     config: ResourceManagerConfig,
@@ -148,7 +155,7 @@ struct Actor {
 
 /// Starts the actor on what was kept. With `draining` everybody who waits is told to ask the successor; with `over` it ends.
 pub(super) fn start(
-    config: ResourceManagerConfig,
+    live: watch::Receiver<ResourceManagerConfig>,
     (pool, journal): (Pool, Journal),
     draining: CancellationToken,
     over: CancellationToken,
@@ -162,14 +169,14 @@ pub(super) fn start(
         outbox: Outbox::default(),
         stopped: None,
         draining: false,
-        config,
+        config: live.borrow().clone(),
         start: Instant::now(),
         calls: BTreeMap::new(),
         tickets: BTreeMap::new(),
         shared: BTreeMap::new(),
         watchers: Vec::new(),
     };
-    let running = tokio::spawn(actor.run(messages, pinged, draining, over));
+    let running = tokio::spawn(actor.run(Inputs { messages, pinged, live }, draining, over));
     (Handle { inbox, pings }, running)
 }
 
@@ -216,13 +223,8 @@ fn most_urgent_first(messages: &mut [Message]) {
 }
 
 impl Actor {
-    async fn run(
-        mut self,
-        mut messages: mpsc::Receiver<Message>,
-        mut pinged: mpsc::Receiver<Ping>,
-        draining: CancellationToken,
-        over: CancellationToken,
-    ) {
+    async fn run(mut self, inputs: Inputs, draining: CancellationToken, over: CancellationToken) {
+        let Inputs { mut messages, mut pinged, mut live } = inputs;
         let mut arrived = Vec::new();
         loop {
             let running = self.stopped.is_none();
@@ -234,6 +236,7 @@ impl Actor {
                 () = over.cancelled() => return self.end(),
                 () = draining.cancelled(), if !self.draining => self.drain(),
                 Some(ping) = pinged.recv() => self.pinged(ping),
+                Ok(()) = live.changed() => self.reconfigure(&live.borrow_and_update()),
                 progress = self.journal.changed(), if running => self.written(progress),
                 () = sleep_until(deadline) => self.pool.advance(self.now()),
                 count = messages.recv_many(&mut arrived, AT_ONCE), if room => {
@@ -258,6 +261,14 @@ impl Actor {
             }
             self.deliver();
         }
+    }
+
+    /// Takes over the bounds of a config; the rest needs a restart.
+    fn reconfigure(&mut self, config: &ResourceManagerConfig) {
+        let ResourceManagerConfig { max_session_ttl_ms, max_wait_ms, max_watchers, limits, .. } = config.clone();
+        self.pool.set_limits(limits.clone());
+        self.config =
+            ResourceManagerConfig { max_session_ttl_ms, max_wait_ms, max_watchers, limits, ..self.config.clone() };
     }
 
     /// Whoever waits is told, and leaves the queue.

@@ -26,6 +26,7 @@ use ratn_proto::v1::resource_service_server::ResourceServiceServer;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
 use std::path::{Path, PathBuf};
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 /// The role's name: of its endpoint file, its command and its section of a config.
@@ -48,26 +49,27 @@ pub async fn run(
     directory: RuntimeDirectory,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    run_as(config, directory, Serving::default(), shutdown).await
+    run_as(watch::Sender::new(config).subscribe(), directory, Serving::default(), shutdown).await
 }
 
-/// As [`run`], served as its host wants it.
+/// As [`run`], served as its host wants it. Of a config that changes its bounds are taken over.
 ///
 /// # Errors
 /// As [`run`].
 pub async fn run_as(
-    config: ResourceManagerConfig,
+    live: watch::Receiver<ResourceManagerConfig>,
     directory: RuntimeDirectory,
     serving: Serving,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
+    let config = live.borrow().clone();
     let storage = config.storage.directory.clone().unwrap_or_else(|| state_directory(directory.path()).join(ROLE));
     let kept = journal::Journal::open(&config.storage, &storage, config.limits.clone())?;
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let over = CancellationToken::new();
     let _over = over.clone().drop_guard();
-    let (actor, ended) = actor::start(config, kept, shutdown.clone(), over.clone());
+    let (actor, ended) = actor::start(live, kept, shutdown.clone(), over.clone());
     let service = ResourceServiceServer::new(service::Service::new(actor, shutdown.clone()))
         .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);

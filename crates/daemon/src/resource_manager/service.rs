@@ -428,12 +428,14 @@ mod tests {
     use super::super::{ResourceManagerConfig, actor};
     use super::*;
     use ratn_model::resource::ResourceClass;
+    use tokio::sync::watch;
 
     #[tokio::test]
     async fn a_lease_that_two_calls_of_one_request_got_goes_back_when_both_are_dropped() {
         let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
         let kept = Journal::open(&config.storage, directory.path(), config.limits.clone()).unwrap();
-        let (actor, _) = actor::start(config, kept, CancellationToken::new(), CancellationToken::new());
+        let (actor, _) =
+            actor::start(watch::Sender::new(config).subscribe(), kept, Default::default(), Default::default());
         let session = SessionId::from("s");
         actor.keep_alive(session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
         let requirement = Requirement {

@@ -1,0 +1,55 @@
+//! SIGHUP to a daemon: its config is read again. What can be taken over is; what cannot is named; a bad config changes nothing.
+
+use crate::system::config::SystemConfig;
+use anyhow::Context;
+use ratn_daemon::reload;
+use ratn_daemon::resource_manager::ResourceManagerConfig;
+use ratn_daemon::service::LiveAccess;
+use ratn_daemon::telemetry::Logs;
+use std::path::PathBuf;
+use tokio::sync::watch;
+
+/// What surrounds every daemon.
+const SHARED: [&str; 2] = ["service", "speed"];
+
+/// A daemon's config and what of it may change.
+pub(super) struct Reloading {
+    /// Without one only the audit log is opened again.
+    pub(super) file: Option<PathBuf>,
+    /// As the process began with it.
+    pub(super) running: SystemConfig,
+    /// The daemon's section.
+    pub(super) role: &'static str,
+    pub(super) logs: Logs,
+    pub(super) access: LiveAccess,
+    /// Of the resource manager.
+    pub(super) bounds: watch::Sender<ResourceManagerConfig>,
+}
+
+impl Reloading {
+    /// Takes over what can be taken over.
+    pub(super) fn reload(&self) {
+        match self.try_reload() {
+            Ok(rest) if rest.is_empty() => tracing::info!("the config was read again and taken over"),
+            Ok(rest) => {
+                tracing::warn!(need_a_restart = rest.join(", "), "the config was taken over but for these keys")
+            }
+            Err(error) => tracing::error!("the config stays as it was: {error:#}"),
+        }
+    }
+
+    /// The keys that need a restart.
+    fn try_reload(&self) -> anyhow::Result<Vec<String>> {
+        let wanted = match &self.file {
+            Some(file) => SystemConfig::read(file)?,
+            None => self.running.clone(),
+        };
+        let (old, new) = (toml::Table::try_from(&self.running)?, toml::Table::try_from(&wanted)?);
+        self.logs.reload(&wanted.service.log).context("[service.log]")?;
+        self.access.replace(wanted.service.access);
+        self.bounds.send_replace(wanted.resource_manager);
+        let mine =
+            |key: &String| SHARED.iter().chain([&self.role]).any(|section| key.split('.').next() == Some(section));
+        Ok(reload::need_a_restart(&old, &new).into_iter().filter(mine).collect())
+    }
+}

@@ -1,0 +1,102 @@
+//! What the service manager of the machine (systemd) hears and says: `sd_notify(3)` and SIGHUP. Without one nothing is sent, and
+//! SIGHUP means the same.
+//!
+//! ```text
+//!   starting ─▶ READY ─ SIGHUP ─▶ RELOADING ─▶ READY ─ drain ─▶ STOPPING          WATCHDOG, twice per time that systemd waits
+//! ```
+//! The watchdog's pings come from the runtime that serves: one that hangs is silent, and systemd ends the process.
+
+use ratn_worker::server::Phase;
+use sd_notify::NotifyState;
+use std::io;
+use std::path::Path;
+use std::time::Duration;
+use tokio::process::Command;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::watch;
+use tokio::time::MissedTickBehavior;
+
+/// What a child must not inherit: it would speak for its parent.
+const VARIABLES: [&str; 3] = ["NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"];
+
+/// A program that does not speak for this process.
+pub fn command_of(program: &Path) -> Command {
+    let mut command = Command::new(program);
+    for variable in VARIABLES {
+        command.env_remove(variable);
+    }
+    command
+}
+
+/// The link to the service manager.
+#[derive(Debug)]
+pub struct Supervisor {
+    hangups: Signal,
+    watchdog: Option<Duration>,
+}
+
+impl Supervisor {
+    /// From here on SIGHUP does not end the process. Needs a tokio runtime.
+    ///
+    /// # Errors
+    /// Where the signal cannot be caught.
+    pub fn start() -> io::Result<Supervisor> {
+        let watchdog = sd_notify::watchdog_enabled().map(|patience| patience / 2).filter(|pause| !pause.is_zero());
+        Ok(Supervisor { hangups: signal(SignalKind::hangup())?, watchdog })
+    }
+
+    /// Says how far the process is, and calls `reload` at every SIGHUP while it serves. Returns when it has ended.
+    pub async fn follow(mut self, mut phase: watch::Receiver<Phase>, mut reload: impl FnMut()) {
+        let mut pings = self.watchdog.map(|pause| {
+            let mut pings = tokio::time::interval(pause);
+            pings.set_missed_tick_behavior(MissedTickBehavior::Delay);
+            pings
+        });
+        loop {
+            let ping = async {
+                match &mut pings {
+                    Some(pings) => pings.tick().await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                changed = phase.changed() => {
+                    if changed.is_err() {
+                        return;
+                    }
+                    let now = *phase.borrow_and_update();
+                    match now {
+                        Phase::Starting => {}
+                        Phase::Serving => say(&[NotifyState::Ready, NotifyState::Status("serving")]),
+                        Phase::Draining => say(&[NotifyState::Stopping, NotifyState::Status("draining")]),
+                    }
+                }
+                Some(()) = self.hangups.recv(), if *phase.borrow() == Phase::Serving => {
+                    match NotifyState::monotonic_usec_now() {
+                        Ok(now) => say(&[NotifyState::Reloading, now]),
+                        Err(error) => tracing::warn!(%error, "systemd does not hear of the reload"),
+                    }
+                    reload();
+                    say(&[NotifyState::Ready]);
+                }
+                _ = ping => say(&[NotifyState::Watchdog]),
+            }
+        }
+    }
+}
+
+/// A process without a server of its own is ready.
+pub fn ready() {
+    say(&[NotifyState::Ready]);
+}
+
+/// And it ends.
+pub fn stopping() {
+    say(&[NotifyState::Stopping]);
+}
+
+fn say(states: &[NotifyState]) {
+    if let Err(error) = sd_notify::notify(states) {
+        tracing::warn!(%error, "the service manager does not listen");
+    }
+}
