@@ -5,6 +5,7 @@ use crate::task_control::control::Word;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use ratn_daemon::resource_manager::Durability;
 use ratn_worker::endpoint::Endpoint;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 /// Runs robot tasks, written as sequential state machines, as fast as their real dependencies allow.
@@ -67,6 +68,9 @@ pub(crate) struct RoleArguments {
     /// Serve addresses beyond loopback also without TLS: the network itself is trusted
     #[arg(long)]
     pub(crate) insecure: bool,
+    /// Show metrics for Prometheus at this address, `127.0.0.1:9464`; the config's unless given
+    #[arg(long, value_name = "ADDRESS")]
+    pub(crate) metrics: Option<SocketAddr>,
     /// End when standard input ends: whoever started this is gone
     #[arg(long)]
     pub(crate) exit_with_parent: bool,

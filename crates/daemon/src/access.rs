@@ -117,6 +117,14 @@ impl Operation {
     }
 }
 
+/// Service and method of a path, if it is one of this system's.
+pub(crate) fn method_of(path: &str) -> Option<(&'static str, &'static str)> {
+    let (service, method) = path.strip_prefix('/')?.split_once('/')?;
+    let (service, rows) = METHODS.iter().find(|(name, _)| *name == service)?;
+    let method = rows.iter().flat_map(|(_, methods)| *methods).find(|name| **name == method)?;
+    Some((service, method))
+}
+
 /// Whether one of these roles may.
 pub fn allowed(operation: Operation, roles: &[Role]) -> bool {
     TABLE.iter().any(|(row, may)| *row == operation && roles.iter().any(|role| may.contains(role)))

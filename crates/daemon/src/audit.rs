@@ -2,6 +2,7 @@
 //! ended. Off unless the config names a file or the filter says `audit=info`: then it costs a comparison.
 
 use crate::access::Caller;
+use crate::{details, metrics};
 use ratn_model::id::FencingToken;
 use tonic::{Code, Status};
 
@@ -28,6 +29,9 @@ pub(crate) fn enabled() -> bool {
 impl Mutation<'_> {
     /// It has ended.
     pub(crate) fn ended(&self, outcome: Result<Option<FencingToken>, &Status>) {
+        if let (Err(status), Some(metrics)) = (outcome, metrics::get()) {
+            metrics.refused(self.operation, details::reason(status));
+        }
         let (code, reason, token) = match outcome {
             Ok(token) => (Code::Ok, "", token.map_or(0, |token| token.0)),
             Err(status) => (status.code(), status.message(), 0),

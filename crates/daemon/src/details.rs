@@ -31,3 +31,10 @@ pub(crate) fn retry_later(code: Code, reason: &str, message: impl Into<String>, 
     details.set_retry_info(Some(after));
     Status::with_error_details(code, message, details)
 }
+
+/// The word for programs; where there is none, the code's.
+pub(crate) fn reason(status: &Status) -> String {
+    let details = status.get_error_details();
+    let said = details.error_info().map(|info| info.reason.clone());
+    said.unwrap_or_else(|| crate::metrics::name_of(status.code()).to_owned())
+}

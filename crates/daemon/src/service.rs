@@ -6,11 +6,14 @@
 
 use crate::access::{AccessConfig, Operation};
 use crate::config::{Check, ConfigError, rule};
+use crate::metrics;
 use crate::telemetry::{self, LogConfig};
 use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::server::{Exposure, Serving};
 use ratn_worker::tls::{self, ClientTls, ServerTls, TlsError};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::Duration;
@@ -29,6 +32,8 @@ pub struct ServiceConfig {
     pub log: LogConfig,
     /// Append every mutation to this file, one JSON object a line.
     pub audit_file: Option<PathBuf>,
+    /// Where each role shows its metrics, `resource-manager = "127.0.0.1:9464"`; a role that is not named shows none.
+    pub metrics: BTreeMap<String, SocketAddr>,
     /// With it every TCP address is served with TLS, and only to who shows a certificate.
     pub tls: Option<ServerTls>,
     /// Who may do what.
@@ -42,6 +47,7 @@ impl Default for ServiceConfig {
             drain_ms: 500,
             log: LogConfig::default(),
             audit_file: None,
+            metrics: BTreeMap::new(),
             tls: None,
             access: AccessConfig::default(),
         }
@@ -117,5 +123,9 @@ impl Gate for RoleGate {
         Ok(())
     }
 
-    fn answered(&self, _: &str, _: Code, _: Duration) {}
+    fn answered(&self, path: &str, code: Code, took: Duration) {
+        if let Some(metrics) = metrics::get() {
+            metrics.call(path, code, took);
+        }
+    }
 }

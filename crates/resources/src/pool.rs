@@ -67,6 +67,11 @@ impl Pool {
         self.limits = limits;
     }
 
+    /// How many resources, sessions, leases and waiters there are.
+    pub fn amounts(&self) -> [usize; 4] {
+        [self.resources.len(), self.sessions.len(), self.leases.len(), self.queue.len()]
+    }
+
     /// Performs a mutation. With a request id, an equal request of that id answered before is not performed again: its
     /// answer is given once more.
     ///

@@ -11,7 +11,7 @@ use anyhow::Context;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::service::LiveAccess;
 use ratn_daemon::supervisor::Supervisor;
-use ratn_daemon::{process_manager, resource_manager, telemetry, world_pool};
+use ratn_daemon::{metrics, process_manager, resource_manager, telemetry, world_pool};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Exposure, Serving};
@@ -145,6 +145,10 @@ fn daemon_on(
         let directory = public_directory(arguments.runtime_dir.as_deref());
         let directory = RuntimeDirectory::create(&directory)
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
+        if let Some(address) = arguments.metrics.or_else(|| service.metrics.get(role).copied()) {
+            let address = metrics::listen(metrics::install(role), address, service.insecure).await?;
+            tracing::info!("metrics are at http://{address}/metrics");
+        }
         let (access, bounds) =
             (LiveAccess::new(service.access.clone()), watch::Sender::new(system.resource_manager.clone()));
         let serving = service.serving_with(&access);

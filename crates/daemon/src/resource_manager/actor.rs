@@ -13,6 +13,7 @@ use super::outbox::{Outbox, Outgoing};
 use super::wire;
 use super::{Granted, ResourceManagerConfig, status};
 use crate::details::{ending, retry_later, status as status_with};
+use crate::metrics::{self, Amounts};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
@@ -260,7 +261,14 @@ impl Actor {
                 }
             }
             self.deliver();
+            self.measure();
         }
+    }
+
+    fn measure(&self) {
+        let Some(metrics) = metrics::get() else { return };
+        let [resources, sessions, leases, waiters] = self.pool.amounts();
+        metrics.set(Amounts { resources, sessions, leases, waiters, watchers: self.watchers.len() });
     }
 
     /// Takes over the bounds of a config; the rest needs a restart.
@@ -551,12 +559,18 @@ impl Actor {
             }
             Ok(_) => {}
         }
+        if let (None, Some(metrics)) = (&self.stopped, metrics::get()) {
+            metrics.journal.commits.inc();
+        }
     }
 
     /// Nothing changes any more. What was not on the disk has not happened.
     fn stop(&mut self, fault: &dyn std::error::Error) {
         let stopped = status::of_fault(fault);
         tracing::error!(fault = stopped.message(), "changes are refused from now on");
+        if let Some(metrics) = metrics::get() {
+            metrics.journal.failed.set(1);
+        }
         // What was let out before was on the disk.
         let mut refused = std::mem::take(&mut self.outgoing);
         while let Some(outgoing) = self.outbox.take() {

@@ -6,6 +6,7 @@
 //! ```
 
 use super::config::StorageConfig;
+use crate::metrics;
 use bytes::Bytes;
 use ratn_resources::{DecodeError, Limits, Pool, Record, RestoreError, Snapshot, decode, encode};
 use ratn_storage::{
@@ -106,6 +107,10 @@ impl Journal {
         let entry = encode(&records);
         self.last = writer.append(&entry)?;
         self.since_snapshot += entry.len() as u64;
+        if let Some(metrics) = metrics::get() {
+            metrics.journal.entries.inc();
+            metrics.journal.bytes.inc_by(entry.len() as u64);
+        }
         if self.since_snapshot >= self.compact_bytes.max(2 * self.snapshot_bytes) {
             self.compact(pool)?;
         }

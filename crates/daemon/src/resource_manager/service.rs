@@ -5,6 +5,7 @@ use super::{Granted, wire};
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
 use crate::details::{ending, retry_later, status};
+use crate::metrics;
 use crate::owners::Owners;
 use futures::{Stream, StreamExt};
 use ratn_model::id::{LeaseId, Revision};
@@ -89,7 +90,11 @@ impl Service {
         wait_ms: u64,
     ) -> Result<Lease, Status> {
         let (request_name, what) = written_down(&request_id, &request);
+        let began = Instant::now();
         let granted = self.granted(request_id, request, wait_ms).await;
+        if let (Ok(_), Some(metrics)) = (&granted, metrics::get()) {
+            metrics.granted(began.elapsed());
+        }
         let mutation = Mutation { caller, operation: "acquire", request: &request_name, what };
         mutation.ended(granted.as_ref().map(|lease| Some(lease.token)));
         granted

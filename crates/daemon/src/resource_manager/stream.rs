@@ -8,6 +8,7 @@
 use super::service::{Service, kept_alive};
 use crate::access::{Caller, Operation};
 use crate::details::{retry_later, status};
+use crate::metrics;
 use futures::stream::FuturesUnordered;
 use futures::{FutureExt, Stream, StreamExt};
 use ratn_proto::v1::resource_service_server::ResourceService;
@@ -15,7 +16,7 @@ use ratn_proto::v1::{self, session_request, session_response};
 use std::future::Future;
 use std::pin::Pin;
 use std::task::{Context, Poll};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 use tonic::{Code, Status, Streaming};
 
@@ -105,12 +106,15 @@ fn call(service: Service, caller: Caller, question: v1::SessionRequest) -> Call 
     use session_response::Kind;
     let id = question.id;
     Box::pin(async move {
-        let operation = match question.kind {
-            Some(Asked::Block(_) | Asked::Acquire(_) | Asked::Withdraw(_)) => Operation::Acquire,
-            Some(Asked::Release(_)) => Operation::Release,
-            Some(Asked::KeepAlive(_)) | None => Operation::Session,
+        let began = Instant::now();
+        let path = match question.kind {
+            Some(Asked::Block(_)) => "/ratn.v1.ResourceService/Block",
+            Some(Asked::Acquire(_)) => "/ratn.v1.ResourceService/Acquire",
+            Some(Asked::Withdraw(_)) => "/ratn.v1.ResourceService/Withdraw",
+            Some(Asked::Release(_)) => "/ratn.v1.ResourceService/Release",
+            Some(Asked::KeepAlive(_)) | None => "/ratn.v1.ResourceService/KeepAlive",
         };
-        if let Err(refused) = caller.admit(operation) {
+        if let Err(refused) = caller.admit(Operation::of_path(path)) {
             return answer(id, Err(refused));
         }
         let answered = match question.kind {
@@ -131,6 +135,10 @@ fn call(service: Service, caller: Caller, question: v1::SessionRequest) -> Call 
             }
             None => Err(status(Code::InvalidArgument, "MALFORMED", "kind: is missing: set one of the calls")),
         };
+        if let Some(metrics) = metrics::get() {
+            let code = answered.as_ref().map_or_else(Status::code, |_| Code::Ok);
+            metrics.call(path, code, began.elapsed());
+        }
         answer(id, answered)
     })
 }

@@ -1,0 +1,230 @@
+//! What a daemon counts and measures, for Prometheus: in the text form of OpenMetrics, at `/metrics` of a listener of its own.
+//!
+//! Like the logs they are the process's: [`install`] once, and whoever has something to count finds them. Without that nothing is
+//! counted. Labels take few values: methods of this system, gRPC codes, reasons of refusals; never what a client sent.
+
+mod listener;
+
+pub use listener::{ListenError, listen};
+
+use crate::access;
+use prometheus_client::encoding::EncodeLabelSet;
+use prometheus_client::encoding::text::encode;
+use prometheus_client::metrics::counter::Counter;
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::Gauge;
+use prometheus_client::metrics::histogram::Histogram;
+use prometheus_client::metrics::info::Info;
+use prometheus_client::registry::{Registry, Unit};
+use std::sync::OnceLock;
+use std::time::Duration;
+use tonic::Code;
+
+/// Seconds of a call: from what a local call takes to what somebody complains about.
+const CALL_SECONDS: [f64; 15] =
+    [5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 5.0];
+/// Seconds in the queue: from none to what a task waits for another.
+const WAIT_SECONDS: [f64; 11] = [1e-4, 1e-3, 1e-2, 0.1, 0.5, 1.0, 5.0, 10.0, 60.0, 300.0, 1800.0];
+
+static METRICS: OnceLock<Metrics> = OnceLock::new();
+
+/// All of them. Daemons other than the resource manager have only the calls.
+#[derive(Debug)]
+pub struct Metrics {
+    registry: Registry,
+    calls: Family<Call, Histogram, fn() -> Histogram>,
+    refusals: Family<Refusal, Counter>,
+    grants: Counter,
+    queue_wait: Histogram,
+    resources: Gauge,
+    sessions: Gauge,
+    leases: Gauge,
+    waiters: Gauge,
+    watchers: Gauge,
+    pub(crate) journal: JournalMetrics,
+}
+
+/// Of what is kept over a restart.
+#[derive(Debug, Default)]
+pub(crate) struct JournalMetrics {
+    pub(crate) entries: Counter,
+    pub(crate) bytes: Counter,
+    pub(crate) commits: Counter,
+    pub(crate) failed: Gauge,
+}
+
+/// How much there is of what.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Amounts {
+    pub(crate) resources: usize,
+    pub(crate) sessions: usize,
+    pub(crate) leases: usize,
+    pub(crate) waiters: usize,
+    pub(crate) watchers: usize,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct Call {
+    service: &'static str,
+    method: &'static str,
+    code: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct Refusal {
+    operation: &'static str,
+    reason: String,
+}
+
+/// Counts from now on, for a process of this role.
+pub fn install(role: &str) -> &'static Metrics {
+    METRICS.get_or_init(|| Metrics::new(role))
+}
+
+/// Where they are wanted.
+pub(crate) fn get() -> Option<&'static Metrics> {
+    METRICS.get()
+}
+
+impl Metrics {
+    fn new(role: &str) -> Metrics {
+        let metrics = Metrics {
+            registry: Registry::with_prefix("ratn"),
+            calls: Family::new_with_constructor(|| Histogram::new(CALL_SECONDS)),
+            refusals: Family::default(),
+            grants: Counter::default(),
+            queue_wait: Histogram::new(WAIT_SECONDS),
+            resources: Gauge::default(),
+            sessions: Gauge::default(),
+            leases: Gauge::default(),
+            waiters: Gauge::default(),
+            watchers: Gauge::default(),
+            journal: JournalMetrics::default(),
+        };
+        metrics.registered(role)
+    }
+
+    fn registered(mut self, role: &str) -> Metrics {
+        let registry = &mut self.registry;
+        let build = Info::new([("version", env!("CARGO_PKG_VERSION").to_owned()), ("role", role.to_owned())]);
+        registry.register("build", "What runs", build);
+        let help = "Time from a call's arrival to its answer, or to the beginning of a stream of answers";
+        registry.register_with_unit("rpc_duration", help, Unit::Seconds, self.calls.clone());
+        if role != crate::resource_manager::ROLE {
+            return self;
+        }
+        registry.register("refusals", "Changes that were asked for and refused", self.refusals.clone());
+        registry.register("grants", "Leases that were granted", self.grants.clone());
+        let help = "Time from an acquire's arrival to its grant";
+        registry.register_with_unit("queue_wait", help, Unit::Seconds, self.queue_wait.clone());
+        registry.register("resources", "Resources that are there", self.resources.clone());
+        registry.register("sessions", "Sessions that live", self.sessions.clone());
+        registry.register("leases", "Leases that are held", self.leases.clone());
+        registry.register("waiters", "Acquires in the queue", self.waiters.clone());
+        registry.register("watchers", "Clients that watch", self.watchers.clone());
+        let JournalMetrics { entries, bytes, commits, failed } = &self.journal;
+        registry.register("journal_entries", "Entries appended to the journal", entries.clone());
+        registry.register_with_unit("journal_appended", "Bytes appended to the journal", Unit::Bytes, bytes.clone());
+        let help = "Times that more of the journal was seen to be on the disk; many entries may share one";
+        registry.register("journal_commits", help, commits.clone());
+        let help = "1 when the journal cannot be written and every change is refused";
+        registry.register("journal_failed", help, failed.clone());
+        self
+    }
+
+    /// A call by its path was answered. Those of services that are not of this system are not counted.
+    pub(crate) fn call(&self, path: &str, code: Code, took: Duration) {
+        if let Some((service, method)) = access::method_of(path) {
+            self.calls.get_or_create(&Call { service, method, code: name_of(code) }).observe(took.as_secs_f64());
+        }
+    }
+
+    pub(crate) fn granted(&self, waited: Duration) {
+        self.grants.inc();
+        self.queue_wait.observe(waited.as_secs_f64());
+    }
+
+    /// A change was refused for one of this system's reasons.
+    pub(crate) fn refused(&self, operation: &'static str, reason: String) {
+        self.refusals.get_or_create(&Refusal { operation, reason }).inc();
+    }
+
+    pub(crate) fn set(&self, amounts: Amounts) {
+        let Amounts { resources, sessions, leases, waiters, watchers } = amounts;
+        let gauges = [&self.resources, &self.sessions, &self.leases, &self.waiters, &self.watchers];
+        for (gauge, amount) in gauges.into_iter().zip([resources, sessions, leases, waiters, watchers]) {
+            gauge.set(i64::try_from(amount).unwrap_or(i64::MAX));
+        }
+    }
+
+    /// All of them as text.
+    fn text(&self) -> String {
+        let mut text = String::new();
+        // Writing to a string fails for nobody.
+        let _ = encode(&mut text, &self.registry);
+        text
+    }
+}
+
+/// A code as gRPC spells it.
+pub(crate) fn name_of(code: Code) -> &'static str {
+    match code {
+        Code::Ok => "OK",
+        Code::Cancelled => "CANCELLED",
+        Code::Unknown => "UNKNOWN",
+        Code::InvalidArgument => "INVALID_ARGUMENT",
+        Code::DeadlineExceeded => "DEADLINE_EXCEEDED",
+        Code::NotFound => "NOT_FOUND",
+        Code::AlreadyExists => "ALREADY_EXISTS",
+        Code::PermissionDenied => "PERMISSION_DENIED",
+        Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
+        Code::FailedPrecondition => "FAILED_PRECONDITION",
+        Code::Aborted => "ABORTED",
+        Code::OutOfRange => "OUT_OF_RANGE",
+        Code::Unimplemented => "UNIMPLEMENTED",
+        Code::Internal => "INTERNAL",
+        Code::Unavailable => "UNAVAILABLE",
+        Code::DataLoss => "DATA_LOSS",
+        Code::Unauthenticated => "UNAUTHENTICATED",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_measured_has_a_unit_and_what_a_client_sends_is_no_label() {
+        let metrics = Metrics::new(crate::resource_manager::ROLE);
+        metrics.call("/ratn.v1.ResourceService/Acquire", Code::Ok, Duration::from_micros(70));
+        metrics.call("/ratn.v1.ResourceService/Acquire", Code::DeadlineExceeded, Duration::from_secs(7));
+        metrics.call("/ratn.v1.ResourceService/\u{7}made up", Code::Unimplemented, Duration::ZERO);
+        metrics.granted(Duration::from_millis(2));
+        metrics.refused("release", "LEASE_UNKNOWN".to_owned());
+        metrics.set(Amounts { sessions: 3, waiters: 2, ..Amounts::default() });
+        let text = metrics.text();
+        let labels = "service=\"ratn.v1.ResourceService\",method=\"Acquire\"";
+        for line in [
+            &format!("ratn_rpc_duration_seconds_count{{{labels},code=\"OK\"}} 1"),
+            &format!("ratn_rpc_duration_seconds_bucket{{le=\"0.0001\",{labels},code=\"OK\"}} 1"),
+            &format!("ratn_rpc_duration_seconds_count{{{labels},code=\"DEADLINE_EXCEEDED\"}} 1"),
+            "ratn_grants_total 1",
+            "ratn_queue_wait_seconds_sum 0.002",
+            "ratn_refusals_total{operation=\"release\",reason=\"LEASE_UNKNOWN\"} 1",
+            "ratn_sessions 3",
+            "ratn_waiters 2",
+            "ratn_journal_failed 0",
+            "ratn_journal_appended_bytes_total 0",
+            "# EOF",
+        ] {
+            assert!(text.lines().any(|there| there == line), "{line} is not in\n{text}");
+        }
+        assert!(!text.contains("made up"), "{text}");
+    }
+
+    #[test]
+    fn a_daemon_that_grants_nothing_says_nothing_of_grants() {
+        let text = Metrics::new("cell").text();
+        assert!(text.contains("role=\"cell\"") && !text.contains("grants"), "{text}");
+    }
+}
