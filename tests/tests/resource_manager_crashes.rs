@@ -164,13 +164,7 @@ async fn answered<T, F: Future<Output = Result<T, CallError>>>(
 }
 
 fn tools(count: u32) -> Requirement {
-    Requirement {
-        operation: ResourceOperation::Block,
-        kind: "Tool".to_owned(),
-        class: None,
-        attributes: BTreeMap::new(),
-        count,
-    }
+    Requirement { count, ..Requirement::new(ResourceOperation::Block, "Tool") }
 }
 
 /// Takes and gives back, makes and deletes, until it is told to end.

@@ -18,7 +18,6 @@ use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
 use ratn_worker::worker::WorkerOptions;
-use std::collections::BTreeMap;
 use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
@@ -67,7 +66,7 @@ async fn system(speed: f64, boxes: usize) -> System {
 
 fn block(kind: &str) -> Requirement {
     let (operation, kind) = (ResourceOperation::Block, kind.to_owned());
-    Requirement { operation, kind, class: None, attributes: BTreeMap::new(), count: 1 }
+    Requirement::new(operation, kind)
 }
 
 impl System {

@@ -4,6 +4,7 @@
 mod support;
 
 use ratn_daemon::resource_manager::ResourceManagerConfig;
+use ratn_model::condition::{Comparison, Condition};
 use ratn_model::id::Revision;
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_model::value::Value;
@@ -12,6 +13,7 @@ use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_resources::Limits;
 use ratn_worker::client::{AcquireOptions, ResourceWatch};
+use std::time::Duration;
 use support::{TestSystem, block, in_time};
 use tonic::Code;
 use tonic_types::StatusExt;
@@ -40,6 +42,25 @@ async fn a_list_is_filtered_and_one_resource_is_got() {
     assert_eq!(a.resources.get("small").await.unwrap().attributes["payload"], Value::Float(1.0));
     let missing = a.resources.get("middle").await.unwrap_err().to_string();
     assert!(missing.contains("there is no resource `middle`"), "{missing}");
+}
+
+#[tokio::test]
+async fn a_request_by_kind_and_conditions_goes_over_the_wire_and_the_lease_says_what_it_got() {
+    let system = TestSystem::new();
+    let kinds = [("Gripper".to_owned(), vec!["Tool".to_owned()])].into();
+    let config = ResourceManagerConfig { listen: system.directory.socket("rm"), kinds, ..Default::default() };
+    let manager = system.resource_manager_with(config).await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(gripper("small", 1.0)).await.unwrap();
+    a.resources.create(gripper("large", 5.0)).await.unwrap();
+    let at_least = |value| Condition { attribute: "payload".to_owned(), comparison: Comparison::GreaterOrEqual, value };
+    let heavy = Requirement { conditions: vec![at_least(Value::Int(2))], ..block("Tool") };
+    assert!(a.resources.exists(heavy.clone()).await.unwrap());
+    let lease = a.resources.acquire(vec![heavy.clone()], AcquireOptions::default()).await.unwrap();
+    assert_eq!(lease.resource("Tool").unwrap().id, "large");
+    let options = AcquireOptions { deadline: Duration::from_millis(30), ..Default::default() };
+    let told = a.resources.acquire(vec![heavy], options).await.unwrap_err().to_string();
+    assert!(told.contains("`block Tool (payload >= 2)`: held by"), "{told}");
 }
 
 #[tokio::test]

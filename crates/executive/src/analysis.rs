@@ -185,9 +185,7 @@ fn requirements(contained: &[&State], around: &[&State]) -> Vec<ResourceExpr> {
 }
 
 fn merge(into: &mut Vec<ResourceExpr>, wanted: &ResourceExpr, counts: impl FnOnce(u32, u32) -> u32) {
-    let same = |have: &&mut ResourceExpr| {
-        have.operation == wanted.operation && have.kind == wanted.kind && have.attributes == wanted.attributes
-    };
+    let same = |have: &&mut ResourceExpr| have.operation == wanted.operation && have.selects_the_same(wanted);
     match into.iter_mut().find(same) {
         Some(have) => have.count = counts(have.count, wanted.count),
         None => into.push(wanted.clone()),
@@ -233,15 +231,15 @@ fn reads(contained: &[&State], around: &[&State], requirements: &[ResourceExpr])
             // It is one node: what happens at the ends of its parts happens within it.
             let effects = state.annotations.effects.values();
             all.extend(effects.flat_map(|effects| EffectExpr::fact_expressions(effects)).cloned());
-            let attributes = state.annotations.resources.iter().flat_map(|r| &r.attributes);
-            all.extend(attributes.flat_map(|(_, value)| value.fact_expressions()).cloned());
+            let selectors = state.annotations.resources.iter().flat_map(|r| r.expressions());
+            all.extend(selectors.flat_map(Expr::fact_expressions).cloned());
         }
     }
     for state in around {
         all.extend(state.annotations.reads.iter().flatten().cloned());
     }
-    let attributes = requirements.iter().flat_map(|r| &r.attributes);
-    all.extend(attributes.flat_map(|(_, value)| value.fact_expressions()).cloned());
+    let selectors = requirements.iter().flat_map(|r| r.expressions());
+    all.extend(selectors.flat_map(Expr::fact_expressions).cloned());
     Some(all)
 }
 
@@ -263,7 +261,7 @@ fn start_flows(state: &State) -> Vec<StateId> {
     state.annotations.requires.iter().for_each(|e| flows.extend(e.flows()));
     for resource in &state.annotations.resources {
         if !matches!(resource.operation, ResourceOperation::Create | ResourceOperation::Delete) {
-            resource.attributes.iter().for_each(|(_, e)| flows.extend(e.flows()));
+            resource.expressions().for_each(|e| flows.extend(e.flows()));
         }
     }
     flows
@@ -273,7 +271,7 @@ fn start_flows(state: &State) -> Vec<StateId> {
 pub(crate) fn effect_flows(state: &State) -> Vec<StateId> {
     let mut flows: Vec<StateId> = state.annotations.effects.values().flat_map(|e| EffectExpr::flows(e)).collect();
     for resource in &state.annotations.resources {
-        resource.attributes.iter().for_each(|(_, e)| flows.extend(e.flows()));
+        resource.expressions().for_each(|e| flows.extend(e.flows()));
     }
     flows
 }

@@ -101,7 +101,7 @@ pub(crate) fn expressions<'a>(program: &'a Program, state: &'a State) -> Vec<(St
     all.extend(annotations.requires.iter().enumerate().map(|(i, e)| (format!("requires.{i}"), e)));
     all.extend(annotations.duration_s.iter().map(|e| ("duration".to_owned(), e)));
     for (i, resource) in annotations.resources.iter().enumerate() {
-        all.extend(resource.attributes.iter().map(|(_, e)| (format!("resources.{i}"), e)));
+        all.extend(resource.expressions().map(|e| (format!("resources.{i}"), e)));
     }
     let facts = annotations.reads.iter().flatten().map(|fact| ("reads", fact));
     let senses = match &annotations.nature {

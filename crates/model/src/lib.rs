@@ -6,6 +6,7 @@
 
 pub mod catalogue;
 pub(crate) mod check;
+pub mod condition;
 pub mod diagnostic;
 pub mod expression;
 pub mod fact;

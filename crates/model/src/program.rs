@@ -3,6 +3,7 @@
 //! The tree is what both modes execute: the sequential interpreter walks it, the window expands it. Loops and conditions
 //! are nodes of the tree; instances (visits) exist only while a task runs, in `ratn-executive`.
 
+use crate::condition::ConditionExpr;
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::id::StateId;
 use crate::resource::{ResourceClass, ResourceOperation};
@@ -252,10 +253,31 @@ pub struct ResourceExpr {
     pub class: Option<ResourceClass>,
     /// Attributes that it must have (for create: that it gets).
     pub attributes: Vec<(String, Expr)>,
+    /// What its attributes must be like besides.
+    pub conditions: Vec<ConditionExpr>,
     /// How many, or how much.
     pub count: u32,
     /// Of a resource that actuates: PIAs that block it need not do so in program order.
     pub unordered: bool,
+}
+
+impl ResourceExpr {
+    /// One of a kind, whatever it is like.
+    pub fn new(operation: ResourceOperation, kind: impl Into<String>) -> ResourceExpr {
+        let (class, attributes, conditions) = Default::default();
+        ResourceExpr { operation, kind: kind.into(), class, attributes, conditions, count: 1, unordered: false }
+    }
+
+    /// What it is selected by, or gets.
+    pub fn expressions(&self) -> impl Iterator<Item = &Expr> {
+        let conditions = self.conditions.iter().map(|condition| &condition.value);
+        self.attributes.iter().map(|(_, value)| value).chain(conditions)
+    }
+
+    /// Whether both select the same resources.
+    pub fn selects_the_same(&self, other: &ResourceExpr) -> bool {
+        self.kind == other.kind && self.attributes == other.attributes && self.conditions == other.conditions
+    }
 }
 
 /// The resource kind that stands for room for a projection.

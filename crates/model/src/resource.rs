@@ -1,7 +1,10 @@
 //! What a state asks of the resource manager.
 
+use crate::condition::Condition;
+use crate::expression::evaluate::equal;
 use crate::value::Value;
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 
@@ -50,6 +53,9 @@ pub struct Requirement {
     pub attributes: BTreeMap<String, Value>,
     /// How many resources (block), or how much of their capacity in all (consume, create).
     pub count: u32,
+    /// What its attributes must be like besides.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub conditions: Vec<Condition>,
 }
 
 /// An amount of a resource in fixed-point units of a thousandth: `2` of something countable, `0.5` of something divisible.
@@ -181,11 +187,26 @@ impl fmt::Display for Requirement {
         for (name, value) in &self.attributes {
             write!(f, " {name}={value}")?;
         }
+        for condition in &self.conditions {
+            write!(f, " ({condition})")?;
+        }
         Ok(())
     }
 }
 
 impl Requirement {
+    /// One of a kind, whatever it is like.
+    pub fn new(operation: ResourceOperation, kind: impl Into<String>) -> Requirement {
+        let (class, attributes, conditions) = Default::default();
+        Requirement { operation, kind: kind.into(), class, attributes, conditions, count: 1 }
+    }
+
+    /// Whether attributes are as it wants them; `of` gives the value of one.
+    pub fn accepts<'a>(&self, of: impl Fn(&str) -> Option<Cow<'a, Value>>) -> bool {
+        self.attributes.iter().all(|(name, want)| of(name).is_some_and(|have| equal(&have, want)))
+            && self.conditions.iter().all(|c| of(&c.attribute).is_some_and(|have| c.holds(&have)))
+    }
+
     /// How much of it.
     pub fn amount(&self) -> Quantity {
         Quantity::whole(self.count)
@@ -212,11 +233,22 @@ pub struct LeasedResource {
     pub kind: String,
     /// Where its action service is served (`http://127.0.0.1:4000` or `unix:/path`); empty where it performs nothing.
     pub endpoint: String,
+    /// The kinds that its kind is a subclass of.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub superclasses: Vec<String>,
+}
+
+impl LeasedResource {
+    /// Whether it is of this kind, or of a subclass of it.
+    pub fn is_a(&self, kind: &str) -> bool {
+        self.kind == kind || self.superclasses.iter().any(|superclass| superclass == kind)
+    }
 }
 
 impl Lease {
-    /// The first leased resource of a kind.
+    /// The first leased resource of a kind, or of a subclass of it.
     pub fn resource(&self, kind: &str) -> Option<&LeasedResource> {
-        self.resources.iter().find(|r| r.kind == kind)
+        let exact = self.resources.iter().find(|r| r.kind == kind);
+        exact.or_else(|| self.resources.iter().find(|r| r.is_a(kind)))
     }
 }

@@ -4,8 +4,10 @@
 
 use insta::assert_snapshot;
 use ratn_model::catalogue::{ActionSignature, Catalogue};
+use ratn_model::expression::scope::{NothingKnown, WithVariable};
 use ratn_model::load::load;
 use ratn_model::program::{Exceptions, Program, Retry, State, StateKind, Target};
+use ratn_model::value::Value;
 
 /// The standard system, with an eye that may see nothing.
 fn catalogue() -> Catalogue {
@@ -310,4 +312,38 @@ states:
     task.yaml:10:68: error[type-mismatch] in c: the default of `n` is string, not int
     task.yaml:10:78: error[unknown-key] in c: there is no key `retry` here. help: leave it out
     "#);
+}
+
+#[test]
+fn a_resource_is_selected_by_attributes_or_by_conditions_on_them() {
+    let source = "
+task: t
+parameters: { load: 2.0 }
+states:
+  - equal: { action: eye/look, resources: [{ block: Gripper, where: { payload: 3, host: compute } }] }
+  - each:
+      action: eye/look
+      resources: [{ block: Gripper, where: [payload >= $load + 0.5, \"tool in [gripper, welder]\", has camera, host != sim] }]
+  - one: { action: eye/look, resources: [{ block: Gripper, where: mass < 4 }] }
+";
+    let program = program(source);
+    let load_of_two = WithVariable { outer: &NothingKnown, name: "load", value: Some(&Value::Int(2)) };
+    let bound = |path: &str| state(&program, path).annotations.resources[0].bind(&load_of_two).unwrap().to_string();
+    assert_snapshot!(bound("equal"), @"block Gripper host=compute payload=3");
+    assert_snapshot!(bound("each"), @"block Gripper (payload >= 2.5) (tool in [gripper, welder]) (has camera) (host != sim)");
+    assert_snapshot!(bound("one"), @"block Gripper (mass < 4)");
+}
+
+#[test]
+fn what_is_no_condition_on_an_attribute_is_refused_with_its_place() {
+    for (wrong, column) in [("payload", 66), ("1 < 2", 66), ("a < 1 and b < 2", 66), ("has a b", 70)] {
+        let source = format!(
+            "task: t\nstates:\n  - a: {{ action: eye/look, resources: [{{ block: Gripper, where: [{wrong}] }}] }}\n"
+        );
+        let found = findings(&source);
+        assert!(found.contains(&format!("task.yaml:3:{column}")), "{found}");
+        assert!(found.contains("payload >= 2.5") || wrong == "has a b", "{found}");
+    }
+    let source = "task: t\nstates:\n  - a: { action: eye/look, resources: [{ block: Gripper }, { create: P, class: task, where: [a < 1] }] }\n";
+    assert!(findings(source).contains("what is created is not chosen by conditions"), "{}", findings(source));
 }

@@ -13,7 +13,6 @@ use ratn_resources::{
     AcquireRequest, Limits, Pool, Request, ResourceSpec, SessionId, Snapshot, WaiterId, decode, encode,
 };
 use std::alloc::{GlobalAlloc, Layout, System};
-use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
@@ -171,7 +170,7 @@ fn drained(pool: &mut Pool) {
 
 fn ask(kind: &str, count: u32) -> AcquireRequest {
     let operation = ResourceOperation::Block;
-    let requirement = Requirement { operation, kind: kind.to_owned(), class: None, attributes: BTreeMap::new(), count };
+    let requirement = Requirement { count, ..Requirement::new(operation, kind) };
     AcquireRequest::new(session(), vec![requirement])
 }
 

@@ -10,7 +10,7 @@ use crate::memory::{Recalled, Remembered};
 use crate::pool::Pool;
 use crate::queue::{AcquireRequest, Waiter};
 use crate::record::Effect;
-use crate::resource::Units;
+use crate::resource::{Resource, Units};
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::{Lease, ResourceOperation};
 use ratn_model::time::Timestamp;
@@ -179,10 +179,13 @@ impl Pool {
     pub fn lease(&self, id: LeaseId) -> Option<Lease> {
         let record = self.leases.get(&id)?;
         let mut resources = Vec::new();
+        let leased = |resource: &Resource| {
+            resource.description.leased(self.resources.kinds().superclasses(&resource.description.kind))
+        };
         for (slot, amount) in &record.held {
             let Some(resource) = self.resources.get(*slot) else { continue };
             let units = if amount.is_whole() && !resource.description.divisible { amount.units() } else { 1 };
-            resources.extend(std::iter::repeat_n(resource.description.leased(), units as usize));
+            resources.extend(std::iter::repeat_n(leased(resource), units as usize));
         }
         Some(Lease { id, token: record.token, resources })
     }

@@ -98,11 +98,10 @@ impl Pool {
             Obstacle::Held { requirement: text, holders }
         } else {
             let wants = |waiter: &Waiter| {
-                waiter
-                    .request
-                    .requirements
-                    .iter()
-                    .any(|r| r.kind == requirement.kind && r.operation != ResourceOperation::Exists)
+                waiter.request.requirements.iter().any(|r| {
+                    self.resources.family(&r.kind) == self.resources.family(&requirement.kind)
+                        && r.operation != ResourceOperation::Exists
+                })
             };
             let waiters = self
                 .queue

@@ -5,6 +5,7 @@ use crate::event::{Notice, WatchEvent};
 use crate::expiry::Timer;
 use crate::history::{Compacted, History};
 use crate::id::{Slot, WaiterId};
+use crate::kinds::Kinds;
 use crate::lease::{LeaseView, Leases};
 use crate::limits::Limits;
 use crate::memory::{Recalled, Remembered, RequestMemory, fingerprint};
@@ -50,6 +51,14 @@ impl Pool {
     /// An empty pool.
     pub fn new(limits: Limits) -> Pool {
         Pool { limits, ..Pool::default() }
+    }
+
+    /// The same pool, in which who asks for a kind may get one of a kind below it. Nobody may wait yet.
+    #[must_use]
+    pub fn with_kinds(mut self, kinds: Kinds) -> Pool {
+        debug_assert!(self.queue.len() == 0, "waiters are in families of the kinds of before");
+        self.resources.set_kinds(kinds);
+        self
     }
 
     /// The same pool; what it grants from now on has ids and tokens above `floor` too. A restarted manager passes a number that

@@ -6,6 +6,7 @@ use ratn_model::id::{FencingToken, LeaseId, Revision};
 use ratn_model::resource::{LeasedResource, Quantity, Requirement, ResourceClass};
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::ops::Deref;
 use std::sync::Arc;
@@ -191,22 +192,23 @@ impl Deref for ResourceView {
 }
 
 impl Description {
-    /// Whether a requirement can be met with it.
+    /// Whether a requirement can be met with it, if it is of the right kind.
     pub(crate) fn fits(&self, requirement: &Requirement) -> bool {
-        self.kind == requirement.kind
-            && requirement.class.is_none_or(|class| class == self.class)
-            && requirement
-                .attributes
-                .iter()
-                .all(|(name, want)| self.attributes.get(name).is_some_and(|have| same(have, want)))
+        requirement.class.is_none_or(|class| class == self.class) && requirement.accepts(|name| self.attribute(name))
     }
 
-    pub(crate) fn leased(&self) -> LeasedResource {
+    /// An attribute; `host` is where it is, unless it says so itself.
+    fn attribute(&self, name: &str) -> Option<Cow<'_, Value>> {
+        let host = || (name == "host" && !self.host.is_empty()).then(|| Cow::Owned(Value::String(self.host.clone())));
+        self.attributes.get(name).map(Cow::Borrowed).or_else(host)
+    }
+
+    pub(crate) fn leased(&self, superclasses: &[String]) -> LeasedResource {
         let endpoint = match self.attributes.get(ENDPOINT_ATTRIBUTE) {
             Some(Value::String(endpoint)) => endpoint.clone(),
             _ => String::new(),
         };
-        LeasedResource { id: self.id.clone(), kind: self.kind.clone(), endpoint }
+        LeasedResource { id: self.id.clone(), kind: self.kind.clone(), endpoint, superclasses: superclasses.to_vec() }
     }
 }
 
@@ -271,11 +273,3 @@ pub(crate) fn remove_from<K: Ord>(amounts: &mut Vec<(K, Quantity)>, key: &K) -> 
 
 /// By slot, which is what everything else in the pool names them by.
 pub(crate) type Units = BTreeMap<Slot, Quantity>;
-
-/// Equal, with `1` and `1.0` the same number.
-pub(crate) fn same(have: &Value, want: &Value) -> bool {
-    match (have.as_number(), want.as_number()) {
-        (Some(a), Some(b)) => a == b,
-        _ => have == want,
-    }
-}

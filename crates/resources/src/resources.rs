@@ -4,6 +4,7 @@
 //! gives the same slots. Every change of a resource goes through [`Resources::change`], which keeps the indices right.
 
 use crate::id::Slot;
+use crate::kinds::Kinds;
 use crate::resource::{Description, Resource};
 use ratn_model::resource::{Quantity, Requirement};
 use std::collections::{BTreeMap, BTreeSet};
@@ -11,6 +12,7 @@ use std::collections::{BTreeMap, BTreeSet};
 /// See the module.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Resources {
+    kinds: Kinds,
     slots: Vec<Option<Resource>>,
     vacant: BTreeSet<Slot>,
     by_id: BTreeMap<Box<str>, Slot>,
@@ -21,13 +23,21 @@ pub(crate) struct Resources {
 #[derive(Debug, Clone, Default)]
 struct OfKind {
     all: BTreeSet<Slot>,
-    /// Those of which something is free.
-    free: BTreeSet<Slot>,
+    /// Those of which something is free, in the order in which they are given away: first what is like few others ask for.
+    free: BTreeSet<(usize, Slot)>,
     /// How much of them there is, held or not.
     quantity: Quantity,
 }
 
 impl Resources {
+    pub(crate) fn kinds(&self) -> &Kinds {
+        &self.kinds
+    }
+
+    pub(crate) fn set_kinds(&mut self, kinds: Kinds) {
+        self.kinds = kinds;
+    }
+
     pub(crate) fn len(&self) -> usize {
         self.by_id.len()
     }
@@ -64,7 +74,7 @@ impl Resources {
             of_kind.all.insert(slot);
             of_kind.quantity += resource.quantity();
             if !resource.free().is_zero() {
-                of_kind.free.insert(slot);
+                of_kind.free.insert((special(&resource), slot));
             }
         }
         self.slots[slot.index()] = Some(resource);
@@ -79,7 +89,7 @@ impl Resources {
         if let Some(of_kind) = self.by_kind.get_mut(kind) {
             of_kind.all.remove(&slot);
             of_kind.quantity = of_kind.quantity.saturating_sub(resource.quantity());
-            of_kind.free.remove(&slot);
+            of_kind.free.remove(&(special(&resource), slot));
             if of_kind.all.is_empty() {
                 self.by_kind.remove(kind);
             }
@@ -90,18 +100,16 @@ impl Resources {
     /// Changes a resource; its kind and id stay.
     pub(crate) fn change<T>(&mut self, slot: Slot, change: impl FnOnce(&mut Resource) -> T) -> Option<T> {
         let resource = self.slots.get_mut(slot.index())?.as_mut()?;
-        let (before, was) = (!resource.free().is_zero(), resource.quantity());
+        let key = |resource: &Resource| (!resource.free().is_zero()).then(|| (special(resource), slot));
+        let (before, was) = (key(resource), resource.quantity());
         let changed = change(resource);
-        let (after, is) = (!resource.free().is_zero(), resource.quantity());
+        let (after, is) = (key(resource), resource.quantity());
         if (before != after || was != is)
             && let Some(of_kind) = self.by_kind.get_mut(resource.description.kind.as_str())
         {
             of_kind.quantity = of_kind.quantity.saturating_sub(was) + is;
-            if after {
-                of_kind.free.insert(slot);
-            } else {
-                of_kind.free.remove(&slot);
-            }
+            before.map(|key| of_kind.free.remove(&key));
+            of_kind.free.extend(after);
         }
         Some(changed)
     }
@@ -112,54 +120,58 @@ impl Resources {
     }
 
     pub(crate) fn has_kind(&self, kind: &str) -> bool {
-        self.by_kind.contains_key(kind)
+        self.kinds.subclasses(kind).any(|kind| self.by_kind.contains_key(kind))
     }
 
-    /// Those that a requirement can be met with, in the order of slots.
+    /// Those that a requirement can be met with, in the order of slots; those of subclasses last.
     pub(crate) fn fitting<'a>(
         &'a self,
         requirement: &'a Requirement,
     ) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
-        self.chosen(requirement, |of_kind| &of_kind.all)
+        let all = self.of(&requirement.kind).flat_map(|of_kind| &of_kind.all);
+        self.chosen(requirement, all)
     }
 
-    /// Those of them of which something is free.
+    /// Those of them of which something is free, in the order in which they are given away.
     pub(crate) fn free<'a>(&'a self, requirement: &'a Requirement) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
-        self.chosen(requirement, |of_kind| &of_kind.free)
+        let free = self.of(&requirement.kind).flat_map(|of_kind| of_kind.free.iter().map(|(_, slot)| slot));
+        self.chosen(requirement, free)
+    }
+
+    /// What there is of a kind and of the kinds below it.
+    fn of<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = &'a OfKind> + 'a {
+        self.kinds.subclasses(kind).filter_map(|kind| self.by_kind.get(kind))
     }
 
     fn chosen<'a>(
         &'a self,
         requirement: &'a Requirement,
-        index: impl Fn(&'a OfKind) -> &'a BTreeSet<Slot> + 'a,
+        slots: impl Iterator<Item = &'a Slot> + 'a,
     ) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
-        self.by_kind
-            .get(requirement.kind.as_str())
-            .into_iter()
-            .flat_map(index)
+        slots
             .filter_map(|slot| self.get(*slot).map(|resource| (*slot, resource)))
             .filter(|(_, resource)| resource.description.fits(requirement))
     }
 
     /// The family of a kind: kinds of different families have no resource in common.
     pub(crate) fn family<'a>(&'a self, kind: &'a str) -> &'a str {
-        kind
+        self.kinds.family(kind)
     }
 
     /// Whether a requirement can be met with a resource of that description.
     pub(crate) fn fits(&self, description: &Description, requirement: &Requirement) -> bool {
-        description.kind == requirement.kind && description.fits(requirement)
+        self.kinds.is_a(&description.kind, &requirement.kind) && description.fits(requirement)
     }
 
     /// Whether every resource of the kind fits.
     pub(crate) fn fits_every(&self, requirement: &Requirement) -> bool {
-        requirement.class.is_none() && requirement.attributes.is_empty()
+        requirement.class.is_none() && requirement.attributes.is_empty() && requirement.conditions.is_empty()
     }
 
     /// How much of what fits exists, held or not, what is consumed excluded.
     pub(crate) fn quantity(&self, requirement: &Requirement) -> Quantity {
         if self.fits_every(requirement) {
-            return self.by_kind.get(requirement.kind.as_str()).map(|of_kind| of_kind.quantity).unwrap_or_default();
+            return self.of(&requirement.kind).map(|of_kind| of_kind.quantity).sum();
         }
         self.fitting(requirement).map(|(_, resource)| resource.quantity()).sum()
     }
@@ -178,8 +190,14 @@ impl Resources {
             && self.vacant.len() + present == self.slots.len()
             && self.iter().all(|(slot, resource)| {
                 self.by_kind.get(resource.description.kind.as_str()).is_some_and(|of_kind| {
-                    of_kind.all.contains(&slot) && of_kind.free.contains(&slot) != resource.free().is_zero()
+                    of_kind.all.contains(&slot)
+                        && of_kind.free.contains(&(special(resource), slot)) != resource.free().is_zero()
                 })
             })
     }
+}
+
+/// The more attributes, the more requests it alone can meet: it is given away last, which keeps most options open.
+fn special(resource: &Resource) -> usize {
+    resource.description.attributes.iter().len()
 }

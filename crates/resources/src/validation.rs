@@ -24,6 +24,8 @@ impl Pool {
                 return Err(malformed(&requirement.to_string(), &format!("1 to {} units", self.limits.units)));
             }
             self.check_attributes(requirement.attributes.keys())?;
+            let conditions: Vec<&String> = requirement.conditions.iter().map(|c| &c.attribute).collect();
+            self.check_attributes(conditions.into_iter())?;
         }
         Ok(())
     }

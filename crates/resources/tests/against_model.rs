@@ -200,7 +200,7 @@ proptest! {
 }
 
 fn requirement(operation: ResourceOperation, kind: usize, count: u32) -> Requirement {
-    Requirement { operation, kind: KINDS[kind].into(), class: None, attributes: BTreeMap::new(), count }
+    Requirement { count, ..Requirement::new(operation, KINDS[kind]) }
 }
 
 fn compare(pool: &mut Pool, model: &mut Model, last_token: &mut FencingToken) -> Result<(), TestCaseError> {

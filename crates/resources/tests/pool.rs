@@ -1,15 +1,15 @@
 //! The pool, feature by feature.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
+use ratn_model::condition::{Comparison, Condition};
 use ratn_model::id::LeaseId;
 use ratn_model::resource::{Lease, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_resources::{
-    AcquireRequest, Change, EndReason, Limits, Notice, Obstacle, Pool, PoolError, Refusal, Reply, Request,
+    AcquireRequest, Change, EndReason, Kinds, Limits, Notice, Obstacle, Pool, PoolError, Refusal, Reply, Request,
     ResourceSpec, SessionId, WaiterId,
 };
-use std::collections::BTreeMap;
 use std::time::Duration;
 
 /// A pool with a session `a` that provides and a session `b`, both with a TTL of 10 s, and a clock.
@@ -78,7 +78,7 @@ fn session(name: &str) -> SessionId {
 }
 
 fn requirement(operation: ResourceOperation, kind: &str, count: u32) -> Requirement {
-    Requirement { operation, kind: kind.into(), class: None, attributes: BTreeMap::new(), count }
+    Requirement { count, ..Requirement::new(operation, kind) }
 }
 
 fn block(kind: &str) -> Requirement {
@@ -311,6 +311,88 @@ fn what_is_consumed_of_something_not_renewable_is_gone() {
     bench.granted("b", &[requirement(ResourceOperation::Consume, "Battery", 30)]);
     bench.at(11.0);
     assert_eq!(bench.pool.get(&id).unwrap().free, 70);
+}
+
+#[test]
+fn a_resource_is_chosen_by_conditions_on_its_attributes_and_by_its_host() {
+    let mut bench = Bench::new();
+    for (id, payload, host) in [("small", 1.0, "compute"), ("large", 5.0, "sim")] {
+        let spec = ResourceSpec::new(ResourceClass::Module, "Gripper").id(id).host(host);
+        bench.create("a", spec.attribute("payload", Value::Float(payload)));
+    }
+    bench.create("a", ResourceSpec::new(ResourceClass::Module, "Gripper").id("odd"));
+    let number = Value::Float;
+    let text = |text: &str| Value::String(text.into());
+    let cases: [(&str, Comparison, Value, &[&str]); 10] = [
+        ("payload", Comparison::Equal, Value::Int(5), &["large"]),
+        ("payload", Comparison::NotEqual, Value::Int(5), &["small"]),
+        ("payload", Comparison::Less, number(5.0), &["small"]),
+        ("payload", Comparison::LessOrEqual, number(5.0), &["large", "small"]),
+        ("payload", Comparison::Greater, number(5.0), &[]),
+        ("payload", Comparison::GreaterOrEqual, number(1.5), &["large"]),
+        ("payload", Comparison::In, Value::List(vec![number(1.0), number(2.0)]), &["small"]),
+        ("payload", Comparison::Has, Value::Null, &["large", "small"]),
+        ("host", Comparison::Equal, text("compute"), &["small"]),
+        ("payload", Comparison::Less, text("5"), &[]),
+    ];
+    for (attribute, comparison, value, expected) in cases {
+        let conditions = vec![Condition { attribute: attribute.into(), comparison, value }];
+        let wanted = Requirement { conditions, ..block("Gripper") };
+        assert_eq!(bench.pool.fitting(&wanted), expected, "{wanted}");
+        let waiter = bench.acquire("b", &[wanted]);
+        let granted = grants(&bench.notices());
+        assert_eq!(granted.is_empty(), expected.is_empty());
+        match granted.into_iter().next() {
+            Some((_, lease)) => drop(bench.release(lease.id)),
+            None => bench.pool.cancel(bench.now, waiter).unwrap(),
+        }
+    }
+    // One that waits is served when one that fits becomes what it wants.
+    let heavy = Condition { attribute: "payload".into(), comparison: Comparison::Greater, value: number(5.0) };
+    let waiter = bench.acquire("b", &[Requirement { conditions: vec![heavy], ..block("Gripper") }]);
+    let spec = ResourceSpec::new(ResourceClass::Module, "Gripper").id("large").host("sim");
+    bench.create("a", spec.attribute("payload", number(6.0)));
+    assert_eq!(grants(&bench.notices())[0].0, waiter);
+}
+
+#[test]
+fn who_asks_for_a_kind_may_get_one_of_a_kind_below_it_and_is_told_what_it_is() {
+    let hierarchy =
+        [("Vacuum".to_owned(), vec!["Gripper".to_owned()]), ("Gripper".to_owned(), vec!["Tool".to_owned()])];
+    let mut bench = Bench::new();
+    bench.pool = bench.pool.clone().with_kinds(Kinds::new(&hierarchy.into()).unwrap());
+    let early = bench.acquire("b", &[block("Tool")]);
+    bench.create("a", ResourceSpec::new(ResourceClass::Module, "Vacuum").id("v"));
+    let (waiter, lease) = grants(&bench.notices()).remove(0);
+    assert_eq!(waiter, early);
+    let resource = lease.resource("Tool").unwrap();
+    assert_eq!((resource.id.as_str(), resource.kind.as_str()), ("v", "Vacuum"));
+    assert_eq!(resource.superclasses, ["Gripper", "Tool"]);
+    assert!(lease.resource("Gripper").is_some() && lease.resource("Camera").is_none());
+    // Three that want it by different names are served in order.
+    let waiters = ["Gripper", "Vacuum", "Tool"].map(|kind| bench.acquire("b", &[block(kind)]));
+    assert!(matches!(&bench.pool.explain(waiters[0]).unwrap().obstacles[..], [Obstacle::Held { .. }]));
+    let mut held = lease.id;
+    for waiter in waiters {
+        bench.pool.release(bench.now, None, held).unwrap();
+        let granted = grants(&bench.notices());
+        assert_eq!(granted.iter().map(|(waiter, _)| *waiter).collect::<Vec<_>>(), [waiter]);
+        held = granted[0].1.id;
+    }
+    assert!(bench.pool.exists(&block("Vacuum")) == 1 && bench.pool.exists(&block("Tool")) == 1);
+}
+
+#[test]
+fn what_fits_fewer_other_requests_is_given_away_first() {
+    let hierarchy = [("Vacuum".to_owned(), vec!["Gripper".to_owned()])];
+    let mut bench = Bench::new();
+    bench.pool = bench.pool.clone().with_kinds(Kinds::new(&hierarchy.into()).unwrap());
+    bench.create("a", ResourceSpec::new(ResourceClass::Module, "Vacuum").id("1"));
+    let gripper = || ResourceSpec::new(ResourceClass::Module, "Gripper");
+    bench.create("a", gripper().id("2").attribute("camera", Value::Bool(true)));
+    bench.create("a", gripper().id("3"));
+    let ids = [(); 3].map(|()| bench.granted("b", &[block("Gripper")]).resources.remove(0).id);
+    assert_eq!(ids, ["3", "2", "1"], "the plain one, the one with a camera, the one of a kind below");
 }
 
 #[test]

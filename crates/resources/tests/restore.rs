@@ -11,7 +11,6 @@ use ratn_resources::{
     AcquireRequest, DecodeError, FORMAT, Limits, Pool, Record, Request, ResourceSpec, RestoreError, SessionId,
     Snapshot, decode, encode,
 };
-use std::collections::BTreeMap;
 use std::time::Duration;
 
 const KINDS: [&str; 3] = ["Arm", "Battery", "PathPlanner"];
@@ -64,7 +63,7 @@ fn step() -> impl Strategy<Value = (Step, u8)> {
 }
 
 fn requirement(operation: ResourceOperation, kind: usize, count: u32) -> Requirement {
-    Requirement { operation, kind: KINDS[kind].into(), class: None, attributes: BTreeMap::new(), count }
+    Requirement { count, ..Requirement::new(operation, KINDS[kind]) }
 }
 
 fn perform(pool: &mut Pool, now: u64, step: &Step, id: u8) -> String {

@@ -86,6 +86,7 @@ impl System {
             id: RESOURCE.to_owned(),
             kind: "PathPlanner".to_owned(),
             endpoint: self.planner.to_string(),
+            superclasses: Vec::new(),
         };
         let mut goal_inputs: BTreeMap<String, Value> =
             [("start".to_owned(), Value::Joints(aimm::OBSERVATION.to_vec()))].into();

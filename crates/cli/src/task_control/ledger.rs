@@ -183,8 +183,9 @@ impl Ledger {
 fn delete(left: &mut Vec<Requirement>, deletion: &Requirement) {
     let mut count = deletion.count;
     for created in left.iter_mut() {
+        let attributes = &created.attributes;
         let fits = created.kind == deletion.kind
-            && deletion.attributes.iter().all(|(name, value)| created.attributes.get(name) == Some(value));
+            && deletion.accepts(|name| attributes.get(name).map(std::borrow::Cow::Borrowed));
         if fits {
             let taken = count.min(created.count);
             created.count -= taken;
@@ -200,7 +201,7 @@ mod tests {
     use ratn_model::resource::Lease;
 
     fn requirement(operation: ResourceOperation, kind: &str, count: u32) -> Requirement {
-        Requirement { operation, kind: kind.to_owned(), class: None, attributes: BTreeMap::new(), count }
+        Requirement { count, ..Requirement::new(operation, kind) }
     }
 
     fn lease(id: u64) -> Lease {

@@ -589,7 +589,7 @@ impl Actor {
         // They find a state that may be behind the one they saw coming, and watch again.
         self.watchers.clear();
         match self.journal.read(self.config.limits.clone()) {
-            Ok(pool) => self.pool = pool,
+            Ok(pool) => self.pool = pool.with_kinds(self.config.hierarchy()),
             Err(error) => {
                 let error = anyhow::Error::new(error);
                 tracing::error!(error = format!("{error:#}"), "what is on the disk cannot be read either");

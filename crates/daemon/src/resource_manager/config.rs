@@ -1,10 +1,11 @@
 //! The resource manager's config.
 
 use crate::config::{Check, ConfigError, rule};
-use ratn_resources::Limits;
+use ratn_resources::{Kinds, Limits};
 use ratn_storage::Durability;
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -20,6 +21,8 @@ pub struct ResourceManagerConfig {
     pub max_wait_ms: u64,
     /// Clients that watch at the same time.
     pub max_watchers: usize,
+    /// The direct superclasses of kinds, `VacuumGripper = ["Gripper"]`: who asks for a kind may get one of a kind below it.
+    pub kinds: BTreeMap<String, Vec<String>>,
     /// Bounds of everything that a client can make grow.
     pub limits: Limits,
     /// What is kept over a restart.
@@ -46,6 +49,7 @@ impl Default for ResourceManagerConfig {
             max_session_ttl_ms: 60_000,
             max_wait_ms: 24 * 3_600_000,
             max_watchers: 1_024,
+            kinds: BTreeMap::new(),
             limits: Limits::default(),
             storage: StorageConfig::default(),
         }
@@ -59,6 +63,11 @@ impl Default for StorageConfig {
 }
 
 impl ResourceManagerConfig {
+    /// None where they are not as [`Check::check`] wants them.
+    pub(crate) fn hierarchy(&self) -> Kinds {
+        Kinds::new(&self.kinds).unwrap_or_default()
+    }
+
     pub(crate) fn max_session_ttl(&self) -> Duration {
         Duration::from_millis(self.max_session_ttl_ms)
     }
@@ -73,6 +82,8 @@ impl Check for ResourceManagerConfig {
         rule("max_session_ttl_ms", self.max_session_ttl_ms >= 100, "at least 100 ms")?;
         rule("max_wait_ms", self.max_wait_ms >= 1, "at least 1 ms")?;
         rule("max_watchers", self.max_watchers >= 1, "at least 1")?;
+        let kinds = Kinds::new(&self.kinds).map(drop).map_err(|cyclic| cyclic.to_string());
+        rule("kinds", kinds.is_ok(), kinds.err().unwrap_or_default())?;
         rule("storage.compact_bytes", self.storage.compact_bytes >= 1 << 16, "at least 65536")
     }
 }

@@ -64,7 +64,8 @@ pub async fn run_as(
 ) -> anyhow::Result<()> {
     let config = live.borrow().clone();
     let storage = config.storage.directory.clone().unwrap_or_else(|| state_directory(directory.path()).join(ROLE));
-    let kept = journal::Journal::open(&config.storage, &storage, config.limits.clone())?;
+    let (pool, journal) = journal::Journal::open(&config.storage, &storage, config.limits.clone())?;
+    let kept = (pool.with_kinds(config.hierarchy()), journal);
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let over = CancellationToken::new();

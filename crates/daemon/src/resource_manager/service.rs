@@ -443,13 +443,7 @@ mod tests {
             actor::start(watch::Sender::new(config).subscribe(), kept, Default::default(), Default::default());
         let session = SessionId::from("s");
         actor.keep_alive(session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
-        let requirement = Requirement {
-            operation: ResourceOperation::Block,
-            kind: "Arm".to_owned(),
-            class: None,
-            attributes: Default::default(),
-            count: 1,
-        };
+        let requirement = Requirement::new(ResourceOperation::Block, "Arm");
         let mut calls = Vec::new();
         for ticket in [1, 2] {
             let (answer, answered) = oneshot::channel();

@@ -8,7 +8,6 @@ use ratn_worker::client::{Channels, ProcessClient, ResourceClient, ResourceWatch
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
-use std::collections::BTreeMap;
 use std::future::Future;
 use std::time::Duration;
 use tokio::task::JoinHandle;
@@ -164,11 +163,5 @@ pub(crate) async fn in_time<T>(future: impl Future<Output = T>) -> T {
 }
 
 pub(crate) fn block(kind: &str) -> Requirement {
-    Requirement {
-        operation: ResourceOperation::Block,
-        kind: kind.to_owned(),
-        class: None,
-        attributes: BTreeMap::new(),
-        count: 1,
-    }
+    Requirement::new(ResourceOperation::Block, kind)
 }

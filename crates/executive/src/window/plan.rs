@@ -389,7 +389,7 @@ fn visit_state<'a>(state: &'a State, visit: &mut dyn FnMut(&'a Expr)) {
     };
     annotations.reads.iter().flatten().chain(senses).for_each(|fact| fact.visit(visit));
     annotations.effects.values().flatten().for_each(|effect| effect.visit(visit));
-    annotations.resources.iter().flat_map(|r| &r.attributes).for_each(|(_, e)| e.visit(visit));
+    annotations.resources.iter().flat_map(|r| r.expressions()).for_each(|e| e.visit(visit));
 }
 
 /// What a routine contains, itself included; any other state alone.

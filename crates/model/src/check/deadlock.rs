@@ -70,7 +70,7 @@ fn too_many_together(subject: &Subject<'_>, node: &State, findings: &mut Finding
             continue;
         }
         let of_kind = wanted.entry(&line.kind).or_default();
-        match of_kind.iter_mut().find(|(_, other)| other.attributes == line.attributes) {
+        match of_kind.iter_mut().find(|(_, other)| other.selects_the_same(line)) {
             Some(same) if same.1.count < line.count => *same = (state, line),
             Some(_) => {}
             None => of_kind.push((state, line)),
@@ -97,7 +97,8 @@ fn too_many_together(subject: &Subject<'_>, node: &State, findings: &mut Finding
 }
 
 fn written(line: &ResourceExpr) -> String {
-    let attributes: Vec<String> = line.attributes.iter().map(|(name, value)| format!("{name} = {value}")).collect();
+    let attributes = line.attributes.iter().map(|(name, value)| format!("{name} = {value}"));
+    let attributes: Vec<String> = attributes.chain(line.conditions.iter().map(ToString::to_string)).collect();
     let count = if line.count == 1 { String::new() } else { format!("{} × ", line.count) };
     match attributes.is_empty() {
         true => format!("{count}`{}`", line.kind),
@@ -167,7 +168,8 @@ fn waits(subject: &Subject<'_>, findings: &mut Findings) {
 
 /// Whether a state can end before it asks for anything.
 fn may_fail_first(state: &State) -> bool {
-    !state.annotations.requires.is_empty() || state.annotations.resources.iter().any(|line| !line.attributes.is_empty())
+    !state.annotations.requires.is_empty()
+        || state.annotations.resources.iter().any(|line| line.expressions().next().is_some())
 }
 
 fn has_ended(control: &ControlFlow, reached: &[bool], state: &State) -> bool {

@@ -70,11 +70,13 @@ impl ResourceExpr {
     /// As [`Expr::evaluate`].
     pub fn bind(&self, scope: &dyn Scope) -> Result<Requirement, EvaluateError> {
         let attributes = self.attributes.iter().map(|(name, value)| Ok((name.clone(), value.evaluate(scope)?)));
+        let conditions = self.conditions.iter().map(|condition| condition.bind(scope));
         Ok(Requirement {
             operation: self.operation,
             kind: self.kind.clone(),
             class: self.class,
             attributes: attributes.collect::<Result<_, EvaluateError>>()?,
+            conditions: conditions.collect::<Result<_, EvaluateError>>()?,
             count: self.count,
         })
     }

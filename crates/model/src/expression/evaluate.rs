@@ -224,6 +224,11 @@ fn binary(operator: BinaryOperator, a: &Value, b: &Value) -> Result<Value, Strin
     })
 }
 
+/// Whether a comparison of two values holds.
+pub(crate) fn compare(operator: BinaryOperator, a: &Value, b: &Value) -> Result<bool, String> {
+    Ok(binary(operator, a, b)? == Value::Bool(true))
+}
+
 pub(crate) fn number(value: &Value) -> Result<f64, String> {
     value.as_number().ok_or_else(|| format!("expected a number, found {}", described(value)))
 }

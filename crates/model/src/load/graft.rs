@@ -128,6 +128,9 @@ impl Moving {
         annotations.reads.iter_mut().flatten().chain(&mut annotations.shared).for_each(|fact| fact.rewrite(self));
         annotations.requires.iter_mut().chain(&mut annotations.duration_s).for_each(|e| e.rewrite(self));
         annotations.effects.values_mut().flatten().for_each(|effect| effect.rewrite(self));
-        annotations.resources.iter_mut().flat_map(|r| &mut r.attributes).for_each(|(_, e)| e.rewrite(self));
+        for resource in &mut annotations.resources {
+            resource.attributes.iter_mut().for_each(|(_, e)| e.rewrite(self));
+            resource.conditions.iter_mut().for_each(|condition| condition.value.rewrite(self));
+        }
     }
 }

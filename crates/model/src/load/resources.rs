@@ -2,9 +2,11 @@
 
 use super::fields::Fields;
 use super::yaml::{Content, Entry, Node};
+use crate::condition::{Comparison, ConditionExpr};
 use crate::expression::Expr;
 use crate::program::{ResourceExpr, WORLD_MODEL};
 use crate::resource::{ResourceClass, ResourceOperation};
+use crate::value::Value;
 
 const OPERATIONS: [(&str, ResourceOperation); 5] = [
     ("block", ResourceOperation::Block),
@@ -38,8 +40,7 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
     if matches!(item.content, Content::Text(_)) {
         let word = fields.word(item, "a kind of resource")?;
         let kind = if word == "world_model" { WORLD_MODEL } else { word }.to_owned();
-        let operation = ResourceOperation::Block;
-        return Some(ResourceExpr { operation, kind, class: None, attributes: Vec::new(), count: 1, unordered: false });
+        return Some(ResourceExpr::new(ResourceOperation::Block, kind));
     }
     let expected = "write `{block: Arm}` with one of block, consume, create, delete, exists";
     let operations: Vec<(&Entry, ResourceOperation)> = item
@@ -80,6 +81,36 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
     let attributes: Vec<(String, Option<Expr>)> =
         attributes.map(|attribute| (attribute.key.clone(), fields.expression(&attribute.value))).collect();
     let attributes = attributes.into_iter().filter_map(|(name, value)| Some((name, value?))).collect();
+    let list = item.get("where").filter(|node| !matches!(node.content, Content::Map(_)));
+    let lines = list.map_or_else(Vec::new, Node::items);
+    let conditions: Vec<Option<ConditionExpr>> = lines.iter().map(|line| condition(fields, line)).collect();
+    let conditions: Vec<ConditionExpr> = conditions.into_iter().flatten().collect();
+    if *operation == ResourceOperation::Create && !lines.is_empty() {
+        let help = "give it attributes: `with: {payload: 2.5}`";
+        fields.error("invalid-state", item.at, "what is created is not chosen by conditions", help);
+    }
     let unordered = item.get("unordered").is_some_and(|node| fields.flag(node));
-    Some(ResourceExpr { operation: *operation, kind, class, attributes, count, unordered })
+    Some(ResourceExpr { operation: *operation, kind, class, attributes, conditions, count, unordered })
+}
+
+/// `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`.
+fn condition(fields: &mut Fields<'_, '_>, line: &Node) -> Option<ConditionExpr> {
+    let text = if let Content::Text(text) = &line.content { text.as_str() } else { "" };
+    if let Some(attribute) = text.strip_prefix("has ").map(str::trim).filter(|name| is_name(name)) {
+        let (attribute, value) = (attribute.to_owned(), Expr::Literal(Value::Null));
+        return Some(ConditionExpr { attribute, comparison: Comparison::Has, value });
+    }
+    if let Expr::Binary(operator, left, right) = fields.expression(line)?
+        && let Expr::Literal(Value::String(attribute)) = *left
+        && let Some(comparison) = Comparison::of(operator)
+    {
+        return Some(ConditionExpr { attribute, comparison, value: *right });
+    }
+    let help = "one attribute and what it must be like: `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`";
+    fields.error("invalid-expression", line.at, "this is no condition on an attribute", help);
+    None
+}
+
+fn is_name(text: &str) -> bool {
+    !text.is_empty() && text.chars().all(|c| c.is_alphanumeric() || c == '_' || c == '-')
 }

@@ -6,8 +6,10 @@ use crate::types::{
     WaitingAcquire,
 };
 use crate::v1;
+use ratn_model::condition::{Comparison, Condition};
 use ratn_model::id::{FencingToken, LeaseId, Revision};
 use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::value::Value;
 
 impl From<ResourceClass> for v1::ResourceClass {
     fn from(class: ResourceClass) -> v1::ResourceClass {
@@ -67,6 +69,7 @@ impl From<Requirement> for v1::Requirement {
             class: requirement.class.map_or(v1::ResourceClass::Unspecified, v1::ResourceClass::from).into(),
             attributes: wire_ports(requirement.attributes),
             count: requirement.count,
+            conditions: all(requirement.conditions),
         }
     }
 }
@@ -85,7 +88,54 @@ impl TryFrom<v1::Requirement> for Requirement {
             class: class(requirement.class)?,
             attributes: ports(requirement.attributes, "attributes")?,
             count: requirement.count,
+            conditions: each(requirement.conditions, "conditions")?,
         })
+    }
+}
+
+impl From<Condition> for v1::Condition {
+    fn from(condition: Condition) -> v1::Condition {
+        let comparison = match condition.comparison {
+            Comparison::Equal => v1::Comparison::Equal,
+            Comparison::NotEqual => v1::Comparison::NotEqual,
+            Comparison::Less => v1::Comparison::Less,
+            Comparison::LessOrEqual => v1::Comparison::LessOrEqual,
+            Comparison::Greater => v1::Comparison::Greater,
+            Comparison::GreaterOrEqual => v1::Comparison::GreaterOrEqual,
+            Comparison::In => v1::Comparison::In,
+            Comparison::Has => v1::Comparison::Has,
+        };
+        let value = (condition.comparison != Comparison::Has).then(|| condition.value.into());
+        v1::Condition { attribute: condition.attribute, comparison: comparison.into(), value }
+    }
+}
+
+impl TryFrom<v1::Condition> for Condition {
+    type Error = Malformed;
+
+    fn try_from(condition: v1::Condition) -> Result<Condition, Malformed> {
+        name(&condition.attribute, "attribute")?;
+        let number = condition.comparison;
+        let comparison = match v1::Comparison::try_from(number) {
+            Ok(v1::Comparison::Equal) => Comparison::Equal,
+            Ok(v1::Comparison::NotEqual) => Comparison::NotEqual,
+            Ok(v1::Comparison::Less) => Comparison::Less,
+            Ok(v1::Comparison::LessOrEqual) => Comparison::LessOrEqual,
+            Ok(v1::Comparison::Greater) => Comparison::Greater,
+            Ok(v1::Comparison::GreaterOrEqual) => Comparison::GreaterOrEqual,
+            Ok(v1::Comparison::In) => Comparison::In,
+            Ok(v1::Comparison::Has) => Comparison::Has,
+            Ok(v1::Comparison::Unspecified) => return Err(Malformed::new("comparison", "is not set")),
+            Err(_) => return Err(Malformed::new("comparison", format!("{number} is no comparison"))),
+        };
+        let value = match comparison {
+            Comparison::Has => Value::Null,
+            _ => required(condition.value, "value")?,
+        };
+        if comparison == Comparison::In && !matches!(value, Value::List(_)) {
+            return Err(Malformed::new("value", "is no list: `in` takes one"));
+        }
+        Ok(Condition { attribute: condition.attribute, comparison, value })
     }
 }
 
@@ -109,7 +159,12 @@ impl TryFrom<v1::Lease> for Lease {
 
 impl From<LeasedResource> for v1::LeasedResource {
     fn from(resource: LeasedResource) -> v1::LeasedResource {
-        v1::LeasedResource { id: resource.id, kind: resource.kind, endpoint: resource.endpoint }
+        v1::LeasedResource {
+            id: resource.id,
+            kind: resource.kind,
+            endpoint: resource.endpoint,
+            superclasses: resource.superclasses,
+        }
     }
 }
 
@@ -120,7 +175,12 @@ impl TryFrom<v1::LeasedResource> for LeasedResource {
         name(&resource.id, "id")?;
         name(&resource.kind, "kind")?;
         label(&resource.endpoint, "endpoint")?;
-        Ok(LeasedResource { id: resource.id, kind: resource.kind, endpoint: resource.endpoint })
+        Ok(LeasedResource {
+            id: resource.id,
+            kind: resource.kind,
+            endpoint: resource.endpoint,
+            superclasses: resource.superclasses,
+        })
     }
 }
 

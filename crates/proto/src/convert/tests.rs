@@ -6,6 +6,7 @@ use crate::types::*;
 use proptest::collection::{btree_map, vec};
 use proptest::prelude::*;
 use prost::Message;
+use ratn_model::condition::{Comparison, Condition};
 use ratn_model::fact::{Change, FactPattern, Footprint, Term};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::pose::Pose;
@@ -105,14 +106,34 @@ fn requirement() -> impl Strategy<Value = Requirement> {
     use ResourceOperation::*;
     let operation = prop::sample::select(vec![Block, Consume, Create, Delete, Exists]);
     let attributes = btree_map(a_name(), value(), 0..3);
-    (operation, a_name(), prop::option::of(class()), attributes, 1..9_u32).prop_map(
-        |(operation, kind, class, attributes, count)| Requirement { operation, kind, class, attributes, count },
+    let conditions = vec(condition(), 0..3);
+    (operation, a_name(), prop::option::of(class()), attributes, conditions, 1..9_u32).prop_map(
+        |(operation, kind, class, attributes, conditions, count)| Requirement {
+            operation,
+            kind,
+            class,
+            attributes,
+            conditions,
+            count,
+        },
     )
+}
+
+fn condition() -> impl Strategy<Value = Condition> {
+    let comparison = prop::sample::select(Comparison::WRITTEN.map(|(_, comparison)| comparison).to_vec());
+    (a_name(), comparison, value()).prop_map(|(attribute, comparison, value)| {
+        let value = match comparison {
+            Comparison::Has => Value::Null,
+            Comparison::In => Value::List(std::vec![value]),
+            _ => value,
+        };
+        Condition { attribute, comparison, value }
+    })
 }
 
 fn lease() -> impl Strategy<Value = Lease> {
     let resource = (a_name(), a_name(), prop_oneof![Just(String::new()), Just("unix:/a.sock".to_owned())])
-        .prop_map(|(id, kind, endpoint)| LeasedResource { id, kind, endpoint });
+        .prop_map(|(id, kind, endpoint)| LeasedResource { superclasses: std::vec![id.clone()], id, kind, endpoint });
     (any::<u64>(), any::<u64>(), vec(resource, 0..3)).prop_map(|(id, token, resources)| Lease {
         id: LeaseId(id),
         token: FencingToken(token),

@@ -58,14 +58,7 @@ impl JobShop {
                     nature: Nature::Computes,
                     reads: Some(Vec::new()),
                     effects: BTreeMap::from([(SUCCESS.to_owned(), Vec::new())]),
-                    resources: vec![ResourceExpr {
-                        operation: ResourceOperation::Block,
-                        kind: machine_kind(*machine),
-                        class: None,
-                        attributes: Vec::new(),
-                        count: 1,
-                        unordered: false,
-                    }],
+                    resources: vec![ResourceExpr::new(ResourceOperation::Block, machine_kind(*machine))],
                     duration_s: Some(Expr::Literal(Value::Float(*duration))),
                     ..Annotations::default()
                 };

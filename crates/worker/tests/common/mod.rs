@@ -153,6 +153,7 @@ pub fn lease(token: u64, resources: &[(&str, &str, &str)]) -> Lease {
         id: (*id).to_owned(),
         kind: (*kind).to_owned(),
         endpoint: (*endpoint).to_owned(),
+        superclasses: Vec::new(),
     };
     Lease { id: LeaseId(token), token: FencingToken(token), resources: resources.iter().map(resource).collect() }
 }

@@ -193,11 +193,10 @@ impl arguments::CreateArguments {
 impl Selector {
     fn requirement(&self, operation: ResourceOperation) -> Requirement {
         Requirement {
-            operation,
-            kind: self.kind.clone(),
             class: self.class,
             attributes: self.attributes.iter().cloned().collect(),
             count: self.count,
+            ..Requirement::new(operation, &self.kind)
         }
     }
 }

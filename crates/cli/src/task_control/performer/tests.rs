@@ -34,13 +34,7 @@ async fn connect_as(
 }
 
 fn arm() -> Vec<Requirement> {
-    vec![Requirement {
-        operation: ResourceOperation::Block,
-        kind: "Arm".into(),
-        class: None,
-        attributes: BTreeMap::new(),
-        count: 1,
-    }]
+    vec![Requirement::new(ResourceOperation::Block, "Arm")]
 }
 
 /// A performer with a resource manager, a world pool and one arm.

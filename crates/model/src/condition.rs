@@ -1,0 +1,165 @@
+//! What a resource's attributes have to be like to be chosen: `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`.
+//!
+//! Comparisons mean what they mean in expressions. An attribute that a resource does not have meets no condition, not even `!=`; nor
+//! does one that cannot be compared. `host` is the host that a resource is on, unless it has an attribute of that name.
+
+use crate::expression::evaluate::compare;
+use crate::expression::{BinaryOperator, EvaluateError, Expr, Scope};
+use crate::value::Value;
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// How an attribute is looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Comparison {
+    /// `=`, exact, with ints and floats as numbers.
+    Equal,
+    /// `!=`
+    NotEqual,
+    /// `<`, of numbers or of texts.
+    Less,
+    /// `<=`
+    LessOrEqual,
+    /// `>`
+    Greater,
+    /// `>=`
+    GreaterOrEqual,
+    /// `in` a list.
+    In,
+    /// `has`: it is there, whatever its value.
+    Has,
+}
+
+/// What one attribute has to be like.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Condition {
+    /// Its name.
+    pub attribute: String,
+    /// How it is looked at.
+    pub comparison: Comparison,
+    /// With what it is compared; null for [`Comparison::Has`], a list for [`Comparison::In`].
+    pub value: Value,
+}
+
+/// A condition as written.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ConditionExpr {
+    /// The attribute's name.
+    pub attribute: String,
+    /// How it is looked at.
+    pub comparison: Comparison,
+    /// With what it is compared; null for [`Comparison::Has`].
+    pub value: Expr,
+}
+
+impl Comparison {
+    /// All of them with their words, as they are written.
+    pub const WRITTEN: [(&'static str, Comparison); 8] = [
+        ("=", Comparison::Equal),
+        ("!=", Comparison::NotEqual),
+        ("<", Comparison::Less),
+        ("<=", Comparison::LessOrEqual),
+        (">", Comparison::Greater),
+        (">=", Comparison::GreaterOrEqual),
+        ("in", Comparison::In),
+        ("has", Comparison::Has),
+    ];
+
+    /// That of an operator of expressions, where it is one.
+    pub fn of(operator: BinaryOperator) -> Option<Comparison> {
+        Comparison::WRITTEN.map(|(_, comparison)| comparison).into_iter().find(|c| c.operator() == Some(operator))
+    }
+
+    fn operator(self) -> Option<BinaryOperator> {
+        Some(match self {
+            Comparison::Equal => BinaryOperator::Equal,
+            Comparison::NotEqual => BinaryOperator::NotEqual,
+            Comparison::Less => BinaryOperator::Less,
+            Comparison::LessOrEqual => BinaryOperator::LessOrEqual,
+            Comparison::Greater => BinaryOperator::Greater,
+            Comparison::GreaterOrEqual => BinaryOperator::GreaterOrEqual,
+            Comparison::In => BinaryOperator::In,
+            Comparison::Has => return None,
+        })
+    }
+}
+
+impl Condition {
+    /// Whether an attribute of this value meets it.
+    pub fn holds(&self, have: &Value) -> bool {
+        match self.comparison.operator() {
+            None => true,
+            Some(operator) => compare(operator, have, &self.value).unwrap_or(false),
+        }
+    }
+}
+
+impl ConditionExpr {
+    /// The condition with its value evaluated.
+    ///
+    /// # Errors
+    /// As [`Expr::evaluate`]; also for an `in` of what is no list.
+    pub fn bind(&self, scope: &dyn Scope) -> Result<Condition, EvaluateError> {
+        let value = self.value.evaluate(scope)?;
+        if self.comparison == Comparison::In && !matches!(value, Value::List(_)) {
+            return Err(self.value.wrong(format!("`{} in` takes a list", self.attribute)));
+        }
+        Ok(Condition { attribute: self.attribute.clone(), comparison: self.comparison, value })
+    }
+}
+
+impl fmt::Display for Comparison {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let written = Comparison::WRITTEN.iter().find(|(_, comparison)| comparison == self);
+        f.write_str(written.map_or("", |(word, _)| word))
+    }
+}
+
+impl fmt::Display for Condition {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        written(f, &self.attribute, self.comparison, &self.value)
+    }
+}
+
+impl fmt::Display for ConditionExpr {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        written(f, &self.attribute, self.comparison, &self.value)
+    }
+}
+
+fn written(
+    f: &mut fmt::Formatter<'_>,
+    attribute: &str,
+    comparison: Comparison,
+    value: &dyn fmt::Display,
+) -> fmt::Result {
+    match comparison {
+        Comparison::Has => write!(f, "has {attribute}"),
+        _ => write!(f, "{attribute} {comparison} {value}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_attribute_is_compared_as_in_expressions_and_what_cannot_be_compared_meets_nothing() {
+        let holds = |have: Value, comparison, value: Value| {
+            Condition { attribute: "a".to_owned(), comparison, value }.holds(&have)
+        };
+        use Comparison::{Equal, Greater, GreaterOrEqual, Has, In, Less, LessOrEqual, NotEqual};
+        assert!(holds(Value::Int(2), Equal, Value::Float(2.0)) && !holds(Value::Int(2), Equal, Value::Int(3)));
+        assert!(holds(Value::Int(2), NotEqual, Value::Int(3)) && !holds(Value::Int(2), NotEqual, Value::Float(2.0)));
+        assert!(holds(Value::Int(2), Less, Value::Float(2.5)) && !holds(Value::Int(2), Less, Value::Int(2)));
+        assert!(holds(Value::Int(2), LessOrEqual, Value::Int(2)) && !holds(Value::Int(3), LessOrEqual, Value::Int(2)));
+        assert!(holds(Value::Float(2.5), Greater, Value::Int(2)) && !holds(Value::Int(2), Greater, Value::Int(2)));
+        assert!(holds(Value::Int(2), GreaterOrEqual, Value::Int(2)));
+        let tools = Value::List(vec![Value::String("gripper".to_owned()), Value::Int(7)]);
+        assert!(holds(Value::Float(7.0), In, tools.clone()) && !holds(Value::Int(8), In, tools));
+        assert!(holds(Value::Null, Has, Value::Null));
+        assert!(!holds(Value::Bool(true), Less, Value::Int(2)) && !holds(Value::Int(2), Less, Value::Bool(true)));
+        assert!(!holds(Value::Int(2), In, Value::Int(2)));
+    }
+}
