@@ -34,6 +34,8 @@ pub(crate) enum Command {
     Tables(TablesArguments),
     /// Run a scheduling problem of the literature in virtual time, as a task, and compare with the best known schedule
     Simulate(SimulateArguments),
+    /// Solve a file of motion planning problems for a robot, and say how fast and how well
+    Plan(PlanArguments),
     /// Look at the resources of a running system and change them
     Resource(ResourceArguments),
     /// Copy what a daemon keeps on the disk, put a copy back, or look at it
@@ -221,6 +223,37 @@ pub(crate) struct TablesArguments {
     /// Write a Gantt chart of every run into this folder
     #[arg(long, value_name = "DIR")]
     pub(crate) gantt: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PlanArguments {
+    /// The robot, with collision shapes or spheres
+    #[arg(long, value_name = "URDF")]
+    pub(crate) robot: PathBuf,
+    /// Which links may touch; without it neighbours, and links that touch in the middle of all limits
+    #[arg(long, value_name = "FILE")]
+    pub(crate) srdf: Option<PathBuf>,
+    /// Problems in JSON: `joints`, and per class `objects`, `start` and `goal`
+    #[arg(long, value_name = "FILE")]
+    pub(crate) problems: PathBuf,
+    /// What the samples are derived from
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) seed: u64,
+    /// Samples per problem before it is given up
+    #[arg(long, value_name = "N", default_value_t = 100_000)]
+    pub(crate) iterations: usize,
+    /// Solve each problem this often and take the least times
+    #[arg(long, value_name = "N", default_value_t = 15)]
+    pub(crate) repeat: usize,
+    /// How much larger the robot's shapes are taken
+    #[arg(long, value_name = "MM", default_value_t = 0.0)]
+    pub(crate) padding_mm: f64,
+    /// Print one JSON array, with every problem
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// In JSON, also print the paths
+    #[arg(long, requires = "json")]
+    pub(crate) paths: bool,
 }
 
 #[derive(Debug, Clone, Args)]

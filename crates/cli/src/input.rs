@@ -7,14 +7,19 @@ use std::path::Path;
 
 /// The text of a file. A device or a pipe, which might never end, and what is too long for a task file are refused.
 pub(crate) fn read(path: &Path) -> Result<String> {
+    read_up_to(path, MAX_SOURCE)
+}
+
+/// As [`read`], where `most` bytes are not too long.
+pub(crate) fn read_up_to(path: &Path, most: usize) -> Result<String> {
     // Asked before it is opened: opening a pipe waits for its writer.
     if !std::fs::metadata(path)?.is_file() {
         return Err(Error::new(ErrorKind::InvalidInput, "not a regular file"));
     }
     let mut bytes = Vec::new();
-    File::open(path)?.take(MAX_SOURCE as u64 + 1).read_to_end(&mut bytes)?;
-    if bytes.len() > MAX_SOURCE {
-        return Err(Error::new(ErrorKind::InvalidData, format!("longer than {MAX_SOURCE} bytes")));
+    File::open(path)?.take(most as u64 + 1).read_to_end(&mut bytes)?;
+    if bytes.len() > most {
+        return Err(Error::new(ErrorKind::InvalidData, format!("longer than {most} bytes")));
     }
     String::from_utf8(bytes).map_err(|error| Error::new(ErrorKind::InvalidData, error))
 }

@@ -108,7 +108,7 @@ fn motion(joint: &urdf_rs::Joint) -> Result<Motion, RobotError> {
     }
 }
 
-fn bodies(link: &urdf_rs::Link) -> Result<Vec<Body>, RobotError> {
+pub(crate) fn bodies(link: &urdf_rs::Link) -> Result<Vec<Body>, RobotError> {
     let body = |collision: &urdf_rs::Collision| {
         let geometry = match &collision.geometry {
             urdf_rs::Geometry::Box { size } => Geometry::Box { half: size.0.map(|s| s / 2.0) },
@@ -129,7 +129,7 @@ fn bodies(link: &urdf_rs::Link) -> Result<Vec<Body>, RobotError> {
     link.collision.iter().map(body).collect()
 }
 
-fn origin(pose: &urdf_rs::Pose) -> Pose {
+pub(crate) fn origin(pose: &urdf_rs::Pose) -> Pose {
     let [roll, pitch, yaw] = pose.rpy.0;
     Pose::from_rpy(pose.xyz.0, roll, pitch, yaw)
 }

@@ -3,6 +3,7 @@
 mod check;
 mod control;
 mod demo;
+mod plan;
 mod reload;
 mod report;
 pub(crate) mod resource;
@@ -37,6 +38,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::State(arguments) => state::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
+        Command::Plan(arguments) => plan::run(&arguments),
         Command::Tables(arguments) => tables::run(&arguments),
         Command::ResourceManager(arguments) => roles::resource_manager(&arguments),
         Command::WorldPool(arguments) => roles::world_pool(&arguments),

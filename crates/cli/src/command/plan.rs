@@ -1,0 +1,198 @@
+//! `ratn plan`: solves a file of planning problems for any robot and says how fast, how short and how well.
+
+use crate::arguments::PlanArguments;
+use crate::failure::Failure;
+use crate::{input, output};
+use ratn_motion::connect::{Budget, ConnectError};
+use ratn_motion::mechanism::Mechanism;
+use ratn_motion::problems::Problems;
+use ratn_motion::trial::{self, Settings, Trial};
+use serde::Serialize;
+use std::path::Path;
+use std::time::Instant;
+
+/// Longest file of problems, and of a robot.
+const MAX_FILE: usize = 256 << 20;
+
+/// A class of problems in numbers.
+#[derive(Debug, Serialize)]
+struct Class {
+    class: String,
+    problems: usize,
+    solved: usize,
+    /// Those whose start or goal touches something.
+    invalid: usize,
+    /// Paths that the exact shapes reject.
+    rejected: usize,
+    plan_us: Spread,
+    simplify_us: Spread,
+    length_rad: Spread,
+    results: Vec<Line>,
+}
+
+/// Over the solved problems; null where there are none.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+struct Spread {
+    median: Option<f64>,
+    p95: Option<f64>,
+}
+
+/// One problem.
+#[derive(Debug, Serialize)]
+struct Line {
+    index: u64,
+    plan_us: f64,
+    simplify_us: f64,
+    iterations: Option<usize>,
+    postures: Option<usize>,
+    length_rad: Option<f64>,
+    /// Why there is no path, or what the exact check found on it.
+    trouble: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    path: Option<Vec<Vec<f64>>>,
+}
+
+/// Solves all problems and prints a line per class.
+pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
+    let urdf = read(&arguments.robot)?;
+    let srdf = arguments.srdf.as_deref().map(read).transpose()?;
+    let problems =
+        Problems::parse(&read(&arguments.problems)?).map_err(|error| refused(&arguments.problems, &error))?;
+    let mechanism =
+        Mechanism::read(&urdf, srdf.as_deref(), &problems.joints).map_err(|error| refused(&arguments.robot, &error))?;
+    let settings = Settings {
+        budget: Budget { iterations: arguments.iterations, seed: arguments.seed },
+        padding_m: arguments.padding_mm * 1e-3,
+        repetitions: arguments.repeat,
+    };
+    let begin = Instant::now();
+    let mut clock = || begin.elapsed().as_secs_f64() * 1e6;
+    let mut classes = Vec::new();
+    for (class, list) in &problems.classes {
+        let trials = list.iter().map(|problem| (problem.index, trial::run(&mechanism, problem, settings, &mut clock)));
+        classes.push(summary(class, trials.collect(), arguments.paths));
+    }
+    if arguments.json {
+        output::result(serde_json::to_string(&classes)?)?;
+    } else {
+        output::result(table(&classes))?;
+    }
+    let rejected: usize = classes.iter().map(|c| c.rejected).sum();
+    if rejected > 0 {
+        return Err(anyhow::anyhow!("{rejected} paths are not free by the exact shapes").into());
+    }
+    Ok(())
+}
+
+fn read(path: &Path) -> Result<String, Failure> {
+    input::read_up_to(path, MAX_FILE).map_err(|error| refused(path, &format!("cannot be read: {error}")))
+}
+
+fn refused(path: &Path, error: &dyn std::fmt::Display) -> Failure {
+    Failure::Refused(format!("{}: {error}", path.display()))
+}
+
+fn summary(class: &str, trials: Vec<(u64, Trial)>, with_paths: bool) -> Class {
+    let found = || trials.iter().filter_map(|(_, t)| t.outcome.as_ref().ok().map(|found| (t, found)));
+    let is_invalid = |t: &Trial| matches!(t.outcome, Err(ConnectError::Start | ConnectError::Goal { .. }));
+    Class {
+        class: class.to_owned(),
+        problems: trials.len(),
+        solved: found().count(),
+        invalid: trials.iter().filter(|(_, t)| is_invalid(t)).count(),
+        rejected: found().filter(|(_, found)| found.touch.is_some()).count(),
+        plan_us: spread(found().map(|(t, _)| t.plan).collect()),
+        simplify_us: spread(found().map(|(t, _)| t.simplify).collect()),
+        length_rad: spread(found().map(|(_, found)| f64::from(found.length_rad)).collect()),
+        results: trials.iter().map(|(index, trial)| line(*index, trial, with_paths)).collect(),
+    }
+}
+
+fn line(index: u64, trial: &Trial, with_paths: bool) -> Line {
+    let found = trial.outcome.as_ref().ok();
+    let trouble = match &trial.outcome {
+        Ok(found) => found.touch.as_ref().map(ToString::to_string),
+        Err(error) => Some(error.to_string()),
+    };
+    Line {
+        index,
+        plan_us: round(trial.plan),
+        simplify_us: round(trial.simplify),
+        iterations: found.map(|f| f.iterations),
+        postures: found.map(|f| f.path.len()),
+        length_rad: found.map(|f| f64::from(f.length_rad)),
+        trouble,
+        path: found.filter(|_| with_paths).map(|f| f.path.clone()),
+    }
+}
+
+/// Nearest ranks.
+fn spread(mut values: Vec<f64>) -> Spread {
+    values.sort_by(f64::total_cmp);
+    let rank = |share: f64| {
+        let rank = (values.len() as f64 * share).ceil() as usize;
+        values.get(rank.saturating_sub(1)).map(|v| round(*v))
+    };
+    Spread { median: rank(0.5), p95: rank(0.95) }
+}
+
+fn round(value: f64) -> f64 {
+    (value * 1e3).round() / 1e3
+}
+
+fn table(classes: &[Class]) -> String {
+    let row = |cells: [String; 9]| {
+        let [name, solved, rest @ ..] = cells;
+        let rest: String = rest.iter().map(|cell| format!("{cell:>10}")).collect();
+        format!("{name:<20}{solved:>9}{rest}")
+    };
+    let head = ["class", "solved", "invalid", "plan µs", "p95", "simplify", "p95", "length", "rejected"];
+    let mut lines = vec![row(head.map(str::to_owned))];
+    for class in classes {
+        let number =
+            |value: Option<f64>, digits: usize| value.map_or_else(|| "-".to_owned(), |v| format!("{v:.digits$}"));
+        lines.push(row([
+            class.class.clone(),
+            format!("{}/{}", class.solved, class.problems),
+            class.invalid.to_string(),
+            number(class.plan_us.median, 0),
+            number(class.plan_us.p95, 0),
+            number(class.simplify_us.median, 0),
+            number(class.simplify_us.p95, 0),
+            number(class.length_rad.median, 2),
+            class.rejected.to_string(),
+        ]));
+    }
+    for class in classes {
+        for line in &class.results {
+            if let Some(trouble) = &line.trouble {
+                lines.push(format!("{} {}: {trouble}", class.class, line.index));
+            }
+        }
+    }
+    lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn medians_and_percentiles_are_nearest_ranks() {
+        assert_eq!(spread(vec![]), Spread { median: None, p95: None });
+        assert_eq!(spread(vec![3.0, 1.0, 2.0]), Spread { median: Some(2.0), p95: Some(3.0) });
+        assert_eq!(spread((1..=100).map(f64::from).collect()), Spread { median: Some(50.0), p95: Some(95.0) });
+    }
+
+    #[test]
+    fn a_problem_without_a_path_counts_as_unsolved_and_says_why() {
+        let trial = Trial { plan: 1.0, simplify: 0.0, outcome: Err(ConnectError::Goal { goals: 1 }) };
+        let class = summary("tight", vec![(7, trial)], false);
+        assert_eq!((class.problems, class.solved, class.invalid), (1, 0, 1));
+        insta::assert_snapshot!(table(&[class]), @r"
+        class                  solved   invalid   plan µs       p95  simplify       p95    length  rejected
+        tight                     0/1         1         -         -         -         -         -         0
+        tight 7: none of the 1 goals is free
+        ");
+    }
+}

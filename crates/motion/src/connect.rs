@@ -1,0 +1,208 @@
+//! RRT-Connect: two trees, one from the start and one from the goals, each growing towards samples and then towards the other
+//! (Kuffner and LaValle, ICRA 2000), with the trees kept balanced (Kuffner and LaValle 2005) and nodes that only take samples
+//! near them once an extension failed (dynamic domain, Yershova et al., ICRA 2005).
+//!
+//! The same space, ends, seed and budget give the same path. The caller is asked every `POLL` iterations whether to go on.
+
+use crate::halton::Halton;
+use crate::pace::Control;
+use crate::space::{Space, State, between, difference, distance, length};
+use crate::tree::Tree;
+
+/// How far a tree grows at once, in radians.
+const RANGE: f32 = 1.0;
+
+/// The dynamic domain: where it begins after a failure, its least size and how fast it changes.
+const DOMAIN: f32 = 4.0;
+const LEAST_DOMAIN: f32 = 1.0;
+const DOMAIN_CHANGE: f32 = 1e-4;
+
+/// Iterations between two questions to the caller: some tens of microseconds.
+const POLL: usize = 32;
+
+/// How often a path with a gap between its postures is mended before the search gives up.
+const MENDINGS: usize = 16;
+
+/// What the search may cost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Budget {
+    /// Samples drawn at most.
+    pub iterations: usize,
+    /// Of the samples.
+    pub seed: u64,
+}
+
+/// A free path.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Route {
+    /// From the start to a goal.
+    pub path: Vec<State>,
+    /// Which goal.
+    pub goal: usize,
+    /// Samples drawn.
+    pub iterations: usize,
+}
+
+/// Why there is no path.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ConnectError {
+    /// The start touches something or is out of the limits.
+    #[error("the start is not free")]
+    Start,
+    /// So do all goals.
+    #[error("none of the {goals} goals is free")]
+    Goal {
+        /// How many there are.
+        goals: usize,
+    },
+    /// The iterations are used up.
+    #[error("no path found in {iterations} iterations; give more, or look whether there is a way at all")]
+    Exhausted {
+        /// How many.
+        iterations: usize,
+    },
+    /// The caller's time is up.
+    #[error("no path found in the time given ({iterations} iterations)")]
+    TimeUp {
+        /// How many.
+        iterations: usize,
+    },
+    /// The caller gave up.
+    #[error("the search was cancelled")]
+    Cancelled,
+}
+
+/// Searches a path from `start` to the nearest goals. `control` gets the iterations so far.
+///
+/// # Errors
+/// [`ConnectError`] says why there is none.
+pub fn connect(
+    space: &mut Space,
+    start: &State,
+    goals: &[State],
+    budget: Budget,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<Route, ConnectError> {
+    if !space.is_within(start) || !space.is_free(start) {
+        return Err(ConnectError::Start);
+    }
+    let mut free: Vec<usize> = (0..goals.len()).filter(|g| space.is_within(&goals[*g])).collect();
+    free.retain(|g| space.is_free(&goals[*g]));
+    free.sort_by(|a, b| distance(start, &goals[*a]).total_cmp(&distance(start, &goals[*b])));
+    if free.is_empty() {
+        return Err(ConnectError::Goal { goals: goals.len() });
+    }
+    for &goal in &free {
+        if space.is_free_motion(start, &goals[goal]) {
+            return Ok(Route { path: vec![*start, goals[goal]], goal, iterations: 0 });
+        }
+    }
+    let ends: Vec<State> = free.iter().map(|g| goals[*g]).collect();
+    let (path, iterations) = grow(space, start, &ends, budget, control)?;
+    let last = path[path.len() - 1];
+    let goal = free.iter().copied().find(|g| goals[*g] == last).unwrap_or(free[0]);
+    Ok(Route { path, goal, iterations })
+}
+
+/// Makes sure that a path is free also between its postures: motions that are not are searched anew, finely.
+///
+/// # Errors
+/// As [`connect`], where a motion cannot be mended.
+pub fn mend(
+    space: &mut Space,
+    path: &[State],
+    budget: Budget,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<Vec<State>, ConnectError> {
+    let mut whole = vec![path[0]];
+    let mut mended = 0;
+    for pair in path.windows(2) {
+        if space.is_swept_free(&pair[0], &pair[1]) {
+            whole.push(pair[1]);
+            continue;
+        }
+        mended += 1;
+        if mended > MENDINGS {
+            return Err(ConnectError::Exhausted { iterations: budget.iterations });
+        }
+        space.set_swept(true);
+        let detour = connect(space, &pair[0], &pair[1..], budget, control);
+        space.set_swept(false);
+        whole.extend_from_slice(&detour?.path[1..]);
+    }
+    Ok(whole)
+}
+
+fn grow(
+    space: &mut Space,
+    start: &State,
+    ends: &[State],
+    budget: Budget,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<(Vec<State>, usize), ConnectError> {
+    let joints = space.joints();
+    let (lower, upper) = (*space.limits().0, *space.limits().1);
+    let mut samples = Halton::new(joints, budget.seed);
+    let mut trees = [Tree::new(space.isa(), joints), Tree::new(space.isa(), joints)];
+    trees[0].push(*start, 0);
+    for (i, end) in ends.iter().enumerate() {
+        trees[1].push(*end, i);
+    }
+    // Which tree grows towards the sample.
+    let mut growing = 1;
+    for iteration in 1..=budget.iterations {
+        if iteration % POLL == 0 {
+            match control(iteration) {
+                Control::Continue => {}
+                Control::TimeUp => return Err(ConnectError::TimeUp { iterations: iteration }),
+                Control::Cancelled => return Err(ConnectError::Cancelled),
+            }
+        }
+        let (own, others) = (trees[growing].len(), trees[1 - growing].len());
+        if own.abs_diff(others) < own {
+            growing = 1 - growing;
+        }
+        let sample = samples.next(&lower, &upper);
+        let (first, second) = trees.split_at_mut(1);
+        let (tree, other) = if growing == 0 { (&mut first[0], &second[0]) } else { (&mut second[0], &first[0]) };
+        let (near, far) = tree.nearest(&sample);
+        if tree.radii[near] < far {
+            continue;
+        }
+        let from = tree.states[near];
+        let to = if far <= RANGE { sample } else { between(&from, &sample, RANGE / far) };
+        if !space.is_free_motion(&from, &to) {
+            let radius = &mut tree.radii[near];
+            *radius = if radius.is_infinite() { DOMAIN } else { (*radius * (1.0 - DOMAIN_CHANGE)).max(LEAST_DOMAIN) };
+            continue;
+        }
+        let mut node = tree.push(to, near);
+        if tree.radii[near].is_finite() {
+            tree.radii[near] *= 1.0 + DOMAIN_CHANGE;
+        }
+        let (meeting, gap) = other.nearest(&to);
+        let goal = other.states[meeting];
+        let steps = (gap / RANGE).ceil().max(1.0) as usize;
+        let mut reached = to;
+        let joined = (1..=steps).all(|step| {
+            let next = if step == steps { goal } else { between(&to, &goal, step as f32 / steps as f32) };
+            let free = space.is_free_motion(&reached, &next);
+            if free && step < steps {
+                node = tree.push(next, node);
+                reached = next;
+            }
+            free
+        });
+        if joined {
+            let (mut path, rest) = (tree.branch(node), other.branch(meeting));
+            path.reverse();
+            path.extend(rest);
+            if growing == 1 {
+                path.reverse();
+            }
+            path.dedup_by(|a, b| length(&difference(a, b)) == 0.0);
+            return Ok((path, iteration));
+        }
+    }
+    Err(ConnectError::Exhausted { iterations: budget.iterations })
+}

@@ -1,0 +1,123 @@
+//! The slow and exact check: every shape of the robot as the URDF has it, against every obstacle, by parry3d.
+//!
+//! It confirms what the vector kernels found, and says what touches what and how deep.
+
+use crate::frame::compose;
+use crate::mechanism::Mechanism;
+use crate::robot::to_f32;
+use crate::space::Obstacle;
+use parry3d::math::Pose as Pose32;
+use parry3d::query;
+use parry3d::shape::SharedShape;
+use ratn_model::pose::Pose;
+use std::fmt;
+
+/// Two things that touch.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Touch {
+    /// A link of the robot.
+    pub link: String,
+    /// An obstacle or another link.
+    pub other: String,
+    /// How far one is inside the other, in metres.
+    pub depth_m: f64,
+}
+
+impl fmt::Display for Touch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} is {:.1} mm inside {}", self.link, self.depth_m * 1e3, self.other)
+    }
+}
+
+/// A robot among obstacles, exactly.
+#[derive(Debug)]
+pub struct Exact<'a> {
+    mechanism: &'a Mechanism,
+    obstacles: Vec<Solid<'a>>,
+    /// Per link.
+    bodies: Vec<Vec<(Pose, SharedShape)>>,
+}
+
+#[derive(Debug)]
+struct Solid<'a> {
+    name: &'a str,
+    pose: Pose32,
+    shape: SharedShape,
+}
+
+impl<'a> Exact<'a> {
+    /// A robot among obstacles.
+    pub fn new(mechanism: &'a Mechanism, obstacles: &'a [Obstacle]) -> Exact<'a> {
+        let solid = |obstacle: &'a Obstacle| {
+            let body = obstacle.geometry.at(obstacle.pose);
+            Solid { name: &obstacle.name, pose: to_f32(&body.pose), shape: body.geometry.shape(0.0) }
+        };
+        let bodies =
+            |link: &crate::mechanism::Part| link.bodies.iter().map(|b| (b.pose, b.geometry.shape(0.0))).collect();
+        Exact {
+            mechanism,
+            obstacles: obstacles.iter().map(solid).collect(),
+            bodies: mechanism.links.iter().map(bodies).collect(),
+        }
+    }
+
+    /// What touches first in a posture, if anything.
+    pub fn touch(&self, positions: &[f64]) -> Option<Touch> {
+        let poses = self.mechanism.poses(positions);
+        let placed: Vec<Vec<(Pose32, &SharedShape)>> = self
+            .bodies
+            .iter()
+            .zip(&poses)
+            .map(|(bodies, pose)| bodies.iter().map(|(at, shape)| (to_f32(&compose(pose, at)), shape)).collect())
+            .collect();
+        let name = |link: usize| self.mechanism.links[link].name.clone();
+        for (link, bodies) in placed.iter().enumerate() {
+            for (pose, shape) in bodies {
+                for solid in &self.obstacles {
+                    if let Some(depth_m) = depth(pose, shape, &solid.pose, &solid.shape) {
+                        return Some(Touch { link: name(link), other: solid.name.to_owned(), depth_m });
+                    }
+                }
+                for (second, others) in placed.iter().enumerate().skip(link + 1) {
+                    if !self.mechanism.is_checked(link, second) {
+                        continue;
+                    }
+                    for (at, other) in others {
+                        if let Some(depth_m) = depth(pose, shape, at, other) {
+                            return Some(Touch { link: name(link), other: name(second), depth_m });
+                        }
+                    }
+                }
+            }
+        }
+        None
+    }
+
+    /// What touches first along a path, looked at `per_radian` times per radian.
+    pub fn touch_along(&self, path: &[Vec<f64>], per_radian: f64) -> Option<Touch> {
+        let start = path.first().and_then(|first| self.touch(first));
+        start.or_else(|| {
+            path.windows(2).find_map(|pair| {
+                let way: f64 = pair[0].iter().zip(&pair[1]).map(|(a, b)| (b - a).powi(2)).sum::<f64>().sqrt();
+                let steps = (way * per_radian).ceil().max(1.0) as usize;
+                (1..=steps).find_map(|i| {
+                    let t = i as f64 / steps as f64;
+                    let posture: Vec<f64> = pair[0].iter().zip(&pair[1]).map(|(a, b)| a + (b - a) * t).collect();
+                    self.touch(&posture)
+                })
+            })
+        })
+    }
+}
+
+/// How deep two shapes are in each other, if they touch; a pair that parry cannot decide counts as touching.
+fn depth(a: &Pose32, first: &SharedShape, b: &Pose32, second: &SharedShape) -> Option<f64> {
+    match query::intersection_test(a, &**first, b, &**second) {
+        Ok(found) if !found.intersecting => None,
+        Ok(_) => {
+            let contact = query::contact(a, &**first, b, &**second, 0.0).ok().flatten();
+            Some(contact.map_or(0.0, |c| -f64::from(c.dist)))
+        }
+        Err(_) => Some(0.0),
+    }
+}

@@ -1,0 +1,280 @@
+//! Any robot, from its URDF and SRDF: a tree of links moved by the joints that are planned for, bounding spheres for the fast
+//! checks, the exact shapes for the others, and the pairs of links that may meet.
+//!
+//! Joints that are not planned for stay at zero, or at the limit next to it. Without an SRDF, links that are neighbours or
+//! that meet at the middle of all limits are taken as made so.
+
+use crate::frame::compose;
+use crate::geometry::Body;
+use crate::robot::Joint;
+use crate::spheres::{self, Sphere};
+use crate::urdf::{self, RobotError};
+use ratn_model::pose::Pose;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Joints that can be planned for at once.
+pub const MAX_JOINTS: usize = 16;
+
+/// Limits of a joint that has none, in radians: a whole turn.
+const ENDLESS_RAD: f64 = std::f64::consts::PI;
+
+/// Where a URDF names no acceleration, the speed is reached in this time, in seconds.
+const TIME_TO_SPEED_S: f64 = 0.25;
+
+/// A robot.
+#[derive(Debug, Clone)]
+pub struct Mechanism {
+    /// As in the URDF.
+    pub name: String,
+    /// What is planned for, in the caller's order.
+    pub joints: Vec<Joint>,
+    /// Parents before children.
+    pub links: Vec<Part>,
+    /// Pairs of links, the lower index first, that are never checked against each other.
+    pub disabled: BTreeSet<(usize, usize)>,
+}
+
+/// A rigid link.
+#[derive(Debug, Clone)]
+pub struct Part {
+    /// As in the URDF.
+    pub name: String,
+    /// The link it hangs on.
+    pub parent: Option<usize>,
+    /// Where its joint sits in the parent's frame.
+    pub origin: Pose,
+    /// The planned joint that moves it.
+    pub drive: Option<Drive>,
+    /// What can collide, exactly.
+    pub bodies: Vec<Body>,
+    /// Spheres that hold all of it.
+    pub spheres: Vec<Sphere>,
+}
+
+/// How a planned joint moves a link.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Drive {
+    /// Index of the joint.
+    pub joint: usize,
+    /// Unit vector.
+    pub axis: [f64; 3],
+    /// Along the axis instead of about it.
+    pub slides: bool,
+}
+
+/// Why there is no robot.
+#[derive(Debug, thiserror::Error)]
+pub enum MechanismError {
+    /// The URDF says nothing that can be used.
+    #[error(transparent)]
+    Robot(#[from] RobotError),
+    /// The SRDF is not XML.
+    #[error("the SRDF is not valid XML: {0}")]
+    Srdf(String),
+    /// Too many joints.
+    #[error("{count} joints are to be planned for: at most {MAX_JOINTS} are supported")]
+    TooMany {
+        /// How many.
+        count: usize,
+    },
+}
+
+impl Mechanism {
+    /// Reads a robot; `joints` are planned for, without any all that move and follow no other.
+    ///
+    /// # Errors
+    /// [`MechanismError`] names the joint or link that is missing or not supported.
+    pub fn read(urdf: &str, srdf: Option<&str>, joints: &[String]) -> Result<Mechanism, MechanismError> {
+        let description = urdf_rs::read_from_string(urdf).map_err(RobotError::Urdf)?;
+        let moves = |j: &&urdf_rs::Joint| j.joint_type != urdf_rs::JointType::Fixed && j.mimic.is_none();
+        let names: Vec<String> = if joints.is_empty() {
+            description.joints.iter().filter(moves).map(|j| j.name.clone()).collect()
+        } else {
+            joints.to_vec()
+        };
+        if names.len() > MAX_JOINTS {
+            return Err(MechanismError::TooMany { count: names.len() });
+        }
+        let joints = names.iter().map(|name| limits(&description, name)).collect::<Result<Vec<_>, _>>()?;
+        let links = links(&description, &names)?;
+        let mut mechanism = Mechanism { name: description.name.clone(), joints, links, disabled: BTreeSet::new() };
+        mechanism.disabled = match srdf {
+            Some(text) => mechanism.listed(text)?,
+            None => mechanism.touching(),
+        };
+        Ok(mechanism)
+    }
+
+    /// Poses of all links, in their order; `positions` in the order of the joints.
+    pub fn poses(&self, positions: &[f64]) -> Vec<Pose> {
+        let mut poses: Vec<Pose> = Vec::with_capacity(self.links.len());
+        for link in &self.links {
+            let moved = match link.drive {
+                None => link.origin,
+                Some(Drive { joint, axis, slides: true }) => {
+                    let [x, y, z] = axis.map(|c| c * positions[joint]);
+                    compose(&link.origin, &Pose::at(x, y, z))
+                }
+                Some(Drive { joint, axis, slides: false }) => compose(&link.origin, &turn(axis, positions[joint])),
+            };
+            poses.push(link.parent.map_or(moved, |parent| compose(&poses[parent], &moved)));
+        }
+        poses
+    }
+
+    /// Whether two links are to be kept apart.
+    pub fn is_checked(&self, a: usize, b: usize) -> bool {
+        a != b && !self.disabled.contains(&(a.min(b), a.max(b)))
+    }
+
+    fn listed(&self, srdf: &str) -> Result<BTreeSet<(usize, usize)>, MechanismError> {
+        let index: BTreeMap<&str, usize> = self.links.iter().enumerate().map(|(i, l)| (l.name.as_str(), i)).collect();
+        let mut pairs = BTreeSet::new();
+        for event in xml::EventReader::from_str(srdf) {
+            let event = event.map_err(|error| MechanismError::Srdf(error.to_string()))?;
+            let xml::reader::XmlEvent::StartElement { name, attributes, .. } = event else { continue };
+            if name.local_name != "disable_collisions" {
+                continue;
+            }
+            let link = |key: &str| attributes.iter().find(|a| a.name.local_name == key).map(|a| a.value.as_str());
+            // An SRDF may speak of links that this variant of the robot does not have.
+            let pair = (link("link1").and_then(|l| index.get(l)), link("link2").and_then(|l| index.get(l)));
+            if let (Some(&a), Some(&b)) = pair {
+                pairs.insert((a.min(b), a.max(b)));
+            }
+        }
+        Ok(pairs)
+    }
+
+    /// Pairs that the robot is made to have in touch.
+    fn touching(&self) -> BTreeSet<(usize, usize)> {
+        let middle: Vec<f64> = self.joints.iter().map(|j| (j.lower + j.upper) / 2.0).collect();
+        let poses = self.poses(&middle);
+        let meet = |a: usize, b: usize| {
+            self.links[a].spheres.iter().any(|s| {
+                let at = poses[a].transform(s.centre);
+                self.links[b].spheres.iter().any(|o| {
+                    let gap: f64 = (0..3).map(|i| (at[i] - poses[b].transform(o.centre)[i]).powi(2)).sum();
+                    gap < (s.radius + o.radius).powi(2)
+                })
+            })
+        };
+        let mut pairs = BTreeSet::new();
+        for b in 0..self.links.len() {
+            for a in 0..b {
+                if self.solid_parent(b) == Some(a) || self.solid_parent(a) == Some(b) || meet(a, b) {
+                    pairs.insert((a, b));
+                }
+            }
+        }
+        pairs
+    }
+
+    /// The next link towards the root that has a shape.
+    fn solid_parent(&self, link: usize) -> Option<usize> {
+        let mut next = self.links[link].parent;
+        while let Some(parent) = next.filter(|p| self.links[*p].bodies.is_empty()) {
+            next = self.links[parent].parent;
+        }
+        next
+    }
+}
+
+/// A turn about a unit vector.
+fn turn(axis: [f64; 3], angle: f64) -> Pose {
+    let (s, c) = (angle / 2.0).sin_cos();
+    Pose { position: [0.0; 3], quaternion_xyzw: [axis[0] * s, axis[1] * s, axis[2] * s, c] }
+}
+
+fn joint<'u>(urdf: &'u urdf_rs::Robot, name: &str) -> Result<&'u urdf_rs::Joint, RobotError> {
+    let found = urdf.joints.iter().find(|j| j.name == name);
+    found.ok_or_else(|| RobotError::Missing { what: "joint", name: name.to_owned() })
+}
+
+fn limits(urdf: &urdf_rs::Robot, name: &str) -> Result<Joint, RobotError> {
+    let joint = joint(urdf, name)?;
+    let limit = &joint.limit;
+    let endless = joint.joint_type == urdf_rs::JointType::Continuous;
+    let (lower, upper) = if endless { (-ENDLESS_RAD, ENDLESS_RAD) } else { (limit.lower, limit.upper) };
+    let reason = if joint.mimic.is_some() {
+        "it follows another joint and cannot be planned for"
+    } else if !(lower < upper && lower.is_finite() && upper.is_finite()) {
+        "its lower limit is not below its upper limit"
+    } else {
+        let velocity = if limit.velocity > 0.0 { limit.velocity } else { 1.0 };
+        let given = limit.acceleration;
+        let acceleration = if given > 0.0 { given } else { velocity / TIME_TO_SPEED_S };
+        return Ok(Joint { name: name.to_owned(), lower, upper, velocity, acceleration });
+    };
+    Err(RobotError::Unsupported { what: "joint", name: name.to_owned(), reason })
+}
+
+fn links(urdf: &urdf_rs::Robot, names: &[String]) -> Result<Vec<Part>, RobotError> {
+    let children: BTreeSet<&str> = urdf.joints.iter().map(|j| j.child.link.as_str()).collect();
+    let root = urdf.links.iter().find(|l| !children.contains(l.name.as_str()));
+    let root = root.ok_or_else(|| RobotError::Missing { what: "link", name: "without a parent".to_owned() })?;
+    let mut links = vec![part(root, None, Pose::IDENTITY, None)?];
+    let mut next = 0;
+    while next < links.len() {
+        let parent = links[next].name.clone();
+        for joint in urdf.joints.iter().filter(|j| j.parent.link == parent) {
+            let name = &joint.child.link;
+            let child = urdf.links.iter().find(|l| l.name == *name);
+            let child = child.ok_or_else(|| RobotError::Missing { what: "link", name: name.clone() })?;
+            if links.iter().any(|l| l.name == *name) {
+                let reason = "a link has two parents";
+                return Err(RobotError::Unsupported { what: "link", name: name.clone(), reason });
+            }
+            let (origin, drive) = drive(urdf, joint, names)?;
+            links.push(part(child, Some(next), origin, drive)?);
+        }
+        next += 1;
+    }
+    Ok(links)
+}
+
+fn part(link: &urdf_rs::Link, parent: Option<usize>, origin: Pose, drive: Option<Drive>) -> Result<Part, RobotError> {
+    let bodies = urdf::bodies(link)?;
+    let spheres = bodies.iter().flat_map(spheres::cover).collect();
+    Ok(Part { name: link.name.clone(), parent, origin, drive, bodies, spheres })
+}
+
+/// Where a joint is, and what moves it.
+fn drive(urdf: &urdf_rs::Robot, joint: &urdf_rs::Joint, names: &[String]) -> Result<(Pose, Option<Drive>), RobotError> {
+    let origin = urdf::origin(&joint.origin);
+    let unsupported = |reason| RobotError::Unsupported { what: "joint", name: joint.name.clone(), reason };
+    let slides = match joint.joint_type {
+        urdf_rs::JointType::Fixed => return Ok((origin, None)),
+        urdf_rs::JointType::Prismatic => true,
+        urdf_rs::JointType::Revolute | urdf_rs::JointType::Continuous => false,
+        _ => return Err(unsupported("only fixed, revolute, continuous and prismatic joints are known")),
+    };
+    let length = joint.axis.xyz.0.iter().map(|c| c * c).sum::<f64>().sqrt();
+    if length < 1e-9 {
+        return Err(unsupported("its axis has no length"));
+    }
+    let axis = joint.axis.xyz.0.map(|c| c / length);
+    let (driver, factor, offset) = match &joint.mimic {
+        None => (&joint.name, 1.0, 0.0),
+        Some(mimic) => (&mimic.joint, mimic.multiplier.unwrap_or(1.0), mimic.offset.unwrap_or(0.0)),
+    };
+    if let Some(index) = names.iter().position(|name| name == driver) {
+        if factor != 1.0 || offset != 0.0 {
+            return Err(unsupported("it mimics a planned joint by a factor or an offset"));
+        }
+        return Ok((origin, Some(Drive { joint: index, axis, slides })));
+    }
+    let resting = self::joint(urdf, driver)?;
+    let rest = match resting.joint_type {
+        urdf_rs::JointType::Continuous => 0.0,
+        _ => 0.0_f64.max(resting.limit.lower).min(resting.limit.upper),
+    };
+    let position = factor * rest + offset;
+    let moved = if slides {
+        let [x, y, z] = axis.map(|c| c * position);
+        Pose::at(x, y, z)
+    } else {
+        turn(axis, position)
+    };
+    Ok((origin.compose(&moved), None))
+}

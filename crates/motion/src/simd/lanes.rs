@@ -1,0 +1,298 @@
+//! Several `f32` side by side, and which instructions this processor has for them.
+//!
+//! The only file of the crate with unsafe code, for two reasons: the vector intrinsics of `core::arch` may be called only where
+//! the processor has them, which [`Isa::detect`] establishes once and nothing else can make an [`Isa`]; and loads and stores
+//! take pointers, here always to a whole [`Block`]. The kernels themselves are safe, generic over [`Lanes`] and inlined into one
+//! function per instruction set.
+
+#![allow(unsafe_code, reason = "vector intrinsics behind a detected instruction set, see above")]
+
+use super::kernel::{self, Edge, Scratch};
+use super::nearest;
+
+/// Sixteen numbers on one cache line; narrower lanes use the first of them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[repr(C, align(64))]
+pub(crate) struct Block(pub(crate) [f32; 16]);
+
+/// Numbers side by side. Masks have one bit per lane.
+pub(super) trait Lanes: Copy {
+    const WIDTH: usize;
+    fn splat(value: f32) -> Self;
+    fn load(block: &Block) -> Self;
+    fn store(self, block: &mut Block);
+    fn add(self, other: Self) -> Self;
+    fn sub(self, other: Self) -> Self;
+    fn mul(self, other: Self) -> Self;
+    /// `self * factor + term`, rounded once where the processor does.
+    fn mul_add(self, factor: Self, term: Self) -> Self;
+    fn max(self, other: Self) -> Self;
+    fn sqrt(self) -> Self;
+    fn below(self, other: Self) -> u32;
+    /// The greatest lane.
+    fn peak(self) -> f32;
+    #[inline(always)]
+    fn abs(self) -> Self {
+        self.max(Self::splat(0.0).sub(self))
+    }
+}
+
+/// Instructions that this processor was found to have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Isa(Kind);
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    Plain,
+}
+
+impl Isa {
+    /// The widest of this processor.
+    pub fn detect() -> Isa {
+        Isa::available()[0]
+    }
+
+    /// All of this processor, the widest first; the last is the plain one.
+    pub fn available() -> Vec<Isa> {
+        let mut all = Vec::new();
+        #[cfg(target_arch = "x86_64")]
+        {
+            if std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("fma") {
+                all.push(Isa(Kind::Avx512));
+            }
+            if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
+                all.push(Isa(Kind::Avx2));
+            }
+        }
+        all.push(Isa(Kind::Plain));
+        all
+    }
+
+    /// How many configurations are checked at once.
+    pub fn width(self) -> usize {
+        match self.0 {
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx512 => 16,
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx2 => 8,
+            Kind::Plain => 8,
+        }
+    }
+
+    /// See [`kernel::is_free`].
+    #[inline]
+    pub(crate) fn is_free(self, edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
+        match self.0 {
+            // SAFETY: an `Isa` of this kind exists only where `available` found the features.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx512 => unsafe { is_free_avx512(edge, scratch) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx2 => unsafe { is_free_avx2(edge, scratch) },
+            Kind::Plain => kernel::is_free::<[f32; 8]>(edge, scratch),
+        }
+    }
+
+    /// See [`nearest::nearest`].
+    #[inline]
+    pub(crate) fn nearest(self, blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> (usize, f32) {
+        match self.0 {
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx512 => unsafe { nearest_avx512(blocks, dimensions, count, to) },
+            _ => nearest::nearest(blocks, dimensions, count, to),
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx2,fma")]
+fn is_free_avx512(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
+    kernel::is_free::<x86::Wide16>(edge, scratch)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn is_free_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
+    kernel::is_free::<x86::Wide8>(edge, scratch)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx2")]
+fn nearest_avx512(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> (usize, f32) {
+    nearest::nearest(blocks, dimensions, count, to)
+}
+
+impl Lanes for [f32; 8] {
+    const WIDTH: usize = 8;
+    #[inline(always)]
+    fn splat(value: f32) -> Self {
+        [value; 8]
+    }
+    #[inline(always)]
+    fn load(block: &Block) -> Self {
+        std::array::from_fn(|i| block.0[i])
+    }
+    #[inline(always)]
+    fn store(self, block: &mut Block) {
+        block.0[..8].copy_from_slice(&self);
+    }
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        std::array::from_fn(|i| self[i] + other[i])
+    }
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        std::array::from_fn(|i| self[i] - other[i])
+    }
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        std::array::from_fn(|i| self[i] * other[i])
+    }
+    #[inline(always)]
+    fn mul_add(self, factor: Self, term: Self) -> Self {
+        // Not `f32::mul_add`: without the instruction it is a library call.
+        std::array::from_fn(|i| self[i] * factor[i] + term[i])
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        std::array::from_fn(|i| if self[i] > other[i] { self[i] } else { other[i] })
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.map(f32::sqrt)
+    }
+    #[inline(always)]
+    fn below(self, other: Self) -> u32 {
+        (0..8).fold(0, |mask, i| mask | u32::from(self[i] < other[i]) << i)
+    }
+    #[inline(always)]
+    fn peak(self) -> f32 {
+        self.into_iter().fold(f32::NEG_INFINITY, f32::max)
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    //! SAFETY of every block here: the methods are inlined into functions that have the features, see above; pointers are to
+    //! the sixteen numbers of a block.
+
+    use super::{Block, Lanes};
+    use core::arch::x86_64::*;
+
+    #[derive(Clone, Copy)]
+    pub(super) struct Wide16(__m512);
+
+    impl Lanes for Wide16 {
+        const WIDTH: usize = 16;
+        #[inline(always)]
+        fn splat(value: f32) -> Self {
+            Wide16(unsafe { _mm512_set1_ps(value) })
+        }
+        #[inline(always)]
+        fn load(block: &Block) -> Self {
+            Wide16(unsafe { _mm512_load_ps(block.0.as_ptr()) })
+        }
+        #[inline(always)]
+        fn store(self, block: &mut Block) {
+            unsafe { _mm512_store_ps(block.0.as_mut_ptr(), self.0) }
+        }
+        #[inline(always)]
+        fn add(self, other: Self) -> Self {
+            Wide16(unsafe { _mm512_add_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn sub(self, other: Self) -> Self {
+            Wide16(unsafe { _mm512_sub_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn mul(self, other: Self) -> Self {
+            Wide16(unsafe { _mm512_mul_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn mul_add(self, factor: Self, term: Self) -> Self {
+            Wide16(unsafe { _mm512_fmadd_ps(self.0, factor.0, term.0) })
+        }
+        #[inline(always)]
+        fn max(self, other: Self) -> Self {
+            Wide16(unsafe { _mm512_max_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn sqrt(self) -> Self {
+            Wide16(unsafe { _mm512_sqrt_ps(self.0) })
+        }
+        #[inline(always)]
+        fn below(self, other: Self) -> u32 {
+            u32::from(unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn peak(self) -> f32 {
+            unsafe { _mm512_reduce_max_ps(self.0) }
+        }
+        #[inline(always)]
+        fn abs(self) -> Self {
+            Wide16(unsafe { _mm512_abs_ps(self.0) })
+        }
+    }
+
+    #[derive(Clone, Copy)]
+    pub(super) struct Wide8(__m256);
+
+    impl Lanes for Wide8 {
+        const WIDTH: usize = 8;
+        #[inline(always)]
+        fn splat(value: f32) -> Self {
+            Wide8(unsafe { _mm256_set1_ps(value) })
+        }
+        #[inline(always)]
+        fn load(block: &Block) -> Self {
+            Wide8(unsafe { _mm256_load_ps(block.0.as_ptr()) })
+        }
+        #[inline(always)]
+        fn store(self, block: &mut Block) {
+            unsafe { _mm256_store_ps(block.0.as_mut_ptr(), self.0) }
+        }
+        #[inline(always)]
+        fn add(self, other: Self) -> Self {
+            Wide8(unsafe { _mm256_add_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn sub(self, other: Self) -> Self {
+            Wide8(unsafe { _mm256_sub_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn mul(self, other: Self) -> Self {
+            Wide8(unsafe { _mm256_mul_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn mul_add(self, factor: Self, term: Self) -> Self {
+            Wide8(unsafe { _mm256_fmadd_ps(self.0, factor.0, term.0) })
+        }
+        #[inline(always)]
+        fn max(self, other: Self) -> Self {
+            Wide8(unsafe { _mm256_max_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn sqrt(self) -> Self {
+            Wide8(unsafe { _mm256_sqrt_ps(self.0) })
+        }
+        #[inline(always)]
+        fn below(self, other: Self) -> u32 {
+            (unsafe { _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LT_OQ>(self.0, other.0)) }) as u32
+        }
+        #[inline(always)]
+        fn peak(self) -> f32 {
+            let mut block = Block([f32::NEG_INFINITY; 16]);
+            self.store(&mut block);
+            block.0.into_iter().fold(f32::NEG_INFINITY, f32::max)
+        }
+        #[inline(always)]
+        fn abs(self) -> Self {
+            Wide8(unsafe { _mm256_andnot_ps(_mm256_set1_ps(-0.0), self.0) })
+        }
+    }
+}

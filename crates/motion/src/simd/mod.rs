@@ -1,0 +1,11 @@
+//! What is computed for several configurations at once: collision of postures along an edge ([`kernel`]), nearest neighbours
+//! ([`nearest`]). [`lanes`] has the vectors and picks the instructions at run time.
+
+mod kernel;
+mod lanes;
+mod nearest;
+
+pub(crate) use kernel::{Compiled, Edge, Frame, Group, Obstacle, Scratch, SelfPair};
+pub(crate) use lanes::Block;
+#[allow(unreachable_pub, reason = "`space` makes it public")]
+pub use lanes::Isa;

@@ -1,0 +1,386 @@
+//! A robot among obstacles, made ready for the vector kernels: which postures and straight motions are free.
+//!
+//! Two ways to check a motion. [`Space::is_free_motion`] looks at [`Space::RESOLUTION`] postures per radian, as the search
+//! does. [`Space::is_swept_free`] leaves nothing between the postures: each sphere is grown by how far it can move until the
+//! next one, and where that is too much the motion is cut finer, down to postures so close that what is between is noise.
+
+use crate::geometry::Geometry;
+use crate::mechanism::{MAX_JOINTS, Mechanism};
+pub use crate::simd::Isa;
+use crate::simd::{self, Compiled, Edge, Frame, Group, Scratch, SelfPair};
+use ratn_model::pose::Pose;
+
+/// Positions in the order of the joints; unused ones are zero.
+pub type State = [f32; MAX_JOINTS];
+
+/// Grown by this, the spheres hide the rounding of `f32`, in metres.
+const ROUNDING_M: f64 = 2e-5;
+
+/// How much finer each level of a swept check is than the one before, and how many levels there are.
+const FINER: usize = 4;
+const LEVELS: usize = 4;
+
+/// Postures of the widest batch.
+const WIDEST: usize = 16;
+
+/// Something that stands still.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Obstacle {
+    /// For messages.
+    pub name: String,
+    /// Its centre; axes along z.
+    pub pose: Pose,
+    /// Its shape.
+    pub geometry: Geometry,
+}
+
+/// A robot among obstacles.
+#[derive(Debug, Clone)]
+pub struct Space {
+    compiled: Compiled,
+    scratch: Scratch,
+    isa: Isa,
+    /// Per group and joint: how far a point of the group moves at most for one radian (or metre) of the joint.
+    lever: Vec<[f32; MAX_JOINTS]>,
+    inflate: Vec<f32>,
+    lower: State,
+    upper: State,
+    /// A part that no joint moves stands in an obstacle.
+    blocked: bool,
+    swept: bool,
+}
+
+impl Space {
+    /// Postures per radian of a motion that the search looks at.
+    pub const RESOLUTION: f32 = 32.0;
+
+    /// A robot, its shapes grown by `padding_m` (metres), among obstacles.
+    pub fn new(mechanism: &Mechanism, obstacles: &[Obstacle], padding_m: f64) -> Space {
+        Space::with_isa(mechanism, obstacles, padding_m, Isa::detect())
+    }
+
+    /// As [`Space::new`], with instructions that are not the widest.
+    pub fn with_isa(mechanism: &Mechanism, obstacles: &[Obstacle], padding_m: f64, isa: Isa) -> Space {
+        let compiled_obstacles: Vec<simd::Obstacle> = obstacles.iter().map(compile_obstacle).collect();
+        let (mut compiled, reaches, links) = compile_robot(mechanism, padding_m + ROUNDING_M);
+        let count = obstacles.len();
+        compiled.nearest = vec![f32::INFINITY; count * compiled.groups.len()];
+        let mut blocked = false;
+        for (index, group) in compiled.groups.iter_mut().enumerate() {
+            let nearest = &mut compiled.nearest[index * count..(index + 1) * count];
+            for (o, obstacle) in obstacles.iter().enumerate() {
+                nearest[o] = (gap(obstacle, group.anchor.map(f64::from)) - 1e-4) as f32;
+                if group.frame == 0 {
+                    let touches =
+                        |s: &[f32; 4]| gap(obstacle, std::array::from_fn(|i| f64::from(s[i]))) < f64::from(s[3]);
+                    blocked |= group.fine.iter().any(touches);
+                } else if nearest[o] <= reaches[index] {
+                    let list = if is_cylinder(obstacle) { &mut group.cylinders } else { &mut group.rounded };
+                    list.push(o as u16);
+                }
+            }
+            for list in [&mut group.rounded, &mut group.cylinders] {
+                list.sort_by(|a, b| nearest[usize::from(*a)].total_cmp(&nearest[usize::from(*b)]));
+            }
+        }
+        compiled.obstacles = compiled_obstacles;
+        compiled.pairs = pairs(mechanism, &compiled.groups, &links);
+        let lever = levers(&compiled);
+        let (mut lower, mut upper) = ([0.0; MAX_JOINTS], [0.0; MAX_JOINTS]);
+        for (j, joint) in mechanism.joints.iter().enumerate() {
+            (lower[j], upper[j]) = (joint.lower as f32, joint.upper as f32);
+        }
+        let scratch = Scratch::new(&compiled);
+        let inflate = vec![0.0; compiled.groups.len()];
+        Space { compiled, scratch, isa, lever, inflate, lower, upper, blocked, swept: false }
+    }
+
+    /// How many joints there are.
+    pub fn joints(&self) -> usize {
+        self.compiled.joints
+    }
+
+    /// Least and greatest positions.
+    pub fn limits(&self) -> (&State, &State) {
+        (&self.lower, &self.upper)
+    }
+
+    /// The instructions in use.
+    pub fn isa(&self) -> Isa {
+        self.isa
+    }
+
+    /// From now on [`Space::is_free_motion`] leaves nothing between the postures.
+    pub fn set_swept(&mut self, swept: bool) {
+        self.swept = swept;
+    }
+
+    /// Whether a posture is within the limits.
+    pub fn is_within(&self, state: &State) -> bool {
+        (0..self.joints()).all(|j| self.lower[j] <= state[j] && state[j] <= self.upper[j])
+    }
+
+    /// Whether a posture touches nothing.
+    pub fn is_free(&mut self, state: &State) -> bool {
+        !self.blocked && self.check(state, &[0.0; MAX_JOINTS], 1, false)
+    }
+
+    /// Whether a straight motion touches nothing; `from` itself is not looked at.
+    #[inline]
+    pub fn is_free_motion(&mut self, from: &State, to: &State) -> bool {
+        if self.swept {
+            return self.is_swept_free(from, to);
+        }
+        let delta = difference(to, from);
+        let batches = self.batches(length(&delta));
+        !self.blocked && self.check(from, &delta, batches, false)
+    }
+
+    /// Whether a straight motion touches nothing, also between the postures.
+    pub fn is_swept_free(&mut self, from: &State, to: &State) -> bool {
+        let delta = difference(to, from);
+        // What is wrong at all is mostly found by the coarse look.
+        let batches = self.batches(length(&delta));
+        !self.blocked && self.check(from, &delta, batches, false) && self.sweep(from, &delta, batches, LEVELS)
+    }
+
+    /// One batch of postures along a motion; what the measurements time.
+    pub fn check_batch(&mut self, from: &State, delta: &State) -> bool {
+        self.check(from, delta, 1, false)
+    }
+
+    fn sweep(&mut self, from: &State, delta: &State, pieces: usize, levels: usize) -> bool {
+        let piece: State = std::array::from_fn(|j| delta[j] / pieces as f32);
+        (0..pieces).all(|i| {
+            let start: State = std::array::from_fn(|j| from[j] + piece[j] * i as f32);
+            if levels == 1 {
+                return self.check(&start, &piece, 1, false);
+            }
+            self.check(&start, &piece, 1, true) || self.sweep(&start, &piece, FINER, levels - 1)
+        })
+    }
+
+    fn batches(&self, length: f32) -> usize {
+        // In wholes of the widest batch, so that every machine looks at the same postures.
+        let widest = ((length * Space::RESOLUTION / WIDEST as f32).ceil() as usize).max(1);
+        widest * (WIDEST / self.isa.width())
+    }
+
+    #[inline]
+    fn check(&mut self, start: &State, delta: &State, batches: usize, grown: bool) -> bool {
+        let mut middle = *start;
+        if grown {
+            // Each posture stands for the step that it is in the middle of: nothing is further than half a step from one.
+            let step = 0.5 / (self.isa.width() * batches) as f32;
+            for (inflate, lever) in self.inflate.iter_mut().zip(&self.lever) {
+                *inflate = step * (0..self.compiled.joints).map(|j| lever[j] * delta[j].abs()).sum::<f32>();
+            }
+            for (at, way) in middle.iter_mut().zip(delta) {
+                *at -= way * step;
+            }
+        }
+        let inflate = if grown { &self.inflate[..] } else { &[] };
+        self.isa.is_free(&Edge { compiled: &self.compiled, start: &middle, delta, batches, inflate }, &mut self.scratch)
+    }
+}
+
+/// `to - from`
+pub fn difference(to: &State, from: &State) -> State {
+    std::array::from_fn(|j| to[j] - from[j])
+}
+
+/// The Euclidean length.
+pub fn length(delta: &State) -> f32 {
+    delta.iter().map(|d| d * d).sum::<f32>().sqrt()
+}
+
+/// The Euclidean distance.
+pub fn distance(a: &State, b: &State) -> f32 {
+    length(&difference(a, b))
+}
+
+/// The posture a fraction of the way from one to another.
+pub fn between(a: &State, b: &State, fraction: f32) -> State {
+    std::array::from_fn(|j| a[j] + (b[j] - a[j]) * fraction)
+}
+
+fn is_cylinder(obstacle: &Obstacle) -> bool {
+    matches!(obstacle.geometry, Geometry::Cylinder { .. })
+}
+
+/// How far a point is from an obstacle, in metres; zero inside.
+fn gap(obstacle: &Obstacle, point: [f64; 3]) -> f64 {
+    let [x, y, z] = obstacle.pose.inverse().transform(point);
+    let beyond = |p: f64, half: f64| (p.abs() - half).max(0.0);
+    match obstacle.geometry {
+        Geometry::Box { half } => beyond(x, half[0]).hypot(beyond(y, half[1])).hypot(beyond(z, half[2])),
+        Geometry::Cylinder { radius, half_length } => beyond(x.hypot(y), radius).hypot(beyond(z, half_length)),
+        Geometry::Capsule { radius, half_length } => (x.hypot(y).hypot(beyond(z, half_length)) - radius).max(0.0),
+        Geometry::Sphere { radius } => (x.hypot(y).hypot(z) - radius).max(0.0),
+    }
+}
+
+fn compile_obstacle(obstacle: &Obstacle) -> simd::Obstacle {
+    let (half, round) = match obstacle.geometry {
+        Geometry::Box { half } => (half, 0.0),
+        Geometry::Cylinder { radius, half_length } => ([radius, radius, half_length], 0.0),
+        Geometry::Capsule { radius, half_length } => ([0.0, 0.0, half_length], radius),
+        Geometry::Sphere { radius } => ([0.0; 3], radius),
+    };
+    let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| obstacle.pose.rotate(axis));
+    simd::Obstacle {
+        centre: obstacle.pose.position.map(|c| c as f32),
+        axes: std::array::from_fn(|i| axes[i / 3][i % 3] as f32),
+        half: half.map(|h| h as f32),
+        round: round as f32,
+        upright: axes[2][2] > 1.0 - 1e-12,
+    }
+}
+
+/// The robot's frames and groups, how far each group can be from its anchor, and the link of each group.
+fn compile_robot(mechanism: &Mechanism, padding: f64) -> (Compiled, Vec<f32>, Vec<usize>) {
+    let mut frames: Vec<Frame> = Vec::new();
+    // Per frame: how far its origin can be from the first joint of its chain, and that joint's place.
+    let mut chains: Vec<(f64, [f64; 3])> = vec![(0.0, [0.0; 3])];
+    // Per link: its frame, and where it is there.
+    let mut places: Vec<(usize, Pose)> = Vec::new();
+    let mut compiled = Compiled { joints: mechanism.joints.len(), ..Compiled::default() };
+    let (mut reaches, mut links) = (Vec::new(), Vec::new());
+    for (index, link) in mechanism.links.iter().enumerate() {
+        let (parent, place) = link.parent.map_or((0, Pose::IDENTITY), |p| places[p]);
+        let origin = place.compose(&link.origin);
+        match link.drive {
+            None => places.push((parent, origin)),
+            Some(drive) => {
+                // The frame's z axis becomes the joint's axis.
+                let aligned = align(drive.axis);
+                let moved = origin.compose(&aligned);
+                places.push((frames.len() + 1, aligned.inverse()));
+                let joint = &mechanism.joints[drive.joint];
+                let slide = if drive.slides { joint.lower.abs().max(joint.upper.abs()) } else { 0.0 };
+                let (travel, origin) = (slide as f32, rows(&moved));
+                frames.push(Frame { parent, origin, joint: drive.joint, slides: drive.slides, travel });
+                let way = moved.distance(&Pose::IDENTITY);
+                chains.push(match parent {
+                    0 => (slide, moved.position),
+                    _ => (chains[parent].0 + way + slide, chains[parent].1),
+                });
+            }
+        }
+        if !link.spheres.is_empty() {
+            let (frame, place) = places[index];
+            let fine: Vec<[f32; 4]> = link
+                .spheres
+                .iter()
+                .map(|s| {
+                    let [x, y, z] = place.transform(s.centre);
+                    [x as f32, y as f32, z as f32, (s.radius + padding) as f32]
+                })
+                .collect();
+            let coarse = enclose(&fine);
+            let anchor = chains[frame].1.map(|c| c as f32);
+            reaches.push(chains[frame].0 as f32 + norm(&coarse) + coarse[3] + 1e-4);
+            links.push(index);
+            let slot = 0;
+            compiled.groups.push(Group {
+                frame,
+                coarse,
+                fine,
+                slot,
+                rounded: Vec::new(),
+                cylinders: Vec::new(),
+                anchor,
+            });
+        }
+    }
+    compiled.frames = frames;
+    // The hand, deepest in the tree, is the likeliest to touch something.
+    let mut order: Vec<usize> = (0..links.len()).collect();
+    order.sort_by_key(|i| std::cmp::Reverse((compiled.groups[*i].frame, *i)));
+    compiled.groups = order.iter().map(|i| compiled.groups[*i].clone()).collect();
+    for group in &mut compiled.groups {
+        group.slot = compiled.slots;
+        compiled.slots += group.fine.len();
+    }
+    let reaches = order.iter().map(|i| reaches[*i]).collect();
+    let links = order.iter().map(|i| links[*i]).collect();
+    (compiled, reaches, links)
+}
+
+fn pairs(mechanism: &Mechanism, groups: &[Group], links: &[usize]) -> Vec<SelfPair> {
+    let mut pairs = Vec::new();
+    for first in 0..groups.len() {
+        for second in first + 1..groups.len() {
+            if groups[first].frame != groups[second].frame && mechanism.is_checked(links[first], links[second]) {
+                pairs.push(SelfPair { first: first as u16, second: second as u16 });
+            }
+        }
+    }
+    pairs
+}
+
+fn levers(compiled: &Compiled) -> Vec<[f32; MAX_JOINTS]> {
+    let lever = |group: &Group| {
+        let mut levers = [0.0; MAX_JOINTS];
+        let mut arm = norm(&group.coarse) + group.coarse[3];
+        let mut frame = group.frame;
+        while frame != 0 {
+            let here = &compiled.frames[frame - 1];
+            // A joint may move several links of a chain.
+            levers[here.joint] += if here.slides { 1.0 } else { arm };
+            arm += here.origin[9].hypot(here.origin[10]).hypot(here.origin[11]) + here.travel;
+            frame = here.parent;
+        }
+        levers
+    };
+    compiled.groups.iter().map(lever).collect()
+}
+
+fn norm(sphere: &[f32; 4]) -> f32 {
+    sphere[0].hypot(sphere[1]).hypot(sphere[2])
+}
+
+/// A rotation that takes z to the axis.
+fn align(axis: [f64; 3]) -> Pose {
+    let [x, y, z] = axis;
+    if z < -1.0 + 1e-12 {
+        return Pose { position: [0.0; 3], quaternion_xyzw: [1.0, 0.0, 0.0, 0.0] };
+    }
+    let length = (2.0 * (1.0 + z)).sqrt();
+    Pose { position: [0.0; 3], quaternion_xyzw: [-y / length, x / length, 0.0, length / 2.0] }
+}
+
+fn rows(pose: &Pose) -> [f32; 12] {
+    let columns = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| pose.rotate(axis));
+    std::array::from_fn(|i| if i < 9 { columns[i % 3][i / 3] } else { pose.position[i - 9] } as f32)
+}
+
+/// A small sphere that holds all of them (Bădoiu and Clarkson's steps towards the farthest).
+fn enclose(spheres: &[[f32; 4]]) -> [f32; 4] {
+    const STEPS: usize = 200;
+    let reach = |c: &[f32; 3], s: &[f32; 4]| (0..3).map(|i| (c[i] - s[i]).powi(2)).sum::<f32>().sqrt() + s[3];
+    let farthest = |c: &[f32; 3]| {
+        let by = |a: &&[f32; 4], b: &&[f32; 4]| reach(c, a).total_cmp(&reach(c, b));
+        spheres.iter().max_by(by).copied().unwrap_or_default()
+    };
+    let first = farthest(&[0.0; 3]);
+    let mut centre = [first[0], first[1], first[2]];
+    let mut best = (reach(&centre, &farthest(&centre)), centre);
+    for step in 1..=STEPS {
+        let far = farthest(&centre);
+        let way = (reach(&centre, &far) - far[3]).max(1e-9);
+        let share = ((reach(&centre, &far) / way).min(1.0)) / (step + 1) as f32;
+        for i in 0..3 {
+            centre[i] += (far[i] - centre[i]) * share;
+        }
+        let radius = reach(&centre, &farthest(&centre));
+        if radius < best.0 {
+            best = (radius, centre);
+        }
+    }
+    if spheres.len() == 1 {
+        return spheres[0];
+    }
+    let [x, y, z] = best.1;
+    [x, y, z, best.0 * (1.0 + 1e-6)]
+}

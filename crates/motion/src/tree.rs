@@ -1,0 +1,57 @@
+//! A tree of free postures, laid out for the vector scan of `simd::nearest`.
+
+use crate::simd::{Block, Isa};
+use crate::space::State;
+
+#[derive(Debug)]
+pub(crate) struct Tree {
+    isa: Isa,
+    joints: usize,
+    blocks: Vec<Block>,
+    pub(crate) states: Vec<State>,
+    pub(crate) parents: Vec<u32>,
+    /// Samples further away than this are not for the node (dynamic domain).
+    pub(crate) radii: Vec<f32>,
+}
+
+impl Tree {
+    pub(crate) fn new(isa: Isa, joints: usize) -> Tree {
+        Tree { isa, joints, blocks: Vec::new(), states: Vec::new(), parents: Vec::new(), radii: Vec::new() }
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.states.len()
+    }
+
+    /// A root is its own parent.
+    pub(crate) fn push(&mut self, state: State, parent: usize) -> usize {
+        let index = self.states.len();
+        if index.is_multiple_of(16) {
+            self.blocks.extend(std::iter::repeat_n(Block([f32::INFINITY; 16]), self.joints));
+        }
+        let row = index / 16 * self.joints;
+        for (block, position) in self.blocks[row..].iter_mut().zip(&state) {
+            block.0[index % 16] = *position;
+        }
+        self.states.push(state);
+        self.parents.push(parent as u32);
+        self.radii.push(f32::INFINITY);
+        index
+    }
+
+    /// The nearest node and its distance.
+    pub(crate) fn nearest(&self, to: &State) -> (usize, f32) {
+        let (index, squared) = self.isa.nearest(&self.blocks, self.joints, self.states.len(), to);
+        (index, squared.sqrt())
+    }
+
+    /// From a node to its root.
+    pub(crate) fn branch(&self, mut node: usize) -> Vec<State> {
+        let mut branch = vec![self.states[node]];
+        while self.parents[node] as usize != node {
+            node = self.parents[node] as usize;
+            branch.push(self.states[node]);
+        }
+        branch
+    }
+}

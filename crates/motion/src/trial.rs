@@ -1,0 +1,94 @@
+//! One planning problem solved as a user of the crate would, timed by the caller's clock and checked by the exact shapes.
+
+use crate::connect::{Budget, ConnectError, Route, connect};
+use crate::exact::{Exact, Touch};
+use crate::mechanism::{MAX_JOINTS, Mechanism};
+use crate::pace::Control;
+use crate::problems::Problem;
+use crate::simplify::{path_length, simplify};
+use crate::space::{Space, State};
+
+/// Postures per radian that the exact check looks at: four times those of the search.
+const EXACT_PER_RADIAN: f64 = 4.0 * Space::RESOLUTION as f64;
+
+/// How a problem is tried.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Settings {
+    /// What the search may cost.
+    pub budget: Budget,
+    /// How much larger every shape of the robot is taken, in metres.
+    pub padding_m: f64,
+    /// How often it is solved, for the least times; at least once. Every time gives the same path.
+    pub repetitions: usize,
+}
+
+/// What came of a problem.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Trial {
+    /// From the search to its path, in the clock's units.
+    pub plan: f64,
+    /// From that to a short path that is free also between its postures.
+    pub simplify: f64,
+    /// Why there is none.
+    pub outcome: Result<Found, ConnectError>,
+}
+
+/// A path.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Found {
+    /// Postures, straight motions between them.
+    pub path: Vec<Vec<f64>>,
+    /// Its length, in radians.
+    pub length_rad: f32,
+    /// Before simplification.
+    pub first_length_rad: f32,
+    /// Samples drawn.
+    pub iterations: usize,
+    /// What the exact check rejects.
+    pub touch: Option<Touch>,
+}
+
+/// Solves a problem; `clock` gives the time in any units.
+pub fn run(mechanism: &Mechanism, problem: &Problem, settings: Settings, clock: &mut dyn FnMut() -> f64) -> Trial {
+    let mut space = Space::new(mechanism, &problem.obstacles, settings.padding_m);
+    let (start, goal) = (state(&problem.start), state(&problem.goal));
+    let mut go_on = |_: usize| Control::Continue;
+    let (mut plan_time, mut simplify_time) = (f64::INFINITY, f64::INFINITY);
+    let mut outcome = Err(ConnectError::Cancelled);
+    for _ in 0..settings.repetitions.max(1) {
+        let begin = clock();
+        let route = connect(&mut space, &start, &[goal], settings.budget, &mut go_on);
+        let between = clock();
+        let paths = route.and_then(|route| {
+            let path = simplify(&mut space, &route.path, settings.budget, &mut go_on)?;
+            Ok((route, path))
+        });
+        let end = clock();
+        plan_time = plan_time.min(between - begin);
+        simplify_time = simplify_time.min(end - between);
+        outcome = paths;
+    }
+    let outcome = outcome.map(|(route, path)| found(mechanism, problem, &route, &path));
+    Trial { plan: plan_time, simplify: simplify_time, outcome }
+}
+
+fn found(mechanism: &Mechanism, problem: &Problem, route: &Route, path: &[State]) -> Found {
+    let joints = mechanism.joints.len();
+    let postures: Vec<Vec<f64>> = path.iter().map(|s| s[..joints].iter().map(|q| f64::from(*q)).collect()).collect();
+    let touch = Exact::new(mechanism, &problem.obstacles).touch_along(&postures, EXACT_PER_RADIAN);
+    Found {
+        path: postures,
+        length_rad: path_length(path),
+        first_length_rad: path_length(&route.path),
+        iterations: route.iterations,
+        touch,
+    }
+}
+
+fn state(positions: &[f64]) -> State {
+    let mut state = [0.0; MAX_JOINTS];
+    for (to, from) in state.iter_mut().zip(positions) {
+        *to = *from as f32;
+    }
+    state
+}

@@ -1,0 +1,302 @@
+//! Any robot from its URDF: the vector checks beside parry's exact shapes, and paths that both find free.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
+
+use parry3d::math::Vector;
+use rand::{Rng, RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_motion::connect::{Budget, ConnectError, connect};
+use ratn_motion::exact::Exact;
+use ratn_motion::geometry::{Body, Geometry};
+use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
+use ratn_motion::pace::Control;
+use ratn_motion::problems::Problems;
+use ratn_motion::simplify::{path_length, simplify};
+use ratn_motion::space::{Isa, Obstacle, Space, State, between};
+use ratn_motion::spheres::cover;
+
+const AIMM: &str = include_str!("../robots/aimm.urdf");
+
+const BUDGET: Budget = Budget { iterations: 20_000, seed: 1 };
+
+fn go_on(_: usize) -> Control {
+    Control::Continue
+}
+
+fn arm() -> Mechanism {
+    let joints: Vec<String> = (1..=7).map(|i| format!("arm_joint_{i}")).collect();
+    Mechanism::read(AIMM, None, &joints).unwrap()
+}
+
+/// A chain of joints about z and y in turn, each link three spheres along x.
+fn chain(joints: usize) -> (String, Vec<String>) {
+    let mut urdf = String::from("<robot name='chain'><link name='l0'/>");
+    let mut names = Vec::new();
+    for i in 1..=joints {
+        urdf += &format!("<link name='l{i}'>");
+        for x in [0.08, 0.14, 0.20] {
+            urdf +=
+                &format!("<collision><origin xyz='{x} 0 0'/><geometry><sphere radius='0.035'/></geometry></collision>");
+        }
+        let (x, axis) = (if i == 1 { 0.0 } else { 0.25 }, ["0 1 0", "0 0 1"][i % 2]);
+        urdf += &format!(
+            "</link><joint name='j{i}' type='revolute'><origin xyz='{x} 0 0'/><parent link='l{}'/><child link='l{i}'/>\
+             <axis xyz='{axis}'/><limit lower='-2.5' upper='2.5' effort='1' velocity='1'/></joint>",
+            i - 1
+        );
+        names.push(format!("j{i}"));
+    }
+    (urdf + "</robot>", names)
+}
+
+fn random_pose(random: &mut impl Rng, reach: f64) -> Pose {
+    let mut range = |most: f64| random.random_range(-most..most);
+    Pose::from_rpy([range(reach), range(reach), range(reach)], range(3.1), range(1.5), range(3.1))
+}
+
+fn clutter(random: &mut impl Rng, count: usize, reach: f64) -> Vec<Obstacle> {
+    let obstacle = |i: usize| {
+        let mut size = || random.random_range(0.02..0.15);
+        let geometry = match i % 4 {
+            0 => Geometry::Box { half: [size(), size(), size()] },
+            1 => Geometry::Cylinder { radius: size(), half_length: size() },
+            2 => Geometry::Capsule { radius: size(), half_length: size() },
+            _ => Geometry::Sphere { radius: size() },
+        };
+        Obstacle { name: format!("thing {i}"), pose: random_pose(random, reach), geometry }
+    };
+    (0..count).map(obstacle).collect()
+}
+
+fn posture(random: &mut impl Rng, mechanism: &Mechanism) -> State {
+    let mut state = [0.0; MAX_JOINTS];
+    for (q, joint) in state.iter_mut().zip(&mechanism.joints) {
+        *q = random.random_range(joint.lower..joint.upper) as f32;
+    }
+    state
+}
+
+fn positions(mechanism: &Mechanism, state: &State) -> Vec<f64> {
+    state[..mechanism.joints.len()].iter().map(|q| f64::from(*q)).collect()
+}
+
+#[test]
+fn the_spheres_of_a_shape_hold_every_point_of_it() {
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    for case in 0..200 {
+        let mut size = || random.random_range(0.005..0.4);
+        let geometry = match case % 4 {
+            0 => Geometry::Box { half: [size(), size(), size()] },
+            1 => Geometry::Cylinder { radius: size(), half_length: size() },
+            2 => Geometry::Capsule { radius: size(), half_length: size() },
+            _ => Geometry::Sphere { radius: size() },
+        };
+        let body: Body = geometry.at(random_pose(&mut random, 1.0));
+        let (spheres, shape) = (cover(&body), body.geometry.shape(0.0));
+        let extents = shape.compute_local_aabb().half_extents();
+        for _ in 0..500 {
+            let mut point = |half: f32| random.random_range(-half..=half);
+            let inside = Vector::new(point(extents.x), point(extents.y), point(extents.z));
+            if !shape.contains_local_point(inside) {
+                continue;
+            }
+            let [x, y, z] = body.pose.transform([f64::from(inside.x), f64::from(inside.y), f64::from(inside.z)]);
+            let holds = |s: &ratn_motion::spheres::Sphere| {
+                let [a, b, c] = s.centre;
+                (x - a).hypot(y - b).hypot(z - c) <= s.radius + 1e-6
+            };
+            assert!(spheres.iter().any(holds), "{geometry:?}: {inside:?} is in none of {} spheres", spheres.len());
+        }
+    }
+}
+
+#[test]
+fn for_a_robot_of_spheres_the_vector_check_is_the_exact_one() {
+    let (urdf, names) = chain(6);
+    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let mut random = ChaCha8Rng::seed_from_u64(2);
+    let (mut free, mut touching) = (0, 0);
+    for _ in 0..40 {
+        let obstacles = clutter(&mut random, 12, 1.2);
+        let exact = Exact::new(&mechanism, &obstacles);
+        let mut spaces: Vec<Space> =
+            Isa::available().into_iter().map(|isa| Space::with_isa(&mechanism, &obstacles, 0.0, isa)).collect();
+        for _ in 0..100 {
+            let state = posture(&mut random, &mechanism);
+            let touch = exact.touch(&positions(&mechanism, &state));
+            for space in &mut spaces {
+                let isa = space.isa();
+                match (space.is_free(&state), &touch) {
+                    (true, None) => free += 1,
+                    (false, Some(_)) => touching += 1,
+                    // Spheres are grown by 0.02 mm; contact within that is either.
+                    (false, None) => {
+                        let mut smaller = Space::with_isa(&mechanism, &obstacles, -1e-4, isa);
+                        assert!(smaller.is_free(&state), "{isa:?} sees a touch that is none");
+                    }
+                    (true, Some(touch)) => panic!("{isa:?} misses that {touch}"),
+                }
+            }
+        }
+    }
+    assert!(free > 500 && touching > 500, "{free} free, {touching} touching");
+}
+
+#[test]
+fn a_posture_that_the_spheres_of_an_arm_find_free_is_free_by_its_exact_shapes() {
+    let mechanism = arm();
+    let mut random = ChaCha8Rng::seed_from_u64(3);
+    let mut free = 0;
+    for _ in 0..20 {
+        let obstacles = clutter(&mut random, 10, 1.5);
+        let exact = Exact::new(&mechanism, &obstacles);
+        let mut space = Space::new(&mechanism, &obstacles, 0.0);
+        for _ in 0..100 {
+            let state = posture(&mut random, &mechanism);
+            if space.is_free(&state) {
+                free += 1;
+                assert_eq!(exact.touch(&positions(&mechanism, &state)), None);
+            }
+        }
+    }
+    assert!(free > 200, "{free}");
+}
+
+#[test]
+fn paths_are_short_repeatable_and_free_by_the_exact_check_at_four_times_the_resolution() {
+    let (urdf, names) = chain(6);
+    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let mut random = ChaCha8Rng::seed_from_u64(4);
+    let (mut solved, mut indirect) = (0, 0);
+    for _ in 0..40 {
+        let obstacles = clutter(&mut random, 14, 1.2);
+        let mut space = Space::new(&mechanism, &obstacles, 0.0);
+        let (start, goal) = (posture(&mut random, &mechanism), posture(&mut random, &mechanism));
+        let Ok(route) = connect(&mut space, &start, &[goal], BUDGET, &mut go_on) else { continue };
+        let path = simplify(&mut space, &route.path, BUDGET, &mut go_on).unwrap();
+        solved += 1;
+        indirect += usize::from(path.len() > 2);
+        assert_eq!((path[0], path[path.len() - 1]), (start, goal));
+        assert!(path_length(&path) <= path_length(&route.path) + 1e-4);
+        let postures: Vec<Vec<f64>> = path.iter().map(|s| positions(&mechanism, s)).collect();
+        assert_eq!(Exact::new(&mechanism, &obstacles).touch_along(&postures, 128.0), None);
+        let mut again = Space::new(&mechanism, &obstacles, 0.0);
+        let second = connect(&mut again, &start, &[goal], BUDGET, &mut go_on).unwrap();
+        assert_eq!(second, route);
+        assert_eq!(simplify(&mut again, &second.path, BUDGET, &mut go_on).unwrap(), path);
+    }
+    assert!(solved > 10 && indirect > 5, "{solved} solved, {indirect} not straight");
+}
+
+#[test]
+fn a_motion_free_between_its_postures_is_free_wherever_one_looks() {
+    let (urdf, names) = chain(5);
+    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let mut random = ChaCha8Rng::seed_from_u64(5);
+    let mut free = 0;
+    for _ in 0..60 {
+        // Thin plates slip between postures that are too far apart.
+        let geometry = Geometry::Box { half: [0.2, 0.2, 0.001] };
+        let plates: Vec<Obstacle> = (0..4)
+            .map(|i| Obstacle { name: format!("plate {i}"), pose: random_pose(&mut random, 0.8), geometry })
+            .collect();
+        let mut space = Space::new(&mechanism, &plates, 0.0);
+        let exact = Exact::new(&mechanism, &plates);
+        let (from, to) = (posture(&mut random, &mechanism), posture(&mut random, &mechanism));
+        if space.is_free(&from) && space.is_swept_free(&from, &to) {
+            free += 1;
+            for i in 0..=2000 {
+                let state = between(&from, &to, i as f32 / 2000.0);
+                assert_eq!(exact.touch(&positions(&mechanism, &state)), None, "at {i} of 2000");
+            }
+        }
+    }
+    assert!(free > 5, "{free}");
+}
+
+#[test]
+fn the_nearest_of_several_goals_that_is_free_is_reached() {
+    let (urdf, names) = chain(4);
+    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let state = |q: [f32; 4]| -> State { std::array::from_fn(|j| q.get(j).copied().unwrap_or(0.0)) };
+    let (start, blocked, open) = (state([0.0; 4]), state([0.6, 0.0, 0.0, 0.0]), state([-1.2, 0.0, 0.0, 0.0]));
+    let at = Pose::at(0.6 * 0.6_f64.cos(), 0.6 * 0.6_f64.sin(), 0.0);
+    let wall = Obstacle { name: "wall".into(), pose: at, geometry: Geometry::Sphere { radius: 0.05 } };
+    let mut space = Space::new(&mechanism, std::slice::from_ref(&wall), 0.0);
+    let route = connect(&mut space, &start, &[blocked, open], BUDGET, &mut go_on).unwrap();
+    assert_eq!((route.goal, route.path[route.path.len() - 1]), (1, open));
+    let none = connect(&mut space, &start, &[blocked], BUDGET, &mut go_on);
+    assert_eq!(none, Err(ConnectError::Goal { goals: 1 }));
+    let touch = Exact::new(&mechanism, &[wall]).touch(&[0.6, 0.0, 0.0, 0.0]).unwrap();
+    assert_eq!(touch.other, "wall");
+    assert!((0.02..0.09).contains(&touch.depth_m), "{touch}");
+}
+
+#[test]
+fn a_search_that_is_cancelled_or_out_of_iterations_ends_and_says_so() {
+    let (urdf, names) = chain(4);
+    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    // The first link cannot go round this plate.
+    let geometry = Geometry::Box { half: [2.0, 0.005, 2.0] };
+    let plate = Obstacle { name: "plate".into(), pose: Pose::at(2.06, 0.0, 0.0), geometry };
+    let mut space = Space::new(&mechanism, &[plate], 0.0);
+    let state = |first: f32| -> State { std::array::from_fn(|j| if j == 0 { first } else { 0.0 }) };
+    let few = Budget { iterations: 3000, seed: 0 };
+    let outcome = connect(&mut space, &state(-0.95), &[state(1.2)], few, &mut go_on);
+    assert_eq!(outcome, Err(ConnectError::Exhausted { iterations: 3000 }));
+    let mut asked = 0;
+    let mut second_time = |_: usize| {
+        asked += 1;
+        if asked == 2 { Control::Cancelled } else { Control::Continue }
+    };
+    let outcome = connect(&mut space, &state(-0.95), &[state(1.2)], few, &mut second_time);
+    assert_eq!((outcome, asked), (Err(ConnectError::Cancelled), 2));
+    let mut at_once = |_: usize| Control::TimeUp;
+    let outcome = connect(&mut space, &state(-0.95), &[state(1.2)], few, &mut at_once);
+    assert!(matches!(outcome, Err(ConnectError::TimeUp { .. })), "{outcome:?}");
+}
+
+#[test]
+fn pairs_that_the_srdf_disables_are_not_checked_and_all_others_are() {
+    let (urdf, names) = chain(6);
+    // The last link touches the first.
+    let folded = [0.0, 2.3, 0.0, 2.3, 0.0, 2.3];
+    let disabled = |pairs: &[(usize, usize)]| {
+        let line = |(a, b): &(usize, usize)| format!("<disable_collisions link1='l{b}' link2='l{a}' reason='Never'/>");
+        format!("<robot name='chain'>{}</robot>", pairs.iter().map(line).collect::<String>())
+    };
+    let all: Vec<(usize, usize)> = (1..=6).flat_map(|b| (1..b).map(move |a| (a, b))).chain([(1, 99)]).collect();
+    let most: Vec<(usize, usize)> = all.iter().copied().filter(|pair| *pair != (1, 6)).collect();
+    let (all, most) = (disabled(&all), disabled(&most));
+    for (srdf, touches) in [(Some(&most[..]), true), (Some(&all[..]), false), (None, true)] {
+        let mechanism = Mechanism::read(&urdf, srdf, &names).unwrap();
+        assert_eq!(Exact::new(&mechanism, &[]).touch(&folded).is_some(), touches, "{srdf:?}");
+        let state: State = std::array::from_fn(|j| folded.get(j).map_or(0.0, |q| *q as f32));
+        assert_eq!(Space::new(&mechanism, &[], 0.0).is_free(&state), !touches, "{srdf:?}");
+    }
+    assert!(Mechanism::read(&urdf, Some("<robot"), &names).unwrap_err().to_string().contains("SRDF"));
+    let unknown = Mechanism::read(&urdf, None, &["elbow".to_owned()]).unwrap_err();
+    assert!(unknown.to_string().contains("no joint `elbow`"), "{unknown}");
+}
+
+#[test]
+fn a_file_of_problems_is_read_and_a_wrong_one_says_where() {
+    let object = r#"{"name": "can", "type": "cylinder", "position": [1, 0, 0], "quat_xyzw": [0, 0, 0, 2], "length": 0.2, "radius": 0.05}"#;
+    let file = |goal: &str, object: &str| {
+        format!(
+            r#"{{"robot": "r", "joints": ["a", "b"], "problems": {{"shelf": [{{"index": 3, "objects": [{object}], "attached": 0,
+            "start": [0, 1], "goal": {goal}}}]}}}}"#
+        )
+    };
+    let problems = Problems::parse(&file("[1, 2]", object)).unwrap();
+    let problem = &problems.classes["shelf"][0];
+    assert_eq!((problem.index, &problem.start[..], &problem.goal[..]), (3, &[0.0, 1.0][..], &[1.0, 2.0][..]));
+    assert_eq!(problem.obstacles[0].geometry, Geometry::Cylinder { radius: 0.05, half_length: 0.1 });
+    let error = Problems::parse(&file("[1]", object)).unwrap_err().to_string();
+    assert_eq!(error, "problem 3 of class `shelf`: its goal has 1 positions, the robot has 2 joints");
+    let flat = object.replace("0.05", "-1");
+    let error = Problems::parse(&file("[1, 2]", &flat)).unwrap_err().to_string();
+    assert_eq!(error, "problem 3 of class `shelf`: object `can` has no proper size, place or rotation");
+    assert!(Problems::parse("{").is_err());
+}
