@@ -1,23 +1,37 @@
 //! Facts, and how changes apply to them.
+//!
+//! A [`World`] is a shared store of facts and an overlay: the changes that only this world has. [`World::project`] writes into the
+//! overlay, so that a projection costs its effects and nothing else; [`World::apply`] writes into the store, so that what is
+//! projected from a root begins with an empty overlay. An overlay that grows beyond [`OVERLAY_LIMIT`] goes into the store, too.
 
-use imbl::OrdMap;
+use crate::store::{Store, begins_as, first_of};
 use ratn_model::fact::{Change, FactKey, FactPattern};
 use ratn_model::id::Revision;
 use ratn_model::value::Value;
+use std::collections::BTreeMap;
+use std::iter::Peekable;
+use std::sync::Arc;
 
-/// A fact's value and the revision that wrote it.
+/// As many facts may differ between a projection and the store it shares, before it gets a store of its own.
+pub const OVERLAY_LIMIT: usize = 1024;
+
+/// A fact's value, and who wrote it when.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fact {
     /// What the fact says.
     pub value: Value,
     /// The revision of the world in which it was written.
     pub revision: Revision,
+    /// The node that wrote it, by the path of its instance; `None` where nobody said.
+    pub writer: Option<Arc<str>>,
 }
 
-/// A world model: the root, or a projection. Cloning takes constant time and shares everything.
-#[derive(Debug, Clone, Default, PartialEq)]
+/// A world model: the root, or a projection. Cloning shares the store and copies the overlay, which the root has none of.
+#[derive(Debug, Clone, Default)]
 pub struct World {
-    facts: OrdMap<FactKey, Fact>,
+    store: Store,
+    /// `None`: the fact does not hold, whatever the store says.
+    overlay: BTreeMap<Arc<FactKey>, Option<Arc<Fact>>>,
     revision: Revision,
 }
 
@@ -35,10 +49,13 @@ pub enum ChangeError {
 }
 
 impl World {
-    /// The world in which these facts hold, at a revision.
+    /// The world in which these facts hold, at a revision; of two for one key the later.
     pub fn from_facts(facts: impl IntoIterator<Item = (FactKey, Value)>, revision: Revision) -> World {
-        let facts = facts.into_iter().map(|(key, value)| (key, Fact { value, revision })).collect();
-        World { facts, revision }
+        let mut store = Store::default();
+        for (key, value) in facts {
+            store.insert(&Arc::new(key), &Arc::new(Fact { value, revision, writer: None }));
+        }
+        World { store, overlay: BTreeMap::new(), revision }
     }
 
     /// The number of commits so far.
@@ -46,43 +63,56 @@ impl World {
         self.revision
     }
 
-    /// How many facts hold.
+    /// How many facts hold; costs the overlay.
     pub fn len(&self) -> usize {
-        self.facts.len()
+        let mut len = self.store.len();
+        for (key, fact) in &self.overlay {
+            match (self.store.get(key).is_some(), fact.is_some()) {
+                (false, true) => len += 1,
+                (true, false) => len -= 1,
+                _ => {}
+            }
+        }
+        len
     }
 
     /// Whether no fact holds.
     pub fn is_empty(&self) -> bool {
-        self.facts.is_empty()
+        self.len() == 0
     }
 
     /// The value of one fact.
     pub fn get(&self, key: &FactKey) -> Option<&Value> {
-        self.facts.get(key).map(|fact| &fact.value)
+        self.fact(key).map(|fact| &fact.value)
+    }
+
+    /// One fact, with who wrote it when.
+    pub fn fact(&self, key: &FactKey) -> Option<&Fact> {
+        // Most worlds asked are roots: a probe of an empty overlay costs nothing.
+        match self.overlay.get(key) {
+            Some(fact) => fact.as_deref(),
+            None => self.store.get(key),
+        }
     }
 
     /// Every fact, in the order of keys.
     pub fn iter(&self) -> impl Iterator<Item = (&FactKey, &Fact)> {
-        self.facts.iter()
+        let overlay = self.overlay.iter().map(|(key, fact)| (key.as_ref(), fact.as_deref()));
+        Merged { below: self.store.iter().peekable(), above: overlay.peekable() }
     }
 
-    /// The facts that match, in the order of keys.
+    /// The facts that match, in the order of keys; costs what matches where the whole key, its leading arguments (the subject) or
+    /// one later argument (the object) narrow it.
     pub fn matching<'a>(&'a self, pattern: &'a FactPattern) -> impl Iterator<Item = (&'a FactKey, &'a Fact)> {
-        // Bound leading arguments narrow the range; the rest is filtered.
-        let first = FactKey {
-            predicate: pattern.predicate.clone(),
-            arguments: pattern.arguments.iter().map_while(Clone::clone).collect(),
-        };
+        let first = first_of(pattern);
         let bound = first.arguments.len();
-        let prefix = first.clone();
-        self.facts
-            .range(first..)
-            .take_while(move |(key, _)| {
-                key.predicate == prefix.predicate
-                    && key.arguments.len() >= bound
-                    && key.arguments[..bound] == prefix.arguments
-            })
-            .filter(move |(key, _)| pattern.matches(key))
+        let overlay = self
+            .overlay
+            .range::<FactKey, _>(first..)
+            .take_while(move |(key, _)| begins_as(key, pattern, bound))
+            .filter(|(key, _)| pattern.matches(key))
+            .map(|(key, fact)| (key.as_ref(), fact.as_deref()));
+        Merged { below: self.store.matching(pattern).peekable(), above: overlay.peekable() }
     }
 
     /// Applies all changes as one new revision, or none of them.
@@ -90,41 +120,109 @@ impl World {
     /// # Errors
     /// [`ChangeError`] names the first change that does not apply.
     pub fn apply(&mut self, changes: &[Change]) -> Result<Revision, ChangeError> {
-        let revision = Revision(self.revision.0 + 1);
-        let mut facts = self.facts.clone();
-        for change in changes {
-            match change {
-                Change::Set { fact, value } => {
-                    facts.insert(fact.clone(), Fact { value: value.clone(), revision });
-                }
-                Change::Delete { pattern } => {
-                    let doomed: Vec<FactKey> = World { facts: facts.clone(), revision }
-                        .matching(pattern)
-                        .map(|(key, _)| key.clone())
-                        .collect();
-                    for key in doomed {
-                        facts.remove(&key);
-                    }
-                }
-                Change::Increase { fact, by } => {
-                    let value = increased(fact, facts.get(fact).map(|f| &f.value), *by)?;
-                    facts.insert(fact.clone(), Fact { value, revision });
-                }
-            }
-        }
-        self.facts = facts;
+        self.apply_as(None, changes)
+    }
+
+    /// As [`World::apply`]; each fact written says that `writer`, a node's path, wrote it.
+    ///
+    /// # Errors
+    /// As [`World::apply`].
+    pub fn apply_as(&mut self, writer: Option<&str>, changes: &[Change]) -> Result<Revision, ChangeError> {
+        // Whoever holds a clone while the store is written makes it copy: so the overlay alone outlives the attempt.
+        let World { overlay, revision, .. } = self.changed(writer, changes)?;
+        self.overlay = overlay;
         self.revision = revision;
+        self.settle();
         Ok(revision)
     }
 
-    /// A copy with the changes applied: what the world will be.
+    /// What the world will be with the changes applied; costs the changes, not the facts.
     ///
     /// # Errors
     /// As [`World::apply`].
     pub fn project(&self, changes: &[Change]) -> Result<World, ChangeError> {
-        let mut world = self.clone();
-        world.apply(changes)?;
+        self.project_as(None, changes)
+    }
+
+    /// As [`World::project`]; each fact written says that `writer`, a node's path, wrote it.
+    ///
+    /// # Errors
+    /// As [`World::apply`].
+    pub fn project_as(&self, writer: Option<&str>, changes: &[Change]) -> Result<World, ChangeError> {
+        let mut world = self.changed(writer, changes)?;
+        if world.overlay.len() > OVERLAY_LIMIT {
+            world.settle();
+        }
         Ok(world)
+    }
+
+    /// A copy with the changes in its overlay.
+    fn changed(&self, writer: Option<&str>, changes: &[Change]) -> Result<World, ChangeError> {
+        let mut world = self.clone();
+        world.revision = Revision(self.revision.0 + 1);
+        let (revision, writer) = (world.revision, writer.map(Arc::<str>::from));
+        let written = |value: Value| Some(Arc::new(Fact { value, revision, writer: writer.clone() }));
+        for change in changes {
+            match change {
+                Change::Set { fact, value } => {
+                    world.overlay.insert(Arc::new(fact.clone()), written(value.clone()));
+                }
+                Change::Delete { pattern } => {
+                    let doomed: Vec<FactKey> = world.matching(pattern).map(|(key, _)| key.clone()).collect();
+                    world.overlay.extend(doomed.into_iter().map(|key| (Arc::new(key), None)));
+                }
+                Change::Increase { fact, by } => {
+                    let value = increased(fact, world.get(fact), *by)?;
+                    world.overlay.insert(Arc::new(fact.clone()), written(value));
+                }
+            }
+        }
+        Ok(world)
+    }
+
+    /// Moves the overlay into the store.
+    fn settle(&mut self) {
+        for (key, fact) in std::mem::take(&mut self.overlay) {
+            match fact {
+                Some(fact) => self.store.insert(&key, &fact),
+                None => self.store.remove(&key),
+            }
+        }
+    }
+}
+
+/// The same facts, written by the same at the same revisions; how they are shared makes no difference.
+impl PartialEq for World {
+    fn eq(&self, other: &World) -> bool {
+        self.revision == other.revision && self.iter().eq(other.iter())
+    }
+}
+
+/// Two orders as one: of equal keys the one above holds.
+struct Merged<B: Iterator, A: Iterator> {
+    below: Peekable<B>,
+    above: Peekable<A>,
+}
+
+impl<'a, B, A> Iterator for Merged<B, A>
+where
+    B: Iterator<Item = (&'a FactKey, &'a Fact)>,
+    A: Iterator<Item = (&'a FactKey, Option<&'a Fact>)>,
+{
+    type Item = (&'a FactKey, &'a Fact);
+
+    fn next(&mut self) -> Option<Self::Item> {
+        loop {
+            let Some((above, _)) = self.above.peek() else { return self.below.next() };
+            if let Some(fact) = self.below.next_if(|(below, _)| below < above) {
+                return Some(fact);
+            }
+            let (key, fact) = self.above.next()?;
+            self.below.next_if(|(below, _)| *below == key);
+            if let Some(fact) = fact {
+                return Some((key, fact));
+            }
+        }
     }
 }
 

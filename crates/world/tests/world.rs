@@ -5,7 +5,7 @@
 use proptest::prelude::*;
 use ratn_model::fact::{Change, FactKey, FactPattern, Term};
 use ratn_model::value::Value;
-use ratn_world::world::{ChangeError, World};
+use ratn_world::world::{ChangeError, OVERLAY_LIMIT, World};
 use std::collections::BTreeMap;
 
 fn term() -> impl Strategy<Value = Term> {
@@ -13,12 +13,12 @@ fn term() -> impl Strategy<Value = Term> {
 }
 
 fn key() -> impl Strategy<Value = FactKey> {
-    ("[pq]{1,2}", prop::collection::vec(term(), 0..3))
+    ("[pq]{1,2}", prop::collection::vec(term(), 0..4))
         .prop_map(|(predicate, arguments)| FactKey { predicate, arguments })
 }
 
 fn pattern() -> impl Strategy<Value = FactPattern> {
-    ("[pq]{1,2}", prop::collection::vec(prop::option::of(term()), 0..3))
+    ("[pq]{1,2}", prop::collection::vec(prop::option::of(term()), 0..4))
         .prop_map(|(predicate, arguments)| FactPattern { predicate, arguments })
 }
 
@@ -77,7 +77,37 @@ proptest! {
         let projection = root.project(&after).unwrap();
         prop_assert_eq!(&root, &unchanged);
         root.apply(&after).unwrap();
-        prop_assert_eq!(facts(&projection), facts(&root));
+        prop_assert_eq!(&projection, &root);
+        prop_assert_eq!(projection.len(), root.len());
+        prop_assert_eq!(facts(&projection).len(), root.len());
+    }
+
+    #[test]
+    fn a_projection_of_a_projection_finds_what_the_obvious_model_finds(
+        lists in prop::collection::vec(prop::collection::vec(change(), 0..12), 0..6),
+        patterns in prop::collection::vec(pattern(), 0..8),
+        commits in any::<[bool; 6]>(),
+    ) {
+        let (mut world, mut model) = (World::default(), BTreeMap::new());
+        for (changes, commit) in lists.iter().zip(commits) {
+            if commit {
+                world.apply_as(Some("place"), changes).unwrap();
+            } else {
+                world = world.project_as(Some("place"), changes).unwrap();
+            }
+            changes.iter().for_each(|change| apply(&mut model, change));
+        }
+        prop_assert_eq!(&facts(&world), &model);
+        prop_assert_eq!(world.len(), model.len());
+        prop_assert!(world.iter().all(|(_, fact)| fact.writer.as_deref() == Some("place") && fact.revision <= world.revision()));
+        for (key, value) in &model {
+            prop_assert_eq!(world.get(key), Some(value));
+        }
+        for pattern in &patterns {
+            let found: Vec<FactKey> = world.matching(pattern).map(|(key, _)| key.clone()).collect();
+            let expected: Vec<FactKey> = model.keys().filter(|key| pattern.matches(key)).cloned().collect();
+            prop_assert_eq!(found, expected);
+        }
     }
 }
 
@@ -93,4 +123,21 @@ fn a_list_of_changes_applies_as_a_whole_or_not_at_all() {
     ]);
     assert!(matches!(result, Err(ChangeError::NotANumber { .. })));
     assert_eq!(world, before);
+}
+
+#[test]
+fn a_projection_that_differs_in_more_than_an_overlay_holds_is_as_right_as_a_small_one() {
+    let set = |i: i64, value: i64| Change::Set {
+        fact: FactKey { predicate: "count".to_owned(), arguments: vec![Term::Int(i)] },
+        value: Value::Int(value),
+    };
+    let many = i64::try_from(OVERLAY_LIMIT).unwrap() * 2;
+    let mut root = World::default();
+    root.apply(&(0..many).map(|i| set(i, 0)).collect::<Vec<_>>()).unwrap();
+    let changes: Vec<Change> = (0..many).map(|i| set(i, 1)).collect();
+    let projection = root.project(&changes).unwrap();
+    assert!(projection.iter().all(|(_, fact)| fact.value == Value::Int(1)));
+    assert!(root.iter().all(|(_, fact)| fact.value == Value::Int(0)), "the root is as it was");
+    root.apply(&changes).unwrap();
+    assert_eq!(projection, root);
 }

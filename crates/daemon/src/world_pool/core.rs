@@ -117,8 +117,8 @@ impl WorldPool {
         if let Some(expected) = expected.filter(|expected| expected.0 != next) {
             return Err(CommitError::Revision { root, next, expected: expected.0 });
         }
-        let world = self.root().project(changes)?;
-        let revision = world.revision();
+        let mut world = self.root().clone();
+        let revision = world.apply(changes)?;
         self.revisions.push_back(world);
         while self.revisions.len() > self.config.revisions_kept {
             self.revisions.pop_front();
