@@ -25,6 +25,8 @@ pub(crate) struct Assignment {
 pub(crate) enum Available<'a> {
     /// What is free without what is reserved.
     Free(&'a Units),
+    /// As [`Available::Free`], for a waiter that has some of the reserved itself.
+    FreeTo(&'a Units, &'a [Units]),
     /// Everything that exists and is not consumed, whoever holds it.
     Existing,
 }
@@ -77,10 +79,13 @@ impl<'a> Search<'a> {
     /// What is left of a resource, in multiples of `grain`.
     fn left(&self, slot: Slot, resource: &Resource, grain: Quantity) -> Quantity {
         let used = self.used.get(&slot).copied().unwrap_or_default();
+        let of = |units: &Units| units.get(&slot).copied().unwrap_or_default();
         let left = match self.available {
             Available::Existing => resource.quantity(),
-            Available::Free(reserved) => {
-                resource.free().saturating_sub(reserved.get(&slot).copied().unwrap_or_default())
+            Available::Free(reserved) => resource.free().saturating_sub(of(reserved)),
+            Available::FreeTo(reserved, own) => {
+                let of_others = own.iter().fold(of(reserved), |left, own| left.saturating_sub(of(own)));
+                resource.free().saturating_sub(of_others)
             }
         };
         left.saturating_sub(used).floor_to(grain)
@@ -106,7 +111,7 @@ impl<'a> Search<'a> {
         let requirements: &'a [&'a Requirement] = self.requirements;
         match self.available {
             Available::Existing => Box::new(self.resources.fitting(requirements[index])),
-            Available::Free(_) => Box::new(self.resources.free(requirements[index])),
+            Available::Free(_) | Available::FreeTo(..) => Box::new(self.resources.free(requirements[index])),
         }
     }
 

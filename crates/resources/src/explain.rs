@@ -63,11 +63,8 @@ impl Pool {
         let ahead = self.queue.order.range(..waiter.place(id)).count();
         let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
         // What others have reserved: nobody behind it has anything that it wants.
-        let mut reserved = self.queue.reserved.clone();
-        for (slot, own) in waiter.reserved.iter().flatten() {
-            reserved.entry(*slot).and_modify(|amount| *amount = amount.saturating_sub(*own));
-        }
-        let free = Assignment::of(&self.resources, Available::Free(&reserved), &requirements);
+        let available = Available::FreeTo(&self.queue.reserved, &waiter.reserved);
+        let free = Assignment::of(&self.resources, available, &requirements);
         let unreserved = Assignment::of(&self.resources, Available::Free(&Units::new()), &requirements);
         let obstacles = requirements
             .into_iter()

@@ -54,6 +54,11 @@ pub(crate) async fn create(client: &mut ResourceServiceClient<Channel>, session:
     client.create(v1::CreateRequest { request_id, session_id, resource: Some(resource) }).await.unwrap();
 }
 
+pub(crate) async fn exists(channel: &Channel, kind: &str) -> bool {
+    let question = v1::ExistsRequest { requirement: Some(requirement(kind)) };
+    ResourceServiceClient::new(channel.clone()).exists(question).await.unwrap().into_inner().exists
+}
+
 pub(crate) struct Line {
     session: String,
     questions: mpsc::Sender<SessionRequest>,
@@ -131,7 +136,8 @@ impl Line {
         }
     }
 
-    async fn say(&self, lane: usize, kind: Asked) {
+    /// Asks without waiting for the answer.
+    pub(crate) async fn say(&self, lane: usize, kind: Asked) {
         self.questions.send(SessionRequest { id: lane as u64, kind: Some(kind) }).await.unwrap();
     }
 }

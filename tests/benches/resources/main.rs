@@ -10,6 +10,7 @@
 //! | `block_…`, `stream_block_…` | a block that is granted at once; `block_release_…` with its release. Without durability |
 //! | `throughput_64_ops_s` | blocks and releases of 64 clients, each on its stream and waiting for every answer; `…_ahead`: each with 16 under way |
 //! | `plain_sync_p50_us` | 200 bytes appended to a file and synced, in the same directory |
+//! | `empty_…`, `crowded_…` | a block beside nothing, and beside 100,000 resources and 10,000 waiters; `explain_…` why one waits, or the first hundred; `resource_bytes` of memory; `restart_…` from the start of the process to its first answer |
 //! | `durable_…` | the same with every acknowledgement on the disk (`--durability group`); `block3` is three kinds, all or none |
 
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr, reason = "a benchmark prints and may panic")]
@@ -17,6 +18,7 @@
 mod echo;
 mod etcd;
 mod line;
+mod load;
 mod process;
 mod redis;
 mod times;
@@ -65,6 +67,7 @@ async fn measure() {
             note(&format!("{prefix}{key}"), throughput(&place, durability, ahead).await);
         }
     }
+    load::measure(directory.path(), &mut note).await;
     rivals(directory.path(), &mut note).await;
     println!("{}", serde_json::to_string_pretty(&report).unwrap());
 }

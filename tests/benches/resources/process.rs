@@ -19,6 +19,15 @@ impl Drop for Process {
     }
 }
 
+impl Process {
+    /// What it has in memory.
+    pub(crate) fn resident_bytes(&self) -> f64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.0.id())).unwrap();
+        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+        line.trim().trim_end_matches(" kB").parse::<f64>().unwrap() * 1_024.0
+    }
+}
+
 /// This program again, as the echo.
 pub(crate) fn echo() -> (Process, String) {
     let mut child =
