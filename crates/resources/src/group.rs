@@ -42,6 +42,8 @@ pub(crate) struct Family {
     pub(crate) takers: BTreeSet<Place>,
     /// Those of them that have reserved some.
     pub(crate) reserving: BTreeSet<Place>,
+    /// Those that must not be overtaken any more: they and all before them reserve.
+    pub(crate) strict: BTreeSet<Place>,
 }
 
 /// A resource before or after a change.
@@ -218,13 +220,15 @@ impl Pool {
         self.queue.ready.remove(&place);
         for (key, units) in groups.iter().zip(reserved) {
             let Some(group) = self.queue.groups.get_mut(key) else { continue };
-            group.wanting.remove(&place);
+            let wanted = group.wanting.remove(&place);
             let family = group.family.clone();
             if let Some(family) = self.queue.families.get_mut(&family) {
                 family.takers.remove(&place);
                 family.reserving.remove(&place);
+                family.strict.remove(&place);
             }
-            if !units.is_empty() {
+            // Without one who lacked it, others may reserve what is free.
+            if !units.is_empty() || (wanted && self.limits.overtaken > 0) {
                 self.queue.mark(&family, false);
             }
             units.into_iter().for_each(|(slot, amount)| self.queue.unreserve(slot, amount));

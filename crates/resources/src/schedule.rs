@@ -2,7 +2,8 @@
 //!
 //! Waiters are served in order. One that cannot be yet, but could be if the holders let go, reserves every free unit that it
 //! would take: nobody behind it gets those, so it is not overtaken for what it waits for more often than
-//! [`crate::Limits::overtaken`] says (until then it reserves nothing). One that asks for more than exists reserves nothing, or
+//! [`crate::Limits::overtaken`] says (until then it reserves nothing, and who is behind it goes past only if it is served with
+//! that). One that asks for more than exists reserves nothing, or
 //! a missing kind would hold up everybody else.
 //!
 //! Families do not touch each other, so what a waiter reserves in one is independent of the rest: when something became free,
@@ -68,6 +69,7 @@ impl Pool {
         }
         let taken: Vec<bool> = waiter.request.requirements.iter().map(takes).collect();
         let groups = waiter.groups.clone();
+        let strict = self.limits.overtaken > 0 && waiter.overtaken >= self.limits.overtaken;
         let mut lacks = BTreeSet::new();
         for (key, _) in groups.iter().zip(taken).filter(|(_, takes)| *takes) {
             let Some(group) = self.queue.groups.get_mut(key) else { continue };
@@ -75,6 +77,9 @@ impl Pool {
             let name = group.family.clone();
             if let Some(family) = self.queue.families.get_mut(&name) {
                 family.takers.insert(place);
+                if strict {
+                    family.strict.insert(place);
+                }
                 let disturbs = family.reserving.last().is_some_and(|behind| *behind > place);
                 self.queue.mark(&name, disturbs);
             }
@@ -94,6 +99,9 @@ impl Pool {
         if anew {
             for place in std::mem::take(&mut known.reserving) {
                 self.take_back(place, family);
+                if self.limits.overtaken > 0 {
+                    self.take_back_elsewhere(place, family);
+                }
             }
         }
         let Some(known) = self.queue.families.get(family) else { return };
@@ -114,6 +122,20 @@ impl Pool {
         }
     }
 
+    /// Who went past others because it would be served at once, and is not, keeps nothing of what it went past them for.
+    fn take_back_elsewhere(&mut self, place: Place, family: &Arc<str>) {
+        let Some(waiter) = self.queue.get(place.1) else { return };
+        let of = |key: &Key| self.queue.groups.get(key).map(|group| group.family.clone());
+        let others: BTreeSet<Arc<str>> = waiter.groups.iter().filter_map(of).filter(|other| other != family).collect();
+        for other in others {
+            let Some(known) = self.queue.families.get_mut(&other) else { continue };
+            if known.reserving.remove(&place) {
+                self.take_back(place, &other);
+                self.queue.mark(&other, false);
+            }
+        }
+    }
+
     /// What a waiter had reserved in a family is anybody's, and it lacks it.
     fn take_back(&mut self, place: Place, family: &Arc<str>) {
         let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
@@ -130,13 +152,59 @@ impl Pool {
         freed.into_iter().for_each(|(slot, amount)| self.queue.unreserve(slot, amount));
     }
 
-    /// Reserves for a waiter what it lacks in a family, as far as that is free.
+    /// Reserves for a waiter what it lacks in a family, as far as that is free and nobody before it is passed for long.
     fn attempt(&mut self, place: Place, family: &Arc<str>) {
         self.take_back(place, family);
-        if let Some(family) = self.queue.families.get_mut(family) {
-            family.reserving.remove(&place);
+        let Some(known) = self.queue.families.get_mut(family) else { return };
+        known.reserving.remove(&place);
+        let kept = self.limits.overtaken == 0 || known.strict.last().is_some_and(|last| place <= *last);
+        let passes = self.passes(place, family);
+        let Some((indices, assignment)) = self.assigned(place, family) else { return };
+        let complete = assignment.is_complete();
+        if (complete && !passes) || (!complete && kept) {
+            self.reserve(place, family, &indices, assignment);
         }
-        let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
+        if complete && self.limits.overtaken > 0 {
+            self.reserve_all(place);
+        }
+    }
+
+    /// Whether somebody before it lacks something of the family and reserves nothing: what is free there goes past them. Only to
+    /// one who gets all that it lacks with it, and so is served at once. If it were reserved for longer, those two could wait
+    /// for each other, with one reserving what the other lacks.
+    fn passes(&self, place: Place, family: &Arc<str>) -> bool {
+        if self.limits.overtaken == 0 {
+            return false;
+        }
+        let Some(family) = self.queue.families.get(family) else { return false };
+        let from = family.strict.last().map_or(Bound::Unbounded, |last| Bound::Excluded(*last));
+        let between = |key: &Key| self.queue.groups.get(key)?.wanting.range((from, Bound::Unbounded)).next();
+        family.groups.iter().filter_map(between).any(|other| *other < place)
+    }
+
+    /// Reserves what a waiter lacks in every family, if all of it is free.
+    fn reserve_all(&mut self, place: Place) {
+        let Some(waiter) = self.queue.get(place.1) else { return };
+        let mut found = Vec::new();
+        for family in &waiter.lacks {
+            // What became free there goes to those before it first; then it is looked at again.
+            if self.queue.changed.contains_key(family) {
+                return;
+            }
+            let Some((indices, assignment)) = self.assigned(place, family) else { return };
+            if !assignment.is_complete() || indices.iter().any(|index| !waiter.reserved[*index].is_empty()) {
+                return;
+            }
+            found.push((family.clone(), indices, assignment));
+        }
+        for (family, indices, assignment) in found {
+            self.reserve(place, &family, &indices, assignment);
+        }
+    }
+
+    /// What of a family a waiter could have now, beside what is reserved; and for which of its requirements that is.
+    fn assigned(&self, place: Place, family: &Arc<str>) -> Option<(Vec<usize>, Assignment)> {
+        let waiter = self.queue.get(place.1)?;
         let of_family = |key: &Key| self.queue.groups.get(key).is_some_and(|group| group.family == *family);
         let indices: Vec<usize> = (0..waiter.groups.len())
             .filter(|index| takes(&waiter.request.requirements[*index]) && of_family(&waiter.groups[*index]))
@@ -145,10 +213,12 @@ impl Pool {
             indices.iter().map(|index| &waiter.request.requirements[*index]).collect();
         let available = Available::Free(&self.queue.reserved);
         let assignment = Assignment::of(&self.resources, available, &requirements);
+        Some((indices, assignment))
+    }
+
+    fn reserve(&mut self, place: Place, family: &Arc<str>, indices: &[usize], assignment: Assignment) {
+        let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
         let complete = assignment.is_complete();
-        if !complete && waiter.overtaken < self.limits.overtaken {
-            return;
-        }
         let mut some = false;
         for (index, units) in indices.iter().zip(assignment.taken) {
             for (slot, amount) in &units {
@@ -171,7 +241,8 @@ impl Pool {
         }
     }
 
-    /// Counts, for those before `place` that lack what is now taken, that they were overtaken.
+    /// Counts, for those before `place` that lack what is now taken, that they were overtaken. From the last time on that one may be,
+    /// it and all before it reserve what is free.
     pub(crate) fn overtake(&mut self, place: Place, taken: &[Units]) {
         if self.limits.overtaken == 0 || self.queue.families.is_empty() {
             return;
@@ -183,15 +254,22 @@ impl Pool {
             for key in self.queue.families.get(family).into_iter().flat_map(|family| &family.groups) {
                 let Some(group) = self.queue.groups.get(key) else { continue };
                 if group.fits(&self.resources, &resource.description) {
-                    passed.extend(group.wanting.range(..place).map(|place| (*place, group.family.clone())));
+                    passed.extend(group.wanting.range(..place).copied());
                 }
             }
         }
-        for (place, family) in passed {
+        for place in passed {
             let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { continue };
             waiter.overtaken = waiter.overtaken.saturating_add(1);
-            if waiter.overtaken == self.limits.overtaken {
-                self.queue.mark(&family, true);
+            if waiter.overtaken < self.limits.overtaken {
+                continue;
+            }
+            for key in &waiter.groups {
+                let Some(group) = self.queue.groups.get(key) else { continue };
+                let Some(family) = self.queue.families.get_mut(&group.family) else { continue };
+                if family.strict.insert(place) {
+                    self.queue.changed.insert(group.family.clone(), true);
+                }
             }
         }
     }

@@ -1,11 +1,18 @@
-//! Random histories: the pool does what a tiny obvious model does, grant by grant, and keeps its invariants.
+//! Random histories: the pool does what a tiny obvious model does, grant by grant, and keeps its invariants, also over crashes
+//! after which it is restored from what it wrote down.
+//!
+//! What is held, free and there is compared from outside besides: no unit has two holders, what there is is what was created
+//! without what was consumed and deleted, a lease has all that was asked for, tokens grow, nobody who can be served waits, and a
+//! large request is overtaken as often as allowed and no more.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use proptest::prelude::*;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
-use ratn_resources::{AcquireRequest, Limits, Notice, Pool, ResourceSpec, SessionId, WaiterId};
+use ratn_resources::{
+    AcquireRequest, Limits, Notice, Pool, Quantity, Record, ResourceSpec, SessionId, Snapshot, WaiterId, decode, encode,
+};
 use std::collections::BTreeMap;
 use std::time::Duration;
 
@@ -19,10 +26,21 @@ enum Step {
     KeepAlive(usize),
     Create(usize, u32),
     DeleteUnit(usize),
-    Acquire { session: usize, units: [u32; 3], consume: bool, priority: i64, patience: Option<u64> },
+    Acquire {
+        session: usize,
+        units: [u32; 3],
+        consume: bool,
+        priority: i64,
+        patience: Option<u64>,
+    },
     Release(usize),
     Cancel(usize),
     EndTask(usize),
+    /// Restored from the snapshot of an earlier moment and the records since; the records of the last step may be lost.
+    Crash {
+        snapshot: prop::sample::Index,
+        last_is_lost: bool,
+    },
 }
 
 fn step() -> impl Strategy<Value = Step> {
@@ -44,13 +62,15 @@ fn step() -> impl Strategy<Value = Step> {
         5 => (0..16usize).prop_map(Step::Release),
         1 => (0..16usize).prop_map(Step::Cancel),
         1 => (0..SESSIONS).prop_map(Step::EndTask),
+        2 => (any::<prop::sample::Index>(), any::<bool>())
+            .prop_map(|(snapshot, last_is_lost)| Step::Crash { snapshot, last_is_lost }),
     ]
 }
 
 /// Units per kind.
 type Units = [u32; 3];
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct ModelWaiter {
     id: WaiterId,
     session: usize,
@@ -61,16 +81,23 @@ struct ModelWaiter {
 }
 
 /// What the pool should be: counts per kind, a list of holders, a sorted queue.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 struct Model {
     capacity: Units,
     expires: [Option<u64>; SESSIONS],
     leases: BTreeMap<LeaseId, (usize, Units)>,
     consumed: [Units; SESSIONS],
     queue: Vec<ModelWaiter>,
+    last_token: FencingToken,
 }
 
 impl Model {
+    /// Who waited asks again, if at all; sessions live on from now.
+    fn restart(&mut self, now: u64) {
+        self.queue.clear();
+        self.expires.iter_mut().flatten().for_each(|expires| *expires = now + TTL);
+    }
+
     fn advance(&mut self, now: u64) {
         self.queue.retain(|waiter| waiter.deadline.is_none_or(|deadline| deadline > now));
         for session in 0..SESSIONS {
@@ -123,26 +150,78 @@ impl Model {
     }
 }
 
+/// The pool, and what is on its disk.
+struct Kept {
+    pool: Pool,
+    /// A snapshot after each entry, and before the first.
+    snapshots: Vec<Vec<u8>>,
+    entries: Vec<Vec<u8>>,
+}
+
+impl Kept {
+    fn new() -> Kept {
+        let pool = Pool::new(Limits::default());
+        Kept { snapshots: vec![pool.snapshot().encode()], entries: Vec::new(), pool }
+    }
+
+    fn write(&mut self) {
+        self.entries.push(encode(&self.pool.take_records()));
+        self.snapshots.push(self.pool.snapshot().encode());
+    }
+
+    fn crash(&mut self, now: Timestamp, snapshot: prop::sample::Index, last_is_lost: bool) {
+        if last_is_lost {
+            self.entries.pop();
+            self.snapshots.pop();
+        }
+        let cut = snapshot.index(self.snapshots.len());
+        let snapshot = Snapshot::decode(&self.snapshots[cut]).unwrap();
+        let records: Vec<Record> = self.entries[cut..].iter().flat_map(|entry| decode(entry).unwrap()).collect();
+        // Numbers of waiters begin anew, as they do in a process that was started again.
+        self.pool = Pool::restore(Limits::default(), now, Some(snapshot), records).unwrap();
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 400, ..ProptestConfig::default() })]
 
     #[test]
     fn every_history_grants_what_the_obvious_model_grants(steps in prop::collection::vec(step(), 1..80)) {
-        let mut pool = Pool::new(Limits::default());
+        let mut kept = Kept::new();
         let mut model = Model::default();
+        let mut before_last = model.clone();
         let names: Vec<SessionId> = ["a", "b", "c"].map(SessionId::from).to_vec();
-        let (mut now, mut last_token) = (0, FencingToken(0));
+        let mut now = 0;
         for step in steps {
             if let Step::Wait(seconds) = step {
                 now += seconds;
             }
             let at = Timestamp(now);
+            if let Step::Crash { snapshot, last_is_lost } = step {
+                let last_is_lost = last_is_lost && !kept.entries.is_empty();
+                kept.crash(at, snapshot, last_is_lost);
+                if last_is_lost {
+                    model = before_last.clone();
+                }
+                model.restart(now);
+                compare(&mut kept.pool, &mut model)?;
+                // What is restored is written down already.
+                prop_assert!(kept.pool.take_records().is_empty());
+                before_last = model.clone();
+                kept.snapshots = vec![kept.pool.snapshot().encode()];
+                kept.entries.clear();
+                continue;
+            }
+            let pool = &mut kept.pool;
             pool.advance(at);
             model.advance(now);
             // What became free while time went on is granted before the step.
-            compare(&mut pool, &mut model, &mut last_token)?;
+            compare(pool, &mut model)?;
+            kept.write();
+            before_last = model.clone();
+            let pool = &mut kept.pool;
             match step {
-                Step::Wait(_) => {}
+                Step::Wait(_) | Step::Crash { .. } => {}
                 Step::KeepAlive(session) => {
                     let created = pool.keep_alive(at, &names[session], "test", Duration::from_nanos(TTL)).unwrap();
                     prop_assert_eq!(created, model.expires[session].is_none());
@@ -194,8 +273,61 @@ proptest! {
                     model.consumed[session] = [0; 3];
                 }
             }
-            compare(&mut pool, &mut model, &mut last_token)?;
+            compare(pool, &mut model)?;
+            kept.write();
         }
+    }
+
+    #[test]
+    fn nobody_is_overtaken_more_often_than_allowed(
+        limit in 0..5_u32,
+        steps in prop::collection::vec((0..3_usize, [0..5_u32, 0..3_u32], any::<prop::sample::Index>()), 1..120),
+    ) {
+        let mut pool = Pool::new(Limits { overtaken: limit, ..Limits::default() });
+        let (at, session) = (Timestamp(0), SessionId::from("a"));
+        pool.keep_alive(at, &session, "a", Duration::from_secs(1)).unwrap();
+        // As much of each as anybody asks for, so that everybody could be served.
+        for (kind, capacity) in [(0, 4), (1, 2)] {
+            pool.create(at, None, ResourceSpec::new(ResourceClass::Module, KINDS[kind]).capacity(capacity)).unwrap();
+        }
+        // By waiter, in the order of arrival, which is that of service: what it wants, and how often it was overtaken.
+        let mut waiting = BTreeMap::<WaiterId, ([u32; 2], u32)>::new();
+        let mut held = Vec::new();
+        for (action, units, index) in steps {
+            if action == 0 {
+                if !held.is_empty() {
+                    let lease = held.swap_remove(index.index(held.len()));
+                    pool.release(at, None, lease).unwrap();
+                }
+            } else if units != [0, 0] {
+                let wanted = (0..2).filter(|kind| units[*kind] > 0);
+                let wanted = wanted.map(|kind| requirement(ResourceOperation::Block, kind, units[kind])).collect();
+                waiting.insert(pool.acquire(at, AcquireRequest::new(session.clone(), wanted)).unwrap(), (units, 0));
+            }
+            pool.check_invariants().map_err(TestCaseError::fail)?;
+            for notice in pool.take_notices() {
+                let Notice::Granted { waiter, lease } = notice else { continue };
+                held.push(lease.id);
+                let (taken, _) = waiting.remove(&waiter).unwrap();
+                for (id, (units, overtaken)) in waiting.range_mut(..waiter) {
+                    // One who wants a single kind lacks some of it as long as it waits.
+                    let (one, shared) = (units.contains(&0), units.iter().zip(taken).any(|(a, b)| *a > 0 && b > 0));
+                    *overtaken += u32::from(one && shared);
+                    prop_assert!(*overtaken <= limit, "{id} was overtaken {overtaken} times, by {waiter} at last");
+                }
+            }
+        }
+        // Nobody waits for ever: when all is given back, one after the other, everybody has been served.
+        while let Some(lease) = held.pop() {
+            pool.release(at, None, lease).unwrap();
+            for notice in pool.take_notices() {
+                if let Notice::Granted { waiter, lease } = notice {
+                    held.push(lease.id);
+                    waiting.remove(&waiter);
+                }
+            }
+        }
+        prop_assert!(waiting.is_empty(), "still waiting: {waiting:?}");
     }
 }
 
@@ -203,13 +335,18 @@ fn requirement(operation: ResourceOperation, kind: usize, count: u32) -> Require
     Requirement { count, ..Requirement::new(operation, KINDS[kind]) }
 }
 
-fn compare(pool: &mut Pool, model: &mut Model, last_token: &mut FencingToken) -> Result<(), TestCaseError> {
+fn compare(pool: &mut Pool, model: &mut Model) -> Result<(), TestCaseError> {
     pool.check_invariants().map_err(TestCaseError::fail)?;
     let mut granted = Vec::new();
     for notice in pool.take_notices() {
         if let Notice::Granted { waiter, lease } = notice {
-            prop_assert!(lease.token > *last_token, "tokens grow strictly");
-            *last_token = lease.token;
+            prop_assert!(lease.token > model.last_token, "tokens grow strictly");
+            model.last_token = lease.token;
+            // All or nothing.
+            let waiting = model.queue.iter().find(|waiting| waiting.id == waiter).unwrap();
+            let expected = if waiting.consume { [0; 3] } else { waiting.units };
+            let of = |kind: &&str| lease.resources.iter().filter(|resource| resource.kind == **kind).count() as u32;
+            prop_assert_eq!(KINDS.each_ref().map(of), expected);
             granted.push((waiter, lease.id));
         }
     }
@@ -219,8 +356,15 @@ fn compare(pool: &mut Pool, model: &mut Model, last_token: &mut FencingToken) ->
     for resource in pool.list() {
         let kind = KINDS.iter().position(|kind| *kind == resource.kind).unwrap();
         free[kind] += resource.free.units();
+        // No unit has two holders.
+        let held: Quantity = resource.holdings.iter().map(|holding| holding.units).sum();
+        prop_assert_eq!(held + resource.consumed + resource.free, resource.capacity);
     }
     prop_assert_eq!(free, [model.free(0), model.free(1), model.free(2)]);
+    for kind in 0..3 {
+        let exists = pool.exists(&requirement(ResourceOperation::Exists, kind, 1));
+        prop_assert_eq!(exists, model.quantity(kind), "created − consumed − deleted");
+    }
     prop_assert_eq!(pool.waiters().len(), model.queue.len());
     prop_assert_eq!(pool.leases().len(), model.leases.len());
     Ok(())

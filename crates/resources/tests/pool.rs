@@ -172,6 +172,30 @@ fn a_large_request_is_not_overtaken_for_what_it_waits_for_but_other_kinds_pass()
 }
 
 #[test]
+fn where_overtaking_is_allowed_nobody_reserves_what_another_lacks_while_it_lacks_what_that_one_has() {
+    let mut bench = Bench::new();
+    bench.pool = Pool::new(Limits { overtaken: 1, ..Limits::default() });
+    bench.pool.keep_alive(bench.now, &session("a"), "a", Duration::from_secs(10)).unwrap();
+    for (kind, capacity) in [("A", 4), ("B", 2)] {
+        bench.create("a", ResourceSpec::new(ResourceClass::Module, kind).capacity(capacity));
+    }
+    let of = |kind: &str, count| requirement(ResourceOperation::Block, kind, count);
+    let first = bench.granted("a", &[of("B", 1)]);
+    let both = bench.acquire("a", &[of("B", 2)]);
+    let passing = bench.granted("a", &[of("A", 1), of("B", 1)]);
+    let large = bench.acquire("a", &[of("A", 4), of("B", 2)]);
+    assert!(bench.release(first.id).is_empty());
+    // A unit of A is free for it, and would be lacking to the large one, which is before it.
+    let small = bench.acquire("a", &[of("A", 1), of("B", 1)]);
+    assert_eq!(bench.release(passing.id), [both]);
+    let mut served = Vec::new();
+    while let Some(lease) = bench.pool.leases().first() {
+        served.extend(bench.release(lease.id));
+    }
+    assert_eq!(served, [large, small]);
+}
+
+#[test]
 fn a_request_for_a_missing_kind_holds_nobody_up_and_is_granted_when_the_kind_appears() {
     let mut bench = Bench::with(&[("Arm", 1)]);
     let missing = bench.acquire("b", &[block("Arm"), block("Detector")]);
