@@ -45,8 +45,10 @@ pub enum LogFormat {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LogPlace {
-    /// Standard error.
+    /// The journal where standard error is the journal's (a unit of systemd), else standard error.
     #[default]
+    Auto,
+    /// Standard error.
     Stderr,
     /// systemd's journal, every field for itself.
     Journald,
@@ -93,7 +95,7 @@ struct AuditFile {
 
 impl Default for LogConfig {
     fn default() -> Self {
-        LogConfig { filter: "info".to_owned(), format: LogFormat::Text, to: LogPlace::Stderr }
+        LogConfig { filter: "info".to_owned(), format: LogFormat::Text, to: LogPlace::Auto }
     }
 }
 
@@ -112,10 +114,15 @@ pub fn start_as(config: &LogConfig, audit_file: Option<&Path>) -> Result<Logs, L
     let (filter, handle) = reload::Layer::new(filter_of(config)?);
     // It would say on the same standard error, and panic, that nothing can be written there.
     let text = tracing_subscriber::fmt::layer().with_writer(io::stderr).with_ansi(false).log_internal_errors(false);
-    let main: Boxed = match (config.to, config.format) {
+    let to = match config.to {
+        LogPlace::Auto if stderr_is_the_journals() => LogPlace::Journald,
+        LogPlace::Auto => LogPlace::Stderr,
+        said => said,
+    };
+    let main: Boxed = match (to, config.format) {
         (LogPlace::Journald, _) => tracing_journald::layer().map_err(LogError::Journal)?.with_filter(filter).boxed(),
-        (LogPlace::Stderr, LogFormat::Text) => text.with_filter(filter).boxed(),
-        (LogPlace::Stderr, LogFormat::Json) => text.json().flatten_event(true).with_filter(filter).boxed(),
+        (_, LogFormat::Text) => text.with_filter(filter).boxed(),
+        (_, LogFormat::Json) => text.json().flatten_event(true).with_filter(filter).boxed(),
     };
     let audit = audit_file.map(AuditFile::open).transpose()?;
     let audit_layer = audit.clone().map(|file| -> Boxed {
@@ -143,6 +150,13 @@ impl Logs {
             None => Ok(()),
         }
     }
+}
+
+/// systemd says in `JOURNAL_STREAM` which file (device and inode) is the journal's: it may be inherited by who writes elsewhere.
+fn stderr_is_the_journals() -> bool {
+    let said = std::env::var("JOURNAL_STREAM").unwrap_or_default();
+    let there = nix::sys::stat::fstat(io::stderr()).map(|file| format!("{}:{}", file.st_dev, file.st_ino));
+    there.is_ok_and(|there| there == said)
 }
 
 /// Mutations are not in the log unless it is asked for them by name.

@@ -26,7 +26,10 @@ impl Line {
         let channel = system.channels.get(&manager.endpoint).unwrap();
         let (questions, outgoing) = mpsc::channel(64);
         let ping = v1::KeepAliveRequest { session_id: session.to_owned(), ttl_ms: 60_000, client: session.to_owned() };
-        questions.send(SessionRequest { id: 1, kind: Some(Asked::KeepAlive(ping)) }).await.unwrap();
+        questions
+            .send(SessionRequest { id: 1, kind: Some(Asked::KeepAlive(ping)), ..Default::default() })
+            .await
+            .unwrap();
         let call = ResourceServiceClient::new(channel).session(ReceiverStream::new(outgoing)).await;
         let mut line = Line { questions, answers: call.unwrap().into_inner() };
         let (id, Kind::KeepAlive(kept)) = line.hear().await else { panic!("it is kept alive") };
@@ -35,7 +38,7 @@ impl Line {
     }
 
     async fn ask(&self, id: u64, kind: Option<Asked>) {
-        self.questions.send(SessionRequest { id, kind }).await.unwrap();
+        self.questions.send(SessionRequest { id, kind, ..Default::default() }).await.unwrap();
     }
 
     async fn hear(&mut self) -> (u64, Kind) {
@@ -131,7 +134,7 @@ async fn more_calls_than_a_stream_may_have_are_refused_and_the_others_go_on() {
     tokio::spawn(async move {
         for number in 0..CALLS {
             let kind = acquire("a", &format!("waits {number}"));
-            let _ = questions.send(SessionRequest { id: 10 + number, kind }).await;
+            let _ = questions.send(SessionRequest { id: 10 + number, kind, ..Default::default() }).await;
         }
     });
     let (id, code) = line.failure().await;

@@ -222,8 +222,7 @@ where
             None => Box::pin(answered),
             Some(context) => {
                 let own = context.child();
-                let span = tracing::info_span!("call", trace = %own.trace_id(), span = %own.span_id());
-                Box::pin(trace::within(own, answered).instrument(span))
+                Box::pin(trace::within(own, answered).instrument(own.entered()))
             }
         }
     }

@@ -10,7 +10,10 @@ use rand::RngExt;
 use std::fmt;
 use std::future::Future;
 use std::str::FromStr;
-use tonic::codegen::http;
+use std::task::{Context, Poll};
+use tonic::body::Body;
+use tonic::codegen::{Service, http};
+use tonic::transport::Channel;
 
 /// The header and metadata key.
 pub const HEADER: &str = "traceparent";
@@ -48,6 +51,11 @@ impl TraceContext {
     /// That of a request, if it carries one; one that is none is as good as absent, as the standard wants it.
     pub fn from_headers(headers: &http::HeaderMap) -> Option<TraceContext> {
         headers.get(HEADER)?.to_str().ok()?.parse().ok()
+    }
+
+    /// What shows it in the logs of what is done for a call.
+    pub fn entered(self) -> tracing::Span {
+        tracing::info_span!("call", trace = %self.trace_id(), span = %self.span_id())
     }
 
     /// Names the whole trace: 32 hex digits.
@@ -95,6 +103,43 @@ struct Hex(u128, usize);
 impl fmt::Display for Hex {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:0width$x}", self.0, width = self.1)
+    }
+}
+
+/// A channel whose calls carry the context of the task that makes them, each as a span of its own.
+#[derive(Debug, Clone)]
+pub struct Traced(Channel);
+
+impl Traced {
+    /// Over this channel.
+    pub fn new(channel: Channel) -> Traced {
+        Traced(channel)
+    }
+}
+
+impl Service<http::Request<Body>> for Traced {
+    type Response = <Channel as Service<http::Request<Body>>>::Response;
+    type Error = <Channel as Service<http::Request<Body>>>::Error;
+    type Future = <Channel as Service<http::Request<Body>>>::Future;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Self::Error>> {
+        self.0.poll_ready(context)
+    }
+
+    fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
+        let header = current().map(|context| http::HeaderValue::try_from(context.child().to_string()));
+        if let Some(Ok(header)) = header {
+            request.headers_mut().insert(HEADER, header);
+        }
+        self.0.call(request)
+    }
+}
+
+/// As [`within`], where there is a context.
+pub async fn within_any<F: Future>(context: Option<TraceContext>, future: F) -> F::Output {
+    match context {
+        Some(context) => within(context, future).await,
+        None => future.await,
     }
 }
 

@@ -9,6 +9,7 @@ use ratn_model::value::Value;
 use ratn_proto::types::{Goal, GoalOutcome};
 use ratn_worker::client::CallError;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::trace::{self, TraceContext};
 use std::sync::atomic::Ordering;
 use tonic::Code;
 
@@ -177,7 +178,10 @@ async fn an_unknown_action_is_refused_with_those_that_there_are() {
     let provider = provider(None).await;
     let error = run(&provider, goal("a", "fly", 1)).await.unwrap_err();
     assert_eq!(error.code(), Some(Code::InvalidArgument));
-    assert!(error.to_string().contains("no action `fly`: there are double, panic, relay, stay, wait"), "{error}");
+    assert!(
+        error.to_string().contains("no action `fly`: there are double, panic, relay, stay, trace, wait"),
+        "{error}"
+    );
     assert!(!error.is_crash());
 }
 
@@ -226,4 +230,21 @@ async fn a_provider_describes_what_it_performs() {
     assert_eq!(double.description, "twice as much");
     assert!(double.cancel_when_abandoned);
     assert!(!info.actions.iter().find(|action| action.name == "stay").unwrap().cancel_when_abandoned);
+}
+
+#[tokio::test]
+async fn a_goal_is_of_the_trace_of_whoever_gave_it() {
+    let provider = provider(None).await;
+    let context = TraceContext::fresh();
+    let trace_of = async |id: &str| {
+        let outcome = provider.client.execute(&provider.endpoint, goal(id, "trace", 1), |_, _| {}).await.unwrap();
+        let Some(Value::String(trace)) = outcome.outputs.get("trace").cloned() else { panic!("{outcome:?}") };
+        trace
+    };
+    let there: TraceContext = trace::within(context, trace_of("a")).await.parse().unwrap();
+    assert_eq!(there.trace_id().to_string(), context.trace_id().to_string());
+    // Another span of it.
+    assert_ne!(there.span_id().to_string(), context.span_id().to_string());
+    // Who is part of none makes none.
+    assert_eq!(trace_of("b").await, "");
 }

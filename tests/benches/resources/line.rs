@@ -70,7 +70,7 @@ impl Line {
     pub(crate) async fn open(channel: Channel, session: &str) -> Line {
         let (questions, outgoing) = mpsc::channel(256);
         let ping = v1::KeepAliveRequest { session_id: session.to_owned(), ttl_ms: 60_000, client: "bench".to_owned() };
-        let first = SessionRequest { id: 0, kind: Some(Asked::KeepAlive(ping)) };
+        let first = SessionRequest { id: 0, kind: Some(Asked::KeepAlive(ping)), ..Default::default() };
         questions.send(first).await.unwrap();
         let mut client = ResourceServiceClient::new(channel);
         let mut answers = client.session(ReceiverStream::new(outgoing)).await.unwrap().into_inner();
@@ -81,7 +81,7 @@ impl Line {
     async fn ask(&mut self, kind: Asked) -> Answered {
         let id = self.next;
         self.next += 1;
-        self.questions.send(SessionRequest { id, kind: Some(kind) }).await.unwrap();
+        self.questions.send(SessionRequest { id, kind: Some(kind), ..Default::default() }).await.unwrap();
         let answer = self.answers.message().await.unwrap().unwrap();
         assert_eq!(answer.id, id, "one question at a time");
         answer.kind.unwrap()
@@ -138,7 +138,7 @@ impl Line {
 
     /// Asks without waiting for the answer.
     pub(crate) async fn say(&self, lane: usize, kind: Asked) {
-        self.questions.send(SessionRequest { id: lane as u64, kind: Some(kind) }).await.unwrap();
+        self.questions.send(SessionRequest { id: lane as u64, kind: Some(kind), ..Default::default() }).await.unwrap();
     }
 }
 

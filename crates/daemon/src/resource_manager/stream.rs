@@ -13,12 +13,14 @@ use futures::stream::FuturesUnordered;
 use futures::{FutureExt, Stream, StreamExt};
 use ratn_proto::v1::resource_service_server::ResourceService;
 use ratn_proto::v1::{self, session_request, session_response};
+use ratn_worker::trace::{self, TraceContext};
 use std::future::Future;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 use tonic::{Code, Status, Streaming};
+use tracing::Instrument;
 
 /// Calls under way of one stream; more are refused.
 const MAX_CALLS: usize = 4_096;
@@ -105,7 +107,8 @@ fn call(service: Service, caller: Caller, question: v1::SessionRequest) -> Call 
     use session_request::Kind as Asked;
     use session_response::Kind;
     let id = question.id;
-    Box::pin(async move {
+    let context = question.traceparent.parse::<TraceContext>().ok().map(TraceContext::child);
+    let called = async move {
         let began = Instant::now();
         let path = match question.kind {
             Some(Asked::Block(_)) => "/ratn.v1.ResourceService/Block",
@@ -140,7 +143,11 @@ fn call(service: Service, caller: Caller, question: v1::SessionRequest) -> Call 
             metrics.call(path, code, began.elapsed());
         }
         answer(id, answered)
-    })
+    };
+    match context {
+        None => Box::pin(called),
+        Some(context) => Box::pin(trace::within(context, called).instrument(context.entered())),
+    }
 }
 
 fn answer(id: u64, answered: Result<session_response::Kind, Status>) -> v1::SessionResponse {

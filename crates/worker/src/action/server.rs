@@ -5,6 +5,7 @@ use super::goal::{Ending, GoalEntry, StopCause};
 use super::service::Messages;
 use super::{Action, ActionFailure, ActionResult, GoalContext};
 use crate::client::Channels;
+use crate::trace;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_proto::types::{Goal, GoalOutcome};
 use std::collections::{BTreeMap, VecDeque};
@@ -14,6 +15,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio::task::JoinError;
 use tonic::Status;
+use tracing::Instrument;
 
 /// So many results are remembered unless said otherwise.
 const RESULTS_KEPT: usize = 64;
@@ -180,7 +182,8 @@ impl ActionServer {
                     let messages = Messages::of(&entry, false);
                     let deadline_ms = goal.deadline_ms;
                     let context = GoalContext::new(goal, Arc::clone(&entry), self.inner.channels.clone());
-                    tokio::spawn(run(Arc::clone(&self.inner), entry, action, context, deadline_ms));
+                    let running = run(Arc::clone(&self.inner), entry, action, context, deadline_ms);
+                    tokio::spawn(trace::within_any(trace::current(), running).in_current_span());
                     return Ok(messages);
                 }
                 // Ends within the grace: the runner sees to it.
@@ -267,7 +270,8 @@ async fn run(
     deadline_ms: u64,
 ) {
     tracing::debug!(goal = %entry.id, action = %context.action, "begun");
-    let mut performing = tokio::spawn(async move { action.execute(context).await });
+    let performing = trace::within_any(trace::current(), async move { action.execute(context).await });
+    let mut performing = tokio::spawn(performing.in_current_span());
     let deadline = async {
         if deadline_ms > 0 {
             tokio::time::sleep(Duration::from_millis(deadline_ms)).await;

@@ -2,6 +2,7 @@
 
 use super::{CallError, Channels};
 use crate::endpoint::Endpoint;
+use crate::trace::Traced;
 use ratn_model::value::Value;
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::{Malformed, ports};
@@ -10,7 +11,6 @@ use ratn_proto::v1;
 use ratn_proto::v1::action_service_client::ActionServiceClient;
 use ratn_proto::v1::execute_response::Kind;
 use std::collections::BTreeMap;
-use tonic::transport::Channel;
 
 /// Gives goals to providers.
 #[derive(Debug, Clone, Default)]
@@ -138,8 +138,8 @@ impl ActionClient {
         Ok(ProviderInfo { resource: answer.resource_id, actions: answer.actions.into_iter().map(info).collect() })
     }
 
-    fn client(&self, endpoint: &Endpoint) -> Result<ActionServiceClient<Channel>, CallError> {
-        Ok(ActionServiceClient::new(self.channels.get(endpoint)?)
+    fn client(&self, endpoint: &Endpoint) -> Result<ActionServiceClient<Traced>, CallError> {
+        Ok(ActionServiceClient::new(self.channels.traced(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES))
     }

@@ -9,6 +9,7 @@
 //! Opened with the first call, and again with the first one after it broke; the calls that were under way then fail as calls of
 //! their own would. One that is dropped is withdrawn.
 
+use crate::trace::{self, Traced};
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_proto::v1::session_request::Kind as Asked;
 use ratn_proto::v1::session_response::Kind as Answered;
@@ -17,7 +18,6 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::Channel;
 use tonic::{Code, Status, Streaming};
 
 /// Questions that wait for the connection; more make their askers wait.
@@ -49,13 +49,13 @@ impl Line {
     /// Asks over the stream, which `client` opens if there is none.
     pub(super) async fn ask(
         &self,
-        client: &ResourceServiceClient<Channel>,
+        client: &ResourceServiceClient<Traced>,
         question: Asked,
     ) -> Result<Answered, Status> {
         self.open(client).await?.ask(question).await
     }
 
-    async fn open(&self, client: &ResourceServiceClient<Channel>) -> Result<Open, Status> {
+    async fn open(&self, client: &ResourceServiceClient<Traced>) -> Result<Open, Status> {
         let mut open = self.open.lock().await;
         if let Some(open) = open.as_ref().filter(|open| open.calls().broken.is_none()) {
             return Ok(open.clone());
@@ -73,7 +73,8 @@ impl Open {
         let undo = undoing(&question);
         let (id, answered) = self.calls().begin()?;
         let mut call = Call { line: self, id, undo };
-        if self.questions.send(SessionRequest { id, kind: Some(question) }).await.is_err() {
+        let traceparent = trace::current().map_or_else(String::new, |context| context.child().to_string());
+        if self.questions.send(SessionRequest { id, kind: Some(question), traceparent }).await.is_err() {
             call.undo = None;
         }
         let answer = answered.await;
@@ -111,7 +112,7 @@ impl Drop for Call<'_> {
         self.line.calls().waiting.remove(&self.id);
         let Some(undo) = self.undo.take() else { return };
         // Nobody waits for its answer.
-        let undo = SessionRequest { id: 0, kind: Some(Asked::Withdraw(undo)) };
+        let undo = SessionRequest { kind: Some(Asked::Withdraw(undo)), ..SessionRequest::default() };
         if let Err(mpsc::error::TrySendError::Full(undo)) = self.line.questions.try_send(undo) {
             let questions = self.line.questions.clone();
             tokio::spawn(async move { questions.send(undo).await });

@@ -16,6 +16,7 @@ pub use resource::{AcquireOptions, ResourceClient, ResourceWatch};
 pub use world::{Projection, WorldClient};
 
 use crate::endpoint::{Endpoint, connect_lazily};
+use crate::trace::Traced;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -53,6 +54,14 @@ impl Channels {
             .map_err(|error| CallError::Broken { endpoint: endpoint.clone(), reason: chain(&error) })?;
         kept.insert(endpoint.clone(), channel.clone());
         Ok(channel)
+    }
+
+    /// As [`Channels::get`]; the calls over it carry the trace of the task that makes them.
+    ///
+    /// # Errors
+    /// As [`Channels::get`].
+    pub fn traced(&self, endpoint: &Endpoint) -> Result<Traced, CallError> {
+        self.get(endpoint).map(Traced::new)
     }
 
     /// Forgets the channel to an endpoint that is gone for good.

@@ -2,18 +2,18 @@
 
 use super::{CallError, Channels};
 use crate::endpoint::Endpoint;
+use crate::trace::Traced;
 use ratn_proto::convert::{each, required};
 use ratn_proto::types::{PoolStatus, WorkerStatus};
 use ratn_proto::v1;
 use ratn_proto::v1::process_service_client::ProcessServiceClient;
 use tonic::Streaming;
-use tonic::transport::Channel;
 
 /// Asks one process manager.
 #[derive(Debug, Clone)]
 pub struct ProcessClient {
     endpoint: Endpoint,
-    client: ProcessServiceClient<Channel>,
+    client: ProcessServiceClient<Traced>,
 }
 
 /// Every worker as it is, then every change.
@@ -29,7 +29,7 @@ impl ProcessClient {
     /// # Errors
     /// As [`Channels::get`].
     pub fn new(channels: &Channels, endpoint: &Endpoint) -> Result<ProcessClient, CallError> {
-        let client = ProcessServiceClient::new(channels.get(endpoint)?);
+        let client = ProcessServiceClient::new(channels.traced(endpoint)?);
         Ok(ProcessClient { endpoint: endpoint.clone(), client })
     }
 

@@ -3,6 +3,7 @@
 use super::line::Line;
 use super::{CallError, Channels, fresh_id};
 use crate::endpoint::Endpoint;
+use crate::trace::Traced;
 use ratn_model::id::LeaseId;
 use ratn_model::resource::{Lease, Requirement};
 use ratn_proto::MAX_MESSAGE_BYTES;
@@ -14,14 +15,13 @@ use ratn_proto::v1::session_request::Kind as Asked;
 use ratn_proto::v1::session_response::Kind as Answered;
 use std::time::Duration;
 use tonic::Streaming;
-use tonic::transport::Channel;
 
 /// Asks one resource manager, in the name of one session. Every mutation gets a fresh request id.
 #[derive(Debug, Clone)]
 pub struct ResourceClient {
     endpoint: Endpoint,
     session: String,
-    client: ResourceServiceClient<Channel>,
+    client: ResourceServiceClient<Traced>,
     line: Line,
 }
 
@@ -63,7 +63,7 @@ impl ResourceClient {
     /// # Errors
     /// As [`Channels::get`].
     pub fn new(channels: &Channels, endpoint: &Endpoint, session: &str) -> Result<ResourceClient, CallError> {
-        let client = ResourceServiceClient::new(channels.get(endpoint)?)
+        let client = ResourceServiceClient::new(channels.traced(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         Ok(ResourceClient { endpoint: endpoint.clone(), session: session.to_owned(), client, line: Line::default() })

@@ -2,6 +2,7 @@
 
 use super::{CallError, Channels};
 use crate::endpoint::Endpoint;
+use crate::trace::Traced;
 use ratn_model::fact::{Change, FactPattern, Footprint};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_proto::MAX_MESSAGE_BYTES;
@@ -9,13 +10,12 @@ use ratn_proto::convert::{all, each};
 use ratn_proto::types::FactRecord;
 use ratn_proto::v1;
 use ratn_proto::v1::world_pool_service_client::WorldPoolServiceClient;
-use tonic::transport::Channel;
 
 /// Asks one world pool.
 #[derive(Debug, Clone)]
 pub struct WorldClient {
     endpoint: Endpoint,
-    client: WorldPoolServiceClient<Channel>,
+    client: WorldPoolServiceClient<Traced>,
 }
 
 /// What a projection shall be.
@@ -39,7 +39,7 @@ impl WorldClient {
     /// # Errors
     /// As [`Channels::get`].
     pub fn new(channels: &Channels, endpoint: &Endpoint) -> Result<WorldClient, CallError> {
-        let client = WorldPoolServiceClient::new(channels.get(endpoint)?)
+        let client = WorldPoolServiceClient::new(channels.traced(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         Ok(WorldClient { endpoint: endpoint.clone(), client })

@@ -34,6 +34,9 @@ pub struct Wait {
 /// `panic`: does.
 pub struct Panic;
 
+/// `trace`: says of which trace it is.
+pub struct Trace;
+
 /// `relay`: has the lease's Doubler double x.
 pub struct Relay;
 
@@ -85,6 +88,18 @@ impl Action for Panic {
 }
 
 #[tonic::async_trait]
+impl Action for Trace {
+    fn name(&self) -> &str {
+        "trace"
+    }
+
+    async fn execute(&self, _: GoalContext) -> ActionResult {
+        let context = ratn_worker::trace::current().map_or_else(String::new, |context| context.to_string());
+        Ok(GoalOutcome::success().with_output("trace", Value::String(context)))
+    }
+}
+
+#[tonic::async_trait]
 impl Action for Relay {
     fn name(&self) -> &str {
         "relay"
@@ -125,6 +140,7 @@ pub async fn provider_with(listen: Option<Endpoint>, drain: Duration) -> Provide
         .action(Wait { name: "wait", abandon: true, ended: Arc::clone(&ended) })
         .action(Wait { name: "stay", abandon: false, ended: Arc::clone(&ended) })
         .action(Panic)
+        .action(Trace)
         .action(Relay)
         .build();
     let bound = bind(&listen).await.unwrap();

@@ -25,6 +25,7 @@ use ratn_proto::types::{self, Resource};
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::{DEFAULT_TTL, Session};
+use ratn_worker::trace::{self, TraceContext};
 use std::collections::BTreeMap;
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
@@ -76,6 +77,8 @@ pub(super) struct Performer {
     operations: u64,
     /// How often task control has come back to this run.
     resumptions: u32,
+    /// Of the run.
+    trace: TraceContext,
 }
 
 struct Job {
@@ -112,7 +115,9 @@ impl Performer {
             cancelled: cancelled.clone(),
             events: events.clone(),
         };
-        tokio::spawn(recorder.work(work));
+        let trace = TraceContext::fresh();
+        tracing::debug!(run, trace = %trace.trace_id(), "calls of this run are of one trace");
+        tokio::spawn(trace::within(trace.child(), recorder.work(work)));
         Ok(Performer {
             run,
             task: task.to_owned(),
@@ -131,6 +136,7 @@ impl Performer {
             acquires: 0,
             operations: 0,
             resumptions: 0,
+            trace,
         })
     }
 
@@ -222,7 +228,7 @@ impl Performer {
             holder: format!("{} {instance}", self.task),
         };
         let (resources, events) = (self.resources.clone(), self.events.clone());
-        let mut asking = Box::pin(async move {
+        let mut asking = Box::pin(trace::within(self.trace.child(), async move {
             let ask = || resources.acquire(requirements.clone(), options.clone());
             let answer = tokio::select! {
                 answer = patiently(Attempts::IDEMPOTENT, ask) => answer,
@@ -237,7 +243,7 @@ impl Performer {
                 Err(error) => Event::Refused { instance, reason: said(&error) },
             };
             let _ = events.send(Answer { event, withdrawn: Some(withdrawn) }).await;
-        });
+        }));
         // The request leaves here and now: tasks would be run, and requests arrive, in any order.
         if asking.as_mut().now_or_never().is_none() {
             tokio::spawn(asking);
@@ -296,7 +302,7 @@ impl Performer {
                 grace_ms: goal::GRACE_MS,
             },
         };
-        let ended = tokio::spawn(performing.perform(given));
+        let ended = tokio::spawn(trace::within(self.trace.child(), performing.perform(given)));
         self.jobs.insert(instance, Job { attempt, lease, stop, ended });
     }
 
