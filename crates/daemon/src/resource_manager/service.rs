@@ -10,7 +10,7 @@ use crate::owners::Owners;
 use futures::{Stream, StreamExt};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Lease, Requirement, ResourceOperation};
-use ratn_proto::convert::{all, each, label, name, required};
+use ratn_proto::convert::{all, each, label, name, names, required};
 use ratn_proto::types::{Resource, ResourceFilter, ResourceUpdate, WatchPosition};
 use ratn_proto::v1;
 use ratn_resources::{AcquireRequest, Reply, Request as PoolRequest, ResourceSpec, SessionId};
@@ -323,6 +323,7 @@ impl v1::resource_service_server::ResourceService for Service {
         request: Request<v1::ResourceServiceWatchRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
         let request = request.into_inner();
+        names(&request.kinds, "kinds")?;
         let part = request.after_part;
         let after = request.after_revision.map(|revision| WatchPosition { revision: Revision(revision), part });
         let kinds: BTreeSet<String> = request.kinds.into_iter().collect();

@@ -142,6 +142,14 @@ pub fn label(text: &str, field: &str) -> Result<(), Malformed> {
     Ok(())
 }
 
+/// Names in a list.
+///
+/// # Errors
+/// [`Malformed`] of the first that is none.
+pub fn names(texts: &[String], field: &str) -> Result<(), Malformed> {
+    texts.iter().enumerate().try_for_each(|(i, text)| name(text, &format!("{field}[{i}]")))
+}
+
 fn finite(number: f64, field: impl fmt::Display) -> Result<f64, Malformed> {
     if number.is_finite() { Ok(number) } else { Err(Malformed::new(field, format!("is {number}: it must be finite"))) }
 }

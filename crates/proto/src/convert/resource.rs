@@ -1,6 +1,6 @@
 //! Resources, requirements, leases, events of the pool.
 
-use super::{Malformed, all, each, label, missing_choice, name, ports, required, wire_ports};
+use super::{Malformed, all, each, label, missing_choice, name, names, ports, required, wire_ports};
 use crate::types::{
     Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState, ResourceUpdate, SessionStatus,
     WaitingAcquire,
@@ -175,6 +175,7 @@ impl TryFrom<v1::LeasedResource> for LeasedResource {
         name(&resource.id, "id")?;
         name(&resource.kind, "kind")?;
         label(&resource.endpoint, "endpoint")?;
+        names(&resource.superclasses, "superclasses")?;
         Ok(LeasedResource {
             id: resource.id,
             kind: resource.kind,
@@ -200,6 +201,8 @@ impl TryFrom<v1::Holding> for Holding {
     type Error = Malformed;
 
     fn try_from(holding: v1::Holding) -> Result<Holding, Malformed> {
+        label(&holding.session_id, "session_id")?;
+        label(&holding.holder, "holder")?;
         Ok(Holding {
             lease: LeaseId(holding.lease_id),
             token: FencingToken(holding.token),
@@ -240,6 +243,7 @@ impl TryFrom<v1::Resource> for Resource {
         label(&resource.id, "id")?;
         name(&resource.kind, "kind")?;
         label(&resource.host, "host")?;
+        label(&resource.session_id, "session_id")?;
         if resource.capacity == 0 {
             return Err(Malformed::new("capacity", "is 0: a resource has at least one unit"));
         }
@@ -421,6 +425,7 @@ impl TryFrom<v1::ListRequest> for ResourceFilter {
     fn try_from(request: v1::ListRequest) -> Result<ResourceFilter, Malformed> {
         label(&request.host, "host")?;
         label(&request.session_id, "session_id")?;
+        names(&request.kinds, "kinds")?;
         Ok(ResourceFilter {
             kinds: request.kinds,
             class: class(request.class)?,

@@ -4,7 +4,7 @@ use super::ActionServer;
 use super::goal::{Ending, GoalEntry, Listener};
 use futures::stream::{BoxStream, StreamExt, unfold};
 use ratn_proto::MAX_MESSAGE_BYTES;
-use ratn_proto::convert::required;
+use ratn_proto::convert::{name, required};
 use ratn_proto::types::Goal;
 use ratn_proto::v1;
 use ratn_proto::v1::action_service_server::{ActionService, ActionServiceServer};
@@ -37,7 +37,9 @@ impl ActionService for ActionServer {
     }
 
     async fn cancel(&self, request: Request<v1::CancelRequest>) -> Result<Response<v1::CancelResponse>, Status> {
-        let under_way = ActionServer::cancel(self, &request.into_inner().goal_id);
+        let goal = request.into_inner().goal_id;
+        name(&goal, "goal_id")?;
+        let under_way = ActionServer::cancel(self, &goal);
         Ok(Response::new(v1::CancelResponse { under_way }))
     }
 
