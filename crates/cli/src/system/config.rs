@@ -156,6 +156,8 @@ impl SystemConfig {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use proptest::collection::vec;
+    use proptest::prelude::*;
 
     #[test]
     fn the_built_in_config_reads_back_as_written() {
@@ -190,5 +192,91 @@ mod tests {
         assert!(format!("{:#}", refusal("speed = 0")).contains("`speed` is 0: it must be 0.01 to 1000"));
         assert!(format!("{:#}", refusal("[cell]\nboxes = 10")).contains("x.toml: [cell]: `boxes`"));
         assert!(format!("{:#}", refusal("[world-pool]\ncapacity = 0")).contains("[world-pool]: `capacity`"));
+    }
+
+    /// Every key that holds a value, as the way to it, with the built-in config for an example.
+    fn keys(value: &toml::Value, way: &mut Vec<String>, all: &mut Vec<Vec<String>>) {
+        match value {
+            toml::Value::Table(table) => table.iter().for_each(|(key, value)| {
+                way.push(key.clone());
+                keys(value, way, all);
+                way.pop();
+            }),
+            toml::Value::Array(values) if values.first().is_some_and(toml::Value::is_table) => {
+                way.push("0".to_owned());
+                keys(&values[0], way, all);
+                way.pop();
+            }
+            _ => all.push(way.clone()),
+        }
+    }
+
+    fn replaced(config: &toml::Value, way: &[String], value: toml::Value) -> String {
+        let mut config = config.clone();
+        let place = way.iter().fold(&mut config, |place, step| match place {
+            toml::Value::Array(values) => &mut values[step.parse::<usize>().unwrap()],
+            place => place.get_mut(step.as_str()).unwrap(),
+        });
+        *place = value;
+        toml::to_string(&config).unwrap()
+    }
+
+    #[test]
+    fn a_value_that_a_key_cannot_have_is_refused_with_the_key() {
+        let config = toml::Value::try_from(SystemConfig::load(None).unwrap()).unwrap();
+        let mut all = Vec::new();
+        keys(&config, &mut Vec::new(), &mut all);
+        assert!(all.len() > 60, "{all:?}");
+        let date: toml::Value = "1979-05-27".parse::<toml::value::Datetime>().unwrap().into();
+        let odd = [
+            toml::Value::Integer(-1),
+            toml::Value::Integer(i64::MAX),
+            toml::Value::Float(f64::NAN),
+            toml::Value::Float(-1e300),
+            toml::Value::String("\u{7f}\u{0}".to_owned()),
+            toml::Value::String(String::new()),
+            toml::Value::Array(Vec::new()),
+            toml::Value::Table(toml::Table::new()),
+        ];
+        for way in all {
+            // A list of numbers is named by the list.
+            let key = way.iter().rev().find(|step| step.parse::<usize>().is_err()).unwrap();
+            // No key is a date; what else may be one, and then it is as the key wants it.
+            let refused = SystemConfig::parse(&replaced(&config, &way, date.clone()), "x.toml").unwrap_err();
+            assert!(format!("{refused:#}").contains(key.as_str()), "{way:?}: {refused:#}");
+            for value in &odd {
+                if let Err(refused) = SystemConfig::parse(&replaced(&config, &way, value.clone()), "x.toml") {
+                    let said = format!("{refused:#}");
+                    assert!(said.starts_with("x.toml") && said.contains(key.as_str()), "{way:?} = {value}: {said}");
+                }
+            }
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(300))]
+
+        #[test]
+        fn a_config_that_was_changed_anywhere_is_taken_or_refused_with_its_file(
+            changes in vec((any::<prop::sample::Index>(), any::<prop::sample::Index>(), ".{0,3}"), 1..6),
+        ) {
+            let mut text: Vec<char> = DEFAULT.chars().collect();
+            for (from, length, instead) in changes {
+                let from = from.index(text.len());
+                let to = (from + length.index(12)).min(text.len());
+                text.splice(from..to, instead.chars());
+            }
+            let text: String = text.into_iter().collect();
+            if let Err(refused) = SystemConfig::parse(&text, "x.toml") {
+                prop_assert!(format!("{refused:#}").starts_with("x.toml: "), "{refused:#}");
+            }
+        }
+
+        #[test]
+        fn any_text_is_taken_or_refused_with_its_file(text in "\\PC{0,200}") {
+            if let Err(refused) = SystemConfig::parse(&text, "x.toml") {
+                prop_assert!(format!("{refused:#}").starts_with("x.toml: "), "{refused:#}");
+            }
+        }
     }
 }

@@ -168,6 +168,8 @@ fn restore(recovered: Recovered, limits: Limits) -> Result<Pool, JournalError> {
     }
     let pool =
         Pool::restore(limits, ratn_model::time::Timestamp(0), snapshot, records).map_err(JournalError::Restore)?;
-    let milliseconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis());
+    #[expect(clippy::disallowed_methods, reason = "a floor: where the clock was set back, what was kept is above it")]
+    let now = SystemTime::now();
+    let milliseconds = now.duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis());
     Ok(pool.above(u64::try_from(milliseconds).unwrap_or(0)))
 }

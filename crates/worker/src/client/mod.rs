@@ -73,7 +73,9 @@ impl Channels {
 /// An id that nobody else has: for requests, sessions and goals.
 pub fn fresh_id(prefix: &str) -> String {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
-    let started = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
+    #[expect(clippy::disallowed_methods, reason = "only has to differ from other processes of the same number")]
+    let now = SystemTime::now();
+    let started = now.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
     let number = COUNTER.fetch_add(1, Ordering::Relaxed);
     format!("{prefix}-{:x}-{started:x}-{number:x}", std::process::id())
 }
