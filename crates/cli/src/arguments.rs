@@ -246,7 +246,7 @@ pub(crate) struct PlanArguments {
     #[arg(long, value_name = "N", default_value_t = 15)]
     pub(crate) repeat: usize,
     /// How much larger the robot's shapes are taken
-    #[arg(long, value_name = "MM", default_value_t = 0.0)]
+    #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = padding)]
     pub(crate) padding_mm: f64,
     /// Print one JSON array, with every problem
     #[arg(long)]
@@ -401,6 +401,12 @@ fn speed(text: &str) -> Result<f64, String> {
         Ok(x) if (SLOWEST..=FASTEST).contains(&x) => Ok(x),
         _ => Err(format!("expected a number from {SLOWEST} to {FASTEST}")),
     }
+}
+
+/// A length that something is grown by.
+fn padding(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
+    if (0.0..1e3).contains(&value) { Ok(value) } else { Err("expected 0 to 1000 mm".to_owned()) }
 }
 
 fn makespan(text: &str) -> Result<f64, String> {

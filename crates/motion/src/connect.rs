@@ -20,6 +20,9 @@ const DOMAIN_CHANGE: f32 = 1e-4;
 /// Iterations between two questions to the caller: some tens of microseconds.
 const POLL: usize = 32;
 
+/// Samples drawn at most to mend one motion.
+const MENDING_ITERATIONS: usize = 2_000;
+
 /// How often a path with a gap between its postures is mended before the search gives up.
 const MENDINGS: usize = 16;
 
@@ -104,7 +107,7 @@ pub fn connect(
     Ok(Route { path, goal, iterations })
 }
 
-/// Makes sure that a path is free also between its postures: motions that are not are searched anew, finely.
+/// Makes sure that a path whose postures are free is free also between them: motions that are not are searched anew, finely.
 ///
 /// # Errors
 /// As [`connect`], where a motion cannot be mended.
@@ -117,7 +120,7 @@ pub fn mend(
     let mut whole = vec![path[0]];
     let mut mended = 0;
     for pair in path.windows(2) {
-        if space.is_swept_free(&pair[0], &pair[1]) {
+        if space.is_swept_free_too(&pair[0], &pair[1]) {
             whole.push(pair[1]);
             continue;
         }
@@ -126,7 +129,8 @@ pub fn mend(
             return Err(ConnectError::Exhausted { iterations: budget.iterations });
         }
         space.set_swept(true);
-        let detour = connect(space, &pair[0], &pair[1..], budget, control);
+        let little = Budget { iterations: budget.iterations.min(MENDING_ITERATIONS), ..budget };
+        let detour = connect(space, &pair[0], &pair[1..], little, control);
         space.set_swept(false);
         whole.extend_from_slice(&detour?.path[1..]);
     }
@@ -150,8 +154,10 @@ fn grow(
     }
     // Which tree grows towards the sample.
     let mut growing = 1;
+    // Where nothing may be left between postures, an iteration takes as long as many others.
+    let poll = if space.is_swept() { 1 } else { POLL };
     for iteration in 1..=budget.iterations {
-        if iteration % POLL == 0 {
+        if iteration % poll == 0 {
             match control(iteration) {
                 Control::Continue => {}
                 Control::TimeUp => return Err(ConnectError::TimeUp { iterations: iteration }),

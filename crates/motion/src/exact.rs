@@ -52,8 +52,9 @@ impl<'a> Exact<'a> {
             let body = obstacle.geometry.at(obstacle.pose);
             Solid { name: &obstacle.name, pose: to_f32(&body.pose), shape: body.geometry.shape(0.0) }
         };
-        let bodies =
-            |link: &crate::mechanism::Part| link.bodies.iter().map(|b| (b.pose, b.geometry.shape(0.0))).collect();
+        let bodies = |link: &crate::mechanism::Part| {
+            link.bodies.iter().map(|b| (b.pose, b.geometry.shape(link.padding_m))).collect()
+        };
         Exact {
             mechanism,
             obstacles: obstacles.iter().map(solid).collect(),
@@ -63,6 +64,33 @@ impl<'a> Exact<'a> {
 
     /// What touches first in a posture, if anything.
     pub fn touch(&self, positions: &[f64]) -> Option<Touch> {
+        let mut first = None;
+        self.visit(positions, &mut |touch| {
+            first = Some(touch);
+            false
+        });
+        first
+    }
+
+    /// All that touches in a posture, the deepest first, once per pair of names.
+    pub fn touches(&self, positions: &[f64]) -> Vec<Touch> {
+        let mut all: Vec<Touch> = Vec::new();
+        self.visit(positions, &mut |touch| {
+            all.push(touch);
+            true
+        });
+        all.sort_by(|a, b| b.depth_m.total_cmp(&a.depth_m));
+        let mut deepest: Vec<Touch> = Vec::new();
+        for touch in all {
+            if !deepest.iter().any(|d| (&d.link, &d.other) == (&touch.link, &touch.other)) {
+                deepest.push(touch);
+            }
+        }
+        deepest
+    }
+
+    /// Shows touches until it hears that no more are wanted.
+    fn visit(&self, positions: &[f64], wants_more: &mut dyn FnMut(Touch) -> bool) {
         let poses = self.mechanism.poses(positions);
         let placed: Vec<Vec<(Pose32, &SharedShape)>> = self
             .bodies
@@ -73,9 +101,11 @@ impl<'a> Exact<'a> {
         let name = |link: usize| self.mechanism.links[link].name.clone();
         for (link, bodies) in placed.iter().enumerate() {
             for (pose, shape) in bodies {
-                for solid in &self.obstacles {
-                    if let Some(depth_m) = depth(pose, shape, &solid.pose, &solid.shape) {
-                        return Some(Touch { link: name(link), other: solid.name.to_owned(), depth_m });
+                for solid in self.obstacles.iter().filter(|o| self.mechanism.is_kept_from(link, o.name)) {
+                    if let Some(depth_m) = depth(pose, shape, &solid.pose, &solid.shape)
+                        && !wants_more(Touch { link: name(link), other: solid.name.to_owned(), depth_m })
+                    {
+                        return;
                     }
                 }
                 for (second, others) in placed.iter().enumerate().skip(link + 1) {
@@ -83,14 +113,15 @@ impl<'a> Exact<'a> {
                         continue;
                     }
                     for (at, other) in others {
-                        if let Some(depth_m) = depth(pose, shape, at, other) {
-                            return Some(Touch { link: name(link), other: name(second), depth_m });
+                        if let Some(depth_m) = depth(pose, shape, at, other)
+                            && !wants_more(Touch { link: name(link), other: name(second), depth_m })
+                        {
+                            return;
                         }
                     }
                 }
             }
         }
-        None
     }
 
     /// What touches first along a path, looked at `per_radian` times per radian.

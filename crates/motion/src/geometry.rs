@@ -60,6 +60,18 @@ impl Geometry {
         }
     }
 
+    /// This, `padding` metres larger on every side.
+    pub(crate) fn grown(&self, padding: f64) -> Geometry {
+        match *self {
+            Geometry::Box { half } => Geometry::Box { half: half.map(|h| h + padding) },
+            Geometry::Cylinder { radius, half_length } => {
+                Geometry::Cylinder { radius: radius + padding, half_length: half_length + padding }
+            }
+            Geometry::Capsule { radius, half_length } => Geometry::Capsule { radius: radius + padding, half_length },
+            Geometry::Sphere { radius } => Geometry::Sphere { radius: radius + padding },
+        }
+    }
+
     /// The rotation from this primitive's frame to the frame of its shape.
     fn turn(&self) -> Pose {
         match self {

@@ -32,6 +32,8 @@ pub struct Mechanism {
     pub links: Vec<Part>,
     /// Pairs of links, the lower index first, that are never checked against each other.
     pub disabled: BTreeSet<(usize, usize)>,
+    /// Links and the names of obstacles that they may touch.
+    pub allowed: BTreeSet<(usize, String)>,
 }
 
 /// A rigid link.
@@ -47,7 +49,9 @@ pub struct Part {
     pub drive: Option<Drive>,
     /// What can collide, exactly.
     pub bodies: Vec<Body>,
-    /// Spheres that hold all of it.
+    /// How much larger its bodies are taken, in metres.
+    pub padding_m: f64,
+    /// Spheres that hold all of it, padding included.
     pub spheres: Vec<Sphere>,
 }
 
@@ -97,7 +101,13 @@ impl Mechanism {
         }
         let joints = names.iter().map(|name| limits(&description, name)).collect::<Result<Vec<_>, _>>()?;
         let links = links(&description, &names)?;
-        let mut mechanism = Mechanism { name: description.name.clone(), joints, links, disabled: BTreeSet::new() };
+        let mut mechanism = Mechanism {
+            name: description.name.clone(),
+            joints,
+            links,
+            disabled: BTreeSet::new(),
+            allowed: BTreeSet::new(),
+        };
         mechanism.disabled = match srdf {
             Some(text) => mechanism.listed(text)?,
             None => mechanism.touching(),
@@ -120,6 +130,54 @@ impl Mechanism {
             poses.push(link.parent.map_or(moved, |parent| compose(&poses[parent], &moved)));
         }
         poses
+    }
+
+    /// The index of a link.
+    pub fn link(&self, name: &str) -> Option<usize> {
+        self.links.iter().position(|link| link.name == name)
+    }
+
+    /// Takes a link's bodies `padding_m` metres larger on every side, in every check.
+    pub fn pad(&mut self, link: usize, padding_m: f64) {
+        let part = &mut self.links[link];
+        part.padding_m = padding_m;
+        let grown = |body: &Body| Body { geometry: body.geometry.grown(padding_m), ..*body };
+        part.spheres = part.bodies.iter().flat_map(|body| spheres::cover(&grown(body))).collect();
+    }
+
+    /// As [`Mechanism::pad`], for all links.
+    pub fn pad_all(&mut self, padding_m: f64) {
+        for link in 0..self.links.len() {
+            self.pad(link, padding_m);
+        }
+    }
+
+    /// Fixes something to a link, as a link of its own, which is given back; bodies in the frame of the link that holds it. It
+    /// may touch that link and those that are listed.
+    pub fn attach(&mut self, name: &str, link: usize, bodies: Vec<Body>, touching: &[usize]) -> usize {
+        let index = self.links.len();
+        let spheres = bodies.iter().flat_map(spheres::cover).collect();
+        self.links.push(Part {
+            name: name.to_owned(),
+            parent: Some(link),
+            origin: Pose::IDENTITY,
+            drive: None,
+            bodies,
+            padding_m: 0.0,
+            spheres,
+        });
+        self.disabled.extend(touching.iter().chain([&link]).map(|other| (*other, index)));
+        index
+    }
+
+    /// Lets a link touch an obstacle.
+    pub fn allow(&mut self, link: usize, obstacle: &str) {
+        self.allowed.insert((link, obstacle.to_owned()));
+    }
+
+    /// Whether a link is to be kept away from an obstacle.
+    pub fn is_kept_from(&self, link: usize, obstacle: &str) -> bool {
+        self.allowed.is_empty() || !self.allowed.contains(&(link, obstacle.to_owned()))
     }
 
     /// Whether two links are to be kept apart.
@@ -236,7 +294,7 @@ fn links(urdf: &urdf_rs::Robot, names: &[String]) -> Result<Vec<Part>, RobotErro
 fn part(link: &urdf_rs::Link, parent: Option<usize>, origin: Pose, drive: Option<Drive>) -> Result<Part, RobotError> {
     let bodies = urdf::bodies(link)?;
     let spheres = bodies.iter().flat_map(spheres::cover).collect();
-    Ok(Part { name: link.name.clone(), parent, origin, drive, bodies, spheres })
+    Ok(Part { name: link.name.clone(), parent, origin, drive, bodies, padding_m: 0.0, spheres })
 }
 
 /// Where a joint is, and what moves it.

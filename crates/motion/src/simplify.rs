@@ -2,7 +2,7 @@
 //! limit is the quadratic B-spline), every new motion validated, parts of validated motions taken as validated. In the end
 //! the whole is made sure of between its postures too.
 
-use crate::connect::{Budget, ConnectError, mend};
+use crate::connect::{Budget, ConnectError, connect, mend};
 use crate::pace::Control;
 use crate::space::{Space, State, between, distance};
 
@@ -34,6 +34,32 @@ pub fn simplify(
     budget: Budget,
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<Vec<State>, ConnectError> {
+    let short = shortened(space, path, control)?;
+    match mend(space, &short, budget, control) {
+        Err(ConnectError::Exhausted { .. }) => {}
+        other => return other,
+    }
+    // The short way leads through a gap that is none. The long one may not, and another search looks between postures.
+    let long = match mend(space, path, budget, control) {
+        Err(ConnectError::Exhausted { .. }) => {
+            space.set_swept(true);
+            let route = connect(space, &path[0], &path[path.len() - 1..], budget, control);
+            space.set_swept(false);
+            route?.path
+        }
+        other => other?,
+    };
+    space.set_swept(true);
+    let short = shortened(space, &long, control);
+    space.set_swept(false);
+    short
+}
+
+fn shortened(
+    space: &mut Space,
+    path: &[State],
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<Vec<State>, ConnectError> {
     let mut work = Work { space, path: path.to_vec(), checks: 0, control, stopped: None };
     work.shorten();
     for _ in 0..ROUNDS {
@@ -47,8 +73,7 @@ pub fn simplify(
     if work.stopped == Some(Control::Cancelled) {
         return Err(ConnectError::Cancelled);
     }
-    let path = std::mem::take(&mut work.path);
-    mend(space, &path, budget, control)
+    Ok(work.path)
 }
 
 struct Work<'a> {

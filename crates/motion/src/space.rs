@@ -2,7 +2,7 @@
 //!
 //! Two ways to check a motion. [`Space::is_free_motion`] looks at [`Space::RESOLUTION`] postures per radian, as the search
 //! does. [`Space::is_swept_free`] leaves nothing between the postures: each sphere is grown by how far it can move until the
-//! next one, and where that is too much the motion is cut finer, down to postures so close that what is between is noise.
+//! next one, and the parts where that is too much are cut finer, down to postures so close that what is between is noise.
 
 use crate::geometry::Geometry;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
@@ -18,7 +18,7 @@ const ROUNDING_M: f64 = 2e-5;
 
 /// How much finer each level of a swept check is than the one before, and how many levels there are.
 const FINER: usize = 4;
-const LEVELS: usize = 4;
+const LEVELS: usize = 3;
 
 /// Postures of the widest batch.
 const WIDEST: usize = 16;
@@ -54,21 +54,24 @@ impl Space {
     /// Postures per radian of a motion that the search looks at.
     pub const RESOLUTION: f32 = 32.0;
 
-    /// A robot, its shapes grown by `padding_m` (metres), among obstacles.
-    pub fn new(mechanism: &Mechanism, obstacles: &[Obstacle], padding_m: f64) -> Space {
-        Space::with_isa(mechanism, obstacles, padding_m, Isa::detect())
+    /// A robot among obstacles.
+    pub fn new(mechanism: &Mechanism, obstacles: &[Obstacle]) -> Space {
+        Space::with_isa(mechanism, obstacles, Isa::detect())
     }
 
     /// As [`Space::new`], with instructions that are not the widest.
-    pub fn with_isa(mechanism: &Mechanism, obstacles: &[Obstacle], padding_m: f64, isa: Isa) -> Space {
+    pub fn with_isa(mechanism: &Mechanism, obstacles: &[Obstacle], isa: Isa) -> Space {
         let compiled_obstacles: Vec<simd::Obstacle> = obstacles.iter().map(compile_obstacle).collect();
-        let (mut compiled, reaches, links) = compile_robot(mechanism, padding_m + ROUNDING_M);
+        let (mut compiled, reaches, links) = compile_robot(mechanism, ROUNDING_M);
         let count = obstacles.len();
         compiled.nearest = vec![f32::INFINITY; count * compiled.groups.len()];
         let mut blocked = false;
         for (index, group) in compiled.groups.iter_mut().enumerate() {
             let nearest = &mut compiled.nearest[index * count..(index + 1) * count];
             for (o, obstacle) in obstacles.iter().enumerate() {
+                if !mechanism.is_kept_from(links[index], &obstacle.name) {
+                    continue;
+                }
                 nearest[o] = (gap(obstacle, group.anchor.map(f64::from)) - 1e-4) as f32;
                 if group.frame == 0 {
                     let touches =
@@ -115,6 +118,11 @@ impl Space {
         self.swept = swept;
     }
 
+    /// Whether it leaves nothing.
+    pub fn is_swept(&self) -> bool {
+        self.swept
+    }
+
     /// Whether a posture is within the limits.
     pub fn is_within(&self, state: &State) -> bool {
         (0..self.joints()).all(|j| self.lower[j] <= state[j] && state[j] <= self.upper[j])
@@ -122,7 +130,7 @@ impl Space {
 
     /// Whether a posture touches nothing.
     pub fn is_free(&mut self, state: &State) -> bool {
-        !self.blocked && self.check(state, &[0.0; MAX_JOINTS], 1, false)
+        !self.blocked && self.check(state, &[0.0; MAX_JOINTS], 1)
     }
 
     /// Whether a straight motion touches nothing; `from` itself is not looked at.
@@ -133,7 +141,7 @@ impl Space {
         }
         let delta = difference(to, from);
         let batches = self.batches(length(&delta));
-        !self.blocked && self.check(from, &delta, batches, false)
+        !self.blocked && self.check(from, &delta, batches)
     }
 
     /// Whether a straight motion touches nothing, also between the postures.
@@ -141,23 +149,44 @@ impl Space {
         let delta = difference(to, from);
         // What is wrong at all is mostly found by the coarse look.
         let batches = self.batches(length(&delta));
-        !self.blocked && self.check(from, &delta, batches, false) && self.sweep(from, &delta, batches, LEVELS)
+        !self.blocked && self.check(from, &delta, batches) && self.sweep(from, &delta, batches, LEVELS)
     }
 
     /// One batch of postures along a motion; what the measurements time.
     pub fn check_batch(&mut self, from: &State, delta: &State) -> bool {
-        self.check(from, delta, 1, false)
+        self.check(from, delta, 1)
+    }
+
+    /// As [`Space::is_swept_free`], for a motion whose postures were looked at before.
+    pub(crate) fn is_swept_free_too(&mut self, from: &State, to: &State) -> bool {
+        let delta = difference(to, from);
+        let batches = self.batches(length(&delta));
+        !self.blocked && self.sweep(from, &delta, batches, LEVELS)
     }
 
     fn sweep(&mut self, from: &State, delta: &State, pieces: usize, levels: usize) -> bool {
+        if levels == 0 {
+            return self.check(from, delta, pieces);
+        }
+        let width = self.isa.width();
         let piece: State = std::array::from_fn(|j| delta[j] / pieces as f32);
-        (0..pieces).all(|i| {
+        for i in 0..pieces {
             let start: State = std::array::from_fn(|j| from[j] + piece[j] * i as f32);
-            if levels == 1 {
-                return self.check(&start, &piece, 1, false);
+            let mut doubtful = self.touching_grown(&start, &piece);
+            // Runs of steps, each cut finer as a motion of its own.
+            while doubtful != 0 {
+                let first = doubtful.trailing_zeros();
+                let steps = (doubtful >> first).trailing_ones();
+                let fraction = |steps: u32| steps as f32 / width as f32;
+                let run: State = std::array::from_fn(|j| piece[j] * fraction(steps));
+                let at: State = std::array::from_fn(|j| start[j] + piece[j] * fraction(first));
+                if !self.sweep(&at, &run, (steps as usize * FINER).div_ceil(width), levels - 1) {
+                    return false;
+                }
+                doubtful &= !(((1_u32 << steps) - 1) << first);
             }
-            self.check(&start, &piece, 1, true) || self.sweep(&start, &piece, FINER, levels - 1)
-        })
+        }
+        true
     }
 
     fn batches(&self, length: f32) -> usize {
@@ -167,20 +196,21 @@ impl Space {
     }
 
     #[inline]
-    fn check(&mut self, start: &State, delta: &State, batches: usize, grown: bool) -> bool {
-        let mut middle = *start;
-        if grown {
-            // Each posture stands for the step that it is in the middle of: nothing is further than half a step from one.
-            let step = 0.5 / (self.isa.width() * batches) as f32;
-            for (inflate, lever) in self.inflate.iter_mut().zip(&self.lever) {
-                *inflate = step * (0..self.compiled.joints).map(|j| lever[j] * delta[j].abs()).sum::<f32>();
-            }
-            for (at, way) in middle.iter_mut().zip(delta) {
-                *at -= way * step;
-            }
+    fn check(&mut self, start: &State, delta: &State, batches: usize) -> bool {
+        self.isa.is_free(&Edge { compiled: &self.compiled, start, delta, batches, inflate: &[] }, &mut self.scratch)
+    }
+
+    /// Which of a batch's steps may touch something, a bit per step.
+    fn touching_grown(&mut self, start: &State, delta: &State) -> u32 {
+        // Each posture stands for the step that it is in the middle of: nothing is further than half a step from one.
+        let step = 0.5 / self.isa.width() as f32;
+        let joints = self.compiled.joints;
+        for (inflate, lever) in self.inflate.iter_mut().zip(&self.lever) {
+            *inflate = step * (0..joints).map(|j| lever[j] * delta[j].abs()).sum::<f32>();
         }
-        let inflate = if grown { &self.inflate[..] } else { &[] };
-        self.isa.is_free(&Edge { compiled: &self.compiled, start: &middle, delta, batches, inflate }, &mut self.scratch)
+        let start: State = std::array::from_fn(|j| start[j] - delta[j] * step);
+        let edge = Edge { compiled: &self.compiled, start: &start, delta, batches: 1, inflate: &self.inflate };
+        self.isa.touching(&edge, &mut self.scratch)
     }
 }
 

@@ -16,8 +16,6 @@ const EXACT_PER_RADIAN: f64 = 4.0 * Space::RESOLUTION as f64;
 pub struct Settings {
     /// What the search may cost.
     pub budget: Budget,
-    /// How much larger every shape of the robot is taken, in metres.
-    pub padding_m: f64,
     /// How often it is solved, for the least times; at least once. Every time gives the same path.
     pub repetitions: usize,
 }
@@ -31,6 +29,8 @@ pub struct Trial {
     pub simplify: f64,
     /// Why there is none.
     pub outcome: Result<Found, ConnectError>,
+    /// What is wrong with the start or the goal, where that is why.
+    pub diagnosis: Vec<String>,
 }
 
 /// A path.
@@ -50,7 +50,7 @@ pub struct Found {
 
 /// Solves a problem; `clock` gives the time in any units.
 pub fn run(mechanism: &Mechanism, problem: &Problem, settings: Settings, clock: &mut dyn FnMut() -> f64) -> Trial {
-    let mut space = Space::new(mechanism, &problem.obstacles, settings.padding_m);
+    let mut space = Space::new(mechanism, &problem.obstacles);
     let (start, goal) = (state(&problem.start), state(&problem.goal));
     let mut go_on = |_: usize| Control::Continue;
     let (mut plan_time, mut simplify_time) = (f64::INFINITY, f64::INFINITY);
@@ -69,7 +69,22 @@ pub fn run(mechanism: &Mechanism, problem: &Problem, settings: Settings, clock: 
         outcome = paths;
     }
     let outcome = outcome.map(|(route, path)| found(mechanism, problem, &route, &path));
-    Trial { plan: plan_time, simplify: simplify_time, outcome }
+    let diagnosis = match &outcome {
+        Err(ConnectError::Start) => diagnose(mechanism, problem, &problem.start, "start state"),
+        Err(ConnectError::Goal { .. }) => diagnose(mechanism, problem, &problem.goal, "goal state"),
+        _ => Vec::new(),
+    };
+    Trial { plan: plan_time, simplify: simplify_time, outcome, diagnosis }
+}
+
+/// What a posture breaks: limits, and what touches what, how deep.
+fn diagnose(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which: &str) -> Vec<String> {
+    let beyond = mechanism.joints.iter().zip(positions).filter(|(j, q)| !(j.lower..=j.upper).contains(*q));
+    let limits = beyond.map(|(joint, position)| {
+        format!("{which}: {} is at {position:.4}, outside {:.4} to {:.4}", joint.name, joint.lower, joint.upper)
+    });
+    let touches = Exact::new(mechanism, &problem.obstacles).touches(positions);
+    limits.chain(touches.iter().map(|touch| format!("{which}: {touch}"))).collect()
 }
 
 fn found(mechanism: &Mechanism, problem: &Problem, route: &Route, path: &[State]) -> Found {

@@ -11,10 +11,11 @@ use ratn_motion::exact::Exact;
 use ratn_motion::geometry::{Body, Geometry};
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
 use ratn_motion::pace::Control;
-use ratn_motion::problems::Problems;
+use ratn_motion::problems::{Problem, Problems};
 use ratn_motion::simplify::{path_length, simplify};
 use ratn_motion::space::{Isa, Obstacle, Space, State, between};
 use ratn_motion::spheres::cover;
+use ratn_motion::trial::{self, Settings};
 
 const AIMM: &str = include_str!("../robots/aimm.urdf");
 
@@ -121,7 +122,7 @@ fn for_a_robot_of_spheres_the_vector_check_is_the_exact_one() {
         let obstacles = clutter(&mut random, 12, 1.2);
         let exact = Exact::new(&mechanism, &obstacles);
         let mut spaces: Vec<Space> =
-            Isa::available().into_iter().map(|isa| Space::with_isa(&mechanism, &obstacles, 0.0, isa)).collect();
+            Isa::available().into_iter().map(|isa| Space::with_isa(&mechanism, &obstacles, isa)).collect();
         for _ in 0..100 {
             let state = posture(&mut random, &mechanism);
             let touch = exact.touch(&positions(&mechanism, &state));
@@ -132,7 +133,9 @@ fn for_a_robot_of_spheres_the_vector_check_is_the_exact_one() {
                     (false, Some(_)) => touching += 1,
                     // Spheres are grown by 0.02 mm; contact within that is either.
                     (false, None) => {
-                        let mut smaller = Space::with_isa(&mechanism, &obstacles, -1e-4, isa);
+                        let mut thin = mechanism.clone();
+                        thin.pad_all(-1e-4);
+                        let mut smaller = Space::with_isa(&thin, &obstacles, isa);
                         assert!(smaller.is_free(&state), "{isa:?} sees a touch that is none");
                     }
                     (true, Some(touch)) => panic!("{isa:?} misses that {touch}"),
@@ -151,7 +154,7 @@ fn a_posture_that_the_spheres_of_an_arm_find_free_is_free_by_its_exact_shapes() 
     for _ in 0..20 {
         let obstacles = clutter(&mut random, 10, 1.5);
         let exact = Exact::new(&mechanism, &obstacles);
-        let mut space = Space::new(&mechanism, &obstacles, 0.0);
+        let mut space = Space::new(&mechanism, &obstacles);
         for _ in 0..100 {
             let state = posture(&mut random, &mechanism);
             if space.is_free(&state) {
@@ -171,7 +174,7 @@ fn paths_are_short_repeatable_and_free_by_the_exact_check_at_four_times_the_reso
     let (mut solved, mut indirect) = (0, 0);
     for _ in 0..40 {
         let obstacles = clutter(&mut random, 14, 1.2);
-        let mut space = Space::new(&mechanism, &obstacles, 0.0);
+        let mut space = Space::new(&mechanism, &obstacles);
         let (start, goal) = (posture(&mut random, &mechanism), posture(&mut random, &mechanism));
         let Ok(route) = connect(&mut space, &start, &[goal], BUDGET, &mut go_on) else { continue };
         let path = simplify(&mut space, &route.path, BUDGET, &mut go_on).unwrap();
@@ -181,7 +184,7 @@ fn paths_are_short_repeatable_and_free_by_the_exact_check_at_four_times_the_reso
         assert!(path_length(&path) <= path_length(&route.path) + 1e-4);
         let postures: Vec<Vec<f64>> = path.iter().map(|s| positions(&mechanism, s)).collect();
         assert_eq!(Exact::new(&mechanism, &obstacles).touch_along(&postures, 128.0), None);
-        let mut again = Space::new(&mechanism, &obstacles, 0.0);
+        let mut again = Space::new(&mechanism, &obstacles);
         let second = connect(&mut again, &start, &[goal], BUDGET, &mut go_on).unwrap();
         assert_eq!(second, route);
         assert_eq!(simplify(&mut again, &second.path, BUDGET, &mut go_on).unwrap(), path);
@@ -201,7 +204,7 @@ fn a_motion_free_between_its_postures_is_free_wherever_one_looks() {
         let plates: Vec<Obstacle> = (0..4)
             .map(|i| Obstacle { name: format!("plate {i}"), pose: random_pose(&mut random, 0.8), geometry })
             .collect();
-        let mut space = Space::new(&mechanism, &plates, 0.0);
+        let mut space = Space::new(&mechanism, &plates);
         let exact = Exact::new(&mechanism, &plates);
         let (from, to) = (posture(&mut random, &mechanism), posture(&mut random, &mechanism));
         if space.is_free(&from) && space.is_swept_free(&from, &to) {
@@ -216,6 +219,42 @@ fn a_motion_free_between_its_postures_is_free_wherever_one_looks() {
 }
 
 #[test]
+fn a_way_that_slips_through_a_thin_plate_is_mended_or_refused() {
+    let (urdf, names) = chain(4);
+    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let mut random = ChaCha8Rng::seed_from_u64(7);
+    let (mut slipped, mut mended) = (0, 0);
+    for _ in 0..60 {
+        let geometry = Geometry::Box { half: [0.3, 0.3, 0.0005] };
+        let plates: Vec<Obstacle> = (0..3)
+            .map(|i| {
+                let place = random_pose(&mut random, 0.9);
+                Obstacle { name: format!("plate {i}"), pose: place, geometry }
+            })
+            .collect();
+        let mut thin = mechanism.clone();
+        // 4 mm thick, and 3 cm from posture to posture at the far end.
+        thin.pad_all(-0.033);
+        let mut space = Space::new(&thin, &plates);
+        let (start, goal) = (posture(&mut random, &thin), posture(&mut random, &thin));
+        let few = Budget { iterations: 3_000, seed: 3 };
+        let Ok(route) = connect(&mut space, &start, &[goal], few, &mut go_on) else { continue };
+        let whole = route.path.windows(2).all(|pair| space.is_swept_free(&pair[0], &pair[1]));
+        slipped += usize::from(!whole);
+        match simplify(&mut space, &route.path, few, &mut go_on) {
+            Ok(path) => {
+                mended += usize::from(!whole);
+                let postures: Vec<Vec<f64>> = path.iter().map(|s| positions(&thin, s)).collect();
+                assert_eq!(Exact::new(&thin, &plates).touch_along(&postures, 1000.0), None);
+            }
+            Err(error) => assert!(matches!(error, ConnectError::Exhausted { .. }), "{error}"),
+        }
+        assert!(!space.is_swept());
+    }
+    assert!(slipped > 1 && mended > 0, "{slipped} slipped, {mended} mended");
+}
+
+#[test]
 fn the_nearest_of_several_goals_that_is_free_is_reached() {
     let (urdf, names) = chain(4);
     let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
@@ -223,7 +262,7 @@ fn the_nearest_of_several_goals_that_is_free_is_reached() {
     let (start, blocked, open) = (state([0.0; 4]), state([0.6, 0.0, 0.0, 0.0]), state([-1.2, 0.0, 0.0, 0.0]));
     let at = Pose::at(0.6 * 0.6_f64.cos(), 0.6 * 0.6_f64.sin(), 0.0);
     let wall = Obstacle { name: "wall".into(), pose: at, geometry: Geometry::Sphere { radius: 0.05 } };
-    let mut space = Space::new(&mechanism, std::slice::from_ref(&wall), 0.0);
+    let mut space = Space::new(&mechanism, std::slice::from_ref(&wall));
     let route = connect(&mut space, &start, &[blocked, open], BUDGET, &mut go_on).unwrap();
     assert_eq!((route.goal, route.path[route.path.len() - 1]), (1, open));
     let none = connect(&mut space, &start, &[blocked], BUDGET, &mut go_on);
@@ -240,7 +279,7 @@ fn a_search_that_is_cancelled_or_out_of_iterations_ends_and_says_so() {
     // The first link cannot go round this plate.
     let geometry = Geometry::Box { half: [2.0, 0.005, 2.0] };
     let plate = Obstacle { name: "plate".into(), pose: Pose::at(2.06, 0.0, 0.0), geometry };
-    let mut space = Space::new(&mechanism, &[plate], 0.0);
+    let mut space = Space::new(&mechanism, &[plate]);
     let state = |first: f32| -> State { std::array::from_fn(|j| if j == 0 { first } else { 0.0 }) };
     let few = Budget { iterations: 3000, seed: 0 };
     let outcome = connect(&mut space, &state(-0.95), &[state(1.2)], few, &mut go_on);
@@ -273,11 +312,97 @@ fn pairs_that_the_srdf_disables_are_not_checked_and_all_others_are() {
         let mechanism = Mechanism::read(&urdf, srdf, &names).unwrap();
         assert_eq!(Exact::new(&mechanism, &[]).touch(&folded).is_some(), touches, "{srdf:?}");
         let state: State = std::array::from_fn(|j| folded.get(j).map_or(0.0, |q| *q as f32));
-        assert_eq!(Space::new(&mechanism, &[], 0.0).is_free(&state), !touches, "{srdf:?}");
+        assert_eq!(Space::new(&mechanism, &[]).is_free(&state), !touches, "{srdf:?}");
     }
     assert!(Mechanism::read(&urdf, Some("<robot"), &names).unwrap_err().to_string().contains("SRDF"));
     let unknown = Mechanism::read(&urdf, None, &["elbow".to_owned()]).unwrap_err();
     assert!(unknown.to_string().contains("no joint `elbow`"), "{unknown}");
+}
+
+#[test]
+fn padding_is_the_same_in_both_checks_and_held_by_the_spheres() {
+    let mut mechanism = arm();
+    mechanism.pad_all(0.03);
+    // Links of an arm are nearer to each other than that.
+    let all = 0..mechanism.links.len();
+    mechanism.disabled = all.clone().flat_map(|b| all.clone().map(move |a| (a, b))).collect();
+    let mut random = ChaCha8Rng::seed_from_u64(6);
+    let mut free = 0;
+    for _ in 0..10 {
+        let obstacles = clutter(&mut random, 8, 1.5);
+        let exact = Exact::new(&mechanism, &obstacles);
+        let mut space = Space::new(&mechanism, &obstacles);
+        for _ in 0..100 {
+            let state = posture(&mut random, &mechanism);
+            if space.is_free(&state) {
+                free += 1;
+                assert_eq!(exact.touch(&positions(&mechanism, &state)), None);
+            }
+        }
+    }
+    assert!(free > 50, "{free}");
+    let (urdf, names) = chain(4);
+    let ball = Geometry::Sphere { radius: 0.05 };
+    let beside = [Obstacle { name: "ball".into(), pose: Pose::at(0.58, 0.0, 0.10), geometry: ball }];
+    for (padding, is_free) in [(0.0, true), (0.014, true), (0.016, false)] {
+        let mut mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+        mechanism.pad(mechanism.link("l3").unwrap(), padding);
+        assert_eq!(Space::new(&mechanism, &beside).is_free(&[0.0; MAX_JOINTS]), is_free, "{padding}");
+        assert_eq!(Exact::new(&mechanism, &beside).touch(&[0.0; 4]).is_none(), is_free, "{padding}");
+    }
+}
+
+#[test]
+fn what_is_attached_moves_along_and_may_touch_only_what_is_allowed() {
+    let (urdf, names) = chain(4);
+    let mut mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let hand = mechanism.link("l4").unwrap();
+    let table = Geometry::Box { half: [0.1, 0.1, 0.01] };
+    let things = [
+        Obstacle { name: "table".into(), pose: Pose::at(1.05, 0.0, -0.075), geometry: table },
+        Obstacle { name: "post".into(), pose: Pose::at(0.0, 1.05, -0.075), geometry: table },
+    ];
+    let there: State = std::array::from_fn(|j| if j == 0 { std::f32::consts::FRAC_PI_2 } else { 0.0 });
+    let free = |mechanism: &Mechanism, state: &State| {
+        let exact = Exact::new(mechanism, &things).touch(&positions(mechanism, state));
+        assert_eq!(Space::new(mechanism, &things).is_free(state), exact.is_none(), "{exact:?}");
+        exact.is_none()
+    };
+    assert!(free(&mechanism, &[0.0; MAX_JOINTS]) && free(&mechanism, &there));
+    let cube = Geometry::Box { half: [0.03; 3] }.at(Pose::at(0.29, 0.0, -0.04));
+    let held = mechanism.attach("cube", hand, vec![cube], &[]);
+    assert!(!free(&mechanism, &[0.0; MAX_JOINTS]) && !free(&mechanism, &there));
+    let touch = Exact::new(&mechanism, &things).touch(&[0.0; 4]).unwrap();
+    assert_eq!((&touch.link[..], &touch.other[..]), ("cube", "table"));
+    mechanism.allow(held, "table");
+    assert!(free(&mechanism, &[0.0; MAX_JOINTS]) && !free(&mechanism, &there));
+}
+
+#[test]
+fn a_problem_that_cannot_be_says_what_touches_what_and_how_deep() {
+    let (urdf, names) = chain(4);
+    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let ball = Geometry::Sphere { radius: 0.05 };
+    let obstacles = vec![
+        Obstacle { name: "near".into(), pose: Pose::at(0.58, 0.0, 0.08), geometry: ball },
+        Obstacle { name: "nearer".into(), pose: Pose::at(0.58, 0.0, -0.075), geometry: ball },
+    ];
+    let problem = Problem { index: 0, obstacles, start: vec![1.0, 0.0, 0.0, 0.0], goal: vec![0.0; 4] };
+    let settings = Settings { budget: BUDGET, repetitions: 1 };
+    let mut now = 0.0;
+    let mut clock = || {
+        now += 1.0;
+        now
+    };
+    let tried = trial::run(&mechanism, &problem, settings, &mut clock);
+    assert_eq!(tried.outcome, Err(ConnectError::Goal { goals: 1 }));
+    let expected = ["goal state: l3 is 10.0 mm inside nearer", "goal state: l3 is 5.0 mm inside near"];
+    assert_eq!(tried.diagnosis, expected);
+    let mut far = problem.clone();
+    far.start[1] = 2.6;
+    let tried = trial::run(&mechanism, &far, settings, &mut clock);
+    assert_eq!(tried.outcome, Err(ConnectError::Start));
+    assert!(tried.diagnosis[0].starts_with("start state: j2 is at 2.6000, outside -2.5000 to 2.5000"));
 }
 
 #[test]

@@ -58,11 +58,11 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     let srdf = arguments.srdf.as_deref().map(read).transpose()?;
     let problems =
         Problems::parse(&read(&arguments.problems)?).map_err(|error| refused(&arguments.problems, &error))?;
-    let mechanism =
+    let mut mechanism =
         Mechanism::read(&urdf, srdf.as_deref(), &problems.joints).map_err(|error| refused(&arguments.robot, &error))?;
+    mechanism.pad_all(arguments.padding_mm * 1e-3);
     let settings = Settings {
         budget: Budget { iterations: arguments.iterations, seed: arguments.seed },
-        padding_m: arguments.padding_mm * 1e-3,
         repetitions: arguments.repeat,
     };
     let begin = Instant::now();
@@ -112,7 +112,8 @@ fn line(index: u64, trial: &Trial, with_paths: bool) -> Line {
     let found = trial.outcome.as_ref().ok();
     let trouble = match &trial.outcome {
         Ok(found) => found.touch.as_ref().map(ToString::to_string),
-        Err(error) => Some(error.to_string()),
+        Err(error) if trial.diagnosis.is_empty() => Some(error.to_string()),
+        Err(error) => Some(format!("{error}: {}", trial.diagnosis.join("; "))),
     };
     Line {
         index,
@@ -186,13 +187,14 @@ mod tests {
 
     #[test]
     fn a_problem_without_a_path_counts_as_unsolved_and_says_why() {
-        let trial = Trial { plan: 1.0, simplify: 0.0, outcome: Err(ConnectError::Goal { goals: 1 }) };
+        let diagnosis = vec!["hand is 3.0 mm inside shelf".to_owned()];
+        let trial = Trial { plan: 1.0, simplify: 0.0, outcome: Err(ConnectError::Goal { goals: 1 }), diagnosis };
         let class = summary("tight", vec![(7, trial)], false);
         assert_eq!((class.problems, class.solved, class.invalid), (1, 0, 1));
         insta::assert_snapshot!(table(&[class]), @r"
         class                  solved   invalid   plan µs       p95  simplify       p95    length  rejected
         tight                     0/1         1         -         -         -         -         -         0
-        tight 7: none of the 1 goals is free
+        tight 7: none of the 1 goals is free: hand is 3.0 mm inside shelf
         ");
     }
 }

@@ -120,21 +120,30 @@ pub(crate) struct Edge<'a> {
 /// Whether no posture touches anything.
 #[inline(always)]
 pub(super) fn is_free<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
-    let mut fractions = Block([0.0; 16]);
-    for lane in 0..V::WIDTH {
-        fractions.0[lane] = (lane + 1) as f32 / V::WIDTH as f32;
-    }
-    let ends = V::load(&fractions);
-    let back = 1.0 / (V::WIDTH * edge.batches) as f32;
     for batch in 0..edge.batches {
-        let at = ends.sub(V::splat(batch as f32 * back));
-        scratch.batch += 1;
-        kinematics(edge, at, scratch);
-        if !clear_of_obstacles::<V>(edge, scratch) || !clear_of_itself::<V>(edge, scratch) {
+        if touching::<V, false>(edge, batch, scratch) != 0 {
             return false;
         }
     }
     true
+}
+
+/// Which postures of a batch touch something, a bit per lane; without `ALL` some of them, if there are any.
+#[inline(always)]
+pub(super) fn touching<V: Lanes, const ALL: bool>(edge: &Edge<'_>, batch: usize, scratch: &mut Scratch) -> u32 {
+    let mut fractions = Block([0.0; 16]);
+    for lane in 0..V::WIDTH {
+        fractions.0[lane] = (lane + 1) as f32 / V::WIDTH as f32;
+    }
+    let back = 1.0 / (V::WIDTH * edge.batches) as f32;
+    let at = V::load(&fractions).sub(V::splat(batch as f32 * back));
+    scratch.batch += 1;
+    kinematics(edge, at, scratch);
+    let found = in_obstacles::<V, ALL>(edge, scratch);
+    if found != 0 && (!ALL || found == V::ALL) {
+        return found;
+    }
+    in_itself::<V, ALL>(edge, found, scratch)
 }
 
 /// Sine and cosine: reduced to half a turn, the half angle by its series (errors below 3e-7), doubled.
@@ -259,7 +268,8 @@ fn refine<V: Lanes>(group: &Group, index: usize, scratch: &mut Scratch) {
 }
 
 #[inline(always)]
-fn clear_of_obstacles<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
+fn in_obstacles<V: Lanes, const ALL: bool>(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
+    let mut found = 0;
     let compiled = edge.compiled;
     let count = compiled.obstacles.len();
     for (index, group) in compiled.groups.iter().enumerate() {
@@ -277,16 +287,23 @@ fn clear_of_obstacles<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool 
                 break;
             }
             let obstacle = &compiled.obstacles[usize::from(o)];
-            if meets_rounded(centre, radius, obstacle) != 0 {
-                if group.fine.len() == 1 {
-                    return false;
-                }
+            let near = meets_rounded(centre, radius, obstacle) & !found;
+            if near == 0 {
+                continue;
+            }
+            if group.fine.len() == 1 {
+                found |= near;
+            } else {
                 refine::<V>(group, index, scratch);
                 for (sphere, at) in group.fine.iter().zip(&scratch.fine[group.slot..]) {
-                    if meets_rounded::<V>(fetch(at), sphere[3] + grown, obstacle) != 0 {
-                        return false;
+                    found |= meets_rounded::<V>(fetch(at), sphere[3] + grown, obstacle);
+                    if !ALL && found != 0 {
+                        return found;
                     }
                 }
+            }
+            if found != 0 && (!ALL || found == V::ALL) {
+                return found;
             }
         }
         for &o in &group.cylinders {
@@ -294,20 +311,27 @@ fn clear_of_obstacles<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool 
                 break;
             }
             let obstacle = &compiled.obstacles[usize::from(o)];
-            if meets_cylinder(centre, radius, obstacle) != 0 {
-                if group.fine.len() == 1 {
-                    return false;
-                }
+            let near = meets_cylinder(centre, radius, obstacle) & !found;
+            if near == 0 {
+                continue;
+            }
+            if group.fine.len() == 1 {
+                found |= near;
+            } else {
                 refine::<V>(group, index, scratch);
                 for (sphere, at) in group.fine.iter().zip(&scratch.fine[group.slot..]) {
-                    if meets_cylinder::<V>(fetch(at), sphere[3] + grown, obstacle) != 0 {
-                        return false;
+                    found |= meets_cylinder::<V>(fetch(at), sphere[3] + grown, obstacle);
+                    if !ALL && found != 0 {
+                        return found;
                     }
                 }
             }
+            if found != 0 && (!ALL || found == V::ALL) {
+                return found;
+            }
         }
     }
-    true
+    found
 }
 
 /// A point in an obstacle's frame.
@@ -354,33 +378,35 @@ fn meets_cylinder<V: Lanes>(centre: [V; 3], radius: f32, obstacle: &Obstacle) ->
 }
 
 #[inline(always)]
-fn meet<V: Lanes>(a: [V; 3], b: [V; 3], reach: f32) -> bool {
-    squared(minus(a, b)).below(V::splat(reach * reach)) != 0
+fn meet<V: Lanes>(a: [V; 3], b: [V; 3], reach: f32) -> u32 {
+    squared(minus(a, b)).below(V::splat(reach * reach))
 }
 
+/// Adds to what was found where two links touch.
 #[inline(always)]
-fn clear_of_itself<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
+fn in_itself<V: Lanes, const ALL: bool>(edge: &Edge<'_>, mut found: u32, scratch: &mut Scratch) -> u32 {
     for pair in &edge.compiled.pairs {
         let (i, j) = (usize::from(pair.first), usize::from(pair.second));
         let (a, b) = (&edge.compiled.groups[i], &edge.compiled.groups[j]);
         let more = if edge.inflate.is_empty() { 0.0 } else { edge.inflate[i] + edge.inflate[j] };
         let (at_a, at_b) = (fetch::<V>(&scratch.coarse[i]), fetch::<V>(&scratch.coarse[j]));
-        if !meet(at_a, at_b, a.coarse[3] + b.coarse[3] + more) {
+        if meet(at_a, at_b, a.coarse[3] + b.coarse[3] + more) & !found == 0 {
             continue;
         }
         refine::<V>(a, i, scratch);
         for (p, sphere) in a.fine.iter().enumerate() {
             let at = fetch::<V>(&scratch.fine[a.slot + p]);
-            if !meet(at, at_b, sphere[3] + b.coarse[3] + more) {
+            if meet(at, at_b, sphere[3] + b.coarse[3] + more) & !found == 0 {
                 continue;
             }
             refine::<V>(b, j, scratch);
             for (q, other) in b.fine.iter().enumerate() {
-                if meet(at, fetch::<V>(&scratch.fine[b.slot + q]), sphere[3] + other[3] + more) {
-                    return false;
+                found |= meet(at, fetch::<V>(&scratch.fine[b.slot + q]), sphere[3] + other[3] + more);
+                if found != 0 && (!ALL || found == V::ALL) {
+                    return found;
                 }
             }
         }
     }
-    true
+    found
 }

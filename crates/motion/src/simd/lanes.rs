@@ -18,6 +18,8 @@ pub(crate) struct Block(pub(crate) [f32; 16]);
 /// Numbers side by side. Masks have one bit per lane.
 pub(super) trait Lanes: Copy {
     const WIDTH: usize;
+    /// The mask with a bit for every lane.
+    const ALL: u32 = (1 << Self::WIDTH) - 1;
     fn splat(value: f32) -> Self;
     fn load(block: &Block) -> Self;
     fn store(self, block: &mut Block);
@@ -97,6 +99,20 @@ impl Isa {
         }
     }
 
+    /// See [`kernel::touching`].
+    #[inline]
+    pub(crate) fn touching(self, edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
+        match self.0 {
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx512 => unsafe { touching_avx512(edge, scratch) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx2 => unsafe { touching_avx2(edge, scratch) },
+            Kind::Plain => kernel::touching::<[f32; 8], true>(edge, 0, scratch),
+        }
+    }
+
     /// See [`nearest::nearest`].
     #[inline]
     pub(crate) fn nearest(self, blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> (usize, f32) {
@@ -119,6 +135,18 @@ fn is_free_avx512(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
 #[target_feature(enable = "avx2,fma")]
 fn is_free_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
     kernel::is_free::<x86::Wide8>(edge, scratch)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx2,fma")]
+fn touching_avx512(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
+    kernel::touching::<x86::Wide16, true>(edge, 0, scratch)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn touching_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
+    kernel::touching::<x86::Wide8, true>(edge, 0, scratch)
 }
 
 #[cfg(target_arch = "x86_64")]
