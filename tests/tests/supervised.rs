@@ -11,7 +11,9 @@ use support::{Place, Started, texts, wait_for};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A resource manager and the service manager that it believes in.
+const ROLES: [&str; 4] = ["resource-manager", "world-pool", "process-manager", "cell"];
+
+/// A daemon and the service manager that it believes in.
 struct Supervised {
     place: Place,
     process: Started,
@@ -20,16 +22,16 @@ struct Supervised {
 }
 
 impl Supervised {
-    fn start(config_text: &str) -> anyhow::Result<Supervised> {
+    fn start(role: &str, config_text: &str) -> anyhow::Result<Supervised> {
         let place = Place::new()?;
         let (notify, config) = (place.path().join("notify.sock"), place.path().join("ratn.toml"));
         let socket = UnixDatagram::bind(&notify)?;
         socket.set_read_timeout(Some(PATIENCE))?;
         std::fs::write(&config, config_text)?;
-        let arguments = ["resource-manager", "--config", config.to_str().context("a path")?];
+        let arguments = [role, "--config", config.to_str().context("a path")?];
         let notify = notify.to_str().context("a path")?.to_owned();
         let environment = [("NOTIFY_SOCKET", notify.as_str()), ("WATCHDOG_USEC", "200000")];
-        let process = place.start_with("manager", &arguments, &environment)?;
+        let process = place.start_with("daemon", &arguments, &environment)?;
         let this = Supervised { place, process, socket, config };
         this.hear("READY=1").with_context(|| this.process.said())?;
         Ok(this)
@@ -66,20 +68,27 @@ impl Supervised {
 
 #[test]
 fn a_service_manager_hears_that_a_daemon_serves_lives_reloads_and_stops() -> anyhow::Result<()> {
-    let mut manager = Supervised::start("[resource-manager.limits]\nresources = 1\n")?;
-    manager.hear("WATCHDOG=1")?;
-    manager.hear("WATCHDOG=1")?;
-    manager.process.signal(Signal::SIGTERM)?;
-    let last = manager.hear("STOPPING=1")?;
-    ensure!(!last.iter().any(|message| message.contains("READY")), "{last:?}");
-    let (code, _, said) = manager.process.finish()?;
-    ensure!(code == Some(0), "{code:?} {said}");
+    for role in ROLES {
+        // Without workers: the process manager has nobody to wait for.
+        let mut daemon = Supervised::start(role, "[process-manager]\ntemplate = []\n")?;
+        daemon.hear("WATCHDOG=1")?;
+        daemon.hear("WATCHDOG=1")?;
+        daemon.reload("[process-manager]\ntemplate = []\n[service.log]\nfilter = 'info'\n")?;
+        daemon.process.signal(Signal::SIGTERM)?;
+        let last = daemon.hear("STOPPING=1")?;
+        ensure!(!last.iter().any(|message| message.contains("READY")), "{role}: {last:?}");
+        let (code, _, said) = daemon.process.finish()?;
+        ensure!(code == Some(0) && said.contains("read again and taken over"), "{role}: {code:?} {said}");
+    }
     Ok(())
 }
 
 #[test]
 fn a_reload_takes_over_bounds_roles_and_the_log_filter_and_names_what_it_does_not() -> anyhow::Result<()> {
-    let manager = Supervised::start("[service.log]\nfilter = 'warn'\n[resource-manager.limits]\nresources = 1\n")?;
+    let manager = Supervised::start(
+        "resource-manager",
+        "[service.log]\nfilter = 'warn'\n[resource-manager.limits]\nresources = 1\n",
+    )?;
     ensure!(manager.create("f1")?.0 == Some(0));
     let (code, refused) = manager.create("f2")?;
     ensure!(code == Some(1) && refused.contains("resources: the limit of 1 is reached"), "{code:?} {refused}");
