@@ -87,7 +87,7 @@ const METHODS: [(&str, &[Row]); 5] = [
         "ratn.v1.ResourceService",
         &[
             (Look, &["Exists", "Explain", "Get", "List", "ListSessions", "Watch"]),
-            (Session, &["KeepAlive", "Session"]),
+            (Session, &["KeepAlive", "ReportShortage", "Session", "WatchDemand"]),
             (Create, &["Create"]),
             (Consume, &["Consume", "EndTask"]),
             (Delete, &["Delete"]),

@@ -12,6 +12,7 @@
 pub mod access;
 pub mod audit;
 pub mod config;
+mod demand;
 mod details;
 mod link;
 pub mod metrics;

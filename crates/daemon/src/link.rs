@@ -1,6 +1,7 @@
 //! The link of a provider to the resource manager: finds it, keeps a session, and keeps the resources there equal to those
 //! wanted, also after the manager came back, on another port if need be.
 
+use crate::demand::DemandLink;
 use crate::resource_manager;
 use ratn_proto::types::Resource;
 use ratn_worker::client::{CallError, Channels};
@@ -37,6 +38,8 @@ pub(crate) struct Link {
     pub(crate) wanted: watch::Receiver<Wanted>,
     /// Hears the id of each resource once it is there.
     pub(crate) there: Option<mpsc::Sender<String>>,
+    /// Hears what is missing.
+    pub(crate) demand: Option<DemandLink>,
 }
 
 impl Manager {
@@ -66,6 +69,7 @@ impl Link {
     /// Keeps it up until `shutdown`; then the session is closed, and with it every resource is gone.
     pub(crate) async fn keep(mut self, shutdown: CancellationToken) {
         let channels = Channels::new();
+        let mut demand = self.demand.take();
         loop {
             let endpoint = tokio::select! {
                 endpoint = self.manager.find() => endpoint,
@@ -77,6 +81,7 @@ impl Link {
                     tracing::error!(%endpoint, "no link to the resource manager: {error}");
                     tokio::time::sleep(LOOK_INTERVAL).await;
                 },
+                () = follow(&mut demand, &channels, &endpoint, &session) => {}
                 () = shutdown.cancelled() => {
                     session.close().await;
                     return;
@@ -128,5 +133,13 @@ impl Link {
                 () = tokio::time::sleep(LOOK_INTERVAL) => if self.manager.has_moved_from(endpoint) { return Ok(()) },
             }
         }
+    }
+}
+
+/// Does not end.
+async fn follow(demand: &mut Option<DemandLink>, channels: &Channels, endpoint: &Endpoint, session: &Session) {
+    match demand {
+        Some(demand) => demand.follow(channels, endpoint, session).await,
+        None => std::future::pending().await,
     }
 }

@@ -6,9 +6,12 @@ mod support;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use ratn_daemon::process_manager::Template;
+use ratn_model::resource::Requirement;
 use ratn_model::value::Value;
 use ratn_proto::types::{Resource, ResourceEventKind, WorkerState};
-use support::{TestSystem, in_time};
+use ratn_worker::client::AcquireOptions;
+use std::time::Duration;
+use support::{TestSystem, block, in_time};
 use tonic::Code;
 
 fn template() -> Template {
@@ -131,4 +134,67 @@ async fn a_pool_whose_workers_crash_in_a_row_fails_with_their_last_words() {
     let words = "3 crashes in a row; planner-3@compute: exited with status 1; its last words: cannot open the model | \
                  of the world";
     assert_eq!(failure, words);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_waits_for_more_workers_than_there_are_makes_them_start_and_who_gave_up_wants_none() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let processes = system.process_manager(vec![Template { min: 0, ..template() }]).await;
+    let client = system.client(&manager, "task").await;
+    let two = Requirement { count: 2, ..block("PathPlanner") };
+    let lease = in_time(client.resources.acquire(vec![two], AcquireOptions::default())).await.unwrap();
+    assert_eq!(lease.resources.len(), 2);
+    assert!(client.resources.release(lease.id).await.unwrap());
+    let workers = async || system.processes(&processes).pools().await.unwrap().1[0].workers.len();
+    assert_eq!(workers().await, 2, "started for it, and they stay");
+    // More than there may be: the caller is told.
+    let four = Requirement { count: 4, ..block("PathPlanner") };
+    let options = AcquireOptions { request: "four".to_owned(), ..AcquireOptions::default() };
+    let waits = {
+        let resources = client.resources.clone();
+        tokio::spawn(async move { resources.acquire(vec![four], options).await })
+    };
+    let told = "only 3 units that fit exist (process-manager@compute: `planner` has 3 workers at the most)";
+    in_time(async {
+        loop {
+            let explained = client.resources.explain("four").await;
+            if explained.is_ok_and(|waiting| waiting[0].obstacles.iter().any(|obstacle| obstacle.contains(told))) {
+                return;
+            }
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+    waits.abort();
+    processes.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn why_a_template_crash_loops_reaches_the_caller_who_waits_for_it() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let broken = Template { args: vec!["fail".to_owned()], min: 0, crash_limit: 2, backoff_ms: 1, ..template() };
+    let processes = system.process_manager(vec![broken]).await;
+    let client = system.client(&manager, "task").await;
+    let words = in_time(async {
+        loop {
+            let options = AcquireOptions { deadline: Duration::from_millis(500), ..AcquireOptions::default() };
+            let refused = client.resources.acquire(vec![block("PathPlanner")], options).await.unwrap_err();
+            assert_eq!(refused.code(), Some(Code::DeadlineExceeded));
+            let words = refused.to_string();
+            if words.contains("crash-loops") {
+                return words;
+            }
+        }
+    })
+    .await;
+    assert!(
+        words.contains(
+            "no resource of kind PathPlanner exists (process-manager@compute: `planner` crash-loops: 2 crashes"
+        ),
+        "{words}"
+    );
+    assert!(words.contains("cannot open the model"), "its last words: {words}");
+    processes.end().await;
 }

@@ -3,7 +3,7 @@
 
 use ratn_model::fact::FactKey;
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
-use ratn_model::resource::{Lease, ResourceClass};
+use ratn_model::resource::{Lease, Requirement, ResourceClass};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 
@@ -200,6 +200,17 @@ pub struct ResourceEvent {
     pub reason: String,
     /// Which of the events of its revision it is, from 0.
     pub part: u32,
+}
+
+/// What waits for more than exists.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Demand {
+    /// What is selected; its count is how many units are missing beside those that exist.
+    pub requirement: Requirement,
+    /// The kinds that would do: its kind, and those below it.
+    pub kinds: Vec<String>,
+    /// How many units of it the provider's session provides already.
+    pub provided: u32,
 }
 
 /// From where a watch goes on.

@@ -32,6 +32,8 @@ pub enum Obstacle {
         requirement: String,
         /// The kind.
         kind: String,
+        /// Why those who could provide it do not, in their words.
+        reasons: Vec<String>,
     },
     /// Resources of the kind are there, but too few that fit.
     TooFew {
@@ -39,6 +41,8 @@ pub enum Obstacle {
         requirement: String,
         /// How many units fit.
         exist: Quantity,
+        /// Why those who could provide more do not, in their words.
+        reasons: Vec<String>,
     },
     /// Enough is there, but others hold it.
     Held {
@@ -79,9 +83,10 @@ impl Pool {
         let text = requirement.to_string();
         let exist = self.resources.quantity(requirement);
         if !self.resources.has_kind(&requirement.kind) {
-            Obstacle::MissingKind { requirement: text, kind: requirement.kind.clone() }
+            let reasons = self.shortages_of(requirement);
+            Obstacle::MissingKind { requirement: text, kind: requirement.kind.clone(), reasons }
         } else if exist < requirement.amount() {
-            Obstacle::TooFew { requirement: text, exist }
+            Obstacle::TooFew { requirement: text, exist, reasons: self.shortages_of(requirement) }
         } else if held {
             let holders = self
                 .resources
@@ -131,10 +136,14 @@ impl fmt::Display for Explanation {
 impl fmt::Display for Obstacle {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Obstacle::MissingKind { requirement, kind } => {
-                write!(f, "`{requirement}`: no resource of kind {kind} exists")
+            Obstacle::MissingKind { requirement, kind, reasons } => {
+                write!(f, "`{requirement}`: no resource of kind {kind} exists")?;
+                reasons.iter().try_for_each(|reason| write!(f, " ({reason})"))
             }
-            Obstacle::TooFew { requirement, exist } => write!(f, "`{requirement}`: only {exist} units that fit exist"),
+            Obstacle::TooFew { requirement, exist, reasons } => {
+                write!(f, "`{requirement}`: only {exist} units that fit exist")?;
+                reasons.iter().try_for_each(|reason| write!(f, " ({reason})"))
+            }
             Obstacle::Held { requirement, holders } => {
                 write!(f, "`{requirement}`: held by ")?;
                 for (i, (lease, session, purpose)) in holders.iter().enumerate() {

@@ -130,6 +130,7 @@ impl Queue {
             let was = group.existing;
             group.existing = was.saturating_sub(before) + quantity;
             if was != group.existing {
+                self.demand_changed |= !self.hopeless.is_empty();
                 // Those to whom it makes a difference; of parts of units every one.
                 let (low, high) = (was.min(group.existing), was.max(group.existing));
                 let last = (Bound::Excluded((low, LAST)), Bound::Included((high, LAST)));
@@ -190,6 +191,7 @@ impl Pool {
         self.queue.order.remove(&place);
         self.queue.ready.remove(&place);
         self.queue.doubtful.remove(&place);
+        self.queue.demand_changed |= self.queue.hopeless.remove(&place);
         for (requirement, key) in waiter.request.requirements.iter().zip(&waiter.groups) {
             let Some(group) = self.queue.groups.get_mut(key) else { continue };
             group.by_amount.remove(&(requirement.amount(), place));

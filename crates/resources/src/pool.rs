@@ -4,7 +4,7 @@ use crate::error::PoolError;
 use crate::event::{Notice, WatchEvent};
 use crate::expiry::Timer;
 use crate::history::{Compacted, History};
-use crate::id::{Slot, WaiterId};
+use crate::id::{SessionId, Slot, WaiterId};
 use crate::kinds::Kinds;
 use crate::lease::{LeaseView, Leases};
 use crate::limits::Limits;
@@ -18,7 +18,7 @@ use crate::session::Sessions;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -41,6 +41,8 @@ pub struct Pool {
     pub(crate) queue: Queue,
     /// What is taken now was reserved, or free for whom it is taken.
     pub(crate) granting: bool,
+    /// What providers cannot provide, by kind, and why.
+    pub(crate) shortages: BTreeMap<SessionId, BTreeMap<String, String>>,
     pub(crate) timers: BTreeSet<(Timestamp, Timer)>,
     pub(crate) next_waiter: u64,
     pub(crate) notices: Vec<Notice>,

@@ -64,6 +64,10 @@ pub(crate) struct Queue {
     pub(crate) changed: BTreeMap<Arc<str>, bool>,
     /// Those of whom it is to be found out anew whether what exists would do.
     pub(crate) doubtful: BTreeSet<Place>,
+    /// Those of whom it would not.
+    pub(crate) hopeless: BTreeSet<Place>,
+    /// What they lack may be something else.
+    pub(crate) demand_changed: bool,
 }
 
 impl AcquireRequest {
@@ -137,7 +141,9 @@ impl Queue {
             ensure(waiter.hopeful || waiter.reserved.iter().all(BTreeMap::is_empty), "a hopeless waiter reserves")?;
             let ready = waiter.hopeful && waiter.lacks.is_empty();
             ensure(self.ready.contains(&place) == ready, "who is ready is not among them")?;
+            ensure(self.hopeless.contains(&place) != waiter.hopeful, "who is hopeless is not among them")?;
         }
+        ensure(self.hopeless.len() <= self.waiters.len(), "somebody hopeless has left")?;
         ensure(reserved == self.reserved, "what is reserved is not what waiters have reserved")?;
         ensure(self.groups.values().map(|group| group.members).sum::<usize>() == members, "a group miscounts")?;
         ensure(self.groups.is_empty() == self.families.is_empty(), "a family without a group")

@@ -60,6 +60,9 @@ impl Pool {
         let Some(waiter) = self.queue.waiters.get(&place.1) else { return };
         let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
         let hopeful = Assignment::of(&self.resources, Available::Existing, &requirements).is_complete();
+        let known = if hopeful { self.queue.hopeless.remove(&place) } else { self.queue.hopeless.insert(place) };
+        self.queue.demand_changed |= known || !hopeful;
+        let Some(waiter) = self.queue.waiters.get(&place.1) else { return };
         if hopeful == waiter.hopeful {
             return;
         }

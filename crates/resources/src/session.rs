@@ -157,6 +157,7 @@ impl Pool {
         for slot in session.provides {
             self.commit(Effect::ResourceDeleted { slot, reason });
         }
+        self.shortages.remove(id);
         self.commit(Effect::SessionEnded { session: id.clone() });
     }
 }

@@ -420,6 +420,46 @@ fn what_fits_fewer_other_requests_is_given_away_first() {
 }
 
 #[test]
+fn what_waits_for_more_than_exists_is_in_demand_until_it_does_not_and_is_told_why_there_is_no_more() {
+    let mut bench = Bench::new();
+    let told = |pool: &mut Pool| {
+        let demand = pool.take_demand()?;
+        Some(
+            demand.iter().map(|demand| (demand.requirement.kind.clone(), demand.requirement.count)).collect::<Vec<_>>(),
+        )
+    };
+    let planners = |count| requirement(ResourceOperation::Block, "PathPlanner", count);
+    assert_eq!(told(&mut bench.pool), None);
+    let two = bench.acquire("b", &[planners(2)]);
+    let three = bench.acquire("b", &[planners(3)]);
+    assert_eq!(told(&mut bench.pool), Some(vec![("PathPlanner".into(), 3)]), "the most that one waits for");
+    assert_eq!(told(&mut bench.pool), None, "nothing has changed");
+    let first = bench.create("a", ResourceSpec::new(ResourceClass::Process, "PathPlanner"));
+    assert_eq!(told(&mut bench.pool), Some(vec![("PathPlanner".into(), 2)]));
+    bench.pool.report_shortage(bench.now, &session("a"), "PathPlanner", "`planner` crash-loops").unwrap();
+    let words = bench.pool.explain(two).unwrap().to_string();
+    assert_eq!(words, "`block PathPlanner × 2`: only 1 units that fit exist (a: `planner` crash-loops)");
+    bench.create("a", ResourceSpec::new(ResourceClass::Process, "PathPlanner"));
+    let (waiter, lease) = grants(&bench.notices()).remove(0);
+    assert_eq!(waiter, two);
+    let left = bench.pool.take_demand().unwrap();
+    assert_eq!((left[0].requirement.count, bench.pool.provided(&session("a"), &left[0])), (1, 2));
+    // Held or not: what exists is not in demand.
+    bench.acquire("b", &[planners(1)]);
+    assert_eq!(told(&mut bench.pool), None);
+    bench.pool.cancel(bench.now, three).unwrap();
+    assert_eq!(told(&mut bench.pool), Some(vec![]), "withdrawn");
+    // It comes back where what existed is gone, and what a provider said goes with its session.
+    bench.release(lease.id);
+    bench.pool.delete(bench.now, None, &first).unwrap();
+    bench.acquire("b", &[planners(2)]);
+    assert_eq!(told(&mut bench.pool), Some(vec![("PathPlanner".into(), 1)]));
+    bench.pool.close_session(bench.now, &session("a")).unwrap();
+    let (last, _) = bench.pool.waiters().pop().unwrap();
+    assert!(!bench.pool.explain(last).unwrap().to_string().contains("crash-loops"));
+}
+
+#[test]
 fn exists_waits_for_the_resource_but_does_not_hold_it() {
     let mut bench = Bench::with(&[("Arm", 1)]);
     let level = Requirement {

@@ -149,6 +149,22 @@ impl ResourceService for Manager {
         Err(Status::unimplemented("not under test"))
     }
 
+    type WatchDemandStream = BoxStream<'static, Result<ratn_proto::v1::WatchDemandResponse, Status>>;
+
+    async fn watch_demand(
+        &self,
+        _: Request<ratn_proto::v1::WatchDemandRequest>,
+    ) -> Result<Response<Self::WatchDemandStream>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
+    async fn report_shortage(
+        &self,
+        _: Request<ratn_proto::v1::ReportShortageRequest>,
+    ) -> Result<Response<ratn_proto::v1::ReportShortageResponse>, Status> {
+        Err(Status::unimplemented("not under test"))
+    }
+
     async fn end_task(
         &self,
         _: Request<ratn_proto::v1::EndTaskRequest>,

@@ -5,12 +5,13 @@ use super::log::EndedLogs;
 use super::pool::{Command, PoolError, Pools};
 use super::spawner::{self, Job, Outcome};
 use super::usage::Usage;
+use crate::demand::Shortages;
 use crate::link::Wanted;
 use nix::sys::signal::Signal;
 use ratn_model::resource::ResourceClass;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use ratn_proto::types::{PoolStatus, Resource, WorkerStatus};
+use ratn_proto::types::{Demand, PoolStatus, Resource, WorkerStatus};
 use ratn_worker::client::wait_until_serving;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::collections::BTreeMap;
@@ -57,6 +58,10 @@ pub(super) struct Parts {
     pub(super) wanted: watch::Sender<Wanted>,
     /// What the link has offered.
     pub(super) there: mpsc::Receiver<String>,
+    /// What is missing.
+    pub(super) demand: mpsc::Receiver<Vec<Demand>>,
+    /// Why there is no more.
+    pub(super) short: watch::Sender<Shortages>,
 }
 
 struct Actor {
@@ -67,6 +72,7 @@ struct Actor {
     pools: Pools,
     start: Instant,
     wanted: watch::Sender<Wanted>,
+    short: watch::Sender<Shortages>,
     jobs: mpsc::Sender<Job>,
     serving: mpsc::Sender<(String, String)>,
     processes: BTreeMap<String, Process>,
@@ -86,7 +92,7 @@ pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Resul
     let (inbox, messages) = mpsc::channel(INBOX);
     let (told, outcomes) = mpsc::channel(OUTCOMES);
     let (serving, served) = mpsc::channel(OUTCOMES);
-    let Parts { config, directory, wanted, there } = parts;
+    let Parts { config, directory, wanted, there, demand, short } = parts;
     let actor = Actor {
         this_program: std::env::current_exe()?,
         pools: Pools::new(&config.host, config.templates.iter().cloned()),
@@ -94,6 +100,7 @@ pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Resul
         directory,
         start: Instant::now(),
         wanted,
+        short,
         jobs: spawner::start(told)?,
         serving,
         processes: BTreeMap::new(),
@@ -101,7 +108,7 @@ pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Resul
         watchers: Vec::new(),
         usage: Usage::new(),
     };
-    let inputs = Inputs { messages, outcomes, served, there };
+    let inputs = Inputs { messages, outcomes, served, there, demand };
     Ok((Handle { inbox }, tokio::spawn(actor.run(inputs, shutdown))))
 }
 
@@ -118,6 +125,7 @@ struct Inputs {
     outcomes: mpsc::Receiver<Outcome>,
     served: mpsc::Receiver<(String, String)>,
     there: mpsc::Receiver<String>,
+    demand: mpsc::Receiver<Vec<Demand>>,
 }
 
 impl Actor {
@@ -130,6 +138,7 @@ impl Actor {
                 Some(outcome) = inputs.outcomes.recv() => self.became(outcome),
                 Some((id, endpoint)) = inputs.served.recv() => self.pools.serving(self.now(), &id, &endpoint),
                 Some(id) = inputs.there.recv() => self.pools.resource_there(&id),
+                Some(demand) = inputs.demand.recv() => self.pools.demanded(self.now(), &demand),
                 Some(message) = inputs.messages.recv() => self.receive(message),
                 () = sleep_until(deadline) => self.pools.advance(self.now()),
                 () = shutdown.cancelled() => break,
@@ -217,6 +226,12 @@ impl Actor {
         loop {
             let commands = self.pools.take_commands();
             if commands.is_empty() {
+                self.short.send_if_modified(|said| {
+                    let shortages = self.pools.shortages();
+                    let changed = *said != shortages;
+                    *said = shortages;
+                    changed
+                });
                 return;
             }
             for command in commands {

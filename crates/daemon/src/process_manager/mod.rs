@@ -19,6 +19,7 @@ mod usage;
 
 pub use config::{ProcessManagerConfig, Template};
 
+use crate::demand::{DemandLink, Shortages};
 use crate::link::{Link, Manager, Wanted};
 use anyhow::Context;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
@@ -32,6 +33,8 @@ use tokio_util::sync::CancellationToken;
 pub const ROLE: &str = "process-manager";
 /// Resources that are there which the actor was not told of yet.
 const THERE: usize = 1_024;
+/// States of the demand that the actor was not told of yet.
+const DEMANDS: usize = 16;
 
 /// Serves until `shutdown` is cancelled, and returns once every worker is gone.
 ///
@@ -59,16 +62,19 @@ pub async fn run_as(
     let endpoint = bound.endpoint().clone();
     let (wanted, to_offer) = watch::channel(Wanted::new());
     let (offered, there) = mpsc::channel(THERE);
+    let (heard, demand) = mpsc::channel(DEMANDS);
+    let (short, shortages) = watch::channel(Shortages::new());
     let link = Link {
         manager: Manager { configured: config.resource_manager.clone(), directory: directory.clone() },
         client: format!("{ROLE}@{}", config.host),
         ttl: Duration::from_millis(config.session_ttl_ms),
         wanted: to_offer,
         there: Some(offered),
+        demand: Some(DemandLink { heard, shortages }),
     };
     let linked = tokio::spawn(link.keep(shutdown.clone()));
     let host = config.host.clone();
-    let parts = actor::Parts { config, directory: directory.clone(), wanted, there };
+    let parts = actor::Parts { config, directory: directory.clone(), wanted, there, demand, short };
     let (actor, ended) = actor::start(parts, shutdown.clone()).context("cannot start workers")?;
     let service = ProcessServiceServer::new(service::Service { actor, host, shutdown: shutdown.clone() });
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;

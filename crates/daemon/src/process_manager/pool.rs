@@ -10,9 +10,12 @@
 //! at once after a first crash, later after each further one, not at all after [`Template::crash_limit`] in a row.
 
 use super::config::Template;
+use ratn_model::resource::ResourceClass;
 use ratn_model::time::Timestamp;
-use ratn_proto::types::{PoolStatus, WorkerState, WorkerStatus};
-use std::collections::BTreeMap;
+use ratn_model::value::Value;
+use ratn_proto::types::{Demand, PoolStatus, WorkerState, WorkerStatus};
+use std::borrow::Cow;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 /// All pools of a host.
@@ -99,11 +102,15 @@ struct Pool {
     template: Template,
     /// How many workers there should be.
     wanted: u32,
+    /// How many there should be for those who wait; 0 when nobody does.
+    demanded: u32,
     workers: BTreeMap<String, Worker>,
     last_number: u64,
     crashes: u32,
     restart_at: Option<Timestamp>,
     failure: String,
+    /// More is asked for than there may be.
+    short: bool,
 }
 
 #[derive(Debug)]
@@ -137,11 +144,13 @@ impl Pools {
         let pool = |template: Template| {
             let pool = Pool {
                 wanted: template.min,
+                demanded: 0,
                 workers: BTreeMap::new(),
                 last_number: 0,
                 crashes: 0,
                 restart_at: None,
                 failure: String::new(),
+                short: false,
                 template,
             };
             (pool.template.name.clone(), pool)
@@ -278,6 +287,50 @@ impl Pools {
         Ok(started.into_iter().rev().take(count as usize).rev().collect())
     }
 
+    /// What waits for more than exists, as it is now: workers are started for it up to the pool's maximum, also where the pool had
+    /// failed before anybody asked. When nobody waits any more, those that do not serve yet are ended; the others stay.
+    pub fn demanded(&mut self, now: Timestamp, demands: &[Demand]) {
+        if self.ending {
+            return;
+        }
+        let host = Value::String(self.host.clone());
+        let of_workers = |name: &str| (name == "host").then_some(Cow::Borrowed(&host));
+        let met = |demand: &&Demand| {
+            demand.requirement.class.is_none_or(|class| class == ResourceClass::Process)
+                && demand.requirement.accepts(of_workers)
+        };
+        let mut taken = BTreeSet::new();
+        for pool in self.pools.values_mut() {
+            // Of several templates of a kind the first meets what is asked for.
+            let first = taken.insert(pool.template.kind.clone());
+            let of_kind = demands.iter().filter(|demand| demand.kinds.contains(&pool.template.kind)).filter(met);
+            let most = of_kind.map(|demand| demand.provided.saturating_add(demand.requirement.count)).max();
+            let demanded = most.filter(|_| first).unwrap_or(0);
+            if pool.demanded == 0 && demanded > 0 && !pool.failure.is_empty() {
+                pool.failure.clear();
+                (pool.crashes, pool.restart_at) = (0, None);
+            }
+            pool.short = demanded > pool.template.max_workers();
+            pool.demanded = demanded.min(pool.template.max_workers());
+            pool.end_surplus(now, &mut self.commands);
+        }
+        self.advance(now);
+    }
+
+    /// Why there are no more workers of a kind, by kind.
+    pub fn shortages(&self) -> BTreeMap<String, String> {
+        let of = |pool: &Pool| {
+            let name = &pool.template.name;
+            let reason = match pool.failure.as_str() {
+                "" if pool.short => format!("`{name}` has {} workers at the most", pool.template.max_workers()),
+                "" => return None,
+                failure => format!("`{name}` crash-loops: {failure}"),
+            };
+            Some((pool.template.kind.clone(), reason))
+        };
+        self.pools.values().filter_map(of).collect()
+    }
+
     /// Ends a worker; it is replaced only where the pool would fall below its minimum.
     ///
     /// # Errors
@@ -340,7 +393,19 @@ impl Pool {
     }
 
     fn missing(&self) -> u32 {
-        if self.failure.is_empty() { self.wanted.saturating_sub(self.there()) } else { 0 }
+        if self.failure.is_empty() { self.wanted.max(self.demanded).saturating_sub(self.there()) } else { 0 }
+    }
+
+    /// Ends those that do not serve yet and are wanted no more, the youngest first.
+    fn end_surplus(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        let mut surplus = self.there().saturating_sub(self.wanted.max(self.demanded));
+        let kill_at = now + self.template.stop_timeout();
+        for (id, worker) in self.workers.iter_mut().rev() {
+            if surplus > 0 && matches!(worker.phase, Phase::Starting { .. }) {
+                worker.stop(id, kill_at, commands);
+                surplus -= 1;
+            }
+        }
     }
 
     /// Starts what is missing, unless it has to wait; the ids.
@@ -593,5 +658,52 @@ mod tests {
         assert!(started(&mut pools).is_empty());
         assert!(pools.is_empty());
         assert_eq!(pools.spawn(at(2.0), "planner", 1), Err(PoolError::Ending));
+    }
+
+    fn demand(provided: u32, missing: u32) -> [Demand; 1] {
+        let requirement = ratn_model::resource::Requirement {
+            count: missing,
+            ..ratn_model::resource::Requirement::new(ratn_model::resource::ResourceOperation::Block, "PathPlanner")
+        };
+        [Demand { requirement, kinds: vec!["Planner".to_owned(), "PathPlanner".to_owned()], provided }]
+    }
+
+    #[test]
+    fn for_those_who_wait_workers_are_started_once_and_up_to_the_maximum() {
+        let now = Timestamp(0);
+        let mut pools = pools(|template| (template.min, template.max) = (0, Some(3)));
+        pools.advance(now);
+        assert_eq!(started(&mut pools).len(), 0);
+        pools.demanded(now, &demand(0, 2));
+        assert_eq!(started(&mut pools).len(), 2);
+        // One of them is there: as many are wanted as before.
+        pools.serving(now, "planner-1@compute", "unix:/1");
+        pools.resource_there("planner-1@compute");
+        pools.demanded(now, &demand(1, 1));
+        assert_eq!((started(&mut pools).len(), pools.shortages().len()), (0, 0));
+        pools.demanded(now, &demand(1, 9));
+        assert_eq!(started(&mut pools).len(), 1);
+        assert_eq!(pools.shortages()["PathPlanner"], "`planner` has 3 workers at the most");
+        // Nobody waits any more: what does not serve yet is ended, the other one stays.
+        pools.demanded(now, &[]);
+        let ended: Vec<Command> = pools.take_commands();
+        let terminated = ended.iter().filter_map(|command| match command {
+            Command::Terminate { id } => Some(id.as_str()),
+            _ => None,
+        });
+        assert_eq!(terminated.collect::<Vec<_>>(), ["planner-3@compute", "planner-2@compute"]);
+        assert!(pools.shortages().is_empty());
+    }
+
+    #[test]
+    fn demand_that_no_worker_of_this_host_would_meet_starts_none() {
+        let mut pools = pools(|template| template.min = 0);
+        let mut elsewhere = demand(0, 1);
+        elsewhere[0].requirement.attributes.insert("host".to_owned(), Value::String("elsewhere".to_owned()));
+        pools.demanded(Timestamp(0), &elsewhere);
+        assert_eq!(started(&mut pools).len(), 0);
+        elsewhere[0].requirement.attributes.insert("host".to_owned(), Value::String("compute".to_owned()));
+        pools.demanded(Timestamp(0), &elsewhere);
+        assert_eq!(started(&mut pools).len(), 1);
     }
 }

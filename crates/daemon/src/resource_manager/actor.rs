@@ -17,7 +17,7 @@ use crate::metrics::{self, Amounts};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
-use ratn_proto::types::{ResourceEvent, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition};
+use ratn_proto::types::{Demand, ResourceEvent, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition};
 use ratn_resources::{
     AcquireRequest, Change, Notice, Pool, PoolError, Quantity, Reply, Request, ResourceView, SessionId, WaiterId,
 };
@@ -110,6 +110,16 @@ pub(super) enum Message {
         request_id: String,
         answer: Answer<(Vec<WaitingAcquire>, usize)>,
     },
+    WatchDemand {
+        session: SessionId,
+        answer: Answer<watch::Receiver<Vec<Demand>>>,
+    },
+    ReportShortage {
+        session: SessionId,
+        kind: String,
+        reason: String,
+        answer: Answer<()>,
+    },
     Watch {
         /// Without a snapshot: what happened after this.
         after: Option<WatchPosition>,
@@ -152,6 +162,9 @@ struct Actor {
     /// How many calls got a lease, where a repeated request had joined: as many have to be dropped before it goes back.
     shared: BTreeMap<LeaseId, usize>,
     watchers: Vec<mpsc::Sender<Arc<ResourceUpdate>>>,
+    /// What waits for more than exists.
+    demand: Vec<ratn_resources::Demand>,
+    demand_watchers: Vec<(SessionId, watch::Sender<Vec<Demand>>)>,
 }
 
 /// Starts the actor on what was kept. With `draining` everybody who waits is told to ask the successor; with `over` it ends.
@@ -176,6 +189,8 @@ pub(super) fn start(
         tickets: BTreeMap::new(),
         shared: BTreeMap::new(),
         watchers: Vec::new(),
+        demand: Vec::new(),
+        demand_watchers: Vec::new(),
     };
     let running = tokio::spawn(actor.run(Inputs { messages, pinged, live }, draining, over));
     (Handle { inbox, pings }, running)
@@ -261,6 +276,7 @@ impl Actor {
                 }
             }
             self.deliver();
+            self.spread_demand();
             self.measure();
         }
     }
@@ -357,6 +373,14 @@ impl Actor {
             Message::Get { id, answer } => self.tell(answer, self.pool.get(&id)),
             Message::List { answer } => self.tell(answer, (self.pool.list(), self.pool.revision())),
             Message::Sessions { answer } => self.tell(answer, self.sessions()),
+            Message::WatchDemand { session, answer } => {
+                let watch = self.watch_demand(session);
+                self.reply(answer, watch);
+            }
+            Message::ReportShortage { session, kind, reason, answer } => {
+                let reported = self.pool.report_shortage(now, &session, &kind, &reason);
+                self.reply(answer, reported.map_err(|error| status::of_error(&error)));
+            }
             Message::Explain { request_id, answer } => {
                 let explained = self.explain(&request_id);
                 self.reply(answer, explained);
@@ -383,6 +407,8 @@ impl Actor {
             Message::Get { id, answer } => drop(answer.send(self.pool.get(&id))),
             Message::List { answer } => drop(answer.send((self.pool.list(), self.pool.revision()))),
             Message::Sessions { answer } => drop(answer.send(self.sessions())),
+            Message::WatchDemand { answer, .. } => drop(answer.send(Err(stopped))),
+            Message::ReportShortage { answer, .. } => drop(answer.send(Err(stopped))),
             Message::Explain { request_id, answer } => drop(answer.send(self.explain(&request_id))),
             Message::Watch { after, answer } => drop(answer.send(self.watch(after))),
         }
@@ -439,6 +465,41 @@ impl Actor {
         }
         tracing::debug!(%lease, "granted to a call that was dropped: released");
         let _ = self.pool.release(self.now(), None, lease);
+    }
+
+    fn watch_demand(&mut self, session: SessionId) -> Result<watch::Receiver<Vec<Demand>>, Status> {
+        self.demand_watchers.retain(|(_, watcher)| !watcher.is_closed());
+        if self.demand_watchers.len() >= self.config.max_watchers {
+            let message = format!("{} providers watch already", self.demand_watchers.len());
+            return Err(retry_later(Code::ResourceExhausted, "TOO_MANY", message, Duration::from_secs(1)));
+        }
+        let (sender, watcher) = watch::channel(self.demand_of(&session));
+        self.demand_watchers.push((session, sender));
+        Ok(watcher)
+    }
+
+    fn demand_of(&self, session: &SessionId) -> Vec<Demand> {
+        let of = |demand: &ratn_resources::Demand| Demand {
+            requirement: demand.requirement.clone(),
+            kinds: demand.kinds.clone(),
+            provided: self.pool.provided(session, demand),
+        };
+        self.demand.iter().map(of).collect()
+    }
+
+    /// Tells providers what is missing, where that may have changed.
+    fn spread_demand(&mut self) {
+        let Some(demand) = self.pool.take_demand() else { return };
+        self.demand = demand;
+        self.demand_watchers.retain(|(_, watcher)| !watcher.is_closed());
+        for (session, watcher) in &self.demand_watchers {
+            let demand = self.demand_of(session);
+            watcher.send_if_modified(|before| {
+                let changed = *before != demand;
+                *before = demand;
+                changed
+            });
+        }
     }
 
     fn sessions(&self) -> Vec<SessionStatus> {

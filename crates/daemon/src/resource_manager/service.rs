@@ -144,6 +144,7 @@ impl Drop for WaitingCall {
 #[tonic::async_trait]
 impl v1::resource_service_server::ResourceService for Service {
     type WatchStream = Streamed<v1::ResourceServiceWatchResponse>;
+    type WatchDemandStream = Streamed<v1::WatchDemandResponse>;
     type KeepAliveStream = Streamed<v1::KeepAliveResponse>;
     type SessionStream = super::stream::SessionStream;
 
@@ -309,6 +310,35 @@ impl v1::resource_service_server::ResourceService for Service {
         let end = PoolRequest::EndTask { session: self.session(&caller, &request.session_id)? };
         let (_, revision) = self.perform(&caller, request.request_id, end).await?;
         Ok(Response::new(v1::EndTaskResponse { revision }))
+    }
+
+    async fn watch_demand(
+        &self,
+        request: Request<v1::WatchDemandRequest>,
+    ) -> Result<Response<Self::WatchDemandStream>, Status> {
+        let (caller, request) = (Caller::of(&request), request.into_inner());
+        let session = self.session(&caller, &request.session_id)?;
+        let mut demand = self.actor.ask(|answer| Message::WatchDemand { session, answer }).await??;
+        demand.mark_changed();
+        let stream = futures::stream::unfold(demand, async |mut demand| {
+            demand.changed().await.ok()?;
+            let demands = all(demand.borrow_and_update().iter().cloned());
+            Some((Ok(v1::WatchDemandResponse { demands }), demand))
+        });
+        Ok(Response::new(Box::pin(stream.take_until(self.shutdown.clone().cancelled_owned()))))
+    }
+
+    async fn report_shortage(
+        &self,
+        request: Request<v1::ReportShortageRequest>,
+    ) -> Result<Response<v1::ReportShortageResponse>, Status> {
+        let caller = Caller::of(&request);
+        let v1::ReportShortageRequest { session_id, kind, reason } = request.into_inner();
+        name(&kind, "kind")?;
+        label(&reason, "reason")?;
+        let session = self.session(&caller, &session_id)?;
+        self.actor.ask(|answer| Message::ReportShortage { session, kind, reason, answer }).await??;
+        Ok(Response::new(v1::ReportShortageResponse {}))
     }
 
     async fn list(&self, request: Request<v1::ListRequest>) -> Result<Response<v1::ListResponse>, Status> {

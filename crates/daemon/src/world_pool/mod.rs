@@ -64,6 +64,7 @@ pub async fn run_as(
         ttl: Duration::from_millis(config.session_ttl_ms),
         wanted,
         there: None,
+        demand: None,
     };
     // Calls under way need all of it until the last has ended.
     let over = CancellationToken::new();

@@ -2,8 +2,8 @@
 
 use super::{Malformed, all, each, label, missing_choice, name, names, ports, required, wire_ports};
 use crate::types::{
-    Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState, ResourceUpdate, SessionStatus,
-    WaitingAcquire,
+    Demand, Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState, ResourceUpdate,
+    SessionStatus, WaitingAcquire,
 };
 use crate::v1;
 use ratn_model::condition::{Comparison, Condition};
@@ -136,6 +136,21 @@ impl TryFrom<v1::Condition> for Condition {
             return Err(Malformed::new("value", "is no list: `in` takes one"));
         }
         Ok(Condition { attribute: condition.attribute, comparison, value })
+    }
+}
+
+impl From<Demand> for v1::Demand {
+    fn from(demand: Demand) -> v1::Demand {
+        v1::Demand { requirement: Some(demand.requirement.into()), kinds: demand.kinds, provided: demand.provided }
+    }
+}
+
+impl TryFrom<v1::Demand> for Demand {
+    type Error = Malformed;
+
+    fn try_from(demand: v1::Demand) -> Result<Demand, Malformed> {
+        let requirement = required(demand.requirement, "requirement")?;
+        Ok(Demand { requirement, kinds: demand.kinds, provided: demand.provided })
     }
 }
 

@@ -12,7 +12,7 @@ pub use action::{ActionClient, ActionInfo, Fate, ProviderInfo};
 pub use error::CallError;
 pub use health::wait_until_serving;
 pub use process::{ProcessClient, WorkerWatch};
-pub use resource::{AcquireOptions, ResourceClient, ResourceWatch};
+pub use resource::{AcquireOptions, DemandWatch, ResourceClient, ResourceWatch};
 pub use world::{Projection, WorldClient};
 
 use crate::endpoint::{Endpoint, connect_lazily};

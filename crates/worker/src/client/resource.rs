@@ -8,7 +8,9 @@ use ratn_model::id::LeaseId;
 use ratn_model::resource::{Lease, Requirement};
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::{Malformed, all, each, required};
-use ratn_proto::types::{Resource, ResourceFilter, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition};
+use ratn_proto::types::{
+    Demand, Resource, ResourceFilter, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition,
+};
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_proto::v1::session_request::Kind as Asked;
@@ -47,6 +49,13 @@ impl Default for AcquireOptions {
             holder: String::new(),
         }
     }
+}
+
+/// A running watch of what is missing.
+#[derive(Debug)]
+pub struct DemandWatch {
+    endpoint: Endpoint,
+    stream: Streaming<v1::WatchDemandResponse>,
 }
 
 /// The resources as they are, then every change.
@@ -303,6 +312,26 @@ impl ResourceClient {
         Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
+    /// Tells a provider what waits for more than exists: what is missing at first, and then whenever that changes.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn watch_demand(&self) -> Result<DemandWatch, CallError> {
+        let question = v1::WatchDemandRequest { session_id: self.session.clone() };
+        let answer = self.client.clone().watch_demand(question).await.map_err(|status| self.failed(&status))?;
+        Ok(DemandWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
+    }
+
+    /// Says to those who wait for a kind why there are no more of it; an empty reason takes that back.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn report_shortage(&self, kind: &str, reason: &str) -> Result<(), CallError> {
+        let (session_id, kind, reason) = (self.session.clone(), kind.to_owned(), reason.to_owned());
+        let question = v1::ReportShortageRequest { session_id, kind, reason };
+        self.client.clone().report_shortage(question).await.map(drop).map_err(|status| self.failed(&status))
+    }
+
     /// Over the session's stream.
     async fn ask(&self, question: Asked) -> Result<Answered, CallError> {
         self.line.ask(&self.client, question).await.map_err(|status| self.failed(&status))
@@ -329,6 +358,18 @@ impl ResourceClient {
 
     fn failed(&self, status: &tonic::Status) -> CallError {
         CallError::from_status(&self.endpoint, status)
+    }
+}
+
+impl DemandWatch {
+    /// What is missing now; `None` when the manager ends the watch.
+    ///
+    /// # Errors
+    /// [`CallError`] when it broke.
+    pub async fn next(&mut self) -> Result<Option<Vec<Demand>>, CallError> {
+        let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
+        let demands = message.map(|message| each(message.demands, "demands")).transpose();
+        demands.map_err(|m| CallError::malformed(&self.endpoint, m))
     }
 }
 
