@@ -223,6 +223,7 @@ fn program(states: Vec<State>, horizon: usize) -> Program {
         parameters: Vec::new(),
         outputs: Vec::new(),
         initial: Vec::new(),
+        ontology: None,
         states,
         digest: String::new(),
     }

@@ -14,6 +14,7 @@
 //! | [`resources`] | unknown-resource, too-many-resources, provider-not-blocked, computes-actuates |
 //! | [`deadlock`] | may-deadlock |
 //! | [`preconditions`] | unestablished-precondition |
+//! | [`ontology`] | unknown-predicate, outside-domain, outside-range |
 
 mod actions;
 pub(crate) mod constants;
@@ -21,6 +22,7 @@ mod deadlock;
 mod flows;
 mod functions;
 mod graph;
+mod ontology;
 mod preconditions;
 mod reach;
 mod resources;
@@ -63,6 +65,7 @@ pub(crate) fn check(
     deadlock::check(&subject, findings);
     functions::check(&subject, findings);
     preconditions::check(&subject, findings);
+    ontology::check(&subject, findings);
 }
 
 impl<'a> Subject<'a> {

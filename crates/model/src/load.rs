@@ -38,6 +38,7 @@ use crate::diagnostic::{Diagnostic, Findings, Severity};
 use crate::expression::EffectExpr;
 use crate::expression::scope::NothingKnown;
 use crate::id::StateId;
+use crate::ontology::{Ontology, turtle};
 use crate::program::{Parameter, Program, StateKind, TaskOutput};
 use crate::value::{Type, Value};
 use fields::{Fields, Output};
@@ -49,7 +50,7 @@ use yaml::{Content, Node};
 /// The horizon of a task that names none.
 pub const DEFAULT_HORIZON: usize = 120;
 
-const TASK_KEYS: [&str; 12] = [
+const TASK_KEYS: [&str; 13] = [
     "task",
     "description",
     "horizon",
@@ -58,12 +59,13 @@ const TASK_KEYS: [&str; 12] = [
     "exceptions",
     "parameters",
     "variables",
+    "ontology",
     "world",
     "outputs",
     "outcomes",
     "states",
 ];
-const LATER_TASK_KEYS: [&str; 3] = ["ontology", "imports", "tolerance"];
+const LATER_TASK_KEYS: [&str; 2] = ["imports", "tolerance"];
 
 /// A program and what was noticed about it.
 #[derive(Debug, Clone, PartialEq)]
@@ -174,6 +176,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     let speculation_width = root.get("speculation_width").and_then(|node| fields.count(node, "speculation_width", 1));
     let deadline_s = root.get("deadline").and_then(|node| flow::positive(&mut fields, node, "deadline"));
     let exceptions = root.get("exceptions").and_then(|node| flow::exceptions(&mut fields, node));
+    let described = root.get("ontology").and_then(|node| ontology(&mut fields, node, loading));
     let parameters = read_parameters(&mut fields, &root);
     let initial = root.get("world").map(|node| world(&mut fields, node)).unwrap_or_default();
     out.declares_world = root.get("world").is_some();
@@ -186,6 +189,8 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     };
     let mut hasher = blake3::Hasher::new();
     hasher.update(source.as_bytes());
+    let (ontology, ontology_text) = described.unzip();
+    hasher.update(ontology_text.unwrap_or_default().as_bytes());
     for (id, library) in &task.libraries {
         hasher.update(library.digest.as_bytes());
         graft::graft(&mut states, *id, library, &task.in_sight(*id));
@@ -201,6 +206,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         parameters,
         outputs,
         initial,
+        ontology,
         states,
         digest,
     };
@@ -224,6 +230,29 @@ fn horizon(fields: &mut Fields<'_, '_>, node: &Node) -> usize {
     }
 }
 
+/// The ontology that a task names, and its text.
+fn ontology(fields: &mut Fields<'_, '_>, node: &Node, loading: &Loading<'_>) -> Option<(Ontology, String)> {
+    let Content::Text(path) = &node.content else {
+        let message = format!("`ontology` is the name of a file, found {}", node.described());
+        fields.error("invalid-ontology", node.at, message, "write `ontology: robot.ttl`, relative to this file");
+        return None;
+    };
+    match loading.files.read(loading.file, path) {
+        Err(why) => {
+            let message = format!("`{path}` cannot be read: {why}");
+            fields.error("invalid-ontology", node.at, message, "the path is relative to this file");
+            None
+        }
+        Ok((name, text)) => match turtle::read(&text) {
+            Ok(ontology) => Some((ontology, text)),
+            Err(error) => {
+                fields.error("invalid-ontology", node.at, format!("{name}: {error}"), "");
+                None
+            }
+        },
+    }
+}
+
 fn world(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<EffectExpr> {
     let mut initial = Vec::new();
     for item in node.items() {
@@ -236,6 +265,9 @@ fn world(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<EffectExpr> {
         effects.iter().for_each(|effect| check::effect_expressions(effect, "world", &mut parts));
         if let Some(problem) = parts.iter().find_map(|(_, expr)| check::constants::problem(expr)) {
             fields.error(check::constants::RULE, item.at, problem.to_string(), check::constants::HELP);
+        }
+        for i in initial.len()..initial.len() + effects.len() {
+            fields.out.places.note(StateId(0), format!("world.{i}"), item.at);
         }
         initial.extend(effects);
     }

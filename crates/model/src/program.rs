@@ -6,6 +6,7 @@
 use crate::condition::ConditionExpr;
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::id::StateId;
+use crate::ontology::Ontology;
 use crate::resource::{ResourceClass, ResourceOperation};
 use crate::value::{Type, Value};
 use serde::{Deserialize, Serialize};
@@ -37,9 +38,11 @@ pub struct Program {
     pub outputs: Vec<TaskOutput>,
     /// The facts that hold at the start, over what the world pool already holds; arguments may use parameters.
     pub initial: Vec<EffectExpr>,
+    /// What its facts may say; `None`: anything.
+    pub ontology: Option<Ontology>,
     /// Every state; a [`StateId`] is an index. State 0 is the root, a [`StateKind::Sequence`].
     pub states: Vec<State>,
-    /// Hash of the task file's text, hexadecimal.
+    /// Hash of the texts of the task file, its ontology and its libraries, hexadecimal.
     pub digest: String,
 }
 

@@ -4,12 +4,12 @@
 
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Severity;
-use ratn_model::load::load;
+use ratn_model::load::{Files, load_with};
 use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Rules that the folder must have a task for.
-const RULES: [&str; 32] = [
+const RULES: [&str; 36] = [
     "branch-may-not-have-written",
     "computes-actuates",
     "conflicting-annotations",
@@ -18,12 +18,15 @@ const RULES: [&str; 32] = [
     "invalid-constant",
     "invalid-expression",
     "invalid-name",
+    "invalid-ontology",
     "invalid-state",
     "invalid-yaml",
     "may-deadlock",
     "missing-input",
     "no-way-out",
     "not-supported-yet",
+    "outside-domain",
+    "outside-range",
     "provider-not-blocked",
     "region-conflict",
     "too-many-resources",
@@ -35,6 +38,7 @@ const RULES: [&str; 32] = [
     "unknown-library",
     "unknown-outcome",
     "unknown-port",
+    "unknown-predicate",
     "unknown-provider",
     "unknown-resource",
     "unknown-state",
@@ -43,6 +47,16 @@ const RULES: [&str; 32] = [
     "unreachable-state",
     "unservable-flow",
 ];
+
+/// Files are beside the bad tasks.
+struct Folder;
+
+impl Files for Folder {
+    fn read(&self, _: &str, path: &str) -> Result<(String, String), String> {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/bad-tasks").join(path);
+        Ok((path.to_owned(), std::fs::read_to_string(file).map_err(|error| error.to_string())?))
+    }
+}
 
 #[test]
 fn every_bad_task_is_refused_for_its_rule_with_a_line() {
@@ -56,7 +70,7 @@ fn every_bad_task_is_refused_for_its_rule_with_a_line() {
         let rule =
             source.lines().next().unwrap().strip_prefix("# rule: ").expect("the first line names the rule").trim();
         assert!(name.starts_with(rule), "{name} is named after its rule, {rule}");
-        let findings = load(&source, &name, &catalogue)
+        let findings = load_with(&source, &name, &catalogue, &Folder)
             .map(|loaded| loaded.warnings)
             .err()
             .unwrap_or_else(|| panic!("{} loads", path.display()));

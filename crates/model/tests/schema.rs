@@ -120,7 +120,10 @@ fn every_task_that_loads_fits_the_schema() {
     }
     let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
     for entry in std::fs::read_dir(examples).unwrap() {
-        tasks.push(std::fs::read_to_string(entry.unwrap().path()).unwrap());
+        let path = entry.unwrap().path();
+        if path.extension().is_some_and(|extension| extension == "yaml") {
+            tasks.push(std::fs::read_to_string(path).unwrap());
+        }
     }
     assert!(tasks.len() >= 8, "{}", tasks.len());
     for task in tasks {

@@ -184,7 +184,7 @@ pub(crate) fn suggestion<'n>(
     otherwise: &str,
 ) -> String {
     /// More names than this are not listed.
-    const MAX_LISTED: usize = 12;
+    const MAX_LISTED: usize = 13;
     let mut known: Vec<&str> = known.collect();
     known.sort_unstable();
     known.dedup();

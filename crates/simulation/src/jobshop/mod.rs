@@ -77,6 +77,7 @@ impl JobShop {
             parameters: Vec::new(),
             outputs: Vec::new(),
             initial: Vec::new(),
+            ontology: None,
             states,
             digest: String::new(),
         }

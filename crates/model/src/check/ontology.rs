@@ -1,0 +1,87 @@
+//! Facts that the task's ontology does not allow: everywhere that a fact is named, as far as its arguments are constants. The rest is
+//! checked when it is bound.
+
+use super::{Subject, expressions};
+use crate::diagnostic::Findings;
+use crate::expression::scope::NothingKnown;
+use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::ontology::{Ontology, Violation};
+use crate::program::{Location, Nature, Program, State};
+use crate::value::Value;
+
+pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
+    let program = subject.program;
+    let Some(ontology) = &program.ontology else { return };
+    let root = program.state(Program::ROOT);
+    for (i, effect) in program.initial.iter().enumerate() {
+        let mut said = Said { ontology, at: subject.place(root, &format!("world.{i}")), path: "", findings };
+        said.effect(effect);
+    }
+    for state in &program.states {
+        of_state(subject, ontology, state, findings);
+    }
+}
+
+fn of_state(subject: &Subject<'_>, ontology: &Ontology, state: &State, findings: &mut Findings) {
+    let annotations = &state.annotations;
+    let at = |part: &str| subject.place(state, part);
+    for (part, expr) in expressions(subject.program, state) {
+        let mut said = Said { ontology, at: at(&part), path: &state.path, findings };
+        expr.fact_expressions().into_iter().for_each(|fact| said.fact(fact));
+    }
+    let sensed: &[FactExpr] = match &annotations.nature {
+        Nature::Senses(facts) => facts,
+        _ => &[],
+    };
+    for (part, facts) in [("reads", annotations.reads.as_deref().unwrap_or_default()), ("senses", sensed)] {
+        let mut said = Said { ontology, at: at(part), path: &state.path, findings };
+        facts.iter().for_each(|fact| said.fact(fact));
+    }
+    for (outcome, effects) in &annotations.effects {
+        let mut said = Said { ontology, at: at(&format!("effects.{outcome}")), path: &state.path, findings };
+        effects.iter().for_each(|effect| said.effect(effect));
+    }
+}
+
+/// What is said at one place.
+struct Said<'a> {
+    ontology: &'a Ontology,
+    at: Location,
+    path: &'a str,
+    findings: &'a mut Findings,
+}
+
+impl Said<'_> {
+    fn fact(&mut self, fact: &FactExpr) {
+        self.note(self.ontology.check_pattern(&fact.pattern(&NothingKnown)));
+    }
+
+    fn effect(&mut self, effect: &EffectExpr) {
+        match effect {
+            EffectExpr::Delete(fact) => self.fact(fact),
+            EffectExpr::Set(fact, value) => {
+                self.fact(fact);
+                if let Some(value) = constant(value) {
+                    self.note(self.ontology.check_value(&fact.pattern(&NothingKnown), &value));
+                }
+            }
+            EffectExpr::Increase(fact, by) => {
+                self.fact(fact);
+                if let Some(by) = constant(by).and_then(|by| by.as_number()) {
+                    self.note(self.ontology.check_increase(&fact.pattern(&NothingKnown), by));
+                }
+            }
+            EffectExpr::ForEach { effects, .. } => effects.iter().for_each(|inner| self.effect(inner)),
+        }
+    }
+
+    fn note(&mut self, checked: Result<(), Violation>) {
+        if let Err(Violation { rule, message, help }) = checked {
+            self.findings.error(rule, self.at, self.path, message, help);
+        }
+    }
+}
+
+fn constant(expr: &Expr) -> Option<Value> {
+    expr.evaluate(&NothingKnown).ok()
+}

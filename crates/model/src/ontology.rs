@@ -1,0 +1,225 @@
+//! What a task's facts may say: classes, individuals and predicates, as an ontology in Turtle declares them ([`turtle`]).
+//!
+//! An ontology only checks. Nothing is inferred from it but subclasses, and what it does not know is refused by the name of the
+//! rule: by `ratn check` as far as the arguments are constants, by the executive when an effect is bound.
+//!
+//! | rule | refuses |
+//! |---|---|
+//! | `unknown-predicate` | a predicate that is not declared |
+//! | `outside-domain` | as many arguments as a predicate does not have; an individual of no class, or of another class |
+//! | `outside-range` | a value of another type, or the name of an individual of another class |
+
+pub mod turtle;
+
+use crate::fact::{Change, FactKey, FactPattern, Term};
+use crate::load::suggestion;
+use crate::value::{Type, Value};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+
+/// What facts may say.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Ontology {
+    /// Every class with all classes that it is a subclass of, itself among them.
+    classes: BTreeMap<String, BTreeSet<String>>,
+    /// Individuals whose names begin so are of this class.
+    named: BTreeMap<String, String>,
+    /// Individuals and the classes they were said to be of.
+    individuals: BTreeMap<String, BTreeSet<String>>,
+    predicates: BTreeMap<String, Predicate>,
+}
+
+/// A predicate: of what it may be said, and what it may say.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Predicate {
+    /// What each argument is; their number is the predicate's arity.
+    pub domain: Vec<Domain>,
+    /// What the value is.
+    pub range: Range,
+}
+
+/// What an argument of a predicate is.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Domain {
+    /// An individual, known or not, or a whole number.
+    Anything,
+    /// A whole number.
+    Integer,
+    /// An individual of this class or a subclass of it.
+    Class(String),
+}
+
+/// What the value of a fact is. No value (null) is always allowed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Range {
+    /// A value of this type.
+    Type(Type),
+    /// The name of an individual of this class or a subclass of it.
+    Class(String),
+}
+
+/// A fact that does not fit the ontology.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("[{rule}] {message}{}{help}", if .help.is_empty() { "" } else { "; " })]
+pub struct Violation {
+    /// The rule's name, `outside-domain`.
+    pub rule: &'static str,
+    /// What does not fit.
+    pub message: String,
+    /// What to do; empty where the message says it.
+    pub help: String,
+}
+
+impl Ontology {
+    /// A predicate by its name.
+    pub fn predicate(&self, name: &str) -> Option<&Predicate> {
+        self.predicates.get(name)
+    }
+
+    /// Whether an individual is of a class: as declared or by its name, directly or over subclasses.
+    pub fn is_a(&self, individual: &str, class: &str) -> bool {
+        self.classes_of(individual).any(|of| self.classes.get(of).is_some_and(|above| above.contains(class)))
+    }
+
+    /// Whether such facts can be.
+    ///
+    /// # Errors
+    /// The rule that is broken.
+    pub fn check_pattern(&self, pattern: &FactPattern) -> Result<(), Violation> {
+        let name = &pattern.predicate;
+        let Some(predicate) = self.predicates.get(name) else {
+            let help = suggestion(name, self.predicates.keys().map(String::as_str), "", "declare it in the ontology");
+            let message = format!("the ontology has no predicate `{name}`");
+            return Err(Violation { rule: "unknown-predicate", message, help });
+        };
+        let outside = |message, help| Err(Violation { rule: "outside-domain", message, help });
+        let (takes, has) = (predicate.domain.len(), pattern.arguments.len());
+        if takes != has {
+            let plural = if takes == 1 { "argument" } else { "arguments" };
+            return outside(format!("`{name}` has {takes} {plural}, and `{pattern}` has {has}"), String::new());
+        }
+        for (domain, argument) in predicate.domain.iter().zip(&pattern.arguments) {
+            match (domain, argument) {
+                (Domain::Anything, _) | (_, None) | (Domain::Integer, Some(Term::Int(_))) => {}
+                (Domain::Class(class), Some(Term::Name(individual))) => {
+                    if let Some(why) = self.is_not(individual, class) {
+                        return outside(format!("in `{pattern}`, {why}"), self.near(individual));
+                    }
+                }
+                (domain, Some(term)) => {
+                    return outside(format!("in `{pattern}`, `{term}` is not {domain}"), String::new());
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether the fact can have the value.
+    ///
+    /// # Errors
+    /// The rule that is broken, by the fact first.
+    pub fn check_fact(&self, fact: &FactKey, value: &Value) -> Result<(), Violation> {
+        let pattern = FactPattern::of(fact);
+        self.check_pattern(&pattern)?;
+        self.check_value(&pattern, value)
+    }
+
+    /// Whether facts that fit the pattern can have the value; a predicate that is not known can.
+    ///
+    /// # Errors
+    /// `outside-range`.
+    pub fn check_value(&self, pattern: &FactPattern, value: &Value) -> Result<(), Violation> {
+        let Some(predicate) = self.predicates.get(&pattern.predicate) else { return Ok(()) };
+        let outside = |message, help| Err(Violation { rule: "outside-range", message, help });
+        match (&predicate.range, value) {
+            (_, Value::Null) => Ok(()),
+            (Range::Type(ty), value) if ty.accepts(value) => Ok(()),
+            (Range::Type(ty), value) => {
+                outside(format!("`{pattern}` is {ty}, and {value} is {}", value.type_name()), String::new())
+            }
+            (Range::Class(class), Value::String(individual)) => match self.is_not(individual, class) {
+                None => Ok(()),
+                Some(why) => outside(format!("as the value of `{pattern}`, {why}"), self.near(individual)),
+            },
+            (Range::Class(class), value) => {
+                let message = format!("`{pattern}` is the name of a {class}, and {value} is {}", value.type_name());
+                outside(message, String::new())
+            }
+        }
+    }
+
+    /// Whether the world can change so.
+    ///
+    /// # Errors
+    /// The rule that the first change that does not fit breaks.
+    pub fn check_change(&self, change: &Change) -> Result<(), Violation> {
+        match change {
+            Change::Set { fact, value } => self.check_fact(fact, value),
+            Change::Delete { pattern } => self.check_pattern(pattern),
+            Change::Increase { fact, by } => {
+                let pattern = FactPattern::of(fact);
+                self.check_pattern(&pattern)?;
+                self.check_increase(&pattern, *by)
+            }
+        }
+    }
+
+    /// Whether facts that fit the pattern can grow by this much.
+    ///
+    /// # Errors
+    /// `outside-range`.
+    pub fn check_increase(&self, pattern: &FactPattern, by: f64) -> Result<(), Violation> {
+        let whole = by.fract() == 0.0 && by.abs() < i64::MAX as f64;
+        // A whole number added to an int leaves an int.
+        let step = if whole { Value::Int(by as i64) } else { Value::Float(by) };
+        self.check_value(pattern, &step)
+    }
+
+    /// As [`Ontology::check_change`], for all of them.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn check_changes(&self, changes: &[Change]) -> Result<(), Violation> {
+        changes.iter().try_for_each(|change| self.check_change(change))
+    }
+
+    fn classes_of(&self, individual: &str) -> impl Iterator<Item = &str> {
+        let declared = self.individuals.get(individual).into_iter().flatten();
+        let named = self.named.iter().filter(move |(prefix, _)| individual.starts_with(prefix.as_str()));
+        declared.chain(named.map(|(_, class)| class)).map(String::as_str)
+    }
+
+    /// Why an individual is not of a class; nothing where it is.
+    fn is_not(&self, individual: &str, class: &str) -> Option<String> {
+        if self.is_a(individual, class) {
+            return None;
+        }
+        let classes: Vec<&str> = self.classes_of(individual).collect();
+        Some(match classes.as_slice() {
+            [] => format!("`{individual}` is no individual of the ontology; a {class} is expected"),
+            of => format!("`{individual}` is a {}, not a {class}", of.join(" and a ")),
+        })
+    }
+
+    /// What to do about an individual that does not fit.
+    fn near(&self, individual: &str) -> String {
+        if self.classes_of(individual).next().is_some() {
+            return String::new();
+        }
+        let known = self.individuals.keys().map(String::as_str);
+        suggestion(individual, known, "", "declare it, or say how such individuals are named (`ratn:named`)")
+    }
+}
+
+impl fmt::Display for Domain {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Domain::Anything => f.write_str("an individual"),
+            Domain::Integer => f.write_str("a whole number"),
+            Domain::Class(class) => write!(f, "a {class}"),
+        }
+    }
+}

@@ -1,0 +1,186 @@
+//! Ontologies: what they allow, what they refuse, and that hostile ones are refused soon.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+#![allow(clippy::disallowed_methods, reason = "that reading is bounded in time is what is tested")]
+
+use ratn_model::catalogue::Catalogue;
+use ratn_model::fact::{Change, FactKey, FactPattern, Term};
+use ratn_model::load::{Files, MAX_SOURCE, load_with};
+use ratn_model::ontology::Ontology;
+use ratn_model::ontology::turtle::{MAX_CLASSES, MAX_STATEMENTS, read};
+use ratn_model::value::Value;
+use std::time::{Duration, Instant};
+
+const PREFIXES: &str = "@prefix ratn: <urn:ratn:ontology#> . @prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> .
+@prefix owl: <http://www.w3.org/2002/07/owl#> . @prefix xsd: <http://www.w3.org/2001/XMLSchema#> . @prefix : <urn:test#> .\n";
+
+/// Longer than reading anything within the bounds takes, by far, in a debug build on a busy machine.
+const SOON: Duration = Duration::from_secs(60);
+
+fn ontology(text: &str) -> Ontology {
+    read(&format!("{PREFIXES}{text}")).unwrap()
+}
+
+fn refusal(text: &str) -> String {
+    let began = Instant::now();
+    let refused = read(&format!("{PREFIXES}{text}")).unwrap_err().to_string();
+    assert!(began.elapsed() < SOON, "{:?}: {refused}", began.elapsed());
+    refused
+}
+
+fn kitchen() -> Ontology {
+    ontology(
+        ":Thing a owl:Class . :Object a owl:Class ; rdfs:subClassOf :Thing . :Box a rdfs:Class ; rdfs:subClassOf :Object ; ratn:named \"box_\" .
+         :Mood a owl:Class . :calm a :Mood . :table a :Object ; rdfs:label \"a table\" .
+         :on a ratn:Predicate ; ratn:arguments ( :Box :Thing ) ; ratn:value \"bool\" .
+         :count a ratn:Predicate ; ratn:arguments ( owl:Thing xsd:integer ) ; ratn:value \"int\" .
+         :mood a ratn:Predicate ; ratn:arguments () ; ratn:value :Mood .",
+    )
+}
+
+fn key(predicate: &str, arguments: &[&str]) -> FactKey {
+    let term = |text: &&str| text.parse().map_or_else(|_| Term::Name((*text).to_owned()), Term::Int);
+    FactKey { predicate: predicate.to_owned(), arguments: arguments.iter().map(term).collect() }
+}
+
+fn set(predicate: &str, arguments: &[&str], value: Value) -> Change {
+    Change::Set { fact: key(predicate, arguments), value }
+}
+
+#[test]
+fn what_fits_is_allowed_over_subclasses_names_and_open_arguments() {
+    let kitchen = kitchen();
+    let text = |text: &str| Value::String(text.to_owned());
+    let any = FactPattern { predicate: "on".to_owned(), arguments: vec![None, Some(Term::Name("table".to_owned()))] };
+    let changes = [
+        set("on", &["box_1", "table"], Value::Bool(true)),
+        set("on", &["box_1", "box_2"], Value::Null),
+        set("count", &["whoever", "3"], Value::Int(1)),
+        set("mood", &[], text("calm")),
+        Change::Delete { pattern: any },
+        Change::Increase { fact: key("count", &["x", "0"]), by: 2.0 },
+    ];
+    assert_eq!(kitchen.check_changes(&changes), Ok(()));
+    assert!(kitchen.is_a("box_7", "Thing") && !kitchen.is_a("table", "Box") && !kitchen.is_a("calm", "Thing"));
+}
+
+#[test]
+fn what_does_not_fit_is_refused_with_the_rule() {
+    let kitchen = kitchen();
+    let yes = || Value::Bool(true);
+    for (change, said) in [
+        (
+            set("onn", &["box_1", "table"], yes()),
+            "[unknown-predicate] the ontology has no predicate `onn`; did you mean `on`?",
+        ),
+        (set("on", &["box_1"], yes()), "[outside-domain] `on` has 2 arguments, and `on(box_1)` has 1"),
+        (
+            set("on", &["table", "box_1"], yes()),
+            "[outside-domain] in `on(table, box_1)`, `table` is a Object, not a Box",
+        ),
+        (
+            set("on", &["box_1", "tabel"], yes()),
+            "[outside-domain] in `on(box_1, tabel)`, `tabel` is no individual of the ontology; a Thing is expected; did you mean `table`?",
+        ),
+        (set("on", &["1", "table"], yes()), "[outside-domain] in `on(1, table)`, `1` is not a Box"),
+        (set("count", &["x", "y"], Value::Int(1)), "[outside-domain] in `count(x, y)`, `y` is not a whole number"),
+        (set("on", &["box_1", "table"], Value::Int(1)), "[outside-range] `on(box_1, table)` is bool, and 1 is int"),
+        (
+            set("mood", &[], Value::String("table".to_owned())),
+            "[outside-range] as the value of `mood()`, `table` is a Object, not a Mood",
+        ),
+        (set("mood", &[], Value::Int(1)), "[outside-range] `mood()` is the name of a Mood, and 1 is int"),
+        (
+            Change::Increase { fact: key("count", &["x", "0"]), by: 0.5 },
+            "[outside-range] `count(x, 0)` is int, and 0.5 is float",
+        ),
+        (
+            Change::Delete { pattern: FactPattern { predicate: "on".to_owned(), arguments: vec![None] } },
+            "[outside-domain] `on` has 2 arguments, and `on(?)` has 1",
+        ),
+    ] {
+        assert_eq!(kitchen.check_change(&change).unwrap_err().to_string(), said);
+    }
+}
+
+#[test]
+fn what_an_ontology_says_and_nobody_would_check_is_refused() {
+    for (text, said) in [
+        (":a a :B .", "`a`: `<urn:test#B>` is not declared as a class, `a owl:Class`"),
+        (":B a owl:Class . :a rdfs:label \"a\" .", "`a`: nothing says what it is; write `a :Class`"),
+        (":B a owl:Class ; :color \"red\" .", "`B`: `urn:test#color` is not understood here; leave it out"),
+        (":p a ratn:Predicate ; ratn:value \"int\" .", "`p`: a predicate says its `ratn:arguments ( … )`"),
+        (":p a ratn:Predicate ; ratn:arguments () ; ratn:value \"int\", \"bool\" .", "`p`: `ratn:value` is said twice"),
+        (
+            ":B a owl:Class . <urn:other#B> a owl:Class .",
+            "`B`: `urn:other#B` and `urn:test#B` would have one name in tasks",
+        ),
+        (":B a owl:Class ; ratn:named \"\" .", "`B`: `ratn:named` is how names begin, not empty"),
+    ] {
+        assert_eq!(refusal(text), said);
+    }
+    assert!(refusal(":p a ratn:Predicate ; ratn:arguments () ; ratn:value \"number\" .").contains("is not a type"));
+    assert!(refusal("\n:p a").starts_with("line "));
+}
+
+#[test]
+fn circles_are_refused_wherever_they_are() {
+    let circle = "`A`: it is a subclass of itself, directly or over others; break the circle";
+    assert_eq!(refusal(":A a owl:Class ; rdfs:subClassOf :A ."), circle);
+    let three = ":A a owl:Class ; rdfs:subClassOf :B . :B a owl:Class ; rdfs:subClassOf :C . :C a owl:Class ; rdfs:subClassOf :A .";
+    assert_eq!(refusal(three), circle);
+    let list = "@prefix rdf: <http://www.w3.org/1999/02/22-rdf-syntax-ns#> . :C a owl:Class .
+        :p a ratn:Predicate ; ratn:value \"int\" ; ratn:arguments _:l . _:l rdf:first :C ; rdf:rest _:l .";
+    assert!(refusal(list).contains("`ratn:arguments` is a list of classes"));
+}
+
+#[test]
+fn hostile_turtle_is_refused_soon() {
+    assert!(refusal(&" ".repeat(MAX_SOURCE)).contains("bytes"));
+    let many: String = (0..=MAX_STATEMENTS).map(|i| format!(":a :b {i} .\n")).collect();
+    assert!(refusal(&many).contains("statements"));
+    let classes: String = (0..=MAX_CLASSES).map(|i| format!(":c{i} a owl:Class .\n")).collect();
+    assert!(refusal(&classes).contains("classes"));
+    for (open, close) in [("[ :p ", "]"), ("( ", ")"), ("<< ", ">>"), ("[", ""), ("(", ""), ("\"\"\"", "")] {
+        let depth = (MAX_SOURCE - 1_000) / (open.len() + close.len());
+        refusal(&format!(":a :b {}1{} .", open.repeat(depth), close.repeat(depth)));
+    }
+}
+
+#[test]
+fn the_deepest_and_the_widest_hierarchy_within_the_bounds_are_read_soon() {
+    let began = Instant::now();
+    let above = |i: usize| if i == 0 { String::new() } else { format!(" ; rdfs:subClassOf :c{}", i - 1) };
+    let deep: String = (0..MAX_CLASSES).map(|i| format!(":c{i} a owl:Class{} .\n", above(i))).collect();
+    let deep = ontology(&format!("{deep}:x a :c{} .", MAX_CLASSES - 1));
+    assert!(deep.is_a("x", "c0"));
+    // Every one below all before it, as far as the statements last.
+    let wide: String = (0..190)
+        .map(|i| {
+            let all: String = (0..i).map(|j| format!(" ; rdfs:subClassOf :c{j}")).collect();
+            format!(":c{i} a owl:Class{all} .\n")
+        })
+        .collect();
+    ontology(&wide);
+    assert!(began.elapsed() < SOON, "{:?}", began.elapsed());
+}
+
+struct Example;
+
+impl Files for Example {
+    fn read(&self, _: &str, path: &str) -> Result<(String, String), String> {
+        Ok((path.to_owned(), include_str!("../../../examples/aimm.ttl").to_owned()))
+    }
+}
+
+#[test]
+fn the_examples_say_only_what_their_ontology_allows() {
+    for task in [include_str!("../../../examples/fetch_boxes.yaml"), include_str!("../../../examples/set_table.yaml")] {
+        let plain = load_with(task, "task.yaml", &Catalogue::standard(), &Example).unwrap().program;
+        let described = format!("{task}\nontology: aimm.ttl\n");
+        let loaded = load_with(&described, "task.yaml", &Catalogue::standard(), &Example).unwrap();
+        assert!(plain.ontology.is_none());
+        assert_eq!(loaded.program.ontology, Some(read(include_str!("../../../examples/aimm.ttl")).unwrap()));
+        assert_ne!(plain.digest, loaded.program.digest);
+    }
+}

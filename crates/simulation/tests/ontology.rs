@@ -1,0 +1,91 @@
+//! A task with an ontology: what comes out otherwise than it allows ends the state `aborted`, in both modes, and changes nothing.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_executive::protocol::{Goal, Mode};
+use ratn_model::catalogue::Catalogue;
+use ratn_model::fact::{FactKey, Term};
+use ratn_model::load::{Files, load_with};
+use ratn_model::value::Value;
+use ratn_simulation::run::{Answer, Oracle, Performance, Run, Setup, run};
+use ratn_world::tolerance::Tolerance;
+use ratn_world::world::World;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+const CATALOGUE: &str = r#"
+[resources]
+Arm = { class = "module", count = 1, actuates = true }
+
+[providers.arm]
+resource = "Arm"
+actions.take = { outputs = { what = "any" } }
+"#;
+
+const TASK: &str = "
+task: grab
+ontology: hand.ttl
+world: [\"held(arm) = nothing\"]
+states:
+  - grab:
+      action: arm/take
+      out: { what: any }
+      pia: true
+      reads: []
+      effects: [\"held(arm) = what\"]
+      resources: [{ block: Arm }]
+";
+
+struct Hand;
+
+impl Files for Hand {
+    fn read(&self, _: &str, path: &str) -> Result<(String, String), String> {
+        let text = "@prefix ratn: <urn:ratn:ontology#> . @prefix owl: <http://www.w3.org/2002/07/owl#> . @prefix : <urn:hand#> .
+            :Arm a owl:Class . :arm a :Arm . :Holdable a owl:Class . :nothing a :Holdable . :cup a :Holdable .
+            :held a ratn:Predicate ; ratn:arguments ( :Arm ) ; ratn:value :Holdable .";
+        Ok((path.to_owned(), text.to_owned()))
+    }
+}
+
+struct Takes(Value);
+
+impl Oracle for Takes {
+    fn perform(&mut self, _: &str, _: u32, _: &Goal, _: &World) -> Performance {
+        let outputs = BTreeMap::from([("what".to_owned(), self.0.clone())]);
+        let answer = Answer::Finished { outcome: "success".to_owned(), outputs, measured: Vec::new() };
+        Performance { duration_s: 1.0, answer }
+    }
+}
+
+fn take(what: Value, mode: Mode) -> Run {
+    let catalogue = Catalogue::from_toml(CATALOGUE).unwrap();
+    let program = load_with(TASK, "task.yaml", &catalogue, &Hand).unwrap().program;
+    let setup = Setup {
+        program: Arc::new(program),
+        mode,
+        parameters: BTreeMap::new(),
+        seed: 1,
+        resources: catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.class, offer.count)).collect(),
+        world: Vec::new(),
+        tolerance: Tolerance::EXACT,
+        latency: Duration::ZERO,
+    };
+    run(setup, &mut Takes(what)).unwrap()
+}
+
+#[test]
+fn an_effect_outside_the_range_is_not_made_real_and_its_state_is_aborted() {
+    let held = FactKey { predicate: "held".to_owned(), arguments: vec![Term::Name("arm".to_owned())] };
+    let text = |text: &str| Value::String(text.to_owned());
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let good = take(text("cup"), mode);
+        assert_eq!((good.outcome.as_str(), good.world.get(&held)), ("success", Some(&text("cup"))), "{mode:?}");
+        for wrong in [Value::Int(3), text("elephant")] {
+            let bad = take(wrong, mode);
+            assert_eq!((bad.outcome.as_str(), bad.world.get(&held)), ("aborted", Some(&text("nothing"))), "{mode:?}");
+            let log = format!("{:?}", bad.log);
+            assert!(log.contains("[outside-range]"), "{mode:?}: {log}");
+        }
+    }
+}
