@@ -35,9 +35,7 @@ type Units = [u32; 2];
 enum Done {
     /// Granted, with this token.
     Acquired { token: u64, units: Units },
-    /// Granted to a call that broke in that moment, and given back by the manager: under a token that nobody heard of.
-    Passed { units: Units, key: u64 },
-    /// What was acquired under a token (or what passed) was released.
+    /// What was acquired under a token was released.
     Released { token: u64 },
     /// So much was free, of all kinds at one moment.
     Seen { free: Units },
@@ -74,10 +72,6 @@ impl Model {
                 }
                 model.held.insert(token, units);
                 model.last_token = token;
-            }
-            Done::Passed { units, key } => {
-                units.iter().zip(self.free()).all(|(wanted, free)| *wanted <= free).then_some(())?;
-                model.held.insert(key, units);
             }
             Done::Released { token } => drop(model.held.remove(&token)?),
             Done::Seen { free } => return (free == self.free()).then_some(model),
@@ -125,13 +119,12 @@ impl Numbers {
     }
 }
 
-/// Asks until there is an answer of the manager's own; `None` where what it granted has been given back.
-async fn answered<T, F: Future<Output = Result<T, CallError>>>(ask: impl Fn() -> F) -> Option<T> {
+/// Asks until there is an answer of the manager's own.
+async fn answered<T, F: Future<Output = Result<T, CallError>>>(ask: impl Fn() -> F) -> T {
     in_time(async {
         loop {
             match ask().await {
-                Ok(answer) => return Some(answer),
-                Err(error) if error.code() == Some(Code::NotFound) => return None,
+                Ok(answer) => return answer,
                 Err(error) => {
                     let broken = error.code().is_none_or(|code| matches!(code, Code::Unavailable | Code::Cancelled));
                     assert!(broken || error.code() == Some(Code::Unknown), "refused: {error}");
@@ -157,23 +150,17 @@ async fn work(resources: ResourceClient, name: usize, clock: Arc<AtomicU64>, mut
         let begin = tick();
         let lease = answered(|| resources.acquire(requirements.clone(), options.clone())).await;
         let end = tick();
-        let Some(lease) = lease else {
-            let key = u64::MAX - begin;
-            let both = [Done::Passed { units, key }, Done::Released { token: key }];
-            calls.extend(both.map(|done| Call { begin, end, done }));
-            continue;
-        };
         let done = Done::Acquired { token: lease.token.0, units };
         calls.push(Call { begin, end, done });
         if numbers.below(3) == 0 {
             let begin = tick();
-            let seen = answered(|| resources.list(&["A", "B"])).await.unwrap();
+            let seen = answered(|| resources.list(&["A", "B"])).await;
             let free = [0, 1].map(|kind| seen.iter().find(|r| r.kind == CAPACITY[kind].0).unwrap().free);
             calls.push(Call { begin, end: tick(), done: Done::Seen { free } });
         }
         let begin = tick();
         // False where an attempt that broke had released it: it is released either way.
-        answered(|| resources.release(lease.id)).await.unwrap();
+        answered(|| resources.release(lease.id)).await;
         calls.push(Call { begin, end: tick(), done: Done::Released { token: lease.token.0 } });
     }
     calls
@@ -197,7 +184,7 @@ async fn history(seed: u64) -> Vec<Vec<Call>> {
         working.push(tokio::spawn(work(client.resources, name, clock.clone(), numbers)));
         sessions.push(client.session);
     }
-    // A round is four ticks, or two where what was granted passed: all restarts are in the first half.
+    // A round is four ticks at least: all restarts are in the first half.
     let whole = (CLIENTS * ROUNDS * 4 / 2) as u64;
     for restart in 1..=RESTARTS {
         in_time(async {

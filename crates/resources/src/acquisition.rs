@@ -77,6 +77,20 @@ impl Pool {
         Ok(())
     }
 
+    /// Takes back a grant that nobody heard of. Its request may be asked again with its id, and waits again.
+    ///
+    /// # Errors
+    /// An unknown or ended lease.
+    pub fn undo_grant(&mut self, now: Timestamp, id: LeaseId) -> Result<(), PoolError> {
+        self.advance(now);
+        if !self.leases.contains_key(&id) {
+            return Err(PoolError::UnknownLease { lease: id });
+        }
+        self.commit(Effect::LeaseEnded { lease: id, reason: EndReason::Undelivered });
+        self.schedule();
+        Ok(())
+    }
+
     pub(crate) fn enqueue(
         &mut self,
         request: AcquireRequest,

@@ -3,6 +3,7 @@
 //! [`Pool::commit`] applies and writes down; restoring applies alone. So what is restored cannot differ from what was.
 //! Each effect also tells the watchers, which makes the revision a function of the records.
 
+use crate::event::EndReason;
 use crate::event::{Change, Notice, WatchEvent};
 use crate::expiry::Timer;
 use crate::group::Seen;
@@ -123,6 +124,9 @@ impl Pool {
                     self.change(*slot, |resource| remove_from(&mut resource.holders, lease));
                 }
                 self.session_mut(&record.session)?.leases.remove(lease);
+                if *reason == EndReason::Undelivered {
+                    self.memory.forget_grant(*lease);
+                }
                 let resources = self.views(&slots)?;
                 let LeaseRecord { token, session, .. } = record;
                 self.publish(Change::LeaseEnded { lease: *lease, token, session, resources, reason: *reason });

@@ -116,6 +116,8 @@ pub enum EndReason {
     HeldTooLong,
     /// All of it was deleted or consumed for good.
     UsedUp,
+    /// Nobody heard of the grant: as if it had not been made.
+    Undelivered,
 }
 
 impl fmt::Display for EndReason {
@@ -126,6 +128,7 @@ impl fmt::Display for EndReason {
             EndReason::SessionClosed => "session closed",
             EndReason::HeldTooLong => "held too long",
             EndReason::UsedUp => "used up",
+            EndReason::Undelivered => "undelivered",
         })
     }
 }

@@ -93,6 +93,15 @@ impl RequestMemory {
         }
     }
 
+    /// The request that led to this lease is as if it had never been asked. It is among the youngest.
+    pub(crate) fn forget_grant(&mut self, lease: LeaseId) {
+        let led_here = |id: &String| self.answers.get(id).is_some_and(|a| a.reply == Remembered::Granted(lease));
+        let found = self.order.iter().rev().find(|(_, (_, id))| led_here(id)).map(|(number, _)| *number);
+        if let Some((_, id)) = found.and_then(|number| self.order.remove(&number)) {
+            self.answers.remove(&id);
+        }
+    }
+
     /// The answers, the oldest first.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (&String, u128, &Remembered)> {
         self.order

@@ -531,6 +531,22 @@ fn a_request_id_used_again_is_performed_once() {
 }
 
 #[test]
+fn a_grant_that_nobody_heard_of_may_be_asked_for_again_with_its_request_id() {
+    let mut bench = Bench::new();
+    bench.create("a", ResourceSpec::new(ResourceClass::Module, "Arm"));
+    let acquire = Request::Acquire(AcquireRequest::new(session("b"), vec![block("Arm")]));
+    bench.pool.handle(bench.now, "q1", acquire.clone()).unwrap();
+    let first = grants(&bench.notices()).remove(0).1;
+    bench.pool.undo_grant(bench.now, first.id).unwrap();
+    bench.pool.check_invariants().unwrap();
+    bench.notices();
+    assert!(matches!(bench.pool.handle(bench.now, "q1", acquire), Ok(Reply::Queued(_))));
+    let again = grants(&bench.notices()).remove(0).1;
+    assert!(again.token > first.token);
+    assert_eq!(bench.pool.undo_grant(bench.now, first.id), Err(PoolError::UnknownLease { lease: first.id }));
+}
+
+#[test]
 fn a_cancelled_acquire_may_be_asked_again_with_its_request_id() {
     let mut bench = Bench::new();
     let acquire = Request::Acquire(AcquireRequest::new(session("b"), vec![block("Arm")]));

@@ -37,7 +37,7 @@ pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
         let directory = public_directory(arguments.runtime_dir.as_deref());
         match (&arguments.resume, &arguments.task) {
             (Some(log), task) => resume::run(arguments, log, task.as_deref(), &directory, &interrupt).await,
-            (None, Some(task)) => begin(arguments, task, &directory, &interrupt).await,
+            (None, Some(task)) => Box::pin(begin(arguments, task, &directory, &interrupt)).await,
             (None, None) => Err(Failure::Refused("ratn: no task file is named".to_owned())),
         }
     })

@@ -463,8 +463,9 @@ impl Actor {
             *calls -= 1;
             return;
         }
-        tracing::debug!(%lease, "granted to a call that was dropped: released");
-        let _ = self.pool.release(self.now(), None, lease);
+        tracing::debug!(%lease, "granted to a call that was dropped: taken back");
+        // Unknown when it has ended meanwhile.
+        let _ = self.pool.undo_grant(self.now(), lease);
     }
 
     fn watch_demand(&mut self, session: SessionId) -> Result<watch::Receiver<Vec<Demand>>, Status> {
