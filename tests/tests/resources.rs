@@ -113,9 +113,9 @@ fn a_block_holds_for_as_long_as_its_command_runs() -> anyhow::Result<()> {
 #[test]
 fn a_release_by_the_operator_and_every_other_mutation_is_in_the_audit_log() -> anyhow::Result<()> {
     let mut manager = Manager::start()?;
-    manager.json(&["create", "Fixture", "--id", "f1"])?;
+    manager.json(&["create", "Fixture", "--id", "the-fixture"])?;
     let mut holder = manager.place.start_as("holder", &["resource", "block", "Fixture"])?;
-    let lease = wait_for("the block", || Ok(manager.json(&["get", "f1"])?["holdings"][0]["lease"].as_u64()))?;
+    let lease = wait_for("the block", || Ok(manager.json(&["get", "the-fixture"])?["holdings"][0]["lease"].as_u64()))?;
     ensure!(manager.resource(&["release", &lease.to_string()])?.0 == Some(0));
     let (code, _, err) = manager.resource(&["release", &lease.to_string()])?;
     ensure!(code == Some(1) && err.contains("had ended before"), "{err}");
@@ -124,7 +124,7 @@ fn a_release_by_the_operator_and_every_other_mutation_is_in_the_audit_log() -> a
     holder.finish()?;
     manager.process.signal(Signal::SIGTERM)?;
     let (code, _, said) = manager.process.finish()?;
-    ensure!(code == Some(0) && !said.contains("f1"), "{code:?} {said}");
+    ensure!(code == Some(0) && !said.contains("the-fixture"), "{code:?} {said}");
 
     let lines = std::fs::read_to_string(&manager.audit)?;
     let lines: Vec<Value> = lines.lines().map(serde_json::from_str).collect::<Result<_, _>>()?;
@@ -135,7 +135,10 @@ fn a_release_by_the_operator_and_every_other_mutation_is_in_the_audit_log() -> a
     let expected =
         [("create", "Ok"), ("acquire", "Ok"), ("release", "Ok"), ("release", "NotFound"), ("delete", "NotFound")];
     ensure!(told == expected, "{lines:?}");
-    ensure!(lines[1]["token"].as_u64() > Some(0) && lines[0]["what"].as_str().is_some_and(|what| what.contains("f1")));
+    ensure!(
+        lines[1]["token"].as_u64() > Some(0)
+            && lines[0]["what"].as_str().is_some_and(|what| what.contains("the-fixture"))
+    );
     Ok(())
 }
 
