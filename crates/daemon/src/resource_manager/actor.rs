@@ -102,6 +102,9 @@ pub(super) enum Message {
     List {
         answer: oneshot::Sender<(Vec<ResourceView>, Revision)>,
     },
+    Revision {
+        answer: oneshot::Sender<Revision>,
+    },
     Sessions {
         answer: oneshot::Sender<Vec<SessionStatus>>,
     },
@@ -372,6 +375,7 @@ impl Actor {
             }
             Message::Get { id, answer } => self.tell(answer, self.pool.get(&id)),
             Message::List { answer } => self.tell(answer, (self.pool.list(), self.pool.revision())),
+            Message::Revision { answer } => self.tell(answer, self.pool.revision()),
             Message::Sessions { answer } => self.tell(answer, self.sessions()),
             Message::WatchDemand { session, answer } => {
                 let watch = self.watch_demand(session);
@@ -406,6 +410,7 @@ impl Actor {
             }
             Message::Get { id, answer } => drop(answer.send(self.pool.get(&id))),
             Message::List { answer } => drop(answer.send((self.pool.list(), self.pool.revision()))),
+            Message::Revision { answer } => drop(answer.send(self.pool.revision())),
             Message::Sessions { answer } => drop(answer.send(self.sessions())),
             Message::WatchDemand { answer, .. } => drop(answer.send(Err(stopped))),
             Message::ReportShortage { answer, .. } => drop(answer.send(Err(stopped))),

@@ -262,8 +262,7 @@ impl v1::resource_service_server::ResourceService for Service {
         let (released, revision) = match self.perform(&caller, request.request_id, release).await {
             Ok((_, revision)) => (true, revision),
             Err(status) if status.code() == Code::NotFound => {
-                let (_, revision) = self.actor.ask(|answer| Message::List { answer }).await?;
-                (false, revision.0)
+                (false, self.actor.ask(|answer| Message::Revision { answer }).await?.0)
             }
             Err(status) => return Err(status),
         };
