@@ -7,7 +7,7 @@
 //!
 //! Every daemon is one `run(config, directory, shutdown)`, or `run_as` with a [`ratn_worker::server::Serving`]: it listens, publishes `<role>.endpoint` in the runtime directory
 //! once it is ready, serves until the token is cancelled, and withdraws. Signals, the parent's end and command lines are
-//! the caller's business. Decisions are made in cores (`ratn-resources`, `ratn-world`, [`process_manager::pool`]), never here.
+//! the caller's business. Decisions are made in cores (`ratn-resources`, `ratn-world`, [`process_manager::pools`]), never here.
 
 pub mod access;
 pub mod audit;

@@ -1,9 +1,9 @@
 //! The one task that owns the pools: performs their commands, and tells them what became of it.
 
 use super::config::ProcessManagerConfig;
-use super::log::EndedLogs;
-use super::pool::{Command, PoolError, Pools};
-use super::spawner::{self, Job, Outcome};
+use super::pools::{Command, Event, PoolError, Pools};
+use super::processes::{Processes, Told};
+use super::spawner::Outcome;
 use super::usage::Usage;
 use crate::demand::Shortages;
 use crate::link::Wanted;
@@ -12,20 +12,16 @@ use ratn_model::resource::ResourceClass;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{Demand, PoolStatus, Resource, WorkerStatus};
-use ratn_worker::client::wait_until_serving;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot, watch};
-use tokio::task::{AbortHandle, JoinHandle};
+use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
 /// Messages that wait for the actor; more make their senders wait.
 const INBOX: usize = 256;
-/// What became of processes that waits for the actor.
-const OUTCOMES: usize = 1_024;
 /// Changes that wait for a watcher; one that has more to catch up with is cut off.
 const WATCH_BUFFER: usize = 4_096;
 /// Clients that watch at the same time.
@@ -65,50 +61,32 @@ pub(super) struct Parts {
 }
 
 struct Actor {
-    config: ProcessManagerConfig,
-    directory: RuntimeDirectory,
-    /// What a template without a program runs.
-    this_program: PathBuf,
+    host: String,
     pools: Pools,
+    processes: Processes,
     start: Instant,
     wanted: watch::Sender<Wanted>,
     short: watch::Sender<Shortages>,
-    jobs: mpsc::Sender<Job>,
-    serving: mpsc::Sender<(String, String)>,
-    processes: BTreeMap<String, Process>,
-    ended_logs: EndedLogs,
     watchers: Vec<mpsc::Sender<WorkerStatus>>,
     usage: Usage,
-}
-
-#[derive(Debug, Default)]
-struct Process {
-    pid: u32,
-    readiness: Option<AbortHandle>,
 }
 
 /// Starts the actor; it ends with the token, once every worker has.
 pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Result<(Handle, JoinHandle<()>)> {
     let (inbox, messages) = mpsc::channel(INBOX);
-    let (told, outcomes) = mpsc::channel(OUTCOMES);
-    let (serving, served) = mpsc::channel(OUTCOMES);
     let Parts { config, directory, wanted, there, demand, short } = parts;
+    let (processes, told) = Processes::start(&config, directory)?;
     let actor = Actor {
-        this_program: std::env::current_exe()?,
-        pools: Pools::new(&config.host, config.templates.iter().cloned()),
-        config,
-        directory,
+        pools: Pools::new(&config.host, config.templates),
+        processes,
+        host: config.host,
         start: Instant::now(),
         wanted,
         short,
-        jobs: spawner::start(told)?,
-        serving,
-        processes: BTreeMap::new(),
-        ended_logs: EndedLogs::default(),
         watchers: Vec::new(),
         usage: Usage::new(),
     };
-    let inputs = Inputs { messages, outcomes, served, there, demand };
+    let inputs = Inputs { messages, told, there, demand };
     Ok((Handle { inbox }, tokio::spawn(actor.run(inputs, shutdown))))
 }
 
@@ -122,50 +100,44 @@ impl Handle {
 
 struct Inputs {
     messages: mpsc::Receiver<Message>,
-    outcomes: mpsc::Receiver<Outcome>,
-    served: mpsc::Receiver<(String, String)>,
+    told: Told,
     there: mpsc::Receiver<String>,
     demand: mpsc::Receiver<Vec<Demand>>,
 }
 
 impl Actor {
     async fn run(mut self, mut inputs: Inputs, shutdown: CancellationToken) {
-        self.pools.advance(self.now());
-        self.perform();
+        self.handle(Event::Time);
         loop {
             let deadline = self.pools.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
             tokio::select! {
-                Some(outcome) = inputs.outcomes.recv() => self.became(outcome),
-                Some((id, endpoint)) = inputs.served.recv() => self.pools.serving(self.now(), &id, &endpoint),
-                Some(id) = inputs.there.recv() => self.pools.resource_there(&id),
-                Some(demand) = inputs.demand.recv() => self.pools.demanded(self.now(), &demand),
+                Some(outcome) = inputs.told.outcomes.recv() => self.became(outcome),
+                Some((id, endpoint)) = inputs.told.serving.recv() => self.handle(Event::Serving { id, endpoint }),
+                Some(id) = inputs.there.recv() => self.handle(Event::Offered { id }),
+                Some(demand) = inputs.demand.recv() => self.handle(Event::Demanded(demand)),
                 Some(message) = inputs.messages.recv() => self.receive(message),
-                () = sleep_until(deadline) => self.pools.advance(self.now()),
+                () = sleep_until(deadline) => self.handle(Event::Time),
                 () = shutdown.cancelled() => break,
             }
-            self.perform();
         }
-        self.end(&mut inputs.outcomes).await;
+        self.end(&mut inputs.told.outcomes).await;
     }
 
     /// Ends every worker, whatever it takes.
     async fn end(&mut self, outcomes: &mut mpsc::Receiver<Outcome>) {
         self.watchers.clear();
-        self.pools.shut_down(self.now(), SHUTDOWN_PATIENCE);
-        self.perform();
+        let commands = self.pools.shut_down(self.now(), SHUTDOWN_PATIENCE);
+        self.perform(commands);
         let last = Instant::now() + SHUTDOWN_PATIENCE + KILL_PATIENCE;
         while !self.pools.is_empty() && Instant::now() < last {
             let deadline = self.pools.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
             tokio::select! {
                 Some(outcome) = outcomes.recv() => self.became(outcome),
-                () = sleep_until(deadline) => self.pools.advance(self.now()),
+                () = sleep_until(deadline) => self.handle(Event::Time),
                 () = tokio::time::sleep_until(last.into()) => {}
             }
-            self.perform();
         }
-        for process in self.processes.values() {
-            spawner::signal(process.pid, Signal::SIGKILL);
-        }
+        self.processes.kill_all();
     }
 
     fn now(&self) -> Timestamp {
@@ -182,9 +154,13 @@ impl Actor {
                 let _ = answer.send(pools);
             }
             Message::Spawn { template, count, answer } => {
-                let _ = answer.send(self.pools.spawn(now, &template, count));
+                let spawned = self.pools.spawn(now, &template, count);
+                let _ = answer.send(self.performed(spawned));
             }
-            Message::Stop { id, answer } => drop(answer.send(self.pools.stop(now, &id))),
+            Message::Stop { id, answer } => {
+                let stopped = self.pools.stop(now, &id).map(|commands| ((), commands));
+                let _ = answer.send(self.performed(stopped));
+            }
             Message::Watch { answer } => drop(answer.send(self.watch())),
         }
     }
@@ -206,114 +182,65 @@ impl Actor {
         match outcome {
             Outcome::Spawned { id, pid } => {
                 tracing::info!(id, pid, "worker started");
-                self.processes.entry(id.clone()).or_default().pid = pid;
-                self.pools.spawned(&id, pid);
+                self.processes.spawned(&id, pid);
+                self.handle(Event::Spawned { id, pid });
             }
             Outcome::Exited { id, reason, last_words } => {
                 tracing::info!(id, reason, last_words, "worker gone");
-                if let Some(readiness) = self.processes.remove(&id).and_then(|process| process.readiness) {
-                    readiness.abort();
-                }
-                // One that was killed could not take it back itself.
-                let _ = std::fs::remove_file(self.directory.endpoint_file(&id));
-                self.ended_logs.add(self.log_file(&id));
-                self.pools.exited(self.now(), &id, &reason, &last_words);
+                self.processes.exited(&id);
+                self.handle(Event::Exited { id, reason, last_words });
             }
         }
     }
 
-    fn perform(&mut self) {
-        loop {
-            let commands = self.pools.take_commands();
-            if commands.is_empty() {
-                self.short.send_if_modified(|said| {
-                    let shortages = self.pools.shortages();
-                    let changed = *said != shortages;
-                    *said = shortages;
-                    changed
-                });
-                return;
-            }
-            for command in commands {
-                match command {
-                    Command::Start { id, template } => self.begin(&id, &template),
-                    Command::Terminate { id } => self.signal(&id, Signal::SIGTERM),
-                    Command::Kill { id } => self.signal(&id, Signal::SIGKILL),
-                    Command::Offer { worker, kind } => self.offer(&worker, &kind),
-                    Command::Withdraw { id } => {
-                        self.wanted.send_if_modified(|wanted| wanted.remove(&id).is_some());
+    fn handle(&mut self, event: Event) {
+        let commands = self.pools.handle(self.now(), event);
+        self.perform(commands);
+    }
+
+    fn performed<T>(&mut self, asked: Result<(T, Vec<Command>), PoolError>) -> Result<T, PoolError> {
+        let (answer, commands) = asked?;
+        self.perform(commands);
+        Ok(answer)
+    }
+
+    fn perform(&mut self, commands: Vec<Command>) {
+        let mut commands = VecDeque::from(commands);
+        while let Some(command) = commands.pop_front() {
+            match command {
+                Command::Start { id, template } => {
+                    let Some(template) = self.pools.template(&template) else { continue };
+                    if let Err(busy) = self.processes.begin(&id, template) {
+                        let exited = Event::Exited { id, reason: busy.to_string(), last_words: String::new() };
+                        commands.extend(self.pools.handle(self.now(), exited));
                     }
-                    Command::Tell(worker) => self.tell(&worker),
                 }
+                Command::Terminate { id } => self.processes.signal(&id, Signal::SIGTERM),
+                Command::Kill { id } => self.processes.signal(&id, Signal::SIGKILL),
+                Command::Offer { worker, kind } => self.offer(&worker, &kind),
+                Command::Withdraw { id } => {
+                    self.wanted.send_if_modified(|wanted| wanted.remove(&id).is_some());
+                }
+                Command::Tell(worker) => self.watchers.retain(|watcher| watcher.try_send(worker.clone()).is_ok()),
             }
         }
-    }
-
-    fn begin(&mut self, id: &str, template: &str) {
-        let Some(template) = self.pools.template(template).cloned() else { return };
-        let runtime_dir = self.directory.path().display().to_string();
-        let endpoint_file = self.directory.endpoint_file(id);
-        let fill = |text: &str| {
-            text.replace("{id}", id)
-                .replace("{kind}", &template.kind)
-                .replace("{host}", &self.config.host)
-                .replace("{runtime_dir}", &runtime_dir)
-                .replace("{endpoint_file}", &endpoint_file.display().to_string())
-        };
-        let _ = std::fs::remove_file(&endpoint_file);
-        let job = Job {
-            id: id.to_owned(),
-            args: template.args.iter().map(|arg| fill(arg)).collect(),
-            env: template.env.iter().map(|(name, value)| (name.clone(), fill(value))).collect(),
-            log: self.log_file(id),
-            max_log_bytes: self.config.max_log_bytes,
-            program: template.program.clone().unwrap_or_else(|| self.this_program.clone()),
-        };
-        if self.jobs.try_send(job).is_err() {
-            self.pools.exited(self.now(), id, "cannot be started: too many processes are being started", "");
-            return;
-        }
-        let readiness = ready(self.directory.clone(), id.to_owned(), template.start_timeout(), self.serving.clone());
-        let readiness = tokio::spawn(readiness).abort_handle();
-        self.processes.entry(id.to_owned()).or_default().readiness = Some(readiness);
-    }
-
-    fn log_file(&self, id: &str) -> PathBuf {
-        self.directory.path().join("logs").join(format!("{id}.log"))
-    }
-
-    fn signal(&self, id: &str, signal: Signal) {
-        // Without a process yet, the pools ask again once it is there.
-        if let Some(process) = self.processes.get(id).filter(|process| process.pid != 0) {
-            spawner::signal(process.pid, signal);
-        }
+        self.short.send_if_modified(|said| {
+            let shortages = self.pools.shortages();
+            let changed = *said != shortages;
+            *said = shortages;
+            changed
+        });
     }
 
     fn offer(&self, worker: &WorkerStatus, kind: &str) {
         let resource = Resource::new(&worker.id, ResourceClass::Process, kind)
             .with_endpoint(&worker.endpoint)
-            .with_attribute("host", Value::String(self.config.host.clone()))
+            .with_attribute("host", Value::String(self.host.clone()))
             .with_attribute("pid", Value::Int(i64::from(worker.pid)))
-            .on_host(&self.config.host);
+            .on_host(&self.host);
         self.wanted.send_modify(|wanted| {
             wanted.insert(worker.id.clone(), resource);
         });
-    }
-
-    fn tell(&mut self, worker: &WorkerStatus) {
-        self.watchers.retain(|watcher| watcher.try_send(worker.clone()).is_ok());
-    }
-}
-
-/// Tells the actor once a worker serves. One that does not is the pools' business: they know when it is too late.
-async fn ready(directory: RuntimeDirectory, id: String, deadline: Duration, serving: mpsc::Sender<(String, String)>) {
-    let found = match directory.wait_for(&id, deadline).await {
-        Ok(endpoint) => endpoint,
-        Err(error) => return tracing::debug!(id, %error, "no endpoint of a worker"),
-    };
-    match wait_until_serving(&found, deadline).await {
-        Ok(()) => drop(serving.send((id, found.to_string())).await),
-        Err(error) => tracing::debug!(id, %error, "a worker does not serve"),
     }
 }
 

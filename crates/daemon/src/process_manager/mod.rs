@@ -3,7 +3,7 @@
 //!
 //! ```text
 //!   gRPC call ──▶ service.rs ──message──▶ actor.rs ──command──▶ spawner.rs (one thread) ──▶ worker processes
-//!                                          │ ▲ pool.rs (what there should be)                  │ exit, health
+//!                                          │ ▲ pools/ (what there should be)                  │ exit, health
 //!                  resource manager ◀──link┘ └─────────────────────────────────────────────────┘
 //! ```
 //! What the workers do, and who uses them, it does not know.
@@ -11,7 +11,8 @@
 mod actor;
 mod config;
 mod log;
-pub mod pool;
+pub mod pools;
+mod processes;
 mod service;
 mod spawner;
 mod status;

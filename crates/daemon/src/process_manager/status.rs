@@ -1,6 +1,6 @@
 //! The pools' errors as gRPC statuses.
 
-use super::pool::PoolError;
+use super::pools::PoolError;
 use crate::details::status;
 use tonic::{Code, Status};
 

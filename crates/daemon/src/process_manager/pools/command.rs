@@ -1,0 +1,110 @@
+//! What the pools hear, what they answer with, and what they refuse.
+
+use ratn_proto::types::{Demand, WorkerStatus};
+
+/// What has happened.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Event {
+    /// Time has passed. The first one starts every pool.
+    Time,
+    /// A worker's process is there.
+    Spawned {
+        /// The worker's id.
+        id: String,
+        /// Its process id, also that of its group.
+        pid: u32,
+    },
+    /// A worker's health is SERVING.
+    Serving {
+        /// The worker's id.
+        id: String,
+        /// Where.
+        endpoint: String,
+    },
+    /// The resource manager has the worker's resource.
+    Offered {
+        /// The worker's id.
+        id: String,
+    },
+    /// A worker's process is gone, or could not be started.
+    Exited {
+        /// The worker's id.
+        id: String,
+        /// How, for people.
+        reason: String,
+        /// The end of its log; may be empty.
+        last_words: String,
+    },
+    /// What waits for more than exists, as it is now.
+    Demanded(Vec<Demand>),
+}
+
+/// What the shell shall do.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Command {
+    /// Start a process of a template; answered by [`Event::Spawned`] or [`Event::Exited`].
+    Start {
+        /// The worker's id.
+        id: String,
+        /// The template's name.
+        template: String,
+    },
+    /// Send SIGTERM to the worker's process group.
+    Terminate {
+        /// The worker's id.
+        id: String,
+    },
+    /// Send SIGKILL to the worker's process group.
+    Kill {
+        /// The worker's id.
+        id: String,
+    },
+    /// Offer the worker to the resource manager; answered by [`Event::Offered`].
+    Offer {
+        /// The worker, with its endpoint.
+        worker: WorkerStatus,
+        /// The kind of resource that it is.
+        kind: String,
+    },
+    /// Withdraw the worker's resource; who holds it loses it.
+    Withdraw {
+        /// The worker's id.
+        id: String,
+    },
+    /// Tell watchers.
+    Tell(WorkerStatus),
+}
+
+/// A request that is refused.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum PoolError {
+    /// No such template in the config.
+    #[error("there is no template `{template}`; the config has {known}")]
+    UnknownTemplate {
+        /// What was asked for.
+        template: String,
+        /// Those there are.
+        known: String,
+    },
+    /// No such worker.
+    #[error("there is no worker `{id}`")]
+    UnknownWorker {
+        /// Which.
+        id: String,
+    },
+    /// The pool would have more than its maximum.
+    #[error("`{template}` has {wanted} workers of at most {max}: {count} more are too many")]
+    TooMany {
+        /// The template.
+        template: String,
+        /// How many there are to be already.
+        wanted: u32,
+        /// The template's maximum.
+        max: u32,
+        /// How many were asked for.
+        count: u32,
+    },
+    /// The process manager is ending.
+    #[error("the process manager is ending")]
+    Ending,
+}

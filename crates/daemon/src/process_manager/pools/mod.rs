@@ -1,0 +1,188 @@
+//! Which workers there should be, and what to do about it: a pure state machine.
+//!
+//! ```text
+//!   Event ─▶ Pools (of which pool, of which worker) ─▶ Pool ─┬─ Worker    one worker's life
+//!                                                            ├─ Size      how many there shall be
+//!   Vec<Command> ◀───────────────────────────────────────────┴─ Restarts  what follows a crash
+//! ```
+//! A worker that exits without being asked to is a crash: its resource is withdrawn at once and another worker is started,
+//! at once after a first crash, later after each further one, not at all after [`Template::crash_limit`] in a row.
+
+mod command;
+mod demand;
+mod pool;
+mod restart;
+mod size;
+mod worker;
+
+pub use command::{Command, Event, PoolError};
+
+use super::config::Template;
+use pool::Pool;
+use ratn_model::time::Timestamp;
+use ratn_proto::types::{Demand, PoolStatus};
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+use worker::Worker;
+
+/// All pools of a host.
+#[derive(Debug)]
+pub struct Pools {
+    host: String,
+    pools: BTreeMap<String, Pool>,
+    ending: bool,
+}
+
+impl Pools {
+    /// The pools of these templates, without workers yet.
+    pub fn new(host: impl Into<String>, templates: impl IntoIterator<Item = Template>) -> Pools {
+        let host = host.into();
+        let pools = templates.into_iter().map(|template| (template.name.clone(), Pool::new(template, &host))).collect();
+        Pools { host, pools, ending: false }
+    }
+
+    /// Takes in what has happened; what to do now, in order.
+    pub fn handle(&mut self, now: Timestamp, event: Event) -> Vec<Command> {
+        let mut commands = Vec::new();
+        match event {
+            Event::Time => self.advance(now, &mut commands),
+            Event::Spawned { id, pid } => {
+                if let Some(worker) = self.worker(&id) {
+                    worker.spawned(pid, &mut commands);
+                }
+            }
+            Event::Serving { id, endpoint } => {
+                if let Some((pool, number)) = self.find(&id) {
+                    pool.serving(now, number, &endpoint, &mut commands);
+                }
+            }
+            Event::Offered { id } => {
+                if let Some(worker) = self.worker(&id) {
+                    worker.offered(&mut commands);
+                }
+            }
+            Event::Exited { id, reason, last_words } => {
+                let ending = self.ending;
+                if let Some((pool, number)) = self.find(&id) {
+                    pool.exited(now, number, (&reason, &last_words), &mut commands);
+                    if !ending {
+                        pool.fill(now, &mut commands);
+                    }
+                }
+            }
+            Event::Demanded(demands) => self.demanded(now, &demands, &mut commands),
+        }
+        commands
+    }
+
+    /// The next moment at which time alone changes something: [`Event::Time`] is due then.
+    pub fn next_deadline(&self) -> Option<Timestamp> {
+        self.pools.values().filter_map(Pool::deadline).min()
+    }
+
+    /// Starts more workers, also where the pool has failed; their ids, and what to do.
+    ///
+    /// # Errors
+    /// An unknown template, more than its maximum, or the end.
+    pub fn spawn(
+        &mut self,
+        now: Timestamp,
+        template: &str,
+        count: u32,
+    ) -> Result<(Vec<String>, Vec<Command>), PoolError> {
+        if self.ending {
+            return Err(PoolError::Ending);
+        }
+        let mut commands = Vec::new();
+        let started = self.pool(template)?.spawn(now, count, &mut commands)?;
+        Ok((started, commands))
+    }
+
+    /// Ends a worker; it is replaced only where the pool would fall below its minimum.
+    ///
+    /// # Errors
+    /// An unknown worker.
+    pub fn stop(&mut self, now: Timestamp, id: &str) -> Result<Vec<Command>, PoolError> {
+        let ending = self.ending;
+        let (pool, number) = self.find(id).ok_or_else(|| PoolError::UnknownWorker { id: id.to_owned() })?;
+        let mut commands = Vec::new();
+        pool.stop(now, number, &mut commands);
+        if !ending {
+            pool.fill(now, &mut commands);
+        }
+        Ok(commands)
+    }
+
+    /// Ends every worker, and starts none any more. What has not ended after `patience` is killed.
+    pub fn shut_down(&mut self, now: Timestamp, patience: Duration) -> Vec<Command> {
+        self.ending = true;
+        let mut commands = Vec::new();
+        self.pools.values_mut().for_each(|pool| pool.shut_down(now, patience, &mut commands));
+        commands
+    }
+
+    /// Why there are no more workers of a kind, by kind.
+    pub fn shortages(&self) -> BTreeMap<String, String> {
+        self.pools.values().filter_map(|pool| Some((pool.template().kind.clone(), pool.shortage()?))).collect()
+    }
+
+    /// Whether no worker is left.
+    pub fn is_empty(&self) -> bool {
+        self.pools.values().all(Pool::is_empty)
+    }
+
+    /// Every pool with its workers, the oldest first.
+    pub fn status(&self) -> Vec<PoolStatus> {
+        self.pools.values().map(Pool::status).collect()
+    }
+
+    /// The template of that name.
+    pub fn template(&self, name: &str) -> Option<&Template> {
+        self.pools.get(name).map(Pool::template)
+    }
+
+    fn advance(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        for pool in self.pools.values_mut() {
+            pool.advance(now, commands);
+            if !self.ending {
+                pool.fill(now, commands);
+            }
+        }
+    }
+
+    /// Workers are started for what waits, up to the pool's maximum, also where the pool had failed before anybody asked. When
+    /// nobody waits any more, those that do not serve yet are ended; the others stay.
+    fn demanded(&mut self, now: Timestamp, demands: &[Demand], commands: &mut Vec<Command>) {
+        if self.ending {
+            return;
+        }
+        let mut taken = BTreeSet::new();
+        for pool in self.pools.values_mut() {
+            // Of several templates of a kind the first meets what is asked for.
+            let kind = pool.template().kind.clone();
+            let count = demand::demanded(demands, &kind, &self.host);
+            pool.demanded(now, if taken.insert(kind) { count } else { 0 }, commands);
+        }
+        self.advance(now, commands);
+    }
+
+    fn pool(&mut self, template: &str) -> Result<&mut Pool, PoolError> {
+        let known = self.pools.keys().cloned().collect::<Vec<_>>().join(", ");
+        self.pools.get_mut(template).ok_or(PoolError::UnknownTemplate { template: template.to_owned(), known })
+    }
+
+    /// The pool of a worker, and its number there.
+    fn find(&mut self, id: &str) -> Option<(&mut Pool, u64)> {
+        let (name, number) = id.strip_suffix(self.host.as_str())?.strip_suffix('@')?.rsplit_once('-')?;
+        let (pool, number) = (self.pools.get_mut(name)?, number.parse().ok()?);
+        pool.worker(number).is_some_and(|worker| worker.id() == id).then_some((pool, number))
+    }
+
+    fn worker(&mut self, id: &str) -> Option<&mut Worker> {
+        let (pool, number) = self.find(id)?;
+        pool.worker(number)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,184 @@
+//! The workers of one template: as many as its size says, replaced as its restarts allow.
+
+use super::command::{Command, PoolError};
+use super::restart::Restarts;
+use super::size::Size;
+use super::worker::Worker;
+use crate::process_manager::config::Template;
+use ratn_model::time::Timestamp;
+use ratn_proto::types::PoolStatus;
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+#[derive(Debug)]
+pub(super) struct Pool {
+    template: Template,
+    host: String,
+    size: Size,
+    restarts: Restarts,
+    /// By number: the youngest is the last.
+    workers: BTreeMap<u64, Worker>,
+    last_number: u64,
+}
+
+impl Pool {
+    pub(super) fn new(template: Template, host: &str) -> Pool {
+        Pool {
+            size: Size::new(template.min, template.max_workers()),
+            restarts: Restarts::default(),
+            workers: BTreeMap::new(),
+            last_number: 0,
+            host: host.to_owned(),
+            template,
+        }
+    }
+
+    pub(super) fn template(&self) -> &Template {
+        &self.template
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.workers.is_empty()
+    }
+
+    pub(super) fn worker(&mut self, number: u64) -> Option<&mut Worker> {
+        self.workers.get_mut(&number)
+    }
+
+    pub(super) fn status(&self) -> PoolStatus {
+        PoolStatus {
+            template: self.template.name.clone(),
+            kind: self.template.kind.clone(),
+            min: self.template.min,
+            max: self.template.max_workers(),
+            workers: self.workers.values().map(Worker::status).collect(),
+            failure: self.restarts.failure().to_owned(),
+        }
+    }
+
+    /// Why there are no more workers.
+    pub(super) fn shortage(&self) -> Option<String> {
+        let name = &self.template.name;
+        match self.restarts.failure() {
+            "" if self.size.is_short() => {
+                Some(format!("`{name}` has {} workers at the most", self.template.max_workers()))
+            }
+            "" => None,
+            failure => Some(format!("`{name}` crash-loops: {failure}")),
+        }
+    }
+
+    /// When time alone changes something.
+    pub(super) fn deadline(&self) -> Option<Timestamp> {
+        let restart = self.restarts.pause_until().filter(|_| self.missing() > 0);
+        self.workers.values().filter_map(Worker::deadline).chain(restart).min()
+    }
+
+    /// Kills what is too late.
+    pub(super) fn advance(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        self.workers.values_mut().for_each(|worker| worker.advance(now, commands));
+    }
+
+    /// Starts what is missing, unless it has to wait; the ids.
+    pub(super) fn fill(&mut self, now: Timestamp, commands: &mut Vec<Command>) -> Vec<String> {
+        if !self.restarts.allow(now) {
+            return Vec::new();
+        }
+        (0..self.missing()).map(|_| self.start(now, commands)).collect()
+    }
+
+    fn start(&mut self, now: Timestamp, commands: &mut Vec<Command>) -> String {
+        self.last_number += 1;
+        let (name, number) = (&self.template.name, self.last_number);
+        let id = format!("{name}-{number}@{}", self.host);
+        let worker = Worker::starting(id.clone(), name, now + self.template.start_timeout());
+        self.workers.insert(number, worker);
+        commands.push(Command::Start { id: id.clone(), template: name.clone() });
+        id
+    }
+
+    /// A worker's process is gone.
+    pub(super) fn exited(
+        &mut self,
+        now: Timestamp,
+        number: u64,
+        (reason, last_words): (&str, &str),
+        commands: &mut Vec<Command>,
+    ) {
+        let Some(worker) = self.workers.remove(&number) else { return };
+        let id = worker.id();
+        commands.push(Command::Withdraw { id: id.to_owned() });
+        let reason = match worker.is_too_late() {
+            true => format!("not serving within {} s", self.template.start_timeout_s),
+            false => reason.to_owned(),
+        };
+        commands.push(Command::Tell(worker.exited(reason.clone())));
+        if !worker.is_stopping() {
+            let words = if last_words.is_empty() { String::new() } else { format!("; its last words: {last_words}") };
+            let what = format!("{id}: {reason}{words}");
+            self.restarts.crashed(now, &self.template, worker.serves_since(), &what);
+        }
+    }
+
+    /// A worker's health is SERVING.
+    pub(super) fn serving(&mut self, now: Timestamp, number: u64, endpoint: &str, commands: &mut Vec<Command>) {
+        if let Some(worker) = self.workers.get_mut(&number) {
+            worker.serving(now, endpoint, &self.template.kind, commands);
+        }
+    }
+
+    /// So many more are asked for, also where it has failed; the ids.
+    pub(super) fn spawn(
+        &mut self,
+        now: Timestamp,
+        count: u32,
+        commands: &mut Vec<Command>,
+    ) -> Result<Vec<String>, PoolError> {
+        // What a failed pool lacks is wanted no more.
+        let wanted = if self.restarts.has_failed() { self.there() } else { self.size.asked() };
+        if !self.size.ask(wanted, count) {
+            let template = self.template.name.clone();
+            return Err(PoolError::TooMany { template, wanted, max: self.template.max_workers(), count });
+        }
+        self.restarts.forgive();
+        let mut started = self.fill(now, commands);
+        Ok(started.split_off(started.len().saturating_sub(count as usize)))
+    }
+
+    /// So many are demanded now. What does not serve yet and is wanted no more is ended; the rest stays.
+    pub(super) fn demanded(&mut self, now: Timestamp, count: u32, commands: &mut Vec<Command>) {
+        if self.size.demand(count) && self.restarts.has_failed() {
+            self.restarts.forgive();
+        }
+        let surplus = self.there().saturating_sub(self.size.wanted()) as usize;
+        let kill_at = now + self.template.stop_timeout();
+        for worker in self.workers.values_mut().rev().filter(|worker| worker.is_starting()).take(surplus) {
+            worker.stop(kill_at, commands);
+        }
+    }
+
+    /// Ends a worker; it is replaced only where the pool would fall below its minimum.
+    pub(super) fn stop(&mut self, now: Timestamp, number: u64, commands: &mut Vec<Command>) {
+        let kill_at = now + self.template.stop_timeout();
+        if self.workers.get_mut(&number).is_some_and(|worker| worker.stop(kill_at, commands)) {
+            self.size.one_less();
+        }
+    }
+
+    /// Ends every worker. What has not ended after `patience` is killed.
+    pub(super) fn shut_down(&mut self, now: Timestamp, patience: Duration, commands: &mut Vec<Command>) {
+        let kill_at = now + patience.min(self.template.stop_timeout());
+        for worker in self.workers.values_mut() {
+            worker.stop(kill_at, commands);
+        }
+    }
+
+    fn there(&self) -> u32 {
+        let there = self.workers.values().filter(|worker| !worker.is_stopping()).count();
+        u32::try_from(there).unwrap_or(u32::MAX)
+    }
+
+    fn missing(&self) -> u32 {
+        if self.restarts.has_failed() { 0 } else { self.size.wanted().saturating_sub(self.there()) }
+    }
+}

@@ -1,0 +1,286 @@
+//! The pools by virtual time.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use super::*;
+use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_model::value::Value;
+use ratn_proto::types::WorkerState;
+use std::ops::Deref;
+
+/// The pools of one template, with what they wanted done since the last look.
+struct Rig {
+    pools: Pools,
+    commands: Vec<Command>,
+}
+
+impl Deref for Rig {
+    type Target = Pools;
+
+    fn deref(&self) -> &Pools {
+        &self.pools
+    }
+}
+
+impl Rig {
+    fn take_commands(&mut self) -> Vec<Command> {
+        std::mem::take(&mut self.commands)
+    }
+
+    fn handle(&mut self, now: Timestamp, event: Event) {
+        self.commands.extend(self.pools.handle(now, event));
+    }
+
+    fn advance(&mut self, now: Timestamp) {
+        self.handle(now, Event::Time);
+    }
+
+    fn spawned(&mut self, id: &str) {
+        self.handle(Timestamp(0), Event::Spawned { id: id.to_owned(), pid: 4711 });
+    }
+
+    fn serving(&mut self, now: Timestamp, id: &str) {
+        self.handle(now, Event::Serving { id: id.to_owned(), endpoint: "unix:/w".to_owned() });
+    }
+
+    fn bring_up(&mut self, now: Timestamp, id: &str) {
+        self.spawned(id);
+        self.serving(now, id);
+        self.handle(now, Event::Offered { id: id.to_owned() });
+    }
+
+    fn exited(&mut self, now: Timestamp, id: &str, reason: &str, last_words: &str) {
+        let (id, reason, last_words) = (id.to_owned(), reason.to_owned(), last_words.to_owned());
+        self.handle(now, Event::Exited { id, reason, last_words });
+    }
+
+    fn spawn(&mut self, now: Timestamp, template: &str, count: u32) -> Result<Vec<String>, PoolError> {
+        let (started, commands) = self.pools.spawn(now, template, count)?;
+        self.commands.extend(commands);
+        Ok(started)
+    }
+
+    fn stop(&mut self, now: Timestamp, id: &str) {
+        self.commands.extend(self.pools.stop(now, id).unwrap());
+    }
+
+    fn demanded(&mut self, now: Timestamp, demands: &[Demand]) {
+        self.handle(now, Event::Demanded(demands.to_vec()));
+    }
+}
+
+fn pools(edit: impl FnOnce(&mut Template)) -> Rig {
+    let mut template = Template::new("planner", "PathPlanner");
+    edit(&mut template);
+    let mut rig = Rig { pools: Pools::new("compute", [template]), commands: Vec::new() };
+    rig.advance(Timestamp(0));
+    rig
+}
+
+fn at(seconds: f64) -> Timestamp {
+    Timestamp::from_seconds(seconds)
+}
+
+fn started(pools: &mut Rig) -> Vec<String> {
+    let id = |command| match command {
+        Command::Start { id, .. } => Some(id),
+        _ => None,
+    };
+    pools.take_commands().into_iter().filter_map(id).collect()
+}
+
+#[test]
+fn the_minimum_is_kept_and_a_worker_is_ready_once_its_resource_is_there() {
+    let mut pools = pools(|template| template.min = 2);
+    assert_eq!(started(&mut pools), ["planner-1@compute", "planner-2@compute"]);
+    pools.spawned("planner-1@compute");
+    pools.serving(at(1.0), "planner-1@compute");
+    let commands = pools.take_commands();
+    assert!(matches!(&commands[1], Command::Offer { worker, kind }
+        if worker.endpoint == "unix:/w" && worker.pid == 4711 && kind == "PathPlanner"));
+    assert_eq!(pools.status()[0].workers[0].state, WorkerState::Starting);
+    pools.handle(at(1.0), Event::Offered { id: "planner-1@compute".to_owned() });
+    assert_eq!(pools.status()[0].workers[0].state, WorkerState::Ready);
+}
+
+#[test]
+fn a_crash_withdraws_the_resource_at_once_and_starts_another_under_a_new_id() {
+    let mut pools = pools(|_| {});
+    pools.bring_up(at(0.0), "planner-1@compute");
+    pools.take_commands();
+    pools.exited(at(60.0), "planner-1@compute", "killed by signal 9", "");
+    let commands = pools.take_commands();
+    assert_eq!(commands[0], Command::Withdraw { id: "planner-1@compute".into() });
+    assert!(matches!(&commands[1], Command::Tell(worker) if worker.reason == "killed by signal 9"));
+    assert!(matches!(&commands[2], Command::Start { id, .. } if id == "planner-2@compute"));
+}
+
+#[test]
+fn crashes_in_a_row_wait_longer_and_longer_and_then_fail_the_pool() {
+    let mut pools = pools(|template| template.crash_limit = 4);
+    let mut now = 0.0;
+    let mut waited = Vec::new();
+    for number in 1.. {
+        let ids = started(&mut pools);
+        if ids.is_empty() {
+            let Some(deadline) = pools.next_deadline() else { break };
+            waited.push((deadline.seconds() - now) * 1000.0);
+            now = deadline.seconds();
+            pools.advance(deadline);
+            continue;
+        }
+        assert!(number < 20);
+        pools.exited(at(now), &ids[0], "exited with status 1", "cannot open the model");
+    }
+    assert_eq!(waited.iter().map(|ms| ms.round()).collect::<Vec<_>>(), [100.0, 200.0]);
+    let failure = &pools.status()[0].failure;
+    assert_eq!(
+        failure,
+        "4 crashes in a row; planner-4@compute: exited with status 1; its last words: cannot open the model"
+    );
+    pools.spawn(at(now), "planner", 1).unwrap();
+    assert_eq!(started(&mut pools).len(), 1, "somebody who asks starts it again");
+}
+
+#[test]
+fn a_stable_worker_that_crashes_is_not_part_of_a_crash_loop() {
+    let mut pools = pools(|template| template.crash_limit = 2);
+    for round in 0..5 {
+        let ids = started(&mut pools);
+        assert_eq!(ids.len(), 1);
+        pools.bring_up(at(f64::from(round) * 100.0), &ids[0]);
+        pools.exited(at(f64::from(round) * 100.0 + 50.0), &ids[0], "killed by signal 9", "");
+    }
+    assert_eq!(pools.status()[0].failure, "");
+}
+
+#[test]
+fn a_worker_that_does_not_serve_in_time_is_killed_and_counts_as_a_crash() {
+    let mut pools = pools(|template| template.start_timeout_s = 3.0);
+    pools.take_commands();
+    assert_eq!(pools.next_deadline(), Some(at(3.0)));
+    pools.advance(at(3.0));
+    assert_eq!(pools.take_commands(), [Command::Kill { id: "planner-1@compute".into() }]);
+    pools.serving(at(3.1), "planner-1@compute");
+    assert!(pools.take_commands().is_empty(), "too late is too late");
+    pools.exited(at(3.2), "planner-1@compute", "killed by signal 9", "");
+    assert!(
+        pools
+            .take_commands()
+            .iter()
+            .any(|command| matches!(command, Command::Tell(worker) if worker.reason == "not serving within 3 s"))
+    );
+}
+
+#[test]
+fn a_worker_whose_time_was_over_before_its_process_was_there_is_killed_when_it_is() {
+    let mut pools = pools(|template| template.start_timeout_s = 3.0);
+    pools.advance(at(3.0));
+    pools.take_commands();
+    pools.spawned("planner-1@compute");
+    assert_eq!(pools.take_commands()[0], Command::Kill { id: "planner-1@compute".into() });
+}
+
+#[test]
+fn a_worker_stopped_before_its_process_was_there_is_terminated_and_if_late_killed_when_it_is() {
+    for (passed, command) in [(0.5, "Terminate"), (3.0, "Kill")] {
+        let mut pools = pools(|_| {});
+        pools.stop(at(0.0), "planner-1@compute");
+        pools.advance(at(passed));
+        pools.take_commands();
+        pools.spawned("planner-1@compute");
+        assert!(format!("{:?}", pools.take_commands()[0]).starts_with(command));
+    }
+}
+
+#[test]
+fn a_failed_pool_at_its_maximum_starts_again_when_somebody_asks() {
+    let mut pools = pools(|template| (template.min, template.crash_limit) = (2, 1));
+    for id in started(&mut pools) {
+        pools.exited(at(0.0), &id, "exited with status 1", "");
+    }
+    assert!(started(&mut pools).is_empty() && !pools.status()[0].failure.is_empty());
+    let asked = pools.spawn(at(1.0), "planner", 1).unwrap();
+    assert_eq!(asked.len(), 1);
+    assert_eq!(started(&mut pools).len(), 2, "the minimum is kept again");
+    assert!(matches!(pools.spawn(at(1.0), "planner", 1), Err(PoolError::TooMany { wanted: 2, .. })));
+}
+
+#[test]
+fn a_stopped_worker_is_terminated_then_killed_and_replaced_only_below_the_minimum() {
+    let mut pools = pools(|template| template.max = Some(2));
+    let first = started(&mut pools).remove(0);
+    let second = pools.spawn(at(0.0), "planner", 1).unwrap().remove(0);
+    let refused = pools.spawn(at(0.0), "planner", 1).unwrap_err().to_string();
+    assert_eq!(refused, "`planner` has 2 workers of at most 2: 1 more are too many");
+    pools.bring_up(at(0.0), &second);
+    pools.take_commands();
+    pools.stop(at(1.0), &second);
+    assert_eq!(
+        pools.take_commands(),
+        [Command::Withdraw { id: second.clone() }, Command::Terminate { id: second.clone() }]
+    );
+    pools.advance(at(3.0));
+    assert_eq!(pools.take_commands(), [Command::Kill { id: second.clone() }]);
+    pools.exited(at(3.1), &second, "killed by signal 9", "");
+    assert!(started(&mut pools).is_empty());
+    pools.stop(at(4.0), &first);
+    assert_eq!(started(&mut pools), ["planner-3@compute"], "the minimum is kept");
+}
+
+#[test]
+fn in_the_end_everything_is_stopped_and_nothing_is_started() {
+    let mut pools = pools(|template| template.min = 2);
+    let ids = started(&mut pools);
+    pools.pools.shut_down(at(1.0), Duration::from_millis(500));
+    assert_eq!(pools.next_deadline(), Some(at(1.5)));
+    for id in ids {
+        pools.exited(at(1.1), &id, "exited with status 0", "");
+    }
+    assert!(started(&mut pools).is_empty());
+    assert!(pools.is_empty());
+    assert_eq!(pools.spawn(at(2.0), "planner", 1), Err(PoolError::Ending));
+}
+
+fn demand(provided: u32, missing: u32) -> [Demand; 1] {
+    let requirement = Requirement { count: missing, ..Requirement::new(ResourceOperation::Block, "PathPlanner") };
+    [Demand { requirement, kinds: vec!["Planner".to_owned(), "PathPlanner".to_owned()], provided }]
+}
+
+#[test]
+fn for_those_who_wait_workers_are_started_once_and_up_to_the_maximum() {
+    let now = Timestamp(0);
+    let mut pools = pools(|template| (template.min, template.max) = (0, Some(3)));
+    pools.advance(now);
+    assert_eq!(started(&mut pools).len(), 0);
+    pools.demanded(now, &demand(0, 2));
+    assert_eq!(started(&mut pools).len(), 2);
+    // One of them is there: as many are wanted as before.
+    pools.serving(now, "planner-1@compute");
+    pools.handle(at(1.0), Event::Offered { id: "planner-1@compute".to_owned() });
+    pools.demanded(now, &demand(1, 1));
+    assert_eq!((started(&mut pools).len(), pools.shortages().len()), (0, 0));
+    pools.demanded(now, &demand(1, 9));
+    assert_eq!(started(&mut pools).len(), 1);
+    assert_eq!(pools.shortages()["PathPlanner"], "`planner` has 3 workers at the most");
+    // Nobody waits any more: what does not serve yet is ended, the other one stays.
+    pools.demanded(now, &[]);
+    let ended: Vec<Command> = pools.take_commands();
+    let terminated = ended.iter().filter_map(|command| match command {
+        Command::Terminate { id } => Some(id.as_str()),
+        _ => None,
+    });
+    assert_eq!(terminated.collect::<Vec<_>>(), ["planner-3@compute", "planner-2@compute"]);
+    assert!(pools.shortages().is_empty());
+}
+
+#[test]
+fn demand_that_no_worker_of_this_host_would_meet_starts_none() {
+    let mut pools = pools(|template| template.min = 0);
+    let mut elsewhere = demand(0, 1);
+    elsewhere[0].requirement.attributes.insert("host".to_owned(), Value::String("elsewhere".to_owned()));
+    pools.demanded(Timestamp(0), &elsewhere);
+    assert_eq!(started(&mut pools).len(), 0);
+    elsewhere[0].requirement.attributes.insert("host".to_owned(), Value::String("compute".to_owned()));
+    pools.demanded(Timestamp(0), &elsewhere);
+    assert_eq!(started(&mut pools).len(), 1);
+}
