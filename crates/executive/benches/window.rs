@@ -12,8 +12,8 @@ use ratn_model::expression::{Expr, Function};
 use ratn_model::id::{InstanceId, Revision, StateId};
 use ratn_model::program::{Annotations, Exceptions, Location, Nature, Program, SUCCESS, State, StateKind};
 use ratn_model::time::Timestamp;
+use ratn_model::tolerance::Tolerance;
 use ratn_model::value::{Type, Value};
-use ratn_world::tolerance::Tolerance;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -223,6 +223,7 @@ fn program(states: Vec<State>, horizon: usize) -> Program {
         parameters: Vec::new(),
         outputs: Vec::new(),
         initial: Vec::new(),
+        tolerances: Default::default(),
         ontology: None,
         states,
         digest: String::new(),

@@ -34,10 +34,10 @@ impl Context<'_> {
         self.commands.push(Command::Note(note));
     }
 
-    /// Whether the task's ontology allows such changes; a task without one allows everything.
-    pub(crate) fn allows(&self, changes: &[Change]) -> Result<(), String> {
+    /// Whether the task's ontology allows a world to change so; a task without one allows everything.
+    pub(crate) fn allows(&self, world: &World, changes: &[Change]) -> Result<(), String> {
         let Some(ontology) = &self.program.ontology else { return Ok(()) };
-        ontology.check_changes(changes).map_err(|violation| violation.to_string())
+        world.admits(ontology, changes).map_err(|violation| violation.to_string())
     }
 
     /// Makes changes real: in the mirror now, in the world pool by command.
@@ -45,7 +45,7 @@ impl Context<'_> {
         if changes.is_empty() {
             return Ok(());
         }
-        self.allows(&changes)?;
+        self.allows(self.root, &changes)?;
         let revision = self.root.apply(&changes).map_err(|e| e.to_string())?;
         self.commands.push(Command::Commit { instance, changes, revision });
         Ok(())

@@ -18,4 +18,5 @@ pub mod pose;
 pub mod program;
 pub mod resource;
 pub mod time;
+pub mod tolerance;
 pub mod value;

@@ -25,6 +25,7 @@ mod names;
 mod outline;
 mod resources;
 mod state;
+mod tolerance;
 mod yaml;
 
 pub(crate) use fields::Places;
@@ -50,7 +51,7 @@ use yaml::{Content, Node};
 /// The horizon of a task that names none.
 pub const DEFAULT_HORIZON: usize = 120;
 
-const TASK_KEYS: [&str; 13] = [
+const TASK_KEYS: [&str; 14] = [
     "task",
     "description",
     "horizon",
@@ -60,12 +61,13 @@ const TASK_KEYS: [&str; 13] = [
     "parameters",
     "variables",
     "ontology",
+    "tolerance",
     "world",
     "outputs",
     "outcomes",
     "states",
 ];
-const LATER_TASK_KEYS: [&str; 2] = ["imports", "tolerance"];
+const LATER_TASK_KEYS: [&str; 1] = ["imports"];
 
 /// A program and what was noticed about it.
 #[derive(Debug, Clone, PartialEq)]
@@ -166,7 +168,9 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     let ports = ports(&outline, catalogue, &libraries, &mut out.findings);
     let parameters = root.get("parameters").map(Node::entries).unwrap_or_default();
     let parameters = parameters.iter().map(|entry| entry.key.clone()).collect();
-    let task = Task { source, catalogue, outline, ports, parameters, libraries };
+    let described = root.get("ontology").and_then(|node| ontology(node, loading, &mut out.findings));
+    let (ontology, ontology_text) = described.unzip();
+    let task = Task { source, catalogue, outline, ports, parameters, libraries, ontology };
     let mut fields = Fields { task: &task, view: View::default(), path: String::new(), out };
     fields.keys(&root, &TASK_KEYS, &LATER_TASK_KEYS);
     let horizon = match root.get("horizon") {
@@ -176,7 +180,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     let speculation_width = root.get("speculation_width").and_then(|node| fields.count(node, "speculation_width", 1));
     let deadline_s = root.get("deadline").and_then(|node| flow::positive(&mut fields, node, "deadline"));
     let exceptions = root.get("exceptions").and_then(|node| flow::exceptions(&mut fields, node));
-    let described = root.get("ontology").and_then(|node| ontology(&mut fields, node, loading));
+    let tolerances = tolerance::tolerances(&mut fields, &root);
     let parameters = read_parameters(&mut fields, &root);
     let initial = root.get("world").map(|node| world(&mut fields, node)).unwrap_or_default();
     out.declares_world = root.get("world").is_some();
@@ -189,7 +193,6 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     };
     let mut hasher = blake3::Hasher::new();
     hasher.update(source.as_bytes());
-    let (ontology, ontology_text) = described.unzip();
     hasher.update(ontology_text.unwrap_or_default().as_bytes());
     for (id, library) in &task.libraries {
         hasher.update(library.digest.as_bytes());
@@ -206,7 +209,8 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         parameters,
         outputs,
         initial,
-        ontology,
+        tolerances,
+        ontology: task.ontology.clone(),
         states,
         digest,
     };
@@ -231,22 +235,22 @@ fn horizon(fields: &mut Fields<'_, '_>, node: &Node) -> usize {
 }
 
 /// The ontology that a task names, and its text.
-fn ontology(fields: &mut Fields<'_, '_>, node: &Node, loading: &Loading<'_>) -> Option<(Ontology, String)> {
+fn ontology(node: &Node, loading: &Loading<'_>, findings: &mut Findings) -> Option<(Ontology, String)> {
+    let mut refuse = |message: String, help: &str| findings.error("invalid-ontology", node.at, "", message, help);
     let Content::Text(path) = &node.content else {
         let message = format!("`ontology` is the name of a file, found {}", node.described());
-        fields.error("invalid-ontology", node.at, message, "write `ontology: robot.ttl`, relative to this file");
+        refuse(message, "write `ontology: robot.ttl`, relative to this file");
         return None;
     };
     match loading.files.read(loading.file, path) {
         Err(why) => {
-            let message = format!("`{path}` cannot be read: {why}");
-            fields.error("invalid-ontology", node.at, message, "the path is relative to this file");
+            refuse(format!("`{path}` cannot be read: {why}"), "the path is relative to this file");
             None
         }
         Ok((name, text)) => match turtle::read(&text) {
             Ok(ontology) => Some((ontology, text)),
             Err(error) => {
-                fields.error("invalid-ontology", node.at, format!("{name}: {error}"), "");
+                refuse(format!("{name}: {error}"), "");
                 None
             }
         },

@@ -8,11 +8,13 @@
 //! | `unknown-predicate` | a predicate that is not declared |
 //! | `outside-domain` | as many arguments as a predicate does not have; an individual of no class, or of another class |
 //! | `outside-range` | a value of another type, or the name of an individual of another class |
+//! | `not-functional` | a second fact of a functional predicate about one subject |
 
 pub mod turtle;
 
 use crate::fact::{Change, FactKey, FactPattern, Term};
 use crate::load::suggestion;
+use crate::tolerance::{Deviation, Tolerances};
 use crate::value::{Type, Value};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -37,6 +39,28 @@ pub struct Predicate {
     pub domain: Vec<Domain>,
     /// What the value is.
     pub range: Range,
+    /// Of the facts that differ in the last argument only, one holds at most (`on(box, ?)`: a box is on one thing).
+    pub functional: bool,
+    /// Which difference between a predicted and a measured value is none; the rest is the task's.
+    pub tolerance: Deviation,
+    /// Its facts make the scene: `reads: [scene]` stands for them.
+    pub geometric: bool,
+    /// A fact that was measured this many seconds ago and not again since is stale; `None`: it holds until it is changed.
+    pub ttl_s: Option<f64>,
+    /// What its measured facts carry about how sure they are.
+    pub uncertainty: Option<Uncertainty>,
+    /// The unit of its numbers, `kg`.
+    pub unit: Option<String>,
+}
+
+/// How sure a measured fact is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Uncertainty {
+    /// A number between 0 and 1.
+    Confidence,
+    /// The covariance matrix of the value's numbers.
+    Covariance,
 }
 
 /// What an argument of a predicate is.
@@ -77,6 +101,37 @@ impl Ontology {
     /// A predicate by its name.
     pub fn predicate(&self, name: &str) -> Option<&Predicate> {
         self.predicates.get(name)
+    }
+
+    /// Every predicate by its name, in order.
+    pub fn predicates(&self) -> impl Iterator<Item = (&str, &Predicate)> {
+        self.predicates.iter().map(|(name, predicate)| (name.as_str(), predicate))
+    }
+
+    /// The predicates that the scene is derived from, with their arity.
+    pub fn scene(&self) -> Vec<(&str, usize)> {
+        let geometric = self.predicates().filter(|(_, predicate)| predicate.geometric);
+        geometric.map(|(name, predicate)| (name, predicate.domain.len())).collect()
+    }
+
+    /// The tolerances of a task with what is said here of its predicates.
+    #[must_use]
+    pub fn tolerances(&self, mut of_task: Tolerances) -> Tolerances {
+        for (name, Predicate { tolerance, .. }) in self.predicates() {
+            if !tolerance.is_empty() {
+                let own = of_task.predicates.entry(name.to_owned()).or_default();
+                *own = own.or(*tolerance);
+            }
+        }
+        of_task
+    }
+
+    /// The facts of which none may hold beside this one: those of a functional predicate about the same subject.
+    pub fn rivals(&self, fact: &FactKey) -> Option<FactPattern> {
+        self.predicate(&fact.predicate).filter(|predicate| predicate.functional)?;
+        let mut rivals = FactPattern::of(fact);
+        *rivals.arguments.last_mut()? = None;
+        Some(rivals)
     }
 
     /// Whether an individual is of a class: as declared or by its name, directly or over subclasses.
@@ -138,7 +193,8 @@ impl Ontology {
             (_, Value::Null) => Ok(()),
             (Range::Type(ty), value) if ty.accepts(value) => Ok(()),
             (Range::Type(ty), value) => {
-                outside(format!("`{pattern}` is {ty}, and {value} is {}", value.type_name()), String::new())
+                let unit = predicate.unit.as_ref().map(|unit| format!(" in {unit}")).unwrap_or_default();
+                outside(format!("`{pattern}` is {ty}{unit}, and {value} is {}", value.type_name()), String::new())
             }
             (Range::Class(class), Value::String(individual)) => match self.is_not(individual, class) {
                 None => Ok(()),
@@ -211,6 +267,20 @@ impl Ontology {
         }
         let known = self.individuals.keys().map(String::as_str);
         suggestion(individual, known, "", "declare it, or say how such individuals are named (`ratn:named`)")
+    }
+}
+
+impl Violation {
+    /// Two facts of a functional predicate about one subject.
+    pub fn not_functional(fact: &FactKey, beside: &FactKey) -> Violation {
+        Violation {
+            rule: "not-functional",
+            message: format!(
+                "`{fact}` beside `{beside}`: `{}` is functional, of one subject it says one thing",
+                fact.predicate
+            ),
+            help: format!("add the effect \"delete {beside}\", or one with `?` in the place of the last argument"),
+        }
     }
 }
 

@@ -8,6 +8,7 @@ use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::id::StateId;
 use crate::ontology::Ontology;
 use crate::resource::{ResourceClass, ResourceOperation};
+use crate::tolerance::Tolerances;
 use crate::value::{Type, Value};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -38,6 +39,8 @@ pub struct Program {
     pub outputs: Vec<TaskOutput>,
     /// The facts that hold at the start, over what the world pool already holds; arguments may use parameters.
     pub initial: Vec<EffectExpr>,
+    /// When a measured value is the predicted one, as far as the task and its ontology say it.
+    pub tolerances: Tolerances,
     /// What its facts may say; `None`: anything.
     pub ontology: Option<Ontology>,
     /// Every state; a [`StateId`] is an index. State 0 is the root, a [`StateKind::Sequence`].

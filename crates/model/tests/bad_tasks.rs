@@ -9,7 +9,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Rules that the folder must have a task for.
-const RULES: [&str; 36] = [
+const RULES: [&str; 37] = [
     "branch-may-not-have-written",
     "computes-actuates",
     "conflicting-annotations",
@@ -24,6 +24,7 @@ const RULES: [&str; 36] = [
     "may-deadlock",
     "missing-input",
     "no-way-out",
+    "not-functional",
     "not-supported-yet",
     "outside-domain",
     "outside-range",

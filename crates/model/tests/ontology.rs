@@ -6,8 +6,9 @@
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::{Change, FactKey, FactPattern, Term};
 use ratn_model::load::{Files, MAX_SOURCE, load_with};
-use ratn_model::ontology::Ontology;
 use ratn_model::ontology::turtle::{MAX_CLASSES, MAX_STATEMENTS, read};
+use ratn_model::ontology::{Ontology, Uncertainty};
+use ratn_model::tolerance::{Deviation, Tolerance, Tolerances};
 use ratn_model::value::Value;
 use std::time::{Duration, Instant};
 
@@ -183,4 +184,85 @@ fn the_examples_say_only_what_their_ontology_allows() {
         assert_eq!(loaded.program.ontology, Some(read(include_str!("../../../examples/aimm.ttl")).unwrap()));
         assert_ne!(plain.digest, loaded.program.digest);
     }
+}
+
+#[test]
+fn what_a_predicate_says_beside_its_value_is_read_and_counts() {
+    let shop = ontology(
+        ":Box a owl:Class ; ratn:named \"box_\" .
+         :on a ratn:Predicate , owl:FunctionalProperty ; ratn:arguments ( :Box :Box ) ; ratn:value \"bool\" .
+         :at a ratn:Predicate ; ratn:arguments ( :Box ) ; ratn:value \"pose\" ; ratn:geometric true ; ratn:ttl 30 ;
+             ratn:positionTolerance 0.02 ; ratn:angleTolerance 0.1 ; ratn:uncertainty \"covariance\" .
+         :weight a ratn:Predicate ; ratn:arguments ( :Box ) ; ratn:value \"float\" ; ratn:unit \"kg\" ; ratn:tolerance 0.05 .",
+    );
+    let at = shop.predicate("at").unwrap();
+    assert_eq!((at.ttl_s, at.uncertainty, at.functional), (Some(30.0), Some(Uncertainty::Covariance), false));
+    assert_eq!(shop.scene(), [("at", 1)]);
+    assert_eq!(shop.rivals(&key("on", &["box_1", "box_2"])).unwrap().to_string(), "on(box_1, ?)");
+    assert_eq!(shop.rivals(&key("at", &["box_1"])), None);
+    assert_eq!(
+        shop.check_change(&set("weight", &["box_1"], Value::Bool(true))).unwrap_err().to_string(),
+        "[outside-range] `weight(box_1)` is float in kg, and true is bool"
+    );
+    let of_task = Deviation { number: Some(0.5), position_m: Some(0.5), ..Deviation::default() };
+    let of_weight = Deviation { number: Some(1.0), ..Deviation::default() };
+    let tolerances =
+        Tolerances { default: of_task, predicates: [("weight".to_owned(), of_weight)].into_iter().collect() };
+    let tolerances = shop.tolerances(tolerances);
+    let of = |predicate: &str| tolerances.of(predicate, Tolerance::EXACT);
+    assert_eq!(of("at"), Tolerance { position_m: 0.02, angle_rad: 0.1, number: 0.5 });
+    assert_eq!(of("weight"), Tolerance { position_m: 0.5, angle_rad: 0.0, number: 1.0 });
+}
+
+#[test]
+fn what_a_predicate_says_of_what_its_value_does_not_hold_is_refused() {
+    for (value, more, said) in [
+        ("bool", "ratn:tolerance 1", "`ratn:tolerance` is said, and its value holds no number"),
+        ("float", "ratn:positionTolerance 1", "`ratn:positionTolerance` is said, and its value holds no pose"),
+        ("float", "ratn:angleTolerance 1", "`ratn:angleTolerance` is said, and its value holds no pose"),
+        ("string", "ratn:unit \"m\"", "`ratn:unit` is said, and its value holds no number"),
+        (
+            "bool",
+            "ratn:uncertainty \"covariance\"",
+            "`ratn:uncertainty` is said, and its value holds no number or pose to have a covariance",
+        ),
+        ("bool", "ratn:uncertainty \"some\"", "`ratn:uncertainty` is \"confidence\" or \"covariance\", found `some`"),
+        ("float", "ratn:tolerance -1", "`ratn:tolerance` is a number from 0, found `-1`"),
+        ("float", "ratn:tolerance 1, 2", "`ratn:tolerance` is said twice"),
+        ("float", "ratn:ttl 0", "`ratn:ttl` is above 0: a fact that is stale at once says nothing"),
+        ("float", "ratn:ttl \"NaN\"", "`ratn:ttl` is a number from 0, found `NaN`"),
+        ("float", "ratn:unit \"\"", "`ratn:unit` is a short name, found ``"),
+        ("float", "ratn:geometric \"perhaps\"", "`ratn:geometric` is true or false, found `perhaps`"),
+        ("float", "a owl:FunctionalProperty", "a functional predicate has a subject, and this one has no arguments"),
+        ("float", "ratn:tolerances 1", "`urn:ratn:ontology#tolerances` is not understood here; leave it out"),
+    ] {
+        let text = format!(":p a ratn:Predicate ; ratn:arguments () ; ratn:value \"{value}\" ; {more} .");
+        assert_eq!(refusal(&text), format!("`p`: {said}"));
+    }
+}
+
+/// One predicate that makes the scene, one that does not.
+struct Shop(&'static str);
+
+impl Files for Shop {
+    fn read(&self, _: &str, path: &str) -> Result<(String, String), String> {
+        let text = ":Box a owl:Class ; ratn:named \"box_\" . :weight a ratn:Predicate ; ratn:arguments ( :Box ) ; ratn:value \"float\" .
+            :place a ratn:Predicate ; ratn:arguments ( :Box ) ; ratn:value \"pose\" ; ratn:positionTolerance 0.02 ; ratn:geometric ";
+        Ok((path.to_owned(), format!("{PREFIXES}{text}{} .", self.0)))
+    }
+}
+
+#[test]
+fn the_scene_and_the_tolerances_of_a_task_are_those_of_its_ontology() {
+    let task = "task: t\nontology: shop.ttl\ntolerance: { number: 0.1, predicates: { weight: 2 } }\nstates:
+  - plan: { action: path_planner/plan, in: { start: \"joints(0, 0, 0, 0, 0, 0, 0)\", goal: \"joints(0, 0, 0, 0, 0, 0, 0)\" }, computes: true, reads: [scene],
+            resources: [{ block: PathPlanner }] }\n";
+    let program = load_with(task, "task.yaml", &Catalogue::standard(), &Shop("true")).unwrap().program;
+    let reads = program.states[1].annotations.reads.as_ref().unwrap();
+    assert_eq!(reads.iter().map(ToString::to_string).collect::<Vec<_>>(), ["place(?)"]);
+    let of = |predicate: &str| program.tolerances.of(predicate, Tolerance::ROBOT);
+    assert_eq!(of("weight"), Tolerance { number: 2.0, ..Tolerance::ROBOT });
+    assert_eq!(of("place"), Tolerance { number: 0.1, position_m: 0.02, ..Tolerance::ROBOT });
+    let refused = load_with(task, "task.yaml", &Catalogue::standard(), &Shop("false")).unwrap_err();
+    assert_eq!((refused.len(), refused[0].rule.as_str()), (1, "unknown-predicate"), "{}", refused[0]);
 }

@@ -6,9 +6,9 @@
 use ratn_executive::protocol::{Goal, Mode};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::load::{Files, load_with};
+use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_simulation::run::{Answer, Oracle, Performance, Run, Setup, run};
-use ratn_world::tolerance::Tolerance;
 use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -5,11 +5,11 @@
 use ratn_executive::protocol::{Event, LogEntry, Mode};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::resource::ResourceClass;
+use ratn_model::tolerance::Tolerance;
 use ratn_simulation::random::{Features, HashOracle, RESOURCES, program};
 use ratn_simulation::run::{Run, Setup, run, run_looking_ahead};
 use ratn_simulation::tables::{FETCH_BOXES, SET_TABLE};
 use ratn_simulation::timed::TimedProviders;
-use ratn_world::tolerance::Tolerance;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;

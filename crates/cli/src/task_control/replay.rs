@@ -7,7 +7,7 @@ use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Note};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::Program;
 use ratn_model::time::Timestamp;
-use ratn_world::tolerance::Tolerance;
+use ratn_model::tolerance::Tolerance;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

@@ -132,7 +132,7 @@ impl Interpreter {
         match &mut self.target {
             Target::Actual => context.commit(instance, changes),
             Target::Projection { changes: all, world, .. } => {
-                context.allows(&changes)?;
+                context.allows(world, &changes)?;
                 world.apply(&changes).map_err(|e| e.to_string())?;
                 all.extend(changes);
                 Ok(())

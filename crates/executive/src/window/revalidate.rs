@@ -1,7 +1,7 @@
 //! Invalidation: a result that was made of a prediction which did not come true is computed again.
 //!
 //! When an instance becomes real, those that used its outputs or effects are compared with what there is now; what differs by
-//! more than the tolerance begins again, and so does what was made of it. PIAs are never among them: they begin when
+//! more than the tolerance of its predicate begins again, and so does what was made of it. PIAs are never among them: they begin when
 //! everything older is real.
 
 use super::Window;
@@ -11,8 +11,8 @@ use crate::context::Context;
 use crate::protocol::Note;
 use ratn_model::fact::FactKey;
 use ratn_model::id::InstanceId;
+use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
-use ratn_world::tolerance::Tolerance;
 
 impl Window {
     /// Compares what an instance was made of with what there is now.
@@ -41,7 +41,9 @@ impl Window {
             }
         }
         drop(view);
-        if let Some(difference) = difference(&seen.facts, &now, &self.tolerance) {
+        if let Some(difference) =
+            difference(&seen.facts, &now, |key| context.program.tolerances.of(&key.predicate, self.tolerance))
+        {
             self.invalidate(context, id, difference);
         }
     }
@@ -69,16 +71,22 @@ impl Window {
 }
 
 /// The first fact that differs, as a sentence.
-fn difference(saw: &[(FactKey, Value)], is: &[(FactKey, Value)], tolerance: &Tolerance) -> Option<String> {
+fn difference(
+    saw: &[(FactKey, Value)],
+    is: &[(FactKey, Value)],
+    tolerance: impl Fn(&FactKey) -> Tolerance,
+) -> Option<String> {
     let said = |value: Option<&Value>| value.map_or("nothing".to_owned(), ToString::to_string);
     let of = |facts: &[(FactKey, Value)], key: &FactKey| facts.iter().find(|(k, _)| k == key).map(|(_, v)| v.clone());
-    if saw.len() == is.len() && saw.iter().zip(is).all(|((a, x), (b, y))| a == b && tolerance.equal(x, y)) {
+    if saw.len() == is.len()
+        && saw.iter().zip(is).all(|((a, x), (b, y))| a == b && (x == y || tolerance(a).equal(x, y)))
+    {
         return None;
     }
     saw.iter().chain(is).map(|(key, _)| key).find_map(|key| {
         let (before, now) = (of(saw, key), of(is, key));
         let same = match (&before, &now) {
-            (Some(before), Some(now)) => tolerance.equal(before, now),
+            (Some(before), Some(now)) => tolerance(key).equal(before, now),
             (before, now) => before == now,
         };
         (!same).then(|| {

@@ -5,6 +5,7 @@ use super::{Subject, expressions};
 use crate::diagnostic::Findings;
 use crate::expression::scope::NothingKnown;
 use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::fact::{FactKey, FactPattern};
 use crate::ontology::{Ontology, Violation};
 use crate::program::{Location, Nature, Program, State};
 use crate::value::Value;
@@ -13,9 +14,11 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let program = subject.program;
     let Some(ontology) = &program.ontology else { return };
     let root = program.state(Program::ROOT);
+    let mut together = Together { ontology, facts: Vec::new() };
     for (i, effect) in program.initial.iter().enumerate() {
         let mut said = Said { ontology, at: subject.place(root, &format!("world.{i}")), path: "", findings };
         said.effect(effect);
+        said.note(together.takes(effect));
     }
     for state in &program.states {
         of_state(subject, ontology, state, findings);
@@ -39,8 +42,48 @@ fn of_state(subject: &Subject<'_>, ontology: &Ontology, state: &State, findings:
     }
     for (outcome, effects) in &annotations.effects {
         let mut said = Said { ontology, at: at(&format!("effects.{outcome}")), path: &state.path, findings };
-        effects.iter().for_each(|effect| said.effect(effect));
+        let mut together = Together { ontology, facts: Vec::new() };
+        for effect in effects {
+            said.effect(effect);
+            said.note(together.takes(effect));
+        }
     }
+}
+
+/// The constant facts that effects leave behind together.
+struct Together<'a> {
+    ontology: &'a Ontology,
+    facts: Vec<FactKey>,
+}
+
+impl Together<'_> {
+    fn takes(&mut self, effect: &EffectExpr) -> Result<(), Violation> {
+        match effect {
+            EffectExpr::Delete(fact) => {
+                // What is not known yet may be any of them.
+                let gone = fact.pattern(&NothingKnown);
+                self.facts.retain(|fact| !gone.matches(fact));
+            }
+            EffectExpr::Set(fact, value) => {
+                let Some(fact) = key(fact.pattern(&NothingKnown)) else { return Ok(()) };
+                let Some(rivals) = self.ontology.rivals(&fact) else { return Ok(()) };
+                self.facts.retain(|other| *other != fact);
+                if matches!(constant(value), Some(Value::Null | Value::Bool(false)) | None) {
+                    return Ok(());
+                }
+                let rival = self.facts.iter().find(|other| rivals.matches(other));
+                let found = rival.map_or(Ok(()), |rival| Err(Violation::not_functional(&fact, rival)));
+                self.facts.push(fact);
+                return found;
+            }
+            EffectExpr::Increase(..) | EffectExpr::ForEach { .. } => {}
+        }
+        Ok(())
+    }
+}
+
+fn key(pattern: FactPattern) -> Option<FactKey> {
+    Some(FactKey { predicate: pattern.predicate, arguments: pattern.arguments.into_iter().collect::<Option<_>>()? })
 }
 
 /// What is said at one place.

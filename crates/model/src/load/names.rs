@@ -8,6 +8,7 @@ use crate::catalogue::Catalogue;
 use crate::expression::Expr;
 use crate::expression::parse::{NameError, Names};
 use crate::id::StateId;
+use crate::ontology::Ontology;
 use crate::program::Program;
 use crate::value::Type;
 use std::collections::{BTreeMap, BTreeSet};
@@ -33,6 +34,8 @@ pub(crate) struct Task<'a> {
     pub(crate) parameters: Vec<String>,
     /// Libraries that states use, loaded, by state.
     pub(crate) libraries: BTreeMap<StateId, Program>,
+    /// What its facts may say; `None`: anything.
+    pub(crate) ontology: Option<Ontology>,
 }
 
 /// From where an expression sees the task.
@@ -184,7 +187,7 @@ pub(crate) fn suggestion<'n>(
     otherwise: &str,
 ) -> String {
     /// More names than this are not listed.
-    const MAX_LISTED: usize = 13;
+    const MAX_LISTED: usize = 14;
     let mut known: Vec<&str> = known.collect();
     known.sort_unstable();
     known.dedup();

@@ -328,13 +328,22 @@ fn nature(fields: &mut Fields<'_, '_>, body: &Node) -> Nature {
     }
 }
 
-/// `scene` stands for the facts that geometry is derived from.
+/// `scene` stands for the facts that geometry is derived from: those that the ontology says, where there is one.
 fn reads(fields: &mut Fields<'_, '_>, item: &Node) -> Vec<FactExpr> {
-    match &item.content {
-        Content::Text(text) if text == "scene" => SCENE_PREDICATES
-            .iter()
-            .map(|(predicate, arity)| FactExpr { predicate: (*predicate).to_owned(), arguments: vec![None; *arity] })
-            .collect(),
-        _ => fields.fact(item).into_iter().collect(),
+    if !matches!(&item.content, Content::Text(text) if text == "scene") {
+        return fields.fact(item).into_iter().collect();
     }
+    let predicates = match &fields.task.ontology {
+        None => SCENE_PREDICATES.to_vec(),
+        Some(ontology) => ontology.scene(),
+    };
+    if predicates.is_empty() {
+        let message = "the ontology has no geometric predicate, and `scene` stands for those";
+        fields.error("unknown-predicate", item.at, message, "say `ratn:geometric true` of some, or name the facts");
+    }
+    let any = |(predicate, arity): &(&str, usize)| FactExpr {
+        predicate: (*predicate).to_owned(),
+        arguments: vec![None; *arity],
+    };
+    predicates.iter().map(any).collect()
 }

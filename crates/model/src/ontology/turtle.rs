@@ -10,12 +10,16 @@
 //! :Box a owl:Class ; rdfs:subClassOf :Object ; ratn:named "box_" .      # whatever is called so is one
 //! :table a :Object .                                                    # an individual
 //! :at a ratn:Predicate ; ratn:arguments ( :Object ) ; ratn:value "pose" .
+//! :weight a ratn:Predicate ; ratn:arguments ( :Object ) ; ratn:value "float" ; ratn:unit "kg" ; ratn:tolerance 0.05 .
 //! ```
 //! A name in a task is the part of an IRI after its last `#`, `/` or `:`. An argument is a class, `owl:Thing` (anything) or
-//! `xsd:integer`; a value is a type in the words of task files, or a class: then it is the name of an individual. Labels and
-//! comments are for people; any other property is refused, as it would say something that is not checked.
+//! `xsd:integer`; a value is a type in the words of task files, or a class: then it is the name of an individual. What else a
+//! predicate may say is in [`said`]. Labels and comments are for people; any other property is refused, as it would say
+//! something that is not checked.
 //!
 //! Reading is bounded: by the size of the text, by the number of statements, and by a check for circles among subclasses.
+
+pub mod said;
 
 use super::{Domain, Ontology, Predicate, Range};
 use crate::load::MAX_SOURCE;
@@ -141,23 +145,28 @@ impl Reader<'_> {
     }
 
     fn predicate(&self, subject: &str, said: &[(String, Node)]) -> Result<Predicate, OntologyError> {
-        let (mut domain, mut range) = (None, None);
+        let (mut domain, mut range, mut more) = (None, None, said::More::default());
+        let mut before = BTreeSet::new();
         for (property, object) in said {
-            let (twice, what) = match property.as_str() {
-                p if p == ours("arguments") => {
-                    (domain.replace(self.arguments(subject, object)?).is_some(), "arguments")
-                }
-                p if p == ours("value") => (range.replace(self.range(subject, object)?).is_some(), "value"),
-                p if p == rdf::TYPE.as_str() || is_for_people(p) => (false, ""),
-                p => return Err(not_understood(subject, p)),
-            };
-            if twice {
+            let local = property.strip_prefix(OURS);
+            if let Some(what) = local
+                && !before.insert(what)
+            {
                 return Err(wrong(subject, format!("`ratn:{what}` is said twice")));
+            }
+            match local {
+                Some("arguments") => domain = Some(self.arguments(subject, object)?),
+                Some("value") => range = Some(self.range(subject, object)?),
+                Some(what) if more.takes(subject, what, object)? => {}
+                None if property == rdf::TYPE.as_str() || is_for_people(property) => {}
+                _ => return Err(not_understood(subject, property)),
             }
         }
         let missing = |what| wrong(subject, format!("a predicate says its `ratn:{what}`"));
         let domain = domain.ok_or_else(|| missing("arguments ( … )"))?;
-        Ok(Predicate { domain, range: range.ok_or_else(|| missing("value"))? })
+        let range = range.ok_or_else(|| missing("value"))?;
+        let functional = is_any(said, &[format!("{OWL}FunctionalProperty")]);
+        more.predicate(subject, domain, range, functional)
     }
 
     fn individual(&self, subject: &str, said: &[(String, Node)]) -> Result<BTreeSet<String>, OntologyError> {

@@ -18,8 +18,8 @@ use ratn_model::program::{
     Annotations, Exceptions, Location, Nature, Program, ResourceExpr, SUCCESS, State, StateKind,
 };
 use ratn_model::resource::{ResourceClass, ResourceOperation};
+use ratn_model::tolerance::Tolerance;
 use ratn_model::value::{Type, Value};
-use ratn_world::tolerance::Tolerance;
 use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -77,6 +77,7 @@ impl JobShop {
             parameters: Vec::new(),
             outputs: Vec::new(),
             initial: Vec::new(),
+            tolerances: Default::default(),
             ontology: None,
             states,
             digest: String::new(),

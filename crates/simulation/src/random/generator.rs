@@ -62,6 +62,7 @@ pub fn program(seed: u64, features: &Features) -> Program {
         initial: (0..PREDICATES)
             .map(|p| EffectExpr::Set(fact_at(p, 0), Expr::Literal(Value::Int(p as i64 % 4))))
             .collect(),
+        tolerances: Default::default(),
         ontology: None,
         states: maker.states,
         digest: String::new(),

@@ -8,7 +8,7 @@ use super::{Dice, Features, HashOracle, RESOURCES, is_in_routine, state_of};
 use crate::run::{Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
 use ratn_executive::protocol::{Event, Mode};
 use ratn_model::program::{Program, StateKind};
-use ratn_world::tolerance::Tolerance;
+use ratn_model::tolerance::Tolerance;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
