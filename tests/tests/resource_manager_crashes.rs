@@ -7,7 +7,6 @@
 mod support;
 
 use anyhow::{Context, bail, ensure};
-use nix::sys::signal::Signal;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::{Lease, Requirement, ResourceClass, ResourceOperation};
 use ratn_proto::types::Resource;
@@ -15,11 +14,9 @@ use ratn_worker::client::{AcquireOptions, CallError, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::Session;
 use std::collections::{BTreeMap, BTreeSet};
-use std::os::unix::fs::FileExt;
-use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
-use support::{Place, Started};
+use support::crashes::{Daemon, Random, number};
 use tokio_util::sync::CancellationToken;
 
 const CLIENTS: usize = 32;
@@ -74,72 +71,6 @@ impl Told {
 
     fn releasing(&mut self, lease: &Lease) {
         self.held.retain(|_, (_, id)| *id != lease.id);
-    }
-}
-
-/// Numbers from a seed (xorshift64*).
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, bound: u64) -> u64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        (self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 32) % bound
-    }
-}
-
-/// The process under test.
-struct Manager {
-    place: Place,
-    endpoint: Endpoint,
-    process: Option<Started>,
-}
-
-impl Manager {
-    fn new() -> anyhow::Result<Manager> {
-        let place = Place::new()?;
-        let endpoint = format!("unix:{}", place.path().join("manager.sock").display()).parse()?;
-        let mut manager = Manager { place, endpoint, process: None };
-        manager.start()?;
-        Ok(manager)
-    }
-
-    fn log(&self) -> PathBuf {
-        self.place.path().join("state/resource-manager")
-    }
-
-    fn start(&mut self) -> anyhow::Result<()> {
-        let (listen, state) = (self.endpoint.to_string(), self.place.path().join("state"));
-        let state = state.to_str().context("a path")?;
-        let arguments = ["resource-manager", "--listen", &listen, "--state-dir", state, "--durability", "group"];
-        self.process = Some(self.place.start(&arguments)?);
-        Ok(())
-    }
-
-    fn kill(&mut self) -> anyhow::Result<()> {
-        let mut process = self.process.take().context("it runs")?;
-        process.signal(Signal::SIGKILL)?;
-        let status = process.child.wait()?;
-        ensure!(!status.success(), "it ended by itself: {}", process.said());
-        Ok(())
-    }
-
-    /// Puts behind the log what a write leaves that was stopped in the middle.
-    fn tear(&self, random: &mut Random) -> anyhow::Result<()> {
-        let entries: Vec<PathBuf> =
-            std::fs::read_dir(self.log())?.map(|entry| Ok(entry?.path())).collect::<anyhow::Result<_>>()?;
-        let segments = entries.into_iter().filter(|path| path.extension().is_some_and(|extension| extension == "log"));
-        let last = segments.max().context("a segment")?;
-        let torn: Vec<u8> = (0..=random.below(300)).map(|_| random.below(256) as u8).collect();
-        let written = std::fs::read(&last)?.iter().rposition(|byte| *byte != 0).map_or(0, |at| at + 1);
-        // Not right behind it: the last record may end in zeros of its own.
-        let file = std::fs::OpenOptions::new().write(true).open(last)?;
-        Ok(file.write_all_at(&torn, (written + 64) as u64)?)
-    }
-
-    fn said(&self) -> String {
-        self.process.as_ref().map(Started::said).unwrap_or_default()
     }
 }
 
@@ -270,17 +201,13 @@ async fn wait_until(
     Ok(())
 }
 
-fn number(variable: &str, otherwise: u64) -> u64 {
-    std::env::var(variable).ok().and_then(|text| text.parse().ok()).unwrap_or(otherwise)
-}
-
 #[tokio::test]
 async fn a_manager_that_is_killed_again_and_again_loses_nothing_acknowledged_and_grants_nothing_twice()
 -> anyhow::Result<()> {
     let (crashes, seed) = (number("RATN_CRASHES", 10), number("RATN_SEED", 4_711));
     println!("{crashes} crashes, RATN_SEED={seed}");
     let mut random = Random(seed | 1);
-    let mut manager = Manager::new()?;
+    let mut manager = Daemon::new("resource-manager")?;
     let endpoint = manager.endpoint.clone();
     let (shared, end, leave) = (Shared::default(), CancellationToken::new(), CancellationToken::new());
     let channels = Channels::new();

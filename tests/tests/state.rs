@@ -1,10 +1,14 @@
-//! `ratn state …`: the state of a resource manager that runs is copied, put back, and looked at.
+//! `ratn state …`: the state of a resource manager or a world pool that runs is copied, put back, and looked at.
 
 mod support;
 
 use anyhow::{Context, ensure};
 use nix::sys::signal::Signal;
-use serde_json::Value;
+use ratn_model::fact::{Change, FactKey};
+use ratn_model::id::Revision;
+use ratn_model::value::Value;
+use ratn_worker::client::{Channels, WorldClient};
+use ratn_worker::endpoint::Endpoint;
 use std::path::{Path, PathBuf};
 use support::{Place, Started, texts, wait_for};
 
@@ -19,9 +23,13 @@ impl Cell {
 
     /// A resource manager that keeps its state in this folder.
     fn manager(&self, state: &str) -> anyhow::Result<Started> {
-        let process = self.place.start_as(state, &["resource-manager", "--state-dir", &self.path(state)])?;
-        let endpoint = self.place.path().join("run/resource-manager.endpoint");
-        wait_for("the manager", || Ok(endpoint.exists().then_some(()))).with_context(|| process.said())?;
+        self.daemon("resource-manager", state)
+    }
+
+    fn daemon(&self, role: &str, state: &str) -> anyhow::Result<Started> {
+        let process = self.place.start_as(state, &[role, "--state-dir", &self.path(state)])?;
+        let endpoint = self.place.path().join(format!("run/{role}.endpoint"));
+        wait_for("the daemon", || Ok(endpoint.exists().then_some(()))).with_context(|| process.said())?;
         Ok(process)
     }
 
@@ -37,7 +45,7 @@ impl Cell {
         Ok((output.status.code(), out, err))
     }
 
-    fn json(&self, arguments: &[&str]) -> anyhow::Result<Value> {
+    fn json(&self, arguments: &[&str]) -> anyhow::Result<serde_json::Value> {
         let (code, out, err) = self.ratn(&[arguments, &["--json"]].concat())?;
         ensure!(code == Some(0), "{code:?}\n{out}\n{err}");
         Ok(serde_json::from_str(&out)?)
@@ -68,6 +76,31 @@ fn a_backup_of_a_running_manager_is_put_back_and_what_came_later_is_gone() -> an
     ensure!(cell.exists("Arm")?, "it was there when the backup was made");
     ensure!(!cell.exists("Base")?, "it came later");
     cell.end(manager)
+}
+
+#[test]
+fn a_backup_of_a_running_world_pool_has_its_facts() -> anyhow::Result<()> {
+    let cell = Cell { place: Place::new()? };
+    let asking = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let endpoint: Endpoint = format!("unix:{}", cell.path("run/world-pool.sock")).parse()?;
+    let world = || WorldClient::new(&Channels::new(), &endpoint);
+    let set = |value| {
+        let fact = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
+        vec![Change::Set { fact, value: Value::Int(value) }]
+    };
+    let pool = cell.daemon("world-pool", "first")?;
+    asking.block_on(async { world()?.commit("one", set(1), None).await })?;
+    let (state, backup) = (cell.path("first/world-pool"), cell.path("backup"));
+    ensure!(cell.json(&["state", "backup", &state, &backup])?["through"] == 1);
+    asking.block_on(async { world()?.commit("two", set(2), None).await })?;
+    ensure!(cell.json(&["state", "show", &state])?["records"]["count"] == 2);
+    cell.end(pool)?;
+
+    ensure!(cell.ratn(&["state", "restore", &backup, &cell.path("second/world-pool")])?.0 == Some(0));
+    let pool = cell.daemon("world-pool", "second")?;
+    let (revision, facts) = asking.block_on(async { world()?.root().await })?;
+    ensure!(revision == Revision(1) && facts.len() == 1 && facts[0].value == Value::Int(1), "{revision} {facts:?}");
+    cell.end(pool)
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use crate::command::resource::ResourceArguments;
 use crate::task_control::control::Word;
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use ratn_daemon::resource_manager::Durability;
+use ratn_daemon::config::Durability;
 use ratn_worker::endpoint::Endpoint;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -41,9 +41,9 @@ pub(crate) enum Command {
     /// Copy what a daemon keeps on the disk, put a copy back, or look at it
     State(StateArguments),
     /// Own the resources: who has what, and who waits (host compute)
-    ResourceManager(ResourceManagerArguments),
+    ResourceManager(KeptRoleArguments),
     /// Hold the root world model and its projections (host compute)
-    WorldPool(RoleArguments),
+    WorldPool(KeptRoleArguments),
     /// Spawn and watch this host's worker processes
     ProcessManager(RoleArguments),
     /// Be the simulated cell: robot, table, boxes, sensors, controllers (host sim)
@@ -78,9 +78,9 @@ pub(crate) struct RoleArguments {
     pub(crate) exit_with_parent: bool,
 }
 
-/// What the resource manager takes beside that.
+/// What a daemon that keeps a state takes beside that.
 #[derive(Debug, Clone, Args)]
-pub(crate) struct ResourceManagerArguments {
+pub(crate) struct KeptRoleArguments {
     #[command(flatten)]
     pub(crate) role: RoleArguments,
     /// When an answer may leave: `none` at once, `group` when it is on the disk, `each` likewise with a sync for every change; the
@@ -106,7 +106,7 @@ pub(crate) struct StateArguments {
 pub(crate) enum StateCommand {
     /// Copy a state, also while its daemon runs; holds at least what was acknowledged when it began
     Backup {
-        /// The folder that the daemon keeps it in, as `…/state/resource-manager`
+        /// The folder that the daemon keeps it in, as `…/state/resource-manager` or `…/state/world-pool`
         state: PathBuf,
         /// Where the copy goes: a folder that is empty or not there yet
         target: PathBuf,

@@ -32,6 +32,15 @@ pub(crate) fn retry_later(code: Code, reason: &str, message: impl Into<String>, 
     Status::with_error_details(code, message, details)
 }
 
+/// The state can no longer be written down. It says what to do; asking again helps when that is done.
+pub(crate) fn of_fault(fault: &dyn std::error::Error) -> Status {
+    let mut message = fault.to_string();
+    if let Some(source) = fault.source() {
+        message = format!("{message} ({source})");
+    }
+    status(Code::Unavailable, "STORAGE_FAILED", message)
+}
+
 /// The word for programs; where there is none, the code's.
 pub(crate) fn reason(status: &Status) -> String {
     let details = status.get_error_details();

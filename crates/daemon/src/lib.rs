@@ -2,7 +2,7 @@
 //! (the one task that owns the state; everything else sends it messages), `service.rs` (the gRPC adapter) and `status.rs`
 //! (errors as gRPC statuses).
 //!
-//! What all of them share: [`service`] (who may connect and do what: [`access`], [`audit`]), [`telemetry`], [`metrics`], [`config`], [`supervisor`] and
+//! What all of them share: [`service`] (who may connect and do what: [`access`], [`audit`]), [`telemetry`], [`metrics`], [`config`] (where state is kept, too), [`supervisor`] and
 //! [`reload`].
 //!
 //! Every daemon is one `run(config, directory, shutdown)`, or `run_as` with a [`ratn_worker::server::Serving`]: it listens, publishes `<role>.endpoint` in the runtime directory
@@ -14,8 +14,10 @@ pub mod audit;
 pub mod config;
 mod demand;
 mod details;
+mod journal;
 mod link;
 pub mod metrics;
+mod outbox;
 mod owners;
 pub mod process_manager;
 pub mod reload;

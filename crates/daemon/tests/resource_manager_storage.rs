@@ -3,15 +3,15 @@
 
 mod support;
 
-use nix::mount::{MntFlags, MsFlags, mount, umount2};
-use ratn_daemon::resource_manager::{self, Durability, ResourceManagerConfig, StorageConfig};
+use ratn_daemon::config::{Durability, StorageConfig};
+use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::{Resource, ResourceUpdate};
 use ratn_worker::client::{AcquireOptions, CallError, ResourceClient};
 use ratn_worker::session::Session;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
-use support::{DEADLINE, Daemon, TestSystem, block, in_time};
+use support::{DEADLINE, Daemon, SmallDisk, TestSystem, block, in_time};
 
 const TTL: Duration = Duration::from_secs(60);
 
@@ -85,38 +85,12 @@ async fn a_second_manager_on_the_same_state_is_refused() {
     manager.end().await;
 }
 
-struct SmallDisk(tempfile::TempDir);
-
-impl SmallDisk {
-    /// Nothing where mounting is not allowed.
-    fn mount() -> Option<SmallDisk> {
-        let place = tempfile::tempdir().unwrap();
-        match mount(Some("tmpfs"), place.path(), Some("tmpfs"), MsFlags::empty(), Some("size=256k")) {
-            Ok(()) => Some(SmallDisk(place)),
-            Err(error) => {
-                eprintln!("skipped: cannot mount a small file system ({error}); run it as root");
-                None
-            }
-        }
-    }
-
-    fn ballast(&self) -> PathBuf {
-        self.0.path().join("ballast")
-    }
-}
-
-impl Drop for SmallDisk {
-    fn drop(&mut self) {
-        let _ = umount2(self.0.path(), MntFlags::MNT_DETACH);
-    }
-}
-
 #[tokio::test]
 async fn on_a_full_disk_changes_are_refused_with_what_to_do_and_reading_goes_on() {
     let Some(disk) = SmallDisk::mount() else { return };
     let system = TestSystem::new();
     std::fs::write(disk.ballast(), vec![1; 128 << 10]).unwrap();
-    let directory = disk.0.path().join("state");
+    let directory = disk.path().join("state");
     let manager = system.resource_manager_with(config(&system, &directory, Durability::Group)).await;
     let (session, resources) = client(&system, &manager).await;
     let mut watch = system.watch(&manager, &[]).await;

@@ -31,9 +31,12 @@ pub struct Fact {
 pub struct World {
     store: Store,
     /// `None`: the fact does not hold, whatever the store says.
-    overlay: BTreeMap<Arc<FactKey>, Option<Arc<Fact>>>,
+    overlay: Written,
     revision: Revision,
 }
+
+/// Facts as they are written: `None` is gone. What a list of changes comes to, whatever the changes were.
+pub type Written = BTreeMap<Arc<FactKey>, Option<Arc<Fact>>>;
 
 /// A change that does not apply; the world is as it was before the whole list of changes.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -54,6 +57,15 @@ impl World {
         let mut store = Store::default();
         for (key, value) in facts {
             store.insert(&Arc::new(key), &Arc::new(Fact { value, revision, writer: None }));
+        }
+        World { store, overlay: BTreeMap::new(), revision }
+    }
+
+    /// The world of facts that were written before, each with who wrote it when.
+    pub fn of(facts: impl IntoIterator<Item = (Arc<FactKey>, Arc<Fact>)>, revision: Revision) -> World {
+        let mut store = Store::default();
+        for (key, fact) in facts {
+            store.insert(&key, &fact);
         }
         World { store, overlay: BTreeMap::new(), revision }
     }
@@ -134,6 +146,23 @@ impl World {
         self.revision = revision;
         self.settle();
         Ok(revision)
+    }
+
+    /// What [`World::apply_as`] would write on a root, for those who look at it first: [`World::write`] then makes it so.
+    ///
+    /// # Errors
+    /// As [`World::apply`].
+    pub fn written_by(&self, writer: Option<&str>, changes: &[Change]) -> Result<Written, ChangeError> {
+        debug_assert!(self.overlay.is_empty(), "a root has no overlay");
+        Ok(self.changed(writer, changes)?.overlay)
+    }
+
+    /// The next revision, in which this is written.
+    pub fn write(&mut self, written: &Written) -> Revision {
+        self.overlay.extend(written.iter().map(|(key, fact)| (Arc::clone(key), fact.clone())));
+        self.settle();
+        self.revision = Revision(self.revision.0 + 1);
+        self.revision
     }
 
     /// What the world will be with the changes applied; costs the changes, not the facts.

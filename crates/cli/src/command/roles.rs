@@ -2,12 +2,13 @@
 
 use super::reload::Reloading;
 use super::{blocking, blocking_on};
-use crate::arguments::{ResourceManagerArguments, RoleArguments, WorkerArguments, WorkerKind};
+use crate::arguments::{KeptRoleArguments, RoleArguments, WorkerArguments, WorkerKind};
 use crate::failure::Failure;
 use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::{public_directory, variable};
 use anyhow::Context;
+use ratn_daemon::config::StorageConfig;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::service::LiveAccess;
 use ratn_daemon::supervisor::Supervisor;
@@ -29,16 +30,12 @@ const STATE_VARIABLES: [&str; 2] = ["RATN_STATE_DIR", "STATE_DIRECTORY"];
 const EXIT_PATIENCE: Duration = Duration::from_secs(2);
 
 /// `ratn resource-manager`
-pub(super) fn resource_manager(arguments: &ResourceManagerArguments) -> Result<(), Failure> {
-    let ResourceManagerArguments { role: arguments, durability, state_dir } = arguments;
-    let mut system = SystemConfig::load(arguments.config.as_deref())?;
+pub(super) fn resource_manager(arguments: &KeptRoleArguments) -> Result<(), Failure> {
+    let mut system = SystemConfig::load(arguments.role.config.as_deref())?;
     let config = &mut system.resource_manager;
+    arguments.apply(resource_manager::ROLE, &mut config.storage);
+    let arguments = &arguments.role;
     config.listen = arguments.listen.clone().unwrap_or(config.listen.clone());
-    let storage = &mut config.storage;
-    storage.durability = durability.unwrap_or(storage.durability);
-    let of_this_role = |directory: PathBuf| directory.join(resource_manager::ROLE);
-    let elsewhere = || STATE_VARIABLES.iter().find_map(|name| variable(name)).map(of_this_role);
-    storage.directory = state_dir.clone().map(of_this_role).or(storage.directory.take()).or_else(elsewhere);
     // On one thread requests are handled in the order in which they arrive; task control sends the most urgent first.
     let runtime = tokio::runtime::Builder::new_current_thread();
     daemon_on(runtime, arguments, system, resource_manager::ROLE, async |_, host| {
@@ -47,12 +44,23 @@ pub(super) fn resource_manager(arguments: &ResourceManagerArguments) -> Result<(
 }
 
 /// `ratn world-pool`
-pub(super) fn world_pool(arguments: &RoleArguments) -> Result<(), Failure> {
-    daemon(arguments, world_pool::ROLE, async |system, host| {
+pub(super) fn world_pool(arguments: &KeptRoleArguments) -> Result<(), Failure> {
+    daemon(&arguments.role, world_pool::ROLE, async |system, host| {
         let mut config = system.world_pool;
+        arguments.apply(world_pool::ROLE, &mut config.storage);
         config.listen = host.listen.unwrap_or(config.listen);
         world_pool::run_as(config, host.directory, host.serving, host.shutdown).await
     })
+}
+
+impl KeptRoleArguments {
+    /// What the command line and the environment say of a role's state.
+    fn apply(&self, role: &str, storage: &mut StorageConfig) {
+        storage.durability = self.durability.unwrap_or(storage.durability);
+        let of_this_role = |directory: PathBuf| directory.join(role);
+        let elsewhere = || STATE_VARIABLES.iter().find_map(|name| variable(name)).map(of_this_role);
+        storage.directory = self.state_dir.clone().map(of_this_role).or(storage.directory.take()).or_else(elsewhere);
+    }
 }
 
 /// `ratn process-manager`

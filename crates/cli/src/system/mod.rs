@@ -8,7 +8,7 @@ use crate::task_control::shell::Place;
 use anyhow::Context;
 use config::SystemConfig;
 use launch::Processes;
-use ratn_daemon::resource_manager::{self, Durability};
+use ratn_daemon::config::{Durability, state_directory};
 use ratn_proto::v1::GetGroundTruthRequest;
 use ratn_proto::v1::cell_service_client::CellServiceClient;
 use ratn_worker::client::{Channels, ResourceClient};
@@ -58,10 +58,12 @@ impl System {
         let directory = RuntimeDirectory::create(directory)
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
         let mut config = config;
-        if config.resource_manager.storage.directory.is_none() {
-            // All of it starts and ends together: whose resources these were is gone with the last system that was here.
-            forget_state(&directory)?;
-            config.resource_manager.storage.durability = Durability::None;
+        let kept = [&mut config.resource_manager.storage, &mut config.world_pool.storage];
+        for (role, storage) in ROLES.iter().zip(kept).filter(|(_, storage)| storage.directory.is_none()) {
+            // All of it starts and ends together: whose resources and what world these were is gone with the last system that was
+            // here.
+            forget_state(&directory, role)?;
+            storage.durability = Durability::None;
         }
         let file = directory.path().join(CONFIG_FILE);
         std::fs::write(&file, config.to_toml()?).with_context(|| format!("cannot write {}", file.display()))?;
@@ -123,8 +125,8 @@ impl System {
     }
 }
 
-fn forget_state(directory: &RuntimeDirectory) -> anyhow::Result<()> {
-    let state = resource_manager::state_directory(directory.path());
+fn forget_state(directory: &RuntimeDirectory, role: &str) -> anyhow::Result<()> {
+    let state = state_directory(directory.path()).join(role);
     match std::fs::remove_dir_all(&state) {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
             Err(error).with_context(|| format!("cannot remove {}", state.display()))

@@ -8,12 +8,12 @@
 //! are on the disk. When they cannot be written, every change is refused from then on; what can be read is the state that is
 //! on the disk.
 
-use super::journal::Journal;
-use super::outbox::{Outbox, Outgoing};
-use super::wire;
-use super::{Granted, ResourceManagerConfig, status};
-use crate::details::{ending, retry_later, status as status_with};
+use super::outgoing::Outgoing;
+use super::{Granted, ResourceManagerConfig, journal, status, wire};
+use crate::details::{ending, of_fault, retry_later, status as status_with};
+use crate::journal::Journal;
 use crate::metrics::{self, Amounts};
+use crate::outbox::{Outbox, send_answer};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
@@ -153,7 +153,7 @@ struct Actor {
     journal: Journal,
     /// What came up since the last look at the pool's records, in order.
     outgoing: Vec<Outgoing>,
-    outbox: Outbox,
+    outbox: Outbox<Outgoing>,
     /// Why nothing changes any more.
     stopped: Option<Status>,
     /// Nobody waits in the queue any more.
@@ -421,9 +421,7 @@ impl Actor {
 
     /// Answers when what the answer tells of is on the disk.
     fn reply<T: Send + 'static>(&mut self, answer: Answer<T>, result: Result<T, Status>) {
-        self.outgoing.push(Outgoing::Answer(Box::new(move |stopped| {
-            let _ = answer.send(stopped.map_or(result, |stopped| Err(stopped.clone())));
-        })));
+        self.outgoing.push(Outgoing::Answer(send_answer(answer, result)));
     }
 
     /// As [`Actor::reply`], to one who only looks; without an answer they ask again.
@@ -633,7 +631,7 @@ impl Actor {
 
     /// Nothing changes any more. What was not on the disk has not happened.
     fn stop(&mut self, fault: &dyn std::error::Error) {
-        let stopped = status::of_fault(fault);
+        let stopped = of_fault(fault);
         tracing::error!(fault = stopped.message(), "changes are refused from now on");
         if let Some(metrics) = metrics::get() {
             metrics.journal.failed.set(1);
@@ -655,7 +653,7 @@ impl Actor {
         self.shared.clear();
         // They find a state that may be behind the one they saw coming, and watch again.
         self.watchers.clear();
-        match self.journal.read(self.config.limits.clone()) {
+        match journal::read(&self.journal, self.config.limits.clone()) {
             Ok(pool) => self.pool = pool.with_kinds(self.config.hierarchy()),
             Err(error) => {
                 let error = anyhow::Error::new(error);

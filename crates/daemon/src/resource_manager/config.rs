@@ -1,12 +1,10 @@
 //! The resource manager's config.
 
-use crate::config::{Check, ConfigError, rule};
+use crate::config::{Check, ConfigError, StorageConfig, rule};
 use ratn_resources::{Kinds, Limits};
-use ratn_storage::Durability;
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::time::Duration;
 
 /// All keys are optional.
@@ -29,19 +27,6 @@ pub struct ResourceManagerConfig {
     pub storage: StorageConfig,
 }
 
-/// Where and how the state is kept. All keys are optional.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct StorageConfig {
-    /// A directory of its own; `state/resource-manager` in the runtime directory unless given.
-    pub directory: Option<PathBuf>,
-    /// When an answer may leave: `none` at once, `group` when what it tells of is on the disk (many share a sync), `each` likewise,
-    /// with a sync for every change.
-    pub durability: Durability,
-    /// After so many bytes of changes (and twice as many as the last snapshot had) a snapshot takes their place.
-    pub compact_bytes: u64,
-}
-
 impl Default for ResourceManagerConfig {
     fn default() -> Self {
         ResourceManagerConfig {
@@ -53,12 +38,6 @@ impl Default for ResourceManagerConfig {
             limits: Limits::default(),
             storage: StorageConfig::default(),
         }
-    }
-}
-
-impl Default for StorageConfig {
-    fn default() -> Self {
-        StorageConfig { directory: None, durability: Durability::default(), compact_bytes: 16 << 20 }
     }
 }
 
@@ -84,6 +63,6 @@ impl Check for ResourceManagerConfig {
         rule("max_watchers", self.max_watchers >= 1, "at least 1")?;
         let kinds = Kinds::new(&self.kinds).map(drop).map_err(|cyclic| cyclic.to_string());
         rule("kinds", kinds.is_ok(), kinds.err().unwrap_or_default())?;
-        rule("storage.compact_bytes", self.storage.compact_bytes >= 1 << 16, "at least 65536")
+        self.storage.check()
     }
 }

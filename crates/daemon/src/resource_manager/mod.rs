@@ -3,7 +3,7 @@
 //! ```text
 //!   gRPC call ──▶ service.rs ──message──▶ actor.rs (Pool of ratn-resources, a clock) ──answer, event──▶ service.rs
 //!   session's stream ──▶ stream.rs, whose every message is such a call
-//!   actor.rs ──records──▶ journal.rs (ratn-storage) ──durable──▶ outbox.rs ──▶ what tells of them leaves
+//!   actor.rs ──records──▶ journal.rs (ratn-storage) ──durable──▶ outbox ──▶ what tells of them leaves
 //! ```
 //! After a restart everything that was acknowledged is as it was: resources, leases with their tokens, what was consumed,
 //! answers by request id; sessions and leases with a time of their own have it once more. Who was in the queue asks again.
@@ -11,21 +11,19 @@
 mod actor;
 mod config;
 mod journal;
-mod outbox;
+mod outgoing;
 mod service;
 mod status;
 mod stream;
 mod wire;
 
-pub use config::{ResourceManagerConfig, StorageConfig};
-pub use ratn_storage::Durability;
+pub use config::ResourceManagerConfig;
 
 use anyhow::Context;
 use ratn_model::resource::Lease;
 use ratn_proto::v1::resource_service_server::ResourceServiceServer;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
-use std::path::{Path, PathBuf};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -34,11 +32,6 @@ pub const ROLE: &str = "resource-manager";
 
 /// How an acquire ends.
 type Granted = Result<Lease, tonic::Status>;
-
-/// Where state is kept unless said otherwise: in a runtime directory.
-pub fn state_directory(runtime_directory: &Path) -> PathBuf {
-    runtime_directory.join("state")
-}
 
 /// Serves until `shutdown` is cancelled.
 ///
@@ -63,8 +56,8 @@ pub async fn run_as(
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
     let config = live.borrow().clone();
-    let storage = config.storage.directory.clone().unwrap_or_else(|| state_directory(directory.path()).join(ROLE));
-    let (pool, journal) = journal::Journal::open(&config.storage, &storage, config.limits.clone())?;
+    let storage = config.storage.directory_of(ROLE, directory.path());
+    let (pool, journal) = journal::open(&config.storage, &storage, config.limits.clone())?;
     let kept = (pool.with_kinds(config.hierarchy()), journal);
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();

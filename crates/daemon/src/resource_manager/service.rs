@@ -459,8 +459,7 @@ fn odd_reply(reply: &Reply) -> Status {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
-    use super::super::journal::Journal;
-    use super::super::{ResourceManagerConfig, actor};
+    use super::super::{ResourceManagerConfig, actor, journal};
     use super::*;
     use ratn_model::resource::ResourceClass;
     use tokio::sync::watch;
@@ -468,7 +467,7 @@ mod tests {
     #[tokio::test]
     async fn a_lease_that_two_calls_of_one_request_got_goes_back_when_both_are_dropped() {
         let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
-        let kept = Journal::open(&config.storage, directory.path(), config.limits.clone()).unwrap();
+        let kept = journal::open(&config.storage, directory.path(), config.limits.clone()).unwrap();
         let (actor, _) =
             actor::start(watch::Sender::new(config).subscribe(), kept, Default::default(), Default::default());
         let session = SessionId::from("s");

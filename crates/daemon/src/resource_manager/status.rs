@@ -35,15 +35,6 @@ pub(super) fn of_refusal(refusal: &Refusal) -> Status {
     status(code, reason, format!("not granted: {refusal}"))
 }
 
-/// The state can no longer be written down. It says what to do; asking again helps when that is done.
-pub(super) fn of_fault(fault: &dyn std::error::Error) -> Status {
-    let mut message = fault.to_string();
-    if let Some(source) = fault.source() {
-        message = format!("{message} ({source})");
-    }
-    status(Code::Unavailable, "STORAGE_FAILED", message)
-}
-
 /// For programs `oldest_revision` and `newest_revision`: from between them a watch can go on.
 pub(super) fn of_compacted(compacted: &Compacted) -> Status {
     let known = [("oldest_revision", compacted.oldest), ("newest_revision", compacted.newest)];

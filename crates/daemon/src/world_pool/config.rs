@@ -1,6 +1,6 @@
 //! The world pool's config.
 
-use crate::config::{Check, ConfigError, rule};
+use crate::config::{Check, ConfigError, StorageConfig, rule};
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
 
@@ -20,14 +20,18 @@ pub struct WorldPoolConfig {
     pub kind: String,
     /// Units of its resource: so many projections can be held by leases at once.
     pub capacity: u32,
-    /// So many revisions of the root are kept to project from.
+    /// So many revisions of the root are kept, to project from and to look back at.
     pub revisions_kept: usize,
+    /// And at most so many that have written so many facts together; the root itself is always kept.
+    pub changes_kept: usize,
     /// Projections at once in all, those without a lease included.
     pub max_projections: usize,
     /// A projection whose lease holds no resource ends after this long, in seconds.
     pub unbound_ttl_s: f64,
     /// Commits and projections remembered so that a repeated id is not performed twice.
     pub remembered_requests: usize,
+    /// What is kept over a restart.
+    pub storage: StorageConfig,
 }
 
 impl Default for WorldPoolConfig {
@@ -40,9 +44,11 @@ impl Default for WorldPoolConfig {
             kind: "WorldModel".to_owned(),
             capacity: 64,
             revisions_kept: 4_096,
+            changes_kept: 1_000_000,
             max_projections: 4_096,
             unbound_ttl_s: 600.0,
             remembered_requests: 65_536,
+            storage: StorageConfig::default(),
         }
     }
 }
@@ -54,8 +60,10 @@ impl Check for WorldPoolConfig {
         rule("session_ttl_ms", self.session_ttl_ms >= 100, "at least 100 ms")?;
         rule("capacity", self.capacity >= 1, "at least 1")?;
         rule("revisions_kept", self.revisions_kept >= 1, "at least 1")?;
+        rule("changes_kept", self.changes_kept >= 1, "at least 1")?;
         rule("max_projections", self.max_projections >= 1, "at least 1")?;
         rule("unbound_ttl_s", (1.0..=86_400.0).contains(&self.unbound_ttl_s), "from 1 s to a day")?;
-        rule("remembered_requests", self.remembered_requests >= 1, "at least 1")
+        rule("remembered_requests", self.remembered_requests >= 1, "at least 1")?;
+        self.storage.check()
     }
 }

@@ -1,23 +1,24 @@
-//! The root world, the revisions that can be projected from, and the projections: a pure state machine.
+//! The root's history and the projections of it: a pure state machine.
 //!
 //! A projection is a clone of a kept revision with its changes applied, so it costs its effects, whatever the size of the
-//! world. It shows its declared reads and nothing else, and it ends with its lease.
+//! world. It shows its declared reads and nothing else, and it ends with its lease. The history is durable, projections are not: they
+//! end with the process, and no later one has the id of an earlier one.
 
 use super::WorldPoolConfig;
+use super::history::{CommitError, History, RevisionError};
+use super::memory::{Memory, Reused, fingerprint};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
 use ratn_model::time::Timestamp;
 use ratn_world::world::{ChangeError, Fact, World};
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 /// The pool's whole state.
 #[derive(Debug)]
 pub(super) struct WorldPool {
     config: WorldPoolConfig,
-    /// The last of them is the root.
-    revisions: VecDeque<World>,
-    commits: Memory<Revision>,
+    pub(super) history: History,
     projections: BTreeMap<ProjectionId, Projection>,
     projected: Memory<ProjectionId>,
     by_lease: BTreeMap<LeaseId, BTreeSet<ProjectionId>>,
@@ -52,22 +53,13 @@ pub(super) struct ProjectRequest {
     pub(super) held_by: HeldBy,
 }
 
-/// A commit that was not made; the root is as it was.
-#[derive(Debug, PartialEq, thiserror::Error)]
-pub(super) enum CommitError {
-    #[error("the root is at revision {root}: a commit makes {next}, not {expected}; read the root again")]
-    Revision { root: u64, next: u64, expected: u64 },
-    #[error(transparent)]
-    Change(#[from] ChangeError),
-}
-
 /// A projection that was not made.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub(super) enum ProjectError {
-    #[error("the root is at revision {root}: there is no revision {base} yet")]
-    Future { root: u64, base: u64 },
-    #[error("revision {base} is no longer kept, the oldest is {oldest}; project from a later one")]
-    Forgotten { base: u64, oldest: u64 },
+    #[error(transparent)]
+    Revision(#[from] RevisionError),
+    #[error(transparent)]
+    Reused(#[from] Reused),
     #[error(transparent)]
     Change(#[from] ChangeError),
     #[error("{limit} projections exist: release some")]
@@ -86,21 +78,20 @@ pub(super) enum QueryError {
 }
 
 impl WorldPool {
-    pub(super) fn new(config: WorldPoolConfig) -> WorldPool {
+    /// Projections get ids above `floor`.
+    pub(super) fn new(config: WorldPoolConfig, history: History, floor: u64) -> WorldPool {
         WorldPool {
-            revisions: VecDeque::from([World::default()]),
-            commits: Memory::new(config.remembered_requests),
+            history,
             projections: BTreeMap::new(),
             projected: Memory::new(config.remembered_requests),
             by_lease: BTreeMap::new(),
-            last_projection: 0,
+            last_projection: floor,
             config,
         }
     }
 
     pub(super) fn root(&self) -> &World {
-        // One revision is always kept.
-        &self.revisions[self.revisions.len() - 1]
+        self.history.root()
     }
 
     /// All changes as the next revision, or none. An id committed before gets its answer again.
@@ -110,48 +101,37 @@ impl WorldPool {
         changes: &[Change],
         expected: Option<Revision>,
     ) -> Result<Revision, CommitError> {
-        if let Some(revision) = self.commits.get(id) {
-            return Ok(*revision);
+        self.history.commit(id, changes, expected)
+    }
+
+    /// Another history instead, which may be behind: what was projected from later revisions ends.
+    pub(super) fn replace_history(&mut self, history: History) {
+        self.history = history;
+        let root = self.root().revision();
+        let ahead = self.projections.iter().filter(|(_, projection)| projection.base > root);
+        let ahead: Vec<ProjectionId> = ahead.map(|(id, _)| *id).collect();
+        for id in ahead {
+            self.release(id);
         }
-        let (root, next) = (self.root().revision().0, self.root().revision().0 + 1);
-        if let Some(expected) = expected.filter(|expected| expected.0 != next) {
-            return Err(CommitError::Revision { root, next, expected: expected.0 });
-        }
-        let mut world = self.root().clone();
-        let revision = world.apply(changes)?;
-        self.revisions.push_back(world);
-        while self.revisions.len() > self.config.revisions_kept {
-            self.revisions.pop_front();
-        }
-        self.commits.insert(id, revision);
-        Ok(revision)
     }
 
     /// The world at a revision with changes applied. A request made before gets its answer again, as long as it lives.
     pub(super) fn project(&mut self, request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
-        if let Some(id) = self.projected.get(&request.request_id) {
+        let fingerprint = fingerprint(&(request.base, &request.changes, &request.reads));
+        if let Some(id) = self.projected.recall(&request.request_id, fingerprint)? {
             let ended = || ProjectError::Ended { request_id: request.request_id.clone() };
-            return self.projections.contains_key(id).then_some(*id).ok_or_else(ended);
+            return self.projections.contains_key(&id).then_some(id).ok_or_else(ended);
         }
         if self.projections.len() >= self.config.max_projections {
             return Err(ProjectError::TooMany { limit: self.config.max_projections });
         }
-        let (root, oldest) = (self.root().revision().0, self.revisions[0].revision().0);
-        let base = request.base.0;
-        if base > root {
-            return Err(ProjectError::Future { root, base });
-        }
-        let below = base
-            .checked_sub(oldest)
-            .and_then(|index| self.revisions.get(usize::try_from(index).ok()?))
-            .ok_or(ProjectError::Forgotten { base, oldest })?;
-        let world = below.project(&request.changes)?;
+        let world = self.history.at(request.base)?.project(&request.changes)?;
         self.last_projection += 1;
         let id = ProjectionId(self.last_projection);
         if let HeldBy::Lease(lease) = request.held_by {
             self.by_lease.entry(lease).or_default().insert(id);
         }
-        self.projected.insert(&request.request_id, id);
+        self.projected.insert(&request.request_id, fingerprint, id);
         let projection = Projection {
             world,
             base: request.base,
@@ -238,36 +218,6 @@ impl WorldPool {
     }
 }
 
-/// The answers given, by id; bounded, the oldest forgotten first.
-#[derive(Debug)]
-struct Memory<T> {
-    answers: BTreeMap<String, T>,
-    order: VecDeque<String>,
-    limit: usize,
-}
-
-impl<T> Memory<T> {
-    fn new(limit: usize) -> Memory<T> {
-        Memory { answers: BTreeMap::new(), order: VecDeque::new(), limit }
-    }
-
-    fn get(&self, id: &str) -> Option<&T> {
-        if id.is_empty() { None } else { self.answers.get(id) }
-    }
-
-    fn insert(&mut self, id: &str, answer: T) {
-        if id.is_empty() || self.answers.insert(id.to_owned(), answer).is_some() {
-            return;
-        }
-        self.order.push_back(id.to_owned());
-        if self.order.len() > self.limit
-            && let Some(oldest) = self.order.pop_front()
-        {
-            self.answers.remove(&oldest);
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
@@ -284,7 +234,9 @@ mod tests {
     }
 
     fn pool() -> WorldPool {
-        WorldPool::new(WorldPoolConfig { revisions_kept: 3, max_projections: 2, ..WorldPoolConfig::default() })
+        let config = WorldPoolConfig { revisions_kept: 3, max_projections: 2, ..WorldPoolConfig::default() };
+        let history = History::new(&config);
+        WorldPool::new(config, history, 0)
     }
 
     fn project(pool: &mut WorldPool, request: &str, base: u64, lease: u64) -> Result<ProjectionId, ProjectError> {
@@ -359,8 +311,8 @@ mod tests {
         for i in 1..=4 {
             pool.commit(&i.to_string(), &[set("box", i)], None).unwrap();
         }
-        assert_eq!(project(&mut pool, "p", 1, 1), Err(ProjectError::Forgotten { base: 1, oldest: 2 }));
-        assert_eq!(project(&mut pool, "p", 5, 1), Err(ProjectError::Future { root: 4, base: 5 }));
+        assert_eq!(project(&mut pool, "p", 1, 1), Err(RevisionError::Forgotten { wanted: 1, oldest: 2 }.into()));
+        assert_eq!(project(&mut pool, "p", 5, 1), Err(RevisionError::Future { root: 4, wanted: 5 }.into()));
         assert!(project(&mut pool, "p", 2, 1).is_ok(), "a refused request can be asked again");
     }
 

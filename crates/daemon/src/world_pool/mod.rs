@@ -3,18 +3,24 @@
 //!
 //! ```text
 //!   gRPC call ──▶ service.rs ──message──▶ actor.rs (core.rs) ◀──leases that live── leases.rs ◀──watch── resource manager
+//!   core.rs (history.rs) ──commits──▶ journal (ratn-storage) ──durable──▶ outbox ──▶ what tells of them leaves
 //! ```
+//! After a restart the root, its revisions and the commit ids are as they were when the last answer left; projections have ended.
 //! Which effects are projected, and when they become real, is task control's business.
 
 mod actor;
 mod config;
 mod core;
+mod history;
 mod leases;
+mod memory;
+mod record;
 mod service;
 mod status;
 
 pub use config::WorldPoolConfig;
 
+use crate::journal::Journal;
 use crate::link::{Link, Manager};
 use anyhow::Context;
 use ratn_model::resource::ResourceClass;
@@ -32,7 +38,7 @@ pub const ROLE: &str = "world-pool";
 /// Serves until `shutdown` is cancelled.
 ///
 /// # Errors
-/// Where it cannot listen or publish its endpoint, or where serving fails.
+/// Where its state cannot be had, where it cannot listen or publish its endpoint, or where serving fails.
 pub async fn run(
     config: WorldPoolConfig,
     directory: RuntimeDirectory,
@@ -51,6 +57,9 @@ pub async fn run_as(
     serving: Serving,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
+    let storage = config.storage.directory_of(ROLE, directory.path());
+    let restore = |recovered| history::History::restore(recovered, &config);
+    let kept = Journal::open(ROLE, &config.storage, &storage, restore)?;
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let manager = Manager { configured: config.resource_manager.clone(), directory: directory.clone() };
@@ -72,7 +81,7 @@ pub async fn run_as(
     let linked = tokio::spawn(link.keep(over.clone()));
     let (live, leases) = watch::channel(leases::LiveLeases::default());
     tokio::spawn(over.clone().run_until_cancelled_owned(leases::follow(manager, live)));
-    let actor = actor::start(config, leases.clone(), over.clone());
+    let (actor, ended) = actor::start(config, kept, leases.clone(), over.clone());
     let service = WorldPoolServiceServer::new(service::Service { actor, leases })
         .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
@@ -80,7 +89,9 @@ pub async fn run_as(
     tracing::info!(%endpoint, "{ROLE} is ready");
     let served = bound.serve_as(Services::new().with(service), serving, shutdown).await;
     drop(published);
+    // What was still to be written is on the disk when this has ended.
     over.cancel();
+    let _ = ended.await;
     let _ = linked.await;
     Ok(served?)
 }

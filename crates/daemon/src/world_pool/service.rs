@@ -2,7 +2,6 @@
 
 use super::actor::{Handle, Message, NewProjection};
 use super::leases::{Known, LiveLeases};
-use super::status;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
 use ratn_proto::convert::{all, each, label, name, required};
@@ -37,8 +36,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let id = request.commit_id;
         let changes = each(request.changes, "changes")?;
         let expected = (request.revision != 0).then_some(Revision(request.revision));
-        let committed = self.actor.ask(|answer| Message::Commit { id, changes, expected, answer }).await?;
-        let revision = committed.map_err(|error| status::of_commit(&error))?;
+        let revision = self.actor.ask(|answer| Message::Commit { id, changes, expected, answer }).await?;
         Ok(Response::new(v1::CommitResponse { revision: revision.0 }))
     }
 
@@ -59,7 +57,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             // In vain for a lease that holds nothing: the actor knows what to do with that.
             let _ = tokio::time::timeout(LEASE_PATIENCE, told).await;
         }
-        let id = self.actor.ask(|answer| Message::Project { projection, answer }).await??;
+        let id = self.actor.ask(|answer| Message::Project { projection, answer }).await?;
         Ok(Response::new(v1::ProjectResponse { projection_id: id.0 }))
     }
 
@@ -67,8 +65,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let request = request.into_inner();
         let projection = request.projection_id.map(ProjectionId);
         let patterns = each(request.patterns, "patterns")?;
-        let answered = self.actor.ask(|answer| Message::Query { projection, patterns, answer }).await?;
-        let (facts, revision) = answered.map_err(|error| status::of_query(&error))?;
+        let (facts, revision) = self.actor.ask(|answer| Message::Query { projection, patterns, answer }).await?;
         Ok(Response::new(v1::QueryResponse { facts: all(facts.into_iter().map(record)), revision: revision.0 }))
     }
 

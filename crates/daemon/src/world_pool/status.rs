@@ -1,6 +1,7 @@
 //! The world pool's errors as gRPC statuses.
 
-use super::core::{CommitError, ProjectError, QueryError};
+use super::core::{ProjectError, QueryError};
+use super::history::{CommitError, RevisionError};
 use crate::details::{retry_later, status};
 use ratn_model::id::LeaseId;
 use std::time::Duration;
@@ -10,17 +11,26 @@ use tonic::{Code, Status};
 const RETRY_DELAY: Duration = Duration::from_millis(200);
 
 pub(super) fn of_commit(error: &CommitError) -> Status {
-    let reason = match error {
-        CommitError::Revision { .. } => "WRONG_REVISION",
-        CommitError::Change(_) => "CHANGE_DOES_NOT_APPLY",
+    let (code, reason) = match error {
+        CommitError::Revision { .. } => (Code::FailedPrecondition, "WRONG_REVISION"),
+        CommitError::Change(_) => (Code::FailedPrecondition, "CHANGE_DOES_NOT_APPLY"),
+        CommitError::Reused(_) => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
     };
-    status(Code::FailedPrecondition, reason, error.to_string())
+    status(code, reason, error.to_string())
+}
+
+pub(super) fn of_revision(error: RevisionError) -> Status {
+    let (code, reason) = match error {
+        RevisionError::Future { .. } => (Code::FailedPrecondition, "NO_SUCH_REVISION"),
+        RevisionError::Forgotten { .. } => (Code::OutOfRange, "REVISION_FORGOTTEN"),
+    };
+    status(code, reason, error.to_string())
 }
 
 pub(super) fn of_project(error: &ProjectError) -> Status {
     let (code, reason) = match error {
-        ProjectError::Future { .. } => (Code::FailedPrecondition, "NO_SUCH_REVISION"),
-        ProjectError::Forgotten { .. } => (Code::OutOfRange, "REVISION_FORGOTTEN"),
+        ProjectError::Revision(error) => return of_revision(*error),
+        ProjectError::Reused(_) => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
         ProjectError::Change(_) => (Code::FailedPrecondition, "CHANGE_DOES_NOT_APPLY"),
         ProjectError::Ended { .. } => (Code::FailedPrecondition, "PROJECTION_ENDED"),
         ProjectError::TooMany { .. } => {

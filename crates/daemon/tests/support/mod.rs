@@ -1,6 +1,7 @@
 //! A system of daemons inside a test, on Unix sockets in a directory of its own.
 #![allow(clippy::unwrap_used, dead_code, reason = "a test may panic; not every test file uses everything")]
 
+use nix::mount::{MntFlags, MsFlags, mount, umount2};
 use ratn_daemon::{process_manager, resource_manager, world_pool};
 use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_proto::types::{ResourceEvent, ResourceEventKind, ResourceUpdate};
@@ -9,6 +10,7 @@ use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
 use std::future::Future;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -57,14 +59,20 @@ impl TestSystem {
         self.started(resource_manager::ROLE, shutdown, run).await
     }
 
-    pub(crate) async fn world_pool(&self, capacity: u32) -> Daemon {
-        let config = world_pool::WorldPoolConfig {
+    pub(crate) fn world_pool_config(&self) -> world_pool::WorldPoolConfig {
+        world_pool::WorldPoolConfig {
             listen: self.directory.socket("wp"),
             host: "compute".to_owned(),
             session_ttl_ms: 1_000,
-            capacity,
             ..Default::default()
-        };
+        }
+    }
+
+    pub(crate) async fn world_pool(&self, capacity: u32) -> Daemon {
+        self.world_pool_with(world_pool::WorldPoolConfig { capacity, ..self.world_pool_config() }).await
+    }
+
+    pub(crate) async fn world_pool_with(&self, config: world_pool::WorldPoolConfig) -> Daemon {
         let shutdown = CancellationToken::new();
         let run = world_pool::run(config, self.directory.clone(), shutdown.clone());
         self.started(world_pool::ROLE, shutdown, run).await
@@ -164,4 +172,36 @@ pub(crate) async fn in_time<T>(future: impl Future<Output = T>) -> T {
 
 pub(crate) fn block(kind: &str) -> Requirement {
     Requirement::new(ResourceOperation::Block, kind)
+}
+
+/// A file system that is soon full.
+pub(crate) struct SmallDisk(tempfile::TempDir);
+
+impl SmallDisk {
+    /// Nothing where mounting is not allowed.
+    pub(crate) fn mount() -> Option<SmallDisk> {
+        let place = tempfile::tempdir().unwrap();
+        match mount(Some("tmpfs"), place.path(), Some("tmpfs"), MsFlags::empty(), Some("size=256k")) {
+            Ok(()) => Some(SmallDisk(place)),
+            Err(error) => {
+                eprintln!("skipped: cannot mount a small file system ({error}); run it as root");
+                None
+            }
+        }
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        self.0.path()
+    }
+
+    /// A file to fill it with.
+    pub(crate) fn ballast(&self) -> PathBuf {
+        self.0.path().join("ballast")
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = umount2(self.0.path(), MntFlags::MNT_DETACH);
+    }
 }

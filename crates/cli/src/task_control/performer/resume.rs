@@ -28,8 +28,8 @@ pub(in crate::task_control) async fn check_world(
     let (root, _) = patiently(Attempts::IDEMPOTENT, || world.root()).await?;
     if root < ledger.first_revision {
         bail!(
-            "the world pool's root is at {root}, and the run began at {}: the world pool has been restarted, and what the \
-               run knew is lost; run the task again",
+            "the world pool's root is at {root}, and the run began at {}: the world pool has lost its \
+               state, or has another's, and what the run knew is gone; run the task again",
             ledger.first_revision
         );
     }

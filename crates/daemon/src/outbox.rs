@@ -1,0 +1,55 @@
+//! What an actor has to say, held back until what it tells of is on the disk. In order: nothing overtakes.
+//!
+//! An answer waits for the last entry written before it was made, also when it changed nothing itself: it may tell of what others
+//! changed.
+
+use ratn_storage::Position;
+use std::collections::VecDeque;
+use tokio::sync::oneshot;
+use tonic::Status;
+
+/// With so much held back an actor takes on nothing new: the disk does not keep up.
+pub(crate) const MOST_HELD: usize = 16_384;
+
+/// Sends an answer, or a status instead of it.
+pub(crate) type SendAnswer = Box<dyn FnOnce(Option<&Status>) + Send>;
+
+/// Answers that can be held back, until it is known whether what they tell of is on the disk.
+pub(crate) fn send_answer<T: Send + 'static>(
+    answer: oneshot::Sender<Result<T, Status>>,
+    result: Result<T, Status>,
+) -> SendAnswer {
+    Box::new(move |refused| drop(answer.send(refused.map_or(result, |status| Err(status.clone())))))
+}
+
+/// What leaves, in order.
+#[derive(Debug)]
+pub(crate) struct Outbox<T> {
+    held: VecDeque<(Position, T)>,
+}
+
+impl<T> Outbox<T> {
+    /// Puts it behind all others.
+    pub(crate) fn hold(&mut self, position: Position, outgoing: T) {
+        self.held.push_back((position, outgoing));
+    }
+
+    /// What the first waits for.
+    pub(crate) fn waits_for(&self) -> Option<Position> {
+        self.held.front().map(|(position, _)| *position)
+    }
+
+    pub(crate) fn take(&mut self) -> Option<T> {
+        self.held.pop_front().map(|(_, outgoing)| outgoing)
+    }
+
+    pub(crate) fn is_full(&self) -> bool {
+        self.held.len() >= MOST_HELD
+    }
+}
+
+impl<T> Default for Outbox<T> {
+    fn default() -> Outbox<T> {
+        Outbox { held: VecDeque::new() }
+    }
+}

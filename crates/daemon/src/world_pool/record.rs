@@ -1,0 +1,151 @@
+//! The root's history as bytes: entries of the log, and the snapshot that stands for them.
+//!
+//! A commit is written down as what it came to (which facts hold which values, which are gone), never as what was asked: nothing is
+//! computed again when it is read.
+
+use ratn_model::fact::{FactKey, FactPattern, Term};
+use ratn_model::id::Revision;
+use ratn_model::value::Value;
+use ratn_world::world::Fact;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+/// The version that is written, the first byte. Variants and fields are only ever added at the end; whatever else changes takes a
+/// new number.
+const FORMAT: u8 = 1;
+
+/// One commit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct CommitRecord {
+    pub(super) revision: u64,
+    pub(super) id: String,
+    pub(super) fingerprint: u128,
+    /// What matches is gone, unless it is among the facts below.
+    pub(super) deleted: Vec<PatternRecord>,
+    pub(super) written: Vec<FactRecord>,
+}
+
+/// The oldest revision that is kept, the commits since, and the answers that are remembered, the oldest first.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct SnapshotRecord {
+    pub(super) revision: u64,
+    pub(super) facts: Vec<FactRecord>,
+    pub(super) commits: Vec<CommitRecord>,
+    pub(super) remembered: Vec<(String, u128, u64)>,
+}
+
+/// A fact with who wrote it when.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct FactRecord {
+    predicate: String,
+    arguments: Vec<TermRecord>,
+    value: Value,
+    revision: u64,
+    writer: Option<Arc<str>>,
+}
+
+/// A pattern over keys.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct PatternRecord {
+    predicate: String,
+    arguments: Vec<Option<TermRecord>>,
+}
+
+/// An argument; of itself it does not say in its bytes which kind it is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+enum TermRecord {
+    Int(i64),
+    Name(String),
+}
+
+/// Bytes that are no records, or of a version that is not known here.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(super) enum DecodeError {
+    #[error(
+        "format {found} of the world pool's records is not known (this is {FORMAT}): use the version that wrote it"
+    )]
+    Version { found: u8 },
+    #[error("these are no records of a world pool: {reason}")]
+    Broken { reason: String },
+}
+
+pub(super) fn encode<T: Serialize>(value: &T) -> Vec<u8> {
+    // Nothing that is written here can fail to serialise: no maps of unknown length, no foreign types.
+    postcard::to_extend(value, vec![FORMAT]).unwrap_or_default()
+}
+
+pub(super) fn decode<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<T, DecodeError> {
+    let broken = |reason: String| DecodeError::Broken { reason };
+    let (version, rest) = bytes.split_first().ok_or_else(|| broken("no bytes".to_owned()))?;
+    if *version != FORMAT {
+        return Err(DecodeError::Version { found: *version });
+    }
+    let (value, rest) = postcard::take_from_bytes(rest).map_err(|error| broken(error.to_string()))?;
+    if rest.is_empty() { Ok(value) } else { Err(broken(format!("{} bytes too many", rest.len()))) }
+}
+
+impl FactRecord {
+    pub(super) fn new(key: &FactKey, fact: &Fact) -> FactRecord {
+        FactRecord {
+            predicate: key.predicate.clone(),
+            arguments: key.arguments.iter().map(TermRecord::new).collect(),
+            value: fact.value.clone(),
+            revision: fact.revision.0,
+            writer: fact.writer.clone(),
+        }
+    }
+
+    /// The fact; writers of the same name share it.
+    pub(super) fn into_fact(self, names: &mut Names) -> (Arc<FactKey>, Arc<Fact>) {
+        let arguments = self.arguments.into_iter().map(TermRecord::into_term).collect();
+        let key = FactKey { predicate: self.predicate, arguments };
+        let writer = self.writer.map(|name| names.share(name));
+        (Arc::new(key), Arc::new(Fact { value: self.value, revision: Revision(self.revision), writer }))
+    }
+}
+
+impl PatternRecord {
+    pub(super) fn new(pattern: &FactPattern) -> PatternRecord {
+        let argument = |term: &Option<Term>| term.as_ref().map(TermRecord::new);
+        PatternRecord {
+            predicate: pattern.predicate.clone(),
+            arguments: pattern.arguments.iter().map(argument).collect(),
+        }
+    }
+
+    pub(super) fn into_pattern(self) -> FactPattern {
+        let argument = |term: Option<TermRecord>| term.map(TermRecord::into_term);
+        FactPattern { predicate: self.predicate, arguments: self.arguments.into_iter().map(argument).collect() }
+    }
+}
+
+impl TermRecord {
+    fn new(term: &Term) -> TermRecord {
+        match term {
+            Term::Int(whole) => TermRecord::Int(*whole),
+            Term::Name(name) => TermRecord::Name(name.clone()),
+        }
+    }
+
+    fn into_term(self) -> Term {
+        match self {
+            TermRecord::Int(whole) => Term::Int(whole),
+            TermRecord::Name(name) => Term::Name(name),
+        }
+    }
+}
+
+/// Names that many facts share.
+#[derive(Debug, Default)]
+pub(super) struct Names(BTreeSet<Arc<str>>);
+
+impl Names {
+    fn share(&mut self, name: Arc<str>) -> Arc<str> {
+        if let Some(known) = self.0.get(&name) {
+            return Arc::clone(known);
+        }
+        self.0.insert(Arc::clone(&name));
+        name
+    }
+}
