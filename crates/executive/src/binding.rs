@@ -1,7 +1,7 @@
 //! Evaluating a state's expressions in a scope: inputs, requirements, preconditions.
 
 use ratn_model::expression::{EvaluateError, Expr, Lookup, Scope};
-use ratn_model::fact::{FactPattern, Footprint};
+use ratn_model::fact::{FactKey, FactPattern, Footprint};
 use ratn_model::id::StateId;
 use ratn_model::program::{ResourceExpr, State};
 use ratn_model::resource::Requirement;
@@ -55,6 +55,14 @@ impl Scope for Bindings<'_> {
             Some((_, fact)) => Lookup::Holds(Cow::Owned(fact.value.clone())),
             None => Lookup::Absent,
         }
+    }
+
+    fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
+        if self.unknown.overlaps(&Footprint::Patterns(vec![pattern.clone()])) {
+            return false;
+        }
+        self.world.each_fact(pattern, visit);
+        true
     }
 }
 

@@ -7,6 +7,7 @@
 //! - [`evaluate`]: expression → value; [`function`] holds the built-ins
 //! - [`bind`]: facts, effects and resources with their arguments evaluated; which facts an effect may write
 //! - [`parse`]: text → expression
+//! - [`query`]: conditions over facts, with variables
 //! - [`walk`]: what an expression mentions
 //! - [`display`]: back to text, for messages
 
@@ -15,6 +16,7 @@ pub mod display;
 pub mod evaluate;
 pub mod function;
 pub mod parse;
+pub mod query;
 pub mod scope;
 mod token;
 pub mod walk;
@@ -57,6 +59,10 @@ pub enum Expr {
     Fact(FactExpr),
     /// `exists predicate(a, ?)`: whether a fact matches.
     Exists(FactExpr),
+    /// `exists (condition, …)`: whether the query has an answer.
+    Query(Vec<Expr>),
+    /// `?name`: a variable of the query around.
+    Unknown(String),
     /// `not a`, `-a`
     Unary(UnaryOperator, Box<Expr>),
     /// `a + b`, `a and b`, `a = b`, `a in b`, …

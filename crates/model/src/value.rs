@@ -2,6 +2,7 @@
 
 use crate::pose::Pose;
 use serde::{Deserialize, Serialize};
+use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::fmt;
 
@@ -114,6 +115,62 @@ impl Value {
             Value::Int(i) => Some(*i as f64),
             Value::Float(f) => Some(*f),
             _ => None,
+        }
+    }
+
+    /// An order of all values, whatever they are: kinds in the order of [`Value`] (but numbers among numbers), then content.
+    pub fn total_order(&self, other: &Value) -> Ordering {
+        let kind = |value: &Value| match value {
+            Value::Null => 0,
+            Value::Bool(_) => 1,
+            Value::Int(_) | Value::Float(_) => 2,
+            Value::String(_) => 3,
+            Value::Pose(_) => 4,
+            Value::Joints(_) => 5,
+            Value::Trajectory(_) => 6,
+            Value::List(_) => 7,
+            Value::Map(_) => 8,
+            Value::Bytes(_) => 9,
+        };
+        let floats = |a: &[f64], b: &[f64]| {
+            let differing = a.iter().zip(b).map(|(x, y)| x.total_cmp(y)).find(|order| order.is_ne());
+            differing.unwrap_or(a.len().cmp(&b.len()))
+        };
+        match (self, other) {
+            (Value::Bool(a), Value::Bool(b)) => a.cmp(b),
+            (Value::Int(a), Value::Int(b)) => a.cmp(b),
+            (Value::String(a), Value::String(b)) => a.cmp(b),
+            (Value::Bytes(a), Value::Bytes(b)) => a.cmp(b),
+            (Value::Pose(a), Value::Pose(b)) => {
+                floats(&a.position, &b.position).then_with(|| floats(&a.quaternion_xyzw, &b.quaternion_xyzw))
+            }
+            (Value::Joints(a), Value::Joints(b)) => floats(a, b),
+            (Value::Trajectory(a), Value::Trajectory(b)) => a.joints.cmp(&b.joints).then_with(|| {
+                let points = a.points.iter().zip(&b.points).map(|(p, q)| {
+                    let times = p.time_s.total_cmp(&q.time_s);
+                    times
+                        .then_with(|| floats(&p.positions, &q.positions))
+                        .then_with(|| floats(&p.velocities, &q.velocities))
+                });
+                let mut differing = points.filter(|order| order.is_ne());
+                differing.next().unwrap_or(a.points.len().cmp(&b.points.len()))
+            }),
+            (Value::List(a), Value::List(b)) => {
+                let mut differing = a.iter().zip(b).map(|(a, b)| a.total_order(b)).filter(|order| order.is_ne());
+                differing.next().unwrap_or(a.len().cmp(&b.len()))
+            }
+            (Value::Map(a), Value::Map(b)) => {
+                let fields = a.iter().zip(b).map(|((n, a), (m, b))| n.cmp(m).then_with(|| a.total_order(b)));
+                let mut differing = fields.filter(|order| order.is_ne());
+                differing.next().unwrap_or(a.len().cmp(&b.len()))
+            }
+            (a, b) => match (a.as_number(), b.as_number()) {
+                // An int and a float that are one number are still told apart.
+                (Some(x), Some(y)) => {
+                    x.total_cmp(&y).then_with(|| matches!(a, Value::Float(_)).cmp(&matches!(b, Value::Float(_))))
+                }
+                _ => kind(a).cmp(&kind(b)),
+            },
         }
     }
 

@@ -2,7 +2,7 @@
 //! derived from facts.
 //!
 //! A [`world::World`] is an overlay of changes over a shared, indexed store: a projection is a clone (constant time) plus its
-//! effects, whatever the number of facts. Which effects are applied when is the executive's business.
+//! effects, whatever the number of facts. Which effects are applied when is the executive's business. A [`query::Query`] asks it.
 //!
 //! What it costs (`cargo bench -p ratn-world`, medians of one run on two busy cores, all indexes counted):
 //!
@@ -18,6 +18,7 @@
 //! Scattered lookups are above the 0.1 µs aimed at; where their time goes has not been measured.
 
 mod functional;
+pub mod query;
 pub mod scene;
 mod store;
 pub mod world;

@@ -72,9 +72,9 @@ impl Store {
         self.in_order.iter().map(|(key, fact)| (key.as_ref(), fact.as_ref()))
     }
 
-    /// The facts that match, in the order of keys, by the index that narrows most by position: a whole key, the leading arguments,
-    /// a later argument, the predicate.
-    pub(crate) fn matching<'a>(
+    /// The facts that match, and what the index cannot tell from them, in the order of keys; by the index that narrows most by
+    /// position: a whole key, the leading arguments, a later argument, the predicate.
+    pub(crate) fn candidates<'a>(
         &'a self,
         pattern: &'a FactPattern,
     ) -> Box<dyn Iterator<Item = (&'a FactKey, &'a Fact)> + 'a> {
@@ -94,14 +94,11 @@ impl Store {
                         && entry.key.predicate == pattern.predicate
                         && entry.key.arguments.get(position) == Some(argument)
                 };
-                let matching = keys.take_while(same).filter(|entry| pattern.matches(&entry.key));
-                Box::new(matching.filter_map(|entry| Some((entry.key.as_ref(), self.get(&entry.key)?))))
+                Box::new(keys.take_while(same).filter_map(|entry| Some((entry.key.as_ref(), self.get(&entry.key)?))))
             }
             _ => {
                 let facts = self.in_order.range::<_, FactKey>(first..);
-                let matching = facts
-                    .take_while(move |(key, _)| begins_as(key, pattern, bound))
-                    .filter(|(key, _)| pattern.matches(key));
+                let matching = facts.take_while(move |(key, _)| begins_as(key, pattern, bound));
                 Box::new(matching.map(|(key, fact)| (key.as_ref(), fact.as_ref())))
             }
         }

@@ -116,6 +116,10 @@ impl World {
     /// The facts that match, in the order of keys; costs what matches where the whole key, its leading arguments (the subject) or
     /// one later argument (the object) narrow it.
     pub fn matching<'a>(&'a self, pattern: &'a FactPattern) -> impl Iterator<Item = (&'a FactKey, &'a Fact)> {
+        self.merged(pattern).filter(|(key, _)| pattern.matches(key))
+    }
+
+    fn merged<'a>(&'a self, pattern: &'a FactPattern) -> impl Iterator<Item = (&'a FactKey, &'a Fact)> {
         let first = first_of(pattern);
         let bound = first.arguments.len();
         let overlay = self
@@ -124,7 +128,17 @@ impl World {
             .take_while(move |(key, _)| begins_as(key, pattern, bound))
             .filter(|(key, _)| pattern.matches(key))
             .map(|(key, fact)| (key.as_ref(), fact.as_deref()));
-        Merged { below: self.store.matching(pattern).peekable(), above: overlay.peekable() }
+        Merged { below: self.store.candidates(pattern).peekable(), above: overlay.peekable() }
+    }
+
+    /// Visits the facts that match, in the order of keys, until told to stop, and what the index cannot tell from them: whoever
+    /// counts what is visited knows the cost.
+    pub fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) {
+        if self.overlay.is_empty() {
+            self.store.candidates(pattern).all(|(key, fact)| visit(key, &fact.value));
+        } else {
+            self.merged(pattern).all(|(key, fact)| visit(key, &fact.value));
+        }
     }
 
     /// Applies all changes as one new revision, or none of them.

@@ -450,6 +450,22 @@ impl Scope for View<'_> {
             },
         }
     }
+
+    fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
+        let footprint = Footprint::Patterns(vec![pattern.clone()]);
+        let Ok(changes) = self.changes(&footprint) else { return false };
+        if changes.is_empty() {
+            self.sight.root.each_fact(pattern, visit);
+            return true;
+        }
+        let Ok(facts) = self.facts(&footprint) else { return false };
+        for (key, value) in &facts {
+            if !visit(key, value) {
+                break;
+            }
+        }
+        true
+    }
 }
 
 /// Whether some of the facts that are written are looked at and not hidden by what is known of younger writers.

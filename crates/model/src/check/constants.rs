@@ -44,7 +44,9 @@ pub(crate) fn problem(expr: &Expr) -> Option<EvaluateError> {
 fn parts(expr: &Expr) -> Vec<&Expr> {
     use crate::expression::BinaryOperator::{And, Or};
     match expr {
-        Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } => Vec::new(),
+        Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } | Expr::Unknown(_) => Vec::new(),
+        // What is not looked at when an earlier condition fails.
+        Expr::Query(_) => Vec::new(),
         Expr::Field(of, _) | Expr::Unary(_, of) | Expr::Binary(And | Or, of, _) => vec![of],
         Expr::Index(a, b) | Expr::Binary(_, a, b) => vec![a, b],
         Expr::Call(Function::If, arguments) => arguments.iter().take(1).collect(),

@@ -113,6 +113,7 @@ fn writes(effects: &[EffectExpr]) -> Vec<FactPattern> {
 fn missing<'e>(required: &'e Expr, established: &Established) -> Option<&'e FactExpr> {
     match required {
         Expr::Unary(UnaryOperator::Not, _) => None,
+        Expr::Query(conditions) => conditions.iter().find_map(|condition| missing(condition, established)),
         Expr::Binary(BinaryOperator::And, a, b) => missing(a, established).or_else(|| missing(b, established)),
         Expr::Binary(BinaryOperator::Or, a, b) => missing(a, established).and_then(|_| missing(b, established)),
         // Absence can be what is asked for.

@@ -207,6 +207,11 @@ impl Types<'_> {
                 fact.arguments.iter().flatten().try_for_each(|a| self.of(a).map(drop))?;
                 if matches!(expr, Expr::Exists(_)) { Type::Bool } else { Type::Any }
             }
+            Expr::Query(conditions) => {
+                conditions.iter().try_for_each(|condition| self.of(condition).map(drop))?;
+                Type::Bool
+            }
+            Expr::Unknown(_) => Type::Any,
             Expr::Unary(operator, operand) => {
                 let found = self.of(operand)?;
                 let wanted = match operator {

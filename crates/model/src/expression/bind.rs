@@ -82,7 +82,7 @@ impl ResourceExpr {
     }
 }
 
-fn term(argument: &Expr, scope: &dyn Scope) -> Result<Term, EvaluateError> {
+pub(super) fn term(argument: &Expr, scope: &dyn Scope) -> Result<Term, EvaluateError> {
     match argument.value(scope)?.as_ref() {
         Value::String(name) => Ok(Term::Name(name.clone())),
         Value::Int(i) => Ok(Term::Int(*i)),

@@ -94,6 +94,15 @@ impl Display for Expr {
             }
             Expr::Fact(fact) => write!(f, "{fact}"),
             Expr::Exists(fact) => write!(f, "exists {fact}"),
+            Expr::Query(conditions) => {
+                f.write_str("exists (")?;
+                separated(f, conditions)?;
+                f.write_str(")")
+            }
+            Expr::Unknown(name) => match name.rsplit_once('#') {
+                Some((fact, _)) => f.write_str(fact),
+                None => write!(f, "?{name}"),
+            },
             Expr::Unary(UnaryOperator::Not, operand) => {
                 f.write_str("not ")?;
                 operand.within(f, 3)

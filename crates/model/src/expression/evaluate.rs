@@ -4,6 +4,7 @@
 //! compare as numbers. `/` always gives a float. Nothing here panics: what cannot be computed is an error that says why.
 //! The depth of an expression is bounded where it is parsed.
 
+use super::query::{self, Flow, RunError};
 use super::scope::{Lookup, Scope};
 use super::{BinaryOperator, Expr, Function, UnaryOperator, function};
 use crate::value::Value;
@@ -105,6 +106,8 @@ impl Expr {
                 Lookup::Absent => Cow::Owned(Value::Bool(false)),
                 Lookup::Unknown => known(None)?,
             },
+            Expr::Query(conditions) => Cow::Owned(Value::Bool(self.has_answer(conditions, scope)?)),
+            Expr::Unknown(name) => known(scope.unknown(name))?,
             Expr::Unary(UnaryOperator::Not, operand) => Cow::Owned(Value::Bool(!operand.holds(scope)?)),
             Expr::Unary(UnaryOperator::Negate, operand) => Cow::Owned(match operand.value(scope)?.as_ref() {
                 Value::Int(i) => Value::Int(i.checked_neg().ok_or_else(|| self.wrong("too large"))?),
@@ -118,6 +121,22 @@ impl Expr {
                 Cow::Owned(binary(*operator, a.as_ref(), b.as_ref()).map_err(|problem| self.wrong(problem))?)
             }
         })
+    }
+
+    /// Whether the query `self` has an answer.
+    fn has_answer(&self, conditions: &[Expr], scope: &dyn Scope) -> Result<bool, EvaluateError> {
+        let plan = query::plan(conditions, &|name| scope.unknown(name).is_some());
+        let plan = plan.map_err(|error| self.wrong(error.to_string()))?;
+        let mut found = false;
+        let ran = query::run(&plan, scope, &mut |_| {
+            found = true;
+            Flow::Enough
+        });
+        match ran {
+            Ok(()) => Ok(found),
+            Err(RunError::Evaluate(error)) => Err(error),
+            Err(error @ RunError::TooManySteps) => Err(self.wrong(error.to_string())),
+        }
     }
 
     fn field<'a>(&self, of: Cow<'a, Value>, name: &str) -> Result<Cow<'a, Value>, EvaluateError> {

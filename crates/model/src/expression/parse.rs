@@ -10,15 +10,17 @@
 //! unary      = "-" unary | postfix
 //! postfix    = primary { "." name | "[" or "]" }
 //! primary    = number | text | "true" | "false" | "null" | "$"name | "(" or ")" | "[" list "]" | "{" name ":" or … "}"
-//!            | "exists" fact | function "(" list ")" | fact | state "." port | individual
+//!            | "exists" ( fact | "(" query ")" ) | "?"name | function "(" list ")" | fact | state "." port | individual
 //! fact       = predicate "(" [ ("?" | or) { "," ("?" | or) } ] ")"
+//! query      = or { "," or }
 //! effect     = ["set"] fact ["=" or] | ("delete" | "not") fact | ("increase" | "decrease") fact "by" or
 //! ```
 //!
-//! What a name stands for is asked of [`Names`]. Text, nesting and the height of the tree are bounded, so that neither
+//! `?name` stands only in queries. What a name stands for is asked of [`Names`]. Text, nesting and the height of the tree are bounded, so that neither
 //! parsing nor evaluating can exhaust the stack.
 
 use super::display::KEYWORDS;
+use super::query::{PlanError, plan};
 use super::token::{Token, tokens};
 use super::{BinaryOperator, EffectExpr, Expr, FactExpr, Function, UnaryOperator};
 use crate::value::Value;
@@ -100,6 +102,14 @@ pub fn parse_fact(text: &str, names: &mut dyn Names) -> Result<FactExpr, ParseEr
     parse(text, names, |parser| Ok(parser.fact()?.0))
 }
 
+/// Parses the conditions of a query, `at(?box) = ?pose, weight(?box) < 2`.
+///
+/// # Errors
+/// As [`parse_expression`]; also for what cannot be planned ([`super::query`]).
+pub fn parse_query(text: &str, names: &mut dyn Names) -> Result<Vec<Expr>, ParseError> {
+    parse(text, names, |parser| Ok(parser.query(None)?.0))
+}
+
 /// Parses an effect.
 ///
 /// # Errors
@@ -116,7 +126,7 @@ fn parse<T>(
     if text.chars().nth(MAX_TEXT).is_some() {
         return Err(ParseError::syntax(0, format!("an expression has at most {MAX_TEXT} characters")));
     }
-    let mut parser = Parser { tokens: tokens(text)?, next: 0, nesting: 0, names };
+    let mut parser = Parser { tokens: tokens(text)?, next: 0, nesting: 0, queries: 0, names };
     let result = what(&mut parser)?;
     match parser.peek() {
         Token::End => Ok(result),
@@ -134,6 +144,8 @@ struct Parser<'a> {
     tokens: Vec<(usize, Token)>,
     next: usize,
     nesting: usize,
+    /// How many queries are open.
+    queries: usize,
     names: &'a mut dyn Names,
 }
 
@@ -344,6 +356,10 @@ impl Parser<'_> {
                 self.node(Expr::List(items), below)
             }
             Token::Symbol("{") => self.map(),
+            Token::Symbol("?") if matches!(self.peek_after(), Token::Word(_)) => {
+                let unknown = self.unknown()?;
+                self.node(unknown, 0)
+            }
             Token::Symbol("?") => Err(self.unexpected("`?` stands only for an argument of a fact")),
             other => Err(self.unexpected(&format!("expected a value, found {}", other.described()))),
         }
@@ -361,6 +377,10 @@ impl Parser<'_> {
             "null" => return self.literal(Value::Null),
             "exists" => {
                 self.next += 1;
+                if self.takes("(") {
+                    let (conditions, below) = self.nested(|parser| parser.query(Some(")")))?;
+                    return self.node(Expr::Query(conditions), below);
+                }
                 let (fact, below) = self.fact()?;
                 return self.node(Expr::Exists(fact), below);
             }
@@ -407,6 +427,42 @@ impl Parser<'_> {
         Ok((items, below))
     }
 
+    /// Conditions up to a closing bracket, or to the end.
+    fn query(&mut self, close: Option<&str>) -> Result<(Vec<Expr>, usize), ParseError> {
+        let at = self.offset();
+        self.queries += 1;
+        let (mut conditions, mut below) = (Vec::new(), 0);
+        loop {
+            let condition = self.nested(Parser::or)?;
+            below = below.max(condition.height);
+            conditions.push(condition.expr);
+            if !self.takes(",") {
+                break;
+            }
+        }
+        if let Some(close) = close {
+            self.expects(close)?;
+        }
+        self.queries -= 1;
+        // What a query around binds is known to this one.
+        let inner = self.queries > 0;
+        match plan(&conditions, &|_| false) {
+            Err(PlanError::Unbound { .. }) if inner => {}
+            Err(error) => return Err(ParseError::syntax(at, error.to_string())),
+            Ok(_) => {}
+        }
+        Ok((conditions, below))
+    }
+
+    fn unknown(&mut self) -> Result<Expr, ParseError> {
+        if self.queries == 0 {
+            let message = "`?name` is a variable of a query, and stands only within `exists (…)`";
+            return Err(self.unexpected(message));
+        }
+        self.expects("?")?;
+        Ok(Expr::Unknown(self.name("a variable's name after `?`")?))
+    }
+
     fn map(&mut self) -> Parsed {
         self.expects("{")?;
         let (mut fields, mut below) = (Vec::<(String, Expr)>::new(), 0);
@@ -448,7 +504,8 @@ impl Parser<'_> {
             if !arguments.is_empty() {
                 self.expects(",")?;
             }
-            if self.takes("?") {
+            let named = matches!(self.peek_after(), Token::Word(_));
+            if !named && self.takes("?") {
                 arguments.push(None);
             } else {
                 let argument = self.nested(Parser::or)?;

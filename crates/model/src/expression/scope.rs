@@ -2,10 +2,11 @@
 //!
 //! Values are borrowed where the scope has them: a field of an element of a long list costs no copy of the list.
 
-use crate::fact::FactPattern;
+use crate::fact::{FactKey, FactPattern};
 use crate::id::StateId;
 use crate::value::Value;
 use std::borrow::Cow;
+use std::cell::Cell;
 use std::collections::BTreeMap;
 
 /// Gives names their values. `None` and [`Lookup::Unknown`] mean not known *yet*: a scope never guesses.
@@ -18,6 +19,16 @@ pub trait Scope {
     fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>>;
     /// The first fact that matches, in the order of keys.
     fn fact(&self, pattern: &FactPattern) -> Lookup<'_>;
+    /// Visits the facts that match, in the order of keys, until told to stop; others may be among them. Whether they are known.
+    fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool;
+    /// `?name`: what a query around has bound.
+    fn unknown(&self, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+    /// How many facts the query around may still look at, with those within it.
+    fn budget(&self) -> Option<&Cell<u64>> {
+        None
+    }
 }
 
 /// What a scope knows of a fact.
@@ -51,6 +62,10 @@ impl Scope for NothingKnown {
     fn fact(&self, _: &FactPattern) -> Lookup<'_> {
         Lookup::Unknown
     }
+
+    fn each_fact(&self, _: &FactPattern, _: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
+        false
+    }
 }
 
 /// The scope in which only these variables are known.
@@ -69,6 +84,10 @@ impl Scope for BTreeMap<String, Value> {
 
     fn fact(&self, _: &FactPattern) -> Lookup<'_> {
         Lookup::Unknown
+    }
+
+    fn each_fact(&self, _: &FactPattern, _: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
+        false
     }
 }
 
@@ -97,5 +116,17 @@ impl Scope for WithVariable<'_> {
 
     fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
         self.outer.fact(pattern)
+    }
+
+    fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
+        self.outer.each_fact(pattern, visit)
+    }
+
+    fn unknown(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer.unknown(name)
+    }
+
+    fn budget(&self) -> Option<&Cell<u64>> {
+        self.outer.budget()
     }
 }

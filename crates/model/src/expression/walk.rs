@@ -8,16 +8,21 @@ impl Expr {
     /// Calls `visit` for this expression and every part of it, outermost first.
     pub fn visit<'a>(&'a self, visit: &mut dyn FnMut(&'a Expr)) {
         visit(self);
+        self.parts(&mut |part| part.visit(visit));
+    }
+
+    /// Calls `visit` for every expression that it is directly made of.
+    pub(crate) fn parts<'a>(&'a self, visit: &mut dyn FnMut(&'a Expr)) {
         match self {
-            Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } => {}
-            Expr::Field(of, _) | Expr::Unary(_, of) => of.visit(visit),
+            Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } | Expr::Unknown(_) => {}
+            Expr::Field(of, _) | Expr::Unary(_, of) => visit(of),
             Expr::Index(a, b) | Expr::Binary(_, a, b) => {
-                a.visit(visit);
-                b.visit(visit);
+                visit(a);
+                visit(b);
             }
-            Expr::List(items) | Expr::Call(_, items) => items.iter().for_each(|item| item.visit(visit)),
-            Expr::Map(fields) => fields.iter().for_each(|(_, item)| item.visit(visit)),
-            Expr::Fact(fact) | Expr::Exists(fact) => fact.visit(visit),
+            Expr::List(items) | Expr::Call(_, items) | Expr::Query(items) => items.iter().for_each(visit),
+            Expr::Map(fields) => fields.iter().for_each(|(_, item)| visit(item)),
+            Expr::Fact(fact) | Expr::Exists(fact) => fact.arguments.iter().flatten().for_each(visit),
         }
     }
 
@@ -67,13 +72,15 @@ impl Expr {
     /// Rewrites every part of it, innermost first, and then itself.
     pub(crate) fn rewrite(&mut self, rewrite: &mut dyn Rewrite) {
         match self {
-            Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } => {}
+            Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } | Expr::Unknown(_) => {}
             Expr::Field(of, _) | Expr::Unary(_, of) => of.rewrite(rewrite),
             Expr::Index(a, b) | Expr::Binary(_, a, b) => {
                 a.rewrite(rewrite);
                 b.rewrite(rewrite);
             }
-            Expr::List(items) | Expr::Call(_, items) => items.iter_mut().for_each(|item| item.rewrite(rewrite)),
+            Expr::List(items) | Expr::Call(_, items) | Expr::Query(items) => {
+                items.iter_mut().for_each(|item| item.rewrite(rewrite))
+            }
             Expr::Map(fields) => fields.iter_mut().for_each(|(_, item)| item.rewrite(rewrite)),
             Expr::Fact(fact) | Expr::Exists(fact) => fact.rewrite(rewrite),
         }

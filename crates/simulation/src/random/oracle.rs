@@ -222,4 +222,8 @@ impl Scope for InputScope<'_> {
     fn fact(&self, _: &FactPattern) -> Lookup<'_> {
         Lookup::Unknown
     }
+
+    fn each_fact(&self, _: &FactPattern, _: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
+        false
+    }
 }

@@ -85,13 +85,15 @@ fn expressions(state: &mut State, change: &dyn Fn(&mut Expr)) {
 fn part_of(expression: &mut Expr, change: &dyn Fn(&mut Expr)) {
     change(expression);
     match expression {
-        Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } => {}
+        Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } | Expr::Unknown(_) => {}
         Expr::Field(of, _) | Expr::Unary(_, of) => part_of(of, change),
         Expr::Index(a, b) | Expr::Binary(_, a, b) => {
             part_of(a, change);
             part_of(b, change);
         }
-        Expr::List(items) | Expr::Call(_, items) => items.iter_mut().for_each(|item| part_of(item, change)),
+        Expr::List(items) | Expr::Call(_, items) | Expr::Query(items) => {
+            items.iter_mut().for_each(|item| part_of(item, change));
+        }
         Expr::Map(fields) => fields.iter_mut().for_each(|(_, item)| part_of(item, change)),
         Expr::Fact(f) | Expr::Exists(f) => fact(f, change),
     }
