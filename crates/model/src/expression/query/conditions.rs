@@ -70,7 +70,17 @@ impl Made {
             Expr::Binary(BinaryOperator::Equal, a, b) => match (a.as_ref(), b.as_ref()) {
                 (Expr::Fact(fact), value) | (value, Expr::Fact(fact)) => {
                     let value = self.without_facts(value, into)?;
-                    self.fact(fact, Says::Value(value), into)?;
+                    // What may need the fact's own arguments is compared once they are bound.
+                    if matches!(value, Expr::Unknown(_)) || !mentions_unknowns(&value) {
+                        self.fact(fact, Says::Value(value), into)?;
+                    } else {
+                        let says = self.without_facts(&Expr::Fact(fact.clone()), into)?;
+                        into.push(Condition::Test(Expr::Binary(
+                            BinaryOperator::Equal,
+                            Box::new(says),
+                            Box::new(value),
+                        )));
+                    }
                 }
                 _ => self.test(expr, into)?,
             },
@@ -105,6 +115,12 @@ impl Made {
             None => Ok(expr),
         }
     }
+}
+
+fn mentions_unknowns(expr: &Expr) -> bool {
+    let mut found = false;
+    expr.visit(&mut |part| found |= matches!(part, Expr::Unknown(_)));
+    found
 }
 
 struct TakeOut<'a> {

@@ -75,6 +75,13 @@ pub fn plan(query: &[Expr], known: &dyn Fn(&str) -> bool) -> Result<Plan, PlanEr
     }
     let mut planner = Planner { known, variables: Vec::new() };
     let mut order = Vec::new();
+    for expr in query {
+        expr.visit(&mut |part| {
+            if let Expr::Unknown(name) = part {
+                note(&mut order, name);
+            }
+        });
+    }
     conditions.iter().for_each(|condition| mentioned(condition, &mut |name| note(&mut order, name)));
     let (named, hidden): (Vec<_>, Vec<_>) = order.into_iter().filter(|n| !known(n)).partition(|n| !n.ends_with('?'));
     // Those that stand in negations only are bound there and forgotten.
