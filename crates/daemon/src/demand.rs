@@ -1,6 +1,6 @@
-//! The part of a provider's link that hears what is missing, and says why there is no more of it.
+//! The part of a provider's link that hears what is missing and what is held, and says why there is no more of it.
 
-use ratn_proto::types::Demand;
+use ratn_proto::types::{Demand, ResourceEventKind, ResourceUpdate};
 use ratn_worker::client::{CallError, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::Session;
@@ -17,24 +17,48 @@ const REASON_LENGTH: usize = 250;
 /// Why there is no more of a kind, by kind.
 pub(crate) type Shortages = BTreeMap<String, String>;
 
+/// Somebody holds a resource now, or nobody any more.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Use {
+    pub(crate) id: String,
+    pub(crate) held: bool,
+}
+
 /// What goes from and to the provider.
 pub(crate) struct DemandLink {
+    /// What it can provide: kinds, and how many of each at the most.
+    pub(crate) kinds: BTreeMap<String, u32>,
     /// Hears what is missing.
     pub(crate) heard: mpsc::Sender<Vec<Demand>>,
     pub(crate) shortages: watch::Receiver<Shortages>,
+    /// Hears who of its kinds is held, its own and those of others.
+    pub(crate) used: mpsc::Sender<Use>,
 }
 
 impl DemandLink {
     /// Goes on for as long as it is polled. What was missing counts until it is heard that it is not.
     pub(crate) async fn follow(&mut self, channels: &Channels, endpoint: &Endpoint, session: &Session) {
-        loop {
-            if session.alive(AGAIN_AFTER).await.is_ok()
-                && let Err(error) = self.follow_once(channels, endpoint, session).await
-            {
-                tracing::debug!(%endpoint, %error, "the demand is not heard now");
+        let kinds: Vec<String> = self.kinds.keys().cloned().collect();
+        let used = self.used.clone();
+        let uses = async {
+            loop {
+                if let Err(error) = follow_uses(channels, endpoint, &kinds, &used).await {
+                    tracing::debug!(%endpoint, %error, "who holds what is not heard now");
+                }
+                tokio::time::sleep(AGAIN_AFTER).await;
             }
-            tokio::time::sleep(AGAIN_AFTER).await;
-        }
+        };
+        let demand = async {
+            loop {
+                if session.alive(AGAIN_AFTER).await.is_ok()
+                    && let Err(error) = self.follow_once(channels, endpoint, session).await
+                {
+                    tracing::debug!(%endpoint, %error, "the demand is not heard now");
+                }
+                tokio::time::sleep(AGAIN_AFTER).await;
+            }
+        };
+        tokio::join!(uses, demand);
     }
 
     async fn follow_once(
@@ -44,7 +68,7 @@ impl DemandLink {
         session: &Session,
     ) -> Result<(), CallError> {
         let manager = ResourceClient::new(channels, endpoint, session.id())?;
-        let mut demand = manager.watch_demand().await?;
+        let mut demand = manager.watch_demand(&self.kinds).await?;
         let mut said = Shortages::new();
         loop {
             let shortages = self.shortages.borrow_and_update().clone();
@@ -64,6 +88,36 @@ impl DemandLink {
             }
         }
     }
+}
+
+/// From who holds what now on.
+async fn follow_uses(
+    channels: &Channels,
+    endpoint: &Endpoint,
+    kinds: &[String],
+    used: &mpsc::Sender<Use>,
+) -> Result<(), CallError> {
+    if kinds.is_empty() {
+        return std::future::pending().await;
+    }
+    let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
+    let mut watch = ResourceClient::new(channels, endpoint, "")?.watch(&kinds).await?;
+    while let Some(update) = watch.next().await? {
+        let changed = match update {
+            ResourceUpdate::Snapshot { resources, .. } => resources,
+            ResourceUpdate::Event(event) => match event.kind {
+                ResourceEventKind::Leased | ResourceEventKind::Released => vec![event.resource],
+                _ => continue,
+            },
+        };
+        for resource in changed {
+            let held = !resource.holdings.is_empty();
+            if used.send(Use { id: resource.id, held }).await.is_err() {
+                return Ok(());
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Last words of a worker may have many.

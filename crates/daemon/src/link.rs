@@ -9,7 +9,7 @@ use ratn_worker::endpoint::Endpoint;
 use ratn_worker::provider::Provider;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
@@ -21,6 +21,25 @@ const LOOK_INTERVAL: Duration = Duration::from_millis(250);
 
 /// The resources wanted, by id.
 pub(crate) type Wanted = BTreeMap<String, Resource>;
+
+/// What became of a resource.
+#[derive(Debug)]
+pub(crate) enum Offering {
+    /// It is there.
+    There(String),
+    /// It was to leave, and is gone.
+    Gone(String),
+    /// It was to leave, and somebody holds it. It is tried again.
+    Kept(String),
+}
+
+/// How resources come and go.
+#[derive(Debug)]
+pub(crate) struct Turnover {
+    pub(crate) told: mpsc::Sender<Offering>,
+    /// Those of the wanted that are to go as soon as nobody holds them.
+    pub(crate) leaving: watch::Receiver<BTreeSet<String>>,
+}
 
 /// Where the resource manager is.
 #[derive(Debug, Clone)]
@@ -36,8 +55,8 @@ pub(crate) struct Link {
     pub(crate) client: String,
     pub(crate) ttl: Duration,
     pub(crate) wanted: watch::Receiver<Wanted>,
-    /// Hears the id of each resource once it is there.
-    pub(crate) there: Option<mpsc::Sender<String>>,
+    /// Hears of each resource once it is there, and gives back those that are free.
+    pub(crate) there: Option<Turnover>,
     /// Hears what is missing.
     pub(crate) demand: Option<DemandLink>,
 }
@@ -109,15 +128,16 @@ impl Link {
                 }
             }
             refused.retain(|id, resource| wanted.get(id) == Some(resource));
+            let leaving = self.let_go(&provider, &mut offered).await;
             for (id, resource) in wanted {
-                if offered.get(&id) == Some(&resource) || refused.contains_key(&id) {
+                if offered.get(&id) == Some(&resource) || refused.contains_key(&id) || leaving.contains(&id) {
                     continue;
                 }
                 match provider.offer(resource.clone()).await {
                     Ok(true) => {
                         offered.insert(id.clone(), resource);
                         if let Some(there) = &self.there {
-                            let _ = there.send(id).await;
+                            let _ = there.told.send(Offering::There(id)).await;
                         }
                     }
                     // The provider offers it by itself as soon as it can; asked again only to learn that it has.
@@ -130,9 +150,31 @@ impl Link {
             }
             tokio::select! {
                 changed = self.wanted.changed() => if changed.is_err() { return Ok(()) },
+                () = more_leave(&mut self.there) => {}
                 () = tokio::time::sleep(LOOK_INTERVAL) => if self.manager.has_moved_from(endpoint) { return Ok(()) },
             }
         }
+    }
+
+    /// Withdraws those that leave and that nobody holds; those that leave.
+    async fn let_go(&mut self, provider: &Provider, offered: &mut Wanted) -> BTreeSet<String> {
+        let Some(there) = &mut self.there else { return BTreeSet::new() };
+        let leaving = there.leaving.borrow_and_update().clone();
+        for id in &leaving {
+            let gone = !offered.contains_key(id) || provider.withdraw_unless_held(id).await;
+            if gone {
+                offered.remove(id);
+            }
+            let _ = there.told.send(if gone { Offering::Gone(id.clone()) } else { Offering::Kept(id.clone()) }).await;
+        }
+        leaving
+    }
+}
+
+async fn more_leave(there: &mut Option<Turnover>) {
+    let changed = async { there.as_mut()?.leaving.changed().await.ok() };
+    if changed.await.is_none() {
+        std::future::pending().await
     }
 }
 

@@ -5,13 +5,13 @@ mod support;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use ratn_daemon::process_manager::Template;
+use ratn_daemon::process_manager::{Liveness, Template};
 use ratn_model::resource::Requirement;
 use ratn_model::value::Value;
-use ratn_proto::types::{Resource, ResourceEventKind, WorkerState};
+use ratn_proto::types::{Resource, ResourceEvent, ResourceEventKind, WorkerState};
 use ratn_worker::client::AcquireOptions;
 use std::time::Duration;
-use support::{TestSystem, block, in_time};
+use support::{DEADLINE, TestSystem, block, in_time};
 use tonic::Code;
 
 fn template() -> Template {
@@ -197,4 +197,107 @@ async fn why_a_template_crash_loops_reaches_the_caller_who_waits_for_it() {
     );
     assert!(words.contains("cannot open the model"), "its last words: {words}");
     processes.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_worker_that_hangs_is_taken_from_its_holder_killed_and_replaced() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut watch = system.watch(&manager, &["PathPlanner"]).await;
+    let liveness = Liveness { interval_s: 0.05, timeout_s: 2.0 };
+    let processes = system.process_manager(vec![Template { liveness, ..template() }]).await;
+    let hung = watch.created("PathPlanner").await;
+    let client = system.client(&manager, "task").await;
+    let lease = client.resources.acquire(vec![block("PathPlanner")], AcquireOptions::default()).await.unwrap();
+
+    kill(pid(&hung), Signal::SIGSTOP).unwrap();
+    let of_lease = |event: &ResourceEvent| event.lease.is_some_and(|(id, _)| id == lease.id);
+    let lost = watch.event(|event| event.kind == ResourceEventKind::Released && of_lease(event)).await;
+    assert_eq!((lost.resource.id.as_str(), lost.reason.as_str()), (hung.id.as_str(), "the resource is gone"));
+    assert_eq!(watch.created("PathPlanner").await.id, "planner-2@compute");
+    gone(pid(&hung)).await;
+    processes.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_worker_started_for_a_demand_ends_when_it_has_been_idle_and_not_while_it_is_held() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut watch = system.watch(&manager, &["PathPlanner"]).await;
+    let processes = system.process_manager(vec![Template { min: 0, idle_s: 0.2, ..template() }]).await;
+    let client = system.client(&manager, "task").await;
+    let asked = client.resources.acquire(vec![block("PathPlanner")], AcquireOptions::default());
+    let lease = in_time(asked).await.unwrap();
+    let worker = watch.created("PathPlanner").await;
+    // Several times as long as an idle one has.
+    let mut changes = system.processes(&processes).watch().await.unwrap();
+    assert_eq!(in_time(changes.next()).await.unwrap().unwrap().state, WorkerState::Ready);
+    assert!(tokio::time::timeout(Duration::from_secs(1), changes.next()).await.is_err(), "it is held");
+    client.resources.release(lease.id).await.unwrap();
+    let ended = watch.event(|event| event.kind == ResourceEventKind::Deleted).await;
+    assert_eq!((&ended.resource.id, ended.resource.holdings.len()), (&worker.id, 0), "nobody lost it");
+    gone(pid(&worker)).await;
+    // And it comes again.
+    in_time(client.resources.acquire(vec![block("PathPlanner")], AcquireOptions::default())).await.unwrap();
+    processes.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_worker_that_is_told_to_stop_is_left_to_its_holder_until_that_releases_it() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut watch = system.watch(&manager, &["PathPlanner"]).await;
+    let processes = system.process_manager(vec![template()]).await;
+    let worker = watch.created("PathPlanner").await;
+    let client = system.client(&manager, "task").await;
+    let lease = client.resources.acquire(vec![block("PathPlanner")], AcquireOptions::default()).await.unwrap();
+    system.processes(&processes).stop(&worker.id).await.unwrap();
+    // Another one takes its place at once.
+    assert_eq!(watch.created("PathPlanner").await.id, "planner-2@compute");
+    assert!(client.resources.release(lease.id).await.unwrap());
+    let ended = watch.event(|event| event.kind == ResourceEventKind::Deleted).await;
+    assert_eq!((&ended.resource.id, ended.resource.holdings.len()), (&worker.id, 0), "nobody lost it");
+    gone(pid(&worker)).await;
+    processes.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_two_hosts_that_offer_the_same_one_starts_a_worker_for_a_demand() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let of_none = || vec![Template { min: 0, max: Some(2), ..template() }];
+    let first = system.process_manager_of(&manager, "compute", of_none()).await;
+    let second = system.process_manager_of(&manager, "control", of_none()).await;
+    let client = system.client(&manager, "task").await;
+    let workers = async || {
+        let of = async |host| system.processes(host).pools().await.unwrap().1[0].workers.len();
+        (of(&first).await, of(&second).await)
+    };
+    let one = client.resources.acquire(vec![block("PathPlanner")], AcquireOptions::default());
+    let one = in_time(one).await.unwrap();
+    assert!(matches!(workers().await, (1, 0) | (0, 1)), "{:?}", workers().await);
+    assert!(client.resources.release(one.id).await.unwrap());
+    // More than one host has room for.
+    let three = Requirement { count: 3, ..block("PathPlanner") };
+    let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+    let three = in_time(client.resources.acquire(vec![three], options)).await.unwrap();
+    assert_eq!(three.resources.len(), 3);
+    assert!(matches!(workers().await, (2, 1) | (1, 2)), "{:?}", workers().await);
+    first.end().await;
+    second.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_demand_goes_on_to_the_next_host_when_the_first_one_cannot_meet_it() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let broken = Template { args: vec!["fail".to_owned()], min: 0, crash_limit: 2, backoff_ms: 1, ..template() };
+    let first = system.process_manager_of(&manager, "compute", vec![broken]).await;
+    let second = system.process_manager_of(&manager, "control", vec![Template { min: 0, ..template() }]).await;
+    let client = system.client(&manager, "task").await;
+    let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+    let lease = in_time(client.resources.acquire(vec![block("PathPlanner")], options)).await.unwrap();
+    assert_eq!(lease.resources[0].id, "planner-1@control");
+    first.end().await;
+    second.end().await;
 }

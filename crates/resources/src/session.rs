@@ -139,6 +139,11 @@ impl Pool {
         self.sessions.iter().map(view).collect()
     }
 
+    /// Whether a session is there.
+    pub fn has_session(&self, id: &SessionId) -> bool {
+        self.sessions.contains_key(id)
+    }
+
     pub(crate) fn session(&self, id: &SessionId) -> Result<&Session, PoolError> {
         self.sessions.get(id).ok_or_else(|| PoolError::UnknownSession { session: id.clone() })
     }

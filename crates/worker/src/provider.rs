@@ -4,6 +4,7 @@
 use crate::client::{CallError, Channels, ResourceClient};
 use crate::endpoint::Endpoint;
 use crate::session::{Session, SessionState};
+use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_proto::types::Resource;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -75,6 +76,31 @@ impl Provider {
     /// [`CallError::Refused`] when the manager does not let it go; that is not asked again.
     pub async fn withdraw(&self, id: &str) -> Result<bool, CallError> {
         self.wish(id.to_owned(), None).await
+    }
+
+    /// Withdraws a resource unless somebody holds it. True once it is gone; false when it is held, or the manager cannot be asked
+    /// now: then it stays.
+    pub async fn withdraw_unless_held(&self, id: &str) -> bool {
+        let mut wishes = self.shared.wishes.lock().await;
+        let Some(resource) = wishes.get(id).and_then(|wish| wish.resource.clone()) else { return true };
+        if !self.shared.state.borrow().alive {
+            return false;
+        }
+        // Only what is free is deleted so, and its attributes are no other's.
+        let mut requirement = Requirement::new(ResourceOperation::Delete, resource.kind);
+        requirement.class = Some(resource.class);
+        requirement.attributes = resource.attributes;
+        match self.shared.client.delete_matching(requirement).await {
+            Ok(deleted) => {
+                debug_assert_eq!(deleted, [id], "attributes of a resource are its own");
+                wishes.remove(id);
+                true
+            }
+            Err(error) => {
+                tracing::debug!(id, %error, "not withdrawn");
+                false
+            }
+        }
     }
 
     async fn wish(&self, id: String, resource: Option<Resource>) -> Result<bool, CallError> {

@@ -5,15 +5,15 @@ use super::pools::{Command, Event, PoolError, Pools};
 use super::processes::{Processes, Told};
 use super::spawner::Outcome;
 use super::usage::Usage;
-use crate::demand::Shortages;
-use crate::link::Wanted;
+use crate::demand::{Shortages, Use};
+use crate::link::{Offering, Wanted};
 use nix::sys::signal::Signal;
 use ratn_model::resource::ResourceClass;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{Demand, PoolStatus, Resource, WorkerStatus};
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
@@ -52,8 +52,12 @@ pub(super) struct Parts {
     pub(super) directory: RuntimeDirectory,
     /// What the link shall offer.
     pub(super) wanted: watch::Sender<Wanted>,
-    /// What the link has offered.
-    pub(super) there: mpsc::Receiver<String>,
+    /// What of it is to go as soon as nobody holds it.
+    pub(super) leaves: watch::Sender<BTreeSet<String>>,
+    /// What became of it.
+    pub(super) there: mpsc::Receiver<Offering>,
+    /// Who is held.
+    pub(super) uses: mpsc::Receiver<Use>,
     /// What is missing.
     pub(super) demand: mpsc::Receiver<Vec<Demand>>,
     /// Why there is no more.
@@ -66,6 +70,7 @@ struct Actor {
     processes: Processes,
     start: Instant,
     wanted: watch::Sender<Wanted>,
+    leaves: watch::Sender<BTreeSet<String>>,
     short: watch::Sender<Shortages>,
     watchers: Vec<mpsc::Sender<WorkerStatus>>,
     usage: Usage,
@@ -74,7 +79,7 @@ struct Actor {
 /// Starts the actor; it ends with the token, once every worker has.
 pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Result<(Handle, JoinHandle<()>)> {
     let (inbox, messages) = mpsc::channel(INBOX);
-    let Parts { config, directory, wanted, there, demand, short } = parts;
+    let Parts { config, directory, wanted, leaves, there, uses, demand, short } = parts;
     let (processes, told) = Processes::start(&config, directory)?;
     let actor = Actor {
         pools: Pools::new(&config.host, config.templates),
@@ -82,11 +87,12 @@ pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Resul
         host: config.host,
         start: Instant::now(),
         wanted,
+        leaves,
         short,
         watchers: Vec::new(),
         usage: Usage::new(),
     };
-    let inputs = Inputs { messages, told, there, demand };
+    let inputs = Inputs { messages, told, there, uses, demand };
     Ok((Handle { inbox }, tokio::spawn(actor.run(inputs, shutdown))))
 }
 
@@ -101,7 +107,8 @@ impl Handle {
 struct Inputs {
     messages: mpsc::Receiver<Message>,
     told: Told,
-    there: mpsc::Receiver<String>,
+    there: mpsc::Receiver<Offering>,
+    uses: mpsc::Receiver<Use>,
     demand: mpsc::Receiver<Vec<Demand>>,
 }
 
@@ -113,7 +120,16 @@ impl Actor {
             tokio::select! {
                 Some(outcome) = inputs.told.outcomes.recv() => self.became(outcome),
                 Some((id, endpoint)) = inputs.told.serving.recv() => self.handle(Event::Serving { id, endpoint }),
-                Some(id) = inputs.there.recv() => self.handle(Event::Offered { id }),
+                Some(health) = inputs.told.health.recv() => self.handle(match health {
+                    (id, Ok(())) => Event::Answered { id },
+                    (id, Err(why)) => Event::Unanswered { id, why },
+                }),
+                Some(offering) = inputs.there.recv() => self.handle(match offering {
+                    Offering::There(id) => Event::Offered { id },
+                    Offering::Gone(id) => Event::Withdrawn { id },
+                    Offering::Kept(id) => Event::Kept { id },
+                }),
+                Some(Use { id, held }) = inputs.uses.recv() => self.handle(Event::Used { id, held }),
                 Some(demand) = inputs.demand.recv() => self.handle(Event::Demanded(demand)),
                 Some(message) = inputs.messages.recv() => self.receive(message),
                 () = sleep_until(deadline) => self.handle(Event::Time),
@@ -220,7 +236,16 @@ impl Actor {
                 Command::Offer { worker, kind } => self.offer(&worker, &kind),
                 Command::Withdraw { id } => {
                     self.wanted.send_if_modified(|wanted| wanted.remove(&id).is_some());
+                    self.leaves.send_if_modified(|leaves| leaves.remove(&id));
                 }
+                // Also where it leaves already: then it is tried at once.
+                Command::Retire { id } => self.leaves.send_modify(|leaves| {
+                    leaves.insert(id);
+                }),
+                Command::Keep { id } => {
+                    self.leaves.send_if_modified(|leaves| leaves.remove(&id));
+                }
+                Command::Check { id, within } => self.processes.check(&id, within),
                 Command::Tell(worker) => self.watchers.retain(|watcher| watcher.try_send(worker.clone()).is_ok()),
             }
         }

@@ -56,9 +56,21 @@ pub struct Template {
     /// At most so many workers are started; without it `min`, but at least one.
     #[serde(default)]
     pub max: Option<u32>,
+    /// So many more are kept ready beside those that are held (and beside `min`).
+    #[serde(default)]
+    pub spares: u32,
+    /// A worker beyond what is kept ends when nobody has held it for this long, in seconds.
+    #[serde(default = "minute")]
+    pub idle_s: f64,
     /// A worker whose health is not SERVING after this long has failed, in seconds.
     #[serde(default = "ten")]
     pub start_timeout_s: f64,
+    /// How a worker that serves is seen to hang.
+    #[serde(default)]
+    pub liveness: Liveness,
+    /// A worker that is to stop while it is held is given this long to be released, in seconds; then its holder loses it.
+    #[serde(default = "half_a_minute")]
+    pub drain_s: f64,
     /// A worker that has not ended this long after SIGTERM is killed, in seconds.
     #[serde(default = "two")]
     pub stop_timeout_s: f64,
@@ -77,6 +89,32 @@ pub struct Template {
     pub crash_limit: u32,
 }
 
+/// How a worker that serves is seen to hang: it is asked for its health, and killed and replaced when it does not answer in time.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Liveness {
+    /// The pause between an answer and the next question, in seconds.
+    pub interval_s: f64,
+    /// How long an answer may take, in seconds.
+    pub timeout_s: f64,
+}
+
+impl Default for Liveness {
+    fn default() -> Self {
+        Liveness { interval_s: 5.0, timeout_s: 10.0 }
+    }
+}
+
+impl Liveness {
+    pub(crate) fn interval(self) -> Duration {
+        Duration::from_secs_f64(self.interval_s)
+    }
+
+    pub(crate) fn timeout(self) -> Duration {
+        Duration::from_secs_f64(self.timeout_s)
+    }
+}
+
 impl Default for ProcessManagerConfig {
     fn default() -> Self {
         ProcessManagerConfig {
@@ -87,6 +125,16 @@ impl Default for ProcessManagerConfig {
             max_log_bytes: 16 * 1024 * 1024,
             templates: Vec::new(),
         }
+    }
+}
+
+impl ProcessManagerConfig {
+    /// The kinds of its workers, and how many there are of each at the most. Of several templates of a kind the first one, in the
+    /// order of names, meets demand.
+    pub(crate) fn kinds(&self) -> BTreeMap<String, u32> {
+        let mut templates: Vec<&Template> = self.templates.iter().collect();
+        templates.sort_by(|a, b| b.name.cmp(&a.name));
+        templates.into_iter().map(|template| (template.kind.clone(), template.max_workers())).collect()
     }
 }
 
@@ -101,7 +149,11 @@ impl Template {
             env: BTreeMap::new(),
             min: one(),
             max: None,
+            spares: 0,
+            idle_s: minute(),
             start_timeout_s: ten(),
+            liveness: Liveness::default(),
+            drain_s: half_a_minute(),
             stop_timeout_s: two(),
             backoff_ms: backoff(),
             max_backoff_ms: max_backoff(),
@@ -117,6 +169,14 @@ impl Template {
 
     pub(crate) fn start_timeout(&self) -> Duration {
         Duration::from_secs_f64(self.start_timeout_s)
+    }
+
+    pub(crate) fn idle(&self) -> Duration {
+        Duration::from_secs_f64(self.idle_s)
+    }
+
+    pub(crate) fn drain(&self) -> Duration {
+        Duration::from_secs_f64(self.drain_s)
     }
 
     pub(crate) fn stop_timeout(&self) -> Duration {
@@ -142,10 +202,20 @@ impl Check for ProcessManagerConfig {
             let max = template.max_workers();
             rule(key("max"), template.min <= max, format!("min = {} is above max = {max}", template.min))?;
             rule(key("max"), max <= MAX_WORKERS, format!("at most {MAX_WORKERS}"))?;
+            let kept = template.min.saturating_add(template.spares);
+            rule(
+                key("spares"),
+                template.spares == 0 || kept <= max,
+                format!("min + spares = {kept} is above max = {max}"),
+            )?;
             for (name, seconds) in [
                 ("start_timeout_s", template.start_timeout_s),
+                ("drain_s", template.drain_s),
                 ("stop_timeout_s", template.stop_timeout_s),
                 ("stable_s", template.stable_s),
+                ("idle_s", template.idle_s),
+                ("liveness.interval_s", template.liveness.interval_s),
+                ("liveness.timeout_s", template.liveness.timeout_s),
             ] {
                 rule(key(name), (0.001..=86_400.0).contains(&seconds), "from 0.001 s to a day")?;
             }
@@ -174,6 +244,14 @@ fn two() -> f64 {
 
 fn ten() -> f64 {
     10.0
+}
+
+fn half_a_minute() -> f64 {
+    30.0
+}
+
+fn minute() -> f64 {
+    60.0
 }
 
 fn backoff() -> u64 {

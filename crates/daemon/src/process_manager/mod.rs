@@ -18,21 +18,22 @@ mod spawner;
 mod status;
 mod usage;
 
-pub use config::{ProcessManagerConfig, Template};
+pub use config::{Liveness, ProcessManagerConfig, Template};
 
 use crate::demand::{DemandLink, Shortages};
-use crate::link::{Link, Manager, Wanted};
+use crate::link::{Link, Manager, Turnover, Wanted};
 use anyhow::Context;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
+use std::collections::BTreeSet;
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
 /// The role's name: of its endpoint file, its command and its section of a config.
 pub const ROLE: &str = "process-manager";
-/// Resources that are there which the actor was not told of yet.
+/// What became of resources which the actor was not told of yet.
 const THERE: usize = 1_024;
 /// States of the demand that the actor was not told of yet.
 const DEMANDS: usize = 16;
@@ -62,7 +63,9 @@ pub async fn run_as(
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let (wanted, to_offer) = watch::channel(Wanted::new());
-    let (offered, there) = mpsc::channel(THERE);
+    let (told, there) = mpsc::channel(THERE);
+    let (leaves, leaving) = watch::channel(BTreeSet::new());
+    let (used, uses) = mpsc::channel(THERE);
     let (heard, demand) = mpsc::channel(DEMANDS);
     let (short, shortages) = watch::channel(Shortages::new());
     let link = Link {
@@ -70,12 +73,12 @@ pub async fn run_as(
         client: format!("{ROLE}@{}", config.host),
         ttl: Duration::from_millis(config.session_ttl_ms),
         wanted: to_offer,
-        there: Some(offered),
-        demand: Some(DemandLink { heard, shortages }),
+        there: Some(Turnover { told, leaving }),
+        demand: Some(DemandLink { kinds: config.kinds(), heard, shortages, used }),
     };
     let linked = tokio::spawn(link.keep(shutdown.clone()));
     let host = config.host.clone();
-    let parts = actor::Parts { config, directory: directory.clone(), wanted, there, demand, short };
+    let parts = actor::Parts { config, directory: directory.clone(), wanted, leaves, there, uses, demand, short };
     let (actor, ended) = actor::start(parts, shutdown.clone()).context("cannot start workers")?;
     let service = ProcessServiceServer::new(service::Service { actor, host, shutdown: shutdown.clone() });
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;

@@ -4,7 +4,7 @@ use super::config::{ProcessManagerConfig, Template};
 use super::log::EndedLogs;
 use super::spawner::{self, Job, Outcome};
 use nix::sys::signal::Signal;
-use ratn_worker::client::wait_until_serving;
+use ratn_worker::client::Health;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::collections::BTreeMap;
 use std::io;
@@ -21,6 +21,8 @@ pub(super) struct Told {
     pub(super) outcomes: mpsc::Receiver<Outcome>,
     /// The id and the endpoint of each that serves.
     pub(super) serving: mpsc::Receiver<(String, String)>,
+    /// The id of each that was asked whether it still serves, with its answer.
+    pub(super) health: mpsc::Receiver<(String, Result<(), String>)>,
 }
 
 /// Too many processes are being started at once.
@@ -35,15 +37,21 @@ pub(super) struct Processes {
     /// What a template without a program runs.
     this_program: PathBuf,
     jobs: mpsc::Sender<Job>,
-    serving: mpsc::Sender<(String, String)>,
+    tell: Tell,
     by_id: BTreeMap<String, Process>,
     ended_logs: EndedLogs,
+}
+
+#[derive(Debug, Clone)]
+struct Tell {
+    serving: mpsc::Sender<(String, String)>,
+    health: mpsc::Sender<(String, Result<(), String>)>,
 }
 
 #[derive(Debug, Default)]
 struct Process {
     pid: u32,
-    readiness: Option<AbortHandle>,
+    attended: Option<(AbortHandle, mpsc::Sender<Duration>)>,
 }
 
 impl Processes {
@@ -51,17 +59,18 @@ impl Processes {
     pub(super) fn start(config: &ProcessManagerConfig, directory: RuntimeDirectory) -> io::Result<(Processes, Told)> {
         let (told, outcomes) = mpsc::channel(OUTCOMES);
         let (serving, served) = mpsc::channel(OUTCOMES);
+        let (health, answered) = mpsc::channel(OUTCOMES);
         let processes = Processes {
             host: config.host.clone(),
             max_log_bytes: config.max_log_bytes,
             directory,
             this_program: std::env::current_exe()?,
             jobs: spawner::start(told)?,
-            serving,
+            tell: Tell { serving, health },
             by_id: BTreeMap::new(),
             ended_logs: EndedLogs::default(),
         };
-        Ok((processes, Told { outcomes, serving: served }))
+        Ok((processes, Told { outcomes, serving: served, health: answered }))
     }
 
     /// Begins a worker of a template.
@@ -85,9 +94,11 @@ impl Processes {
             program: template.program.clone().unwrap_or_else(|| self.this_program.clone()),
         };
         self.jobs.try_send(job).map_err(|_| Busy)?;
-        let readiness = ready(self.directory.clone(), id.to_owned(), template.start_timeout(), self.serving.clone());
-        let readiness = tokio::spawn(readiness).abort_handle();
-        self.by_id.entry(id.to_owned()).or_default().readiness = Some(readiness);
+        let (ask, questions) = mpsc::channel(1);
+        let within = template.start_timeout();
+        let attended = attend(self.directory.clone(), id.to_owned(), within, questions, self.tell.clone());
+        let attended = tokio::spawn(attended).abort_handle();
+        self.by_id.entry(id.to_owned()).or_default().attended = Some((attended, ask));
         Ok(())
     }
 
@@ -98,12 +109,20 @@ impl Processes {
 
     /// Its process is gone.
     pub(super) fn exited(&mut self, id: &str) {
-        if let Some(readiness) = self.by_id.remove(id).and_then(|process| process.readiness) {
-            readiness.abort();
+        if let Some((attended, _)) = self.by_id.remove(id).and_then(|process| process.attended) {
+            attended.abort();
         }
         // One that was killed could not take it back itself.
         let _ = std::fs::remove_file(self.directory.endpoint_file(id));
         self.ended_logs.add(self.log_file(id));
+    }
+
+    /// Asks one that serves whether it still does.
+    pub(super) fn check(&self, id: &str, within: Duration) {
+        if let Some((_, ask)) = self.by_id.get(id).and_then(|process| process.attended.as_ref()) {
+            // Full where the last question has not been answered: then that answer serves.
+            let _ = ask.try_send(within);
+        }
     }
 
     /// Signals a worker. Without a process yet, the pools ask again once it is there.
@@ -123,14 +142,28 @@ impl Processes {
     }
 }
 
-/// Tells once a worker serves. One that does not is the pools' business: they know when it is too late.
-async fn ready(directory: RuntimeDirectory, id: String, deadline: Duration, serving: mpsc::Sender<(String, String)>) {
-    let found = match directory.wait_for(&id, deadline).await {
+/// Tells once a worker serves, and whether it still does whenever that is asked. One that never does is the pools' business: they
+/// know when it is too late.
+async fn attend(
+    directory: RuntimeDirectory,
+    id: String,
+    within: Duration,
+    mut questions: mpsc::Receiver<Duration>,
+    tell: Tell,
+) {
+    let found = match directory.wait_for(&id, within).await {
         Ok(endpoint) => endpoint,
         Err(error) => return tracing::debug!(id, %error, "no endpoint of a worker"),
     };
-    match wait_until_serving(&found, deadline).await {
-        Ok(()) => drop(serving.send((id, found.to_string())).await),
-        Err(error) => tracing::debug!(id, %error, "a worker does not serve"),
+    let mut health = Health::of(found.clone());
+    match health.serving(within).await {
+        Ok(()) => drop(tell.serving.send((id.clone(), found.to_string())).await),
+        Err(error) => return tracing::debug!(id, %error, "a worker does not serve"),
+    }
+    while let Some(within) = questions.recv().await {
+        let answer = health.serving(within).await.map_err(|error| error.to_string());
+        if tell.health.send((id.clone(), answer)).await.is_err() {
+            return;
+        }
     }
 }

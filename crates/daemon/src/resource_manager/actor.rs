@@ -9,6 +9,7 @@
 //! on the disk.
 
 use super::outgoing::Outgoing;
+use super::providers::Providers;
 use super::{Granted, ResourceManagerConfig, journal, status, wire};
 use crate::details::{ending, of_fault, retry_later, status as status_with};
 use crate::journal::Journal;
@@ -115,6 +116,8 @@ pub(super) enum Message {
     },
     WatchDemand {
         session: SessionId,
+        /// What it can provide: kinds, and how many of each at the most.
+        kinds: BTreeMap<String, u32>,
         answer: Answer<watch::Receiver<Vec<Demand>>>,
     },
     ReportShortage {
@@ -167,7 +170,8 @@ struct Actor {
     watchers: Vec<mpsc::Sender<Arc<ResourceUpdate>>>,
     /// What waits for more than exists.
     demand: Vec<ratn_resources::Demand>,
-    demand_watchers: Vec<(SessionId, watch::Sender<Vec<Demand>>)>,
+    /// What of it is asked of whom.
+    providers: Providers,
 }
 
 /// Starts the actor on what was kept. With `draining` everybody who waits is told to ask the successor; with `over` it ends.
@@ -193,7 +197,7 @@ pub(super) fn start(
         shared: BTreeMap::new(),
         watchers: Vec::new(),
         demand: Vec::new(),
-        demand_watchers: Vec::new(),
+        providers: Providers::new(live.borrow().provider_patience()),
     };
     let running = tokio::spawn(actor.run(Inputs { messages, pinged, live }, draining, over));
     (Handle { inbox, pings }, running)
@@ -247,7 +251,8 @@ impl Actor {
         let mut arrived = Vec::new();
         loop {
             let running = self.stopped.is_none();
-            let deadline = self.pool.next_deadline().filter(|_| running);
+            let deadline = self.pool.next_deadline().into_iter().chain(self.providers.deadline()).min();
+            let deadline = deadline.filter(|_| running);
             let deadline = deadline.map(|at| self.start + Duration::from_nanos(at.0));
             let room = !self.outbox.is_full();
             tokio::select! {
@@ -377,12 +382,13 @@ impl Actor {
             Message::List { answer } => self.tell(answer, (self.pool.list(), self.pool.revision())),
             Message::Revision { answer } => self.tell(answer, self.pool.revision()),
             Message::Sessions { answer } => self.tell(answer, self.sessions()),
-            Message::WatchDemand { session, answer } => {
-                let watch = self.watch_demand(session);
+            Message::WatchDemand { session, kinds, answer } => {
+                let watch = self.watch_demand(session, kinds);
                 self.reply(answer, watch);
             }
             Message::ReportShortage { session, kind, reason, answer } => {
                 let reported = self.pool.report_shortage(now, &session, &kind, &reason);
+                self.providers.changed();
                 self.reply(answer, reported.map_err(|error| status::of_error(&error)));
             }
             Message::Explain { request_id, answer } => {
@@ -471,39 +477,26 @@ impl Actor {
         let _ = self.pool.undo_grant(self.now(), lease);
     }
 
-    fn watch_demand(&mut self, session: SessionId) -> Result<watch::Receiver<Vec<Demand>>, Status> {
-        self.demand_watchers.retain(|(_, watcher)| !watcher.is_closed());
-        if self.demand_watchers.len() >= self.config.max_watchers {
-            let message = format!("{} providers watch already", self.demand_watchers.len());
-            return Err(retry_later(Code::ResourceExhausted, "TOO_MANY", message, Duration::from_secs(1)));
-        }
-        let (sender, watcher) = watch::channel(self.demand_of(&session));
-        self.demand_watchers.push((session, sender));
-        Ok(watcher)
-    }
-
-    fn demand_of(&self, session: &SessionId) -> Vec<Demand> {
-        let of = |demand: &ratn_resources::Demand| Demand {
-            requirement: demand.requirement.clone(),
-            kinds: demand.kinds.clone(),
-            provided: self.pool.provided(session, demand),
-        };
-        self.demand.iter().map(of).collect()
+    fn watch_demand(
+        &mut self,
+        session: SessionId,
+        kinds: BTreeMap<String, u32>,
+    ) -> Result<watch::Receiver<Vec<Demand>>, Status> {
+        self.providers.join(session, kinds, self.config.max_watchers).map_err(|there| {
+            let message = format!("{there} providers watch already");
+            retry_later(Code::ResourceExhausted, "TOO_MANY", message, Duration::from_secs(1))
+        })
     }
 
     /// Tells providers what is missing, where that may have changed.
     fn spread_demand(&mut self) {
-        let Some(demand) = self.pool.take_demand() else { return };
-        self.demand = demand;
-        self.demand_watchers.retain(|(_, watcher)| !watcher.is_closed());
-        for (session, watcher) in &self.demand_watchers {
-            let demand = self.demand_of(session);
-            watcher.send_if_modified(|before| {
-                let changed = *before != demand;
-                *before = demand;
-                changed
-            });
+        let now = self.now();
+        let changed = self.pool.take_demand();
+        if changed.is_none() && !self.providers.are_due(now) {
+            return;
         }
+        self.demand = changed.unwrap_or_else(|| std::mem::take(&mut self.demand));
+        self.providers.tell(now, &self.pool, &self.demand);
     }
 
     fn sessions(&self) -> Vec<SessionStatus> {

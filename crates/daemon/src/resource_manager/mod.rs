@@ -10,8 +10,10 @@
 
 mod actor;
 mod config;
+mod handout;
 mod journal;
 mod outgoing;
+mod providers;
 mod service;
 mod status;
 mod stream;

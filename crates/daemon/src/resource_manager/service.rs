@@ -317,7 +317,11 @@ impl v1::resource_service_server::ResourceService for Service {
     ) -> Result<Response<Self::WatchDemandStream>, Status> {
         let (caller, request) = (Caller::of(&request), request.into_inner());
         let session = self.session(&caller, &request.session_id)?;
-        let mut demand = self.actor.ask(|answer| Message::WatchDemand { session, answer }).await??;
+        for (index, provision) in request.provisions.iter().enumerate() {
+            name(&provision.kind, &format!("provisions[{index}].kind"))?;
+        }
+        let kinds = request.provisions.into_iter().map(|provision| (provision.kind, provision.most)).collect();
+        let mut demand = self.actor.ask(|answer| Message::WatchDemand { session, kinds, answer }).await??;
         demand.mark_changed();
         let stream = futures::stream::unfold(demand, async |mut demand| {
             demand.changed().await.ok()?;

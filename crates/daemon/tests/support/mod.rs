@@ -26,7 +26,7 @@ pub(crate) struct Daemon {
 }
 
 pub(crate) struct TestSystem {
-    _parent: tempfile::TempDir,
+    parent: tempfile::TempDir,
     pub(crate) directory: RuntimeDirectory,
     pub(crate) channels: Channels,
 }
@@ -42,7 +42,7 @@ impl TestSystem {
     pub(crate) fn new() -> TestSystem {
         let parent = tempfile::tempdir().unwrap();
         let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
-        TestSystem { _parent: parent, directory, channels: Channels::new() }
+        TestSystem { parent, directory, channels: Channels::new() }
     }
 
     pub(crate) async fn resource_manager(&self) -> Daemon {
@@ -88,6 +88,27 @@ impl TestSystem {
         let shutdown = CancellationToken::new();
         let run = process_manager::run(config, self.directory.clone(), shutdown.clone());
         self.started(process_manager::ROLE, shutdown, run).await
+    }
+
+    /// A second host, with a runtime directory of its own.
+    pub(crate) async fn process_manager_of(
+        &self,
+        manager: &Daemon,
+        host: &str,
+        templates: Vec<process_manager::Template>,
+    ) -> Daemon {
+        let directory = RuntimeDirectory::create(self.parent.path().join(host)).unwrap();
+        let config = process_manager::ProcessManagerConfig {
+            listen: directory.socket("pm"),
+            host: host.to_owned(),
+            resource_manager: Some(manager.endpoint.clone()),
+            templates,
+            ..Default::default()
+        };
+        let shutdown = CancellationToken::new();
+        let running = tokio::spawn(process_manager::run(config, directory.clone(), shutdown.clone()));
+        let endpoint = directory.wait_for(process_manager::ROLE, DEADLINE).await.unwrap();
+        Daemon { shutdown, running, endpoint }
     }
 
     async fn started(

@@ -10,7 +10,7 @@ mod world;
 
 pub use action::{ActionClient, ActionInfo, Fate, ProviderInfo};
 pub use error::CallError;
-pub use health::wait_until_serving;
+pub use health::{Health, wait_until_serving};
 pub use process::{ProcessClient, WorkerWatch};
 pub use resource::{AcquireOptions, DemandWatch, ResourceClient, ResourceWatch};
 pub use world::{Projection, WorldClient};

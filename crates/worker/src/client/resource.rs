@@ -15,6 +15,7 @@ use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_proto::v1::session_request::Kind as Asked;
 use ratn_proto::v1::session_response::Kind as Answered;
+use std::collections::BTreeMap;
 use std::time::Duration;
 use tonic::Streaming;
 
@@ -312,12 +313,15 @@ impl ResourceClient {
         Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
-    /// Tells a provider what waits for more than exists: what is missing at first, and then whenever that changes.
+    /// Tells a provider of so many of these kinds at the most what is asked of it: what is missing at first, and then whenever that
+    /// changes.
     ///
     /// # Errors
     /// [`CallError`].
-    pub async fn watch_demand(&self) -> Result<DemandWatch, CallError> {
-        let question = v1::WatchDemandRequest { session_id: self.session.clone() };
+    pub async fn watch_demand(&self, kinds: &BTreeMap<String, u32>) -> Result<DemandWatch, CallError> {
+        let provision = |(kind, most): (&String, &u32)| v1::Provision { kind: kind.clone(), most: *most };
+        let provisions = kinds.iter().map(provision).collect();
+        let question = v1::WatchDemandRequest { session_id: self.session.clone(), provisions };
         let answer = self.client.clone().watch_demand(question).await.map_err(|status| self.failed(&status))?;
         Ok(DemandWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }

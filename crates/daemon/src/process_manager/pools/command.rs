@@ -1,6 +1,7 @@
 //! What the pools hear, what they answer with, and what they refuse.
 
 use ratn_proto::types::{Demand, WorkerStatus};
+use std::time::Duration;
 
 /// What has happened.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,6 +35,35 @@ pub enum Event {
         reason: String,
         /// The end of its log; may be empty.
         last_words: String,
+    },
+    /// The worker's resource is gone, as it was asked to be with [`Command::Retire`].
+    Withdrawn {
+        /// The worker's id.
+        id: String,
+    },
+    /// The worker's resource is held, so it is not gone.
+    Kept {
+        /// The worker's id.
+        id: String,
+    },
+    /// Somebody holds the worker's resource now, or nobody any more.
+    Used {
+        /// The worker's id.
+        id: String,
+        /// Whether somebody does.
+        held: bool,
+    },
+    /// The worker has answered [`Command::Check`].
+    Answered {
+        /// The worker's id.
+        id: String,
+    },
+    /// It has not, in time.
+    Unanswered {
+        /// The worker's id.
+        id: String,
+        /// What came instead, for people.
+        why: String,
     },
     /// What waits for more than exists, as it is now.
     Demanded(Vec<Demand>),
@@ -70,6 +100,24 @@ pub enum Command {
     Withdraw {
         /// The worker's id.
         id: String,
+    },
+    /// Withdraw the worker's resource as soon as nobody holds it; answered by [`Event::Withdrawn`] or [`Event::Kept`], after which it
+    /// is tried again until [`Command::Keep`].
+    Retire {
+        /// The worker's id.
+        id: String,
+    },
+    /// Do not try to withdraw it any more.
+    Keep {
+        /// The worker's id.
+        id: String,
+    },
+    /// Ask whether the worker still serves; answered by [`Event::Answered`] or [`Event::Unanswered`].
+    Check {
+        /// The worker's id.
+        id: String,
+        /// How long it has for its answer.
+        within: Duration,
     },
     /// Tell watchers.
     Tell(WorkerStatus),

@@ -1,7 +1,7 @@
 //! Which workers there should be, and what to do about it: a pure state machine.
 //!
 //! ```text
-//!   Event ─▶ Pools (of which pool, of which worker) ─▶ Pool ─┬─ Worker    one worker's life
+//!   Event ─▶ Pools (of which pool, of which worker) ─▶ Pool ─┬─ Worker    one worker's life;  Liveness  when it is asked
 //!                                                            ├─ Size      how many there shall be
 //!   Vec<Command> ◀───────────────────────────────────────────┴─ Restarts  what follows a crash
 //! ```
@@ -10,6 +10,7 @@
 
 mod command;
 mod demand;
+mod liveness;
 mod pool;
 mod restart;
 mod size;
@@ -58,16 +59,33 @@ impl Pools {
             }
             Event::Offered { id } => {
                 if let Some(worker) = self.worker(&id) {
-                    worker.offered(&mut commands);
+                    worker.offered(now, &mut commands);
                 }
             }
             Event::Exited { id, reason, last_words } => {
-                let ending = self.ending;
-                if let Some((pool, number)) = self.find(&id) {
-                    pool.exited(now, number, (&reason, &last_words), &mut commands);
-                    if !ending {
-                        pool.fill(now, &mut commands);
-                    }
+                self.about(now, &id, &mut commands, |pool, number, commands| {
+                    pool.exited(now, number, (&reason, &last_words), commands);
+                });
+            }
+            Event::Used { id, held } => {
+                self.about(now, &id, &mut commands, |pool, number, c| pool.used(now, number, held, c));
+            }
+            Event::Withdrawn { id } => {
+                self.about(now, &id, &mut commands, |pool, number, c| pool.withdrawn(now, number, c));
+            }
+            Event::Kept { id } => {
+                if let Some(worker) = self.worker(&id) {
+                    worker.kept(now, &mut commands);
+                }
+            }
+            Event::Answered { id } => {
+                if let Some(worker) = self.worker(&id) {
+                    worker.answered(now);
+                }
+            }
+            Event::Unanswered { id, why } => {
+                if let Some(worker) = self.worker(&id) {
+                    worker.unanswered(&why, &mut commands);
                 }
             }
             Event::Demanded(demands) => self.demanded(now, &demands, &mut commands),
@@ -98,17 +116,15 @@ impl Pools {
         Ok((started, commands))
     }
 
-    /// Ends a worker; it is replaced only where the pool would fall below its minimum.
+    /// Ends a worker once nobody holds it, at the latest when its template's time for that is over; it is replaced only where the
+    /// pool would fall below its minimum.
     ///
     /// # Errors
     /// An unknown worker.
     pub fn stop(&mut self, now: Timestamp, id: &str) -> Result<Vec<Command>, PoolError> {
-        let ending = self.ending;
-        let (pool, number) = self.find(id).ok_or_else(|| PoolError::UnknownWorker { id: id.to_owned() })?;
         let mut commands = Vec::new();
-        pool.stop(now, number, &mut commands);
-        if !ending {
-            pool.fill(now, &mut commands);
+        if !self.about(now, id, &mut commands, |pool, number, commands| pool.stop(now, number, commands)) {
+            return Err(PoolError::UnknownWorker { id: id.to_owned() });
         }
         Ok(commands)
     }
@@ -169,6 +185,23 @@ impl Pools {
     fn pool(&mut self, template: &str) -> Result<&mut Pool, PoolError> {
         let known = self.pools.keys().cloned().collect::<Vec<_>>().join(", ");
         self.pools.get_mut(template).ok_or(PoolError::UnknownTemplate { template: template.to_owned(), known })
+    }
+
+    /// Lets its pool do something about a worker, and then start what is missing. False where the worker is not known.
+    fn about(
+        &mut self,
+        now: Timestamp,
+        id: &str,
+        commands: &mut Vec<Command>,
+        act: impl FnOnce(&mut Pool, u64, &mut Vec<Command>),
+    ) -> bool {
+        let ending = self.ending;
+        let Some((pool, number)) = self.find(id) else { return false };
+        act(pool, number, commands);
+        if !ending {
+            pool.fill(now, commands);
+        }
+        true
     }
 
     /// The pool of a worker, and its number there.

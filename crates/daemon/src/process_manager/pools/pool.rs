@@ -2,7 +2,7 @@
 
 use super::command::{Command, PoolError};
 use super::restart::Restarts;
-use super::size::Size;
+use super::size::{Size, retiring};
 use super::worker::Worker;
 use crate::process_manager::config::Template;
 use ratn_model::time::Timestamp;
@@ -24,8 +24,8 @@ pub(super) struct Pool {
 impl Pool {
     pub(super) fn new(template: Template, host: &str) -> Pool {
         Pool {
-            size: Size::new(template.min, template.max_workers()),
-            restarts: Restarts::default(),
+            size: Size::new(template.min, template.max_workers(), template.spares),
+            restarts: Restarts::new(host, &template.name),
             workers: BTreeMap::new(),
             last_number: 0,
             host: host.to_owned(),
@@ -71,12 +71,25 @@ impl Pool {
     /// When time alone changes something.
     pub(super) fn deadline(&self) -> Option<Timestamp> {
         let restart = self.restarts.pause_until().filter(|_| self.missing() > 0);
-        self.workers.values().filter_map(Worker::deadline).chain(restart).min()
+        let (_, retires) = self.retiring(Timestamp(0));
+        self.workers.values().filter_map(Worker::deadline).chain(restart).chain(retires).min()
     }
 
-    /// Kills what is too late.
+    /// Does what is due: kills, asks, and ends those that have been too many for long enough.
     pub(super) fn advance(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
-        self.workers.values_mut().for_each(|worker| worker.advance(now, commands));
+        self.workers.values_mut().for_each(|worker| worker.advance(now, &self.template, commands));
+        for number in self.retiring(now).0 {
+            if let Some(worker) = self.workers.get_mut(&number) {
+                worker.retire(commands);
+            }
+        }
+    }
+
+    /// Who ends now because there are too many, and when the next one does.
+    fn retiring(&self, now: Timestamp) -> (Vec<u64>, Option<Timestamp>) {
+        let surplus = self.there().saturating_sub(self.wanted());
+        let idle = self.workers.iter().filter_map(|(number, worker)| Some((worker.idle_since()?, *number)));
+        retiring(idle, surplus, self.template.idle(), now)
     }
 
     /// Starts what is missing, unless it has to wait; the ids.
@@ -91,7 +104,7 @@ impl Pool {
         self.last_number += 1;
         let (name, number) = (&self.template.name, self.last_number);
         let id = format!("{name}-{number}@{}", self.host);
-        let worker = Worker::starting(id.clone(), name, now + self.template.start_timeout());
+        let worker = Worker::starting(now, id.clone(), &self.template);
         self.workers.insert(number, worker);
         commands.push(Command::Start { id: id.clone(), template: name.clone() });
         id
@@ -108,11 +121,9 @@ impl Pool {
         let Some(worker) = self.workers.remove(&number) else { return };
         let id = worker.id();
         commands.push(Command::Withdraw { id: id.to_owned() });
-        let reason = match worker.is_too_late() {
-            true => format!("not serving within {} s", self.template.start_timeout_s),
-            false => reason.to_owned(),
-        };
-        commands.push(Command::Tell(worker.exited(reason.clone())));
+        let exited = worker.exited(reason);
+        let reason = exited.reason.clone();
+        commands.push(Command::Tell(exited));
         if !worker.is_stopping() {
             let words = if last_words.is_empty() { String::new() } else { format!("; its last words: {last_words}") };
             let what = format!("{id}: {reason}{words}");
@@ -150,17 +161,32 @@ impl Pool {
         if self.size.demand(count) && self.restarts.has_failed() {
             self.restarts.forgive();
         }
-        let surplus = self.there().saturating_sub(self.size.wanted()) as usize;
+        let surplus = self.there().saturating_sub(self.wanted()) as usize;
         let kill_at = now + self.template.stop_timeout();
         for worker in self.workers.values_mut().rev().filter(|worker| worker.is_starting()).take(surplus) {
             worker.stop(kill_at, commands);
         }
     }
 
-    /// Ends a worker; it is replaced only where the pool would fall below its minimum.
-    pub(super) fn stop(&mut self, now: Timestamp, number: u64, commands: &mut Vec<Command>) {
+    /// Somebody holds a worker's resource now, or nobody any more.
+    pub(super) fn used(&mut self, now: Timestamp, number: u64, held: bool, commands: &mut Vec<Command>) {
+        if let Some(worker) = self.workers.get_mut(&number) {
+            worker.used(now, held, commands);
+        }
+    }
+
+    /// A worker's resource is gone, as it was to be.
+    pub(super) fn withdrawn(&mut self, now: Timestamp, number: u64, commands: &mut Vec<Command>) {
         let kill_at = now + self.template.stop_timeout();
-        if self.workers.get_mut(&number).is_some_and(|worker| worker.stop(kill_at, commands)) {
+        if let Some(worker) = self.workers.get_mut(&number) {
+            worker.withdrawn(kill_at, commands);
+        }
+    }
+
+    /// Ends a worker once nobody holds it; it is replaced only where the pool would fall below its minimum.
+    pub(super) fn stop(&mut self, now: Timestamp, number: u64, commands: &mut Vec<Command>) {
+        let (until, kill_at) = (now + self.template.drain(), now + self.template.stop_timeout());
+        if self.workers.get_mut(&number).is_some_and(|worker| worker.drain(until, kill_at, commands)) {
             self.size.one_less();
         }
     }
@@ -174,11 +200,18 @@ impl Pool {
     }
 
     fn there(&self) -> u32 {
-        let there = self.workers.values().filter(|worker| !worker.is_stopping()).count();
-        u32::try_from(there).unwrap_or(u32::MAX)
+        self.count(|worker| !worker.is_leaving())
+    }
+
+    fn wanted(&self) -> u32 {
+        self.size.wanted(self.count(|worker| worker.is_ready() && worker.is_held()))
     }
 
     fn missing(&self) -> u32 {
-        if self.restarts.has_failed() { 0 } else { self.size.wanted().saturating_sub(self.there()) }
+        if self.restarts.has_failed() { 0 } else { self.wanted().saturating_sub(self.there()) }
+    }
+
+    fn count(&self, of: impl Fn(&Worker) -> bool) -> u32 {
+        u32::try_from(self.workers.values().filter(|worker| of(worker)).count()).unwrap_or(u32::MAX)
     }
 }

@@ -1,10 +1,19 @@
-//! How many workers a pool shall have: what was asked for, and what those who wait demand, between its minimum and maximum.
+//! How many workers a pool shall have.
+//!
+//! ```text
+//!   wanted = max(asked for (at least `min`), held) + spares,   or what is demanded where that is more;   `max` at the most
+//! ```
+//! Those above it end when they have been idle for long enough, the longest idle ones first; who is held never does.
+
+use ratn_model::time::Timestamp;
+use std::time::Duration;
 
 /// See the module.
 #[derive(Debug, Clone)]
 pub(super) struct Size {
     min: u32,
     max: u32,
+    spares: u32,
     /// What is kept without any demand.
     asked: u32,
     /// How many there should be for those who wait; 0 when nobody does.
@@ -14,16 +23,16 @@ pub(super) struct Size {
 }
 
 impl Size {
-    pub(super) fn new(min: u32, max: u32) -> Size {
-        Size { min, max, asked: min, demanded: 0, short: false }
+    pub(super) fn new(min: u32, max: u32, spares: u32) -> Size {
+        Size { min, max, spares, asked: min, demanded: 0, short: false }
     }
 
-    /// How many there shall be now.
-    pub(super) fn wanted(&self) -> u32 {
-        self.asked.max(self.demanded)
+    /// How many there shall be now that so many are held.
+    pub(super) fn wanted(&self, held: u32) -> u32 {
+        self.asked.max(held).saturating_add(self.spares).max(self.demanded).min(self.max)
     }
 
-    /// More than were asked for so far are demanded, and more than there may be.
+    /// More is demanded than there may be.
     pub(super) fn is_short(&self) -> bool {
         self.short
     }
@@ -57,30 +66,62 @@ impl Size {
     }
 }
 
+/// Which of those that are idle (since when, by number) are to end now, of so many too many; and when the next one is.
+pub(super) fn retiring(
+    idle: impl Iterator<Item = (Timestamp, u64)>,
+    surplus: u32,
+    patience: Duration,
+    now: Timestamp,
+) -> (Vec<u64>, Option<Timestamp>) {
+    let mut idle: Vec<(Timestamp, u64)> = idle.collect();
+    idle.sort_unstable();
+    idle.truncate(surplus as usize);
+    let due = idle.iter().take_while(|(since, _)| *since + patience <= now).count();
+    let next = idle.get(due).map(|(since, _)| *since + patience);
+    (idle[..due].iter().map(|(_, number)| *number).collect(), next)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn what_is_asked_for_stays_between_minimum_and_maximum() {
-        let mut size = Size::new(1, 3);
+        let mut size = Size::new(1, 3, 0);
         assert!(size.ask(size.asked(), 2));
-        assert_eq!(size.wanted(), 3);
+        assert_eq!(size.wanted(0), 3);
         assert!(!size.ask(size.asked(), 1));
         for _ in 0..5 {
             size.one_less();
         }
-        assert_eq!(size.wanted(), 1);
+        assert_eq!(size.wanted(0), 1);
     }
 
     #[test]
     fn demand_raises_it_for_as_long_as_it_is_there_and_to_the_maximum_only() {
-        let mut size = Size::new(0, 3);
+        let mut size = Size::new(0, 3, 0);
         assert!(size.demand(2));
-        assert_eq!((size.wanted(), size.is_short()), (2, false));
+        assert_eq!((size.wanted(0), size.is_short()), (2, false));
         assert!(!size.demand(9), "it goes on");
-        assert_eq!((size.wanted(), size.is_short()), (3, true));
+        assert_eq!((size.wanted(0), size.is_short()), (3, true));
         size.demand(0);
-        assert_eq!((size.wanted(), size.is_short()), (0, false));
+        assert_eq!((size.wanted(0), size.is_short()), (0, false));
+    }
+
+    #[test]
+    fn spares_are_kept_beside_those_that_are_held() {
+        let size = Size::new(2, 5, 1);
+        let wanted = (0..=5).map(|held| size.wanted(held));
+        assert_eq!(wanted.collect::<Vec<_>>(), [3, 3, 3, 4, 5, 5]);
+    }
+
+    #[test]
+    fn of_those_too_many_the_longest_idle_end_first_each_when_it_is_due() {
+        let (at, patience) = (Timestamp::from_seconds, Duration::from_secs(10));
+        let idle = || [(at(3.0), 1), (at(1.0), 2), (at(2.0), 3)].into_iter();
+        assert_eq!(retiring(idle(), 2, patience, at(10.0)), (vec![], Some(at(11.0))));
+        assert_eq!(retiring(idle(), 2, patience, at(11.5)), (vec![2], Some(at(12.0))));
+        assert_eq!(retiring(idle(), 2, patience, at(99.0)), (vec![2, 3], None));
+        assert_eq!(retiring(idle(), 0, patience, at(99.0)), (vec![], None));
     }
 }

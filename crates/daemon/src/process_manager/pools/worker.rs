@@ -1,14 +1,18 @@
 //! The life of one worker.
 //!
 //! ```text
-//!            start                health SERVING          resource there
-//!   (none) ────────▶ starting ──────────────▶ serving ──────────────▶ ready
-//!      ▲                │ too late: kill          │ stop asked: terminate, later kill │
-//!      └────────────────┴──────── exited ◀────────┴───────────────────────────────────┘
+//!            start               SERVING            resource there          idle, or stop asked
+//!   (none) ────────▶ starting ───────────▶ serving ────────────────▶ ready ────────────────────▶ leaving
+//!                       │ too late           │ not answering           │ ▲ held: it stays          │ withdrawn, or
+//!                       ▼                    ▼                         ▼ └──────── (idle) ─────────┤ its time is over
+//!                     failed (killed; its exit is a crash) ◀───────────┴───────────────────────────┤
+//!                                                                          stopping (SIGTERM, later SIGKILL) ◀┘
 //! ```
 //! How many there are, and what follows one that is gone, is not its business.
 
 use super::command::Command;
+use super::liveness;
+use crate::process_manager::config::Template;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{WorkerState, WorkerStatus};
 
@@ -17,23 +21,30 @@ pub(super) struct Worker {
     id: String,
     template: String,
     phase: Phase,
+    /// Since when it serves.
+    serves_since: Option<Timestamp>,
+    /// Since when nobody holds its resource; `None` while somebody does.
+    idle_since: Option<Timestamp>,
+    liveness: liveness::Liveness,
     pid: u32,
     endpoint: String,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 enum Phase {
     Starting {
         until: Timestamp,
     },
-    Serving {
-        since: Timestamp,
+    Serving,
+    Ready,
+    /// Its resource goes as soon as nobody holds it; at the latest then, where it was asked to stop.
+    Leaving {
+        until: Option<Timestamp>,
     },
-    Ready {
-        since: Timestamp,
+    /// Killed because of that: its exit is a crash.
+    Failed {
+        why: String,
     },
-    /// Killed because it did not serve in time: its exit is a crash.
-    TooLate,
     /// Killed at `kill_at`; without one it has been.
     Stopping {
         kill_at: Option<Timestamp>,
@@ -41,10 +52,18 @@ enum Phase {
 }
 
 impl Worker {
-    /// One whose process is being started; it has failed if it does not serve at `until`.
-    pub(super) fn starting(id: String, template: &str, until: Timestamp) -> Worker {
-        let phase = Phase::Starting { until };
-        Worker { id, template: template.to_owned(), phase, pid: 0, endpoint: String::new() }
+    /// One whose process is being started now.
+    pub(super) fn starting(now: Timestamp, id: String, template: &Template) -> Worker {
+        Worker {
+            id,
+            template: template.name.clone(),
+            phase: Phase::Starting { until: now + template.start_timeout() },
+            serves_since: None,
+            idle_since: Some(now),
+            liveness: liveness::Liveness::of(template),
+            pid: 0,
+            endpoint: String::new(),
+        }
     }
 
     pub(super) fn id(&self) -> &str {
@@ -56,8 +75,10 @@ impl Worker {
         self.pid = pid;
         match self.phase {
             Phase::Stopping { kill_at: Some(_) } => commands.push(Command::Terminate { id: self.id.clone() }),
-            Phase::Stopping { kill_at: None } | Phase::TooLate => commands.push(Command::Kill { id: self.id.clone() }),
-            Phase::Starting { .. } | Phase::Serving { .. } | Phase::Ready { .. } => {}
+            Phase::Stopping { kill_at: None } | Phase::Failed { .. } => {
+                commands.push(Command::Kill { id: self.id.clone() });
+            }
+            Phase::Starting { .. } | Phase::Serving | Phase::Ready | Phase::Leaving { .. } => {}
         }
         commands.push(Command::Tell(self.status()));
     }
@@ -65,23 +86,81 @@ impl Worker {
     /// It serves as a resource of `kind`. Too late is too late.
     pub(super) fn serving(&mut self, now: Timestamp, endpoint: &str, kind: &str, commands: &mut Vec<Command>) {
         if self.is_starting() {
-            self.phase = Phase::Serving { since: now };
+            self.phase = Phase::Serving;
+            self.serves_since = Some(now);
+            self.liveness.answered(now);
             endpoint.clone_into(&mut self.endpoint);
             commands.push(Command::Offer { worker: self.status(), kind: kind.to_owned() });
         }
     }
 
     /// Its resource is there.
-    pub(super) fn offered(&mut self, commands: &mut Vec<Command>) {
-        if let Phase::Serving { since } = self.phase {
-            self.phase = Phase::Ready { since };
+    pub(super) fn offered(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        if self.phase == Phase::Serving {
+            self.phase = Phase::Ready;
+            self.idle_since = self.idle_since.and(Some(now));
             commands.push(Command::Tell(self.status()));
         }
     }
 
-    /// Ends it: killed if it has not ended at `kill_at`. False where it is ending already.
+    /// Somebody holds it now, or nobody any more.
+    pub(super) fn used(&mut self, now: Timestamp, held: bool, commands: &mut Vec<Command>) {
+        match (held, self.idle_since) {
+            (true, _) => self.idle_since = None,
+            (false, None) => self.idle_since = Some(now),
+            (false, Some(_)) => return,
+        }
+        if !held && matches!(self.phase, Phase::Leaving { .. }) {
+            commands.push(Command::Retire { id: self.id.clone() });
+        }
+    }
+
+    /// Gives its resource back as soon as nobody holds it, and ends it then; if it was held meanwhile, it stays.
+    pub(super) fn retire(&mut self, commands: &mut Vec<Command>) {
+        if self.phase == Phase::Ready {
+            self.phase = Phase::Leaving { until: None };
+            commands.push(Command::Retire { id: self.id.clone() });
+        }
+    }
+
+    /// Somebody was given its resource before it could be withdrawn.
+    pub(super) fn kept(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        if self.phase == (Phase::Leaving { until: None }) {
+            self.phase = Phase::Ready;
+            self.idle_since = self.idle_since.and(Some(now));
+            commands.push(Command::Keep { id: self.id.clone() });
+        }
+    }
+
+    /// Its resource is gone as it was to be: nothing is given to it any more.
+    pub(super) fn withdrawn(&mut self, kill_at: Timestamp, commands: &mut Vec<Command>) {
+        if matches!(self.phase, Phase::Leaving { .. }) {
+            self.stop(kill_at, commands);
+        }
+    }
+
+    /// Ends it once nobody holds its resource, at the latest at `until`. False where it is ending already.
+    pub(super) fn drain(&mut self, until: Timestamp, kill_at: Timestamp, commands: &mut Vec<Command>) -> bool {
+        match self.phase {
+            Phase::Ready => {
+                self.phase = Phase::Leaving { until: Some(until) };
+                commands.push(Command::Retire { id: self.id.clone() });
+                true
+            }
+            Phase::Leaving { until: None } => {
+                self.phase = Phase::Leaving { until: Some(until) };
+                true
+            }
+            Phase::Leaving { .. } => false,
+            Phase::Starting { .. } | Phase::Serving | Phase::Failed { .. } | Phase::Stopping { .. } => {
+                self.stop(kill_at, commands)
+            }
+        }
+    }
+
+    /// Ends it now: killed if it has not ended at `kill_at`. False where it is ending already.
     pub(super) fn stop(&mut self, kill_at: Timestamp, commands: &mut Vec<Command>) -> bool {
-        if self.is_stopping() {
+        if matches!(self.phase, Phase::Stopping { .. }) {
             return false;
         }
         self.phase = Phase::Stopping { kill_at: Some(kill_at) };
@@ -90,51 +169,98 @@ impl Worker {
         true
     }
 
-    /// Kills it where its time is over.
-    pub(super) fn advance(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+    /// It has said that it still serves.
+    pub(super) fn answered(&mut self, now: Timestamp) {
+        self.liveness.answered(now);
+    }
+
+    /// It has not: it is taken away from whoever holds it, and killed.
+    pub(super) fn unanswered(&mut self, why: &str, commands: &mut Vec<Command>) {
+        if self.is_live() {
+            commands.push(Command::Withdraw { id: self.id.clone() });
+            self.fail(format!("hung: {why}"), commands);
+        }
+    }
+
+    /// Does what is due.
+    pub(super) fn advance(&mut self, now: Timestamp, template: &Template, commands: &mut Vec<Command>) {
         match self.phase {
-            Phase::Starting { until } if until <= now => self.phase = Phase::TooLate,
+            Phase::Starting { until } if until <= now => {
+                self.fail(format!("not serving within {} s", template.start_timeout_s), commands);
+            }
+            Phase::Leaving { until: Some(until) } if until <= now => {
+                self.stop(now + template.stop_timeout(), commands);
+            }
             Phase::Stopping { kill_at: Some(kill_at) } if kill_at <= now => {
                 self.phase = Phase::Stopping { kill_at: None };
+                commands.push(Command::Kill { id: self.id.clone() });
             }
-            _ => return,
+            _ => {}
         }
+        if self.is_live()
+            && let Some(within) = self.liveness.ask(now)
+        {
+            commands.push(Command::Check { id: self.id.clone(), within });
+        }
+    }
+
+    fn fail(&mut self, why: String, commands: &mut Vec<Command>) {
+        self.phase = Phase::Failed { why };
         commands.push(Command::Kill { id: self.id.clone() });
     }
 
     /// When time alone changes it.
     pub(super) fn deadline(&self) -> Option<Timestamp> {
-        match self.phase {
+        let of_phase = match self.phase {
             Phase::Starting { until } => Some(until),
+            Phase::Leaving { until } => until,
             Phase::Stopping { kill_at } => kill_at,
-            Phase::Serving { .. } | Phase::Ready { .. } | Phase::TooLate => None,
-        }
+            Phase::Serving | Phase::Ready | Phase::Failed { .. } => None,
+        };
+        let of_liveness = self.liveness.deadline().filter(|_| self.is_live());
+        of_phase.into_iter().chain(of_liveness).min()
     }
 
     pub(super) fn is_starting(&self) -> bool {
         matches!(self.phase, Phase::Starting { .. })
     }
 
-    /// Whether its end was asked for.
+    pub(super) fn is_ready(&self) -> bool {
+        self.phase == Phase::Ready
+    }
+
+    /// Whether its end was asked for, so that another one is to take its place.
+    pub(super) fn is_leaving(&self) -> bool {
+        matches!(self.phase, Phase::Leaving { .. } | Phase::Stopping { .. })
+    }
+
+    /// Whether its exit is what was asked for.
     pub(super) fn is_stopping(&self) -> bool {
         matches!(self.phase, Phase::Stopping { .. })
     }
 
-    /// It was killed because it did not serve in time.
-    pub(super) fn is_too_late(&self) -> bool {
-        self.phase == Phase::TooLate
+    /// Whether it serves, and is to answer.
+    fn is_live(&self) -> bool {
+        matches!(self.phase, Phase::Serving | Phase::Ready | Phase::Leaving { .. })
+    }
+
+    /// Whether somebody holds its resource.
+    pub(super) fn is_held(&self) -> bool {
+        self.idle_since.is_none()
+    }
+
+    /// Since when it is ready and nobody holds it.
+    pub(super) fn idle_since(&self) -> Option<Timestamp> {
+        self.idle_since.filter(|_| self.is_ready())
     }
 
     pub(super) fn serves_since(&self) -> Option<Timestamp> {
-        match self.phase {
-            Phase::Serving { since } | Phase::Ready { since } => Some(since),
-            Phase::Starting { .. } | Phase::TooLate | Phase::Stopping { .. } => None,
-        }
+        self.serves_since
     }
 
     pub(super) fn status(&self) -> WorkerStatus {
         let state = match self.phase {
-            Phase::Ready { .. } => WorkerState::Ready,
+            Phase::Ready | Phase::Leaving { .. } => WorkerState::Ready,
             _ => WorkerState::Starting,
         };
         WorkerStatus {
@@ -149,8 +275,12 @@ impl Worker {
         }
     }
 
-    /// As it is told when its process is gone.
-    pub(super) fn exited(&self, reason: String) -> WorkerStatus {
+    /// As it is told when its process is gone; why it was killed counts more than how it ended.
+    pub(super) fn exited(&self, how: &str) -> WorkerStatus {
+        let reason = match &self.phase {
+            Phase::Failed { why } => why.clone(),
+            _ => how.to_owned(),
+        };
         WorkerStatus { state: WorkerState::Exited, reason, ..self.status() }
     }
 }
@@ -158,11 +288,34 @@ impl Worker {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::process_manager::config::Liveness;
 
     const ID: &str = "planner-1@compute";
+    const SELDOM: Liveness = Liveness { interval_s: 1_000.0, timeout_s: 1.0 };
+
+    fn at(seconds: f64) -> Timestamp {
+        Timestamp::from_seconds(seconds)
+    }
+
+    fn template() -> Template {
+        Template {
+            start_timeout_s: 3.0,
+            stop_timeout_s: 2.0,
+            liveness: SELDOM,
+            ..Template::new("planner", "PathPlanner")
+        }
+    }
 
     fn worker() -> Worker {
-        Worker::starting(ID.to_owned(), "planner", Timestamp(3))
+        Worker::starting(at(0.0), ID.to_owned(), &template())
+    }
+
+    fn ready() -> Worker {
+        let mut worker = worker();
+        worker.spawned(4711, &mut Vec::new());
+        worker.serving(at(1.0), "unix:/w", "PathPlanner", &mut Vec::new());
+        worker.offered(at(1.0), &mut Vec::new());
+        worker
     }
 
     fn commands(act: impl FnOnce(&mut Vec<Command>)) -> Vec<Command> {
@@ -172,38 +325,88 @@ mod tests {
         commands
     }
 
+    fn stopped() -> [Command; 2] {
+        [Command::Withdraw { id: ID.into() }, Command::Terminate { id: ID.into() }]
+    }
+
     #[test]
     fn a_worker_is_offered_when_it_serves_and_ready_when_its_resource_is_there() {
         let mut worker = worker();
         assert!(commands(|c| worker.spawned(4711, c)).is_empty());
-        let offered = commands(|c| worker.serving(Timestamp(1), "unix:/w", "PathPlanner", c));
+        let offered = commands(|c| worker.serving(at(1.0), "unix:/w", "PathPlanner", c));
         assert!(matches!(&offered[..], [Command::Offer { worker, kind }]
             if worker.endpoint == "unix:/w" && worker.pid == 4711 && kind == "PathPlanner"));
         assert_eq!(worker.status().state, WorkerState::Starting);
-        worker.offered(&mut Vec::new());
-        assert_eq!((worker.status().state, worker.serves_since()), (WorkerState::Ready, Some(Timestamp(1))));
+        worker.offered(at(1.5), &mut Vec::new());
+        assert_eq!((worker.status().state, worker.serves_since()), (WorkerState::Ready, Some(at(1.0))));
+        assert_eq!(worker.idle_since(), Some(at(1.5)));
     }
 
     #[test]
     fn one_that_does_not_serve_in_time_is_killed_and_not_offered_any_more() {
         let mut worker = worker();
-        assert!(commands(|c| worker.advance(Timestamp(2), c)).is_empty());
-        assert_eq!(commands(|c| worker.advance(Timestamp(3), c)), [Command::Kill { id: ID.into() }]);
-        assert!(worker.is_too_late() && worker.deadline().is_none());
-        assert!(commands(|c| worker.serving(Timestamp(4), "unix:/late", "PathPlanner", c)).is_empty());
+        assert!(commands(|c| worker.advance(at(2.0), &template(), c)).is_empty());
+        assert_eq!(commands(|c| worker.advance(at(3.0), &template(), c)), [Command::Kill { id: ID.into() }]);
+        assert!(worker.deadline().is_none());
+        assert!(commands(|c| worker.serving(at(4.0), "unix:/late", "PathPlanner", c)).is_empty());
         // Its process came only now.
         assert_eq!(commands(|c| worker.spawned(4711, c)), [Command::Kill { id: ID.into() }]);
+        assert_eq!(worker.exited("killed by signal 9").reason, "not serving within 3 s");
     }
 
     #[test]
     fn one_that_is_stopped_is_withdrawn_terminated_and_killed_when_it_stays() {
         let mut worker = worker();
-        let stopped = [Command::Withdraw { id: ID.into() }, Command::Terminate { id: ID.into() }];
-        assert_eq!(commands(|c| assert!(worker.stop(Timestamp(5), c))), stopped);
-        assert!(commands(|c| assert!(!worker.stop(Timestamp(9), c))).is_empty(), "once");
-        assert_eq!(commands(|c| worker.spawned(4711, c)), stopped[1..], "there was nobody to hear it before");
-        assert_eq!(worker.deadline(), Some(Timestamp(5)));
-        assert_eq!(commands(|c| worker.advance(Timestamp(5), c)), [Command::Kill { id: ID.into() }]);
+        assert_eq!(commands(|c| assert!(worker.stop(at(5.0), c))), stopped());
+        assert!(commands(|c| assert!(!worker.stop(at(9.0), c))).is_empty(), "once");
+        assert_eq!(commands(|c| worker.spawned(4711, c)), stopped()[1..], "there was nobody to hear it before");
+        assert_eq!(worker.deadline(), Some(at(5.0)));
+        assert_eq!(commands(|c| worker.advance(at(5.0), &template(), c)), [Command::Kill { id: ID.into() }]);
         assert_eq!(commands(|c| worker.spawned(4711, c)), [Command::Kill { id: ID.into() }]);
+    }
+
+    #[test]
+    fn one_that_retires_ends_when_its_resource_is_gone() {
+        let mut worker = ready();
+        assert_eq!(commands(|c| worker.retire(c)), [Command::Retire { id: ID.into() }]);
+        assert_eq!(commands(|c| worker.withdrawn(at(9.0), c)), stopped());
+    }
+
+    #[test]
+    fn one_that_is_held_before_it_could_retire_stays() {
+        let mut worker = ready();
+        worker.retire(&mut Vec::new());
+        assert_eq!(commands(|c| worker.kept(at(5.0), c)), [Command::Keep { id: ID.into() }]);
+        assert_eq!((worker.is_ready(), worker.idle_since()), (true, Some(at(5.0))), "until it is heard who holds it");
+        worker.used(at(6.0), true, &mut Vec::new());
+        worker.used(at(7.0), false, &mut Vec::new());
+        assert_eq!(worker.idle_since(), Some(at(7.0)));
+    }
+
+    #[test]
+    fn one_that_is_drained_waits_for_its_holder_and_not_for_ever() {
+        for patient in [true, false] {
+            let mut worker = ready();
+            worker.used(at(2.0), true, &mut Vec::new());
+            assert_eq!(commands(|c| assert!(worker.drain(at(30.0), at(4.0), c))), [Command::Retire { id: ID.into() }]);
+            assert!(commands(|c| worker.kept(at(3.0), c)).is_empty(), "it leaves all the same");
+            assert_eq!((worker.is_leaving(), worker.deadline()), (true, Some(at(30.0))));
+            if patient {
+                assert_eq!(commands(|c| worker.used(at(9.0), false, c)), [Command::Retire { id: ID.into() }]);
+                assert_eq!(commands(|c| worker.withdrawn(at(11.0), c)), stopped());
+            } else {
+                assert_eq!(commands(|c| worker.advance(at(30.0), &template(), c)), stopped());
+                assert_eq!(worker.deadline(), Some(at(32.0)));
+            }
+        }
+    }
+
+    #[test]
+    fn one_that_does_not_answer_is_withdrawn_and_killed() {
+        let mut worker = ready();
+        let killed = [Command::Withdraw { id: ID.into() }, Command::Kill { id: ID.into() }];
+        assert_eq!(commands(|c| worker.unanswered("no answer within 1 s", c)), killed);
+        assert_eq!(worker.exited("killed by signal 9").reason, "hung: no answer within 1 s");
+        assert!(!worker.is_stopping(), "its exit is a crash");
     }
 }

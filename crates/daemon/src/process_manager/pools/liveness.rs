@@ -1,0 +1,55 @@
+//! When a worker that serves is asked whether it still does. One question at a time; the next one a while after the answer.
+
+use crate::process_manager::config::Template;
+use ratn_model::time::Timestamp;
+use std::time::Duration;
+
+/// See the module.
+#[derive(Debug)]
+pub(super) struct Liveness {
+    pause: Duration,
+    /// The time for an answer.
+    within: Duration,
+    /// When to ask; `None` while an answer is awaited, and before it serves.
+    next: Option<Timestamp>,
+}
+
+impl Liveness {
+    pub(super) fn of(template: &Template) -> Liveness {
+        Liveness { pause: template.liveness.interval(), within: template.liveness.timeout(), next: None }
+    }
+
+    /// How long it has to answer, where it is to be asked now.
+    pub(super) fn ask(&mut self, now: Timestamp) -> Option<Duration> {
+        self.next.take_if(|next| *next <= now).map(|_| self.within)
+    }
+
+    /// It serves.
+    pub(super) fn answered(&mut self, now: Timestamp) {
+        self.next = Some(now + self.pause);
+    }
+
+    pub(super) fn deadline(&self) -> Option<Timestamp> {
+        self.next
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::process_manager::config::Liveness as Config;
+
+    #[test]
+    fn it_is_asked_once_and_again_a_while_after_its_answer() {
+        let config = Config { interval_s: 2.0, timeout_s: 5.0 };
+        let template = Template { liveness: config, ..Template::new("planner", "PathPlanner") };
+        let (mut liveness, at) = (Liveness::of(&template), Timestamp::from_seconds);
+        assert_eq!(liveness.ask(at(9.0)), None, "it does not serve yet");
+        liveness.answered(at(10.0));
+        assert_eq!((liveness.ask(at(11.0)), liveness.deadline()), (None, Some(at(12.0))));
+        assert_eq!(liveness.ask(at(12.0)), Some(Duration::from_secs(5)));
+        assert_eq!((liveness.ask(at(20.0)), liveness.deadline()), (None, None), "one question at a time");
+        liveness.answered(at(20.0));
+        assert_eq!(liveness.deadline(), Some(at(22.0)));
+    }
+}
