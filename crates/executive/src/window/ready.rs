@@ -10,7 +10,7 @@ use super::view::{Blocked, Sight, View};
 use crate::analysis::NodeNature;
 use crate::binding::{self, BindError, Outputs};
 use crate::context::Context;
-use ratn_model::expression::{Expr, FactExpr};
+use ratn_model::expression::{EffectExpr, Expr, FactExpr};
 use ratn_model::fact::{FactKey, Footprint};
 use ratn_model::id::InstanceId;
 use ratn_model::program::StateKind;
@@ -198,7 +198,7 @@ impl Window {
         })
     }
 
-    /// What an instance reads or requires, and what it writes on the path that is computed ahead.
+    /// What an instance reads or requires, at its beginning or at its end, and what it writes on the path that is computed ahead.
     fn touches(&self, context: &Context<'_>, instance: &Instance) -> (Footprint, Footprint) {
         let sight = self.sight(context);
         let view = sight.view(instance, None);
@@ -213,6 +213,11 @@ impl Window {
         };
         reads = reads.union(facts_of(&state.annotations.requires, &view));
         reads = reads.union(FactExpr::footprint(&analysis.senses, &view));
+        // What its effects are made of is read when it ends.
+        let effects = state.annotations.effects.values();
+        let looked_up: Vec<FactExpr> =
+            effects.flat_map(|effects| EffectExpr::fact_expressions(effects)).cloned().collect();
+        reads = reads.union(FactExpr::footprint(&looked_up, &view));
         (reads, view.may_write(instance, self.own_link(instance)))
     }
 

@@ -1,7 +1,7 @@
 //! What is discarded: the arms that are not taken, and everything behind an outcome that was not computed ahead.
 
 use super::cursor::{Cursor, Todo};
-use super::instance::{Role, Status};
+use super::instance::{Line, Role, Status};
 use super::{Window, give_back};
 use crate::context::Context;
 use crate::protocol::{Command, Note};
@@ -22,7 +22,7 @@ impl Window {
         instance.arms = smallvec![kept];
         let lost: Vec<InstanceId> = arms.iter().filter_map(|arm| arm.next).collect();
         let lost_segments: BTreeSet<u64> = arms.iter().map(|arm| arm.segment).collect();
-        self.discard(context, lost, lost_segments);
+        self.discard(context, lost, lost_segments, BTreeSet::new());
         for cursor in &mut self.cursors {
             if let Some((tail, arm)) = &mut cursor.tail
                 && *tail == id
@@ -43,26 +43,52 @@ impl Window {
     pub(super) fn squash_behind(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.instances.get_mut(id) else { return };
         let arms = std::mem::take(&mut instance.arms);
-        let (own, line, detached) = (instance.segment, instance.line, instance.detached);
+        let (own, line, position, detached) = (instance.segment, instance.line, instance.position, instance.detached);
         let segments = arms.iter().map(|arm| arm.segment).filter(|segment| *segment != own).collect();
         let mut next: Vec<InstanceId> = arms.iter().filter_map(|arm| arm.next).collect();
-        if detached {
-            // Its line went on without it: what has not retired is behind it.
-            next.extend(self.threads.get(&line).and_then(|thread| thread.head));
-        }
+        let mut regions = BTreeSet::new();
         self.cursors.retain(|cursor| cursor.tail.is_none_or(|(tail, _)| tail != id) && cursor.todo != Todo::Await(id));
         if detached {
+            // Its line went on without it: what has not retired is behind it.
+            regions = self.stop_line(line, &mut next);
+            let beside = self.detached.iter().filter_map(|id| self.instances.get(*id));
+            let behind = beside.filter(|other| other.line == line && other.position > position);
+            next.extend(behind.map(|other| other.id));
             self.cursors.retain(|cursor| cursor.line != line);
         }
-        self.discard(context, next, segments);
+        self.discard(context, next, segments, regions);
     }
 
-    /// Discards instances, what is behind them, and segments with their cursors.
-    fn discard(&mut self, context: &mut Context<'_>, from: Vec<InstanceId>, mut segments: BTreeSet<u64>) {
+    /// Adds to `heads` what a line has come to, also in the regions that it waits for, and waits for them no more: their lines.
+    fn stop_line(&mut self, line: Line, heads: &mut Vec<InstanceId>) -> BTreeSet<Line> {
+        let mut regions = BTreeSet::new();
+        let mut open = vec![line];
+        while let Some(line) = open.pop() {
+            if let Some(thread) = self.threads.get_mut(&line) {
+                heads.extend(thread.head);
+                thread.open_regions = 0;
+            }
+            let instances = &self.instances;
+            for (_, fork) in self.forks.extract_if(.., |id, fork| fork.line == line && instances.get(*id).is_none()) {
+                heads.extend(fork.join);
+                regions.extend(&fork.regions);
+                open.extend(fork.regions);
+            }
+        }
+        regions
+    }
+
+    /// Discards instances, what is behind them, segments with their cursors, and lines.
+    fn discard(
+        &mut self,
+        context: &mut Context<'_>,
+        from: Vec<InstanceId>,
+        mut segments: BTreeSet<u64>,
+        mut lines: BTreeSet<Line>,
+    ) {
         let mut open = from;
         let mut squashed: BTreeSet<InstanceId> = BTreeSet::new();
         let mut reopened: Vec<Cursor> = Vec::new();
-        let mut lines: BTreeSet<u64> = BTreeSet::new();
         loop {
             while let Some(id) = open.pop() {
                 let Some(instance) = self.instances.get(id) else { continue };
