@@ -246,6 +246,11 @@ impl Instance {
     pub(crate) fn is_pia(&self) -> bool {
         self.role == Role::Node && self.nature == NodeNature::Irreversible
     }
+
+    /// Whether it is a motion whose path was left: it ends as it ends, and leads nowhere.
+    pub(crate) fn is_orphan(&self) -> bool {
+        self.detached && self.arms.is_empty()
+    }
 }
 
 /// Whether outputs and assignments count after this outcome.

@@ -230,11 +230,11 @@ impl Window {
             Event::PauseRequested => self.hold = Hold::Paused(0),
             Event::ResumeRequested => {
                 self.hold = Hold::Running;
-                self.look_at_heads();
+                self.look_at_those_held();
             }
             Event::StepRequested => {
                 self.hold.step();
-                self.look_at_heads();
+                self.look_at_those_held();
             }
             Event::Advised { urgency_s } => self.advise(context, &urgency_s),
             Event::Woken => self.wake_routines(context),
@@ -343,10 +343,12 @@ impl Window {
         }
     }
 
-    fn look_at_heads(&mut self) {
-        let heads: Vec<InstanceId> = self.threads.values().filter_map(|thread| thread.head).collect();
-        for head in heads {
-            self.enqueue(head);
+    /// PIAs that may begin, and those beside that may try again.
+    fn look_at_those_held(&mut self) {
+        let heads = self.threads.values().filter_map(|thread| thread.head);
+        let held: Vec<InstanceId> = heads.chain(self.detached.iter().copied()).collect();
+        for id in held {
+            self.enqueue(id);
         }
     }
 
@@ -475,6 +477,7 @@ impl Window {
         let state = context.program.state(instance.state);
         if let (Some(retry), ABORTED) = (state.annotations.retry, &*ended.outcome)
             && instance.tries <= retry.count
+            && !instance.is_orphan()
         {
             let pause_s = retry.backoff_s * f64::from(2_u32.saturating_pow(instance.tries - 1));
             give_back(context, instance);

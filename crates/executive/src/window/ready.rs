@@ -88,6 +88,9 @@ impl Window {
         if is_pia && let Some(beside) = self.conflict_beside(context, instance) {
             return Readiness::Waits(Wait::World(beside));
         }
+        if is_pia && let Some(beside) = self.producer_beside(instance) {
+            return Readiness::Waits(Wait::Data(beside));
+        }
         if !is_pia {
             match self.look(context, instance, view) {
                 Ok(looked) => *seen = looked,
@@ -196,6 +199,14 @@ impl Window {
             let its_writes = sight.view(other, None).may_write(other, self.own_link(other));
             its_writes.overlaps(&reads) || its_writes.overlaps(&writes) || its_reads.overlaps(&writes)
         })
+    }
+
+    /// An imprecise PIA that still runs beside an instance and whose outputs it is made of, its effects included.
+    pub(super) fn producer_beside(&self, instance: &Instance) -> Option<InstanceId> {
+        if self.detached.is_empty() {
+            return None;
+        }
+        self.producers_of(instance).find(|producer| self.detached.contains(producer))
     }
 
     /// What an instance reads or requires, at its beginning or at its end, and what it writes on the path that is computed ahead.

@@ -81,12 +81,7 @@ impl Window {
             self.wait(id, Wait::World(beside));
             return false;
         }
-        let mut beside = None;
-        if !self.detached.is_empty() {
-            beside = self.producers_of(instance).find(|producer| self.detached.contains(producer));
-        }
-        if let Some(beside) = beside {
-            // What it is made of is not there yet.
+        if let Some(beside) = self.producer_beside(instance) {
             self.wait(id, Wait::Data(beside));
             return false;
         }
@@ -239,8 +234,7 @@ impl Window {
         let Some(instance) = self.instances.get(id) else { return };
         let number = self.plan.state(instance.state).outcome(&outcome);
         let expected = number.is_some_and(|n| instance.arms.first().is_some_and(|arm| arm.outcomes & (1 << n) != 0));
-        let is_orphan = !self.threads.contains_key(&instance.line) || instance.arms.is_empty();
-        if expected || is_orphan {
+        if expected || instance.is_orphan() || !self.threads.contains_key(&instance.line) {
             self.remove_retired(context, id);
         } else {
             let number = number.unwrap_or(self.plan.state(instance.state).outcomes.len() - 2);

@@ -52,7 +52,8 @@ impl Window {
             // Its line went on without it: what has not retired is behind it.
             regions = self.stop_line(line, &mut next);
             let beside = self.detached.iter().filter_map(|id| self.instances.get(*id));
-            let behind = beside.filter(|other| other.line == line && other.position > position);
+            let behind = beside
+                .filter(|other| regions.contains(&other.line) || (other.line == line && other.position > position));
             next.extend(behind.map(|other| other.id));
             self.cursors.retain(|cursor| cursor.line != line);
         }
@@ -171,6 +172,7 @@ impl Window {
         self.remember(context, id);
         self.stop_instance(context, id);
         self.wake_waiters(id);
+        self.detached.remove(&id);
         self.joins.remove(&id);
         let Some(instance) = self.instances.remove(id) else { return };
         if let Some(thread) = self.threads.get_mut(&instance.line)
