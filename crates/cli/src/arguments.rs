@@ -40,6 +40,8 @@ pub(crate) enum Command {
     Resource(ResourceArguments),
     /// Copy what a daemon keeps on the disk, put a copy back, or look at it
     State(StateArguments),
+    /// Make the authority of a system and certificates for its hosts
+    Certs(CertsArguments),
     /// Own the resources: who has what, and who waits (host compute)
     ResourceManager(KeptRoleArguments),
     /// Hold the root world model and its projections (host compute)
@@ -91,6 +93,24 @@ pub(crate) struct KeptRoleArguments {
     /// directory unless given
     #[arg(long, value_name = "DIR")]
     pub(crate) state_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct CertsArguments {
+    /// Where they are: `ca.pem` and `ca.key` of the authority, `HOST.pem` and `HOST.key` of every host
+    pub(crate) directory: PathBuf,
+    /// A host by the name that others reach it by; `HOST=NAME,ADDRESS` where they reach it otherwise, too
+    #[arg(value_name = "HOST[=NAME,...]")]
+    pub(crate) hosts: Vec<String>,
+    /// How long a host's certificate holds
+    #[arg(long, value_name = "DAYS", default_value_t = 825, value_parser = clap::value_parser!(u16).range(1..=3650))]
+    pub(crate) days: u16,
+    /// Make new ones also for hosts that have one
+    #[arg(long)]
+    pub(crate) renew: bool,
+    /// One JSON document on standard output
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 #[derive(Debug, Clone, Args)]

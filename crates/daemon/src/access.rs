@@ -11,10 +11,12 @@ use crate::config::{Check, ConfigError, rule};
 use crate::details::status;
 use ratn_model::resource::ResourceClass;
 use ratn_worker::gate::Identity;
+use rustls_pki_types::CertificateDer;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::sync::Arc;
 use tonic::{Code, Status};
+use webpki::EndEntityCert;
 
 /// What a caller is in a system. One may have several.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -156,16 +158,27 @@ pub struct UserAccess {
     pub roles: Vec<Role>,
 }
 
-/// Roles of the holder of a certificate.
+/// Roles of the holder of a certificate: of one certificate, or of any that the authority made for a host.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CertificateAccess {
     /// SHA-256 of the certificate in hex, colons allowed, as `openssl x509 -noout -fingerprint -sha256` prints it.
-    pub fingerprint: String,
-    /// A name for people and for the audit log.
-    pub name: String,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fingerprint: Option<String>,
+    /// A host that the certificate is for, by name: a new certificate of the same host needs no new config.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub host: Option<String>,
+    /// A name for people and for the audit log; the host's unless given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
     /// What they are.
     pub roles: Vec<Role>,
+}
+
+impl CertificateAccess {
+    fn name(&self) -> &str {
+        self.name.as_deref().or(self.host.as_deref()).unwrap_or_default()
+    }
 }
 
 impl Default for AccessConfig {
@@ -182,12 +195,14 @@ impl Default for AccessConfig {
 impl Check for AccessConfig {
     fn check(&self) -> Result<(), ConfigError> {
         for (i, certificate) in self.certificates.iter().enumerate() {
-            let digits = hex_digits(&certificate.fingerprint);
-            let good = digits.len() == 64 && digits.bytes().all(|b| b.is_ascii_hexdigit());
+            let one = certificate.fingerprint.is_some() != certificate.host.is_some();
+            rule(format!("access.certificate[{i}]"), one, "either by `fingerprint` or by `host`")?;
+            let digits = certificate.fingerprint.as_deref().map(hex_digits);
+            let good = digits.is_none_or(|d| d.len() == 64 && d.bytes().all(|b| b.is_ascii_hexdigit()));
             rule(format!("access.certificate[{i}].fingerprint"), good, "64 hex digits (SHA-256)")?;
-            let name = &certificate.name;
+            let name = certificate.name();
             let good = !name.is_empty() && !name.chars().any(char::is_control);
-            rule(format!("access.certificate[{i}].name"), good, "not empty, no control characters")?;
+            rule(format!("access.certificate[{i}].name"), good, "given, or the host's; no control characters")?;
         }
         Ok(())
     }
@@ -212,9 +227,13 @@ impl AccessConfig {
                 (format!("uid {uid}"), named.or(own).unwrap_or(&self.others))
             }
             Identity::Certificate { der } => {
-                let shown = fingerprint(der);
-                match self.certificates.iter().find(|known| hex_digits(&known.fingerprint) == shown) {
-                    Some(known) => (format!("{} (certificate)", known.name), &known.roles),
+                let (shown, hosts) = (fingerprint(der), hosts(der));
+                let same =
+                    |known: &&CertificateAccess| known.fingerprint.as_deref().map(hex_digits) == Some(shown.clone());
+                let of_host = |known: &&CertificateAccess| known.host.as_ref().is_some_and(|host| hosts.contains(host));
+                let known = self.certificates.iter().find(same).or_else(|| self.certificates.iter().find(of_host));
+                match known {
+                    Some(known) => (format!("{} (certificate)", known.name()), &known.roles),
                     None => (format!("certificate {shown}"), &[Viewer]),
                 }
             }
@@ -287,6 +306,13 @@ fn fingerprint(der: &[u8]) -> String {
     })
 }
 
+/// The names of hosts that a certificate is for; the connection has checked who signed it.
+fn hosts(der: &[u8]) -> Vec<String> {
+    let der = CertificateDer::from(der);
+    let Ok(certificate) = EndEntityCert::try_from(&der) else { return Vec::new() };
+    certificate.valid_dns_names().map(str::to_owned).collect()
+}
+
 fn hex_digits(fingerprint: &str) -> String {
     fingerprint.chars().filter(|c| *c != ':').map(|c| c.to_ascii_lowercase()).collect()
 }
@@ -352,8 +378,9 @@ mod tests {
         let access = AccessConfig {
             users: vec![UserAccess { uid: 7, roles: vec![Task] }],
             certificates: vec![CertificateAccess {
-                fingerprint: colons,
-                name: "control".to_owned(),
+                fingerprint: Some(colons),
+                host: None,
+                name: Some("control".to_owned()),
                 roles: vec![Agent],
             }],
             ..AccessConfig::default()
@@ -382,9 +409,34 @@ mod tests {
     }
 
     #[test]
-    fn a_fingerprint_that_is_none_is_refused_with_its_place() {
-        let access: AccessConfig =
-            toml::from_str("[[certificate]]\nfingerprint = \"12:34\"\nname = \"x\"\nroles = [\"viewer\"]").unwrap();
-        assert!(access.check().unwrap_err().to_string().contains("access.certificate[0].fingerprint"));
+    fn a_certificate_is_named_by_its_fingerprint_or_its_host_else_it_is_refused_with_its_place() {
+        let refused = |certificate: &str| {
+            let text = format!("[[certificate]]\nroles = [\"viewer\"]\n{certificate}");
+            let access: AccessConfig = toml::from_str(&text).unwrap();
+            access.check().err().map(|error| error.to_string())
+        };
+        let says = |certificate: &str, what: &str| {
+            let said = refused(certificate).unwrap_or_default();
+            assert!(said.contains(what), "{said}");
+        };
+        says("fingerprint = \"12:34\"\nname = \"x\"", "access.certificate[0].fingerprint");
+        says("name = \"x\"", "either by `fingerprint` or by `host`");
+        says("host = \"control\"\nfingerprint = \"12\"", "either by");
+        says(&format!("fingerprint = \"{}\"", "ab".repeat(32)), "access.certificate[0].name");
+        assert_eq!(refused("host = \"control\""), None);
+    }
+
+    #[test]
+    fn a_certificate_has_the_roles_of_the_host_it_is_for() {
+        let sign = |names: &[&str]| {
+            let key = rcgen::KeyPair::generate().unwrap();
+            let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
+            let signed = rcgen::CertificateParams::new(names).unwrap().self_signed(&key).unwrap();
+            Identity::Certificate { der: signed.der().to_vec().into() }
+        };
+        let access: AccessConfig = toml::from_str("[[certificate]]\nhost = \"control\"\nroles = [\"task\"]").unwrap();
+        let control = access.caller(&sign(&["elsewhere", "control"]), 0);
+        assert_eq!((&*control.name, &*control.roles), ("control (certificate)", &[Task] as &[Role]));
+        assert_eq!(&*access.caller(&sign(&["control.example"]), 0).roles, [Viewer]);
     }
 }

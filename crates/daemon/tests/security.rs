@@ -143,8 +143,9 @@ async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_another
         client_ca: file("ca.pem", &authority.0.pem()),
     };
     let known = |signed: &Signed, name: &str| CertificateAccess {
-        fingerprint: signed.fingerprint.clone(),
-        name: name.to_owned(),
+        fingerprint: Some(signed.fingerprint.clone()),
+        host: None,
+        name: Some(name.to_owned()),
         roles: vec![Role::Task],
     };
     let access =

@@ -1,5 +1,6 @@
 //! One file per command of the user; `roles.rs` holds the daemons and workers.
 
+mod certs;
 mod check;
 mod control;
 mod demo;
@@ -36,6 +37,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Check(arguments) => check::run(&arguments),
         Command::Resource(arguments) => resource::run(&arguments),
         Command::State(arguments) => state::run(&arguments),
+        Command::Certs(arguments) => certs::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Plan(arguments) => plan::run(&arguments),

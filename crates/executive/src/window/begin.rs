@@ -123,7 +123,7 @@ impl Window {
         let stepping_back: Vec<InstanceId> = {
             let Some(instance) = self.instances.get(id) else { return };
             let sight = self.sight(context);
-            let writes = sight.view(instance, None).may_write(instance, self.own_link(instance));
+            let writes = self.writes(context, instance);
             let active = self.active.iter().filter_map(|id| self.instances.get(*id));
             active
                 .filter(|other| {

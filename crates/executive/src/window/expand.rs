@@ -588,6 +588,7 @@ impl Window {
             wait: Wait::Nothing,
             attempt: 1,
             tries: 1,
+            has_acted: false,
             crashes: 0,
             not_before: Timestamp(0),
             began: Timestamp(0),

@@ -191,6 +191,8 @@ pub(crate) struct Instance {
     pub(crate) is_head: bool,
     /// Retired in order while it runs: an imprecise PIA.
     pub(crate) detached: bool,
+    /// Its goal was under way when it ended.
+    pub(crate) has_acted: bool,
     pub(crate) queued: bool,
     pub(crate) status: Status,
     pub(crate) wait: Wait,

@@ -518,6 +518,7 @@ impl Window {
         let Some(instance) = self.instances.get_mut(id) else { return };
         context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
         give_back(context, instance);
+        instance.has_acted = instance.status == Status::Running;
         let detached = instance.detached;
         self.is_idle(id);
         self.end_instance(id, ended);

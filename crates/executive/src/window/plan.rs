@@ -24,7 +24,7 @@ pub(crate) type Outcome = usize;
 pub(crate) type Outcomes = u64;
 
 /// More outcomes than this are exceptional, whatever they lead to.
-const MAX_OUTCOMES: usize = 64;
+pub(crate) const MAX_OUTCOMES: usize = 64;
 
 /// The plan of a program.
 #[derive(Debug)]

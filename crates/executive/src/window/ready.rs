@@ -4,8 +4,9 @@
 //! again when that instance has gone on: the work per event is proportional to what it touches, not to the window.
 
 use super::Window;
-use super::environment::Binding;
-use super::instance::{Instance, Seen, Wait};
+use super::environment::{Binding, Link};
+use super::instance::{Instance, Role, Seen, Wait};
+use super::plan::MAX_OUTCOMES;
 use super::view::{Blocked, Sight, View};
 use crate::analysis::NodeNature;
 use crate::binding::{self, BindError, Outputs};
@@ -160,21 +161,16 @@ impl Window {
             NodeNature::Computes => None,
             NodeNature::Senses => {
                 let senses = FactExpr::footprint(&context.analysis.state(instance.state).senses, view);
-                let writer = others().find(|other| {
-                    other.is_pia() && sight.view(other, None).may_write(other, self.own_link(other)).overlaps(&senses)
-                });
+                let writer = others().find(|other| other.is_pia() && self.writes(context, other).overlaps(&senses));
                 let about_to = || {
                     let heads = self.threads.values().filter_map(|thread| self.instances.get(thread.head?));
                     let mut waiting = heads.filter(|head| matches!(head.wait, Wait::Sensing(_)) && head.is_pia());
-                    waiting.find(|head| {
-                        head.id != instance.id
-                            && sight.view(head, None).may_write(head, self.own_link(head)).overlaps(&senses)
-                    })
+                    waiting.find(|head| head.id != instance.id && self.writes(context, head).overlaps(&senses))
                 };
                 writer.or_else(about_to).map(|other| Wait::Writer(other.id))
             }
             NodeNature::Irreversible => {
-                let writes = sight.view(instance, None).may_write(instance, self.own_link(instance));
+                let writes = self.writes(context, instance);
                 let looking = others().find(|other| {
                     other.nature == NodeNature::Senses
                         && other.status != super::instance::Status::Acquiring
@@ -191,12 +187,11 @@ impl Window {
         if self.detached.is_empty() {
             return None;
         }
-        let sight = self.sight(context);
         let (reads, writes) = self.touches(context, instance);
         self.detached.iter().copied().filter(|id| *id < instance.id).find(|id| {
             let Some(other) = self.instances.get(*id) else { return false };
             let (its_reads, _) = self.touches(context, other);
-            let its_writes = sight.view(other, None).may_write(other, self.own_link(other));
+            let its_writes = self.writes(context, other);
             its_writes.overlaps(&reads) || its_writes.overlaps(&writes) || its_reads.overlaps(&writes)
         })
     }
@@ -216,8 +211,8 @@ impl Window {
         let state = context.program.state(instance.state);
         let analysis = context.analysis.state(instance.state);
         let mut reads = match (instance.role, &analysis.reads) {
-            (super::instance::Role::Node, Some(facts)) => FactExpr::footprint(facts, &view),
-            (super::instance::Role::Node, None) => Footprint::Everything,
+            (Role::Node, Some(facts)) => FactExpr::footprint(facts, &view),
+            (Role::Node, None) => Footprint::Everything,
             _ => instance.seen.as_ref().map_or(Footprint::NOTHING, |seen| {
                 seen.read.iter().cloned().fold(Footprint::NOTHING, Footprint::union)
             }),
@@ -229,17 +224,25 @@ impl Window {
         let looked_up: Vec<FactExpr> =
             effects.flat_map(|effects| EffectExpr::fact_expressions(effects)).cloned().collect();
         reads = reads.union(FactExpr::footprint(&looked_up, &view));
-        (reads, view.may_write(instance, self.own_link(instance)))
+        (reads, self.writes(context, instance))
     }
 
-    /// An instance as a writer on the path that is computed ahead.
-    pub(super) fn own_link(&self, instance: &Instance) -> super::environment::Link {
-        let outcome = match instance.role {
-            super::instance::Role::Exit => instance.leaves_by,
-            _ => instance.arms.first().map_or(0, |arm| arm.outcome),
+    /// What an instance may write: with the outcome that it had, else with any that is computed ahead.
+    pub(super) fn writes(&self, context: &Context<'_>, instance: &Instance) -> Footprint {
+        let view = self.sight(context).view(instance, None);
+        let plan = self.plan.state(instance.state);
+        let ended = instance.ended.as_ref().and_then(|ended| plan.outcome(&ended.outcome));
+        let outcomes = match (instance.role, ended) {
+            (Role::Exit, _) => vec![instance.leaves_by],
+            (_, Some(outcome)) => vec![outcome],
+            (_, None) => {
+                let ahead = plan.arms.iter().fold(0, |all, arm| all | arm.outcomes);
+                (0..plan.outcomes.len().min(MAX_OUTCOMES)).filter(|outcome| ahead & (1 << outcome) != 0).collect()
+            }
         };
-        let vague = self.plan.state(instance.state).arms.iter().any(|arm| arm.outcome == outcome && !arm.same_effects);
-        super::environment::Link { writer: instance.id, outcome, vague }
+        let link = |outcome| Link { writer: instance.id, outcome, vague: false };
+        let each = outcomes.into_iter().map(|outcome| view.may_write(instance, link(outcome)));
+        each.fold(Footprint::NOTHING, Footprint::union)
     }
 }
 

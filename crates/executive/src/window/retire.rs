@@ -243,6 +243,18 @@ impl Window {
         self.compare(context, users);
     }
 
+    /// A motion that has ended, and whose path was left before it could retire: what it did stands.
+    pub(super) fn retire_orphan(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        self.make_real(context, id);
+        let line = self.instances.get(id).map(|instance| instance.line);
+        self.remove_retired(context, id);
+        if let Some(thread) = line.and_then(|line| self.threads.get_mut(&line))
+            && thread.head == Some(id)
+        {
+            thread.head = None;
+        }
+    }
+
     /// Takes a retired instance out of the window: its line, its position, whether its line had passed it before.
     fn remove_retired(&mut self, context: &mut Context<'_>, id: InstanceId) -> Option<(Line, u64, bool)> {
         self.wake_waiters(id);

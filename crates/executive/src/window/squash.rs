@@ -164,10 +164,13 @@ impl Window {
 
     fn squash(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.instances.get(id) else { return };
-        if instance.is_pia() && instance.status == Status::Running && !self.is_ending {
-            // A motion beside a failed one: it ends as it ends, and what it does stands.
-            self.orphan(id);
-            return;
+        if instance.is_pia() && !self.is_ending {
+            match instance.status {
+                // A motion beside a failed one: it ends as it ends, and what it does stands.
+                Status::Running => return self.orphan(id),
+                Status::Finished if instance.has_acted => return self.retire_orphan(context, id),
+                _ => {}
+            }
         }
         self.remember(context, id);
         self.stop_instance(context, id);

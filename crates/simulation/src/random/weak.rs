@@ -105,8 +105,11 @@ fn inputs_were_final(program: &Program, cdtn: &Run) -> Option<String> {
             }
             LogEntry::Command(Command::Note(Note::Invalidated { instance, .. })) => {
                 let Some((state, path)) = states.get(instance) else { continue };
-                let user = used.get(state).into_iter().flatten().find(|user| *user > instance);
-                if let Some((_, user)) = user.and_then(|user| states.get(user)) {
+                let younger = used.get(state).into_iter().flatten().filter(|user| *user > instance);
+                // What is inside of another iteration, or beside, has its outputs from another visit.
+                let around = path.rfind('/').map_or("", |end| &path[..=end]);
+                let mut users = younger.filter_map(|user| states.get(user)).map(|(_, path)| path);
+                if let Some(user) = users.find(|user| user.starts_with(around)) {
                     return Some(format!("{path} was computed again after {user} had started with its outputs"));
                 }
             }
