@@ -68,7 +68,7 @@ pub enum Change {
 }
 
 /// The predicates that the geometric scene is derived from; `reads: [scene]` stands for them.
-pub const SCENE_PREDICATES: [(&str, usize); 3] = [("at", 1), ("shape", 1), ("in_gripper", 1)];
+pub const SCENE_PREDICATES: [(&str, usize); 4] = [("at", 1), ("shape", 1), ("in_gripper", 1), ("on", 2)];
 
 impl FactPattern {
     /// The pattern that matches only `key`.

@@ -1,8 +1,9 @@
 //! The world model: a set of facts `predicate(argument, …) = value`, its root and its projections, and the geometric scene
-//! derived from facts.
+//! derived from facts ([`scene`]).
 //!
 //! A [`world::World`] is an overlay of changes over a shared, indexed store: a projection is a clone (constant time) plus its
-//! effects, whatever the number of facts. Which effects are applied when is the executive's business. A [`query::Query`] asks it.
+//! effects, whatever the number of facts. Which effects are applied when is the executive's business. A [`query::Query`] asks it. [`reads::Live`]
+//! knows what projections have read, and which of them a commit contradicts; [`digest::Digest`] says when two have read the same.
 //!
 //! What it costs (`cargo bench -p ratn-world`, medians of one run on two busy cores, all indexes counted):
 //!
@@ -17,8 +18,10 @@
 //!
 //! Scattered lookups are above the 0.1 µs aimed at; where their time goes has not been measured.
 
+pub mod digest;
 mod functional;
 pub mod query;
+pub mod reads;
 pub mod scene;
 mod store;
 pub mod world;

@@ -2,15 +2,28 @@
 //!
 //! `shape(o) = {type: box, size: [x, y, z]}` or `{type: cylinder, radius: r, length: l}` (metres, centred, axis z) gives an
 //! object its shape; `at(o) = pose` puts it into the world; `in_gripper(o) = pose` attaches it to the gripper's tool frame
-//! (then `at(o)`, if any, is ignored). The mobile base stands at `at(base)`, which needs no shape.
+//! (then `at(o)`, if any, is ignored). `on(o, carrier)` attaches it to what it stands on or in: true, or its pose as seen from the
+//! carrier. What is on a held thing is held with it, where it was on it: between the two `at`, unless the pose is said. The mobile
+//! base stands at `at(base)`, which needs no shape.
+//!
+//! - [`Scene::of`]: all of it, from a world
+//! - [`live::LiveScene`]: kept up to date with the changes of a world, each costing what it moves
+//! - [`delta::SceneDelta`]: what one scene differs by from another, for whoever has the other
+
+pub mod delta;
+pub mod live;
 
 use crate::world::World;
-use ratn_model::fact::{FactPattern, Term};
+use ratn_model::fact::{FactKey, FactPattern, Term};
 use ratn_model::pose::Pose;
 use ratn_model::value::Value;
+use serde::{Deserialize, Serialize};
 
 /// The individual that names the robot's mobile base.
 pub const BASE: &str = "base";
+
+/// Things stand on things at most this high: more is taken for a circle.
+pub const MAX_STACK: usize = 32;
 
 /// Shapes in their places.
 #[derive(Debug, Clone, PartialEq)]
@@ -22,7 +35,7 @@ pub struct Scene {
 }
 
 /// One object of the scene.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneObject {
     /// The individual.
     pub name: String,
@@ -33,7 +46,8 @@ pub struct SceneObject {
 }
 
 /// A shape, centred on its frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Shape {
     /// Edge lengths in metres along x, y, z.
     Box {
@@ -50,7 +64,8 @@ pub enum Shape {
 }
 
 /// Where an object is.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Placement {
     /// In the world frame.
     World(Pose),
@@ -71,6 +86,12 @@ pub enum SceneError {
         /// What it should be.
         expected: &'static str,
     },
+    /// Things that stand on each other, or on more than there can be.
+    #[error("`{individual}` stands on things in a circle, or on more than {MAX_STACK} of them: see its `on` facts")]
+    Circle {
+        /// One of them.
+        individual: String,
+    },
 }
 
 impl Scene {
@@ -79,28 +100,81 @@ impl Scene {
     /// # Errors
     /// [`SceneError::Malformed`] where a geometric fact has a value of another form.
     pub fn of(world: &World) -> Result<Scene, SceneError> {
-        let mut scene = Scene { base: Pose::IDENTITY, objects: Vec::new() };
-        if let Some(pose) = pose_of(world, "at", &Term::Name(BASE.to_owned()))? {
-            scene.base = pose;
-        }
+        let mut scene = Scene { base: base(world)?, objects: Vec::new() };
         let shapes = FactPattern { predicate: "shape".to_owned(), arguments: vec![None] };
-        for (key, fact) in world.matching(&shapes) {
-            let individual = &key.arguments[0];
-            let placement = match pose_of(world, "in_gripper", individual)? {
-                Some(pose) => Some(Placement::Gripper(pose)),
-                None => pose_of(world, "at", individual)?.map(Placement::World),
-            };
-            if let Some(placement) = placement {
-                let shape = shape(&fact.value).ok_or_else(|| SceneError::Malformed {
-                    fact: key.to_string(),
-                    value: fact.value.to_string(),
-                    expected: "{type: box, size: [x, y, z]} or {type: cylinder, radius: r, length: l}, all above 0",
-                })?;
-                scene.objects.push(SceneObject { name: individual.to_string(), shape, placement });
-            }
+        for (key, _) in world.matching(&shapes) {
+            scene.objects.extend(object(world, &key.arguments[0])?);
         }
         Ok(scene)
     }
+}
+
+/// Where the mobile base stands.
+fn base(world: &World) -> Result<Pose, SceneError> {
+    Ok(pose_of(world, "at", &Term::Name(BASE.to_owned()))?.unwrap_or(Pose::IDENTITY))
+}
+
+/// An individual, if it is an object of the scene.
+fn object(world: &World, individual: &Term) -> Result<Option<SceneObject>, SceneError> {
+    let key = FactKey { predicate: "shape".to_owned(), arguments: vec![individual.clone()] };
+    let Some(value) = world.get(&key).filter(|value| **value != Value::Null) else { return Ok(None) };
+    let Some(placement) = placement(world, individual, 0)? else { return Ok(None) };
+    let shape = shape(value).ok_or_else(|| SceneError::Malformed {
+        fact: key.to_string(),
+        value: value.to_string(),
+        expected: "{type: box, size: [x, y, z]} or {type: cylinder, radius: r, length: l}, all above 0",
+    })?;
+    Ok(Some(SceneObject { name: individual.to_string(), shape, placement }))
+}
+
+/// Where an individual is, with what it stands on.
+fn placement(world: &World, individual: &Term, depth: usize) -> Result<Option<Placement>, SceneError> {
+    if depth > MAX_STACK {
+        return Err(SceneError::Circle { individual: individual.to_string() });
+    }
+    if let Some(pose) = pose_of(world, "in_gripper", individual)? {
+        return Ok(Some(Placement::Gripper(pose)));
+    }
+    let at = pose_of(world, "at", individual)?;
+    if let Some((carrier, said)) = carrier(world, individual)? {
+        let below = placement(world, &carrier, depth + 1)?;
+        let placed = match (below, said) {
+            (Some(Placement::Gripper(held)), None) => {
+                let of_carrier = pose_of(world, "at", &carrier)?;
+                let seen = of_carrier.zip(at).map(|(carrier, at)| carrier.inverse().compose(&at));
+                seen.map(|seen| Placement::Gripper(held.compose(&seen)))
+            }
+            (Some(Placement::Gripper(held)), Some(seen)) => Some(Placement::Gripper(held.compose(&seen))),
+            (Some(Placement::World(pose)), Some(seen)) => Some(Placement::World(pose.compose(&seen))),
+            _ => None,
+        };
+        if placed.is_some() {
+            return Ok(placed);
+        }
+    }
+    Ok(at.map(Placement::World))
+}
+
+/// What an individual stands on (the first in the order of keys), and its pose as seen from there, where that is said.
+fn carrier(world: &World, individual: &Term) -> Result<Option<(Term, Option<Pose>)>, SceneError> {
+    let on = FactPattern { predicate: "on".to_owned(), arguments: vec![Some(individual.clone()), None] };
+    for (key, fact) in world.matching(&on) {
+        let carrier = || key.arguments[1].clone();
+        match &fact.value {
+            Value::Bool(true) => return Ok(Some((carrier(), None))),
+            Value::Pose(pose) => return Ok(Some((carrier(), Some(*pose)))),
+            Value::Bool(false) | Value::Null => {}
+            other => {
+                let (fact, value) = (key.to_string(), other.to_string());
+                return Err(SceneError::Malformed {
+                    fact,
+                    value,
+                    expected: "true, or a pose as seen from what it stands on",
+                });
+            }
+        }
+    }
+    Ok(None)
 }
 
 impl Shape {
@@ -122,7 +196,7 @@ impl Shape {
 }
 
 fn pose_of(world: &World, predicate: &str, individual: &Term) -> Result<Option<Pose>, SceneError> {
-    let key = ratn_model::fact::FactKey { predicate: predicate.to_owned(), arguments: vec![individual.clone()] };
+    let key = FactKey { predicate: predicate.to_owned(), arguments: vec![individual.clone()] };
     match world.get(&key) {
         None | Some(Value::Null) => Ok(None),
         Some(Value::Pose(pose)) => Ok(Some(*pose)),

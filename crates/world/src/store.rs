@@ -12,7 +12,7 @@ use imbl::shared_ptr::DefaultSharedPtr;
 use imbl::{GenericHashMap, OrdMap, OrdSet};
 use ratn_model::fact::{FactKey, FactPattern, Term};
 use std::cmp::Ordering;
-use std::hash::{BuildHasherDefault, Hasher};
+use std::hash::{BuildHasherDefault, Hash, Hasher};
 use std::ops::Bound;
 use std::sync::Arc;
 
@@ -155,6 +155,13 @@ impl equivalent::Comparable<ByArgument> for Place<'_> {
 /// `splitmix64`). Not secret: keys that collide on purpose make a lookup slow, and are still told apart.
 #[derive(Debug, Default)]
 pub(crate) struct KeyHasher(u64);
+
+/// The hash of a key.
+pub(crate) fn hash_of(key: &FactKey) -> u64 {
+    let mut hasher = KeyHasher::default();
+    key.hash(&mut hasher);
+    hasher.finish()
+}
 
 const MULTIPLIER: u64 = 0x9e37_79b9_7f4a_7c15;
 

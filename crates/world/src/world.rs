@@ -8,7 +8,7 @@ use crate::store::{Store, begins_as, first_of};
 use ratn_model::fact::{Change, FactKey, FactPattern};
 use ratn_model::id::Revision;
 use ratn_model::value::Value;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::iter::Peekable;
 use std::sync::Arc;
 
@@ -267,6 +267,18 @@ where
             }
         }
     }
+}
+
+/// The facts that changes write in a world.
+pub(crate) fn written(before: &World, changes: &[Change]) -> BTreeSet<FactKey> {
+    let mut keys = BTreeSet::new();
+    for change in changes {
+        match change {
+            Change::Set { fact, .. } | Change::Increase { fact, .. } => drop(keys.insert(fact.clone())),
+            Change::Delete { pattern } => keys.extend(before.matching(pattern).map(|(key, _)| key.clone())),
+        }
+    }
+    keys
 }
 
 /// What `increase` makes of a value; an absent one counts as 0.

@@ -11,6 +11,7 @@ use ratn_model::program::{ABORTED, SUCCESS};
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
+use ratn_world::digest::Digest;
 use smallvec::SmallVec;
 use std::cell::Cell;
 use std::sync::Arc;
@@ -141,8 +142,8 @@ pub(crate) struct Seen {
     pub(crate) read: Vec<Footprint>,
     /// As they were.
     pub(crate) facts: Vec<(FactKey, Value)>,
-    /// What its inputs come to: [`super::twins::digest`].
-    pub(crate) inputs: u128,
+    /// What its inputs come to.
+    pub(crate) inputs: Digest,
 }
 
 impl Seen {

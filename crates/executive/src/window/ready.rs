@@ -17,6 +17,7 @@ use ratn_model::id::InstanceId;
 use ratn_model::program::StateKind;
 use ratn_model::resource::Requirement;
 use ratn_model::value::Value;
+use ratn_world::digest::Digest;
 use ratn_world::world::World;
 
 /// Whether a node may begin.
@@ -118,7 +119,7 @@ impl Window {
         if let (StateKind::Action { inputs, .. }, false) = (&state.kind, is_pia) {
             match binding::inputs(state, inputs, view) {
                 Ok(inputs) => {
-                    seen.inputs = super::twins::digest(&inputs);
+                    seen.inputs = Digest::of_values(&inputs);
                     bound = Some(inputs);
                 }
                 Err(error) => return not_bound(view, &error),

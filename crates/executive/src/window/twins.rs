@@ -7,14 +7,12 @@ use super::Window;
 use super::environment::ASSIGNED;
 use super::instance::{Ended, Instance, Seen, Status, Wait};
 use crate::analysis::NodeNature;
-use crate::binding::{Outputs, Seed};
+use crate::binding::Seed;
 use crate::context::Context;
 use crate::protocol::Note;
 use ratn_model::id::InstanceId;
 use ratn_model::program::StateKind;
-use ratn_model::value::Value;
 use std::collections::{BTreeMap, VecDeque};
-use std::hash::{DefaultHasher, Hash, Hasher};
 
 /// This many results are kept.
 const MAX_RESULTS: usize = 1024;
@@ -108,60 +106,6 @@ impl Window {
         let environment = &instance.environment;
         environment.path_parts(&state.name, instance.visit, instance.iteration, |part| seed.add(part.as_bytes()));
         seed.of_try(if state.annotations.deterministic { 1 } else { instance.tries })
-    }
-}
-
-/// What inputs come to, as a number: different inputs do not have the same.
-pub(crate) fn digest(inputs: &Outputs) -> u128 {
-    let half = |salt: u64| {
-        let mut hasher = DefaultHasher::new();
-        hasher.write_u64(salt);
-        for (port, value) in inputs {
-            port.hash(&mut hasher);
-            feed(value, &mut hasher);
-        }
-        u128::from(hasher.finish())
-    };
-    half(1) << 64 | half(2)
-}
-
-fn feed(value: &Value, into: &mut impl Hasher) {
-    let numbers = |numbers: &[f64], into: &mut dyn Hasher| {
-        into.write_usize(numbers.len());
-        numbers.iter().for_each(|x| into.write_u64(x.to_bits()));
-    };
-    std::mem::discriminant(value).hash(into);
-    match value {
-        Value::Null => {}
-        Value::Bool(b) => b.hash(into),
-        Value::Int(i) => i.hash(into),
-        Value::Float(x) => into.write_u64(x.to_bits()),
-        Value::String(text) => text.hash(into),
-        Value::Pose(pose) => {
-            numbers(&pose.position, into);
-            numbers(&pose.quaternion_xyzw, into);
-        }
-        Value::Joints(joints) => numbers(joints, into),
-        Value::Trajectory(trajectory) => {
-            trajectory.joints.hash(into);
-            for point in &trajectory.points {
-                into.write_u64(point.time_s.to_bits());
-                numbers(&point.positions, into);
-                numbers(&point.velocities, into);
-            }
-        }
-        Value::List(items) => {
-            into.write_usize(items.len());
-            items.iter().for_each(|item| feed(item, into));
-        }
-        Value::Map(fields) => {
-            into.write_usize(fields.len());
-            for (name, item) in fields {
-                name.hash(into);
-                feed(item, into);
-            }
-        }
-        Value::Bytes(bytes) => bytes.hash(into),
     }
 }
 
