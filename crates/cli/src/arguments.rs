@@ -1,6 +1,7 @@
 //! The command line.
 
 use crate::command::resource::ResourceArguments;
+use crate::command::world::WorldArguments;
 use crate::task_control::control::Word;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use ratn_daemon::config::Durability;
@@ -38,6 +39,8 @@ pub(crate) enum Command {
     Plan(PlanArguments),
     /// Look at the resources of a running system and change them
     Resource(ResourceArguments),
+    /// Look at the world model of a running system, back in time too, and load facts into it
+    World(WorldArguments),
     /// Copy what a daemon keeps on the disk, put a copy back, or look at it
     State(StateArguments),
     /// Make the authority of a system and certificates for its hosts

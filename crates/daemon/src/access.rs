@@ -99,7 +99,11 @@ const METHODS: [(&str, &[Row]); 5] = [
     ),
     (
         "ratn.v1.WorldPoolService",
-        &[(Look, &["GetRoot", "Query"]), (Commit, &["Commit"]), (Project, &["Project", "Release"])],
+        &[
+            (Look, &["Diff", "GetFactHistory", "GetRoot", "Query", "Watch"]),
+            (Commit, &["Commit"]),
+            (Project, &["Project", "Release"]),
+        ],
     ),
     ("ratn.v1.ProcessService", &[(Look, &["ListPools", "Watch"]), (Administer, &["Spawn", "Stop"])]),
     ("ratn.v1.ActionService", &[(Look, &["Describe"]), (Perform, &["Execute", "Cancel"])]),

@@ -3,12 +3,15 @@
 
 mod support;
 
+use ratn_daemon::config::StorageConfig;
+use ratn_daemon::world_pool::WorldPoolConfig;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint, Term};
 use ratn_model::id::{ProjectionId, Revision};
+use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
-use ratn_proto::types::{Resource, ResourceEventKind};
-use ratn_worker::client::{AcquireOptions, Projection, WorldClient};
+use ratn_proto::types::{Resource, ResourceEventKind, WorldUpdate};
+use ratn_worker::client::{AcquireOptions, Commit, Projection, WorldClient, WorldWatch};
 use ratn_worker::endpoint::Endpoint;
 use std::time::Duration;
 use support::{TestSystem, block, in_time};
@@ -112,4 +115,135 @@ async fn a_world_pool_takes_the_place_of_a_killed_one_once_that_one_has_expired(
 
 fn soon() -> AcquireOptions {
     AcquireOptions { deadline: Duration::from_millis(300), ..AcquireOptions::default() }
+}
+
+#[tokio::test]
+async fn the_root_is_shown_as_it_was_and_what_changed_since_as_far_as_revisions_are_kept() {
+    let system = TestSystem::new();
+    let config = WorldPoolConfig { revisions_kept: 3, ..system.world_pool_config() };
+    let pool = system.world_pool_with(config).await;
+    let world = system.world(&pool);
+    let gone = Change::Delete { pattern: FactPattern::of(&key("at", "cup")) };
+    let steps = [vec![set("at", "box", 1), set("at", "cup", 1)], vec![set("at", "box", 2)], vec![gone]];
+    for (n, changes) in steps.into_iter().enumerate() {
+        let (id, writer) = (format!("run/i{n}"), format!("place[{n}]"));
+        world.commit_as(Commit { id, changes, writer, ..Commit::default() }).await.unwrap();
+    }
+    let (revision, facts) = world.root_at(Some(Revision(1)), &[any("at")]).await.unwrap();
+    let then: Vec<_> = facts.iter().map(|fact| (fact.value.clone(), fact.writer.as_deref())).collect();
+    let expected = [(Value::Int(1), Some("place[0]")), (Value::Int(1), Some("place[0]"))];
+    assert_eq!((revision, then), (Revision(1), expected.to_vec()));
+    let (differences, to) = world.diff(Revision(1), None, &[]).await.unwrap();
+    let shown: Vec<_> = differences.iter().map(|one| (one.key.to_string(), one.after.is_some())).collect();
+    assert_eq!((to, shown), (Revision(3), vec![("at(box)".to_owned(), true), ("at(cup)".to_owned(), false)]));
+    let (versions, oldest) = world.history(key("at", "cup")).await.unwrap();
+    let revisions: Vec<_> = versions.iter().map(|version| (version.revision.0, version.fact.is_some())).collect();
+    assert_eq!((revisions, oldest), (vec![(3, false), (1, true)], Revision(1)));
+
+    world.commit("run/i9", vec![set("at", "box", 9)], None).await.unwrap();
+    let forgotten = [
+        world.root_at(Some(Revision(1)), &[]).await.unwrap_err(),
+        world.diff(Revision(1), Some(Revision(2)), &[]).await.unwrap_err(),
+        world.watch(Some(Revision(1)), &[]).await.unwrap_err(),
+    ];
+    for error in forgotten {
+        assert_eq!(error.code(), Some(Code::OutOfRange), "{error}");
+        assert!(error.to_string().contains("the oldest is 2"), "{error}");
+    }
+    let future = world.root_at(Some(Revision(5)), &[]).await.unwrap_err();
+    assert_eq!(future.code(), Some(Code::FailedPrecondition), "{future}");
+}
+
+#[tokio::test]
+async fn a_watch_tells_of_every_revision_once_and_in_order_and_goes_on_over_a_restart() {
+    let system = TestSystem::new();
+    let place = tempfile::tempdir().unwrap();
+    let config = || {
+        let storage = StorageConfig { directory: Some(place.path().to_owned()), ..StorageConfig::default() };
+        WorldPoolConfig { storage, ..system.world_pool_config() }
+    };
+    let pool = system.world_pool_with(config()).await;
+    let world = system.world(&pool);
+    world.commit("first", vec![set("at", "box", 0)], None).await.unwrap();
+    let mut watch = world.watch(None, &[]).await.unwrap();
+    let Some(WorldUpdate::Snapshot { revision, facts }) = in_time(watch.next()).await.unwrap() else { panic!() };
+    assert_eq!((revision, facts.len()), (Revision(1), 1));
+    let committers = (0..8).map(|n| {
+        let world = world.clone();
+        async move {
+            for i in 0..20 {
+                world.commit(&format!("run/{n}/{i}"), vec![set("at", "box", i)], None).await.unwrap();
+            }
+        }
+    });
+    let committing = tokio::spawn(futures::future::join_all(committers));
+    for expected in 2..=100 {
+        assert_eq!(next_revision(&mut watch).await, expected);
+    }
+    in_time(committing).await.unwrap();
+    pool.end().await;
+
+    let pool = system.world_pool_with(config()).await;
+    let world = system.world(&pool);
+    let mut watch = in_time(async {
+        loop {
+            // The channel finds out first that the other end has changed.
+            if let Ok(watch) = world.watch(Some(Revision(100)), &[]).await {
+                return watch;
+            }
+        }
+    })
+    .await;
+    for expected in 101..=161 {
+        assert_eq!(next_revision(&mut watch).await, expected);
+    }
+    let mut cups = world.watch(Some(Revision(161)), &[any("full")]).await.unwrap();
+    world.commit("last", vec![set("at", "box", 3)], None).await.unwrap();
+    world.commit("really", vec![set("full", "cup", 3), set("at", "box", 4)], None).await.unwrap();
+    let Some(WorldUpdate::Changed(change)) = in_time(cups.next()).await.unwrap() else { panic!() };
+    let written: Vec<String> = change.written.iter().map(|fact| fact.key.to_string()).collect();
+    assert_eq!((change.revision, change.commit.as_str(), written), (Revision(163), "really", vec!["full(cup)".into()]));
+}
+
+async fn next_revision(watch: &mut WorldWatch) -> u64 {
+    match in_time(watch.next()).await.unwrap() {
+        Some(WorldUpdate::Changed(change)) => change.revision.0,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test]
+async fn a_measured_fact_says_what_measured_it_and_is_gone_after_its_time() {
+    let system = TestSystem::new();
+    let ontology = system.directory.path().join("robot.ttl");
+    let text = "@prefix ratn: <urn:ratn:ontology#> .
+        @prefix owl: <http://www.w3.org/2002/07/owl#> .
+        @prefix : <urn:robot#> .
+        :seen a ratn:Predicate ; ratn:arguments ( owl:Thing ) ; ratn:value \"int\" .
+        :full a ratn:Predicate ; ratn:arguments ( owl:Thing ) ; ratn:value \"int\" .";
+    std::fs::write(&ontology, text).unwrap();
+    let ttl_s = [("seen".to_owned(), 0.05)].into();
+    let pool =
+        system.world_pool_with(WorldPoolConfig { ontology: Some(ontology), ttl_s, ..system.world_pool_config() });
+    let pool = pool.await;
+    let world = system.world(&pool);
+    let mut watch = world.watch(None, &[]).await.unwrap();
+    in_time(watch.next()).await.unwrap();
+    let measured = Measurement { source: "camera".to_owned(), certainty: Some(Certainty::Covariance(vec![0.25])) };
+    let commit = Commit {
+        id: "run/i1".to_owned(),
+        changes: vec![set("seen", "box", 1), set("full", "box", 1)],
+        writer: "detect".to_owned(),
+        evidence: vec![(key("seen", "box"), measured.clone())],
+        ..Commit::default()
+    };
+    world.commit_as(commit).await.unwrap();
+    let Some(WorldUpdate::Changed(change)) = in_time(watch.next()).await.unwrap() else { panic!() };
+    let said: Vec<_> = change.written.iter().map(|fact| (fact.writer.as_deref(), fact.measured.as_deref())).collect();
+    assert_eq!(said, [(Some("detect"), None), (Some("detect"), Some(&measured))]);
+    let Some(WorldUpdate::Changed(change)) = in_time(watch.next()).await.unwrap() else { panic!() };
+    assert_eq!((change.revision, change.commit.as_str(), change.gone), (Revision(2), "", vec![key("seen", "box")]));
+    let outside = world.commit("run/i2", vec![set("at", "box", 1)], None).await.unwrap_err();
+    assert_eq!(outside.code(), Some(Code::FailedPrecondition), "{outside}");
+    assert_eq!(values(&world, None, "full").await, Ok(vec![Value::Int(1)]));
 }

@@ -12,6 +12,7 @@ pub mod expression;
 pub mod fact;
 pub mod id;
 pub mod load;
+pub mod measurement;
 pub mod ontology;
 pub mod parameters;
 pub mod pose;

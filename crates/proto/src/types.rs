@@ -3,9 +3,11 @@
 
 use ratn_model::fact::FactKey;
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
+use ratn_model::measurement::Measurement;
 use ratn_model::resource::{Lease, Requirement, ResourceClass};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// The attribute of a resource that says where its action service is.
 pub const ENDPOINT_ATTRIBUTE: &str = "endpoint";
@@ -251,15 +253,68 @@ pub enum ResourceUpdate {
     Event(ResourceEvent),
 }
 
-/// A fact with the revision of the world that wrote it (0 for a measured one).
+/// A fact with the revision of the world that wrote it (0 for a measured one), who wrote it and what measured it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FactRecord {
     /// Which fact.
     pub key: FactKey,
     /// What it says.
     pub value: Value,
-    /// Who wrote it.
+    /// When it was written.
     pub revision: Revision,
+    /// The node that wrote it, by the path of its instance.
+    pub writer: Option<Arc<str>>,
+    /// What measured it.
+    pub measured: Option<Arc<Measurement>>,
+}
+
+/// What watchers of the root world are told.
+#[derive(Debug, Clone, PartialEq)]
+pub enum WorldUpdate {
+    /// What holds; changes follow from the next revision on.
+    Snapshot {
+        /// The root's revision.
+        revision: Revision,
+        /// In the order of keys.
+        facts: Vec<FactRecord>,
+    },
+    /// What a revision changed.
+    Changed(WorldChange),
+}
+
+/// What one revision of the root world changed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WorldChange {
+    /// The revision.
+    pub revision: Revision,
+    /// The commit's id; empty where facts were too old.
+    pub commit: String,
+    /// In the order of keys.
+    pub written: Vec<FactRecord>,
+    /// What is gone, in the order of keys.
+    pub gone: Vec<FactKey>,
+}
+
+/// A fact in two revisions; `None` where it does not hold.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FactDifference {
+    /// Which fact.
+    pub key: FactKey,
+    /// In the one.
+    pub before: Option<FactRecord>,
+    /// In the other.
+    pub after: Option<FactRecord>,
+}
+
+/// What a fact was from one revision on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FactVersion {
+    /// The revision that wrote or deleted it.
+    pub revision: Revision,
+    /// The commit's id; empty where it was too old, or is not kept any more.
+    pub commit: String,
+    /// `None` where it does not hold.
+    pub fact: Option<FactRecord>,
 }
 
 /// What a worker process is doing.

@@ -7,6 +7,7 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use prost::Message;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint, Term};
+use ratn_model::measurement::Measurement;
 use ratn_model::resource::{Lease, Requirement};
 use ratn_model::value::Value;
 use ratn_proto::convert::Malformed;
@@ -23,10 +24,13 @@ fn read<W: Message + Default, T: TryFrom<W, Error = Malformed>>(bytes: &[u8]) ->
 }
 
 /// All that can come in, by the message's name.
-const READERS: [(&str, Read); 19] = [
+const READERS: [(&str, Read); 24] = [
     ("Change", read::<v1::Change, Change>),
+    ("Evidence", read::<v1::Evidence, (FactKey, Measurement)>),
+    ("FactDifference", read::<v1::FactDifference, types::FactDifference>),
     ("FactKey", read::<v1::FactKey, FactKey>),
     ("Fact", read::<v1::Fact, types::FactRecord>),
+    ("FactVersion", read::<v1::FactVersion, types::FactVersion>),
     ("FactPattern", read::<v1::FactPattern, FactPattern>),
     ("Footprint", read::<v1::Footprint, Footprint>),
     ("Goal", read::<v1::Goal, types::Goal>),
@@ -34,6 +38,7 @@ const READERS: [(&str, Read); 19] = [
     ("Holding", read::<v1::Holding, types::Holding>),
     ("Lease", read::<v1::Lease, Lease>),
     ("ListRequest", read::<v1::ListRequest, types::ResourceFilter>),
+    ("Measurement", read::<v1::Measurement, Measurement>),
     ("Pool", read::<v1::Pool, types::PoolStatus>),
     ("Requirement", read::<v1::Requirement, Requirement>),
     ("Resource", read::<v1::Resource, types::Resource>),
@@ -42,6 +47,7 @@ const READERS: [(&str, Read); 19] = [
     ("SessionStatus", read::<v1::SessionStatus, types::SessionStatus>),
     ("Term", read::<v1::Term, Term>),
     ("WaitingAcquire", read::<v1::WaitingAcquire, types::WaitingAcquire>),
+    ("WorldPoolServiceWatchResponse", read::<v1::WorldPoolServiceWatchResponse, types::WorldUpdate>),
     ("WorkerStatus", read::<v1::WorkerStatus, types::WorkerStatus>),
 ];
 

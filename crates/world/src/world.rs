@@ -7,6 +7,7 @@
 use crate::store::{Store, begins_as, first_of};
 use ratn_model::fact::{Change, FactKey, FactPattern};
 use ratn_model::id::Revision;
+use ratn_model::measurement::Measurement;
 use ratn_model::value::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::iter::Peekable;
@@ -24,6 +25,8 @@ pub struct Fact {
     pub revision: Revision,
     /// The node that wrote it, by the path of its instance; `None` where nobody said.
     pub writer: Option<Arc<str>>,
+    /// What measured it and how sure that is; `None` for what was not measured.
+    pub measured: Option<Arc<Measurement>>,
 }
 
 /// A world model: the root, or a projection. Cloning shares the store and copies the overlay, which the root has none of.
@@ -56,7 +59,7 @@ impl World {
     pub fn from_facts(facts: impl IntoIterator<Item = (FactKey, Value)>, revision: Revision) -> World {
         let mut store = Store::default();
         for (key, value) in facts {
-            store.insert(&Arc::new(key), &Arc::new(Fact { value, revision, writer: None }));
+            store.insert(&Arc::new(key), &Arc::new(Fact { value, revision, writer: None, measured: None }));
         }
         World { store, overlay: BTreeMap::new(), revision }
     }
@@ -204,7 +207,7 @@ impl World {
         let mut world = self.clone();
         world.revision = Revision(self.revision.0 + 1);
         let (revision, writer) = (world.revision, writer.map(Arc::<str>::from));
-        let written = |value: Value| Some(Arc::new(Fact { value, revision, writer: writer.clone() }));
+        let written = |value: Value| Some(Arc::new(Fact { value, revision, writer: writer.clone(), measured: None }));
         for change in changes {
             match change {
                 Change::Set { fact, value } => {

@@ -14,6 +14,7 @@ mod simulate;
 mod state;
 mod tables;
 mod up;
+pub(crate) mod world;
 
 #[cfg(test)]
 pub(crate) use check::load_text;
@@ -21,6 +22,7 @@ pub(crate) use check::load_text;
 use crate::arguments::Command;
 use crate::failure::Failure;
 use anyhow::Context;
+use ratn_worker::client::CallError;
 use std::time::Duration;
 
 /// At the end of a process, for computations under way.
@@ -36,6 +38,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Control(arguments) => control::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Resource(arguments) => resource::run(&arguments),
+        Command::World(arguments) => world::run(&arguments),
         Command::State(arguments) => state::run(&arguments),
         Command::Certs(arguments) => certs::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
@@ -48,6 +51,15 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Cell(arguments) => roles::cell(&arguments),
         Command::Worker(arguments) => roles::worker(&arguments),
     }
+}
+
+/// A script can tell a daemon that says no from one that is not there.
+fn unanswered(failure: Failure) -> Failure {
+    let Failure::Failed(error) = failure else { return failure };
+    if error.downcast_ref::<CallError>().is_some_and(CallError::is_crash) {
+        return Failure::Refused(format!("ratn: {error:#}"));
+    }
+    Failure::Failed(error)
 }
 
 /// Runs a future on a runtime of its own.

@@ -9,7 +9,7 @@ use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_proto::types::Resource;
-use ratn_worker::client::{CallError, Projection, ResourceClient, WorldClient};
+use ratn_worker::client::{CallError, Commit, Projection, ResourceClient, WorldClient};
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
 use tokio::sync::{mpsc, oneshot};
@@ -32,6 +32,8 @@ pub(super) enum Record {
         instance: InstanceId,
         changes: Vec<Change>,
         revision: Revision,
+        /// The instance's path; empty where it is not known.
+        writer: String,
     },
     Operate {
         instance: InstanceId,
@@ -65,7 +67,11 @@ impl Recorder {
                     let request = format!("{}/{instance}/{attempt}", self.run);
                     self.project(instance, attempt, Projection { request, base, changes, reads, lease }).await
                 }
-                Record::Commit { instance, changes, revision } => self.commit(instance, changes, revision).await,
+                Record::Commit { instance, changes, revision, writer } => {
+                    let id = commit_request(&self.run, instance, revision);
+                    let commit = Commit { id, changes, revision: Some(revision), writer, ..Commit::default() };
+                    self.commit(instance, commit).await
+                }
                 Record::Operate { instance, number, operations } => self.operate(instance, number, operations).await,
                 Record::Flush(done) => {
                     let _ = done.send(recorded.clone());
@@ -101,10 +107,8 @@ impl Recorder {
         }
     }
 
-    async fn commit(&self, instance: InstanceId, changes: Vec<Change>, revision: Revision) -> Option<Event> {
-        let commit = commit_request(&self.run, instance, revision);
-        let done = patiently(Attempts::IDEMPOTENT, || self.world.commit(&commit, changes.clone(), Some(revision)));
-        match done.await {
+    async fn commit(&self, instance: InstanceId, commit: Commit) -> Option<Event> {
+        match patiently(Attempts::IDEMPOTENT, || self.world.commit_as(commit.clone())).await {
             Ok(_) => None,
             Err(error) => Some(Event::RetirementFailed {
                 instance,

@@ -4,28 +4,35 @@
 //! be written, every commit is refused from then on; what can be read, and projected from, is what is on the disk.
 
 use super::core::{HeldBy, ProjectError, ProjectRequest, WorldPool};
-use super::history::History;
+use super::history::{Commit, Difference, History, Kept, Version};
 use super::leases::{Known, LiveLeases};
 use super::{WorldPoolConfig, status};
-use crate::details::of_fault;
+use crate::details::{of_fault, retry_later, status as status_of};
 use crate::journal::{Journal, floor};
 use crate::metrics;
 use crate::outbox::{Outbox, SendAnswer, send_answer};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
+use ratn_model::ontology::Ontology;
 use ratn_model::time::Timestamp;
 use ratn_storage::{Fault, Progress};
 use ratn_world::world::{Fact, World};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
-use tonic::Status;
+use tonic::{Code, Status};
 
 /// Messages that wait for the actor; more make their senders wait.
 const INBOX: usize = 1_024;
 /// How often projections without a lease are looked at.
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Updates that wait for a watcher; one that has more to catch up with is cut off.
+const WATCH_BUFFER: usize = 4_096;
+/// When a watch that was refused may be asked for again.
+pub(super) const WATCH_AGAIN_AFTER: Duration = Duration::from_secs(1);
 
 /// Facts of one revision.
 pub(super) type Facts = (Vec<(FactKey, Fact)>, Revision);
@@ -33,14 +40,54 @@ pub(super) type Facts = (Vec<(FactKey, Fact)>, Revision);
 /// What the service asks of the actor.
 #[derive(Debug)]
 pub(super) enum Message {
-    Root { answer: Answer<World> },
-    Commit { id: String, changes: Vec<Change>, expected: Option<Revision>, answer: Answer<Revision> },
-    Project { projection: NewProjection, answer: Answer<ProjectionId> },
-    Query { projection: Option<ProjectionId>, patterns: Vec<FactPattern>, answer: Answer<Facts> },
-    Release { projection: ProjectionId, answer: Answer<bool> },
+    Root {
+        answer: Answer<World>,
+    },
+    Commit {
+        commit: Commit,
+        answer: Answer<Revision>,
+    },
+    Project {
+        projection: NewProjection,
+        answer: Answer<ProjectionId>,
+    },
+    Query {
+        projection: Option<ProjectionId>,
+        at: Option<Revision>,
+        patterns: Vec<FactPattern>,
+        answer: Answer<Facts>,
+    },
+    Watch {
+        /// Without a snapshot: the revisions after this.
+        after: Option<Revision>,
+        answer: Answer<mpsc::Receiver<Update>>,
+    },
+    Diff {
+        from: Revision,
+        /// Unset, the root as it is.
+        to: Option<Revision>,
+        answer: Answer<(Vec<Difference>, Revision)>,
+    },
+    Versions {
+        key: FactKey,
+        limit: usize,
+        answer: Answer<(Vec<Version>, Revision)>,
+    },
+    Release {
+        projection: ProjectionId,
+        answer: Answer<bool>,
+    },
 }
 
 type Answer<T> = oneshot::Sender<Result<T, Status>>;
+
+/// What watchers are told.
+#[derive(Debug, Clone)]
+pub(super) enum Update {
+    /// What holds; every revision follows.
+    Snapshot(World),
+    Revision(Arc<Kept>),
+}
 
 /// A projection as it was asked for.
 #[derive(Debug)]
@@ -77,25 +124,34 @@ struct Actor {
     stopped: Option<Status>,
     /// Nor is anything shown: it is not known what is on the disk.
     unreadable: bool,
+    watchers: Vec<mpsc::Sender<Update>>,
     leases: watch::Receiver<LiveLeases>,
     start: Instant,
 }
 
 /// Something that leaves.
-struct Outgoing(SendAnswer);
+enum Outgoing {
+    Answer(SendAnswer),
+    /// To everybody who watches.
+    News(Arc<Kept>),
+    /// From here on it sees every revision.
+    Watcher(mpsc::Sender<Update>),
+}
 
 /// Starts the actor on what was kept. It ends with the token, when everything is on the disk.
 pub(super) fn start(
     config: WorldPoolConfig,
+    ontology: Option<Ontology>,
     (history, journal): (History, Journal),
     leases: watch::Receiver<LiveLeases>,
     over: CancellationToken,
 ) -> (Handle, JoinHandle<()>) {
     let (inbox, messages) = mpsc::channel(INBOX);
     // A pool that makes a projection every microsecond for as long as it lives would reach those of its successor.
-    let pool = WorldPool::new(config.clone(), history, floor().saturating_mul(1_000));
+    let pool = WorldPool::new(config.clone(), ontology, history, floor().saturating_mul(1_000));
     let (outbox, start) = (Outbox::default(), Instant::now());
-    let actor = Actor { config, pool, journal, outbox, stopped: None, unreadable: false, leases, start };
+    let actor =
+        Actor { config, pool, journal, outbox, stopped: None, unreadable: false, watchers: Vec::new(), leases, start };
     (Handle { inbox }, tokio::spawn(actor.run(messages, over)))
 }
 
@@ -105,6 +161,7 @@ impl Actor {
         let mut leases = self.leases.clone();
         loop {
             let (running, room) = (self.stopped.is_none(), !self.outbox.is_full());
+            let stale = self.pool.next_expiry().filter(|_| running).map(|at| self.start + Duration::from_nanos(at.0));
             tokio::select! {
                 biased;
                 () = over.cancelled() => return self.end(),
@@ -120,6 +177,10 @@ impl Actor {
                 }
                 progress = self.journal.changed(), if running => self.written(progress),
                 _ = expiry.tick() => self.pool.expire(self.now()),
+                () = sleep_until(stale) => {
+                    self.pool.expire_facts(self.now());
+                    self.write(None);
+                }
                 message = messages.recv(), if room => match message {
                     Some(message) => self.receive(message),
                     None => return self.end(),
@@ -146,21 +207,39 @@ impl Actor {
     fn receive(&mut self, message: Message) {
         match message {
             Message::Root { answer } => self.reply(answer, Ok(self.pool.root().clone())),
-            Message::Commit { id, changes, expected, answer } => {
+            Message::Commit { commit, answer } => {
+                let now = self.now();
                 let committed = match &self.stopped {
                     Some(stopped) => Err(stopped.clone()),
-                    None => self.pool.commit(&id, &changes, expected).map_err(|error| status::of_commit(&error)),
+                    None => self.pool.commit(now, &commit).map_err(|error| status::of_commit(&error)),
                 };
-                tracing::debug!(id, changes = changes.len(), ?committed, "commit");
+                tracing::debug!(id = commit.id, changes = commit.changes.len(), ?committed, "commit");
                 self.reply(answer, committed);
             }
             Message::Project { projection, answer } => {
                 let projected = self.project(projection);
                 self.reply(answer, projected);
             }
-            Message::Query { projection, patterns, answer } => {
-                let found = self.pool.query(projection, &patterns).map_err(|error| status::of_query(&error));
+            Message::Query { projection, at, patterns, answer } => {
+                let found = self.pool.query(projection, at, &patterns).map_err(|error| status::of_query(&error));
                 self.reply(answer, found);
+            }
+            Message::Watch { after, answer } => match self.watch(after) {
+                Ok((sender, updates)) => {
+                    self.reply(answer, Ok(updates));
+                    // Revisions of before that wait for the disk are in what it was given.
+                    self.write(Some(Outgoing::Watcher(sender)));
+                }
+                Err(refused) => self.reply(answer, Err(refused)),
+            },
+            Message::Diff { from, to, answer } => {
+                let to = to.unwrap_or(self.pool.root().revision());
+                let differences = self.pool.history.diff(from, to).map_err(status::of_revision);
+                self.reply(answer, differences.map(|differences| (differences, to)));
+            }
+            Message::Versions { key, limit, answer } => {
+                let versions = self.pool.history.versions(&key, limit);
+                self.reply(answer, Ok(versions));
             }
             Message::Release { projection, answer } => {
                 let released = self.pool.release(projection);
@@ -170,20 +249,65 @@ impl Actor {
     }
 
     fn reply<T: Send + 'static>(&mut self, answer: Answer<T>, result: Result<T, Status>) {
-        self.say(Outgoing(send_answer(answer, result)));
+        self.write(Some(Outgoing::Answer(send_answer(answer, result))));
     }
 
     /// Writes down what was committed; what is said about it waits for that.
-    fn say(&mut self, outgoing: Outgoing) {
-        if let Some(stopped) = &self.stopped {
-            return outgoing.hand_out(self.unreadable.then_some(stopped));
+    fn write(&mut self, outgoing: Option<Outgoing>) {
+        if self.stopped.is_some() {
+            let refused = self.stopped.clone().filter(|_| self.unreadable);
+            outgoing.into_iter().for_each(|outgoing| self.hand_out(outgoing, refused.as_ref()));
+            return;
         }
-        match self.journal.write(&mut self.pool.history) {
-            Ok(()) => self.outbox.hold(self.journal.last(), outgoing),
-            Err(error) => {
-                self.outbox.hold(self.journal.last().next(), outgoing);
-                self.stop(&error);
+        let written = self.journal.write(&mut self.pool.history);
+        // What could not be written is not on the disk either when all else is.
+        let position = if written.is_ok() { self.journal.last() } else { self.journal.last().next() };
+        for kept in self.pool.history.take_news() {
+            self.outbox.hold(position, Outgoing::News(kept));
+        }
+        outgoing.into_iter().for_each(|outgoing| self.outbox.hold(position, outgoing));
+        if let Err(error) = written {
+            self.stop(&error);
+        }
+    }
+
+    /// What a watcher begins with is in its channel already.
+    fn watch(&mut self, after: Option<Revision>) -> Result<(mpsc::Sender<Update>, mpsc::Receiver<Update>), Status> {
+        self.watchers.retain(|watcher| !watcher.is_closed());
+        if self.watchers.len() >= self.config.max_watchers {
+            let message = format!("{} clients watch already", self.watchers.len());
+            return Err(retry_later(Code::ResourceExhausted, "TOO_MANY", message, WATCH_AGAIN_AFTER));
+        }
+        let first: Vec<Update> = match after {
+            None => vec![Update::Snapshot(self.pool.root().clone())],
+            Some(after) => {
+                let missed = self.pool.history.after(after).map_err(status::of_revision)?;
+                missed.map(|kept| Update::Revision(Arc::clone(kept))).collect()
             }
+        };
+        let (sender, updates) = mpsc::channel(WATCH_BUFFER + first.len());
+        for update in first {
+            sender.try_send(update).map_err(|_| status_of(Code::Internal, "BROKEN", "a new watch took no update"))?;
+        }
+        Ok((sender, updates))
+    }
+
+    /// Or a status instead.
+    fn hand_out(&mut self, outgoing: Outgoing, refused: Option<&Status>) {
+        match outgoing {
+            Outgoing::Answer(answer) => answer(refused),
+            Outgoing::Watcher(watcher) if refused.is_none() => self.watchers.push(watcher),
+            Outgoing::News(kept) if refused.is_none() => {
+                self.watchers.retain(|watcher| match watcher.try_send(Update::Revision(Arc::clone(&kept))) {
+                    Ok(()) => true,
+                    Err(mpsc::error::TrySendError::Closed(_)) => false,
+                    Err(mpsc::error::TrySendError::Full(_)) => {
+                        tracing::warn!("a watcher did not keep up and was cut off");
+                        false
+                    }
+                });
+            }
+            Outgoing::Watcher(_) | Outgoing::News(_) => {}
         }
     }
 
@@ -191,7 +315,7 @@ impl Actor {
     fn deliver(&mut self) {
         while self.outbox.waits_for().is_some_and(|position| self.journal.reached(position)) {
             if let Some(outgoing) = self.outbox.take() {
-                outgoing.hand_out(None);
+                self.hand_out(outgoing, None);
             }
         }
     }
@@ -219,10 +343,12 @@ impl Actor {
         }
         self.deliver();
         while let Some(outgoing) = self.outbox.take() {
-            outgoing.hand_out(Some(&stopped));
+            self.hand_out(outgoing, Some(&stopped));
         }
+        // They find a root that may be behind the one they would have seen, and watch again.
+        self.watchers.clear();
         match self.journal.read(|recovered| History::restore(recovered, &self.config)) {
-            Ok(history) => self.pool.replace_history(history),
+            Ok(history) => self.pool.replace_history(self.now(), history),
             Err(error) => {
                 let error = anyhow::Error::new(error);
                 tracing::error!(error = format!("{error:#}"), "what is on the disk cannot be read either");
@@ -250,15 +376,19 @@ impl Actor {
     }
 }
 
-impl Outgoing {
-    /// Or a status instead.
-    fn hand_out(self, refused: Option<&Status>) {
-        self.0(refused);
+async fn sleep_until(deadline: Option<Instant>) {
+    match deadline {
+        Some(deadline) => tokio::time::sleep_until(deadline.into()).await,
+        None => std::future::pending().await,
     }
 }
 
 impl std::fmt::Debug for Outgoing {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Answer")
+        f.write_str(match self {
+            Outgoing::Answer(_) => "Answer",
+            Outgoing::News(_) => "News",
+            Outgoing::Watcher(_) => "Watcher",
+        })
     }
 }

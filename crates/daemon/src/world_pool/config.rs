@@ -3,6 +3,12 @@
 use crate::config::{Check, ConfigError, StorageConfig, rule};
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
+
+/// How long a fact may live.
+const TTLS_S: RangeInclusive<f64> = 0.001..=1e9;
 
 /// All keys are optional.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -28,6 +34,12 @@ pub struct WorldPoolConfig {
     pub max_projections: usize,
     /// A projection whose lease holds no resource ends after this long, in seconds.
     pub unbound_ttl_s: f64,
+    /// Clients that watch at the same time.
+    pub max_watchers: usize,
+    /// A file in Turtle: what does not fit it is not committed, and facts live as long as it declares.
+    pub ontology: Option<PathBuf>,
+    /// Seconds by predicate, instead of what the ontology declares: a fact that is not written again within them is gone.
+    pub ttl_s: BTreeMap<String, f64>,
     /// Commits and projections remembered so that a repeated id is not performed twice.
     pub remembered_requests: usize,
     /// What is kept over a restart.
@@ -47,6 +59,9 @@ impl Default for WorldPoolConfig {
             changes_kept: 1_000_000,
             max_projections: 4_096,
             unbound_ttl_s: 600.0,
+            max_watchers: 1_024,
+            ontology: None,
+            ttl_s: BTreeMap::new(),
             remembered_requests: 65_536,
             storage: StorageConfig::default(),
         }
@@ -63,6 +78,9 @@ impl Check for WorldPoolConfig {
         rule("changes_kept", self.changes_kept >= 1, "at least 1")?;
         rule("max_projections", self.max_projections >= 1, "at least 1")?;
         rule("unbound_ttl_s", (1.0..=86_400.0).contains(&self.unbound_ttl_s), "from 1 s to a day")?;
+        rule("max_watchers", self.max_watchers >= 1, "at least 1")?;
+        let lasting = self.ttl_s.values().all(|ttl_s| TTLS_S.contains(ttl_s));
+        rule("ttl_s", lasting, "from 0.001 s to 1,000,000,000 s each")?;
         rule("remembered_requests", self.remembered_requests >= 1, "at least 1")?;
         self.storage.check()
     }

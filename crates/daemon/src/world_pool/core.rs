@@ -5,13 +5,16 @@
 //! end with the process, and no later one has the id of an earlier one.
 
 use super::WorldPoolConfig;
-use super::history::{CommitError, History, RevisionError};
+use super::expiry::Expiry;
+use super::history::{Commit, CommitError, History, RevisionError};
 use super::memory::{Memory, Reused, fingerprint};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
+use ratn_model::ontology::Ontology;
 use ratn_model::time::Timestamp;
 use ratn_world::world::{ChangeError, Fact, World};
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 /// The pool's whole state.
@@ -19,6 +22,8 @@ use std::time::Duration;
 pub(super) struct WorldPool {
     config: WorldPoolConfig,
     pub(super) history: History,
+    ontology: Option<Ontology>,
+    expiry: Expiry,
     projections: BTreeMap<ProjectionId, Projection>,
     projected: Memory<ProjectionId>,
     by_lease: BTreeMap<LeaseId, BTreeSet<ProjectionId>>,
@@ -75,19 +80,30 @@ pub(super) enum QueryError {
     Unknown { id: ProjectionId },
     #[error("{id} does not show {pattern}: it is not among the reads declared for it; declare it (reads: […])")]
     Hidden { id: ProjectionId, pattern: FactPattern },
+    #[error(transparent)]
+    Revision(#[from] RevisionError),
 }
 
 impl WorldPool {
-    /// Projections get ids above `floor`.
-    pub(super) fn new(config: WorldPoolConfig, history: History, floor: u64) -> WorldPool {
-        WorldPool {
+    /// Projections get ids above `floor`. With an ontology only what fits it is committed, and its times to live hold where the config
+    /// has none.
+    pub(super) fn new(config: WorldPoolConfig, ontology: Option<Ontology>, history: History, floor: u64) -> WorldPool {
+        let declared = ontology.iter().flat_map(Ontology::predicates);
+        let declared = declared.filter_map(|(name, predicate)| Some((name.to_owned(), predicate.ttl_s?)));
+        let configured = config.ttl_s.iter().map(|(name, ttl_s)| (name.clone(), *ttl_s));
+        let ttl = declared.chain(configured).map(|(name, ttl_s)| (name, Duration::from_secs_f64(ttl_s)));
+        let mut pool = WorldPool {
+            expiry: Expiry::new(ttl.collect()),
+            ontology,
             history,
             projections: BTreeMap::new(),
             projected: Memory::new(config.remembered_requests),
             by_lease: BTreeMap::new(),
             last_projection: floor,
             config,
-        }
+        };
+        pool.all_begin(Timestamp(0));
+        pool
     }
 
     pub(super) fn root(&self) -> &World {
@@ -95,18 +111,47 @@ impl WorldPool {
     }
 
     /// All changes as the next revision, or none. An id committed before gets its answer again.
-    pub(super) fn commit(
-        &mut self,
-        id: &str,
-        changes: &[Change],
-        expected: Option<Revision>,
-    ) -> Result<Revision, CommitError> {
-        self.history.commit(id, changes, expected)
+    pub(super) fn commit(&mut self, now: Timestamp, commit: &Commit) -> Result<Revision, CommitError> {
+        let before = self.root().revision();
+        let revision = self.history.commit(commit, self.ontology.as_ref())?;
+        // An answer of before has written nothing now.
+        if let Some(kept) = self.history.newest().filter(|kept| kept.world.revision() > before) {
+            self.expiry.written(now, &kept.written);
+        }
+        Ok(revision)
+    }
+
+    /// When [`WorldPool::expire_facts`] has something to do.
+    pub(super) fn next_expiry(&self) -> Option<Timestamp> {
+        self.expiry.next()
+    }
+
+    /// The facts whose time is over are gone, all as one revision.
+    pub(super) fn expire_facts(&mut self, now: Timestamp) {
+        let changes = self.expiry.due(now);
+        if changes.is_empty() {
+            return;
+        }
+        let commit = Commit { changes, ..Commit::default() };
+        if let Err(error) = self.commit(now, &commit) {
+            debug_assert!(false, "facts that hold can be deleted: {error}");
+        }
+    }
+
+    /// Every fact has its whole time from now on.
+    fn all_begin(&mut self, now: Timestamp) {
+        self.expiry.clear();
+        if !self.expiry.is_empty() {
+            for (key, _) in self.history.root().iter() {
+                self.expiry.begin(now, &Arc::new(key.clone()));
+            }
+        }
     }
 
     /// Another history instead, which may be behind: what was projected from later revisions ends.
-    pub(super) fn replace_history(&mut self, history: History) {
+    pub(super) fn replace_history(&mut self, now: Timestamp, history: History) {
         self.history = history;
+        self.all_begin(now);
         let root = self.root().revision();
         let ahead = self.projections.iter().filter(|(_, projection)| projection.base > root);
         let ahead: Vec<ProjectionId> = ahead.map(|(id, _)| *id).collect();
@@ -143,16 +188,18 @@ impl WorldPool {
         Ok(id)
     }
 
-    /// What matches any of the patterns, in the order of keys, of the root or of a projection; without a pattern everything
+    /// What matches any of the patterns, in the order of keys, of the root (now or at a revision) or of a projection; without a pattern everything
     /// that it shows.
     pub(super) fn query(
         &self,
         id: Option<ProjectionId>,
+        at: Option<Revision>,
         patterns: &[FactPattern],
     ) -> Result<(Vec<(FactKey, Fact)>, Revision), QueryError> {
-        let (world, revision, shown) = match id {
-            None => (self.root(), self.root().revision(), &Footprint::Everything),
-            Some(id) => {
+        let (world, revision, shown) = match (id, at) {
+            (None, None) => (self.root(), self.root().revision(), &Footprint::Everything),
+            (None, Some(at)) => (self.history.at(at)?, at, &Footprint::Everything),
+            (Some(id), _) => {
                 let projection = self.projections.get(&id).ok_or(QueryError::Unknown { id })?;
                 let hidden = |pattern: &&FactPattern| match &projection.reads {
                     Footprint::Everything => false,
@@ -223,6 +270,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
     use ratn_model::fact::Term;
+    use ratn_model::measurement::{Certainty, Measurement};
     use ratn_model::value::Value;
 
     fn key(name: &str) -> FactKey {
@@ -236,7 +284,17 @@ mod tests {
     fn pool() -> WorldPool {
         let config = WorldPoolConfig { revisions_kept: 3, max_projections: 2, ..WorldPoolConfig::default() };
         let history = History::new(&config);
-        WorldPool::new(config, history, 0)
+        WorldPool::new(config, None, history, 0)
+    }
+
+    fn commit(
+        pool: &mut WorldPool,
+        id: &str,
+        changes: &[Change],
+        expected: Option<Revision>,
+    ) -> Result<Revision, CommitError> {
+        let commit = Commit { id: id.to_owned(), changes: changes.to_vec(), expected, ..Commit::default() };
+        pool.commit(Timestamp(0), &commit)
     }
 
     fn project(pool: &mut WorldPool, request: &str, base: u64, lease: u64) -> Result<ProjectionId, ProjectError> {
@@ -250,26 +308,26 @@ mod tests {
     }
 
     fn value(pool: &WorldPool, id: Option<ProjectionId>, name: &str) -> Result<Option<Value>, QueryError> {
-        let (facts, _) = pool.query(id, &[FactPattern::of(&key(name))])?;
+        let (facts, _) = pool.query(id, None, &[FactPattern::of(&key(name))])?;
         Ok(facts.into_iter().next().map(|(_, fact)| fact.value))
     }
 
     #[test]
     fn a_commit_is_made_once_and_only_as_the_revision_expected() {
         let mut pool = pool();
-        assert_eq!(pool.commit("a", &[set("box", 1)], Some(Revision(1))), Ok(Revision(1)));
-        assert_eq!(pool.commit("a", &[set("box", 1)], Some(Revision(1))), Ok(Revision(1)));
-        let wrong = pool.commit("b", &[set("box", 2)], Some(Revision(3)));
+        assert_eq!(commit(&mut pool, "a", &[set("box", 1)], Some(Revision(1))), Ok(Revision(1)));
+        assert_eq!(commit(&mut pool, "a", &[set("box", 1)], Some(Revision(1))), Ok(Revision(1)));
+        let wrong = commit(&mut pool, "b", &[set("box", 2)], Some(Revision(3)));
         assert_eq!(wrong, Err(CommitError::Revision { root: 1, next: 2, expected: 3 }));
         assert_eq!(value(&pool, None, "box"), Ok(Some(Value::Int(1))));
-        assert_eq!(pool.commit("b", &[set("box", 2)], None), Ok(Revision(2)));
+        assert_eq!(commit(&mut pool, "b", &[set("box", 2)], None), Ok(Revision(2)));
     }
 
     #[test]
     fn a_projection_is_of_its_base_whatever_was_committed_since() {
         let mut pool = pool();
-        pool.commit("a", &[set("box", 1), set("cup", 1)], None).unwrap();
-        pool.commit("b", &[set("box", 2), set("cup", 2)], None).unwrap();
+        commit(&mut pool, "a", &[set("box", 1), set("cup", 1)], None).unwrap();
+        commit(&mut pool, "b", &[set("box", 2), set("cup", 2)], None).unwrap();
         let all = Footprint::Everything;
         let request = ProjectRequest {
             request_id: "p".to_owned(),
@@ -291,7 +349,7 @@ mod tests {
     #[test]
     fn a_projection_shows_its_declared_reads_and_nothing_else() {
         let mut pool = pool();
-        pool.commit("a", &[set("cup", 1)], None).unwrap();
+        commit(&mut pool, "a", &[set("cup", 1)], None).unwrap();
         let id = project(&mut pool, "p", 1, 1).unwrap();
         assert_eq!(value(&pool, Some(id), "box"), Ok(Some(Value::Int(7))));
         let hidden = value(&pool, Some(id), "cup").unwrap_err();
@@ -300,8 +358,8 @@ mod tests {
             "projection-1 does not show at(cup): it is not among the reads declared for it; declare it (reads: […])"
         );
         let wider = FactPattern { predicate: "at".to_owned(), arguments: vec![None] };
-        assert!(matches!(pool.query(Some(id), &[wider]), Err(QueryError::Hidden { .. })));
-        let (all, _) = pool.query(Some(id), &[]).unwrap();
+        assert!(matches!(pool.query(Some(id), None, &[wider]), Err(QueryError::Hidden { .. })));
+        let (all, _) = pool.query(Some(id), None, &[]).unwrap();
         assert_eq!(all.iter().map(|(key, _)| key.to_string()).collect::<Vec<_>>(), ["at(box)"]);
     }
 
@@ -309,9 +367,12 @@ mod tests {
     fn revisions_outside_those_kept_are_refused() {
         let mut pool = pool();
         for i in 1..=4 {
-            pool.commit(&i.to_string(), &[set("box", i)], None).unwrap();
+            commit(&mut pool, &i.to_string(), &[set("box", i)], None).unwrap();
         }
-        assert_eq!(project(&mut pool, "p", 1, 1), Err(RevisionError::Forgotten { wanted: 1, oldest: 2 }.into()));
+        assert_eq!(
+            project(&mut pool, "p", 1, 1),
+            Err(RevisionError::Forgotten { wanted: 1, oldest: 2, root: 4 }.into())
+        );
         assert_eq!(project(&mut pool, "p", 5, 1), Err(RevisionError::Future { root: 4, wanted: 5 }.into()));
         assert!(project(&mut pool, "p", 2, 1).is_ok(), "a refused request can be asked again");
     }
@@ -330,5 +391,67 @@ mod tests {
         assert_eq!(pool.keep_leases(|_| false), 1);
         assert_eq!(pool.projections(), 0);
         assert!(pool.by_lease.is_empty());
+    }
+
+    #[test]
+    fn a_fact_with_a_time_to_live_is_gone_after_it_unless_it_was_written_again() {
+        let second = |n: f64| Timestamp::from_seconds(n);
+        let config = WorldPoolConfig { ttl_s: [("at".to_owned(), 2.0)].into(), ..WorldPoolConfig::default() };
+        let history = History::new(&config);
+        let mut pool = WorldPool::new(config, None, history, 0);
+        let of = |id: &str, changes: Vec<Change>| Commit { id: id.to_owned(), changes, ..Commit::default() };
+        let full = Change::Set { fact: FactKey { predicate: "full".to_owned(), ..key("box") }, value: Value::Int(1) };
+        pool.commit(second(0.0), &of("a", vec![set("box", 1), set("cup", 1), full])).unwrap();
+        pool.commit(second(1.0), &of("b", vec![set("cup", 1)])).unwrap();
+        // Asked again: it is as old as it was.
+        pool.commit(second(1.5), &of("a", vec![set("box", 1), set("cup", 1)])).unwrap_err();
+        assert_eq!(pool.next_expiry(), Some(second(2.0)));
+        pool.expire_facts(second(1.9));
+        assert_eq!(pool.root().revision(), Revision(2));
+        pool.expire_facts(second(2.0));
+        assert_eq!(pool.root().revision(), Revision(3), "a revision as any other");
+        let names: Vec<String> = pool.root().iter().map(|(key, _)| key.to_string()).collect();
+        assert_eq!(names, ["at(cup)", "full(box)"]);
+        let news: Vec<u64> = pool.history.take_news().iter().map(|kept| kept.world.revision().0).collect();
+        assert_eq!(news, [1, 2, 3], "watchers hear of it");
+        pool.commit(second(2.5), &of("c", vec![Change::Delete { pattern: FactPattern::of(&key("cup")) }])).unwrap();
+        assert_eq!(pool.next_expiry(), None);
+    }
+
+    #[test]
+    fn what_does_not_fit_the_ontology_is_not_committed() {
+        let text = "
+            @prefix ratn: <urn:ratn:ontology#> .
+            @prefix owl: <http://www.w3.org/2002/07/owl#> .
+            @prefix : <urn:robot#> .
+            :full a ratn:Predicate ; ratn:arguments ( owl:Thing ) ; ratn:value \"int\" .";
+        let ontology = ratn_model::ontology::turtle::read(text).unwrap();
+        let config = WorldPoolConfig::default();
+        let history = History::new(&config);
+        let mut pool = WorldPool::new(config, Some(ontology), history, 0);
+        let refused = commit(&mut pool, "a", &[set("box", 1)], None).unwrap_err();
+        assert!(matches!(refused, CommitError::Violation(_)), "{refused}");
+        assert_eq!(pool.root().revision(), Revision(0));
+    }
+
+    #[test]
+    fn a_fact_says_who_wrote_it_and_what_measured_it() {
+        let mut pool = pool();
+        let measured = Measurement { source: "camera".to_owned(), certainty: Some(Certainty::Confidence(0.9)) };
+        let evidence = vec![(key("box"), measured.clone())];
+        let commit = Commit {
+            id: "a".to_owned(),
+            changes: vec![set("box", 1), set("cup", 2)],
+            writer: Some("detect[1]".to_owned()),
+            evidence,
+            ..Commit::default()
+        };
+        pool.commit(Timestamp(0), &commit).unwrap();
+        let (facts, _) = pool.query(None, None, &[]).unwrap();
+        assert!(facts.iter().all(|(_, fact)| fact.writer.as_deref() == Some("detect[1]")));
+        assert_eq!(facts[0].1.measured.as_deref(), Some(&measured));
+        assert_eq!(facts[1].1.measured, None);
+        let none = Commit { id: "b".to_owned(), changes: vec![set("cup", 3)], ..commit };
+        assert_eq!(pool.commit(Timestamp(0), &none), Err(CommitError::Evidence { fact: key("box") }));
     }
 }

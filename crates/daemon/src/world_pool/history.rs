@@ -8,11 +8,13 @@ use super::memory::{Memory, Reused, fingerprint};
 use super::record::{CommitRecord, DecodeError, FactRecord, Names, PatternRecord, SnapshotRecord, decode, encode};
 use crate::journal::Journaled;
 use bytes::Bytes;
-use ratn_model::fact::{Change, FactPattern};
+use ratn_model::fact::{Change, FactKey, FactPattern};
 use ratn_model::id::Revision;
+use ratn_model::measurement::Measurement;
+use ratn_model::ontology::{Ontology, Violation};
 use ratn_storage::{MakeSnapshot, Position, Recovered};
-use ratn_world::world::{ChangeError, World, Written};
-use std::collections::VecDeque;
+use ratn_world::world::{ChangeError, Fact, World, Written};
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 
 /// See the module.
@@ -25,9 +27,30 @@ pub(super) struct History {
     commits: Memory<Revision>,
     /// Commits since the journal took the last.
     records: Vec<CommitRecord>,
+    /// Revisions since [`History::take_news`].
+    news: Vec<Arc<Kept>>,
     revisions_kept: usize,
     changes_kept: usize,
 }
+
+/// What is to become the next revision.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Commit {
+    /// Unique to what is committed; the same once more gets the answer of before. Empty where facts were too old.
+    pub(super) id: String,
+    pub(super) changes: Vec<Change>,
+    /// What the next revision has to be.
+    pub(super) expected: Option<Revision>,
+    pub(super) writer: Option<String>,
+    /// What measured which of the facts that are written.
+    pub(super) evidence: Vec<(FactKey, Measurement)>,
+}
+
+/// A fact in two revisions.
+pub(super) type Difference = (Arc<FactKey>, Option<Arc<Fact>>, Option<Arc<Fact>>);
+
+/// A fact from one revision on: the revision, the commit's id, the fact.
+pub(super) type Version = (Revision, Arc<str>, Option<Arc<Fact>>);
 
 /// A revision, and what makes it another than the one before.
 #[derive(Debug)]
@@ -47,6 +70,10 @@ pub(super) enum CommitError {
     Change(#[from] ChangeError),
     #[error(transparent)]
     Reused(#[from] Reused),
+    #[error("{fact} is not among what is written: it has no evidence")]
+    Evidence { fact: FactKey },
+    #[error(transparent)]
+    Violation(#[from] Violation),
 }
 
 /// A revision that is not kept.
@@ -55,7 +82,7 @@ pub(super) enum RevisionError {
     #[error("the root is at revision {root}: there is no revision {wanted} yet")]
     Future { root: u64, wanted: u64 },
     #[error("revision {wanted} is no longer kept, the oldest is {oldest}; ask for a later one")]
-    Forgotten { wanted: u64, oldest: u64 },
+    Forgotten { wanted: u64, oldest: u64, root: u64 },
 }
 
 /// Why a log is no history.
@@ -84,6 +111,7 @@ impl History {
             written: 0,
             commits: Memory::new(config.remembered_requests),
             records: Vec::new(),
+            news: Vec::new(),
             revisions_kept: config.revisions_kept,
             changes_kept: config.changes_kept,
         }
@@ -122,13 +150,9 @@ impl History {
     }
 
     /// All changes as the next revision, or none. An id committed before gets its answer again.
-    pub(super) fn commit(
-        &mut self,
-        id: &str,
-        changes: &[Change],
-        expected: Option<Revision>,
-    ) -> Result<Revision, CommitError> {
-        let fingerprint = fingerprint(&changes);
+    pub(super) fn commit(&mut self, commit: &Commit, ontology: Option<&Ontology>) -> Result<Revision, CommitError> {
+        let Commit { id, changes, expected, writer, evidence } = commit;
+        let fingerprint = fingerprint(changes);
         if let Some(revision) = self.commits.recall(id, fingerprint)? {
             return Ok(revision);
         }
@@ -136,19 +160,28 @@ impl History {
         if let Some(expected) = expected.filter(|expected| expected.0 != next) {
             return Err(CommitError::Revision { root, next, expected: expected.0 });
         }
-        let written = self.root().written_by(None, changes)?;
+        if let Some(ontology) = ontology {
+            ontology.check_changes(changes)?;
+        }
+        let mut written = self.root().written_by(writer.as_deref(), changes)?;
+        for (key, measured) in evidence {
+            let fact = written.get_mut(key).and_then(Option::as_mut);
+            let fact = fact.ok_or_else(|| CommitError::Evidence { fact: key.clone() })?;
+            Arc::make_mut(fact).measured = Some(Arc::new(measured.clone()));
+        }
         let deleted = changes.iter().filter_map(|change| match change {
             Change::Delete { pattern } => Some(PatternRecord::new(pattern)),
             _ => None,
         });
         self.records.push(CommitRecord {
             revision: next,
-            id: id.to_owned(),
+            id: id.clone(),
             fingerprint,
             deleted: deleted.collect(),
             written: facts_of(&written),
         });
         let revision = self.push(id, written);
+        self.news.extend(self.revisions.back().cloned());
         self.commits.insert(id, fingerprint, revision);
         Ok(revision)
     }
@@ -160,7 +193,46 @@ impl History {
             return Err(RevisionError::Future { root, wanted });
         }
         let kept = wanted.checked_sub(oldest).and_then(|index| self.revisions.get(usize::try_from(index).ok()?));
-        kept.map(|kept| &kept.world).ok_or(RevisionError::Forgotten { wanted, oldest })
+        kept.map(|kept| &kept.world).ok_or(RevisionError::Forgotten { wanted, oldest, root })
+    }
+
+    /// The root as it is kept.
+    pub(super) fn newest(&self) -> Option<&Arc<Kept>> {
+        self.revisions.back()
+    }
+
+    /// The revisions since the last call.
+    pub(super) fn take_news(&mut self) -> Vec<Arc<Kept>> {
+        std::mem::take(&mut self.news)
+    }
+
+    /// Every revision after one.
+    pub(super) fn after(&self, revision: Revision) -> Result<impl Iterator<Item = &Arc<Kept>>, RevisionError> {
+        self.at(revision)?;
+        let known = self.revisions.iter().skip(1);
+        Ok(known.skip_while(move |kept| kept.world.revision() <= revision))
+    }
+
+    /// The facts that differ between two revisions, in the order of keys: what was written in between and is not as it was.
+    pub(super) fn diff(&self, from: Revision, to: Revision) -> Result<Vec<Difference>, RevisionError> {
+        let (before, after) = (self.at(from)?, self.at(to)?);
+        let between = self.after(from.min(to))?.take_while(|kept| kept.world.revision() <= from.max(to));
+        let keys: BTreeSet<&Arc<FactKey>> = between.flat_map(|kept| kept.written.keys()).collect();
+        let shared = |world: &World, key| world.fact(key).map(|fact| Arc::new(fact.clone()));
+        let both = keys.into_iter().map(|key| (Arc::clone(key), shared(before, key), shared(after, key)));
+        Ok(both.filter(|(_, before, after)| before != after).collect())
+    }
+
+    /// What a fact was, the newest first, and the oldest revision that is kept.
+    pub(super) fn versions(&self, key: &FactKey, limit: usize) -> (Vec<Version>, Revision) {
+        let oldest = &self.revisions[0].world;
+        let written =
+            self.revisions.iter().rev().filter_map(|kept| {
+                Some((kept.world.revision(), Arc::clone(&kept.commit), kept.written.get(key)?.clone()))
+            });
+        let before = oldest.fact(key).filter(|_| !self.revisions[0].written.contains_key(key));
+        let before = before.map(|fact| (fact.revision, Arc::from(""), Some(Arc::new(fact.clone()))));
+        (written.chain(before).take(limit).collect(), oldest.revision())
     }
 
     fn push(&mut self, commit: &str, written: Written) -> Revision {
@@ -242,7 +314,7 @@ mod tests {
     use super::*;
     use proptest::collection::vec;
     use proptest::prelude::*;
-    use ratn_model::fact::{FactKey, Term};
+    use ratn_model::fact::Term;
     use ratn_model::value::Value;
     use ratn_storage::{Record, Snapshot};
 
@@ -264,6 +336,10 @@ mod tests {
         ]
     }
 
+    fn commit(id: &str, changes: &[Change]) -> Commit {
+        Commit { id: id.to_owned(), changes: changes.to_vec(), ..Commit::default() }
+    }
+
     /// What the log of a pool holds.
     #[derive(Default)]
     struct Kept {
@@ -281,6 +357,14 @@ mod tests {
         }
     }
 
+    /// By looking at every fact.
+    fn difference(before: &World, after: &World) -> Vec<Difference> {
+        let keys: BTreeSet<&FactKey> = before.iter().chain(after.iter()).map(|(key, _)| key).collect();
+        let fact = |world: &World, key| world.fact(key).map(|fact| Arc::new(fact.clone()));
+        let both = keys.into_iter().map(|key| (Arc::new(key.clone()), fact(before, key), fact(after, key)));
+        both.filter(|(_, before, after)| before != after).collect()
+    }
+
     proptest! {
         #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
 
@@ -292,7 +376,7 @@ mod tests {
             let (mut kept, mut worlds, mut made) = (Kept::default(), vec![World::default()], Vec::new());
             for (number, (changes, then)) in steps.into_iter().enumerate() {
                 let id = format!("commit-{number}");
-                let revision = history.commit(&id, &changes, None).unwrap();
+                let revision = history.commit(&commit(&id, &changes), None).unwrap();
                 let mut world = worlds[worlds.len() - 1].clone();
                 world.apply(&changes).unwrap();
                 worlds.push(world);
@@ -311,9 +395,25 @@ mod tests {
                 for kept in &history.revisions {
                     let revision = kept.world.revision();
                     prop_assert_eq!(history.at(revision).unwrap(), &worlds[revision.0 as usize]);
+                    for (from, to) in [(revision, history.root().revision()), (history.root().revision(), revision)] {
+                        let expected = difference(&worlds[from.0 as usize], &worlds[to.0 as usize]);
+                        prop_assert_eq!(history.diff(from, to).unwrap(), expected);
+                    }
+                    let after: Vec<Revision> =
+                        history.after(revision).unwrap().map(|kept| kept.world.revision()).collect();
+                    let expected: Vec<Revision> = (revision.0 + 1..worlds.len() as u64).map(Revision).collect();
+                    prop_assert_eq!(after, expected, "no gap, in order");
+                }
+                for n in 0..6 {
+                    let (versions, oldest) = history.versions(&key(n), 100);
+                    prop_assert_eq!(oldest, history.revisions[0].world.revision());
+                    for (at, world) in worlds.iter().enumerate().skip(oldest.0 as usize) {
+                        let then = versions.iter().find(|(revision, ..)| revision.0 as usize <= at);
+                        prop_assert_eq!(then.and_then(|(.., fact)| fact.as_deref()), world.fact(&key(n)));
+                    }
                 }
                 for (id, changes, revision) in made.iter().rev().take(7) {
-                    prop_assert_eq!(history.commit(id, changes, None), Ok(*revision), "asked again, made once");
+                    prop_assert_eq!(history.commit(&commit(id, changes), None), Ok(*revision), "asked again, made once");
                 }
             }
         }
@@ -331,7 +431,8 @@ mod tests {
         let mut history = History::new(&config());
         let mut kept = Kept::default();
         for n in 0..3 {
-            history.commit(&n.to_string(), &[Change::Set { fact: key(n), value: Value::Null }], None).unwrap();
+            let changes = [Change::Set { fact: key(n), value: Value::Null }];
+            history.commit(&commit(&n.to_string(), &changes), None).unwrap();
             kept.entries.extend(history.take_entry());
         }
         let mut gap = Kept { entries: kept.entries.clone(), snapshot: None };

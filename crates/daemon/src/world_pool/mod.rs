@@ -11,6 +11,7 @@
 mod actor;
 mod config;
 mod core;
+mod expiry;
 mod history;
 mod leases;
 mod memory;
@@ -23,11 +24,13 @@ pub use config::WorldPoolConfig;
 use crate::journal::Journal;
 use crate::link::{Link, Manager};
 use anyhow::Context;
+use ratn_model::ontology::{Ontology, turtle};
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
 use ratn_proto::v1::world_pool_service_server::WorldPoolServiceServer;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
+use std::path::Path;
 use std::time::Duration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -57,6 +60,7 @@ pub async fn run_as(
     serving: Serving,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
+    let ontology = config.ontology.as_deref().map(ontology).transpose()?;
     let storage = config.storage.directory_of(ROLE, directory.path());
     let restore = |recovered| history::History::restore(recovered, &config);
     let kept = Journal::open(ROLE, &config.storage, &storage, restore)?;
@@ -81,8 +85,8 @@ pub async fn run_as(
     let linked = tokio::spawn(link.keep(over.clone()));
     let (live, leases) = watch::channel(leases::LiveLeases::default());
     tokio::spawn(over.clone().run_until_cancelled_owned(leases::follow(manager, live)));
-    let (actor, ended) = actor::start(config, kept, leases.clone(), over.clone());
-    let service = WorldPoolServiceServer::new(service::Service { actor, leases })
+    let (actor, ended) = actor::start(config, ontology, kept, leases.clone(), over.clone());
+    let service = WorldPoolServiceServer::new(service::Service { actor, leases, shutdown: shutdown.clone() })
         .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
@@ -94,4 +98,10 @@ pub async fn run_as(
     let _ = ended.await;
     let _ = linked.await;
     Ok(served?)
+}
+
+fn ontology(file: &Path) -> anyhow::Result<Ontology> {
+    let place = file.display();
+    let text = std::fs::read_to_string(file).with_context(|| format!("cannot read the ontology {place}"))?;
+    turtle::read(&text).with_context(|| format!("the ontology {place}"))
 }

@@ -5,6 +5,7 @@
 
 use ratn_model::fact::{FactKey, FactPattern, Term};
 use ratn_model::id::Revision;
+use ratn_model::measurement::Measurement;
 use ratn_model::value::Value;
 use ratn_world::world::Fact;
 use serde::{Deserialize, Serialize};
@@ -43,6 +44,7 @@ pub(super) struct FactRecord {
     value: Value,
     revision: u64,
     writer: Option<Arc<str>>,
+    measured: Option<Arc<Measurement>>,
 }
 
 /// A pattern over keys.
@@ -93,6 +95,7 @@ impl FactRecord {
             value: fact.value.clone(),
             revision: fact.revision.0,
             writer: fact.writer.clone(),
+            measured: fact.measured.clone(),
         }
     }
 
@@ -101,7 +104,8 @@ impl FactRecord {
         let arguments = self.arguments.into_iter().map(TermRecord::into_term).collect();
         let key = FactKey { predicate: self.predicate, arguments };
         let writer = self.writer.map(|name| names.share(name));
-        (Arc::new(key), Arc::new(Fact { value: self.value, revision: Revision(self.revision), writer }))
+        let (revision, measured) = (Revision(self.revision), self.measured);
+        (Arc::new(key), Arc::new(Fact { value: self.value, revision, writer, measured }))
     }
 }
 

@@ -1,25 +1,34 @@
 //! gRPC in front of the actor.
 
-use super::actor::{Handle, Message, NewProjection};
+use super::actor::{Handle, Message, NewProjection, Update, WATCH_AGAIN_AFTER};
+use super::history::Commit;
 use super::leases::{Known, LiveLeases};
-use ratn_model::fact::FactKey;
+use crate::details::{ending, retry_later};
+use futures::StreamExt;
+use futures::stream::BoxStream;
+use ratn_model::fact::{FactKey, FactPattern};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
-use ratn_proto::convert::{all, each, label, name, required};
-use ratn_proto::types::FactRecord;
+use ratn_proto::convert::{Malformed, all, each, label, name, required};
+use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
 use ratn_proto::v1;
 use ratn_world::world::Fact;
 use std::time::Duration;
 use tokio::sync::watch;
-use tonic::{Request, Response, Status};
+use tokio_util::sync::CancellationToken;
+use tonic::{Code, Request, Response, Status};
 
 /// A grant may reach the client before the watch tells of it: so long a projection waits for that.
 const LEASE_PATIENCE: Duration = Duration::from_secs(1);
+
+/// Of a fact's history.
+const MOST_VERSIONS: usize = 1_000;
 
 /// The service; clones share the actor.
 #[derive(Debug, Clone)]
 pub(super) struct Service {
     pub(super) actor: Handle,
     pub(super) leases: watch::Receiver<LiveLeases>,
+    pub(super) shutdown: CancellationToken,
 }
 
 #[tonic::async_trait]
@@ -33,10 +42,15 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     async fn commit(&self, request: Request<v1::CommitRequest>) -> Result<Response<v1::CommitResponse>, Status> {
         let request = request.into_inner();
         name(&request.commit_id, "commit_id")?;
-        let id = request.commit_id;
-        let changes = each(request.changes, "changes")?;
-        let expected = (request.revision != 0).then_some(Revision(request.revision));
-        let revision = self.actor.ask(|answer| Message::Commit { id, changes, expected, answer }).await?;
+        label(&request.writer, "writer")?;
+        let commit = Commit {
+            id: request.commit_id,
+            changes: each(request.changes, "changes")?,
+            expected: (request.revision != 0).then_some(Revision(request.revision)),
+            writer: Some(request.writer).filter(|writer| !writer.is_empty()),
+            evidence: each(request.evidence, "evidence")?,
+        };
+        let revision = self.actor.ask(|answer| Message::Commit { commit, answer }).await?;
         Ok(Response::new(v1::CommitResponse { revision: revision.0 }))
     }
 
@@ -65,8 +79,68 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let request = request.into_inner();
         let projection = request.projection_id.map(ProjectionId);
         let patterns = each(request.patterns, "patterns")?;
-        let (facts, revision) = self.actor.ask(|answer| Message::Query { projection, patterns, answer }).await?;
+        let at = request.at_revision.map(Revision);
+        if projection.is_some() && at.is_some() {
+            return Err(Malformed::new("at_revision", "is of the root: not together with projection_id").into());
+        }
+        let (facts, revision) = self.actor.ask(|answer| Message::Query { projection, at, patterns, answer }).await?;
         Ok(Response::new(v1::QueryResponse { facts: all(facts.into_iter().map(record)), revision: revision.0 }))
+    }
+
+    type WatchStream = BoxStream<'static, Result<v1::WorldPoolServiceWatchResponse, Status>>;
+
+    async fn watch(
+        &self,
+        request: Request<v1::WorldPoolServiceWatchRequest>,
+    ) -> Result<Response<Self::WatchStream>, Status> {
+        let request = request.into_inner();
+        let patterns: Vec<FactPattern> = each(request.patterns, "patterns")?;
+        let after = request.after_revision.map(Revision);
+        let updates = self.actor.ask(|answer| Message::Watch { after, answer }).await?;
+        let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
+            .filter_map(move |update| futures::future::ready(told(&update, &patterns)))
+            .map(|update| Ok(update.into()));
+        let shutdown = self.shutdown.clone();
+        let last = futures::stream::once(async move {
+            if shutdown.is_cancelled() {
+                return Err(ending());
+            }
+            let message = "the watch has ended, for it was too slow or the disk failed: watch again";
+            Err(retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER))
+        });
+        let stream = updates.take_until(self.shutdown.clone().cancelled_owned()).chain(last);
+        Ok(Response::new(Box::pin(stream)))
+    }
+
+    async fn diff(&self, request: Request<v1::DiffRequest>) -> Result<Response<v1::DiffResponse>, Status> {
+        let request = request.into_inner();
+        let patterns: Vec<FactPattern> = each(request.patterns, "patterns")?;
+        let from = Revision(request.from_revision);
+        let to = request.to_revision.map(Revision);
+        let (differences, to) = self.actor.ask(|answer| Message::Diff { from, to, answer }).await?;
+        let differences = differences.into_iter().filter(|(key, ..)| wanted(key, &patterns));
+        let differences = differences.map(|(key, before, after)| FactDifference {
+            before: before.map(|fact| record((key.as_ref().clone(), fact.as_ref().clone()))),
+            after: after.map(|fact| record((key.as_ref().clone(), fact.as_ref().clone()))),
+            key: key.as_ref().clone(),
+        });
+        Ok(Response::new(v1::DiffResponse { differences: all(differences), to_revision: to.0 }))
+    }
+
+    async fn get_fact_history(
+        &self,
+        request: Request<v1::GetFactHistoryRequest>,
+    ) -> Result<Response<v1::GetFactHistoryResponse>, Status> {
+        let key: FactKey = required(request.into_inner().key, "key")?;
+        let asked = key.clone();
+        let message = |answer| Message::Versions { key: asked, limit: MOST_VERSIONS, answer };
+        let (versions, oldest) = self.actor.ask(message).await?;
+        let versions = versions.into_iter().map(|(revision, commit, fact)| FactVersion {
+            revision,
+            commit: commit.to_string(),
+            fact: fact.map(|fact| record((key.clone(), fact.as_ref().clone()))),
+        });
+        Ok(Response::new(v1::GetFactHistoryResponse { versions: all(versions), oldest_revision: oldest.0 }))
     }
 
     async fn release(
@@ -79,6 +153,33 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     }
 }
 
+/// What of an update a watcher of these patterns is told; nothing, when none of it.
+fn told(update: &Update, patterns: &[FactPattern]) -> Option<WorldUpdate> {
+    match update {
+        Update::Snapshot(world) => {
+            let facts = world.iter().filter(|(key, _)| wanted(key, patterns));
+            let facts = facts.map(|(key, fact)| record((key.clone(), fact.clone()))).collect();
+            Some(WorldUpdate::Snapshot { revision: world.revision(), facts })
+        }
+        Update::Revision(kept) => {
+            let (mut written, mut gone) = (Vec::new(), Vec::new());
+            for (key, fact) in kept.written.iter().filter(|(key, _)| wanted(key, patterns)) {
+                match fact {
+                    Some(fact) => written.push(record((key.as_ref().clone(), fact.as_ref().clone()))),
+                    None => gone.push(key.as_ref().clone()),
+                }
+            }
+            let nothing = written.is_empty() && gone.is_empty() && !patterns.is_empty();
+            let (revision, commit) = (kept.world.revision(), kept.commit.to_string());
+            (!nothing).then_some(WorldUpdate::Changed(WorldChange { revision, commit, written, gone }))
+        }
+    }
+}
+
+fn wanted(key: &FactKey, patterns: &[FactPattern]) -> bool {
+    patterns.is_empty() || patterns.iter().any(|pattern| pattern.matches(key))
+}
+
 fn record((key, fact): (FactKey, Fact)) -> FactRecord {
-    FactRecord { key, value: fact.value, revision: fact.revision }
+    FactRecord { key, value: fact.value, revision: fact.revision, writer: fact.writer, measured: fact.measured }
 }

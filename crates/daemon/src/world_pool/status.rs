@@ -2,7 +2,7 @@
 
 use super::core::{ProjectError, QueryError};
 use super::history::{CommitError, RevisionError};
-use crate::details::{retry_later, status};
+use crate::details::{retry_later, status, status_about};
 use ratn_model::id::LeaseId;
 use std::time::Duration;
 use tonic::{Code, Status};
@@ -15,16 +15,22 @@ pub(super) fn of_commit(error: &CommitError) -> Status {
         CommitError::Revision { .. } => (Code::FailedPrecondition, "WRONG_REVISION"),
         CommitError::Change(_) => (Code::FailedPrecondition, "CHANGE_DOES_NOT_APPLY"),
         CommitError::Reused(_) => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
+        CommitError::Evidence { .. } => (Code::InvalidArgument, "NOT_WRITTEN"),
+        CommitError::Violation(_) => (Code::FailedPrecondition, "OUTSIDE_THE_ONTOLOGY"),
     };
     status(code, reason, error.to_string())
 }
 
+/// For programs `oldest_revision` and `newest_revision`: what is kept.
 pub(super) fn of_revision(error: RevisionError) -> Status {
-    let (code, reason) = match error {
-        RevisionError::Future { .. } => (Code::FailedPrecondition, "NO_SUCH_REVISION"),
-        RevisionError::Forgotten { .. } => (Code::OutOfRange, "REVISION_FORGOTTEN"),
-    };
-    status(code, reason, error.to_string())
+    match error {
+        RevisionError::Future { .. } => status(Code::FailedPrecondition, "NO_SUCH_REVISION", error.to_string()),
+        RevisionError::Forgotten { oldest, root, .. } => {
+            let kept = [("oldest_revision", oldest), ("newest_revision", root)];
+            let kept = kept.map(|(name, revision)| (name, revision.to_string()));
+            status_about(Code::OutOfRange, "REVISION_FORGOTTEN", error.to_string(), kept)
+        }
+    }
 }
 
 pub(super) fn of_project(error: &ProjectError) -> Status {
@@ -43,6 +49,7 @@ pub(super) fn of_project(error: &ProjectError) -> Status {
 pub(super) fn of_query(error: &QueryError) -> Status {
     match error {
         QueryError::Unknown { .. } => status(Code::NotFound, "PROJECTION_UNKNOWN", error.to_string()),
+        QueryError::Revision(error) => of_revision(*error),
         QueryError::Hidden { .. } => status(Code::PermissionDenied, "NOT_AMONG_READS", error.to_string()),
     }
 }

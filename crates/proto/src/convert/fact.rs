@@ -1,10 +1,12 @@
 //! Facts, patterns, footprints, changes.
 
-use super::{Malformed, all, each, finite, missing_choice, name, required};
+use super::{Malformed, all, each, finite, label, missing_choice, name, required};
 use crate::types::FactRecord;
 use crate::v1;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint, Term};
 use ratn_model::id::Revision;
+use ratn_model::measurement::{Certainty, Measurement};
+use std::sync::Arc;
 
 impl From<Term> for v1::Term {
     fn from(term: Term) -> v1::Term {
@@ -47,7 +49,13 @@ impl TryFrom<v1::FactKey> for FactKey {
 
 impl From<FactRecord> for v1::Fact {
     fn from(record: FactRecord) -> v1::Fact {
-        v1::Fact { key: Some(record.key.into()), value: Some(record.value.into()), revision: record.revision.0 }
+        v1::Fact {
+            key: Some(record.key.into()),
+            value: Some(record.value.into()),
+            revision: record.revision.0,
+            writer: record.writer.map_or_else(String::new, |writer| writer.to_string()),
+            measurement: record.measured.map(|measured| measured.as_ref().clone().into()),
+        }
     }
 }
 
@@ -55,11 +63,58 @@ impl TryFrom<v1::Fact> for FactRecord {
     type Error = Malformed;
 
     fn try_from(fact: v1::Fact) -> Result<FactRecord, Malformed> {
+        label(&fact.writer, "writer")?;
+        let measured = fact.measurement.map(Measurement::try_from).transpose();
         Ok(FactRecord {
             key: required(fact.key, "key")?,
             value: required(fact.value, "value")?,
             revision: Revision(fact.revision),
+            writer: (!fact.writer.is_empty()).then(|| fact.writer.into()),
+            measured: measured.map_err(|m| m.within("measurement"))?.map(Arc::new),
         })
+    }
+}
+
+impl From<Measurement> for v1::Measurement {
+    fn from(measurement: Measurement) -> v1::Measurement {
+        let certainty = measurement.certainty.map(|certainty| match certainty {
+            Certainty::Confidence(p) => v1::measurement::Certainty::Confidence(p),
+            Certainty::Covariance(entries) => v1::measurement::Certainty::Covariance(v1::Covariance { entries }),
+        });
+        v1::Measurement { source: measurement.source, certainty }
+    }
+}
+
+impl TryFrom<v1::Measurement> for Measurement {
+    type Error = Malformed;
+
+    fn try_from(measurement: v1::Measurement) -> Result<Measurement, Malformed> {
+        label(&measurement.source, "source")?;
+        let (field, certainty) = match measurement.certainty {
+            Some(v1::measurement::Certainty::Confidence(p)) => ("confidence", Some(Certainty::Confidence(p))),
+            Some(v1::measurement::Certainty::Covariance(v1::Covariance { entries })) => {
+                ("covariance", Some(Certainty::Covariance(entries)))
+            }
+            None => ("", None),
+        };
+        if let Some(Err(wrong)) = certainty.as_ref().map(Certainty::check) {
+            return Err(Malformed::new(field, wrong));
+        }
+        Ok(Measurement { source: measurement.source, certainty })
+    }
+}
+
+impl From<(FactKey, Measurement)> for v1::Evidence {
+    fn from((fact, measurement): (FactKey, Measurement)) -> v1::Evidence {
+        v1::Evidence { fact: Some(fact.into()), measurement: Some(measurement.into()) }
+    }
+}
+
+impl TryFrom<v1::Evidence> for (FactKey, Measurement) {
+    type Error = Malformed;
+
+    fn try_from(evidence: v1::Evidence) -> Result<(FactKey, Measurement), Malformed> {
+        Ok((required(evidence.fact, "fact")?, required(evidence.measurement, "measurement")?))
     }
 }
 

@@ -8,6 +8,7 @@ mod fact;
 mod process;
 mod resource;
 mod value;
+mod world;
 
 use ratn_model::fact::FactKey;
 use ratn_model::value::Value;
@@ -112,8 +113,11 @@ pub fn facts(facts: Vec<v1::Fact>, field: &str) -> Result<Vec<(FactKey, Value)>,
 
 /// Facts without a revision onto the wire.
 pub fn wire_facts(facts: Vec<(FactKey, Value)>) -> Vec<v1::Fact> {
-    let fact =
-        |(key, value): (FactKey, Value)| v1::Fact { key: Some(key.into()), value: Some(value.into()), revision: 0 };
+    let fact = |(key, value): (FactKey, Value)| v1::Fact {
+        key: Some(key.into()),
+        value: Some(value.into()),
+        ..v1::Fact::default()
+    };
     facts.into_iter().map(fact).collect()
 }
 

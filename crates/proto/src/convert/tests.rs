@@ -9,10 +9,12 @@ use prost::Message;
 use ratn_model::condition::{Comparison, Condition};
 use ratn_model::fact::{Change, FactPattern, Footprint, Term};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
+use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::pose::Pose;
 use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::value::{Trajectory, TrajectoryPoint};
 use std::fmt::Debug;
+use std::sync::Arc;
 
 /// Over the wire and back.
 fn check<T, W>(original: &T) -> Result<(), TestCaseError>
@@ -182,6 +184,22 @@ fn update() -> impl Strategy<Value = ResourceUpdate> {
     prop_oneof![event, snapshot]
 }
 
+fn record() -> impl Strategy<Value = FactRecord> {
+    let certainty =
+        prop_oneof![(0.0..=1.0).prop_map(Certainty::Confidence), vec(-1.0..1.0, 9).prop_map(Certainty::Covariance),];
+    let measured = (a_name(), prop::option::of(certainty))
+        .prop_map(|(source, certainty)| Arc::new(Measurement { source, certainty }));
+    (key(), value(), any::<u64>(), prop::option::of(a_name()), prop::option::of(measured)).prop_map(
+        |(key, value, revision, writer, measured)| FactRecord {
+            key,
+            value,
+            revision: Revision(revision),
+            writer: writer.map(Arc::from),
+            measured,
+        },
+    )
+}
+
 fn goal() -> impl Strategy<Value = Goal> {
     let inputs = btree_map(a_name(), value(), 0..3);
     (a_name(), a_name(), inputs, any::<u64>(), prop::option::of(lease()), prop::option::of(any::<u64>())).prop_map(
@@ -209,10 +227,22 @@ proptest! {
 
     #[test]
     fn what_goes_onto_the_wire_comes_back_the_same(
-        value in value(), key in key(), footprint in footprint(), change in change(), requirement in requirement(),
+        value in value(), key in key(), record in record(), footprint in footprint(), change in change(), requirement in requirement(),
         lease in lease(), update in update(), goal in goal(), outcome in outcome(),
     ) {
-        check::<_, v1::Fact>(&FactRecord { key: key.clone(), value: value.clone(), revision: Revision(7) })?;
+        check::<_, v1::Fact>(&record)?;
+        let told = WorldChange {
+            revision: Revision(7),
+            commit: "run/i1".to_owned(),
+            written: vec![record.clone()],
+            gone: vec![key.clone()],
+        };
+        check::<_, v1::WorldPoolServiceWatchResponse>(&WorldUpdate::Changed(told))?;
+        let snapshot = WorldUpdate::Snapshot { revision: Revision(7), facts: vec![record.clone()] };
+        check::<_, v1::WorldPoolServiceWatchResponse>(&snapshot)?;
+        let (before, after) = (Some(record.clone()), None);
+        check::<_, v1::FactDifference>(&FactDifference { key: key.clone(), before, after })?;
+        check::<_, v1::FactVersion>(&FactVersion { revision: Revision(7), commit: String::new(), fact: Some(record) })?;
         check::<_, v1::Value>(&value)?;
         check::<_, v1::FactKey>(&key)?;
         check::<_, v1::Footprint>(&footprint)?;

@@ -3,13 +3,15 @@
 use super::{CallError, Channels};
 use crate::endpoint::Endpoint;
 use crate::trace::Traced;
-use ratn_model::fact::{Change, FactPattern, Footprint};
+use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
+use ratn_model::measurement::Measurement;
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::{all, each};
-use ratn_proto::types::FactRecord;
+use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::world_pool_service_client::WorldPoolServiceClient;
+use tonic::Streaming;
 
 /// Asks one world pool.
 #[derive(Debug, Clone)]
@@ -31,6 +33,40 @@ pub struct Projection {
     pub reads: Footprint,
     /// The lease that holds the room for it, with its token.
     pub lease: Option<(LeaseId, FencingToken)>,
+}
+
+/// What shall become real.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Commit {
+    /// Unique to what is committed, `run/instance`.
+    pub id: String,
+    /// The changes, in order.
+    pub changes: Vec<Change>,
+    /// What the root's revision must become, where that matters.
+    pub revision: Option<Revision>,
+    /// The node that writes, by the path of its instance; may be empty.
+    pub writer: String,
+    /// What measured which of the facts that are written.
+    pub evidence: Vec<(FactKey, Measurement)>,
+}
+
+/// A running watch of the root.
+#[derive(Debug)]
+pub struct WorldWatch {
+    endpoint: Endpoint,
+    stream: Streaming<v1::WorldPoolServiceWatchResponse>,
+}
+
+impl WorldWatch {
+    /// The snapshot, then every revision; `None` when the pool ends the watch.
+    ///
+    /// # Errors
+    /// [`CallError`] when it broke.
+    pub async fn next(&mut self) -> Result<Option<WorldUpdate>, CallError> {
+        let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
+        let update = message.map(WorldUpdate::try_from).transpose();
+        update.map_err(|m| CallError::malformed(&self.endpoint, m))
+    }
 }
 
 impl WorldClient {
@@ -71,10 +107,20 @@ impl WorldClient {
         changes: Vec<Change>,
         revision: Option<Revision>,
     ) -> Result<Revision, CallError> {
+        self.commit_as(Commit { id: commit.to_owned(), changes, revision, ..Commit::default() }).await
+    }
+
+    /// As [`WorldClient::commit`], with who writes and what measured what is written.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn commit_as(&self, commit: Commit) -> Result<Revision, CallError> {
         let question = v1::CommitRequest {
-            commit_id: commit.to_owned(),
-            changes: all(changes),
-            revision: revision.map_or(0, |r| r.0),
+            commit_id: commit.id,
+            changes: all(commit.changes),
+            revision: commit.revision.map_or(0, |r| r.0),
+            writer: commit.writer,
+            evidence: all(commit.evidence),
         };
         let answer = self.client.clone().commit(question).await.map_err(|status| self.failed(&status))?;
         Ok(Revision(answer.into_inner().revision))
@@ -107,10 +153,69 @@ impl WorldClient {
         projection: Option<ProjectionId>,
         patterns: &[FactPattern],
     ) -> Result<Vec<FactRecord>, CallError> {
-        let question =
-            v1::QueryRequest { projection_id: projection.map(|p| p.0), patterns: all(patterns.iter().cloned()) };
+        let projection_id = projection.map(|p| p.0);
+        let question = v1::QueryRequest { projection_id, at_revision: None, patterns: all(patterns.iter().cloned()) };
         let answer = self.client.clone().query(question).await.map_err(|status| self.failed(&status))?;
         self.records(answer.into_inner().facts)
+    }
+
+    /// The facts of the root as it was at a revision (as it is, where none is given) that match any of the patterns, all without
+    /// one; and that revision.
+    ///
+    /// # Errors
+    /// [`CallError`], also where the revision is not kept any more.
+    pub async fn root_at(
+        &self,
+        revision: Option<Revision>,
+        patterns: &[FactPattern],
+    ) -> Result<(Revision, Vec<FactRecord>), CallError> {
+        let at_revision = revision.map(|revision| revision.0);
+        let question = v1::QueryRequest { projection_id: None, at_revision, patterns: all(patterns.iter().cloned()) };
+        let answer = self.client.clone().query(question).await.map_err(|status| self.failed(&status))?.into_inner();
+        Ok((Revision(answer.revision), self.records(answer.facts)?))
+    }
+
+    /// Tells of every revision of the root, a snapshot first; with a revision, of every one after it and without a snapshot. With
+    /// patterns only of what matches one.
+    ///
+    /// # Errors
+    /// [`CallError`], also where the revisions after it are not all kept any more.
+    pub async fn watch(&self, after: Option<Revision>, patterns: &[FactPattern]) -> Result<WorldWatch, CallError> {
+        let after_revision = after.map(|after| after.0);
+        let patterns = all(patterns.iter().cloned());
+        let question = v1::WorldPoolServiceWatchRequest { patterns, after_revision };
+        let answer = self.client.clone().watch(question).await.map_err(|status| self.failed(&status))?;
+        Ok(WorldWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
+    }
+
+    /// The facts that differ between two revisions of the root, and the second as a number; `None` is the root as it is.
+    ///
+    /// # Errors
+    /// [`CallError`], also where one is not kept any more.
+    pub async fn diff(
+        &self,
+        from: Revision,
+        to: Option<Revision>,
+        patterns: &[FactPattern],
+    ) -> Result<(Vec<FactDifference>, Revision), CallError> {
+        let (from_revision, to_revision) = (from.0, to.map(|to| to.0));
+        let question = v1::DiffRequest { from_revision, to_revision, patterns: all(patterns.iter().cloned()) };
+        let answer = self.client.clone().diff(question).await.map_err(|status| self.failed(&status))?.into_inner();
+        let differences =
+            each(answer.differences, "differences").map_err(|m| CallError::malformed(&self.endpoint, m))?;
+        Ok((differences, Revision(answer.to_revision)))
+    }
+
+    /// What a fact was, the newest first, and the oldest revision that is kept: what was before that is not known.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn history(&self, fact: FactKey) -> Result<(Vec<FactVersion>, Revision), CallError> {
+        let question = v1::GetFactHistoryRequest { key: Some(fact.into()) };
+        let answer = self.client.clone().get_fact_history(question).await;
+        let answer = answer.map_err(|status| self.failed(&status))?.into_inner();
+        let versions = each(answer.versions, "versions").map_err(|m| CallError::malformed(&self.endpoint, m))?;
+        Ok((versions, Revision(answer.oldest_revision)))
     }
 
     /// Ends a projection; false when it had ended before.

@@ -9,7 +9,7 @@ mod show;
 
 pub(crate) use arguments::ResourceArguments;
 
-use super::blocking_on;
+use super::{blocking_on, unanswered};
 use crate::failure::Failure;
 use crate::output;
 use crate::system::public_directory;
@@ -53,15 +53,6 @@ pub(super) fn run(arguments: &ResourceArguments) -> Result<(), Failure> {
         let performed = trace::within(TraceContext::fresh(), asking.perform(&arguments.command)).await;
         performed.map_err(unanswered)
     })
-}
-
-/// A script can tell a manager that says no from one that is not there.
-fn unanswered(failure: Failure) -> Failure {
-    let Failure::Failed(error) = failure else { return failure };
-    if error.downcast_ref::<CallError>().is_some_and(CallError::is_crash) {
-        return Failure::Refused(format!("ratn: {error:#}"));
-    }
-    Failure::Failed(error)
 }
 
 impl Asking {

@@ -15,7 +15,7 @@ use super::shell::Place;
 use anyhow::bail;
 use futures::FutureExt;
 use goal::{Given, Performing};
-use ratn_executive::protocol::{Command, Event, Goal};
+use ratn_executive::protocol::{Command, Event, Goal, Note};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
@@ -70,6 +70,8 @@ pub(super) struct Performer {
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
     cancelled: Cancelled,
+    /// The paths of the instances that may still commit.
+    paths: BTreeMap<InstanceId, String>,
     asking: BTreeMap<InstanceId, CancellationToken>,
     jobs: BTreeMap<InstanceId, Job>,
     giving_back: JoinSet<()>,
@@ -130,6 +132,7 @@ impl Performer {
             events,
             records,
             cancelled,
+            paths: BTreeMap::new(),
             asking: BTreeMap::new(),
             jobs: BTreeMap::new(),
             giving_back: JoinSet::new(),
@@ -156,7 +159,8 @@ impl Performer {
         while self.giving_back.try_join_next().is_some() {}
         match command {
             // Waking is the shell's: it has the clock.
-            Command::Note(_) | Command::End { .. } | Command::Wake { .. } => {}
+            Command::Note(note) => self.follow(note),
+            Command::End { .. } | Command::Wake { .. } => {}
             Command::Acquire { instance, requirements, priority } => {
                 self.acquires += 1;
                 self.acquire(instance, self.acquires, requirements, priority);
@@ -178,7 +182,8 @@ impl Performer {
             },
             Command::Release { instance, lease, projection } => self.release(instance, lease, projection),
             Command::Commit { instance, changes, revision } => {
-                self.record(Record::Commit { instance, changes, revision })?;
+                let writer = self.paths.get(&instance).cloned().unwrap_or_default();
+                self.record(Record::Commit { instance, changes, revision, writer })?;
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
@@ -208,6 +213,14 @@ impl Performer {
             Ok(Ok(())) => Ok(()),
             Ok(Err(reason)) => bail!("what the run did is not all recorded: {reason}"),
             Err(_) => bail!("what the run did is not all recorded: the world pool has not answered in time"),
+        }
+    }
+
+    fn follow(&mut self, note: Note) {
+        match note {
+            Note::Expanded { instance, path, .. } => drop(self.paths.insert(instance, path)),
+            Note::Retired { instance } | Note::Squashed { instance } => drop(self.paths.remove(&instance)),
+            _ => {}
         }
     }
 

@@ -263,6 +263,6 @@ async fn a_commit_that_did_not_leave_is_made_and_another_world_is_refused() -> a
     // A pool that began anew.
     let later = Ledger { first_revision: Revision(9), ..open };
     let refused = check_world(&bench.endpoints, &later, &mirror).await;
-    assert!(refused.is_err_and(|error| error.to_string().contains("restarted")));
+    assert!(refused.is_err_and(|error| error.to_string().contains("lost its state")));
     bench.performer.close().await
 }

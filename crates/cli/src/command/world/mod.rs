@@ -1,0 +1,159 @@
+//! `ratn world …`: the root world model for people and scripts.
+//!
+//! Queries are answered here, over the facts that the pool gives: they cost the pool nothing but a view. Tables go to standard output, or
+//! one JSON document each, in which values are exact. A dump says everything exactly, in JSON or in Turtle; loading one is one commit.
+
+mod arguments;
+mod dump;
+mod pattern;
+mod show;
+mod turtle;
+
+pub(crate) use arguments::WorldArguments;
+
+use super::{blocking_on, unanswered};
+use crate::failure::Failure;
+use crate::system::public_directory;
+use crate::{input, output};
+use anyhow::Context;
+use arguments::{Format, WorldCommand};
+use ratn_model::fact::{Change, FactPattern};
+use ratn_model::id::Revision;
+use ratn_proto::MAX_MESSAGE_BYTES;
+use ratn_proto::types::{FactRecord, WorldUpdate};
+use ratn_worker::client::{CallError, Channels, Commit, WorldClient, fresh_id};
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::trace::{self, TraceContext};
+use ratn_world::query::Query;
+use ratn_world::world::World;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+const ROLE: &str = ratn_daemon::world_pool::ROLE;
+/// Of a dump in JSON, which is longer than the message that it becomes.
+const MAX_DUMP: usize = 8 * MAX_MESSAGE_BYTES;
+/// Who writes what is loaded.
+const WRITER: &str = "ratn world load";
+
+/// Where the world pool is, and how its answers are shown.
+struct Asking {
+    client: WorldClient,
+    json: bool,
+}
+
+/// Performs one operation.
+pub(super) fn run(arguments: &WorldArguments) -> Result<(), Failure> {
+    blocking_on(tokio::runtime::Builder::new_current_thread(), async {
+        let endpoint = match &arguments.pool {
+            Some(endpoint) => endpoint.clone(),
+            None => RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()))
+                .find(ROLE)
+                .map_err(|error| Failure::Refused(format!("ratn: {error}")))?,
+        };
+        let client = WorldClient::new(&Channels::new(), &endpoint)?;
+        let asking = Asking { client, json: arguments.json };
+        let performed = trace::within(TraceContext::fresh(), asking.perform(&arguments.command)).await;
+        performed.map_err(unanswered)
+    })
+}
+
+impl Asking {
+    async fn perform(&self, command: &WorldCommand) -> Result<(), Failure> {
+        let client = &self.client;
+        match command {
+            WorldCommand::Facts { patterns, at } => {
+                let (revision, facts) = client.root_at(at.map(Revision), patterns).await?;
+                self.show(&dump::json(revision, &facts), || show::facts(&facts))?;
+            }
+            WorldCommand::Query { query, at, limit } => self.query(query, at.map(Revision), *limit).await?,
+            WorldCommand::Diff { from, to, patterns } => {
+                let (differences, to) = client.diff(Revision(*from), to.map(Revision), patterns).await?;
+                let json = show::differences_json(Revision(*from), to, &differences);
+                self.show(&json, || show::differences(&differences))?;
+            }
+            WorldCommand::History { fact } => {
+                let (versions, oldest) = client.history(fact.clone()).await?;
+                let json = show::versions_json(oldest, &versions);
+                self.show(&json, || show::versions(fact, oldest, &versions))?;
+            }
+            WorldCommand::Watch { patterns, after } => self.watch(patterns, after.map(Revision)).await?,
+            WorldCommand::Dump { format, at } => {
+                let (revision, facts) = client.root_at(at.map(Revision), &[]).await?;
+                output::result(match format {
+                    Format::Json => serde_json::to_string_pretty(&dump::json(revision, &facts)).context("the facts")?,
+                    Format::Turtle => turtle::write(&facts)?.trim_end().to_owned(),
+                })?;
+            }
+            WorldCommand::Load { file, replace } => self.load(file, *replace).await?,
+        }
+        Ok(())
+    }
+
+    async fn query(&self, text: &str, at: Option<Revision>, limit: usize) -> Result<(), Failure> {
+        let refused = |error| Failure::Refused(format!("ratn: {error}"));
+        let query = Query::parse(text).and_then(|query| query.prepare(None)).map_err(refused)?;
+        let (revision, facts) = self.client.root_at(at, &[]).await?;
+        let world = World::from_facts(facts.into_iter().map(|fact| (fact.key, fact.value)), revision);
+        let rows = query.run(&world, &BTreeMap::new(), limit).map_err(refused)?;
+        Ok(self.show(&show::rows_json(revision, &rows), || show::rows(&rows))?)
+    }
+
+    async fn load(&self, file: &Path, replace: bool) -> Result<(), Failure> {
+        let name = file.display();
+        let refused = |error: &dyn std::fmt::Display| Failure::Refused(format!("ratn: {name}: {error}"));
+        let text = input::read_up_to(file, MAX_DUMP).map_err(|error| refused(&error))?;
+        let is_turtle = file.extension().is_some_and(|extension| extension == "ttl");
+        let read = if is_turtle { turtle::read(&text) } else { dump::read(&text) };
+        let facts = read.map_err(|error| refused(&format!("{error:#}")))?;
+        let (mut changes, mut revision) = (Vec::new(), None);
+        if replace {
+            // Refused where somebody commits in between: what they wrote would be gone unseen.
+            let (root, before) = self.client.root_at(None, &[]).await?;
+            revision = Some(Revision(root.0 + 1));
+            let every = |fact: FactRecord| FactPattern {
+                arguments: fact.key.arguments.iter().map(|_| None).collect(),
+                predicate: fact.key.predicate,
+            };
+            let every: BTreeSet<FactPattern> = before.into_iter().map(every).collect();
+            changes.extend(every.into_iter().map(|pattern| Change::Delete { pattern }));
+        }
+        let count = facts.len();
+        let measured = facts.iter().filter_map(|fact| Some((fact.key.clone(), fact.measured.as_deref()?.clone())));
+        let evidence = measured.collect();
+        changes.extend(facts.into_iter().map(|fact| Change::Set { fact: fact.key, value: fact.value }));
+        let commit = Commit { id: fresh_id("load"), changes, revision, writer: WRITER.to_owned(), evidence };
+        let revision = self.client.commit_as(commit).await.with_context(|| format!("{name} is not loaded"))?;
+        let json = serde_json::json!({ "revision": revision.0, "facts": count });
+        Ok(self.show(&json, || format!("{count} facts, revision {}", revision.0))?)
+    }
+
+    /// Until the reader has had enough, or the pool ends.
+    async fn watch(&self, patterns: &[FactPattern], after: Option<Revision>) -> anyhow::Result<()> {
+        let mut watch = self.client.watch(after, patterns).await?;
+        let mut ended: Result<(), CallError> = Ok(());
+        loop {
+            let update = match watch.next().await {
+                Ok(Some(update)) => update,
+                Ok(None) => break,
+                Err(error) => {
+                    ended = Err(error);
+                    break;
+                }
+            };
+            let shown = match (&update, self.json) {
+                (update, true) => output::line(show::update_json(update))?,
+                (WorldUpdate::Snapshot { facts, .. }, false) => output::line(show::facts(facts))?,
+                (WorldUpdate::Changed(change), false) => output::line(show::change(change))?,
+            };
+            if !shown {
+                return Ok(());
+            }
+        }
+        ended.context("the watch ended")?;
+        anyhow::bail!("the world pool ended the watch")
+    }
+
+    fn show(&self, json: &serde_json::Value, text: impl FnOnce() -> String) -> anyhow::Result<()> {
+        if self.json { output::result(serde_json::to_string_pretty(json)?) } else { output::result(text()) }
+    }
+}

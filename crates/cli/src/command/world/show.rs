@@ -1,0 +1,195 @@
+//! Facts, differences and histories as tables for people and as JSON for programs.
+
+use super::dump;
+use crate::columns::columns;
+use ratn_model::fact::FactKey;
+use ratn_model::id::Revision;
+use ratn_model::measurement::{Certainty, Measurement};
+use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
+use ratn_world::query::Rows;
+use serde_json::json;
+
+/// One line each.
+pub(super) fn facts(facts: &[FactRecord]) -> String {
+    let rows = facts.iter().map(|fact| {
+        [
+            fact.key.to_string(),
+            fact.value.to_string(),
+            fact.revision.0.to_string(),
+            fact.writer.as_deref().unwrap_or("-").to_owned(),
+            fact.measured.as_deref().map_or_else(String::new, measured),
+        ]
+    });
+    columns(&["FACT", "VALUE", "REVISION", "WRITER", "MEASURED BY"], rows.collect())
+}
+
+/// One line each: as it was, as it is.
+pub(super) fn differences(differences: &[FactDifference]) -> String {
+    let value = |fact: &Option<FactRecord>| fact.as_ref().map_or_else(|| "-".to_owned(), |fact| fact.value.to_string());
+    let rows = differences.iter().map(|one| [one.key.to_string(), value(&one.before), value(&one.after)]);
+    columns(&["FACT", "BEFORE", "AFTER"], rows.collect())
+}
+
+pub(super) fn differences_json(from: Revision, to: Revision, differences: &[FactDifference]) -> serde_json::Value {
+    let differences: Vec<_> = differences
+        .iter()
+        .map(|one| {
+            json!({
+                "predicate": one.key.predicate, "arguments": one.key.arguments,
+                "before": one.before.as_ref().map(dump::fact), "after": one.after.as_ref().map(dump::fact),
+            })
+        })
+        .collect();
+    json!({ "from": from.0, "to": to.0, "differences": differences })
+}
+
+/// One line each, the newest first, and from where on nothing is known.
+pub(super) fn versions(key: &FactKey, oldest: Revision, versions: &[FactVersion]) -> String {
+    if versions.is_empty() {
+        return format!("{key} never was, since revision {}, the oldest that is kept", oldest.0);
+    }
+    let rows = versions.iter().map(|version| {
+        let fact = version.fact.as_ref();
+        [
+            version.revision.0.to_string(),
+            fact.map_or_else(|| "(gone)".to_owned(), |fact| fact.value.to_string()),
+            fact.and_then(|fact| fact.writer.as_deref()).unwrap_or("-").to_owned(),
+            if version.commit.is_empty() { "-".to_owned() } else { version.commit.clone() },
+        ]
+    });
+    let table = columns(&["REVISION", "VALUE", "WRITER", "COMMIT"], rows.collect());
+    format!("{table}\nkept since revision {}", oldest.0)
+}
+
+pub(super) fn versions_json(oldest: Revision, versions: &[FactVersion]) -> serde_json::Value {
+    let versions: Vec<_> = versions
+        .iter()
+        .map(|version| {
+            let fact = version.fact.as_ref().map(dump::fact);
+            json!({ "revision": version.revision.0, "commit": version.commit, "fact": fact })
+        })
+        .collect();
+    json!({ "oldest": oldest.0, "versions": versions })
+}
+
+/// A revision, and below what it wrote.
+pub(super) fn change(change: &WorldChange) -> String {
+    let by = if change.commit.is_empty() { "too old" } else { &change.commit };
+    let mut lines = vec![format!("revision {} ({by})", change.revision.0)];
+    lines.extend(change.written.iter().map(|fact| format!("  {} = {}", fact.key, fact.value)));
+    lines.extend(change.gone.iter().map(|key| format!("  {key} is gone")));
+    lines.join("\n")
+}
+
+pub(super) fn update_json(update: &WorldUpdate) -> serde_json::Value {
+    match update {
+        WorldUpdate::Snapshot { revision, facts } => dump::json(*revision, facts),
+        WorldUpdate::Changed(change) => {
+            let written: Vec<_> = change.written.iter().map(dump::fact).collect();
+            let gone: Vec<_> = change
+                .gone
+                .iter()
+                .map(|key| json!({ "predicate": key.predicate, "arguments": key.arguments }))
+                .collect();
+            json!({ "revision": change.revision.0, "commit": change.commit, "written": written, "gone": gone })
+        }
+    }
+}
+
+/// One line an answer; a query without variables is true or not.
+pub(super) fn rows(rows: &Rows) -> String {
+    if rows.variables.is_empty() {
+        return if rows.rows.is_empty() { "no" } else { "yes" }.to_owned();
+    }
+    let widths: Vec<usize> = (0..rows.variables.len())
+        .map(|i| {
+            let cells = rows.rows.iter().map(|row| row[i].to_string().chars().count());
+            cells.chain([rows.variables[i].chars().count() + 1]).max().unwrap_or(0)
+        })
+        .collect();
+    let line = |cells: Vec<String>| {
+        let cells: Vec<String> = cells.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}")).collect();
+        cells.join("  ").trim_end().to_owned()
+    };
+    let mut lines = vec![line(rows.variables.iter().map(|name| format!("?{name}")).collect())];
+    lines.extend(rows.rows.iter().map(|row| line(row.iter().map(ToString::to_string).collect())));
+    if rows.more {
+        lines.push("(there are more: --limit)".to_owned());
+    }
+    lines.join("\n")
+}
+
+pub(super) fn rows_json(revision: Revision, rows: &Rows) -> serde_json::Value {
+    json!({ "revision": revision.0, "variables": rows.variables, "rows": rows.rows, "more": rows.more })
+}
+
+fn measured(measured: &Measurement) -> String {
+    match &measured.certainty {
+        None => measured.source.clone(),
+        Some(Certainty::Confidence(confidence)) => format!("{} (confidence {confidence})", measured.source),
+        Some(Certainty::Covariance(_)) => format!("{} (with covariance)", measured.source),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use insta::assert_snapshot;
+    use ratn_model::fact::Term;
+    use ratn_model::value::Value;
+    use std::sync::Arc;
+
+    fn fact(name: &str, value: i64) -> FactRecord {
+        let measured = Measurement { source: "camera".to_owned(), certainty: Some(Certainty::Confidence(0.9)) };
+        FactRecord {
+            key: FactKey { predicate: "full".to_owned(), arguments: vec![Term::Name(name.to_owned())] },
+            value: Value::Int(value),
+            revision: Revision(3),
+            writer: Some(Arc::from("fill[2]")),
+            measured: (name == "box").then(|| Arc::new(measured)),
+        }
+    }
+
+    #[test]
+    fn facts_say_who_wrote_them_when_and_what_measured_them() {
+        let unsaid = FactRecord { writer: None, ..fact("base", 1) };
+        assert_snapshot!(facts(&[fact("box", 12), unsaid]), @r"
+        FACT        VALUE  REVISION  WRITER   MEASURED BY
+        full(box)   12     3         fill[2]  camera (confidence 0.9)
+        full(base)  1      3         -
+        ");
+    }
+
+    #[test]
+    fn differences_and_versions_say_what_was() {
+        let key = fact("box", 1).key;
+        let one = FactDifference { key: key.clone(), before: Some(fact("box", 1)), after: None };
+        assert_snapshot!(differences(&[one]), @r"
+        FACT       BEFORE  AFTER
+        full(box)  1       -
+        ");
+        let gone = FactVersion { revision: Revision(9), commit: String::new(), fact: None };
+        let was = FactVersion { revision: Revision(3), commit: "run/i1".to_owned(), fact: Some(fact("box", 1)) };
+        assert_snapshot!(versions(&key, Revision(2), &[gone, was]), @r"
+        REVISION  VALUE   WRITER   COMMIT
+        9         (gone)  -        -
+        3         1       fill[2]  run/i1
+        kept since revision 2
+        ");
+    }
+
+    #[test]
+    fn answers_are_a_table_or_yes_or_no() {
+        let rows = |variables: &[&str], rows: Vec<Vec<Value>>| Rows {
+            variables: variables.iter().map(|&name| name.to_owned()).collect(),
+            rows,
+            more: false,
+        };
+        assert_snapshot!(super::rows(&rows(&["box", "n"], vec![vec![Value::String("box_1".into()), Value::Int(2)]])), @r"
+        ?box   ?n
+        box_1  2
+        ");
+        assert_eq!(super::rows(&rows(&[], vec![Vec::new()])), "yes");
+        assert_eq!(super::rows(&rows(&[], Vec::new())), "no");
+    }
+}

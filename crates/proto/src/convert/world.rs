@@ -1,0 +1,95 @@
+//! What is told of the root world: revisions as they are made, what differs between two, what a fact was.
+
+use super::{Malformed, all, each, label, missing_choice, required};
+use crate::types::{FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
+use crate::v1;
+use crate::v1::world_pool_service_watch_response::Kind;
+use ratn_model::id::Revision;
+
+impl From<WorldUpdate> for v1::WorldPoolServiceWatchResponse {
+    fn from(update: WorldUpdate) -> v1::WorldPoolServiceWatchResponse {
+        let kind = match update {
+            WorldUpdate::Snapshot { revision, facts } => {
+                Kind::Snapshot(v1::WorldSnapshot { revision: revision.0, facts: all(facts) })
+            }
+            WorldUpdate::Changed(change) => Kind::Change(v1::WorldChange {
+                revision: change.revision.0,
+                commit_id: change.commit,
+                written: all(change.written),
+                gone: all(change.gone),
+            }),
+        };
+        v1::WorldPoolServiceWatchResponse { kind: Some(kind) }
+    }
+}
+
+impl TryFrom<v1::WorldPoolServiceWatchResponse> for WorldUpdate {
+    type Error = Malformed;
+
+    fn try_from(update: v1::WorldPoolServiceWatchResponse) -> Result<WorldUpdate, Malformed> {
+        Ok(match update.kind.ok_or_else(|| missing_choice("snapshot, change"))? {
+            Kind::Snapshot(snapshot) => WorldUpdate::Snapshot {
+                revision: Revision(snapshot.revision),
+                facts: each(snapshot.facts, "snapshot.facts")?,
+            },
+            Kind::Change(change) => {
+                label(&change.commit_id, "change.commit_id")?;
+                WorldUpdate::Changed(WorldChange {
+                    revision: Revision(change.revision),
+                    commit: change.commit_id,
+                    written: each(change.written, "change.written")?,
+                    gone: each(change.gone, "change.gone")?,
+                })
+            }
+        })
+    }
+}
+
+impl From<FactDifference> for v1::FactDifference {
+    fn from(difference: FactDifference) -> v1::FactDifference {
+        v1::FactDifference {
+            key: Some(difference.key.into()),
+            before: difference.before.map(v1::Fact::from),
+            after: difference.after.map(v1::Fact::from),
+        }
+    }
+}
+
+impl TryFrom<v1::FactDifference> for FactDifference {
+    type Error = Malformed;
+
+    fn try_from(difference: v1::FactDifference) -> Result<FactDifference, Malformed> {
+        Ok(FactDifference {
+            key: required(difference.key, "key")?,
+            before: maybe(difference.before, "before")?,
+            after: maybe(difference.after, "after")?,
+        })
+    }
+}
+
+impl From<FactVersion> for v1::FactVersion {
+    fn from(version: FactVersion) -> v1::FactVersion {
+        v1::FactVersion {
+            revision: version.revision.0,
+            commit_id: version.commit,
+            fact: version.fact.map(v1::Fact::from),
+        }
+    }
+}
+
+impl TryFrom<v1::FactVersion> for FactVersion {
+    type Error = Malformed;
+
+    fn try_from(version: v1::FactVersion) -> Result<FactVersion, Malformed> {
+        label(&version.commit_id, "commit_id")?;
+        Ok(FactVersion {
+            revision: Revision(version.revision),
+            commit: version.commit_id,
+            fact: maybe(version.fact, "fact")?,
+        })
+    }
+}
+
+fn maybe(fact: Option<v1::Fact>, field: &str) -> Result<Option<FactRecord>, Malformed> {
+    fact.map(FactRecord::try_from).transpose().map_err(|m| m.within(field))
+}
