@@ -95,7 +95,7 @@ async fn answered<T, F: Future<Output = Result<T, CallError>>>(
 }
 
 fn tools(count: u32) -> Requirement {
-    Requirement { count, ..Requirement::new(ResourceOperation::Block, "Tool") }
+    Requirement { count: count.into(), ..Requirement::new(ResourceOperation::Block, "Tool") }
 }
 
 /// Takes and gives back, makes and deletes, until it is told to end.
@@ -179,7 +179,7 @@ async fn verify(shared: &Shared, endpoint: &Endpoint) -> anyhow::Result<()> {
     for id in &before.2 {
         ensure!(!by_id.contains_key(id.as_str()), "{id} was deleted, and the manager has it");
     }
-    let units: u32 = listed.iter().filter(|one| one.kind == "Tool").map(|one| one.capacity).sum();
+    let units: u32 = listed.iter().filter(|one| one.kind == "Tool").map(|one| one.capacity.units()).sum();
     ensure!(units as usize == TOOLS, "{units} tools of {TOOLS}");
     Ok(())
 }

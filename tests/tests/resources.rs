@@ -65,6 +65,29 @@ fn resources_are_created_shown_and_deleted() -> anyhow::Result<()> {
 }
 
 #[test]
+fn parts_of_what_is_divisible_are_held_and_what_is_not_renewable_is_gone() -> anyhow::Result<()> {
+    let manager = Manager::start()?;
+    let create = ["create", "Charge", "--id", "c", "--capacity", "2.5", "--divisible", "--non-renewable"];
+    let created = manager.json(&create)?;
+    ensure!(created["capacity"] == 2.5 && created["divisible"] == true && created["renewable"] == false, "{created}");
+    ensure!(manager.resource(&["block", "Charge", "--count", "0.75", "--", "true"])?.0 == Some(0));
+    ensure!(manager.resource(&["consume", "Charge", "--count", "0.125", "--", "true"])?.0 == Some(0));
+    let (_, full, _) = manager.resource(&["get", "c"])?;
+    ensure!(full.contains("2.375 of 2.5, in parts, gone when it is consumed"), "{full}");
+    ensure!(manager.resource(&["exists", "Charge", "--count", "2.375"])?.0 == Some(0));
+    ensure!(manager.resource(&["exists", "Charge", "--count", "2.376"])?.0 == Some(1));
+    for (count, why) in
+        [("0", "more than nothing"), ("-1", "not negative"), ("0.0001", "three decimals"), ("NaN", "number")]
+    {
+        let (code, _, err) = manager.resource(&["exists", "Charge", &format!("--count={count}")])?;
+        ensure!(code == Some(2) && err.contains(why), "{code:?} {err}");
+    }
+    let (code, _, err) = manager.resource(&["create", "Fixture", "--capacity", "1.5"])?;
+    ensure!(code == Some(1) && err.contains("what is not divisible has whole units"), "{code:?} {err}");
+    Ok(())
+}
+
+#[test]
 fn a_block_holds_for_as_long_as_its_command_runs() -> anyhow::Result<()> {
     let manager = Manager::start()?;
     manager.json(&["create", "Fixture", "--id", "f1"])?;

@@ -142,14 +142,14 @@ async fn what_waits_for_more_workers_than_there_are_makes_them_start_and_who_gav
     let manager = system.resource_manager().await;
     let processes = system.process_manager(vec![Template { min: 0, ..template() }]).await;
     let client = system.client(&manager, "task").await;
-    let two = Requirement { count: 2, ..block("PathPlanner") };
+    let two = Requirement { count: 2.into(), ..block("PathPlanner") };
     let lease = in_time(client.resources.acquire(vec![two], AcquireOptions::default())).await.unwrap();
     assert_eq!(lease.resources.len(), 2);
     assert!(client.resources.release(lease.id).await.unwrap());
     let workers = async || system.processes(&processes).pools().await.unwrap().1[0].workers.len();
     assert_eq!(workers().await, 2, "started for it, and they stay");
     // More than there may be: the caller is told.
-    let four = Requirement { count: 4, ..block("PathPlanner") };
+    let four = Requirement { count: 4.into(), ..block("PathPlanner") };
     let options = AcquireOptions { request: "four".to_owned(), ..AcquireOptions::default() };
     let waits = {
         let resources = client.resources.clone();
@@ -278,7 +278,7 @@ async fn of_two_hosts_that_offer_the_same_one_starts_a_worker_for_a_demand() {
     assert!(matches!(workers().await, (1, 0) | (0, 1)), "{:?}", workers().await);
     assert!(client.resources.release(one.id).await.unwrap());
     // More than one host has room for.
-    let three = Requirement { count: 3, ..block("PathPlanner") };
+    let three = Requirement { count: 3.into(), ..block("PathPlanner") };
     let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
     let three = in_time(client.resources.acquire(vec![three], options)).await.unwrap();
     assert_eq!(three.resources.len(), 3);

@@ -104,7 +104,7 @@ async fn what_a_task_consumed_returns_when_it_ends() {
     let manager = system.resource_manager().await;
     let a = system.client(&manager, "a").await;
     a.resources.create(Resource::new("slots", ResourceClass::System, "Slot").with_capacity(3)).await.unwrap();
-    let consume = Requirement { operation: ResourceOperation::Consume, count: 2, ..block("Slot") };
+    let consume = Requirement { operation: ResourceOperation::Consume, count: 2.into(), ..block("Slot") };
     a.resources.consume(consume).await.unwrap();
     assert_eq!(a.resources.get("slots").await.unwrap().free, 1);
     a.resources.end_task().await.unwrap();
@@ -159,7 +159,7 @@ async fn a_watch_that_broke_within_a_revision_goes_on_within_it() {
         a.resources.create(gripper(id, 1.0)).await.unwrap();
     }
     let mut watch = a.resources.watch_from(&[], Some(Revision(3).into())).await.unwrap();
-    let three = Requirement { count: 3, ..block("Gripper") };
+    let three = Requirement { count: 3.into(), ..block("Gripper") };
     let lease = a.resources.acquire(vec![three], AcquireOptions::default()).await.unwrap();
     a.resources.release(lease.id).await.unwrap();
     let mut whole = Vec::new();

@@ -26,7 +26,7 @@ async fn manager_with(system: &TestSystem, limits: Limits) -> Daemon {
 
 /// Asks under a request id, and returns when that waits (or was answered).
 async fn ask(client: &Client, request: &str, count: u32) -> Waiting {
-    let (resources, requirement) = (client.resources.clone(), Requirement { count, ..block("Planner") });
+    let (resources, requirement) = (client.resources.clone(), Requirement { count: count.into(), ..block("Planner") });
     let options = AcquireOptions { request: request.to_owned(), ..Default::default() };
     let asked = tokio::spawn(async move { resources.acquire(vec![requirement], options).await });
     in_time(async {

@@ -19,7 +19,7 @@ use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity};
 type Raw = ResourceServiceClient<Channel>;
 
 fn create(session: &str, class: v1::ResourceClass) -> v1::CreateRequest {
-    let resource = v1::Resource { class: class.into(), kind: "Thing".into(), capacity: 1, ..Default::default() };
+    let resource = v1::Resource { class: class.into(), kind: "Thing".into(), capacity: 1.0, ..Default::default() };
     v1::CreateRequest { request_id: String::new(), session_id: session.into(), resource: Some(resource) }
 }
 
@@ -173,7 +173,7 @@ async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_another
         requirement: Some(v1::Requirement {
             operation: v1::ResourceOperation::Block.into(),
             kind: "Thing".into(),
-            count: 1,
+            count: 1.0,
             ..Default::default()
         }),
         deadline_ms: 10_000,

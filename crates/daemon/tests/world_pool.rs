@@ -85,7 +85,7 @@ async fn room_for_projections_is_a_resource_with_a_capacity_and_is_offered_again
     let manager = system.resource_manager().await;
     let _pool = system.world_pool(2).await;
     let room = system.watch(&manager, &[]).await.created("WorldModel").await;
-    assert_eq!((room.id.as_str(), room.capacity, room.host.as_str()), ("world-model@compute", 2, "compute"));
+    assert_eq!((room.id.as_str(), room.capacity.units(), room.host.as_str()), ("world-model@compute", 2, "compute"));
     manager.end().await;
     let manager = system.resource_manager_at(Endpoint::loopback()).await;
     let room = system.watch(&manager, &[]).await.created("WorldModel").await;

@@ -5,7 +5,7 @@ use crate::effects;
 use ratn_model::expression::{EffectExpr, Expr, FactExpr};
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, ResourceExpr, State, StateKind, WORLD_MODEL};
-use ratn_model::resource::ResourceOperation;
+use ratn_model::resource::{Quantity, ResourceOperation};
 use std::collections::BTreeSet;
 
 /// What a node does to the environment. A routine computes if all of it does, else it is irreversible.
@@ -179,12 +179,12 @@ fn requirements(contained: &[&State], around: &[&State]) -> Vec<ResourceExpr> {
                 _ => {}
             }
         }
-        blocked.iter().for_each(|wanted| merge(&mut merged, wanted, u32::max));
+        blocked.iter().for_each(|wanted| merge(&mut merged, wanted, Quantity::max));
     }
     merged
 }
 
-fn merge(into: &mut Vec<ResourceExpr>, wanted: &ResourceExpr, counts: impl FnOnce(u32, u32) -> u32) {
+fn merge(into: &mut Vec<ResourceExpr>, wanted: &ResourceExpr, counts: impl FnOnce(Quantity, Quantity) -> Quantity) {
     let same = |have: &&mut ResourceExpr| have.operation == wanted.operation && have.selects_the_same(wanted);
     match into.iter_mut().find(same) {
         Some(have) => have.count = counts(have.count, wanted.count),

@@ -2,7 +2,7 @@
 
 use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision, StateId};
-use ratn_model::resource::{Lease, Requirement};
+use ratn_model::resource::{Lease, Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
@@ -71,10 +71,10 @@ pub enum Event {
         world: Vec<(FactKey, Value)>,
         /// The revision of that world.
         revision: Revision,
-        /// How many units of each resource kind there are, where that is known: whom a speculative holder keeps waiting follows
+        /// How much of each resource kind there are, where that is known: whom a speculative holder keeps waiting follows
         /// from it.
         #[serde(default)]
-        capacity: BTreeMap<String, u32>,
+        capacity: BTreeMap<String, Quantity>,
         /// What earlier runs of the task have taught.
         #[serde(default)]
         learned: Learned,

@@ -1,7 +1,7 @@
 //! What a system offers to tasks: its providers of actions and its resources. Read from the system's config, so that a
 //! task can be checked before anything is started.
 
-use crate::resource::ResourceClass;
+use crate::resource::{Quantity, ResourceClass};
 use crate::value::Type;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -89,11 +89,28 @@ pub struct ActionSignature {
 pub struct ResourceOffer {
     /// Its class.
     pub class: ResourceClass,
-    /// How many there can be at the most.
-    pub count: u32,
+    /// How many there can be at the most, or how much in all.
+    pub count: Quantity,
+    /// Parts of a unit can be had (battery charge).
+    #[serde(default)]
+    pub divisible: bool,
+    /// What a task consumed returns when the task ends; so it does unless it says otherwise.
+    #[serde(default = "renewable")]
+    pub renewable: bool,
     /// Blocking it can change the environment: a state that computes or senses may not.
     #[serde(default)]
     pub actuates: bool,
+}
+
+impl ResourceOffer {
+    /// So much of something countable that does not act.
+    pub fn new(class: ResourceClass, count: impl Into<Quantity>) -> ResourceOffer {
+        ResourceOffer { class, count: count.into(), divisible: false, renewable: true, actuates: false }
+    }
+}
+
+fn renewable() -> bool {
+    true
 }
 
 #[cfg(test)]

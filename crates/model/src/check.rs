@@ -11,7 +11,7 @@
 //! | [`functions`] | unknown-function |
 //! | [`flows`] | unservable-flow, branch-may-not-have-written, unknown-state |
 //! | [`reach`] | unreachable-state, no-way-out, horizon-too-small, region-conflict, region-unannotated |
-//! | [`resources`] | unknown-resource, too-many-resources, provider-not-blocked, computes-actuates |
+//! | [`resources`] | unknown-resource, too-many-resources, indivisible-resource, provider-not-blocked, computes-actuates |
 //! | [`deadlock`] | may-deadlock |
 //! | [`preconditions`] | unestablished-precondition |
 //! | [`ontology`] | unknown-predicate, outside-domain, outside-range |

@@ -7,7 +7,7 @@ use crate::condition::ConditionExpr;
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::id::StateId;
 use crate::ontology::Ontology;
-use crate::resource::{ResourceClass, ResourceOperation};
+use crate::resource::{Quantity, ResourceClass, ResourceOperation};
 use crate::tolerance::Tolerances;
 use crate::value::{Type, Value};
 use serde::{Deserialize, Serialize};
@@ -261,8 +261,10 @@ pub struct ResourceExpr {
     pub attributes: Vec<(String, Expr)>,
     /// What its attributes must be like besides.
     pub conditions: Vec<ConditionExpr>,
-    /// How many, or how much.
-    pub count: u32,
+    /// How much; of what is not divisible, how many.
+    pub count: Quantity,
+    /// What it creates is divisible.
+    pub divisible: bool,
     /// Of a resource that actuates: PIAs that block it need not do so in program order.
     pub unordered: bool,
 }
@@ -271,7 +273,8 @@ impl ResourceExpr {
     /// One of a kind, whatever it is like.
     pub fn new(operation: ResourceOperation, kind: impl Into<String>) -> ResourceExpr {
         let (class, attributes, conditions) = Default::default();
-        ResourceExpr { operation, kind: kind.into(), class, attributes, conditions, count: 1, unordered: false }
+        let (count, divisible, unordered) = (Quantity::ONE, false, false);
+        ResourceExpr { operation, kind: kind.into(), class, attributes, conditions, count, divisible, unordered }
     }
 
     /// What it is selected by, or gets.

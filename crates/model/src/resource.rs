@@ -1,5 +1,9 @@
 //! What a state asks of the resource manager.
 
+mod quantity;
+
+pub use quantity::{Quantity, QuantityError};
+
 use crate::condition::Condition;
 use crate::expression::evaluate::equal;
 use crate::value::Value;
@@ -51,107 +55,14 @@ pub struct Requirement {
     pub class: Option<ResourceClass>,
     /// Attributes that it must have (for create: that it gets).
     pub attributes: BTreeMap<String, Value>,
-    /// How many resources (block), or how much of their capacity in all (consume, create).
-    pub count: u32,
+    /// How much of their capacity in all; of what is not divisible, how many.
+    pub count: Quantity,
+    /// For create: whether parts of a unit of it can be had.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub divisible: bool,
     /// What its attributes must be like besides.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub conditions: Vec<Condition>,
-}
-
-/// An amount of a resource in fixed-point units of a thousandth: `2` of something countable, `0.5` of something divisible.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(transparent)]
-pub struct Quantity(u64);
-
-impl Quantity {
-    /// Nothing.
-    pub const ZERO: Quantity = Quantity(0);
-    /// One whole unit.
-    pub const ONE: Quantity = Quantity(1_000);
-
-    /// So many whole units.
-    pub const fn whole(units: u32) -> Quantity {
-        Quantity(units as u64 * 1_000)
-    }
-
-    /// So many thousandths of a unit.
-    pub const fn from_thousandths(thousandths: u64) -> Quantity {
-        Quantity(thousandths)
-    }
-
-    /// In thousandths of a unit.
-    pub const fn thousandths(self) -> u64 {
-        self.0
-    }
-
-    /// The whole units in it.
-    pub fn units(self) -> u32 {
-        u32::try_from(self.0 / 1_000).unwrap_or(u32::MAX)
-    }
-
-    /// Whether it is a number of whole units.
-    pub const fn is_whole(self) -> bool {
-        self.0.is_multiple_of(1_000)
-    }
-
-    /// Whether it is nothing.
-    pub const fn is_zero(self) -> bool {
-        self.0 == 0
-    }
-
-    /// The largest multiple of `grain` in it.
-    #[must_use]
-    pub fn floor_to(self, grain: Quantity) -> Quantity {
-        Quantity(self.0 - self.0 % grain.0.max(1))
-    }
-
-    /// The difference, or nothing where that would be negative.
-    #[must_use]
-    pub const fn saturating_sub(self, other: Quantity) -> Quantity {
-        Quantity(self.0.saturating_sub(other.0))
-    }
-}
-
-impl From<u32> for Quantity {
-    fn from(units: u32) -> Quantity {
-        Quantity::whole(units)
-    }
-}
-
-impl PartialEq<u32> for Quantity {
-    fn eq(&self, units: &u32) -> bool {
-        *self == Quantity::whole(*units)
-    }
-}
-
-impl std::ops::Add for Quantity {
-    type Output = Quantity;
-
-    fn add(self, other: Quantity) -> Quantity {
-        Quantity(self.0.saturating_add(other.0))
-    }
-}
-
-impl std::ops::AddAssign for Quantity {
-    fn add_assign(&mut self, other: Quantity) {
-        *self = *self + other;
-    }
-}
-
-impl std::iter::Sum for Quantity {
-    fn sum<I: Iterator<Item = Quantity>>(amounts: I) -> Quantity {
-        amounts.fold(Quantity::ZERO, |sum, amount| sum + amount)
-    }
-}
-
-impl fmt::Display for Quantity {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.0 / 1_000)?;
-        match self.0 % 1_000 {
-            0 => Ok(()),
-            rest => f.write_str(format!(".{rest:03}").trim_end_matches('0')),
-        }
-    }
 }
 
 impl fmt::Display for ResourceClass {
@@ -181,7 +92,7 @@ impl fmt::Display for ResourceOperation {
 impl fmt::Display for Requirement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} {}", self.operation, self.kind)?;
-        if self.count != 1 {
+        if self.count != Quantity::ONE {
             write!(f, " × {}", self.count)?;
         }
         for (name, value) in &self.attributes {
@@ -198,18 +109,21 @@ impl Requirement {
     /// One of a kind, whatever it is like.
     pub fn new(operation: ResourceOperation, kind: impl Into<String>) -> Requirement {
         let (class, attributes, conditions) = Default::default();
-        Requirement { operation, kind: kind.into(), class, attributes, conditions, count: 1 }
+        Requirement {
+            operation,
+            kind: kind.into(),
+            class,
+            attributes,
+            conditions,
+            count: Quantity::ONE,
+            divisible: false,
+        }
     }
 
     /// Whether attributes are as it wants them; `of` gives the value of one.
     pub fn accepts<'a>(&self, of: impl Fn(&str) -> Option<Cow<'a, Value>>) -> bool {
         self.attributes.iter().all(|(name, want)| of(name).is_some_and(|have| equal(&have, want)))
             && self.conditions.iter().all(|c| of(&c.attribute).is_some_and(|have| c.holds(&have)))
-    }
-
-    /// How much of it.
-    pub fn amount(&self) -> Quantity {
-        Quantity::whole(self.count)
     }
 }
 

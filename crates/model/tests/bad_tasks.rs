@@ -9,12 +9,14 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Rules that the folder must have a task for.
-const RULES: [&str; 37] = [
+const RULES: [&str; 39] = [
     "branch-may-not-have-written",
     "computes-actuates",
     "conflicting-annotations",
     "duplicate-name",
     "horizon-too-small",
+    "indivisible-resource",
+    "invalid-amount",
     "invalid-constant",
     "invalid-expression",
     "invalid-name",

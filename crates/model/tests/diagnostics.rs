@@ -73,7 +73,7 @@ states:
     task.yaml:7:5: error[invalid-state] in while: there is no `do`. help: list its states there
     task.yaml:8:51: error[type-mismatch] in release: `attempts` is a whole number of at least 1
     task.yaml:8:64: error[invalid-expression] in release: an estimated duration cannot look up facts. help: use a parameter
-    task.yaml:8:108: error[type-mismatch] in release: `count` is a whole number of at least 1
+    task.yaml:8:108: error[type-mismatch] in release: `count` is a number, found text. help: write an amount such as 2 or 0.5
     task.yaml:9:5: error[invalid-state]: expected `name: {…}`, found a number. help: each state is one list item `- name: {…}`; mind the indentation of what belongs to it
     "#);
 }

@@ -4,7 +4,7 @@
 use ratn_model::fact::FactKey;
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::Measurement;
-use ratn_model::resource::{Lease, Requirement, ResourceClass};
+use ratn_model::resource::{Lease, Quantity, Requirement, ResourceClass};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -24,22 +24,22 @@ pub enum ResourceState {
     Exhausted,
 }
 
-/// Units of a resource under a lease.
+/// An amount of a resource under a lease.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Holding {
     /// The lease.
     pub lease: LeaseId,
     /// Its fencing token.
     pub token: FencingToken,
-    /// Units.
-    pub units: u32,
+    /// How much.
+    pub units: Quantity,
     /// The session of the lease.
     pub session: String,
     /// What the holder said it is, for people.
     pub holder: String,
 }
 
-/// A resource. A provider fills in the first six fields, the manager the rest.
+/// A resource. A provider fills in the first eight fields, the manager the rest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Resource {
     /// Unique among all resources, `path-planner-1@compute`; empty in a create lets the manager choose.
@@ -50,8 +50,12 @@ pub struct Resource {
     pub kind: String,
     /// What selectors compare with.
     pub attributes: BTreeMap<String, Value>,
-    /// Units in all, at least 1.
-    pub capacity: u32,
+    /// How much of it there is in all, more than nothing; whole units unless it is divisible.
+    pub capacity: Quantity,
+    /// Parts of a unit can be had.
+    pub divisible: bool,
+    /// What a task consumed returns when the task ends.
+    pub renewable: bool,
     /// The host that it is on; may be empty.
     pub host: String,
     /// The session that owns it.
@@ -60,9 +64,9 @@ pub struct Resource {
     pub revision: Revision,
     /// What it is doing.
     pub state: ResourceState,
-    /// Units that can be had now.
-    pub free: u32,
-    /// Who has units of it.
+    /// How much can be had now.
+    pub free: Quantity,
+    /// Who has some of it.
     pub holdings: Vec<Holding>,
 }
 
@@ -74,12 +78,14 @@ impl Resource {
             class,
             kind: kind.into(),
             attributes: BTreeMap::new(),
-            capacity: 1,
+            capacity: Quantity::ONE,
+            divisible: false,
+            renewable: true,
             host: String::new(),
             session: String::new(),
             revision: Revision(0),
             state: ResourceState::Free,
-            free: 1,
+            free: Quantity::ONE,
             holdings: Vec::new(),
         }
     }
@@ -97,11 +103,25 @@ impl Resource {
         self.with_attribute(ENDPOINT_ATTRIBUTE, Value::String(endpoint.to_string()))
     }
 
-    /// With this many units.
+    /// With so much of it.
     #[must_use]
-    pub fn with_capacity(mut self, capacity: u32) -> Resource {
-        self.capacity = capacity;
-        self.free = capacity;
+    pub fn with_capacity(mut self, capacity: impl Into<Quantity>) -> Resource {
+        self.capacity = capacity.into();
+        self.free = self.capacity;
+        self
+    }
+
+    /// Of which parts of a unit can be had.
+    #[must_use]
+    pub fn divisible(mut self) -> Resource {
+        self.divisible = true;
+        self
+    }
+
+    /// Of which what is consumed is gone for good.
+    #[must_use]
+    pub fn non_renewable(mut self) -> Resource {
+        self.renewable = false;
         self
     }
 
@@ -207,12 +227,12 @@ pub struct ResourceEvent {
 /// What waits for more than exists.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Demand {
-    /// What is selected; its count is how many units are missing beside those that exist.
+    /// What is selected; its count is how much is missing beside those that exist.
     pub requirement: Requirement,
     /// The kinds that would do: its kind, and those below it.
     pub kinds: Vec<String>,
-    /// How many units of it the provider's session provides already.
-    pub provided: u32,
+    /// How much of it the provider's session provides already.
+    pub provided: Quantity,
 }
 
 /// From where a watch goes on.

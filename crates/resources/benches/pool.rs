@@ -170,7 +170,7 @@ fn drained(pool: &mut Pool) {
 
 fn ask(kind: &str, count: u32) -> AcquireRequest {
     let operation = ResourceOperation::Block;
-    let requirement = Requirement { count, ..Requirement::new(operation, kind) };
+    let requirement = Requirement { count: count.into(), ..Requirement::new(operation, kind) };
     AcquireRequest::new(session(), vec![requirement])
 }
 

@@ -54,6 +54,7 @@ impl Pool {
             Some(Recalled::Answered(Remembered::Granted(lease))) => {
                 let Some(record) = self.leases.get(&lease) else { return Ok(false) };
                 check_owner(|| lease.to_string(), &record.session, caller)?;
+                self.return_consumed(lease);
                 self.commit(Effect::LeaseEnded { lease, reason: EndReason::Asked });
             }
             _ => return Ok(false),
@@ -77,7 +78,8 @@ impl Pool {
         Ok(())
     }
 
-    /// Takes back a grant that nobody heard of. Its request may be asked again with its id, and waits again.
+    /// Takes back a grant that nobody heard of, and what was consumed with it. Its request may be asked again with its id, and
+    /// waits again.
     ///
     /// # Errors
     /// An unknown or ended lease.
@@ -86,6 +88,7 @@ impl Pool {
         if !self.leases.contains_key(&id) {
             return Err(PoolError::UnknownLease { lease: id });
         }
+        self.return_consumed(id);
         self.commit(Effect::LeaseEnded { lease: id, reason: EndReason::Undelivered });
         self.schedule();
         Ok(())
@@ -157,9 +160,10 @@ impl Pool {
     ) {
         self.overtake((Reverse(request.priority), id), &taken);
         self.granting = true;
-        let mut held = Vec::new();
+        let (mut held, mut consumed) = (Vec::new(), Vec::new());
         for (requirement, taken) in request.requirements.iter().zip(taken) {
             if requirement.operation == ResourceOperation::Consume {
+                taken.iter().for_each(|(slot, amount)| crate::apply::join(&mut consumed, *slot, *amount));
                 self.commit_consumed(&request.session, taken);
             } else {
                 taken.into_iter().for_each(|(slot, amount)| crate::apply::join(&mut held, slot, amount));
@@ -171,6 +175,7 @@ impl Pool {
             token,
             session: request.session,
             held,
+            consumed,
             hold_for: request.hold_for,
             purpose: request.purpose.into(),
             expires: None,
@@ -180,6 +185,14 @@ impl Pool {
         self.remember(request_id, fingerprint, Remembered::Granted(lease));
         if let Some(lease) = self.lease(lease) {
             self.notices.push(Notice::Granted { waiter: id, lease });
+        }
+    }
+
+    fn return_consumed(&mut self, lease: LeaseId) {
+        let Some(record) = self.leases.get(&lease) else { return };
+        let session = record.session.clone();
+        for (slot, amount) in record.consumed.clone() {
+            self.commit(Effect::Returned { session: session.clone(), slot, amount });
         }
     }
 

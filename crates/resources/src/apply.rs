@@ -11,7 +11,7 @@ use crate::id::{SessionId, Slot};
 use crate::lease::LeaseRecord;
 use crate::pool::Pool;
 use crate::record::{Effect, Record};
-use crate::resource::{Resource, ResourceView, add_to, remove_from};
+use crate::resource::{Resource, ResourceView, add_to, remove_from, take_from};
 use crate::session::Session;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Quantity;
@@ -83,6 +83,9 @@ impl Pool {
                 for (session, _) in &resource.consumers {
                     self.session_mut(session)?.consumed.remove(slot);
                 }
+                if !resource.consumed().is_zero() {
+                    self.leases.values_mut().for_each(|lease| lease.consumed.retain(|(consumed, _)| consumed != slot));
+                }
                 for (lease, _) in resource.holders {
                     let record = self.leases.get_mut(&lease).ok_or_else(|| format!("{lease} is not there"))?;
                     record.held.retain(|(held, _)| held != slot);
@@ -107,11 +110,30 @@ impl Pool {
                 self.updated(*slot)
             }
             Effect::TaskEnded { session } => {
-                for slot in std::mem::take(&mut self.session_mut(session)?.consumed) {
+                let slots = std::mem::take(&mut self.session_mut(session)?.consumed);
+                for lease in self.session_mut(session)?.leases.clone() {
+                    let known = self.leases.get_mut(&lease).ok_or_else(|| format!("{lease} is not there"))?;
+                    known.consumed.retain(|(slot, _)| !slots.contains(slot));
+                }
+                for slot in slots {
                     self.change(slot, |resource| remove_from(&mut resource.consumers, session));
                     self.updated(slot)?;
                 }
                 Ok(())
+            }
+            Effect::Returned { session, slot, amount } => {
+                let left = self.change(*slot, |resource| {
+                    if resource.description.renewable {
+                        take_from(&mut resource.consumers, session, *amount)
+                    } else {
+                        resource.spent = resource.spent.saturating_sub(*amount);
+                        true
+                    }
+                });
+                if !left.ok_or_else(|| missing(*slot))? {
+                    self.session_mut(session)?.consumed.remove(slot);
+                }
+                self.updated(*slot)
             }
             Effect::LeaseGranted { lease, granted } => self.begin_lease(*lease, granted),
             Effect::LeaseEnded { lease, reason } => {

@@ -48,7 +48,7 @@ impl Assignment {
         let mut missing = vec![Quantity::ZERO; requirements.len()];
         for (index, requirement) in requirements.iter().enumerate() {
             missing[index] = match requirement.operation {
-                ResourceOperation::Exists => requirement.amount().saturating_sub(resources.quantity(requirement)),
+                ResourceOperation::Exists => requirement.count.saturating_sub(resources.quantity(requirement)),
                 _ => search.greedy(index),
             };
         }
@@ -118,7 +118,7 @@ impl<'a> Search<'a> {
     /// Takes what is there; returns what is missing.
     fn greedy(&mut self, index: usize) -> Quantity {
         let requirement = self.requirements[index];
-        let (mut wanted, grain) = (requirement.amount(), grain(requirement));
+        let (mut wanted, grain) = (requirement.count, grain(requirement));
         for (slot, resource) in self.candidates(index) {
             if wanted.is_zero() {
                 break;
@@ -171,5 +171,5 @@ impl<'a> Search<'a> {
 
 /// Whole units, unless a part of one is asked for.
 fn grain(requirement: &Requirement) -> Quantity {
-    if requirement.amount().is_whole() { Quantity::ONE } else { Quantity::from_thousandths(1) }
+    if requirement.count.is_whole() { Quantity::ONE } else { Quantity::from_thousandths(1) }
 }

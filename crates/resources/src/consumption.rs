@@ -27,7 +27,7 @@ impl Pool {
         let assignment = Assignment::of(&self.resources, Available::Free(&self.queue.reserved), &[requirement]);
         if !assignment.is_complete() {
             let missing = assignment.missing.into_iter().sum();
-            let found = requirement.amount().saturating_sub(missing);
+            let found = requirement.count.saturating_sub(missing);
             return Err(PoolError::NotEnough { wanted: requirement.to_string(), found });
         }
         let taken: Units = assignment.taken.into_iter().flatten().collect();

@@ -84,7 +84,7 @@ impl Pool {
         self.advance(now);
         self.session(session)?;
         self.check_requirements(std::slice::from_ref(requirement), &[ResourceOperation::Delete])?;
-        let whole = requirement.amount().is_whole();
+        let whole = requirement.count.is_whole();
         let amount = |resource: &crate::resource::Resource| match whole {
             true => resource.free().floor_to(Quantity::ONE),
             false if resource.description.divisible => resource.free(),
@@ -93,7 +93,7 @@ impl Pool {
         let free: Vec<(Slot, Quantity)> =
             self.resources.free(requirement).map(|(slot, resource)| (slot, amount(resource))).collect();
         let found: Quantity = free.iter().map(|(_, free)| *free).sum();
-        let mut wanted = requirement.amount();
+        let mut wanted = requirement.count;
         if found < wanted {
             return Err(PoolError::NotEnough { wanted: requirement.to_string(), found });
         }

@@ -22,7 +22,7 @@ const REASON_LENGTH: usize = 512;
 /// What one selector lacks.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Demand {
-    /// What is selected; its count is how many units are missing beside those that exist.
+    /// What is selected; its count is how much is missing beside those that exist.
     pub requirement: Requirement,
     /// The kinds that would do: its kind, and those below.
     pub kinds: Vec<String>,
@@ -46,19 +46,15 @@ impl Pool {
         }
         let demand = |(requirement, amount): (&Requirement, Quantity)| Demand {
             kinds: self.resources.kinds().subclasses(&requirement.kind).map(str::to_owned).collect(),
-            requirement: Requirement { count: amount.units().max(1), ..requirement.clone() },
+            requirement: Requirement { count: amount, ..requirement.clone() },
         };
         Some(missing.into_values().map(demand).collect())
     }
 
-    /// How many units of what a demand selects a session provides already.
-    pub fn provided(&self, session: &SessionId, demand: &Demand) -> u32 {
+    /// How much of what a demand selects a session provides already.
+    pub fn provided(&self, session: &SessionId, demand: &Demand) -> Quantity {
         let fitting = self.resources.fitting(&demand.requirement).map(|(_, resource)| resource);
-        fitting
-            .filter(|resource| resource.owner.as_ref() == Some(session))
-            .map(|r| r.quantity())
-            .sum::<Quantity>()
-            .units()
+        fitting.filter(|resource| resource.owner.as_ref() == Some(session)).map(|r| r.quantity()).sum()
     }
 
     /// Whether a session has said that it cannot provide more of one of these kinds.

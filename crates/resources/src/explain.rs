@@ -85,7 +85,7 @@ impl Pool {
         if !self.resources.has_kind(&requirement.kind) {
             let reasons = self.shortages_of(requirement);
             Obstacle::MissingKind { requirement: text, kind: requirement.kind.clone(), reasons }
-        } else if exist < requirement.amount() {
+        } else if exist < requirement.count {
             Obstacle::TooFew { requirement: text, exist, reasons: self.shortages_of(requirement) }
         } else if held {
             let holders = self

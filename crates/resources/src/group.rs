@@ -55,7 +55,7 @@ pub(crate) struct Seen {
 }
 
 pub(crate) fn key(requirement: &Requirement) -> Key {
-    let selector = Requirement { operation: ResourceOperation::Block, count: 0, ..requirement.clone() };
+    let selector = Requirement { operation: ResourceOperation::Block, count: Quantity::ZERO, ..requirement.clone() };
     to_bytes(&selector).into()
 }
 
@@ -173,7 +173,7 @@ impl Pool {
         for (index, (requirement, key)) in waiter.request.requirements.iter().zip(&waiter.groups).enumerate() {
             let Some(group) = self.queue.groups.get_mut(key) else { continue };
             group.members += 1;
-            group.by_amount.insert((requirement.amount(), place));
+            group.by_amount.insert((requirement.count, place));
             if families.iter().filter(|family| **family == families[index]).count() > 1 {
                 group.several.insert(place);
             }
@@ -194,7 +194,7 @@ impl Pool {
         self.queue.demand_changed |= self.queue.hopeless.remove(&place);
         for (requirement, key) in waiter.request.requirements.iter().zip(&waiter.groups) {
             let Some(group) = self.queue.groups.get_mut(key) else { continue };
-            group.by_amount.remove(&(requirement.amount(), place));
+            group.by_amount.remove(&(requirement.count, place));
             group.several.remove(&place);
             group.members -= 1;
             if group.members > 0 {

@@ -20,6 +20,8 @@ pub(crate) struct LeaseRecord {
     pub(crate) session: SessionId,
     /// What it holds, in the order of the requirements.
     pub(crate) held: Vec<(Slot, Quantity)>,
+    /// What was consumed when it was granted, as long as that could be taken back: with a grant that nobody heard of it is.
+    pub(crate) consumed: Vec<(Slot, Quantity)>,
     pub(crate) hold_for: Option<Duration>,
     pub(crate) purpose: Arc<str>,
     /// When it ends by itself; counted anew after a restart.

@@ -18,7 +18,7 @@ use std::time::Duration;
 
 /// The version that [`encode`] writes, its first byte. Variants and fields are only ever added at the end; whatever else
 /// changes takes a new number.
-pub const FORMAT: u8 = 1;
+pub const FORMAT: u8 = 2;
 
 /// One durable change of a pool.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -46,6 +46,8 @@ pub(crate) enum Effect {
     LeaseEnded { lease: LeaseId, reason: EndReason },
     /// A request id has its answer; the oldest `forget` answers were forgotten for it.
     Answered { request_id: String, fingerprint: u128, reply: Remembered, forget: usize },
+    /// What a session consumed of a resource with a grant that was undone is there again.
+    Returned { session: SessionId, slot: Slot, amount: Quantity },
 }
 
 /// Bytes that are no records, or of a version that is not known here.

@@ -142,6 +142,13 @@ impl ResourceSpec {
         self
     }
 
+    /// Of which what is consumed is gone for good.
+    #[must_use]
+    pub fn non_renewable(mut self) -> ResourceSpec {
+        self.renewable = false;
+        self
+    }
+
     /// On this host.
     #[must_use]
     pub fn host(mut self, host: impl Into<String>) -> ResourceSpec {
@@ -263,6 +270,17 @@ pub(crate) fn add_to<K: Ord + Clone>(amounts: &mut Vec<(K, Quantity)>, key: &K, 
             amounts.insert(at, (key.clone(), amount));
         }
     }
+}
+
+/// Takes some out of an amount in such a list; whether anything is left of it.
+pub(crate) fn take_from<K: Ord>(amounts: &mut Vec<(K, Quantity)>, key: &K, amount: Quantity) -> bool {
+    let Ok(at) = amounts.binary_search_by(|(other, _)| other.cmp(key)) else { return false };
+    amounts[at].1 = amounts[at].1.saturating_sub(amount);
+    let left = !amounts[at].1.is_zero();
+    if !left {
+        amounts.remove(at);
+    }
+    left
 }
 
 /// Takes an amount out of such a list, whole.

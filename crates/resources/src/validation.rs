@@ -20,8 +20,11 @@ impl Pool {
                 return Err(malformed(&requirement.to_string(), &format!("only {} here", names.join(", "))));
             }
             self.check_name("kind", &requirement.kind)?;
-            if requirement.amount().is_zero() || requirement.amount() > Quantity::whole(self.limits.units) {
-                return Err(malformed(&requirement.to_string(), &format!("1 to {} units", self.limits.units)));
+            if requirement.count.is_zero() || requirement.count > Quantity::whole(self.limits.units) {
+                return Err(malformed(
+                    &requirement.to_string(),
+                    &format!("more than nothing and at most {} units", self.limits.units),
+                ));
             }
             self.check_attributes(requirement.attributes.keys())?;
             let conditions: Vec<&String> = requirement.conditions.iter().map(|c| &c.attribute).collect();

@@ -16,7 +16,10 @@ use ratn_resources::{
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-const KINDS: [&str; 3] = ["Arm", "Camera", "PathPlanner"];
+/// The last is divisible, and what is consumed of it is gone for good. Amounts of it are never whole, so that several resources of
+/// it count as their sum as well: a whole unit would have to come from one of them.
+const KINDS: [&str; 4] = ["Arm", "Camera", "PathPlanner", "Charge"];
+const CHARGE: usize = 3;
 const SESSIONS: usize = 3;
 const TTL: u64 = 20;
 
@@ -24,11 +27,11 @@ const TTL: u64 = 20;
 enum Step {
     Wait(u64),
     KeepAlive(usize),
-    Create(usize, u32),
+    Create(usize, u64),
     DeleteUnit(usize),
     Acquire {
         session: usize,
-        units: [u32; 3],
+        units: Units,
         consume: bool,
         priority: i64,
         patience: Option<u64>,
@@ -44,19 +47,16 @@ enum Step {
 }
 
 fn step() -> impl Strategy<Value = Step> {
-    let acquire =
-        (0..SESSIONS, [0..3u32, 0..2u32, 0..4u32], prop::bool::weighted(0.15), -2..3i64, prop::option::of(1..15u64))
-            .prop_map(|(session, units, consume, priority, patience)| Step::Acquire {
-                session,
-                units,
-                consume,
-                priority,
-                patience,
-            });
+    let charge = prop::sample::select(vec![0, 0, 0, 1, 300, 700, 1_100]);
+    let units = (0..3u64, 0..2u64, 0..4u64, charge)
+        .prop_map(|(arms, cameras, planners, charge)| [arms * UNIT, cameras * UNIT, planners * UNIT, charge]);
+    let acquire = (0..SESSIONS, units, prop::bool::weighted(0.15), -2..3i64, prop::option::of(1..15u64)).prop_map(
+        |(session, units, consume, priority, patience)| Step::Acquire { session, units, consume, priority, patience },
+    );
     prop_oneof![
         2 => (1..8u64).prop_map(Step::Wait),
         2 => (0..SESSIONS).prop_map(Step::KeepAlive),
-        2 => (0..KINDS.len(), 1..3u32).prop_map(|(kind, capacity)| Step::Create(kind, capacity)),
+        2 => (0..KINDS.len(), 1..3u64).prop_map(|(kind, capacity)| Step::Create(kind, capacity * grain(kind))),
         1 => (0..KINDS.len()).prop_map(Step::DeleteUnit),
         8 => acquire,
         5 => (0..16usize).prop_map(Step::Release),
@@ -67,8 +67,16 @@ fn step() -> impl Strategy<Value = Step> {
     ]
 }
 
-/// Units per kind.
-type Units = [u32; 3];
+/// Thousandths of a unit.
+const UNIT: u64 = 1_000;
+
+/// Thousandths per kind.
+type Units = [u64; 4];
+
+/// What is created and deleted at a time.
+fn grain(kind: usize) -> u64 {
+    if kind == CHARGE { 450 } else { UNIT }
+}
 
 #[derive(Debug, Clone)]
 struct ModelWaiter {
@@ -87,6 +95,7 @@ struct Model {
     expires: [Option<u64>; SESSIONS],
     leases: BTreeMap<LeaseId, (usize, Units)>,
     consumed: [Units; SESSIONS],
+    spent: Units,
     queue: Vec<ModelWaiter>,
     last_token: FencingToken,
 }
@@ -103,43 +112,45 @@ impl Model {
         for session in 0..SESSIONS {
             if self.expires[session].is_some_and(|at| at <= now) {
                 self.expires[session] = None;
-                self.consumed[session] = [0; 3];
+                self.consumed[session] = Units::default();
                 self.leases.retain(|_, (owner, _)| *owner != session);
                 self.queue.retain(|waiter| waiter.session != session);
             }
         }
     }
 
-    fn quantity(&self, kind: usize) -> u32 {
-        self.capacity[kind] - self.consumed.iter().map(|units| units[kind]).sum::<u32>()
+    fn quantity(&self, kind: usize) -> u64 {
+        self.capacity[kind] - self.spent[kind] - self.consumed.iter().map(|units| units[kind]).sum::<u64>()
     }
 
-    fn free(&self, kind: usize) -> u32 {
-        self.quantity(kind) - self.leases.values().map(|(_, units)| units[kind]).sum::<u32>()
+    fn free(&self, kind: usize) -> u64 {
+        self.quantity(kind) - self.leases.values().map(|(_, units)| units[kind]).sum::<u64>()
     }
 
     /// Who should be granted now, in order; `ids` are the lease ids that the pool gave them.
     fn grant(&mut self, granted: &[(WaiterId, LeaseId)]) -> Vec<WaiterId> {
         self.queue.sort_by_key(|waiter| (-waiter.priority, waiter.id));
-        let mut reserved = [0; 3];
+        let mut reserved = Units::default();
         let mut expected = Vec::new();
         let mut left = Vec::new();
         for waiter in std::mem::take(&mut self.queue) {
             let free = |model: &Model, reserved: &Units, kind: usize| model.free(kind).saturating_sub(reserved[kind]);
-            if (0..3).all(|kind| waiter.units[kind] <= free(self, &reserved, kind)) {
+            if (0..4).all(|kind| waiter.units[kind] <= free(self, &reserved, kind)) {
                 expected.push(waiter.id);
                 let lease = granted.iter().find(|(id, _)| *id == waiter.id).map_or(LeaseId(0), |(_, lease)| *lease);
                 if waiter.consume {
-                    for kind in 0..3 {
-                        self.consumed[waiter.session][kind] += waiter.units[kind];
+                    for kind in 0..4 {
+                        let consumed =
+                            if kind == CHARGE { &mut self.spent } else { &mut self.consumed[waiter.session] };
+                        consumed[kind] += waiter.units[kind];
                     }
                 }
-                let held = if waiter.consume { [0; 3] } else { waiter.units };
+                let held = if waiter.consume { Units::default() } else { waiter.units };
                 self.leases.insert(lease, (waiter.session, held));
                 continue;
             }
-            if (0..3).all(|kind| waiter.units[kind] <= self.quantity(kind)) {
-                for kind in 0..3 {
+            if (0..4).all(|kind| waiter.units[kind] <= self.quantity(kind)) {
+                for kind in 0..4 {
                     reserved[kind] += waiter.units[kind].min(free(self, &reserved, kind));
                 }
             }
@@ -229,21 +240,23 @@ proptest! {
                 }
                 Step::Create(kind, capacity) => {
                     // Several resources of one kind count as their sum.
-                    let spec = ResourceSpec::new(ResourceClass::Module, KINDS[kind]).capacity(capacity);
+                    let spec = ResourceSpec::new(ResourceClass::Module, KINDS[kind]);
+                    let spec = spec.capacity(Quantity::from_thousandths(capacity));
+                    let spec = if kind == CHARGE { spec.divisible().non_renewable() } else { spec };
                     pool.create(at, None, spec).unwrap();
                     model.capacity[kind] += capacity;
                 }
                 Step::DeleteUnit(kind) => {
                     if model.expires[0].is_some() {
-                        let one = requirement(ResourceOperation::Delete, kind, 1);
+                        let one = requirement(ResourceOperation::Delete, kind, grain(kind));
                         let deleted = pool.delete_units(at, &names[0], &one).is_ok();
-                        prop_assert_eq!(deleted, model.free(kind) > 0);
-                        model.capacity[kind] -= u32::from(deleted);
+                        prop_assert_eq!(deleted, model.free(kind) >= grain(kind));
+                        model.capacity[kind] -= u64::from(deleted) * grain(kind);
                     }
                 }
                 Step::Acquire { session, units, consume, priority, patience } => {
                     let operation = if consume { ResourceOperation::Consume } else { ResourceOperation::Block };
-                    let requirements: Vec<Requirement> = (0..3)
+                    let requirements: Vec<Requirement> = (0..4)
                         .filter(|kind| units[*kind] > 0)
                         .map(|kind| requirement(operation, kind, units[kind]))
                         .collect();
@@ -270,7 +283,7 @@ proptest! {
                 Step::EndTask(session) => {
                     let known = pool.end_task(at, &names[session]).is_ok();
                     prop_assert_eq!(known, model.expires[session].is_some());
-                    model.consumed[session] = [0; 3];
+                    model.consumed[session] = Units::default();
                 }
             }
             compare(pool, &mut model)?;
@@ -301,7 +314,7 @@ proptest! {
                 }
             } else if units != [0, 0] {
                 let wanted = (0..2).filter(|kind| units[*kind] > 0);
-                let wanted = wanted.map(|kind| requirement(ResourceOperation::Block, kind, units[kind])).collect();
+                let wanted = wanted.map(|kind| requirement(ResourceOperation::Block, kind, u64::from(units[kind]) * UNIT)).collect();
                 waiting.insert(pool.acquire(at, AcquireRequest::new(session.clone(), wanted)).unwrap(), (units, 0));
             }
             pool.check_invariants().map_err(TestCaseError::fail)?;
@@ -331,7 +344,8 @@ proptest! {
     }
 }
 
-fn requirement(operation: ResourceOperation, kind: usize, count: u32) -> Requirement {
+fn requirement(operation: ResourceOperation, kind: usize, thousandths: u64) -> Requirement {
+    let count = Quantity::from_thousandths(thousandths);
     Requirement { count, ..Requirement::new(operation, KINDS[kind]) }
 }
 
@@ -344,26 +358,30 @@ fn compare(pool: &mut Pool, model: &mut Model) -> Result<(), TestCaseError> {
             model.last_token = lease.token;
             // All or nothing.
             let waiting = model.queue.iter().find(|waiting| waiting.id == waiter).unwrap();
-            let expected = if waiting.consume { [0; 3] } else { waiting.units };
-            let of = |kind: &&str| lease.resources.iter().filter(|resource| resource.kind == **kind).count() as u32;
-            prop_assert_eq!(KINDS.each_ref().map(of), expected);
+            let expected = if waiting.consume { Units::default() } else { waiting.units };
+            let of = |kind: &&str| lease.resources.iter().filter(|resource| resource.kind == **kind).count() as u64;
+            let [arms, cameras, planners, charge] = KINDS.each_ref().map(of);
+            let [whole @ .., parts] = expected;
+            prop_assert_eq!([arms, cameras, planners].map(|count| count * UNIT), whole);
+            // Parts are under a lease once per resource, however much that is; how much is compared below.
+            prop_assert_eq!(charge > 0, parts > 0);
             granted.push((waiter, lease.id));
         }
     }
     let expected = model.grant(&granted);
     prop_assert_eq!(granted.iter().map(|(waiter, _)| *waiter).collect::<Vec<_>>(), expected);
-    let mut free = [0; 3];
+    let mut free = Units::default();
     for resource in pool.list() {
         let kind = KINDS.iter().position(|kind| *kind == resource.kind).unwrap();
-        free[kind] += resource.free.units();
+        free[kind] += resource.free.thousandths();
         // No unit has two holders.
         let held: Quantity = resource.holdings.iter().map(|holding| holding.units).sum();
         prop_assert_eq!(held + resource.consumed + resource.free, resource.capacity);
     }
-    prop_assert_eq!(free, [model.free(0), model.free(1), model.free(2)]);
-    for kind in 0..3 {
+    prop_assert_eq!(free, [0, 1, 2, 3].map(|kind| model.free(kind)));
+    for kind in 0..4 {
         let exists = pool.exists(&requirement(ResourceOperation::Exists, kind, 1));
-        prop_assert_eq!(exists, model.quantity(kind), "created − consumed − deleted");
+        prop_assert_eq!(exists.thousandths(), model.quantity(kind), "created − consumed − deleted");
     }
     prop_assert_eq!(pool.waiters().len(), model.queue.len());
     prop_assert_eq!(pool.leases().len(), model.leases.len());

@@ -3,7 +3,7 @@
 
 use ratn_model::condition::{Comparison, Condition};
 use ratn_model::id::LeaseId;
-use ratn_model::resource::{Lease, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{Lease, Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_resources::{
@@ -78,7 +78,7 @@ fn session(name: &str) -> SessionId {
 }
 
 fn requirement(operation: ResourceOperation, kind: &str, count: u32) -> Requirement {
-    Requirement { count, ..Requirement::new(operation, kind) }
+    Requirement { count: count.into(), ..Requirement::new(operation, kind) }
 }
 
 fn block(kind: &str) -> Requirement {
@@ -425,7 +425,10 @@ fn what_waits_for_more_than_exists_is_in_demand_until_it_does_not_and_is_told_wh
     let told = |pool: &mut Pool| {
         let demand = pool.take_demand()?;
         Some(
-            demand.iter().map(|demand| (demand.requirement.kind.clone(), demand.requirement.count)).collect::<Vec<_>>(),
+            demand
+                .iter()
+                .map(|demand| (demand.requirement.kind.clone(), demand.requirement.count.units()))
+                .collect::<Vec<_>>(),
         )
     };
     let planners = |count| requirement(ResourceOperation::Block, "PathPlanner", count);
@@ -443,7 +446,8 @@ fn what_waits_for_more_than_exists_is_in_demand_until_it_does_not_and_is_told_wh
     let (waiter, lease) = grants(&bench.notices()).remove(0);
     assert_eq!(waiter, two);
     let left = bench.pool.take_demand().unwrap();
-    assert_eq!((left[0].requirement.count, bench.pool.provided(&session("a"), &left[0])), (1, 2));
+    let provided = bench.pool.provided(&session("a"), &left[0]);
+    assert_eq!((left[0].requirement.count, provided), (Quantity::ONE, Quantity::whole(2)));
     // Held or not: what exists is not in demand.
     bench.acquire("b", &[planners(1)]);
     assert_eq!(told(&mut bench.pool), None);
@@ -544,6 +548,37 @@ fn a_grant_that_nobody_heard_of_may_be_asked_for_again_with_its_request_id() {
     let again = grants(&bench.notices()).remove(0).1;
     assert!(again.token > first.token);
     assert_eq!(bench.pool.undo_grant(bench.now, first.id), Err(PoolError::UnknownLease { lease: first.id }));
+}
+
+#[test]
+fn what_was_consumed_with_a_grant_that_is_undone_is_there_again_once() {
+    for renewable in [true, false] {
+        let mut bench = Bench::new();
+        let spec = ResourceSpec::new(ResourceClass::System, "Charge").id("charge").capacity(2).divisible();
+        bench.create("a", ResourceSpec { renewable, ..spec });
+        let part = Quantity::from_thousandths(750);
+        let consume = Requirement { count: part, ..requirement(ResourceOperation::Consume, "Charge", 1) };
+        let left = |bench: &Bench| bench.pool.get("charge").unwrap().free.thousandths();
+        let acquire = Request::Acquire(AcquireRequest::new(session("b"), vec![consume]));
+        for id in ["kept", "undelivered", "withdrawn"] {
+            bench.pool.handle(bench.now, id, acquire.clone()).unwrap();
+            let lease = grants(&bench.notices()).remove(0).1;
+            match id {
+                "kept" => drop(bench.release(lease.id)),
+                "undelivered" => bench.pool.undo_grant(bench.now, lease.id).unwrap(),
+                _ => assert!(bench.pool.withdraw(bench.now, &session("b"), id).unwrap()),
+            }
+            bench.pool.check_invariants().unwrap();
+            assert_eq!(left(&bench), 1_250, "{id}");
+        }
+        // The end of the task gives back what is renewable; an undone grant gives nothing a second time.
+        bench.pool.handle(bench.now, "last", acquire.clone()).unwrap();
+        let lease = grants(&bench.notices()).remove(0).1;
+        bench.pool.end_task(bench.now, &session("b")).unwrap();
+        bench.pool.undo_grant(bench.now, lease.id).unwrap();
+        bench.pool.check_invariants().unwrap();
+        assert_eq!(left(&bench), if renewable { 2_000 } else { 1_250 });
+    }
 }
 
 #[test]

@@ -63,7 +63,7 @@ fn step() -> impl Strategy<Value = (Step, u8)> {
 }
 
 fn requirement(operation: ResourceOperation, kind: usize, count: u32) -> Requirement {
-    Requirement { count, ..Requirement::new(operation, KINDS[kind]) }
+    Requirement { count: count.into(), ..Requirement::new(operation, KINDS[kind]) }
 }
 
 fn perform(pool: &mut Pool, now: u64, step: &Step, id: u8) -> String {

@@ -9,10 +9,11 @@ use crate::random::Dice;
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::{Lookout, Problem, Search};
 use ratn_executive::protocol::{Command, Event, Goal, Learned, LogEntry, LogLine, Mode, Origin};
+use ratn_model::catalogue::ResourceOffer;
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::program::Program;
-use ratn_model::resource::{ResourceClass, ResourceOperation};
+use ratn_model::resource::{Quantity, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
@@ -65,8 +66,8 @@ pub struct Setup {
     pub parameters: BTreeMap<String, Value>,
     /// The run's seed.
     pub seed: u64,
-    /// Kind, class and number of units of everything there is.
-    pub resources: Vec<(String, ResourceClass, u32)>,
+    /// Everything there is, by kind.
+    pub resources: Vec<(String, ResourceOffer)>,
     /// The facts that hold before the task's own initial world.
     pub world: Vec<(FactKey, Value)>,
     /// When a measured value is the predicted one.
@@ -90,8 +91,8 @@ pub struct Run {
     pub log: Vec<LogLine>,
     /// The root world at the end.
     pub world: World,
-    /// What there is of task resources at the end: units by kind.
-    pub units: BTreeMap<String, u64>,
+    /// What there is of task resources at the end, by kind.
+    pub units: BTreeMap<String, Quantity>,
 }
 
 /// A run that did not end as runs do: a broken promise of one of the cores.
@@ -188,11 +189,13 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
     let session = SessionId::from("task");
     let forever = Duration::from_secs(10 * 365 * 24 * 3600);
     pool.keep_alive(Timestamp(0), &session, "simulation", forever).map_err(|e| broken(Timestamp(0), e.to_string()))?;
-    for (kind, class, units) in &setup.resources {
-        let shared = *class == ResourceClass::World;
-        let (count, capacity) = if shared { (1, *units) } else { (*units, 1) };
+    for (kind, offer) in &setup.resources {
+        let shared = offer.class == ResourceClass::World || offer.divisible;
+        let (count, capacity) = if shared { (1, offer.count) } else { (offer.count.units(), Quantity::ONE) };
         for number in 1..=count {
-            let spec = ResourceSpec::new(*class, kind.clone()).id(format!("{kind}-{number}")).capacity(capacity);
+            let mut spec =
+                ResourceSpec::new(offer.class, kind.clone()).id(format!("{kind}-{number}")).capacity(capacity);
+            (spec.divisible, spec.renewable) = (offer.divisible, offer.renewable);
             pool.create(Timestamp(0), None, spec).map_err(|e| broken(Timestamp(0), e.to_string()))?;
         }
     }
@@ -233,7 +236,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
             seed: setup.seed,
             world: simulation.root.iter().map(|(k, f)| (k.clone(), f.value.clone())).collect(),
             revision: simulation.root.revision(),
-            capacity: setup.resources.iter().map(|(kind, _, units)| (kind.clone(), *units)).collect(),
+            capacity: setup.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
             learned: Learned::default(),
             origin: Origin::default(),
         },
@@ -455,6 +458,7 @@ impl Simulation<'_> {
                             let class = operation.class.unwrap_or(ResourceClass::Task);
                             let mut spec = ResourceSpec::new(class, &operation.kind).capacity(operation.count);
                             spec.attributes = operation.attributes.clone();
+                            spec.divisible = operation.divisible;
                             self.pool.create(self.now, Some(&self.session), spec).map(drop)
                         }
                         _ => self.pool.delete_units(self.now, &self.session, operation).map(drop),
@@ -512,11 +516,11 @@ impl Simulation<'_> {
         self.send(Duration::from_secs_f64(duration_s.max(0.0)), "answer", instance, attempt, event);
     }
 
-    fn task_resources(&self) -> BTreeMap<String, u64> {
-        let mut units = BTreeMap::new();
+    fn task_resources(&self) -> BTreeMap<String, Quantity> {
+        let mut units: BTreeMap<String, Quantity> = BTreeMap::new();
         for resource in self.pool.list().into_iter().filter(|r| r.class == ResourceClass::Task) {
             let left = resource.capacity.saturating_sub(resource.consumed);
-            *units.entry(resource.kind.clone()).or_default() += u64::from(left.units());
+            *units.entry(resource.kind.clone()).or_default() += left;
         }
         units
     }

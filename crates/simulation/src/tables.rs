@@ -3,11 +3,11 @@
 use crate::run::{Run, RunError, Setup, run_looking_ahead};
 use crate::timed::TimedProviders;
 use ratn_executive::protocol::Mode;
-use ratn_model::catalogue::Catalogue;
+use ratn_model::catalogue::{Catalogue, ResourceOffer};
 use ratn_model::diagnostic::Diagnostic;
 use ratn_model::parameters::ParameterError;
 use ratn_model::program::Program;
-use ratn_model::resource::ResourceClass;
+use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use serde::Serialize;
@@ -159,16 +159,12 @@ impl Scenario {
 
 fn setup(program: Program, parameters: &[(String, String)], mode: Mode, planners: u32) -> Result<Setup, TableError> {
     let parameters: BTreeMap<String, Value> = program.bind_parameters(parameters)?;
-    let mut resources: Vec<(String, ResourceClass, u32)> = Catalogue::standard()
-        .resources
-        .iter()
-        .map(|(kind, offer)| {
-            (kind.clone(), offer.class, if offer.class == ResourceClass::World { offer.count } else { 1 })
-        })
-        .collect();
-    for (kind, _, units) in &mut resources {
+    let mut resources: Vec<(String, ResourceOffer)> = Catalogue::standard().resources.into_iter().collect();
+    for (kind, offer) in &mut resources {
         if kind == "PathPlanner" {
-            *units = planners;
+            offer.count = planners.into();
+        } else if offer.class != ResourceClass::World {
+            offer.count = Quantity::ONE;
         }
     }
     Ok(Setup {

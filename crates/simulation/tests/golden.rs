@@ -25,11 +25,11 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, Mode, Note};
-use ratn_model::catalogue::Catalogue;
+use ratn_model::catalogue::{Catalogue, ResourceOffer};
 use ratn_model::fact::{FactKey, Term};
 use ratn_model::id::InstanceId;
 use ratn_model::pose::Pose;
-use ratn_model::resource::ResourceClass;
+use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_simulation::run::{Answer, Circumstances, Oracle, Performance, Run, Setup, Trigger, run_under};
@@ -155,13 +155,17 @@ fn simulate(folder: &Path, mode: Mode, script: &mut Script) -> Run {
         panic!("{}", problems.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))
     });
     let parameters = loaded.program.bind_parameters(&[]).unwrap();
-    let units = |class: ResourceClass, count: u32| if class == ResourceClass::System { 0 } else { count };
+    // Of the system's class there is nothing here.
+    let there = |offer: &ResourceOffer| match offer.class {
+        ResourceClass::System => ResourceOffer { count: Quantity::ZERO, ..offer.clone() },
+        _ => offer.clone(),
+    };
     let setup = Setup {
         program: Arc::new(loaded.program),
         mode,
         parameters,
         seed: 7,
-        resources: catalogue.resources.iter().map(|(k, o)| (k.clone(), o.class, units(o.class, o.count))).collect(),
+        resources: catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), there(offer))).collect(),
         world: Vec::new(),
         tolerance: Tolerance::ROBOT,
         latency: Duration::ZERO,

@@ -91,7 +91,7 @@ fn execute_program((catalogue, program): (Catalogue, Program), mode: Mode, scrip
         mode,
         parameters,
         seed: 7,
-        resources: catalogue.resources.iter().map(|(k, o)| (k.clone(), o.class, o.count)).collect(),
+        resources: catalogue.resources.clone().into_iter().collect(),
         world: Vec::new(),
         tolerance: Tolerance::EXACT,
         latency: Duration::ZERO,

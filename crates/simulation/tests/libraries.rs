@@ -95,7 +95,7 @@ fn both(task: &str) -> [Run; 2] {
         panic!("{}", problems.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))
     });
     let program = Arc::new(loaded.program);
-    let resources: Vec<_> = catalogue.resources.iter().map(|(k, o)| (k.clone(), o.class, o.count)).collect();
+    let resources: Vec<_> = catalogue.resources.clone().into_iter().collect();
     [Mode::Hsm, Mode::Cdtn].map(|mode| {
         let setup = Setup {
             program: Arc::clone(&program),

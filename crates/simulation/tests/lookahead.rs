@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use ratn_executive::protocol::{Event, LogEntry, Mode};
-use ratn_model::catalogue::Catalogue;
+use ratn_model::catalogue::{Catalogue, ResourceOffer};
 use ratn_model::resource::ResourceClass;
 use ratn_model::tolerance::Tolerance;
 use ratn_simulation::random::{Features, HashOracle, RESOURCES, program};
@@ -32,7 +32,10 @@ fn random_programs_come_to_the_same_with_and_without() {
             mode,
             parameters: BTreeMap::new(),
             seed,
-            resources: RESOURCES.iter().map(|(kind, class, units)| ((*kind).to_owned(), *class, *units)).collect(),
+            resources: RESOURCES
+                .iter()
+                .map(|(kind, class, units)| ((*kind).to_owned(), ResourceOffer::new(*class, *units)))
+                .collect(),
             world: Vec::new(),
             tolerance: Tolerance::EXACT,
             latency: if seed.is_multiple_of(2) { Duration::ZERO } else { Duration::from_millis(1500) },
@@ -73,9 +76,9 @@ fn the_papers_tasks_take_no_longer() {
                     .resources
                     .iter()
                     .map(|(kind, offer)| match (kind.as_str(), offer.class) {
-                        ("PathPlanner", class) => (kind.clone(), class, planners),
-                        (_, class @ ResourceClass::World) => (kind.clone(), class, offer.count),
-                        (_, class) => (kind.clone(), class, 1),
+                        ("PathPlanner", class) => (kind.clone(), ResourceOffer::new(class, planners)),
+                        (_, ResourceClass::World) => (kind.clone(), offer.clone()),
+                        (_, class) => (kind.clone(), ResourceOffer::new(class, 1)),
                     })
                     .collect(),
                 world: Vec::new(),

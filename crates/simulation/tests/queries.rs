@@ -65,7 +65,7 @@ fn lift(place: &str, mode: Mode) -> Run {
         mode,
         parameters: BTreeMap::new(),
         seed: 1,
-        resources: catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.class, offer.count)).collect(),
+        resources: catalogue.resources.clone().into_iter().collect(),
         world: Vec::new(),
         tolerance: Tolerance::EXACT,
         latency: Duration::ZERO,

@@ -4,11 +4,11 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, Mode, Note};
-use ratn_model::catalogue::Catalogue;
+use ratn_model::catalogue::{Catalogue, ResourceOffer};
 use ratn_model::fact::{FactKey, Term};
 use ratn_model::id::InstanceId;
 use ratn_model::pose::Pose;
-use ratn_model::resource::ResourceClass;
+use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_simulation::run::{Answer, Oracle, Performance, Run, Setup, run};
@@ -24,6 +24,7 @@ Eye = { class = "process", count = 1 }
 Arm = { class = "module", count = 1, actuates = true }
 Head = { class = "module", count = 1, actuates = true }
 WorldModel = { class = "world", count = 8 }
+Charge = { class = "module", count = 1, divisible = true, renewable = false }
 
 [providers.brain]
 resource = "Brain"
@@ -76,13 +77,17 @@ fn simulate(task: &str, mode: Mode, script: &mut Script) -> Run {
         panic!("{}", problems.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))
     });
     let parameters = loaded.program.bind_parameters(&[]).unwrap();
-    let units = |class: ResourceClass, count: u32| if class == ResourceClass::System { 0 } else { count };
+    // Of the system's class there is nothing here.
+    let there = |offer: &ResourceOffer| match offer.class {
+        ResourceClass::System => ResourceOffer { count: Quantity::ZERO, ..offer.clone() },
+        _ => offer.clone(),
+    };
     let setup = Setup {
         program: Arc::new(loaded.program),
         mode,
         parameters,
         seed: 7,
-        resources: catalogue.resources.iter().map(|(k, o)| (k.clone(), o.class, units(o.class, o.count))).collect(),
+        resources: catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), there(offer))).collect(),
         world: Vec::new(),
         tolerance: Tolerance::ROBOT,
         latency: Duration::ZERO,
@@ -661,9 +666,34 @@ states:
         for mode in [Mode::Hsm, Mode::Cdtn] {
             let run = simulate(&task, mode, &mut Script::default());
             assert_eq!((run.outcome.as_str(), run.end_s), ("success", 4.0), "{mode:?} {}", run.reason);
-            assert_eq!(run.units.get("Part").copied().unwrap_or(0), 0, "{mode:?}, routine: {routine}");
+            assert_eq!(run.units.get("Part").copied().unwrap_or_default(), 0, "{mode:?}, routine: {routine}");
         }
     }
+}
+
+#[test]
+fn parts_of_what_is_divisible_are_used_up_and_held_in_both_modes() {
+    let task = "
+task: paint
+states:
+  - mix: { action: arm/move, pia: true, effects: [], resources: [{ block: Arm }, { create: Paint, class: task, count: 2.5, divisible: true }] }
+  - dip: { action: arm/move, pia: true, effects: [], resources: [{ block: Arm }, { consume: Paint, count: 0.5 }] }
+  - left: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }, { block: Charge, count: 0.375 }], duration: 4 }
+  - right: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }, { block: Charge, count: 0.375 }], duration: 4 }
+  - spill: { action: arm/move, pia: true, effects: [], resources: [{ block: Arm }, { delete: Paint, count: 0.125 }] }
+  - dry: { action: arm/move, pia: true, effects: [], resources: [{ block: Arm }, { exists: Paint, count: 1.8 }, { consume: Charge, count: 0.25 }] }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let run = simulate(task, mode, &mut Script::default());
+        assert_eq!(run.outcome, "success", "{mode:?} {}", run.reason);
+        assert_eq!(run.units["Paint"], Quantity::from_thousandths(1_875), "{mode:?}");
+    }
+    // Each gets its part of the one unit at once, and the whole of it would not be enough for three.
+    let run = simulate(task, Mode::Cdtn, &mut Script::default());
+    assert_eq!((at(&run, "start left"), at(&run, "start right")), (0.0, 0.0));
+    let third = task.replace("count: 0.375", "count: 0.625");
+    let run = simulate(&third, Mode::Cdtn, &mut Script::default());
+    assert_eq!((at(&run, "start left"), at(&run, "start right")), (0.0, 4.0));
 }
 
 #[test]

@@ -17,7 +17,7 @@ pub(crate) fn requirement(kind: &str) -> v1::Requirement {
     v1::Requirement {
         operation: v1::ResourceOperation::Block.into(),
         kind: kind.to_owned(),
-        count: 1,
+        count: 1.0,
         ..Default::default()
     }
 }
@@ -46,7 +46,7 @@ pub(crate) async fn create(client: &mut ResourceServiceClient<Channel>, session:
         id: format!("{kind}-1"),
         class: v1::ResourceClass::Module.into(),
         kind: kind.to_owned(),
-        capacity: 1,
+        capacity: 1.0,
         ..Default::default()
     };
     let request_id = format!("create/{kind}");

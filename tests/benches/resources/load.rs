@@ -90,7 +90,7 @@ async fn fill(channel: &Channel) {
                     id: format!("resource-{number}@compute"),
                     class: v1::ResourceClass::Module.into(),
                     kind: kind(number % KINDS),
-                    capacity: 1,
+                    capacity: 1.0,
                     host: "compute".to_owned(),
                     ..Default::default()
                 };
@@ -119,7 +119,7 @@ async fn wait(channel: &Channel) -> Vec<Line> {
             asked.request_id = format!("{name}/{waiter}");
             asked.deadline_ms = 600_000;
             if let Some(requirement) = &mut asked.requirement {
-                requirement.count = OF_EACH as u32;
+                requirement.count = OF_EACH as f64;
             }
             line.say(1_000_000 + waiter, Asked::Block(asked)).await;
         }

@@ -107,6 +107,7 @@ impl Link {
 
     fn battery(&self, level: f64) -> Resource {
         Resource::new(format!("battery@{}", self.config.host), ResourceClass::System, "Battery")
+            .divisible()
             .with_attribute("level", Value::Float((level * 1000.0).round() / 1000.0))
             .on_host(&self.config.host)
     }

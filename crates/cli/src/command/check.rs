@@ -10,6 +10,7 @@ use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
 use ratn_model::parameters::ParameterError;
 use ratn_model::program::Program;
+use ratn_model::resource::Quantity;
 use ratn_simulation::sequential::{Assumptions, Gain, Link, Sequential, sequential};
 use serde::Serialize;
 use std::path::Path;
@@ -90,7 +91,7 @@ fn simulate(
         elements: usize::from(arguments.elements),
         durations_s: learned.durations_s,
         // What a system starts when there is demand is there in time.
-        units: config.promised_resources().into_iter().map(|(kind, units)| (kind, units.max(1))).collect(),
+        units: config.promised_resources().into_iter().map(|(kind, units)| (kind, units.max(Quantity::ONE))).collect(),
     };
     Ok(sequential(program, &config.catalogue, &assumptions).map_err(|obstacle| obstacle.to_string()))
 }

@@ -11,7 +11,7 @@ use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::service::ServiceConfig;
 use ratn_daemon::world_pool::WorldPoolConfig;
 use ratn_model::catalogue::Catalogue;
-use ratn_model::resource::ResourceClass;
+use ratn_model::resource::{Quantity, ResourceClass};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -107,7 +107,7 @@ impl SystemConfig {
         self.catalogue.resources.retain(|kind, offer| {
             let provided: u32 = templates.iter().filter(|t| t.kind == *kind).map(|t| t.max_workers()).sum();
             if provided > 0 {
-                offer.count = provided;
+                offer.count = provided.into();
             }
             provided > 0 || offer.class != ResourceClass::Process || !built_in
         });
@@ -136,12 +136,13 @@ impl SystemConfig {
         config
     }
 
-    /// Units by kind that are there once the system is ready.
-    pub(crate) fn promised_resources(&self) -> BTreeMap<String, u32> {
-        let mut promised: BTreeMap<String, u32> = CELL_RESOURCES.iter().map(|&kind| (kind.to_owned(), 1)).collect();
-        promised.insert(self.world_pool.kind.clone(), self.world_pool.capacity);
+    /// How much of each kind is there once the system is ready.
+    pub(crate) fn promised_resources(&self) -> BTreeMap<String, Quantity> {
+        let one_of = |&kind: &&str| (kind.to_owned(), Quantity::ONE);
+        let mut promised: BTreeMap<String, Quantity> = CELL_RESOURCES.iter().map(one_of).collect();
+        promised.insert(self.world_pool.kind.clone(), self.world_pool.capacity.into());
         for template in &self.process_manager.templates {
-            *promised.entry(template.kind.clone()).or_default() += template.min;
+            *promised.entry(template.kind.clone()).or_default() += template.min.into();
         }
         promised
     }

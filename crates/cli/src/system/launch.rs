@@ -8,6 +8,7 @@
 use crate::output;
 use anyhow::{Context, bail};
 use ratn_daemon::supervisor::command_of;
+use ratn_model::resource::Quantity;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -161,9 +162,9 @@ fn last_words(log: &Path) -> String {
 }
 
 /// What of `wanted` (resources by kind) is not among `there`.
-pub(crate) fn missing(wanted: &BTreeMap<String, u32>, there: &BTreeMap<String, u32>) -> Vec<String> {
+pub(crate) fn missing(wanted: &BTreeMap<String, Quantity>, there: &BTreeMap<String, Quantity>) -> Vec<String> {
     let short = wanted.iter().filter_map(|(kind, n)| {
-        let have = there.get(kind).copied().unwrap_or(0);
+        let have = there.get(kind).copied().unwrap_or_default();
         (have < *n).then(|| format!("{kind} ({have} of {n})"))
     });
     short.collect()

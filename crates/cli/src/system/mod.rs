@@ -9,6 +9,7 @@ use anyhow::Context;
 use config::SystemConfig;
 use launch::Processes;
 use ratn_daemon::config::{Durability, state_directory};
+use ratn_model::resource::Quantity;
 use ratn_proto::v1::GetGroundTruthRequest;
 use ratn_proto::v1::cell_service_client::CellServiceClient;
 use ratn_worker::client::{Channels, ResourceClient};
@@ -161,7 +162,7 @@ async fn ready(
         let client = ResourceClient::new(&channels, &directory.find(ROLES[0])?, "")?;
         // A manager that does not answer yet is asked again.
         let Ok(resources) = client.list(&[]).await else { return Ok(vec!["an answer of the resource manager".into()]) };
-        let mut there: BTreeMap<String, u32> = BTreeMap::new();
+        let mut there: BTreeMap<String, Quantity> = BTreeMap::new();
         for resource in resources {
             *there.entry(resource.kind).or_default() += resource.capacity;
         }

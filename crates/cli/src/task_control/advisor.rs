@@ -144,7 +144,7 @@ mod tests {
             instance: InstanceId(id),
             duration_s,
             is_running: id == 0,
-            demands: vec![(kind.to_owned(), 1)],
+            demands: vec![(kind.to_owned(), 1.into())],
             after: after.to_vec(),
             is_speculative: false,
             urgency_s: 0.0,
@@ -161,7 +161,7 @@ mod tests {
             task(2, 1.0, "Arm", &[]),
             task(3, 9.0, "Oven", &[2]),
         ];
-        Problem { tasks, capacity: [("Arm".to_owned(), 1), ("Oven".to_owned(), 1)].into() }
+        Problem { tasks, capacity: [("Arm".to_owned(), 1.into()), ("Oven".to_owned(), 1.into())].into() }
     }
 
     #[tokio::test]

@@ -188,11 +188,11 @@ fn delete(left: &mut Vec<Requirement>, deletion: &Requirement) {
             && deletion.accepts(|name| attributes.get(name).map(std::borrow::Cow::Borrowed));
         if fits {
             let taken = count.min(created.count);
-            created.count -= taken;
-            count -= taken;
+            created.count = created.count.saturating_sub(taken);
+            count = count.saturating_sub(taken);
         }
     }
-    left.retain(|created| created.count > 0);
+    left.retain(|created| !created.count.is_zero());
 }
 
 #[cfg(test)]
@@ -201,7 +201,7 @@ mod tests {
     use ratn_model::resource::Lease;
 
     fn requirement(operation: ResourceOperation, kind: &str, count: u32) -> Requirement {
-        Requirement { count, ..Requirement::new(operation, kind) }
+        Requirement { count: count.into(), ..Requirement::new(operation, kind) }
     }
 
     fn lease(id: u64) -> Lease {

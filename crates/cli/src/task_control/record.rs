@@ -139,6 +139,7 @@ pub(super) async fn operate_once(
         ResourceOperation::Create => {
             let class = operation.class.unwrap_or(ResourceClass::Task);
             let mut resource = Resource::new("", class, operation.kind.clone()).with_capacity(operation.count);
+            resource.divisible = operation.divisible;
             resource.attributes = operation.attributes.clone();
             resources.create_once(request, resource).await.map(|_| ())
         }

@@ -182,7 +182,7 @@ mod tests {
             mode,
             parameters: program.bind_parameters(&[("boxes".into(), "2".into())]).unwrap(),
             seed: 3,
-            resources: resources.iter().map(|(kind, offer)| (kind.clone(), offer.class, offer.count)).collect(),
+            resources: resources.into_iter().collect(),
             world: Vec::new(),
             tolerance: Tolerance::ROBOT,
             latency: Duration::from_millis(50),

@@ -1,6 +1,7 @@
 //! The providers that listen: each is told what is asked of it.
 
 use super::handout::{HandOut, Missing, Provider};
+use ratn_model::resource::Quantity;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::Demand;
 use ratn_resources::{Pool, SessionId};
@@ -65,12 +66,16 @@ impl Providers {
         self.all.retain(|(provider, listener)| !listener.is_closed() && pool.has_session(&provider.session));
         let providers: Vec<Provider> = self.all.iter().map(|(provider, _)| provider.clone()).collect();
         let missing = |demand: &ratn_resources::Demand| Missing {
-            selector: format!("{:?}", ratn_model::resource::Requirement { count: 1, ..demand.requirement.clone() }),
+            selector: format!(
+                "{:?}",
+                ratn_model::resource::Requirement { count: Quantity::ONE, ..demand.requirement.clone() }
+            ),
             kinds: demand.kinds.clone(),
-            count: demand.requirement.count,
+            // Whole resources are provided, also for parts of them.
+            count: demand.requirement.count.units_up(),
             of: providers
                 .iter()
-                .map(|p| (pool.provided(&p.session, demand), pool.is_short(&p.session, &demand.kinds)))
+                .map(|p| (pool.provided(&p.session, demand).units(), pool.is_short(&p.session, &demand.kinds)))
                 .collect(),
         };
         let missing: Vec<Missing> = demands.iter().map(missing).collect();
@@ -79,11 +84,11 @@ impl Providers {
             let of_it = demands.iter().enumerate().filter(|(at, _)| asked[index][*at] > 0);
             let demand = |(at, demand): (usize, &ratn_resources::Demand)| Demand {
                 requirement: ratn_model::resource::Requirement {
-                    count: asked[index][at],
+                    count: asked[index][at].into(),
                     ..demand.requirement.clone()
                 },
                 kinds: demand.kinds.clone(),
-                provided: missing[at].of[index].0,
+                provided: missing[at].of[index].0.into(),
             };
             let told: Vec<Demand> = of_it.map(demand).collect();
             listener.send_if_modified(|before| {

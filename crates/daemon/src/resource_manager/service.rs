@@ -160,9 +160,9 @@ impl v1::resource_service_server::ResourceService for Service {
             class: resource.class,
             kind: resource.kind,
             attributes: resource.attributes,
-            capacity: resource.capacity.into(),
-            divisible: false,
-            renewable: true,
+            capacity: resource.capacity,
+            divisible: resource.divisible,
+            renewable: resource.renewable,
             host: resource.host,
         };
         let session = self.optional_session(&caller, &request.session_id)?;
@@ -271,7 +271,7 @@ impl v1::resource_service_server::ResourceService for Service {
 
     async fn exists(&self, request: Request<v1::ExistsRequest>) -> Result<Response<v1::ExistsResponse>, Status> {
         let requirement: Requirement = required(request.into_inner().requirement, "requirement")?;
-        let wanted = requirement.amount();
+        let wanted = requirement.count;
         let (units, resource_ids) = self.actor.ask(|answer| Message::Find { requirement, answer }).await?;
         Ok(Response::new(v1::ExistsResponse { exists: units >= wanted, resource_ids }))
     }

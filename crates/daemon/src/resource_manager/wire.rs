@@ -18,7 +18,7 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
     let holding = |holding: ratn_resources::Holding| Holding {
         lease: holding.lease,
         token: holding.token,
-        units: holding.units.units(),
+        units: holding.units,
         session: holding.session.as_str().to_owned(),
         holder: holding.purpose.to_string(),
     };
@@ -28,12 +28,14 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
         class: description.class,
         kind: description.kind.clone(),
         attributes: description.attributes.iter().map(|(name, value)| (name.to_owned(), value.clone())).collect(),
-        capacity: description.capacity.units(),
+        capacity: description.capacity,
+        divisible: description.divisible,
+        renewable: description.renewable,
         host: description.host.clone(),
         session: view.owner.as_ref().map(|owner| owner.as_str().to_owned()).unwrap_or_default(),
         revision: view.revision,
         state,
-        free: view.free.units(),
+        free: view.free,
         holdings: view.holdings.iter().cloned().map(holding).collect(),
     }
 }

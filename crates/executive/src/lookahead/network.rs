@@ -39,7 +39,8 @@ impl<T> Lists<T> {
 pub(super) struct Demand {
     /// The kind, as an index.
     pub(super) kind: u32,
-    pub(super) units: u32,
+    /// In thousandths, as everything here that is an amount.
+    pub(super) units: u64,
 }
 
 /// A compiled problem.
@@ -52,8 +53,8 @@ pub(super) struct Network {
     pub(super) demands: Lists<Demand>,
     pub(super) before: Lists<Place>,
     pub(super) behind: Lists<Place>,
-    /// Units per kind.
-    pub(super) capacity: Vec<u32>,
+    /// By kind, in thousandths of a unit.
+    pub(super) capacity: Vec<u64>,
     /// In nanoseconds, with its own duration; plain dispatch goes by it.
     pub(super) remaining: Vec<u64>,
 }
@@ -65,7 +66,7 @@ impl Network {
         for (number, kind) in problem.capacity.keys().enumerate() {
             kinds.insert(kind, number as u32);
         }
-        let capacity: Vec<u32> = problem.capacity.values().copied().collect();
+        let capacity: Vec<u64> = problem.capacity.values().map(|amount| amount.thousandths()).collect();
         let mut behind = vec![Vec::new(); size];
         for (place, task) in problem.tasks.iter().enumerate() {
             let (instance, duration_s, probability) = (task.instance, task.duration_s, task.probability);
@@ -81,10 +82,10 @@ impl Network {
             }
         }
         let demands = |task: &super::problem::Task| {
-            let mut units: BTreeMap<u32, u32> = BTreeMap::new();
+            let mut units: BTreeMap<u32, u64> = BTreeMap::new();
             for (kind, count) in &task.demands {
                 if let Some(kind) = kinds.get(kind.as_str()) {
-                    *units.entry(*kind).or_default() += count;
+                    *units.entry(*kind).or_default() += count.thousandths();
                 }
             }
             // More than there is can never be granted; the executive hears of that otherwise.

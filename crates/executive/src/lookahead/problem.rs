@@ -1,6 +1,7 @@
 //! What a look-ahead plans: the tasks that have not ended, what they wait for and what they occupy.
 
 use ratn_model::id::InstanceId;
+use ratn_model::resource::Quantity;
 use std::collections::BTreeMap;
 
 /// The rest of a window, as it is most likely to go on: of an undecided condition only the likelier branch.
@@ -8,8 +9,8 @@ use std::collections::BTreeMap;
 pub struct Problem {
     /// In program order.
     pub tasks: Vec<Task>,
-    /// How many units of each resource kind there are, whoever holds them; of a kind that is not listed there is enough.
-    pub capacity: BTreeMap<String, u32>,
+    /// How much of each resource kind there is, whoever holds it; of a kind that is not listed there is enough.
+    pub capacity: BTreeMap<String, Quantity>,
 }
 
 /// An instance that has not ended.
@@ -21,8 +22,8 @@ pub struct Task {
     pub duration_s: f64,
     /// It holds its resources already.
     pub is_running: bool,
-    /// What it blocks: kind and units, all at once, from its begin to its end.
-    pub demands: Vec<(String, u32)>,
+    /// What it blocks: kind and amount, all at once, from its begin to its end.
+    pub demands: Vec<(String, Quantity)>,
     /// The tasks that must have ended before it may ask for resources, as places in [`Problem::tasks`]: producers of its inputs, the writers
     /// of what it reads, and for a PIA everything that must have ended before it.
     pub after: Vec<usize>,

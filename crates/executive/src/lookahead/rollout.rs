@@ -12,8 +12,8 @@ use std::collections::BinaryHeap;
 #[derive(Debug, Clone)]
 pub(super) struct Rollout {
     waits: Vec<u32>,
-    free: Vec<u32>,
-    reserved: Vec<u32>,
+    free: Vec<u64>,
+    reserved: Vec<u64>,
     /// Those that ask, the most urgent first.
     asking: Vec<Place>,
     became_ready: Vec<Place>,
@@ -107,7 +107,7 @@ impl Rollout {
         for at in 0..self.asking.len() {
             let place = self.asking[at];
             let demands = network.demands.of_place(place);
-            let left = |free: &[u32], reserved: &[u32], kind: u32| free[kind as usize] - reserved[kind as usize];
+            let left = |free: &[u64], reserved: &[u64], kind: u32| free[kind as usize] - reserved[kind as usize];
             if demands.iter().all(|d| d.units <= left(&self.free, &self.reserved, d.kind)) {
                 self.begin(network, place, now);
             } else {

@@ -3,13 +3,14 @@
 use super::dice::Dice;
 use super::{Problem, ProblemError, Search, Task};
 use ratn_model::id::InstanceId;
+use ratn_model::resource::Quantity;
 
 fn task(id: u64, duration_s: f64, kind: &str, after: &[usize]) -> Task {
     Task {
         instance: InstanceId(id),
         duration_s,
         is_running: false,
-        demands: vec![(kind.to_owned(), 1)],
+        demands: vec![(kind.to_owned(), Quantity::ONE)],
         after: after.to_vec(),
         is_speculative: false,
         urgency_s: 0.0,
@@ -18,7 +19,7 @@ fn task(id: u64, duration_s: f64, kind: &str, after: &[usize]) -> Task {
 }
 
 fn problem(tasks: Vec<Task>, capacity: &[(&str, u32)]) -> Problem {
-    Problem { tasks, capacity: capacity.iter().map(|(kind, units)| ((*kind).to_owned(), *units)).collect() }
+    Problem { tasks, capacity: capacity.iter().map(|(kind, units)| ((*kind).to_owned(), (*units).into())).collect() }
 }
 
 /// Anything: chains and joins, several units, running and speculative tasks.
@@ -35,7 +36,7 @@ fn random(seed: u64) -> Problem {
             Task {
                 is_running: place < 2 && dice.below(2) == 0,
                 demands: (0..dice.below(3))
-                    .map(|at| (kinds[(at + place) % 3].to_owned(), 1 + dice.below(2) as u32))
+                    .map(|at| (kinds[(at + place) % 3].to_owned(), Quantity::whole(1 + dice.below(2) as u32)))
                     .collect(),
                 is_speculative,
                 urgency_s: dice.share() * 20.0,
@@ -76,6 +77,24 @@ fn what_is_advised_reproduces_the_end_and_is_never_worse_than_what_was() {
         }
         let again = Search::new(&problem, 0).unwrap().best().plain_s;
         assert!((again - advice.end_s).abs() < 1e-9, "seed {seed}: advised {}, came to {again}", advice.end_s);
+    }
+}
+
+#[test]
+fn parts_of_a_unit_are_planned_as_units_are() {
+    for seed in 0..100 {
+        let whole = random(seed);
+        let mut parts = whole.clone();
+        let demands = parts.tasks.iter_mut().flat_map(|task| task.demands.iter_mut().map(|(_, amount)| amount));
+        for amount in parts.capacity.values_mut().chain(demands) {
+            *amount = Quantity::from_thousandths(amount.thousandths() / 8);
+        }
+        let [whole, parts] = [whole, parts].map(|problem| {
+            let mut search = Search::new(&problem, seed).unwrap();
+            search.step(100);
+            search.best()
+        });
+        assert_eq!(whole, parts, "seed {seed}");
     }
 }
 

@@ -49,6 +49,7 @@ use instances::Instances;
 use plan::{Plan, Predicate};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind};
+use ratn_model::resource::Quantity;
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
@@ -72,7 +73,7 @@ pub(crate) struct Window {
     plan: Arc<Plan>,
     tolerance: Tolerance,
     learned: Learned,
-    capacity: BTreeMap<String, u32>,
+    capacity: BTreeMap<String, Quantity>,
     speculation_width: usize,
     instances: Instances,
     cursors: Vec<Cursor>,
@@ -110,7 +111,7 @@ impl Window {
         program: &Program,
         analysis: &Analysis,
         parameters: &BTreeMap<String, Value>,
-        capacity: BTreeMap<String, u32>,
+        capacity: BTreeMap<String, Quantity>,
         learned: Learned,
         tolerance: Tolerance,
     ) -> Window {

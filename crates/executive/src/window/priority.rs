@@ -12,7 +12,7 @@ use crate::context::Context;
 use crate::lookahead;
 use crate::protocol::Command;
 use ratn_model::id::InstanceId;
-use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use std::collections::BTreeMap;
 
 /// From the top: one bit that says "not speculative", milliseconds of remaining path, program order.
@@ -167,7 +167,8 @@ impl Window {
             .filter(|other| self.is_speculative(other.segment))
             .filter(|other| context.analysis.state(other.state).needs_world)
             .count();
-        *capacity <= 1 || taken + 1 < *capacity as usize
+        let rooms = capacity.units() as usize;
+        rooms <= 1 || taken + 1 < rooms
     }
 
     /// Speculative holders give way to a node that is not speculative, where they keep it from its resources.
@@ -176,20 +177,20 @@ impl Window {
         if self.is_speculative(instance.segment) || self.branches.is_empty() {
             return;
         }
-        let needs = |state| -> Vec<(String, u32)> {
+        let needs = |state| -> Vec<(String, Quantity)> {
             let blocks = context.analysis.state(state).requirements.iter();
             let blocks = blocks.filter(|r| r.operation == ResourceOperation::Block);
             blocks.map(|r| (r.kind.clone(), r.count)).collect()
         };
         for (kind, _) in needs(instance.state) {
             let Some(capacity) = self.capacity.get(&kind).copied() else { continue };
-            let mut taken = 0;
-            let mut speculative: Vec<(i64, InstanceId, u32)> = Vec::new();
+            let mut taken = Quantity::ZERO;
+            let mut speculative: Vec<(i64, InstanceId, Quantity)> = Vec::new();
             for other in self.active.iter().filter_map(|id| self.instances.get(*id)) {
-                let count: u32 = needs(other.state).iter().filter(|(k, _)| *k == kind).map(|(_, n)| n).sum();
+                let count: Quantity = needs(other.state).iter().filter(|(k, _)| *k == kind).map(|(_, n)| *n).sum();
                 let certain = !self.is_speculative(other.segment);
                 // What is not speculative and waits shall be served, too.
-                if count > 0 && (certain || other.lease.is_some()) {
+                if !count.is_zero() && (certain || other.lease.is_some()) {
                     taken += count;
                     if !certain {
                         speculative.push((self.priority(other), other.id, count));
@@ -201,7 +202,7 @@ impl Window {
                 if taken <= capacity {
                     break;
                 }
-                taken -= count;
+                taken = taken.saturating_sub(count);
                 context.note(crate::protocol::Note::Preempted { instance: holder, by: id });
                 self.step_back(context, holder, super::instance::Wait::Nothing);
                 self.enqueue(holder);

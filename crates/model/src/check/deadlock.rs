@@ -14,7 +14,7 @@ use super::graph::{ControlFlow, Point};
 use crate::diagnostic::Findings;
 use crate::id::StateId;
 use crate::program::{Program, ResourceExpr, SUCCESS, State, StateKind};
-use crate::resource::ResourceOperation;
+use crate::resource::{Quantity, ResourceOperation};
 use std::collections::{BTreeMap, BTreeSet};
 
 const RULE: &str = "may-deadlock";
@@ -78,7 +78,7 @@ fn too_many_together(subject: &Subject<'_>, node: &State, findings: &mut Finding
     }
     for (kind, parts) in wanted {
         let Some(offer) = subject.catalogue.resources.get(kind) else { continue };
-        let count = parts.iter().fold(0_u32, |sum, (_, line)| sum.saturating_add(line.count));
+        let count = parts.iter().map(|(_, line)| line.count).sum::<Quantity>();
         let states: BTreeSet<StateId> = parts.iter().map(|(state, _)| state.id).collect();
         // What one state asks for alone is another rule's.
         if count <= offer.count || states.len() < 2 {
@@ -99,7 +99,7 @@ fn too_many_together(subject: &Subject<'_>, node: &State, findings: &mut Finding
 fn written(line: &ResourceExpr) -> String {
     let attributes = line.attributes.iter().map(|(name, value)| format!("{name} = {value}"));
     let attributes: Vec<String> = attributes.chain(line.conditions.iter().map(ToString::to_string)).collect();
-    let count = if line.count == 1 { String::new() } else { format!("{} × ", line.count) };
+    let count = if line.count == Quantity::ONE { String::new() } else { format!("{} × ", line.count) };
     match attributes.is_empty() {
         true => format!("{count}`{}`", line.kind),
         false => format!("{count}`{}` where {}", line.kind, attributes.join(", ")),

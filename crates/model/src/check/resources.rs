@@ -5,23 +5,21 @@ use super::Subject;
 use crate::diagnostic::Findings;
 use crate::load::suggestion;
 use crate::program::{Nature, ResourceExpr, State, StateKind};
-use crate::resource::{ResourceClass, ResourceOperation};
+use crate::resource::{Quantity, ResourceClass, ResourceOperation};
 use std::collections::{BTreeMap, BTreeSet};
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
-    let created: BTreeSet<&str> = subject
-        .program
-        .states
-        .iter()
-        .flat_map(|state| &state.annotations.resources)
-        .filter(|r| r.operation == ResourceOperation::Create)
-        .map(|r| r.kind.as_str())
-        .collect();
+    let lines = subject.program.states.iter().flat_map(|state| &state.annotations.resources);
+    let mut created = Created::new();
+    for line in lines.filter(|line| line.operation == ResourceOperation::Create) {
+        *created.entry(&line.kind).or_default() |= line.divisible;
+    }
     for state in &subject.program.states {
         for (i, resource) in state.annotations.resources.iter().enumerate() {
             offered(subject, state, i, resource, &created, findings);
         }
         too_many(subject, state, findings);
+        parts_of_a_unit(subject, state, &created, findings);
         deletes_what_it_holds(subject, state, findings);
         exists_of_a_composite(subject, state, findings);
         if let StateKind::Action { provider, .. } = &state.kind {
@@ -30,6 +28,9 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
         }
     }
 }
+
+/// The kinds that the task creates, and whether any of them is divisible.
+type Created<'a> = BTreeMap<&'a str, bool>;
 
 fn is_task_class(resource: &ResourceExpr) -> bool {
     resource.class == Some(ResourceClass::Task)
@@ -40,14 +41,14 @@ fn offered(
     state: &State,
     i: usize,
     resource: &ResourceExpr,
-    created: &BTreeSet<&str>,
+    created: &Created<'_>,
     findings: &mut Findings,
 ) {
     let at = subject.place(state, &format!("resources.{i}"));
     let offer = subject.catalogue.resources.get(&resource.kind);
-    let by_the_task = resource.operation == ResourceOperation::Create || created.contains(resource.kind.as_str());
+    let by_the_task = resource.operation == ResourceOperation::Create || created.contains_key(resource.kind.as_str());
     if offer.is_none() && !by_the_task {
-        let known = subject.catalogue.resources.keys().map(String::as_str).chain(created.iter().copied());
+        let known = subject.catalogue.resources.keys().map(String::as_str).chain(created.keys().copied());
         let message = format!("no template or module of the system provides `{}`", resource.kind);
         let help = suggestion(&resource.kind, known, "", "offer it in the catalogue, or create it in an older state");
         findings.error("unknown-resource", at, &state.path, message, help);
@@ -67,14 +68,16 @@ fn offered(
 
 /// What one node blocks at once: its own lines by kind and attributes, merged with those around it by maximum.
 fn too_many(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
-    let mut own = BTreeMap::<&str, (u32, usize)>::new();
+    use ResourceOperation::{Block, Consume, Create, Delete, Exists};
+    let mut own = BTreeMap::<&str, (Quantity, usize)>::new();
     for (i, resource) in state.annotations.resources.iter().enumerate() {
-        if matches!(resource.operation, ResourceOperation::Block | ResourceOperation::Exists) {
-            let (count, _) = own.entry(&resource.kind).or_insert((0, i));
-            *count = match resource.operation {
-                ResourceOperation::Block => count.saturating_add(resource.count),
-                _ => (*count).max(resource.count),
-            };
+        let (count, _) = own.entry(&resource.kind).or_insert((Quantity::ZERO, i));
+        match resource.operation {
+            Block => *count += resource.count,
+            // What contains others consumes at its end, when it holds nothing.
+            Consume if matches!(state.kind, StateKind::Action { .. }) => *count += resource.count,
+            Consume | Exists => *count = (*count).max(resource.count),
+            Create | Delete => {}
         }
     }
     for (kind, (count, i)) in own {
@@ -83,6 +86,24 @@ fn too_many(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
             let message = format!("this asks for {count} of `{kind}` at once; the system can have {}", offer.count);
             let at = subject.place(state, &format!("resources.{i}"));
             findings.error("too-many-resources", at, &state.path, message, "ask for fewer, or offer more");
+        }
+    }
+}
+
+/// A part of a unit is asked for only of what is divisible: says the catalogue, or the task that creates it.
+fn parts_of_a_unit(subject: &Subject<'_>, state: &State, created: &Created<'_>, findings: &mut Findings) {
+    for (i, resource) in state.annotations.resources.iter().enumerate().filter(|(_, r)| !r.count.is_whole()) {
+        let kind = resource.kind.as_str();
+        let divisible = match (resource.operation, subject.catalogue.resources.get(kind)) {
+            (ResourceOperation::Create, _) => resource.divisible,
+            (_, Some(offer)) => offer.divisible || created.get(kind).is_some_and(|divisible| *divisible),
+            (_, None) => created.get(kind).is_none_or(|divisible| *divisible),
+        };
+        if !divisible {
+            let message = format!("this asks for {} of `{kind}`, of which there are whole units only", resource.count);
+            let help = "ask for a whole number, or say `divisible: true` where it is created or offered";
+            let at = subject.place(state, &format!("resources.{i}"));
+            findings.error("indivisible-resource", at, &state.path, message, help);
         }
     }
 }

@@ -78,6 +78,7 @@ impl ResourceExpr {
             attributes: attributes.collect::<Result<_, EvaluateError>>()?,
             conditions: conditions.collect::<Result<_, EvaluateError>>()?,
             count: self.count,
+            divisible: self.divisible,
         })
     }
 }

@@ -7,6 +7,7 @@ use crate::expression::parse::{Names, ParseError, parse_effect, parse_expression
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::id::StateId;
 use crate::program::Location;
+use crate::resource::Quantity;
 use crate::value::Value;
 use std::collections::BTreeMap;
 
@@ -164,6 +165,26 @@ impl<'t, 'a> Fields<'t, 'a> {
             self.error("type-mismatch", node.at, message, "");
         }
         count
+    }
+
+    /// An amount of a resource: more than nothing.
+    pub(crate) fn quantity(&mut self, node: &Node, what: &str) -> Option<Quantity> {
+        let number = match node.content {
+            Content::Int(i) => i as f64,
+            Content::Float(number) => number,
+            _ => {
+                let message = format!("`{what}` is a number, found {}", node.described());
+                self.error("type-mismatch", node.at, message, "write an amount such as 2 or 0.5");
+                return None;
+            }
+        };
+        let wrong = match Quantity::try_from(number) {
+            Ok(Quantity::ZERO) => "is 0: that asks for nothing".to_owned(),
+            Ok(quantity) => return Some(quantity),
+            Err(error) => error.to_string(),
+        };
+        self.error("invalid-amount", node.at, format!("`{what}` {wrong}"), "write an amount such as 2 or 0.5");
+        None
     }
 
     pub(crate) fn word<'n>(&mut self, node: &'n Node, what: &str) -> Option<&'n str> {

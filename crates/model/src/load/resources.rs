@@ -5,7 +5,7 @@ use super::yaml::{Content, Entry, Node};
 use crate::condition::{Comparison, ConditionExpr};
 use crate::expression::Expr;
 use crate::program::{ResourceExpr, WORLD_MODEL};
-use crate::resource::{ResourceClass, ResourceOperation};
+use crate::resource::{Quantity, ResourceClass, ResourceOperation};
 use crate::value::Value;
 
 const OPERATIONS: [(&str, ResourceOperation); 5] = [
@@ -54,9 +54,26 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
     };
     fields.keys(
         item,
-        &["block", "consume", "create", "delete", "exists", "class", "count", "where", "with", "hold", "unordered"],
+        &[
+            "block",
+            "consume",
+            "create",
+            "delete",
+            "exists",
+            "class",
+            "count",
+            "divisible",
+            "where",
+            "with",
+            "hold",
+            "unordered",
+        ],
         &[],
     );
+    if let Some(node) = item.get("divisible").filter(|_| *operation != ResourceOperation::Create) {
+        let help = "leave it out: what is there already says so itself";
+        fields.error("conflicting-annotations", node.at, "`divisible` is said of a `create`", help);
+    }
     for key in ["hold", "unordered"] {
         if let Some(node) = item.get(key).filter(|_| *operation != ResourceOperation::Block) {
             let help = "leave it out: nothing of it is held while the state runs";
@@ -64,7 +81,8 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
         }
     }
     let kind = fields.word(&entry.value, "a kind of resource")?.to_owned();
-    let count = item.get("count").map_or(Some(1), |node| fields.count(node, "count", 1))?;
+    let count = item.get("count").map_or(Some(Quantity::ONE), |node| fields.quantity(node, "count"))?;
+    let divisible = item.get("divisible").is_some_and(|node| fields.flag(node));
     let class = match item.get("class") {
         None => None,
         Some(node) => {
@@ -90,7 +108,7 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
         fields.error("invalid-state", item.at, "what is created is not chosen by conditions", help);
     }
     let unordered = item.get("unordered").is_some_and(|node| fields.flag(node));
-    Some(ResourceExpr { operation: *operation, kind, class, attributes, conditions, count, unordered })
+    Some(ResourceExpr { operation: *operation, kind, class, attributes, conditions, count, divisible, unordered })
 }
 
 /// `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`.

@@ -8,7 +8,7 @@ use crate::types::{
 use crate::v1;
 use ratn_model::condition::{Comparison, Condition};
 use ratn_model::id::{FencingToken, LeaseId, Revision};
-use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{Lease, LeasedResource, Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::value::Value;
 
 impl From<ResourceClass> for v1::ResourceClass {
@@ -61,6 +61,19 @@ fn operation(number: i32) -> Result<ResourceOperation, Malformed> {
     }
 }
 
+/// An amount as it may come from anywhere.
+fn amount(number: f64, field: &str) -> Result<Quantity, Malformed> {
+    Quantity::try_from(number).map_err(|error| Malformed::new(field, error.to_string()))
+}
+
+/// An amount that is something.
+fn some(number: f64, field: &str) -> Result<Quantity, Malformed> {
+    match amount(number, field)? {
+        Quantity::ZERO => Err(Malformed::new(field, "is 0: it must be more than nothing")),
+        quantity => Ok(quantity),
+    }
+}
+
 impl From<Requirement> for v1::Requirement {
     fn from(requirement: Requirement) -> v1::Requirement {
         v1::Requirement {
@@ -68,8 +81,9 @@ impl From<Requirement> for v1::Requirement {
             kind: requirement.kind,
             class: requirement.class.map_or(v1::ResourceClass::Unspecified, v1::ResourceClass::from).into(),
             attributes: wire_ports(requirement.attributes),
-            count: requirement.count,
+            count: requirement.count.into(),
             conditions: all(requirement.conditions),
+            divisible: requirement.divisible,
         }
     }
 }
@@ -79,15 +93,13 @@ impl TryFrom<v1::Requirement> for Requirement {
 
     fn try_from(requirement: v1::Requirement) -> Result<Requirement, Malformed> {
         name(&requirement.kind, "kind")?;
-        if requirement.count == 0 {
-            return Err(Malformed::new("count", "is 0: it must be at least 1"));
-        }
         Ok(Requirement {
             operation: operation(requirement.operation)?,
             kind: requirement.kind,
             class: class(requirement.class)?,
             attributes: ports(requirement.attributes, "attributes")?,
-            count: requirement.count,
+            count: some(requirement.count, "count")?,
+            divisible: requirement.divisible,
             conditions: each(requirement.conditions, "conditions")?,
         })
     }
@@ -141,7 +153,11 @@ impl TryFrom<v1::Condition> for Condition {
 
 impl From<Demand> for v1::Demand {
     fn from(demand: Demand) -> v1::Demand {
-        v1::Demand { requirement: Some(demand.requirement.into()), kinds: demand.kinds, provided: demand.provided }
+        v1::Demand {
+            requirement: Some(demand.requirement.into()),
+            kinds: demand.kinds,
+            provided: demand.provided.into(),
+        }
     }
 }
 
@@ -150,7 +166,7 @@ impl TryFrom<v1::Demand> for Demand {
 
     fn try_from(demand: v1::Demand) -> Result<Demand, Malformed> {
         let requirement = required(demand.requirement, "requirement")?;
-        Ok(Demand { requirement, kinds: demand.kinds, provided: demand.provided })
+        Ok(Demand { requirement, kinds: demand.kinds, provided: amount(demand.provided, "provided")? })
     }
 }
 
@@ -205,7 +221,7 @@ impl From<Holding> for v1::Holding {
         v1::Holding {
             lease_id: holding.lease.0,
             token: holding.token.0,
-            units: holding.units,
+            units: holding.units.into(),
             session_id: holding.session,
             holder: holding.holder,
         }
@@ -221,7 +237,7 @@ impl TryFrom<v1::Holding> for Holding {
         Ok(Holding {
             lease: LeaseId(holding.lease_id),
             token: FencingToken(holding.token),
-            units: holding.units,
+            units: amount(holding.units, "units")?,
             session: holding.session_id,
             holder: holding.holder,
         })
@@ -240,12 +256,14 @@ impl From<Resource> for v1::Resource {
             class: v1::ResourceClass::from(resource.class).into(),
             kind: resource.kind,
             attributes: wire_ports(resource.attributes),
-            capacity: resource.capacity,
+            capacity: resource.capacity.into(),
+            divisible: resource.divisible,
+            non_renewable: !resource.renewable,
             host: resource.host,
             session_id: resource.session,
             revision: resource.revision.0,
             state: state.into(),
-            free: resource.free,
+            free: resource.free.into(),
             holdings: all(resource.holdings),
         }
     }
@@ -259,9 +277,6 @@ impl TryFrom<v1::Resource> for Resource {
         name(&resource.kind, "kind")?;
         label(&resource.host, "host")?;
         label(&resource.session_id, "session_id")?;
-        if resource.capacity == 0 {
-            return Err(Malformed::new("capacity", "is 0: a resource has at least one unit"));
-        }
         let state = match v1::ResourceState::try_from(resource.state) {
             Ok(v1::ResourceState::Unspecified | v1::ResourceState::Free) => ResourceState::Free,
             Ok(v1::ResourceState::Leased) => ResourceState::Leased,
@@ -273,12 +288,14 @@ impl TryFrom<v1::Resource> for Resource {
             class: class(resource.class)?.ok_or_else(|| Malformed::new("class", "is not set"))?,
             kind: resource.kind,
             attributes: ports(resource.attributes, "attributes")?,
-            capacity: resource.capacity,
+            capacity: some(resource.capacity, "capacity")?,
+            divisible: resource.divisible,
+            renewable: !resource.non_renewable,
             host: resource.host,
             session: resource.session_id,
             revision: Revision(resource.revision),
             state,
-            free: resource.free,
+            free: amount(resource.free, "free")?,
             holdings: each(resource.holdings, "holdings")?,
         })
     }

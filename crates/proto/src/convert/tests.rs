@@ -11,7 +11,7 @@ use ratn_model::fact::{Change, FactPattern, Footprint, Term};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::pose::Pose;
-use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{Lease, LeasedResource, Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::value::{Trajectory, TrajectoryPoint};
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -109,16 +109,21 @@ fn requirement() -> impl Strategy<Value = Requirement> {
     let operation = prop::sample::select(vec![Block, Consume, Create, Delete, Exists]);
     let attributes = btree_map(a_name(), value(), 0..3);
     let conditions = vec(condition(), 0..3);
-    (operation, a_name(), prop::option::of(class()), attributes, conditions, 1..9_u32).prop_map(
-        |(operation, kind, class, attributes, conditions, count)| Requirement {
+    (operation, a_name(), prop::option::of(class()), attributes, conditions, amount(), any::<bool>()).prop_map(
+        |(operation, kind, class, attributes, conditions, count, divisible)| Requirement {
             operation,
             kind,
             class,
             attributes,
             conditions,
             count,
+            divisible,
         },
     )
+}
+
+fn amount() -> impl Strategy<Value = Quantity> {
+    (1..=Quantity::MAX.thousandths()).prop_map(Quantity::from_thousandths)
 }
 
 fn condition() -> impl Strategy<Value = Condition> {
@@ -145,24 +150,34 @@ fn lease() -> impl Strategy<Value = Lease> {
 
 fn resource() -> impl Strategy<Value = Resource> {
     let state = prop::sample::select(vec![ResourceState::Free, ResourceState::Leased, ResourceState::Exhausted]);
-    let holding = (any::<u64>(), any::<u64>(), 1..3_u32, a_name()).prop_map(|(lease, token, units, session)| Holding {
+    let holding = (any::<u64>(), any::<u64>(), amount(), a_name()).prop_map(|(lease, token, units, session)| Holding {
         lease: LeaseId(lease),
         token: FencingToken(token),
         units,
         holder: format!("{session}/a"),
         session,
     });
-    (a_name(), class(), a_name(), btree_map(a_name(), value(), 0..3), 1..9_u32, state, vec(holding, 0..3)).prop_map(
-        |(id, class, kind, attributes, capacity, state, holdings)| Resource {
+    (
+        a_name(),
+        class(),
+        a_name(),
+        btree_map(a_name(), value(), 0..3),
+        amount(),
+        any::<[bool; 2]>(),
+        state,
+        vec(holding, 0..3),
+    )
+        .prop_map(|(id, class, kind, attributes, capacity, [divisible, renewable], state, holdings)| Resource {
             attributes,
             capacity,
+            divisible,
+            renewable,
             state,
             holdings,
             session: "s".to_owned(),
-            revision: Revision(u64::from(capacity)),
+            revision: Revision(capacity.thousandths()),
             ..Resource::new(id, class, kind).on_host("here")
-        },
-    )
+        })
 }
 
 fn update() -> impl Strategy<Value = ResourceUpdate> {
@@ -327,9 +342,22 @@ fn what_means_nothing_is_refused_with_its_path() {
     refused::<FactKey, _>(v1::FactKey { predicate: "x".repeat(2000), arguments: vec![] }, "at most 1024");
     refused::<Change, _>(v1::Change { kind: None }, "one of set, delete, increase");
     refused::<Requirement, _>(
-        v1::Requirement { kind: "Arm".to_owned(), count: 1, operation: 99, ..Default::default() },
+        v1::Requirement { kind: "Arm".to_owned(), count: 1.0, operation: 99, ..Default::default() },
         "operation: 99",
     );
+    for (count, why) in [
+        (0.0, "count: is 0: it must be more than nothing"),
+        (-1.0, "count: is -1: an amount is not negative"),
+        (f64::NAN, "count: is `NaN`: an amount is a number"),
+        (f64::INFINITY, "count: is `inf`: an amount is a number"),
+        (0.1234, "count: is 0.1234: an amount has at most three decimals"),
+        (1e300, "an amount is at most 4294967295"),
+    ] {
+        let requirement = v1::Requirement { kind: "Arm".to_owned(), operation: 1, count, ..Default::default() };
+        refused::<Requirement, _>(requirement, why);
+        let resource = v1::Resource { kind: "Arm".to_owned(), class: 3, capacity: count, ..Default::default() };
+        refused::<Resource, _>(resource, &why.replace("count", "capacity"));
+    }
 }
 
 #[test]

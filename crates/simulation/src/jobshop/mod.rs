@@ -12,6 +12,7 @@ pub use format::{InvalidJobShop, MAX_OPERATIONS};
 
 use crate::run::{Answer, Oracle, Performance, Run, RunError, Setup, run_looking_ahead};
 use ratn_executive::protocol::{Goal, Mode};
+use ratn_model::catalogue::ResourceOffer;
 use ratn_model::expression::Expr;
 use ratn_model::id::StateId;
 use ratn_model::program::{
@@ -94,7 +95,9 @@ impl JobShop {
             mode: Mode::Cdtn,
             parameters: BTreeMap::new(),
             seed,
-            resources: (0..self.machines).map(|m| (machine_kind(m), ResourceClass::Process, 1)).collect(),
+            resources: (0..self.machines)
+                .map(|m| (machine_kind(m), ResourceOffer::new(ResourceClass::Process, 1)))
+                .collect(),
             world: Vec::new(),
             tolerance: Tolerance::EXACT,
             latency: Duration::ZERO,

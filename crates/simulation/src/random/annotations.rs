@@ -174,7 +174,7 @@ pub(super) fn block(kind: &str) -> ResourceExpr {
 }
 
 pub(super) fn resource(operation: ResourceOperation, kind: &str, count: u32) -> ResourceExpr {
-    ResourceExpr { count, ..ResourceExpr::new(operation, kind) }
+    ResourceExpr { count: count.into(), ..ResourceExpr::new(operation, kind) }
 }
 
 pub(super) fn task_resource(operation: ResourceOperation) -> ResourceExpr {

@@ -6,6 +6,7 @@ use super::trial::{Conditions, Verdict, trial};
 use super::{around, is_preemptive};
 use ratn_model::expression::Expr;
 use ratn_model::program::{Program, StateKind};
+use ratn_model::resource::Quantity;
 use ratn_model::value::Value;
 use std::sync::Arc;
 
@@ -110,7 +111,7 @@ fn simplify(program: &mut Program, at: usize, what: usize) {
             a.effects.insert("success".to_owned(), Vec::new());
         }
         10 => a.resources.retain(|r| r.operation == ratn_model::resource::ResourceOperation::Block),
-        11 => a.resources.iter_mut().for_each(|r| r.count = 1),
+        11 => a.resources.iter_mut().for_each(|r| r.count = Quantity::ONE),
         12 => state.assign.clear(),
         13 => state.defaults.clear(),
         14..18 => {

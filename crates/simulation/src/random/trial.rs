@@ -7,6 +7,7 @@ use super::weak;
 use super::{Dice, Features, HashOracle, RESOURCES, is_in_routine, state_of};
 use crate::run::{Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
 use ratn_executive::protocol::{Event, Mode};
+use ratn_model::catalogue::ResourceOffer;
 use ratn_model::program::{Program, StateKind};
 use ratn_model::tolerance::Tolerance;
 use std::collections::{BTreeMap, BTreeSet};
@@ -110,7 +111,10 @@ pub fn execute(
         mode,
         parameters: BTreeMap::new(),
         seed,
-        resources: RESOURCES.iter().map(|(kind, class, units)| ((*kind).to_owned(), *class, *units)).collect(),
+        resources: RESOURCES
+            .iter()
+            .map(|(kind, class, units)| ((*kind).to_owned(), ResourceOffer::new(*class, *units)))
+            .collect(),
         world: Vec::new(),
         tolerance: Tolerance::EXACT,
         latency: Duration::from_secs_f64(conditions.latency_s),

@@ -15,10 +15,10 @@ use annotate::{annotated, missing};
 use providers::AssumedProviders;
 use ratn_executive::protocol::{Command, LogEntry};
 use ratn_executive::protocol::{Mode, Note};
-use ratn_model::catalogue::Catalogue;
+use ratn_model::catalogue::{Catalogue, ResourceOffer};
 use ratn_model::id::StateId;
 use ratn_model::program::{Program, SUCCESS};
-use ratn_model::resource::ResourceClass;
+use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use serde::Serialize;
@@ -44,8 +44,8 @@ pub struct Assumptions {
     pub elements: usize,
     /// Durations that earlier runs have taught, by plain path, in seconds.
     pub durations_s: BTreeMap<String, f64>,
-    /// Units of each resource kind, where they are not as many as the catalogue allows.
-    pub units: BTreeMap<String, u32>,
+    /// How much there is of each resource kind, where it is not as much as the catalogue allows.
+    pub units: BTreeMap<String, Quantity>,
 }
 
 /// What keeps a task sequential.
@@ -185,7 +185,10 @@ fn simulate(
         Mode::Hsm => "HSM",
         Mode::Cdtn => "CDTN",
     };
-    let units = |kind: &str, count: u32| assumptions.units.get(kind).copied().unwrap_or(count);
+    let assumed = |kind: &String, offer: &ResourceOffer| match assumptions.units.get(kind) {
+        Some(units) => ResourceOffer { count: *units, ..offer.clone() },
+        None => offer.clone(),
+    };
     let offered = catalogue.resources.iter().filter(|(_, offer)| offer.class != ResourceClass::Task);
     let mut program = program.clone();
     // How long it may take is not asked here.
@@ -196,7 +199,7 @@ fn simulate(
         mode,
         parameters: assumptions.parameters.clone(),
         seed: 1,
-        resources: offered.map(|(kind, offer)| (kind.clone(), offer.class, units(kind, offer.count))).collect(),
+        resources: offered.map(|(kind, offer)| (kind.clone(), assumed(kind, offer))).collect(),
         world: Vec::new(),
         tolerance: Tolerance::EXACT,
         latency: Duration::ZERO,

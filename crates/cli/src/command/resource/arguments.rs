@@ -1,7 +1,7 @@
 //! The command line of `ratn resource`.
 
 use clap::{Args, Subcommand};
-use ratn_model::resource::ResourceClass;
+use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::value::Value;
 use ratn_worker::endpoint::Endpoint;
 use std::path::PathBuf;
@@ -86,9 +86,15 @@ pub(super) struct CreateArguments {
     /// Its id; the resource manager gives one unless given
     #[arg(long, value_name = "ID", default_value = "")]
     pub(super) id: String,
-    /// Units of it
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
-    pub(super) capacity: u32,
+    /// How much of it there is, `3` or, of what is divisible, `2.5`
+    #[arg(long, value_name = "N", default_value = "1", value_parser = amount)]
+    pub(super) capacity: Quantity,
+    /// Parts of a unit of it can be had
+    #[arg(long)]
+    pub(super) divisible: bool,
+    /// What is consumed of it is gone for good, and not back at the end of the task
+    #[arg(long)]
+    pub(super) non_renewable: bool,
     /// The host that it is on
     #[arg(long, value_name = "NAME", default_value = "")]
     pub(super) host: String,
@@ -103,9 +109,9 @@ pub(super) struct Selector {
     /// Their kind
     #[arg(value_name = "KIND")]
     pub(super) kind: String,
-    /// How many
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
-    pub(super) count: u32,
+    /// How many, or of what is divisible how much: `0.5`
+    #[arg(long, value_name = "N", default_value = "1", value_parser = amount)]
+    pub(super) count: Quantity,
     /// Their class
     #[arg(long, value_name = "CLASS", value_parser = class)]
     pub(super) class: Option<ResourceClass>,
@@ -136,6 +142,14 @@ fn class(text: &str) -> Result<ResourceClass, String> {
     use ResourceClass::{Module, Process, System, Task, World};
     let known = [System, Process, Module, World, Task].into_iter().find(|class| class.to_string() == text);
     known.ok_or_else(|| "expected system, process, module, world or task".to_owned())
+}
+
+fn amount(text: &str) -> Result<Quantity, String> {
+    match text.parse::<Quantity>() {
+        Ok(Quantity::ZERO) => Err("is 0: expected more than nothing".to_owned()),
+        Ok(quantity) => Ok(quantity),
+        Err(error) => Err(error.to_string()),
+    }
 }
 
 /// A number or a truth value where it reads as one, else text.

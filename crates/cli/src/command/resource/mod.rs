@@ -176,6 +176,8 @@ impl arguments::CreateArguments {
         Resource {
             attributes: self.attributes.iter().cloned().collect(),
             host: self.host.clone(),
+            divisible: self.divisible,
+            renewable: !self.non_renewable,
             ..Resource::new(&self.id, self.class, &self.kind).with_capacity(self.capacity)
         }
     }

@@ -32,7 +32,7 @@ pub(super) fn in_full(resource: &Resource) -> String {
         ["class".to_owned(), resource.class.to_string()],
         ["host".to_owned(), resource.host.clone()],
         ["state".to_owned(), state(resource.state).to_owned()],
-        ["free".to_owned(), format!("{} of {}", resource.free, resource.capacity)],
+        ["free".to_owned(), amounts(resource)],
         [
             "owner".to_owned(),
             if resource.session.is_empty() { "nobody: it stays".into() } else { resource.session.clone() },
@@ -144,6 +144,7 @@ pub(super) fn resource_json(resource: &Resource) -> serde_json::Value {
     json!({
         "id": resource.id, "kind": resource.kind, "class": resource.class.to_string(), "host": resource.host,
         "state": state(resource.state), "free": resource.free, "capacity": resource.capacity,
+        "divisible": resource.divisible, "renewable": resource.renewable,
         "session": resource.session, "revision": resource.revision.0, "attributes": attributes,
         "holdings": holdings.collect::<Vec<_>>(),
     })
@@ -175,6 +176,13 @@ fn plain(value: &Value) -> serde_json::Value {
         Value::String(text) => json!(text),
         other => json!(other.to_string()),
     }
+}
+
+/// What is free of what there is, and how it is to be had.
+fn amounts(resource: &Resource) -> String {
+    let parts = if resource.divisible { ", in parts" } else { "" };
+    let spent = if resource.renewable { "" } else { ", gone when it is consumed" };
+    format!("{} of {}{parts}{spent}", resource.free, resource.capacity)
 }
 
 fn holders(resource: &Resource) -> String {
@@ -209,19 +217,19 @@ mod tests {
     use super::*;
     use insta::assert_snapshot;
     use ratn_model::id::{FencingToken, LeaseId, Revision};
-    use ratn_model::resource::ResourceClass;
+    use ratn_model::resource::{Quantity, ResourceClass};
     use ratn_proto::types::Holding;
 
     fn arm() -> Resource {
         let mut arm = Resource::new("arm", ResourceClass::Module, "Arm")
             .with_attribute("reach", Value::Float(1.2))
             .on_host("sim");
-        arm.free = 0;
+        arm.free = Quantity::ZERO;
         arm.state = ResourceState::Leased;
         arm.holdings = vec![Holding {
             lease: LeaseId(7),
             token: FencingToken(12),
-            units: 1,
+            units: Quantity::ONE,
             session: "s".to_owned(),
             holder: "fetch/approach".to_owned(),
         }];

@@ -102,7 +102,7 @@ impl Bench {
     /// How many units of a kind there are.
     async fn units(&self, kind: &str) -> anyhow::Result<u32> {
         let resources = self.performer.resources.list(&[kind]).await?;
-        Ok(resources.iter().map(|resource| resource.capacity).sum())
+        Ok(resources.iter().map(|resource| resource.capacity.units()).sum())
     }
 
     async fn granted(&mut self, to: InstanceId) -> anyhow::Result<LeaseId> {
@@ -189,7 +189,7 @@ async fn a_grant_that_crosses_its_withdrawal_goes_back() -> anyhow::Result<()> {
 }
 
 fn create(kind: &str, count: u32) -> Requirement {
-    Requirement { operation: ResourceOperation::Create, kind: kind.to_owned(), count, ..arm().remove(0) }
+    Requirement { operation: ResourceOperation::Create, kind: kind.to_owned(), count: count.into(), ..arm().remove(0) }
 }
 
 fn done() -> Vec<Change> {

@@ -14,7 +14,7 @@ pub(super) fn demanded(demands: &[Demand], kind: &str, host: &str) -> u32 {
             && demand.requirement.class.is_none_or(|class| class == ResourceClass::Process)
             && demand.requirement.accepts(of_workers)
     };
-    let count = |demand: &Demand| demand.provided.saturating_add(demand.requirement.count);
+    let count = |demand: &Demand| (demand.provided + demand.requirement.count).units_up();
     demands.iter().filter(met).map(count).max().unwrap_or(0)
 }
 
@@ -25,9 +25,9 @@ mod tests {
 
     fn demand(missing: u32, edit: impl FnOnce(&mut Requirement)) -> Demand {
         let mut requirement =
-            Requirement { count: missing, ..Requirement::new(ResourceOperation::Block, "PathPlanner") };
+            Requirement { count: missing.into(), ..Requirement::new(ResourceOperation::Block, "PathPlanner") };
         edit(&mut requirement);
-        Demand { requirement, kinds: vec!["Planner".to_owned(), "PathPlanner".to_owned()], provided: 1 }
+        Demand { requirement, kinds: vec!["Planner".to_owned(), "PathPlanner".to_owned()], provided: 1.into() }
     }
 
     #[test]

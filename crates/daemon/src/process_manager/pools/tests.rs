@@ -278,8 +278,9 @@ fn in_the_end_everything_is_stopped_and_nothing_is_started() {
 }
 
 fn demand(provided: u32, missing: u32) -> [Demand; 1] {
-    let requirement = Requirement { count: missing, ..Requirement::new(ResourceOperation::Block, "PathPlanner") };
-    [Demand { requirement, kinds: vec!["Planner".to_owned(), "PathPlanner".to_owned()], provided }]
+    let requirement =
+        Requirement { count: missing.into(), ..Requirement::new(ResourceOperation::Block, "PathPlanner") };
+    [Demand { requirement, kinds: vec!["Planner".to_owned(), "PathPlanner".to_owned()], provided: provided.into() }]
 }
 
 #[test]
