@@ -129,6 +129,12 @@ async fn beyond_the_bounds_on_waiters_a_request_is_refused_with_a_delay_to_try_a
     let last = ask(&b, "b1", 1).await;
     let refused = in_time(raw.acquire(acquire(&b, "b2", 60_000))).await.unwrap_err();
     refused_for_their_number(&refused, "waiters");
+    // What can be had at once is had, however many wait for something else.
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    for client in [&a, &b] {
+        let arm = client.resources.acquire(vec![block("Arm")], AcquireOptions::default()).await.unwrap();
+        client.resources.release(arm.id).await.unwrap();
+    }
     // A place that is left can be taken.
     assert!(a.resources.withdraw("a1").await.unwrap());
     let taken = ask(&b, "b2", 1).await;

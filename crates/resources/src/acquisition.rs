@@ -101,13 +101,7 @@ impl Pool {
         fingerprint: u128,
     ) -> Result<WaiterId, PoolError> {
         use ResourceOperation::{Block, Consume, Exists};
-        let session = self.session(&request.session)?;
-        if session.waiters.len() >= self.limits.waiters_per_session {
-            return Err(PoolError::TooMany { what: "waiters of one session", limit: self.limits.waiters_per_session });
-        }
-        if self.queue.len() >= self.limits.waiters {
-            return Err(PoolError::TooMany { what: "waiters", limit: self.limits.waiters });
-        }
+        let full = self.no_room(&request.session)?;
         self.check_requirements(&request.requirements, &[Block, Consume, Exists])?;
         if request.purpose.chars().count() > self.limits.name_length {
             return Err(malformed("purpose", &format!("at most {} characters", self.limits.name_length)));
@@ -117,10 +111,15 @@ impl Pool {
         }
         self.next_waiter += 1;
         let id = WaiterId(self.next_waiter);
-        if let Some(taken) = self.at_once((Reverse(request.priority), id), &request.requirements) {
+        let place = (Reverse(request.priority), id);
+        if let Some(taken) = self.at_once(place, &request.requirements) {
             self.give(id, request, request_id.to_owned(), fingerprint, taken);
             self.schedule();
             return Ok(id);
+        }
+        // A more urgent one may be served with what a waiter has reserved; of any other one it is known that it has to wait.
+        if let Some(full) = full.as_ref().filter(|_| !self.is_before_others(place, &request.requirements)) {
+            return Err(full.clone());
         }
         let groups: Vec<Key> = request.requirements.iter().map(key).collect();
         let new = groups.iter().filter(|key| !self.queue.groups.contains_key(*key)).count();
@@ -141,7 +140,26 @@ impl Pool {
         let (hopeful, lacks, overtaken) = Default::default();
         self.join(id, Waiter { request, request_id, groups, hopeful, reserved, lacks, overtaken });
         self.schedule();
-        Ok(id)
+        match full {
+            Some(full) if self.queue.get(id).is_some() => {
+                self.leave(id);
+                self.schedule();
+                Err(full)
+            }
+            _ => Ok(id),
+        }
+    }
+
+    /// Why one more of a session could not wait, if it could not.
+    fn no_room(&self, session: &SessionId) -> Result<Option<PoolError>, PoolError> {
+        let (of_session, limits) = (self.session(session)?.waiters.len(), &self.limits);
+        Ok(if of_session >= limits.waiters_per_session {
+            Some(PoolError::TooMany { what: "waiters of one session", limit: limits.waiters_per_session })
+        } else if self.queue.len() >= limits.waiters {
+            Some(PoolError::TooMany { what: "waiters", limit: limits.waiters })
+        } else {
+            None
+        })
     }
 
     /// Gives a waiter what was found for it.

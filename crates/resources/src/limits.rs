@@ -11,7 +11,7 @@ pub struct Limits {
     pub resources: usize,
     /// Sessions in all.
     pub sessions: usize,
-    /// Queued acquires in all.
+    /// Queued acquires in all. Who can be served at once does not queue, and is not refused for this.
     pub waiters: usize,
     /// Queued acquires of one session.
     pub waiters_per_session: usize,

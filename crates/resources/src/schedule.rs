@@ -43,16 +43,21 @@ impl Pool {
 
     /// What a request can have at once: all of it, or `None`. Nobody waits before it for any of it.
     pub(crate) fn at_once(&self, place: Place, requirements: &[Requirement]) -> Option<Vec<Units>> {
-        let last = |requirement: &Requirement| {
-            let family = self.queue.families.get(self.resources.family(&requirement.kind));
-            family.and_then(|family| family.takers.last()).is_none_or(|taker| *taker < place)
-        };
-        if self.leases.len() >= self.limits.leases || !requirements.iter().filter(|r| takes(r)).all(last) {
+        if self.leases.len() >= self.limits.leases || self.is_before_others(place, requirements) {
             return None;
         }
         let requirements: Vec<&Requirement> = requirements.iter().collect();
         let assignment = Assignment::of(&self.resources, Available::Free(&self.queue.reserved), &requirements);
         assignment.is_complete().then_some(assignment.taken)
+    }
+
+    /// Whether somebody waits behind this place for something of it, and may have reserved what is this one's.
+    pub(crate) fn is_before_others(&self, place: Place, requirements: &[Requirement]) -> bool {
+        let others = |requirement: &Requirement| {
+            let family = self.queue.families.get(self.resources.family(&requirement.kind));
+            family.and_then(|family| family.takers.last()).is_some_and(|taker| *taker > place)
+        };
+        requirements.iter().filter(|r| takes(r)).any(others)
     }
 
     /// Whether what exists would do for a waiter.

@@ -22,6 +22,9 @@ const KINDS: [&str; 4] = ["Arm", "Camera", "PathPlanner", "Charge"];
 const CHARGE: usize = 3;
 const SESSIONS: usize = 3;
 const TTL: u64 = 20;
+/// So many may wait, in all and of one session; who need not wait is not refused for it.
+const WAITERS: usize = 5;
+const WAITERS_OF_ONE: usize = 3;
 
 #[derive(Debug, Clone)]
 enum Step {
@@ -161,6 +164,10 @@ impl Model {
     }
 }
 
+fn limits() -> Limits {
+    Limits { waiters: WAITERS, waiters_per_session: WAITERS_OF_ONE, ..Limits::default() }
+}
+
 /// The pool, and what is on its disk.
 struct Kept {
     pool: Pool,
@@ -171,7 +178,7 @@ struct Kept {
 
 impl Kept {
     fn new() -> Kept {
-        let pool = Pool::new(Limits::default());
+        let pool = Pool::new(limits());
         Kept { snapshots: vec![pool.snapshot().encode()], entries: Vec::new(), pool }
     }
 
@@ -189,7 +196,7 @@ impl Kept {
         let snapshot = Snapshot::decode(&self.snapshots[cut]).unwrap();
         let records: Vec<Record> = self.entries[cut..].iter().flat_map(|entry| decode(entry).unwrap()).collect();
         // Numbers of waiters begin anew, as they do in a process that was started again.
-        self.pool = Pool::restore(Limits::default(), now, Some(snapshot), records).unwrap();
+        self.pool = Pool::restore(limits(), now, Some(snapshot), records).unwrap();
     }
 }
 
@@ -263,10 +270,21 @@ proptest! {
                     let mut request = AcquireRequest::new(names[session].clone(), requirements).priority(priority);
                     request.deadline = patience.map(|seconds| Timestamp(now + seconds));
                     let result = pool.acquire(at, request);
-                    prop_assert_eq!(result.is_ok(), model.expires[session].is_some());
+                    let deadline = patience.map(|seconds| now + seconds);
+                    // Behind all of its priority, as the pool numbers it.
+                    let id = WaiterId(u64::MAX);
+                    let waiter = ModelWaiter { id, session, units, consume, priority, deadline };
+                    let of_session = model.queue.iter().filter(|waiter| waiter.session == session).count();
+                    let full = model.queue.len() >= WAITERS || of_session >= WAITERS_OF_ONE;
+                    let waits = || {
+                        let mut model = model.clone();
+                        model.queue.push(waiter.clone());
+                        !model.grant(&[]).contains(&id)
+                    };
+                    let welcome = model.expires[session].is_some() && !(full && waits());
+                    prop_assert_eq!(result.is_ok(), welcome, "full: {}", full);
                     if let Ok(id) = result {
-                        let deadline = patience.map(|seconds| now + seconds);
-                        model.queue.push(ModelWaiter { id, session, units, consume, priority, deadline });
+                        model.queue.push(ModelWaiter { id, ..waiter });
                     }
                 }
                 Step::Release(index) => {

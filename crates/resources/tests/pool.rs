@@ -624,6 +624,35 @@ fn the_id_of_another_sessions_resource_is_refused() {
 }
 
 #[test]
+fn a_full_queue_refuses_only_who_would_have_to_wait() {
+    for limits in [Limits { waiters: 2, ..Limits::default() }, Limits { waiters_per_session: 2, ..Limits::default() }] {
+        let mut bench = Bench::with(&[("Arm", 1), ("Camera", 1), ("Gripper", 2)]);
+        bench.pool.set_limits(limits);
+        let held = bench.granted("b", &[block("Arm")]);
+        bench.acquire("b", &[block("Arm")]);
+        // It has reserved the one gripper that is free.
+        bench.granted("b", &[block("Gripper")]);
+        let waiting = bench.acquire("b", &[requirement(ResourceOperation::Block, "Gripper", 2)]);
+        let ask = |kind: &str, priority| AcquireRequest::new(session("b"), vec![block(kind)]).priority(priority);
+        for (kind, priority) in [("Arm", 0), ("Arm", 9), ("Gripper", 0)] {
+            let refused = bench.pool.acquire(bench.now, ask(kind, priority)).unwrap_err();
+            assert!(matches!(refused, PoolError::TooMany { limit: 2, .. }), "{kind}: {refused}");
+            bench.pool.check_invariants().unwrap();
+        }
+        assert!(bench.notices().is_empty() && bench.pool.waiting() == 2, "who was refused leaves nothing behind");
+        // What is free is given, and to the more urgent also what a waiter has reserved.
+        let camera = bench.pool.acquire(bench.now, ask("Camera", 0)).unwrap();
+        let urgent = bench.pool.acquire(bench.now, ask("Gripper", 9)).unwrap();
+        let granted: Vec<WaiterId> = grants(&bench.notices()).into_iter().map(|(waiter, _)| waiter).collect();
+        assert_eq!(granted, [camera, urgent]);
+        assert!(bench.pool.explain(waiting).is_some());
+        bench.pool.check_invariants().unwrap();
+        bench.release(held.id);
+        assert_eq!(bench.pool.waiting(), 1);
+    }
+}
+
+#[test]
 fn requests_beyond_a_bound_are_refused() {
     let mut pool = Pool::new(Limits { waiters: 1, name_length: 8, ..Limits::default() });
     let now = Timestamp(0);
