@@ -134,6 +134,113 @@ fn a_block_holds_for_as_long_as_its_command_runs() -> anyhow::Result<()> {
 }
 
 #[test]
+fn what_cannot_be_deleted_or_is_there_otherwise_is_said_of_each() -> anyhow::Result<()> {
+    let manager = Manager::start()?;
+    for id in ["f1", "f2"] {
+        manager.json(&["create", "Fixture", "--id", id])?;
+    }
+    // Every one is tried, and what happened is said of each.
+    let (code, out, err) = manager.resource(&["delete", "f1", "nope", "f2"])?;
+    ensure!(code == Some(1) && out == "f1\nf2\n" && err.contains("`nope` is not deleted"), "{code:?} {out} {err}");
+    // One of a kind.
+    manager.json(&["create", "Fixture", "--id", "f3"])?;
+    let (code, out, err) = manager.resource(&["delete", "--kind", "Fixture"])?;
+    ensure!(code == Some(0) && out == "f3\n", "{code:?} {out} {err}");
+    ensure!(manager.resource(&["delete", "--kind", "Fixture"])?.0 == Some(1));
+
+    let create = ["create", "Fixture", "--id", "f4", "--attribute"];
+    manager.json(&[create.as_slice(), &["a=1"]].concat())?;
+    manager.json(&[create.as_slice(), &["a=1"]].concat())?;
+    let (code, _, err) = manager.resource(&[create.as_slice(), &["a=2"]].concat())?;
+    ensure!(code == Some(1) && err.contains("a=1") && err.contains("--update"), "{code:?} {err}");
+    ensure!(manager.json(&["get", "f4"])?["attributes"]["a"] == 1);
+    ensure!(manager.json(&[create.as_slice(), &["a=2", "--update"]].concat())?["attributes"]["a"] == 2);
+    let (code, _, err) = manager.resource(&["create", "Fixture", "--attribute", "a=1", "--attribute", "a=2"])?;
+    ensure!(code == Some(2) && err.contains("given twice"), "{code:?} {err}");
+    ensure!(manager.resource(&["create", "bad kind"])?.0 == Some(2));
+    Ok(())
+}
+
+#[test]
+fn whoever_holds_what_an_operator_takes_away_hears_it_and_its_program_ends() -> anyhow::Result<()> {
+    let manager = Manager::start()?;
+    manager.json(&["create", "Tool", "--id", "t1"])?;
+    let works =
+        |name: &str, what: &str| manager.place.start_as(name, &["resource", "block", "Tool", "--", "sh", "-c", what]);
+    let lease = || wait_for("the block", || Ok(manager.json(&["get", "t1"])?["holdings"][0]["lease"].as_u64()));
+
+    // Asked to end, and what it started with it; one that does not is killed.
+    let ended = manager.place.path().join("ended");
+    let polite = format!("trap 'echo $? > {}; exit 3' TERM; sleep 600 & wait", ended.display());
+    let mut holder = works("released", &polite)?;
+    manager.json(&["release", &lease()?.to_string()])?;
+    let (code, _, err) = holder.finish()?;
+    ensure!(code == Some(75) && err.contains("was released by another"), "{code:?} {err}");
+    ensure!(ended.exists(), "{err}");
+    let mut holder = works("deleted", "trap '' TERM; while true; do sleep 1; done")?;
+    lease()?;
+    manager.json(&["delete", "t1"])?;
+    let (code, _, err) = holder.finish()?;
+    ensure!(code == Some(75) && err.contains("`t1` was deleted") && err.contains("is killed"), "{code:?} {err}");
+
+    // And without a program.
+    manager.json(&["create", "Tool", "--id", "t1"])?;
+    let mut holder = manager.place.start_as("bare", &["resource", "block", "Tool"])?;
+    manager.json(&["release", &lease()?.to_string()])?;
+    let (code, _, err) = holder.finish()?;
+    ensure!(code == Some(75) && err.contains("was released by another"), "{code:?} {err}");
+    Ok(())
+}
+
+#[test]
+fn who_waits_and_who_watches_goes_on_with_the_manager_that_comes_back() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let start = |name: &str| {
+        let endpoint = place.path().join("run/resource-manager.endpoint");
+        let _ = std::fs::remove_file(&endpoint);
+        let process = place.start_as(name, &["resource-manager"])?;
+        wait_for("the manager", || Ok(endpoint.exists().then_some(()))).with_context(|| process.said())?;
+        anyhow::Ok(process)
+    };
+    let resource = |arguments: &[&str]| -> anyhow::Result<String> {
+        let output = place.ratn(&[&["resource"], arguments].concat()).output()?;
+        ensure!(output.status.success(), "{arguments:?}: {:?}", texts(&output));
+        Ok(texts(&output).0)
+    };
+    let waiting = || {
+        wait_for("the waiter", || {
+            let waiting: Value = serde_json::from_str(&resource(&["explain", "--json"])?)?;
+            Ok(waiting[0]["request"].as_str().map(str::to_owned))
+        })
+    };
+    let mut manager = start("first")?;
+    resource(&["create", "Tool", "--id", "t1"])?;
+    let mut watch = place.start_as("watch", &["resource", "watch", "--json"])?;
+    let mut holder = place.start_as("holder", &["resource", "block", "Tool"])?;
+    wait_for("the block", || Ok(resource(&["list"])?.contains("lease").then_some(())))?;
+    let mut waiter = place.start_as("waiter", &["resource", "block", "Tool", "--", "echo", "worked"])?;
+    let request = waiting()?;
+    for (name, signal) in [("second", Signal::SIGTERM), ("third", Signal::SIGKILL)] {
+        manager.signal(signal)?;
+        manager.finish()?;
+        manager = start(name)?;
+        // The same request, though the queue was forgotten.
+        ensure!(waiting().with_context(|| waiter.said())? == request);
+    }
+    holder.signal(Signal::SIGINT)?;
+    holder.finish()?;
+    let (code, out, err) = waiter.finish()?;
+    ensure!(code == Some(0) && out.contains("worked"), "{code:?} {out} {err}");
+    let seen = || std::fs::read_to_string(place.path().join("watchout")).unwrap_or_default();
+    let released = |line: &Value| line["event"] == "released" && line["resource"]["id"] == "t1";
+    let read =
+        |all: &str| all.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok()).filter(released).count();
+    wait_for("both releases", || Ok((read(&seen()) == 2).then_some(()))).with_context(seen)?;
+    watch.child.kill()?;
+    Ok(())
+}
+
+#[test]
 fn a_release_by_the_operator_and_every_other_mutation_is_in_the_audit_log() -> anyhow::Result<()> {
     let mut manager = Manager::start()?;
     manager.json(&["create", "Fixture", "--id", "the-fixture"])?;
@@ -143,8 +250,7 @@ fn a_release_by_the_operator_and_every_other_mutation_is_in_the_audit_log() -> a
     let (code, _, err) = manager.resource(&["release", &lease.to_string()])?;
     ensure!(code == Some(1) && err.contains("had ended before"), "{err}");
     ensure!(manager.resource(&["delete", "nothing"])?.0 == Some(1));
-    holder.signal(Signal::SIGINT)?;
-    holder.finish()?;
+    ensure!(holder.finish()?.0 == Some(75));
     manager.process.signal(Signal::SIGTERM)?;
     let (code, _, said) = manager.process.finish()?;
     ensure!(code == Some(0) && !said.contains("the-fixture"), "{code:?} {said}");

@@ -1,9 +1,11 @@
 //! The command line of `ratn resource`.
 
+use crate::failure::Failure;
 use clap::{Args, Subcommand};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::value::Value;
 use ratn_worker::endpoint::Endpoint;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -77,9 +79,12 @@ pub(super) enum ResourceCommand {
 
 #[derive(Debug, Clone, Args)]
 pub(super) struct CreateArguments {
-    /// Its kind, `Fixture`
-    #[arg(value_name = "KIND")]
+    /// Its kind, `Fixture`: letters, digits, `_` and `-`
+    #[arg(value_name = "KIND", value_parser = kind)]
     pub(super) kind: String,
+    /// Replace the attributes, the capacity and the host of one of this id that is there
+    #[arg(long, requires = "id")]
+    pub(super) update: bool,
     /// system, process, module, world or task
     #[arg(long, value_name = "CLASS", default_value = "module", value_parser = class)]
     pub(super) class: ResourceClass,
@@ -124,7 +129,7 @@ pub(super) struct Selector {
 pub(super) struct HoldArguments {
     #[command(flatten)]
     pub(super) selector: Selector,
-    /// Wait at most so long for the resources, in seconds
+    /// Wait at most so long for the resources, in seconds; a manager that restarts meanwhile is asked again
     #[arg(long, value_name = "S", default_value = "600", value_parser = seconds)]
     pub(super) wait: Duration,
     /// Larger goes first
@@ -150,6 +155,29 @@ fn amount(text: &str) -> Result<Quantity, String> {
         Ok(quantity) => Ok(quantity),
         Err(error) => Err(error.to_string()),
     }
+}
+
+/// What a task can name.
+fn kind(text: &str) -> Result<String, String> {
+    let names = |c: char| c.is_alphanumeric() || c == '_' || c == '-';
+    let first = text.chars().next().is_some_and(char::is_alphabetic);
+    if first && text.chars().all(names) {
+        Ok(text.to_owned())
+    } else {
+        Err("expected a letter, then letters, digits, `_` and `-`".to_owned())
+    }
+}
+
+/// The attributes; a name that is given twice is refused.
+pub(super) fn attributes(given: &[(String, Value)]) -> Result<BTreeMap<String, Value>, Failure> {
+    let mut attributes = BTreeMap::new();
+    for (name, value) in given {
+        if let Some(before) = attributes.insert(name.clone(), value.clone()) {
+            let message = format!("ratn: --attribute {name} is given twice, {before} and {value}: leave one out");
+            return Err(Failure::Refused(message));
+        }
+    }
+    Ok(attributes)
 }
 
 /// A number or a truth value where it reads as one, else text.

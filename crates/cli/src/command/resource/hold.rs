@@ -1,36 +1,41 @@
 //! `block` and `consume`: what they take is held by a session of their own, which ends with the command however that ends.
 
 use super::arguments::HoldArguments;
-use super::{Asking, show};
+use super::{Asking, loss, show};
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
 use crate::output;
 use anyhow::Context;
-use ratn_model::resource::ResourceOperation;
-use ratn_worker::client::AcquireOptions;
+use nix::sys::signal::Signal;
+use nix::unistd::Pid;
+use ratn_model::resource::{Lease, Requirement, ResourceOperation};
+use ratn_worker::client::{AcquireOptions, CallError, ResourceClient, fresh_id};
 use ratn_worker::session::Session;
+use std::io::IsTerminal;
 use std::os::unix::process::ExitStatusExt;
-use std::time::Duration;
-use tokio::process::Command;
+use std::time::{Duration, Instant};
+use tokio::process::{Child, Command};
 
 /// From the loss of the lease to the end of the program that it was for.
 const STOP_PATIENCE: Duration = Duration::from_secs(2);
+/// From a manager that does not answer to the next question.
+const AGAIN: Duration = Duration::from_millis(250);
 const LEASE_VARIABLE: &str = "RATN_LEASE";
 const TOKEN_VARIABLE: &str = "RATN_TOKEN";
 
 /// `ratn resource block`
 pub(super) async fn block(asking: &Asking, held: &HoldArguments) -> Result<(), Failure> {
+    let requirement = held.selector.requirement(ResourceOperation::Block)?;
     let interrupt = Interrupt::listen()?;
     let (session, client) = asking.session("block").await?;
-    let requirement = held.selector.requirement(ResourceOperation::Block);
     let options = AcquireOptions {
+        request: fresh_id("block"),
         priority: held.priority,
         deadline: held.wait,
         holder: format!("ratn resource block, process {}", std::process::id()),
-        ..AcquireOptions::default()
     };
     let granted = tokio::select! {
-        granted = client.block(requirement, options) => granted.context("not blocked"),
+        granted = granted(&session, &client, requirement, options) => granted.context("not blocked"),
         () = interrupt.asked_times(1) => Err(anyhow::anyhow!("not blocked: interrupted while waiting")),
     };
     let lease = match granted {
@@ -42,14 +47,46 @@ pub(super) async fn block(asking: &Asking, held: &HoldArguments) -> Result<(), F
     };
     asking.show(&show::lease_json(&lease), || show::lease(&lease))?;
     let environment = [(LEASE_VARIABLE, lease.id.0.to_string()), (TOKEN_VARIABLE, lease.token.0.to_string())];
-    hold(session, &interrupt, held, &environment).await
+    let lost = loss::of(&client, &lease);
+    hold(session, &interrupt, held, &environment, lost).await
+}
+
+/// Asks until there is an answer or the time is over: a manager that restarts keeps who holds, not who waits, and the request id
+/// makes one request of all.
+async fn granted(
+    session: &Session,
+    client: &ResourceClient,
+    requirement: Requirement,
+    options: AcquireOptions,
+) -> Result<Lease, CallError> {
+    let until = Instant::now() + options.deadline;
+    let mut broke = false;
+    loop {
+        let left = until.saturating_duration_since(Instant::now()).max(Duration::from_millis(1));
+        let asked = AcquireOptions { deadline: left, ..options.clone() };
+        let error = match client.block(requirement.clone(), asked).await {
+            Ok(lease) => return Ok(lease),
+            Err(error) => error,
+        };
+        // A manager that came back without its memory knows the session again after the next ping.
+        let forgotten = broke && error.code() == Some(tonic::Code::FailedPrecondition);
+        if !(error.is_crash() || forgotten) || until.saturating_duration_since(Instant::now()) < AGAIN {
+            return Err(error);
+        }
+        if !std::mem::replace(&mut broke, true) {
+            output::progress("the resource manager does not answer; it is asked again");
+        }
+        tokio::time::sleep(AGAIN).await;
+        let _ = session.alive(until.saturating_duration_since(Instant::now())).await;
+    }
 }
 
 /// `ratn resource consume`
 pub(super) async fn consume(asking: &Asking, held: &HoldArguments) -> Result<(), Failure> {
+    let requirement = held.selector.requirement(ResourceOperation::Consume)?;
     let interrupt = Interrupt::listen()?;
     let (session, client) = asking.session("consume").await?;
-    let consumed = client.consume(held.selector.requirement(ResourceOperation::Consume)).await;
+    let consumed = client.consume(requirement).await;
     let consumed = match consumed {
         Ok(consumed) => consumed,
         Err(error) => {
@@ -58,15 +95,16 @@ pub(super) async fn consume(asking: &Asking, held: &HoldArguments) -> Result<(),
         }
     };
     asking.show(&consumed.as_slice().into(), || consumed.join("\n"))?;
-    hold(session, &interrupt, held, &[]).await
+    hold(session, &interrupt, held, &[], std::future::pending()).await
 }
 
-/// Until the time, the user, the program or the resource manager ends it.
+/// Until the time, the user, the program, the resource manager or an operator ends it; `lost` says what the last did.
 async fn hold(
     session: Session,
     interrupt: &Interrupt,
     held: &HoldArguments,
     environment: &[(&str, String)],
+    lost: impl Future<Output = String>,
 ) -> Result<(), Failure> {
     let mut program = match held.program.split_first() {
         None => None,
@@ -74,6 +112,10 @@ async fn hold(
             let mut command = Command::new(program);
             command.args(arguments).kill_on_drop(true);
             command.envs(environment.iter().map(|(name, value)| (name, value)));
+            // A group of its own, so that what it starts ends with it; at a terminal it stays in the one that the keys are for.
+            if !std::io::stdin().is_terminal() {
+                command.process_group(0);
+            }
             let started = command.spawn().with_context(|| format!("cannot start `{program}`"));
             match started {
                 Ok(child) => Some(child),
@@ -107,11 +149,15 @@ async fn hold(
         },
         () = over => Ok(()),
         () = interrupt.asked_times(1) => Ok(()),
-        () = session.lost() => Err(Failure::from(anyhow::anyhow!(
-            "lost: the resource manager was not heard for {} s, others may have the resources now",
+        () = session.lost() => Err(Failure::Lost(format!(
+            "the resource manager was not heard for {} s, others may have the resources now",
             super::SESSION_TTL.as_secs()
         ))),
+        why = lost => Err(Failure::Lost(format!("{why}; others may have the resources now"))),
     };
+    if let (Err(Failure::Lost(why)), Some(_)) = (&outcome, &program) {
+        output::progress(format_args!("ratn: lost: {why}: the program is asked to end"));
+    }
     if let Some(mut child) = program {
         stop(&mut child).await;
     }
@@ -120,11 +166,17 @@ async fn hold(
 }
 
 /// Asks a program that still runs to end, and ends it when it does not.
-async fn stop(child: &mut tokio::process::Child) {
-    let Some(pid) = child.id().and_then(|pid| i32::try_from(pid).ok()) else { return };
-    let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGTERM);
+async fn stop(child: &mut Child) {
+    let Some(pid) = child.id().and_then(|pid| i32::try_from(pid).ok()).map(Pid::from_raw) else { return };
+    let leads = nix::unistd::getpgid(Some(pid)) == Ok(pid);
+    let signal = |signal| {
+        // Nobody is left to hear it otherwise.
+        let _ = if leads { nix::sys::signal::killpg(pid, signal) } else { nix::sys::signal::kill(pid, signal) };
+    };
+    signal(Signal::SIGTERM);
     if tokio::time::timeout(STOP_PATIENCE, child.wait()).await.is_err() {
         output::progress("the program did not end in time and is killed");
-        let _ = child.kill().await;
+        signal(Signal::SIGKILL);
+        let _ = child.wait().await;
     }
 }

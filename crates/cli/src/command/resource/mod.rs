@@ -5,7 +5,9 @@
 
 mod arguments;
 mod hold;
+mod loss;
 mod show;
+mod watch;
 
 pub(crate) use arguments::ResourceArguments;
 
@@ -16,9 +18,9 @@ use crate::system::public_directory;
 use anyhow::Context;
 use arguments::{ResourceCommand, Selector};
 use ratn_model::id::LeaseId;
-use ratn_model::resource::{Requirement, ResourceOperation};
-use ratn_proto::types::{Resource, ResourceUpdate};
-use ratn_worker::client::{CallError, Channels, ResourceClient};
+use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
+use ratn_proto::types::Resource;
+use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
@@ -60,19 +62,19 @@ impl Asking {
         let client = &self.client;
         match command {
             ResourceCommand::Create(create) => {
-                let created = client.create(create.resource()).await.context("not created")?;
+                let wanted = create.resource()?;
+                self.not_there_otherwise(create, &wanted).await?;
+                let created = client.create(wanted).await.context("not created")?;
                 self.show(&show::resource_json(&created), || created.id.clone())?;
             }
             ResourceCommand::Delete { ids, kind: None } => {
-                for id in ids {
-                    client.delete(id).await.with_context(|| format!("`{id}` is not deleted"))?;
-                }
-                self.show(&ids.as_slice().into(), || lines(ids))?;
+                return self.delete(ids).await;
             }
             ResourceCommand::Delete { kind: Some(kind), .. } => {
-                let requirement = Selector { kind: kind.clone(), ..Selector::default() };
+                let requirement = Selector { kind: kind.clone(), count: Quantity::ONE, ..Selector::default() };
+                let requirement = requirement.requirement(ResourceOperation::Delete)?;
                 let (session, client) = self.session("delete").await?;
-                let deleted = client.delete_matching(requirement.requirement(ResourceOperation::Delete)).await;
+                let deleted = client.delete_matching(requirement).await;
                 session.close().await;
                 let deleted = deleted.context("not deleted")?;
                 self.show(&deleted.as_slice().into(), || lines(&deleted))?;
@@ -87,7 +89,7 @@ impl Asking {
                 self.show(&serde_json::json!({ "released": lease }), || format!("lease {lease} is released"))?;
             }
             ResourceCommand::Exists(selector) => {
-                let requirement = selector.requirement(ResourceOperation::Exists);
+                let requirement = selector.requirement(ResourceOperation::Exists)?;
                 let exists = client.exists(requirement.clone()).await;
                 let exists = exists.map_err(|error| Failure::Refused(format!("ratn: {error}")))?;
                 let word = if exists { "yes" } else { "no" };
@@ -115,10 +117,51 @@ impl Asking {
             }
             ResourceCommand::Watch { kinds } => {
                 let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
-                self.watch(&kinds).await?;
+                watch::watch(self, &kinds).await?;
             }
         }
         Ok(())
+    }
+
+    /// Deletes what can be deleted; what cannot is said of each.
+    async fn delete(&self, ids: &[String]) -> Result<(), Failure> {
+        let (mut deleted, mut kept) = (Vec::new(), Vec::new());
+        for id in ids {
+            match self.client.delete(id).await {
+                Ok(()) => deleted.push(id.clone()),
+                Err(error) if error.is_crash() => {
+                    self.show(&deleted.as_slice().into(), || lines(&deleted))?;
+                    return Err(anyhow::Error::from(error).context(format!("`{id}` is not deleted")).into());
+                }
+                Err(error) => kept.push(format!("`{id}` is not deleted: {error}")),
+            }
+        }
+        if !deleted.is_empty() || self.json {
+            self.show(&deleted.as_slice().into(), || lines(&deleted))?;
+        }
+        if kept.is_empty() { Ok(()) } else { Err(anyhow::anyhow!(kept.join("\nratn: ")).into()) }
+    }
+
+    /// What is there with other attributes is only changed where that is asked for.
+    async fn not_there_otherwise(&self, create: &arguments::CreateArguments, wanted: &Resource) -> Result<(), Failure> {
+        if create.id.is_empty() || create.update {
+            return Ok(());
+        }
+        let there = match self.client.get(&create.id).await {
+            Err(error) if error.code() == Some(tonic::Code::NotFound) => return Ok(()),
+            there => there.context("not created")?,
+        };
+        if there.attributes == wanted.attributes && there.capacity == wanted.capacity && there.host == wanted.host {
+            return Ok(());
+        }
+        let is = there.attributes.iter().map(|(name, value)| format!(", {name}={value}"));
+        let message = format!(
+            "not created: `{}` is there: capacity {}{}: `--update` replaces that",
+            create.id,
+            there.capacity,
+            is.collect::<String>()
+        );
+        Err(anyhow::anyhow!(message).into())
     }
 
     /// A session for as long as it is kept, and a client in its name.
@@ -136,32 +179,6 @@ impl Asking {
         Ok((session, client))
     }
 
-    /// Until the reader has had enough, or the manager ends.
-    async fn watch(&self, kinds: &[&str]) -> anyhow::Result<()> {
-        let mut watch = self.client.watch(kinds).await?;
-        let mut ended: Result<(), CallError> = Ok(());
-        loop {
-            let update = match watch.next().await {
-                Ok(Some(update)) => update,
-                Ok(None) => break,
-                Err(error) => {
-                    ended = Err(error);
-                    break;
-                }
-            };
-            let shown = match (&update, self.json) {
-                (update, true) => output::line(show::update_json(update))?,
-                (ResourceUpdate::Snapshot { resources, .. }, false) => output::line(show::table(resources))?,
-                (ResourceUpdate::Event(event), false) => output::line(show::event(event))?,
-            };
-            if !shown {
-                return Ok(());
-            }
-        }
-        ended.context("the watch ended")?;
-        anyhow::bail!("the resource manager ended the watch")
-    }
-
     fn show(&self, json: &serde_json::Value, text: impl FnOnce() -> String) -> anyhow::Result<()> {
         if self.json { output::result(serde_json::to_string_pretty(json)?) } else { output::result(text()) }
     }
@@ -172,24 +189,24 @@ fn lines(ids: &[String]) -> String {
 }
 
 impl arguments::CreateArguments {
-    fn resource(&self) -> Resource {
-        Resource {
-            attributes: self.attributes.iter().cloned().collect(),
+    fn resource(&self) -> Result<Resource, Failure> {
+        Ok(Resource {
+            attributes: arguments::attributes(&self.attributes)?,
             host: self.host.clone(),
             divisible: self.divisible,
             renewable: !self.non_renewable,
             ..Resource::new(&self.id, self.class, &self.kind).with_capacity(self.capacity)
-        }
+        })
     }
 }
 
 impl Selector {
-    fn requirement(&self, operation: ResourceOperation) -> Requirement {
-        Requirement {
+    fn requirement(&self, operation: ResourceOperation) -> Result<Requirement, Failure> {
+        Ok(Requirement {
             class: self.class,
-            attributes: self.attributes.iter().cloned().collect(),
+            attributes: arguments::attributes(&self.attributes)?,
             count: self.count,
             ..Requirement::new(operation, &self.kind)
-        }
+        })
     }
 }
