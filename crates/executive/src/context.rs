@@ -51,3 +51,9 @@ impl Context<'_> {
         Ok(())
     }
 }
+
+/// Why a run ends that goes on without an action: `path` is where it is.
+pub(crate) fn in_circles(path: &str) -> String {
+    let place = if path.is_empty() { String::new() } else { format!("{path}: ") };
+    format!("{place}the task goes in circles without doing anything; does what its loop looks at ever change?")
+}

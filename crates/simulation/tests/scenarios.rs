@@ -861,3 +861,29 @@ states:
     // Of two brains the speculative one gives its back.
     assert_eq!((at(&run, "start plan"), run.end_s), (3.0, 5.0), "{:#?}", transcript(&run));
 }
+
+#[test]
+fn a_loop_that_does_nothing_ends_with_where_it_is_and_one_that_counts_does_not() {
+    let task = "
+task: circles
+variables: { i: 0 }
+states:
+  - wait: { while: '$i < 3', do: [ nothing: { states: [] } ] }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let run = simulate(task, mode, &mut Script::default());
+        assert_eq!(run.outcome, "aborted");
+        assert!(run.reason.contains("wait") && run.reason.contains("goes in circles"), "{mode:?}: {}", run.reason);
+        assert!(run.log.len() < 500_000, "{mode:?}: {} lines of log", run.log.len());
+    }
+    let counts = "
+task: counts
+variables: { i: 0 }
+states:
+  - count: { while: '$i < 5000', do: [ one: { states: [], assign: { i: '$i + 1' } } ] }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let run = simulate(counts, mode, &mut Script::default());
+        assert_eq!((run.outcome.as_str(), run.reason.as_str()), ("success", ""), "{mode:?}");
+    }
+}

@@ -2,14 +2,14 @@
 
 use super::{Frame, Interpreter, MAIN, Progress, Todo};
 use crate::binding::{self, child_path};
-use crate::context::Context;
+use crate::context::{Context, in_circles};
 use crate::protocol::Note;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Program, SUCCESS, StateKind, Target};
 use ratn_model::value::Value;
 
-/// So many steps without an event between them go in circles.
-const MAX_STEPS: usize = 1_000_000;
+/// So many steps without an event between them go in circles: some four for an iteration that does nothing.
+const MAX_STEPS: usize = 400_000;
 
 impl Interpreter {
     /// Lets every thread go on until all wait for events, or the state has ended.
@@ -33,8 +33,10 @@ impl Interpreter {
                 Todo::Done { outcome, reason } => return Progress::Ended { outcome, reason },
             }
         }
+        let frames = self.threads.values().flat_map(|thread| &thread.frames);
+        let innermost = frames.filter(|frame| frame.iteration.is_some()).last();
+        let reason = in_circles(innermost.map_or("", |frame| &frame.path));
         self.abort(context);
-        let reason = "the task goes in circles without doing anything".to_owned();
         Progress::Ended { outcome: ABORTED.to_owned(), reason }
     }
 

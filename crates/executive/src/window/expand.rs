@@ -10,7 +10,7 @@ use super::instance::{Arm, Instance, Role, Segment, Status, Wait, gives_outputs}
 use super::plan::{Outcome, Predicate};
 use super::segment::Branch;
 use crate::analysis::NodeNature;
-use crate::context::Context;
+use crate::context::{Context, in_circles};
 use crate::protocol::Note;
 use ratn_model::expression::scope::NothingKnown;
 use ratn_model::id::{InstanceId, StateId};
@@ -104,7 +104,8 @@ impl Window {
         let cursor = &mut self.cursors[index];
         cursor.idle += 1;
         if cursor.idle > MAX_IDLE_STEPS {
-            cursor.because = Some("the task goes in circles without doing anything".into());
+            let path = cursor.environment.frames.as_ref().map_or("", |frame| &frame.path);
+            cursor.because = Some(in_circles(path).into());
             self.end_of_task(context, index, ABORTED);
             return;
         }

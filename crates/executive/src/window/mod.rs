@@ -37,7 +37,7 @@ mod view;
 
 use crate::analysis::Analysis;
 use crate::binding;
-use crate::context::Context;
+use crate::context::{Context, in_circles};
 use crate::hold::Hold;
 use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
 use crate::protocol::{Command, Event, Learned, Note};
@@ -99,8 +99,11 @@ pub(crate) struct Window {
     grown_since_estimate: usize,
 }
 
-/// More instances than this in one event, beyond the horizon, go in circles.
-const MAX_INSTANCES_AT_ONCE: u64 = 10_000_000;
+/// More instances than this in one event, beyond what the horizon lets expand, go in circles.
+const MAX_INSTANCES_AT_ONCE: u64 = 100_000;
+
+/// Branches and regions may each be expanded up to the horizon: so many of them at the most are counted.
+const MAX_HORIZONS: u64 = 64;
 
 /// The task's own line.
 const MAIN: Line = 0;
@@ -355,10 +358,13 @@ impl Window {
 
     /// Looks, retires and grows until nothing changes.
     fn settle(&mut self, context: &mut Context<'_>) -> Option<End> {
-        let newest = context.last_instance.saturating_add(MAX_INSTANCES_AT_ONCE);
+        let ahead = (context.program.horizon as u64).saturating_mul(MAX_HORIZONS);
+        let newest = context.last_instance.saturating_add(ahead).saturating_add(MAX_INSTANCES_AT_ONCE);
         loop {
             if *context.last_instance > newest {
-                self.stop(context, ABORTED, "the task goes in circles without doing anything".to_owned());
+                let head = self.threads.values().find_map(|thread| thread.head);
+                let path = head.map(|head| self.path(context.program, head)).unwrap_or_default();
+                self.stop(context, ABORTED, in_circles(&path));
             }
             while let Some(id) = self.queue.pop_front() {
                 if let Some(instance) = self.instances.get_mut(id) {

@@ -5,7 +5,7 @@
 
 use super::Window;
 use super::cursor::{Cursor, Todo};
-use super::instance::{Changed, Line, Role, Status, Wait, gives_outputs};
+use super::instance::{Changed, Instance, Line, Role, Status, Wait, gives_outputs};
 use super::plan::{Effects, Outcome};
 use crate::analysis::NodeNature;
 use crate::binding;
@@ -81,7 +81,7 @@ impl Window {
             self.wait(id, Wait::World(beside));
             return false;
         }
-        if let Some(beside) = self.producer_beside(instance) {
+        if let Some(beside) = self.producer_beside(instance).or_else(|| self.inside_beside(instance)) {
             self.wait(id, Wait::Data(beside));
             return false;
         }
@@ -96,6 +96,18 @@ impl Window {
         }
         self.compare(context, users);
         true
+    }
+
+    /// Of the exit of a state: an imprecise PIA inside of it that still runs. By how it ends the state may be left otherwise.
+    fn inside_beside(&self, exit: &Instance) -> Option<InstanceId> {
+        if exit.role != Role::Exit {
+            return None;
+        }
+        let is_inside = |id: &&InstanceId| {
+            let frames = self.instances.get(**id).and_then(|inside| inside.environment.frames.as_deref());
+            **id < exit.id && std::iter::successors(frames, |f| f.below.as_deref()).any(|f| f.owner == exit.state)
+        };
+        self.detached.iter().find(is_inside).copied()
     }
 
     /// The line goes on behind an instance that is real, where its outcome leads.
