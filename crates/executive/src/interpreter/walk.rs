@@ -34,7 +34,7 @@ impl Interpreter {
             }
         }
         let frames = self.threads.values().flat_map(|thread| &thread.frames);
-        let innermost = frames.filter(|frame| frame.iteration.is_some()).last();
+        let innermost = frames.filter(|frame| frame.iteration.is_some()).next_back();
         let reason = in_circles(innermost.map_or("", |frame| &frame.path));
         self.abort(context);
         Progress::Ended { outcome: ABORTED.to_owned(), reason }
