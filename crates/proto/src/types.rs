@@ -367,6 +367,8 @@ pub struct WorkerStatus {
     pub resident_bytes: u64,
     /// Processor use since the last listing, in thousandths of a core; only where pools are listed.
     pub cpu_millicores: u32,
+    /// What it may use of the machine, and what keeps it to that; empty without limits.
+    pub limits: String,
 }
 
 /// A pool of workers of one template.
@@ -380,7 +382,7 @@ pub struct PoolStatus {
     pub min: u32,
     /// At most so many are started.
     pub max: u32,
-    /// In the order of ids.
+    /// The oldest first.
     pub workers: Vec<WorkerStatus>,
     /// Why no more workers are started; empty while all is well.
     pub failure: String,

@@ -196,10 +196,10 @@ impl Actor {
 
     fn became(&mut self, outcome: Outcome) {
         match outcome {
-            Outcome::Spawned { id, pid } => {
-                tracing::info!(id, pid, "worker started");
+            Outcome::Spawned { id, pid, limits } => {
+                tracing::info!(id, pid, limits, "worker started");
                 self.processes.spawned(&id, pid);
-                self.handle(Event::Spawned { id, pid });
+                self.handle(Event::Spawned { id, pid, limits });
             }
             Outcome::Exited { id, reason, last_words } => {
                 tracing::info!(id, reason, last_words, "worker gone");
@@ -226,8 +226,8 @@ impl Actor {
             match command {
                 Command::Start { id, template } => {
                     let Some(template) = self.pools.template(&template) else { continue };
-                    if let Err(busy) = self.processes.begin(&id, template) {
-                        let exited = Event::Exited { id, reason: busy.to_string(), last_words: String::new() };
+                    if let Err(error) = self.processes.begin(&id, template) {
+                        let exited = Event::Exited { id, reason: error.to_string(), last_words: String::new() };
                         commands.extend(self.pools.handle(self.now(), exited));
                     }
                 }
@@ -258,8 +258,10 @@ impl Actor {
     }
 
     fn offer(&self, worker: &WorkerStatus, kind: &str) {
-        let resource = Resource::new(&worker.id, ResourceClass::Process, kind)
-            .with_endpoint(&worker.endpoint)
+        let resource = Resource::new(&worker.id, ResourceClass::Process, kind);
+        // One that is no server has none.
+        let resource = if worker.endpoint.is_empty() { resource } else { resource.with_endpoint(&worker.endpoint) };
+        let resource = resource
             .with_attribute("host", Value::String(self.host.clone()))
             .with_attribute("pid", Value::Int(i64::from(worker.pid)))
             .on_host(&self.host);

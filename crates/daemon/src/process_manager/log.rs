@@ -7,11 +7,14 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use tokio::io::{AsyncRead, AsyncReadExt};
+use tokio::sync::Notify;
 
 /// How much of the end is kept.
 const LAST_WORDS_BYTES: usize = 400;
 /// How much is read at once.
 const CHUNK_BYTES: usize = 4_096;
+/// Bytes of a line that are looked at.
+const MAX_LINE_BYTES: usize = 4_096;
 /// So many ended workers leave a log.
 const ENDED_LOGS_KEPT: usize = 64;
 
@@ -19,6 +22,15 @@ const ENDED_LOGS_KEPT: usize = 64;
 #[derive(Debug, Clone)]
 pub(super) struct Log {
     inner: Arc<Mutex<Inner>>,
+}
+
+/// A line that somebody waits for.
+#[derive(Debug)]
+pub(super) struct Awaited {
+    text: String,
+    seen: Arc<Notify>,
+    /// The line that is being written, as far as it is looked at.
+    line: Vec<u8>,
 }
 
 #[derive(Debug)]
@@ -67,9 +79,10 @@ impl Log {
     }
 
     /// Copies until the other side ends.
-    pub(super) async fn capture(self, mut from: impl AsyncRead + Unpin) {
+    pub(super) async fn capture(self, mut from: impl AsyncRead + Unpin, mut awaited: Option<Awaited>) {
         let mut chunk = vec![0; CHUNK_BYTES];
         while let Ok(length @ 1..) = from.read(&mut chunk).await {
+            awaited = awaited.and_then(|awaited| awaited.after(&chunk[..length]));
             let mut inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
             if let Err(error) = inner.write(&chunk[..length]) {
                 // The worker goes on; a full disk costs its log only.
@@ -84,6 +97,31 @@ impl Log {
         let (front, back) = inner.tail.as_slices();
         let text = String::from_utf8_lossy(&[front, back].concat()).into_owned();
         text.lines().map(str::trim).filter(|line| !line.is_empty()).collect::<Vec<_>>().join(" | ")
+    }
+}
+
+impl Awaited {
+    /// A line with `text` in it makes `seen` known.
+    pub(super) fn new(text: &str, seen: Arc<Notify>) -> Awaited {
+        Awaited { text: text.to_owned(), seen, line: Vec::new() }
+    }
+
+    /// What is still awaited after more was written.
+    fn after(mut self, written: &[u8]) -> Option<Awaited> {
+        for byte in written {
+            if *byte != b'\n' {
+                if self.line.len() < MAX_LINE_BYTES {
+                    self.line.push(*byte);
+                }
+                continue;
+            }
+            if String::from_utf8_lossy(&self.line).contains(&self.text) {
+                self.seen.notify_one();
+                return None;
+            }
+            self.line.clear();
+        }
+        Some(self)
     }
 }
 
@@ -127,10 +165,19 @@ mod tests {
         let path = directory.path().join("logs/planner-1@compute.log");
         let log = Log::create(&path, 10_000).unwrap();
         let lines: String = (0..2_000).map(|i| format!("line {i}\n")).collect();
-        log.clone().capture(lines.as_bytes()).await;
+        log.clone().capture(lines.as_bytes(), None).await;
         assert!(fs::metadata(&path).unwrap().len() <= 10_000);
         assert!(fs::metadata(path.with_extension("log.1")).unwrap().len() <= 10_000);
         assert!(log.last_words().ends_with("line 1998 | line 1999"));
         assert!(log.last_words().len() < 600);
+    }
+
+    #[test]
+    fn a_line_is_seen_whole_and_however_it_comes() {
+        let seen = Arc::new(Notify::new());
+        let awaited = Awaited::new("now ready", seen.clone());
+        let awaited = awaited.after(b"not yet\nI am now re").unwrap();
+        assert!(awaited.after(b"ady.\nmore").is_none());
+        assert!(Awaited::new("ready", seen).after(b"ready").is_some(), "the line goes on");
     }
 }

@@ -10,15 +10,25 @@
 
 mod actor;
 mod config;
+mod environment;
+mod limits;
 mod log;
+mod order;
+mod parameter;
 pub mod pools;
 mod processes;
+mod readiness;
 mod service;
 mod spawner;
 mod status;
+mod template;
 mod usage;
 
-pub use config::{Liveness, ProcessManagerConfig, Template};
+pub use config::ProcessManagerConfig;
+pub use limits::Limits;
+pub use parameter::Parameter;
+pub use readiness::Readiness;
+pub use template::{Liveness, Template};
 
 use crate::demand::{DemandLink, Shortages};
 use crate::link::{Link, Manager, Turnover, Wanted};

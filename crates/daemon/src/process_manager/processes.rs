@@ -1,10 +1,13 @@
 //! The processes of the workers: begins them from their templates, signals them, waits until they serve, and clears up behind them.
 
-use super::config::{ProcessManagerConfig, Template};
-use super::log::EndedLogs;
+use super::config::ProcessManagerConfig;
+use super::environment;
+use super::log::{Awaited, EndedLogs};
+use super::parameter;
+use super::readiness::{Readiness, Signs};
 use super::spawner::{self, Job, Outcome};
+use super::template::Template;
 use nix::sys::signal::Signal;
-use ratn_worker::client::Health;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::collections::BTreeMap;
 use std::io;
@@ -25,14 +28,27 @@ pub(super) struct Told {
     pub(super) health: mpsc::Receiver<(String, Result<(), String>)>,
 }
 
-/// Too many processes are being started at once.
+/// A worker that cannot be begun.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot be started: too many processes are being started")]
-pub(super) struct Busy;
+pub(super) enum BeginError {
+    /// Too many processes are being started at once.
+    #[error("cannot be started: too many processes are being started")]
+    Busy,
+    /// Its socket cannot be made.
+    #[error("cannot be started: no socket {} for it to notify: {reason}", socket.display())]
+    Socket {
+        /// Where it was to be.
+        socket: PathBuf,
+        /// Why not.
+        reason: String,
+    },
+}
 
 pub(super) struct Processes {
     host: String,
     max_log_bytes: u64,
+    /// Where groups of processes are made.
+    groups: Option<PathBuf>,
     directory: RuntimeDirectory,
     /// What a template without a program runs.
     this_program: PathBuf,
@@ -63,6 +79,7 @@ impl Processes {
         let processes = Processes {
             host: config.host.clone(),
             max_log_bytes: config.max_log_bytes,
+            groups: config.cgroup.clone(),
             directory,
             this_program: std::env::current_exe()?,
             jobs: spawner::start(told)?,
@@ -74,29 +91,46 @@ impl Processes {
     }
 
     /// Begins a worker of a template.
-    pub(super) fn begin(&mut self, id: &str, template: &Template) -> Result<(), Busy> {
-        let runtime_dir = self.directory.path().display().to_string();
+    pub(super) fn begin(&mut self, id: &str, template: &Template) -> Result<(), BeginError> {
         let endpoint_file = self.directory.endpoint_file(id);
-        let fill = |text: &str| {
-            text.replace("{id}", id)
-                .replace("{kind}", &template.kind)
-                .replace("{host}", &self.host)
-                .replace("{runtime_dir}", &runtime_dir)
-                .replace("{endpoint_file}", &endpoint_file.display().to_string())
+        let builtin = |name: &str| match name {
+            "id" => Some(id.to_owned()),
+            "kind" => Some(template.kind.clone()),
+            "host" => Some(self.host.clone()),
+            "runtime_dir" => Some(self.directory.path().display().to_string()),
+            "endpoint_file" => Some(endpoint_file.display().to_string()),
+            _ => None,
         };
+        let fill = |text: &str| parameter::fill(text, &builtin, &template.parameters);
         let _ = std::fs::remove_file(&endpoint_file);
+        let socket = self.notify_socket(id);
+        let signs = template.readiness.signs(&socket);
+        let signs = signs.map_err(|error| BeginError::Socket { socket: socket.clone(), reason: error.to_string() })?;
+        let mut env = environment::passed(std::env::vars_os(), &template.pass_env);
+        env.extend(template.env.iter().map(|(name, value)| (name.into(), fill(value).into())));
+        if let Signs::Notify(_) = signs {
+            env.insert("NOTIFY_SOCKET".into(), socket.into());
+        }
+        let awaited = match (&signs, &template.readiness) {
+            (Signs::Line(seen), Readiness::Line { contains }) => Some(Awaited::new(contains, seen.clone())),
+            _ => None,
+        };
         let job = Job {
             id: id.to_owned(),
             args: template.args.iter().map(|arg| fill(arg)).collect(),
-            env: template.env.iter().map(|(name, value)| (name.clone(), fill(value))).collect(),
+            env,
+            directory: template.directory.clone(),
+            limits: template.limits,
+            groups: self.groups.clone(),
+            awaited,
             log: self.log_file(id),
             max_log_bytes: self.max_log_bytes,
             program: template.program.clone().unwrap_or_else(|| self.this_program.clone()),
         };
-        self.jobs.try_send(job).map_err(|_| Busy)?;
+        self.jobs.try_send(job).map_err(|_| BeginError::Busy)?;
         let (ask, questions) = mpsc::channel(1);
         let within = template.start_timeout();
-        let attended = attend(self.directory.clone(), id.to_owned(), within, questions, self.tell.clone());
+        let attended = attend(self.directory.clone(), id.to_owned(), (signs, within), questions, self.tell.clone());
         let attended = tokio::spawn(attended).abort_handle();
         self.by_id.entry(id.to_owned()).or_default().attended = Some((attended, ask));
         Ok(())
@@ -114,6 +148,7 @@ impl Processes {
         }
         // One that was killed could not take it back itself.
         let _ = std::fs::remove_file(self.directory.endpoint_file(id));
+        let _ = std::fs::remove_file(self.notify_socket(id));
         self.ended_logs.add(self.log_file(id));
     }
 
@@ -137,31 +172,33 @@ impl Processes {
         self.by_id.values().for_each(|process| spawner::signal(process.pid, Signal::SIGKILL));
     }
 
+    fn notify_socket(&self, id: &str) -> PathBuf {
+        self.directory.path().join(format!("{id}.notify"))
+    }
+
     fn log_file(&self, id: &str) -> PathBuf {
         self.directory.path().join("logs").join(format!("{id}.log"))
     }
 }
 
-/// Tells once a worker serves, and whether it still does whenever that is asked. One that never does is the pools' business: they
+/// Tells once a worker is ready, and whether it still is whenever that is asked. One that never is is the pools' business: they
 /// know when it is too late.
 async fn attend(
     directory: RuntimeDirectory,
     id: String,
-    within: Duration,
+    (signs, within): (Signs, Duration),
     mut questions: mpsc::Receiver<Duration>,
     tell: Tell,
 ) {
-    let found = match directory.wait_for(&id, within).await {
-        Ok(endpoint) => endpoint,
-        Err(error) => return tracing::debug!(id, %error, "no endpoint of a worker"),
+    let mut pulse = match signs.ready(&directory, &id, within).await {
+        Ok((endpoint, pulse)) => {
+            drop(tell.serving.send((id.clone(), endpoint)).await);
+            pulse
+        }
+        Err(reason) => return tracing::debug!(id, reason, "a worker is not ready"),
     };
-    let mut health = Health::of(found.clone());
-    match health.serving(within).await {
-        Ok(()) => drop(tell.serving.send((id.clone(), found.to_string())).await),
-        Err(error) => return tracing::debug!(id, %error, "a worker does not serve"),
-    }
     while let Some(within) = questions.recv().await {
-        let answer = health.serving(within).await.map_err(|error| error.to_string());
+        let answer = pulse.beats(within).await;
         if tell.health.send((id.clone(), answer)).await.is_err() {
             return;
         }

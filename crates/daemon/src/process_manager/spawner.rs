@@ -3,12 +3,14 @@
 //! Each worker leads a process group of its own, so that it can be ended with all that it started. Its standard input is a
 //! pipe that nobody writes to: it ends with the process manager, however that ends. Nothing runs in the child before exec.
 
-use super::log::Log;
+use super::limits::{InForce, Limits};
+use super::log::{Awaited, Log};
 use crate::supervisor::command_of;
 use nix::errno::Errno;
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::io;
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
@@ -29,7 +31,14 @@ pub(super) struct Job {
     pub(super) id: String,
     pub(super) program: PathBuf,
     pub(super) args: Vec<String>,
-    pub(super) env: BTreeMap<String, String>,
+    /// All of it.
+    pub(super) env: BTreeMap<OsString, OsString>,
+    pub(super) directory: Option<PathBuf>,
+    pub(super) limits: Limits,
+    /// Where groups of processes are made.
+    pub(super) groups: Option<PathBuf>,
+    /// A line of its standard output that is waited for.
+    pub(super) awaited: Option<Awaited>,
     pub(super) log: PathBuf,
     pub(super) max_log_bytes: u64,
 }
@@ -38,7 +47,12 @@ pub(super) struct Job {
 #[derive(Debug)]
 pub(super) enum Outcome {
     /// The process is there.
-    Spawned { id: String, pid: u32 },
+    Spawned {
+        id: String,
+        pid: u32,
+        /// What it may use, for people.
+        limits: String,
+    },
     /// It is gone, or never was.
     Exited { id: String, reason: String, last_words: String },
 }
@@ -49,15 +63,18 @@ pub(super) fn start(outcomes: mpsc::Sender<Outcome>) -> io::Result<mpsc::Sender<
     let runtime = Handle::current();
     std::thread::Builder::new().name("spawner".to_owned()).spawn(move || {
         let _entered = runtime.enter();
-        while let Some(job) = jobs.blocking_recv() {
+        while let Some(mut job) = jobs.blocking_recv() {
             let id = job.id.clone();
             match spawn(&job) {
                 Ok((child, log)) => {
                     let pid = child.id().unwrap_or(0);
-                    if outcomes.blocking_send(Outcome::Spawned { id: id.clone(), pid }).is_err() {
+                    let force = job.limits.enforce(&id, pid, job.groups.as_deref());
+                    let spawned = Outcome::Spawned { id: id.clone(), pid, limits: force.words() };
+                    if outcomes.blocking_send(spawned).is_err() {
                         return;
                     }
-                    runtime.spawn(watch(id, pid, child, log, outcomes.clone()));
+                    let worker = Watched { id, pid, child, log, awaited: job.awaited.take(), force };
+                    runtime.spawn(watch(worker, outcomes.clone()));
                 }
                 Err(error) => {
                     let reason = format!("cannot start {}: {error}", job.program.display());
@@ -83,8 +100,17 @@ pub(super) fn signal(pid: u32, signal: Signal) {
 
 fn spawn(job: &Job) -> io::Result<(Child, Log)> {
     let log = Log::create(&job.log, job.max_log_bytes)?;
-    let child = command_of(&job.program)
+    let mut command = command_of(&job.program);
+    if let Some(directory) = &job.directory {
+        let known = directory.is_dir();
+        known
+            .then_some(())
+            .ok_or_else(|| io::Error::other(format!("there is no directory {}", directory.display())))?;
+        command.current_dir(directory);
+    }
+    let child = command
         .args(&job.args)
+        .env_clear()
         .envs(&job.env)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
@@ -95,9 +121,19 @@ fn spawn(job: &Job) -> io::Result<(Child, Log)> {
     Ok((child, log))
 }
 
-async fn watch(id: String, pid: u32, mut child: Child, log: Log, outcomes: mpsc::Sender<Outcome>) {
-    let out = child.stdout.take().map(|out| tokio::spawn(log.clone().capture(out)));
-    let err = child.stderr.take().map(|err| tokio::spawn(log.clone().capture(err)));
+struct Watched {
+    id: String,
+    pid: u32,
+    child: Child,
+    log: Log,
+    awaited: Option<Awaited>,
+    force: InForce,
+}
+
+async fn watch(worker: Watched, outcomes: mpsc::Sender<Outcome>) {
+    let Watched { id, pid, mut child, log, awaited, force } = worker;
+    let out = child.stdout.take().map(|out| tokio::spawn(log.clone().capture(out, awaited)));
+    let err = child.stderr.take().map(|err| tokio::spawn(log.clone().capture(err, None)));
     // `wait` would close the pipe that tells the worker that its parent lives.
     let parent_lives = child.stdin.take();
     let reason = match child.wait().await {
@@ -106,6 +142,7 @@ async fn watch(id: String, pid: u32, mut child: Child, log: Log, outcomes: mpsc:
     };
     drop(parent_lives);
     signal(pid, Signal::SIGKILL);
+    drop(force);
     let captured = async {
         for capture in [out, err].into_iter().flatten() {
             let _ = capture.await;

@@ -20,6 +20,7 @@ impl From<WorkerStatus> for v1::WorkerStatus {
             reason: worker.reason,
             resident_bytes: worker.resident_bytes,
             cpu_millicores: worker.cpu_millicores,
+            limits: worker.limits,
         }
     }
 }
@@ -47,6 +48,7 @@ impl TryFrom<v1::WorkerStatus> for WorkerStatus {
             reason: worker.reason,
             resident_bytes: worker.resident_bytes,
             cpu_millicores: worker.cpu_millicores,
+            limits: worker.limits,
         })
     }
 }

@@ -292,6 +292,7 @@ fn workers_and_pools_come_back_the_same() {
             reason: "killed by signal 9".to_owned(),
             resident_bytes: 1 << 20,
             cpu_millicores: 1500,
+            limits: "memory 64 MiB (cgroup)".to_owned(),
         };
         let pool = PoolStatus {
             template: worker.template.clone(),

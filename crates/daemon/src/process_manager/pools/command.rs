@@ -14,6 +14,8 @@ pub enum Event {
         id: String,
         /// Its process id, also that of its group.
         pid: u32,
+        /// What it may use of the machine, for people.
+        limits: String,
     },
     /// A worker's health is SERVING.
     Serving {

@@ -1,13 +1,14 @@
 //! When a worker that serves is asked whether it still does. One question at a time; the next one a while after the answer.
 
-use crate::process_manager::config::Template;
+use crate::process_manager::template::Template;
 use ratn_model::time::Timestamp;
 use std::time::Duration;
 
 /// See the module.
 #[derive(Debug)]
 pub(super) struct Liveness {
-    pause: Duration,
+    /// `None` where it cannot be asked.
+    pause: Option<Duration>,
     /// The time for an answer.
     within: Duration,
     /// When to ask; `None` while an answer is awaited, and before it serves.
@@ -16,7 +17,8 @@ pub(super) struct Liveness {
 
 impl Liveness {
     pub(super) fn of(template: &Template) -> Liveness {
-        Liveness { pause: template.liveness.interval(), within: template.liveness.timeout(), next: None }
+        let pause = template.readiness.can_be_asked().then(|| template.liveness.interval());
+        Liveness { pause, within: template.liveness.timeout(), next: None }
     }
 
     /// How long it has to answer, where it is to be asked now.
@@ -26,7 +28,7 @@ impl Liveness {
 
     /// It serves.
     pub(super) fn answered(&mut self, now: Timestamp) {
-        self.next = Some(now + self.pause);
+        self.next = self.pause.map(|pause| now + pause);
     }
 
     pub(super) fn deadline(&self) -> Option<Timestamp> {
@@ -37,7 +39,7 @@ impl Liveness {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::process_manager::config::Liveness as Config;
+    use crate::process_manager::template::Liveness as Config;
 
     #[test]
     fn it_is_asked_once_and_again_a_while_after_its_answer() {

@@ -18,7 +18,7 @@ mod worker;
 
 pub use command::{Command, Event, PoolError};
 
-use super::config::Template;
+use super::template::Template;
 use pool::Pool;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{Demand, PoolStatus};
@@ -47,9 +47,9 @@ impl Pools {
         let mut commands = Vec::new();
         match event {
             Event::Time => self.advance(now, &mut commands),
-            Event::Spawned { id, pid } => {
+            Event::Spawned { id, pid, limits } => {
                 if let Some(worker) = self.worker(&id) {
-                    worker.spawned(pid, &mut commands);
+                    worker.spawned(pid, limits, &mut commands);
                 }
             }
             Event::Serving { id, endpoint } => {
@@ -61,6 +61,7 @@ impl Pools {
                 if let Some(worker) = self.worker(&id) {
                     worker.offered(now, &mut commands);
                 }
+                self.let_follow(now, &mut commands);
             }
             Event::Exited { id, reason, last_words } => {
                 self.about(now, &id, &mut commands, |pool, number, commands| {
@@ -160,6 +161,18 @@ impl Pools {
     fn advance(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         for pool in self.pools.values_mut() {
             pool.advance(now, commands);
+            if !self.ending {
+                pool.fill(now, commands);
+            }
+        }
+    }
+
+    /// Starts the pools that have been waiting for others, where those have somebody ready now.
+    fn let_follow(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        let ready: BTreeSet<String> =
+            self.pools.iter().filter(|(_, pool)| pool.has_ready()).map(|(name, _)| name.clone()).collect();
+        for pool in self.pools.values_mut().filter(|pool| pool.waits()) {
+            pool.follow(&ready);
             if !self.ending {
                 pool.fill(now, commands);
             }

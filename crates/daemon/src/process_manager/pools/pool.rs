@@ -4,10 +4,10 @@ use super::command::{Command, PoolError};
 use super::restart::Restarts;
 use super::size::{Size, retiring};
 use super::worker::Worker;
-use crate::process_manager::config::Template;
+use crate::process_manager::template::Template;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::PoolStatus;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 #[derive(Debug)]
@@ -16,6 +16,8 @@ pub(super) struct Pool {
     host: String,
     size: Size,
     restarts: Restarts,
+    /// Templates that are waited for before the first worker is started.
+    waits_for: Vec<String>,
     /// By number: the youngest is the last.
     workers: BTreeMap<u64, Worker>,
     last_number: u64,
@@ -26,6 +28,7 @@ impl Pool {
         Pool {
             size: Size::new(template.min, template.max_workers(), template.spares),
             restarts: Restarts::new(host, &template.name),
+            waits_for: template.after.clone(),
             workers: BTreeMap::new(),
             last_number: 0,
             host: host.to_owned(),
@@ -60,6 +63,9 @@ impl Pool {
     pub(super) fn shortage(&self) -> Option<String> {
         let name = &self.template.name;
         match self.restarts.failure() {
+            "" if self.waits() && self.wanted() > 0 => {
+                Some(format!("`{name}` waits until there is a worker of {}", self.waits_for.join(", ")))
+            }
             "" if self.size.is_short() => {
                 Some(format!("`{name}` has {} workers at the most", self.template.max_workers()))
             }
@@ -90,6 +96,20 @@ impl Pool {
         let surplus = self.there().saturating_sub(self.wanted());
         let idle = self.workers.iter().filter_map(|(number, worker)| Some((worker.idle_since()?, *number)));
         retiring(idle, surplus, self.template.idle(), now)
+    }
+
+    /// Whether it waits for other templates still.
+    pub(super) fn waits(&self) -> bool {
+        !self.waits_for.is_empty()
+    }
+
+    /// Of these templates there is somebody ready.
+    pub(super) fn follow(&mut self, ready: &BTreeSet<String>) {
+        self.waits_for.retain(|name| !ready.contains(name));
+    }
+
+    pub(super) fn has_ready(&self) -> bool {
+        self.workers.values().any(Worker::is_ready)
     }
 
     /// Starts what is missing, unless it has to wait; the ids.
@@ -208,7 +228,7 @@ impl Pool {
     }
 
     fn missing(&self) -> u32 {
-        if self.restarts.has_failed() { 0 } else { self.wanted().saturating_sub(self.there()) }
+        if self.restarts.has_failed() || self.waits() { 0 } else { self.wanted().saturating_sub(self.there()) }
     }
 
     fn count(&self, of: impl Fn(&Worker) -> bool) -> u32 {

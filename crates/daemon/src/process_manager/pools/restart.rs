@@ -4,7 +4,7 @@
 //! Pauses are shorter than they say by up to a quarter, differently on every host and each time (but the same in every run), so that
 //! pools that lost the same thing at the same moment do not come back at the same moment.
 
-use crate::process_manager::config::Template;
+use crate::process_manager::template::Template;
 use ratn_model::time::Timestamp;
 use std::time::Duration;
 

@@ -35,7 +35,7 @@ impl Rig {
     }
 
     fn spawned(&mut self, id: &str) {
-        self.handle(Timestamp(0), Event::Spawned { id: id.to_owned(), pid: 4711 });
+        self.handle(Timestamp(0), Event::Spawned { id: id.to_owned(), pid: 4711, limits: String::new() });
     }
 
     fn serving(&mut self, now: Timestamp, id: &str) {
@@ -201,7 +201,7 @@ fn a_worker_that_does_not_serve_in_time_is_killed_and_counts_as_a_crash() {
         pools
             .take_commands()
             .iter()
-            .any(|command| matches!(command, Command::Tell(worker) if worker.reason == "not serving within 3 s"))
+            .any(|command| matches!(command, Command::Tell(worker) if worker.reason == "not ready within 3 s"))
     );
 }
 
@@ -401,4 +401,23 @@ fn a_worker_that_does_not_answer_is_taken_away_at_once_and_replaced() {
     let commands = pools.take_commands();
     assert!(matches!(&commands[1], Command::Tell(worker) if worker.reason == "hung: not serving within 10.0 s"));
     assert!(matches!(&commands[2], Command::Start { id, .. } if id == "planner-2@compute"));
+}
+
+#[test]
+fn a_template_starts_after_those_it_waits_for() {
+    let template = |name: &str, after: &[&str]| Template {
+        after: after.iter().map(|&name| name.to_owned()).collect(),
+        ..Template::new(name, "Any")
+    };
+    let pools = Pools::new("compute", [template("a", &["b", "c"]), template("b", &["c"]), template("c", &[])]);
+    let mut pools = Rig { pools, commands: Vec::new() };
+    pools.advance(at(0.0));
+    assert_eq!(started(&mut pools), ["c-1@compute"]);
+    assert_eq!(pools.shortages()["Any"], "`b` waits until there is a worker of c");
+    pools.bring_up(at(1.0), "c-1@compute");
+    assert_eq!(started(&mut pools), ["b-1@compute"]);
+    // What has ended since was there.
+    pools.exited(at(2.0), "c-1@compute", "killed by signal 9", "");
+    pools.bring_up(at(3.0), "b-1@compute");
+    assert_eq!(started(&mut pools), ["c-2@compute", "a-1@compute"]);
 }

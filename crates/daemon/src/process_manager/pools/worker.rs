@@ -12,7 +12,7 @@
 
 use super::command::Command;
 use super::liveness;
-use crate::process_manager::config::Template;
+use crate::process_manager::template::Template;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{WorkerState, WorkerStatus};
 
@@ -27,6 +27,8 @@ pub(super) struct Worker {
     idle_since: Option<Timestamp>,
     liveness: liveness::Liveness,
     pid: u32,
+    /// What it may use of the machine, for people.
+    limits: String,
     endpoint: String,
 }
 
@@ -62,6 +64,7 @@ impl Worker {
             idle_since: Some(now),
             liveness: liveness::Liveness::of(template),
             pid: 0,
+            limits: String::new(),
             endpoint: String::new(),
         }
     }
@@ -71,8 +74,8 @@ impl Worker {
     }
 
     /// Its process is there. One that was to end before is ended now.
-    pub(super) fn spawned(&mut self, pid: u32, commands: &mut Vec<Command>) {
-        self.pid = pid;
+    pub(super) fn spawned(&mut self, pid: u32, limits: String, commands: &mut Vec<Command>) {
+        (self.pid, self.limits) = (pid, limits);
         match self.phase {
             Phase::Stopping { kill_at: Some(_) } => commands.push(Command::Terminate { id: self.id.clone() }),
             Phase::Stopping { kill_at: None } | Phase::Failed { .. } => {
@@ -186,7 +189,7 @@ impl Worker {
     pub(super) fn advance(&mut self, now: Timestamp, template: &Template, commands: &mut Vec<Command>) {
         match self.phase {
             Phase::Starting { until } if until <= now => {
-                self.fail(format!("not serving within {} s", template.start_timeout_s), commands);
+                self.fail(format!("not ready within {} s", template.start_timeout_s), commands);
             }
             Phase::Leaving { until: Some(until) } if until <= now => {
                 self.stop(now + template.stop_timeout(), commands);
@@ -272,6 +275,7 @@ impl Worker {
             reason: String::new(),
             resident_bytes: 0,
             cpu_millicores: 0,
+            limits: self.limits.clone(),
         }
     }
 
@@ -288,7 +292,7 @@ impl Worker {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::process_manager::config::Liveness;
+    use crate::process_manager::template::Liveness;
 
     const ID: &str = "planner-1@compute";
     const SELDOM: Liveness = Liveness { interval_s: 1_000.0, timeout_s: 1.0 };
@@ -312,7 +316,7 @@ mod tests {
 
     fn ready() -> Worker {
         let mut worker = worker();
-        worker.spawned(4711, &mut Vec::new());
+        worker.spawned(4711, String::new(), &mut Vec::new());
         worker.serving(at(1.0), "unix:/w", "PathPlanner", &mut Vec::new());
         worker.offered(at(1.0), &mut Vec::new());
         worker
@@ -332,7 +336,7 @@ mod tests {
     #[test]
     fn a_worker_is_offered_when_it_serves_and_ready_when_its_resource_is_there() {
         let mut worker = worker();
-        assert!(commands(|c| worker.spawned(4711, c)).is_empty());
+        assert!(commands(|c| worker.spawned(4711, String::new(), c)).is_empty());
         let offered = commands(|c| worker.serving(at(1.0), "unix:/w", "PathPlanner", c));
         assert!(matches!(&offered[..], [Command::Offer { worker, kind }]
             if worker.endpoint == "unix:/w" && worker.pid == 4711 && kind == "PathPlanner"));
@@ -350,8 +354,8 @@ mod tests {
         assert!(worker.deadline().is_none());
         assert!(commands(|c| worker.serving(at(4.0), "unix:/late", "PathPlanner", c)).is_empty());
         // Its process came only now.
-        assert_eq!(commands(|c| worker.spawned(4711, c)), [Command::Kill { id: ID.into() }]);
-        assert_eq!(worker.exited("killed by signal 9").reason, "not serving within 3 s");
+        assert_eq!(commands(|c| worker.spawned(4711, String::new(), c)), [Command::Kill { id: ID.into() }]);
+        assert_eq!(worker.exited("killed by signal 9").reason, "not ready within 3 s");
     }
 
     #[test]
@@ -359,10 +363,14 @@ mod tests {
         let mut worker = worker();
         assert_eq!(commands(|c| assert!(worker.stop(at(5.0), c))), stopped());
         assert!(commands(|c| assert!(!worker.stop(at(9.0), c))).is_empty(), "once");
-        assert_eq!(commands(|c| worker.spawned(4711, c)), stopped()[1..], "there was nobody to hear it before");
+        assert_eq!(
+            commands(|c| worker.spawned(4711, String::new(), c)),
+            stopped()[1..],
+            "there was nobody to hear it before"
+        );
         assert_eq!(worker.deadline(), Some(at(5.0)));
         assert_eq!(commands(|c| worker.advance(at(5.0), &template(), c)), [Command::Kill { id: ID.into() }]);
-        assert_eq!(commands(|c| worker.spawned(4711, c)), [Command::Kill { id: ID.into() }]);
+        assert_eq!(commands(|c| worker.spawned(4711, String::new(), c)), [Command::Kill { id: ID.into() }]);
     }
 
     #[test]

@@ -1,0 +1,154 @@
+//! When a worker is ready, and whether it still is.
+
+use super::template::Template;
+use crate::config::{ConfigError, rule};
+use ratn_worker::client::Health;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use serde::{Deserialize, Serialize};
+use std::io;
+use std::net::Ipv4Addr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::net::{TcpStream, UnixDatagram};
+use tokio::sync::Notify;
+
+/// The pause between two tries of a port.
+const TRY_AGAIN_AFTER: Duration = Duration::from_millis(20);
+/// A message of `sd_notify` is not longer.
+const MESSAGE_BYTES: usize = 4_096;
+/// Bytes of a line that is waited for.
+const MAX_LINE_BYTES: usize = 256;
+
+/// How a worker shows that it is ready.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Readiness {
+    /// It writes its endpoint file, and its gRPC health there says SERVING.
+    #[default]
+    Health,
+    /// It says `READY=1` to the socket of `NOTIFY_SOCKET` (`sd_notify(3)`).
+    Notify,
+    /// A line of its standard output has this in it.
+    Line {
+        /// What.
+        contains: String,
+    },
+    /// A TCP port of loopback takes connections.
+    Port {
+        /// Which.
+        port: u16,
+    },
+}
+
+/// What is looked at until a worker is ready.
+#[derive(Debug)]
+pub(super) enum Signs {
+    Health,
+    Notify(UnixDatagram),
+    Line(Arc<Notify>),
+    Port(u16),
+}
+
+/// What is asked whether a worker still serves.
+#[derive(Debug)]
+pub(super) enum Pulse {
+    Health(Health),
+    Port(u16),
+    /// Nothing: it says so once.
+    None,
+}
+
+impl Readiness {
+    pub(super) fn check(&self, at: &str, template: &Template) -> Result<(), ConfigError> {
+        match self {
+            Readiness::Health | Readiness::Notify => Ok(()),
+            Readiness::Line { contains } => {
+                let holds = (1..=MAX_LINE_BYTES).contains(&contains.len()) && !contains.contains(char::is_control);
+                rule(format!("{at}.contains"), holds, format!("1 to {MAX_LINE_BYTES} bytes of one line"))
+            }
+            Readiness::Port { port } => {
+                rule(format!("{at}.port"), *port > 0, "from 1 to 65535")?;
+                let one = template.max_workers() == 1;
+                rule(format!("{at}.port"), one, "two workers cannot have the same port: max has to be 1")
+            }
+        }
+    }
+
+    /// Whether a worker that is ready can be asked whether it still is.
+    pub(super) fn can_be_asked(&self) -> bool {
+        matches!(self, Readiness::Health | Readiness::Port { .. })
+    }
+
+    /// What to look at; before the worker is started. `socket` is where it may notify.
+    pub(super) fn signs(&self, socket: &PathBuf) -> io::Result<Signs> {
+        Ok(match self {
+            Readiness::Health => Signs::Health,
+            Readiness::Notify => {
+                let _ = std::fs::remove_file(socket);
+                Signs::Notify(UnixDatagram::bind(socket)?)
+            }
+            Readiness::Line { .. } => Signs::Line(Arc::default()),
+            Readiness::Port { port } => Signs::Port(*port),
+        })
+    }
+}
+
+impl Signs {
+    /// Returns where the worker serves (empty where it does not say) once it is ready.
+    pub(super) async fn ready(
+        self,
+        directory: &RuntimeDirectory,
+        id: &str,
+        within: Duration,
+    ) -> Result<(String, Pulse), String> {
+        // A worker that is no server has no endpoint.
+        let endpoint = || directory.find(id).map(|endpoint| endpoint.to_string()).unwrap_or_default();
+        match self {
+            Signs::Health => {
+                let endpoint = directory.wait_for(id, within).await.map_err(|error| error.to_string())?;
+                let mut health = Health::of(endpoint.clone());
+                health.serving(within).await.map_err(|error| error.to_string())?;
+                Ok((endpoint.to_string(), Pulse::Health(health)))
+            }
+            Signs::Notify(socket) => {
+                let mut message = vec![0; MESSAGE_BYTES];
+                loop {
+                    let length = socket.recv(&mut message).await.map_err(|error| error.to_string())?;
+                    if message[..length].split(|byte| *byte == b'\n').any(|line| line == b"READY=1") {
+                        return Ok((endpoint(), Pulse::None));
+                    }
+                }
+            }
+            Signs::Line(seen) => {
+                seen.notified().await;
+                Ok((endpoint(), Pulse::None))
+            }
+            Signs::Port(port) => {
+                let mut pulse = Pulse::Port(port);
+                pulse.beats(within).await?;
+                Ok((format!("http://{}:{port}", Ipv4Addr::LOCALHOST), pulse))
+            }
+        }
+    }
+}
+
+impl Pulse {
+    /// Returns once it says that it serves.
+    pub(super) async fn beats(&mut self, within: Duration) -> Result<(), String> {
+        match self {
+            Pulse::Health(health) => health.serving(within).await.map_err(|error| error.to_string()),
+            Pulse::Port(port) => {
+                let connected = tokio::time::timeout(within, async {
+                    while TcpStream::connect((Ipv4Addr::LOCALHOST, *port)).await.is_err() {
+                        tokio::time::sleep(TRY_AGAIN_AFTER).await;
+                    }
+                });
+                connected
+                    .await
+                    .map_err(|_| format!("no connection to port {port} within {:.1} s", within.as_secs_f64()))
+            }
+            Pulse::None => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,244 @@
+//! A pool of equal workers, as the config has it: what is run, how many, and how it is watched and ended.
+
+use super::config::check_name;
+use super::limits::Limits;
+use super::parameter::{self, Parameter};
+use super::readiness::Readiness;
+use crate::config::{ConfigError, rule};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// A pool has at most so many workers.
+const MAX_WORKERS: u32 = 1_000;
+
+/// A pool of equal workers.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Template {
+    /// Its name, the beginning of every worker's id.
+    pub name: String,
+    /// The kind of resource that a worker is, `PathPlanner`; its class is process.
+    pub kind: String,
+    /// What to run; without it, this program.
+    #[serde(default)]
+    pub program: Option<PathBuf>,
+    /// Its arguments. `{id}`, `{kind}`, `{host}`, `{runtime_dir}`, `{endpoint_file}` and the names of `parameters` are filled in.
+    /// The worker writes where it serves to `{endpoint_file}`, which is `{runtime_dir}/{id}.endpoint`; its standard input is a
+    /// pipe that ends with the process manager.
+    #[serde(default)]
+    pub args: Vec<String>,
+    /// What else is filled in, by name.
+    #[serde(default)]
+    pub parameters: BTreeMap<String, Parameter>,
+    /// Environment variables, filled in likewise. Of the process manager's own it gets what programs need to run at all (`PATH`,
+    /// `HOME`, `LANG`, `TZ` and the like) and whatever begins with `RATN_`.
+    #[serde(default)]
+    pub env: BTreeMap<String, String>,
+    /// Variables of the process manager's own environment that it gets, too.
+    #[serde(default)]
+    pub pass_env: Vec<String>,
+    /// Where it runs; without it, where the process manager does.
+    #[serde(default)]
+    pub directory: Option<PathBuf>,
+    /// What it may use of the machine.
+    #[serde(default)]
+    pub limits: Limits,
+    /// When it is ready.
+    #[serde(default)]
+    pub readiness: Readiness,
+    /// Templates of which a worker has to be ready before the first of this one is started.
+    #[serde(default)]
+    pub after: Vec<String>,
+    /// At least so many workers are kept.
+    #[serde(default = "one")]
+    pub min: u32,
+    /// At most so many workers are started; without it `min`, but at least one.
+    #[serde(default)]
+    pub max: Option<u32>,
+    /// So many more are kept ready beside those that are held (and beside `min`).
+    #[serde(default)]
+    pub spares: u32,
+    /// A worker beyond what is kept ends when nobody has held it for this long, in seconds.
+    #[serde(default = "minute")]
+    pub idle_s: f64,
+    /// A worker that is not ready after this long has failed, in seconds.
+    #[serde(default = "ten")]
+    pub start_timeout_s: f64,
+    /// How a worker that serves is seen to hang.
+    #[serde(default)]
+    pub liveness: Liveness,
+    /// A worker that is to stop while it is held is given this long to be released, in seconds; then its holder loses it.
+    #[serde(default = "half_a_minute")]
+    pub drain_s: f64,
+    /// A worker that has not ended this long after SIGTERM is killed, in seconds.
+    #[serde(default = "two")]
+    pub stop_timeout_s: f64,
+    /// A first crash is followed by a new start at once, a second one after this long, each further one after twice as
+    /// long, in milliseconds.
+    #[serde(default = "backoff")]
+    pub backoff_ms: u64,
+    /// … up to this, in milliseconds.
+    #[serde(default = "max_backoff")]
+    pub max_backoff_ms: u64,
+    /// A worker that served this long was not part of a crash loop, in seconds.
+    #[serde(default = "ten")]
+    pub stable_s: f64,
+    /// After so many crashes in a row the pool has failed: nothing is started until somebody asks for it.
+    #[serde(default = "crash_limit")]
+    pub crash_limit: u32,
+}
+
+/// How a worker that serves is seen to hang: it is asked for its health, and killed and replaced when it does not answer in time.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Liveness {
+    /// The pause between an answer and the next question, in seconds.
+    pub interval_s: f64,
+    /// How long an answer may take, in seconds.
+    pub timeout_s: f64,
+}
+
+impl Default for Liveness {
+    fn default() -> Self {
+        Liveness { interval_s: 5.0, timeout_s: 10.0 }
+    }
+}
+
+impl Liveness {
+    pub(crate) fn interval(self) -> Duration {
+        Duration::from_secs_f64(self.interval_s)
+    }
+
+    pub(crate) fn timeout(self) -> Duration {
+        Duration::from_secs_f64(self.timeout_s)
+    }
+}
+
+impl Template {
+    /// A template with the default of every optional key.
+    pub fn new(name: impl Into<String>, kind: impl Into<String>) -> Template {
+        Template {
+            name: name.into(),
+            kind: kind.into(),
+            program: None,
+            args: Vec::new(),
+            parameters: BTreeMap::new(),
+            env: BTreeMap::new(),
+            pass_env: Vec::new(),
+            directory: None,
+            limits: Limits::default(),
+            readiness: Readiness::default(),
+            after: Vec::new(),
+            min: one(),
+            max: None,
+            spares: 0,
+            idle_s: minute(),
+            start_timeout_s: ten(),
+            liveness: Liveness::default(),
+            drain_s: half_a_minute(),
+            stop_timeout_s: two(),
+            backoff_ms: backoff(),
+            max_backoff_ms: max_backoff(),
+            stable_s: ten(),
+            crash_limit: crash_limit(),
+        }
+    }
+
+    /// At most so many workers.
+    pub fn max_workers(&self) -> u32 {
+        self.max.unwrap_or(self.min.max(1))
+    }
+
+    pub(crate) fn start_timeout(&self) -> Duration {
+        Duration::from_secs_f64(self.start_timeout_s)
+    }
+
+    pub(crate) fn idle(&self) -> Duration {
+        Duration::from_secs_f64(self.idle_s)
+    }
+
+    pub(crate) fn drain(&self) -> Duration {
+        Duration::from_secs_f64(self.drain_s)
+    }
+
+    pub(crate) fn stop_timeout(&self) -> Duration {
+        Duration::from_secs_f64(self.stop_timeout_s)
+    }
+
+    pub(crate) fn stable(&self) -> Duration {
+        Duration::from_secs_f64(self.stable_s)
+    }
+
+    /// Says what is wrong with it; `at` is its place in the config.
+    pub(super) fn check(&self, at: &str) -> Result<(), ConfigError> {
+        let key = |name: &str| format!("{at}.{name}");
+        check_name(&key("name"), &self.name)?;
+        check_name(&key("kind"), &self.kind)?;
+        let max = self.max_workers();
+        rule(key("max"), self.min <= max, format!("min = {} is above max = {max}", self.min))?;
+        rule(key("max"), max <= MAX_WORKERS, format!("at most {MAX_WORKERS}"))?;
+        let kept = self.min.saturating_add(self.spares);
+        rule(key("spares"), self.spares == 0 || kept <= max, format!("min + spares = {kept} is above max = {max}"))?;
+        for (name, seconds) in [
+            ("start_timeout_s", self.start_timeout_s),
+            ("drain_s", self.drain_s),
+            ("stop_timeout_s", self.stop_timeout_s),
+            ("stable_s", self.stable_s),
+            ("idle_s", self.idle_s),
+            ("liveness.interval_s", self.liveness.interval_s),
+            ("liveness.timeout_s", self.liveness.timeout_s),
+        ] {
+            rule(key(name), (0.001..=86_400.0).contains(&seconds), "from 0.001 s to a day")?;
+        }
+        rule(key("crash_limit"), self.crash_limit >= 1, "at least 1")?;
+        rule(key("backoff_ms"), self.backoff_ms >= 1, "at least 1 ms")?;
+        rule(key("max_backoff_ms"), self.max_backoff_ms >= self.backoff_ms, "at least backoff_ms")?;
+        let absolute = self.directory.as_ref().is_none_or(|directory| directory.is_absolute());
+        rule(key("directory"), absolute, "an absolute path")?;
+        self.limits.check(&key("limits"))?;
+        self.readiness.check(&key("readiness"), self)?;
+        for (name, parameter) in &self.parameters {
+            parameter.check(&key(&format!("parameters.{name}")), name)?;
+        }
+        let texts = self.args.iter().enumerate().map(|(i, text)| (format!("args[{i}]"), text));
+        for (name, text) in texts.chain(self.env.iter().map(|(name, text)| (format!("env.{name}"), text))) {
+            let unknown = parameter::unknown(text, &self.parameters);
+            rule(key(&name), unknown.is_none(), format!("`{{{}}}` is not known", unknown.unwrap_or_default()))?;
+        }
+        Ok(())
+    }
+}
+
+fn one() -> u32 {
+    1
+}
+
+fn two() -> f64 {
+    2.0
+}
+
+fn ten() -> f64 {
+    10.0
+}
+
+fn half_a_minute() -> f64 {
+    30.0
+}
+
+fn minute() -> f64 {
+    60.0
+}
+
+fn backoff() -> u64 {
+    100
+}
+
+fn max_backoff() -> u64 {
+    5_000
+}
+
+fn crash_limit() -> u32 {
+    5
+}
