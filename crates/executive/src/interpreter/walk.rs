@@ -33,8 +33,8 @@ impl Interpreter {
                 Todo::Done { outcome, reason } => return Progress::Ended { outcome, reason },
             }
         }
-        let frames = self.threads.values().flat_map(|thread| &thread.frames);
-        let innermost = frames.filter(|frame| frame.iteration.is_some()).next_back();
+        let mut frames = self.threads.values().flat_map(|thread| &thread.frames);
+        let innermost = frames.rfind(|frame| frame.iteration.is_some());
         let reason = in_circles(innermost.map_or("", |frame| &frame.path));
         self.abort(context);
         Progress::Ended { outcome: ABORTED.to_owned(), reason }
