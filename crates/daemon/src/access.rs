@@ -100,7 +100,7 @@ const METHODS: [(&str, &[Row]); 5] = [
     (
         "ratn.v1.WorldPoolService",
         &[
-            (Look, &["Diff", "GetFactHistory", "GetRoot", "Query", "Watch"]),
+            (Look, &["Diff", "GetFactHistory", "GetRoot", "Query", "Watch", "WatchProjection"]),
             (Commit, &["Commit"]),
             (Project, &["Project", "Release"]),
         ],

@@ -46,6 +46,7 @@ async fn a_projection_shows_its_reads_only_and_dies_with_its_lease() {
         request: "run/i2/1".to_owned(),
         base: Revision(1),
         changes: vec![set("at", "box", 2)],
+        writers: Vec::new(),
         reads: Footprint::Patterns(vec![any("at")]),
         lease: Some((lease.id, lease.token)),
     };
@@ -246,4 +247,36 @@ async fn a_measured_fact_says_what_measured_it_and_is_gone_after_its_time() {
     let outside = world.commit("run/i2", vec![set("at", "box", 1)], None).await.unwrap_err();
     assert_eq!(outside.code(), Some(Code::FailedPrecondition), "{outside}");
     assert_eq!(values(&world, None, "full").await, Ok(vec![Value::Int(1)]));
+}
+
+#[tokio::test]
+async fn whoever_holds_a_projection_hears_when_a_commit_contradicts_it() {
+    let system = TestSystem::new();
+    let pool = system.world_pool(2).await;
+    let world = system.world(&pool);
+    world.commit("a", vec![set("at", "box", 1), set("at", "cup", 1)], None).await.unwrap();
+    let projection = Projection {
+        request: "run/i2/1".to_owned(),
+        base: Revision(1),
+        changes: vec![set("at", "box", 2)],
+        writers: vec!["place[1]".to_owned()],
+        reads: Footprint::Patterns(vec![any("at")]),
+        lease: None,
+    };
+    let id = world.project(projection).await.unwrap();
+    let mut watch = world.watch_projection(id).await.unwrap();
+    assert_eq!(in_time(watch.next()).await.unwrap(), Some(None), "it holds");
+    let commit = |id: &str, changes, writer: &str| {
+        let (id, writer) = (id.to_owned(), writer.to_owned());
+        world.commit_as(Commit { id, changes, writer, ..Commit::default() })
+    };
+    let (_, none) = commit("b", vec![set("at", "box", 2)], "place[1]").await.unwrap();
+    assert_eq!(none, [], "as it was predicted");
+    let (revision, found) = commit("c", vec![set("at", "cup", 5)], "").await.unwrap();
+    let said: Vec<_> = found.iter().map(|one| (one.projection, one.fact.to_string(), one.revision)).collect();
+    assert_eq!(said, [(id, "at(cup)".to_owned(), revision)]);
+    assert_eq!(in_time(watch.next()).await.unwrap().flatten().as_ref(), found.first());
+    assert!(world.release(id).await.unwrap());
+    assert_eq!(in_time(watch.next()).await.unwrap(), None, "it has ended");
+    assert_eq!(world.watch_projection(id).await.unwrap_err().code(), Some(Code::NotFound));
 }

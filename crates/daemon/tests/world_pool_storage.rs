@@ -29,6 +29,7 @@ fn projection(request: &str, base: u64) -> Projection {
         request: request.to_owned(),
         base: Revision(base),
         changes: vec![set("cup", "projected")],
+        writers: Vec::new(),
         reads: Footprint::Everything,
         lease: None,
     }

@@ -326,6 +326,21 @@ pub struct FactDifference {
     pub after: Option<FactRecord>,
 }
 
+/// A projection that a revision of the root world contradicts.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Contradiction {
+    /// Which.
+    pub projection: ProjectionId,
+    /// The first fact, in the order of keys, that it showed and that is otherwise.
+    pub fact: FactKey,
+    /// What it showed; `None`: that there is no such fact.
+    pub was: Option<Value>,
+    /// What it would show now.
+    pub is: Option<Value>,
+    /// The revision that made it so.
+    pub revision: Revision,
+}
+
 /// What a fact was from one revision on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FactVersion {

@@ -1,7 +1,7 @@
-//! A bare tonic echo, unary and over a stream, with the messages of a block: what the transport alone costs.
+//! A bare tonic echo, unary and over a stream, with the messages of a block and of a projection: what the transport alone costs.
 
 use futures::{Stream, StreamExt};
-use ratn_proto::v1::{BlockRequest, BlockResponse, Lease};
+use ratn_proto::v1::{BlockRequest, BlockResponse, Lease, ProjectRequest, ProjectResponse};
 use std::convert::Infallible;
 use std::future::Future;
 use std::pin::Pin;
@@ -17,6 +17,7 @@ use tonic::{Request, Response, Status, Streaming};
 use tonic_prost::ProstCodec;
 
 const UNARY: &str = "/bench.Echo/Unary";
+const PROJECT: &str = "/bench.Echo/Project";
 const STREAM: &str = "/bench.Echo/Stream";
 
 /// Says where it listens on its standard output and serves until it is killed.
@@ -51,6 +52,10 @@ impl tower_service::Service<http::Request<Body>> for Echo {
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
         Box::pin(async move {
+            if request.uri().path() == PROJECT {
+                let mut grpc = Grpc::new(ProstCodec::<ProjectResponse, ProjectRequest>::default());
+                return Ok(grpc.unary(Projected, request).await);
+            }
             let mut grpc = Grpc::new(ProstCodec::<BlockResponse, BlockRequest>::default());
             Ok(match request.uri().path() {
                 UNARY => grpc.unary(Unary, request).await,
@@ -68,6 +73,17 @@ impl UnaryService<BlockRequest> for Unary {
 
     fn call(&mut self, request: Request<BlockRequest>) -> Self::Future {
         Box::pin(async move { Ok(Response::new(granted(request.get_ref()))) })
+    }
+}
+
+struct Projected;
+
+impl UnaryService<ProjectRequest> for Projected {
+    type Response = ProjectResponse;
+    type Future = Boxed<Result<Response<ProjectResponse>, Status>>;
+
+    fn call(&mut self, request: Request<ProjectRequest>) -> Self::Future {
+        Box::pin(async move { Ok(Response::new(ProjectResponse { projection_id: request.get_ref().base_revision })) })
     }
 }
 
@@ -96,6 +112,13 @@ impl Client {
         self.0.ready().await.unwrap();
         let codec = ProstCodec::<BlockRequest, BlockResponse>::default();
         let path = PathAndQuery::from_static(UNARY);
+        self.0.unary(Request::new(request), path, codec).await.unwrap().into_inner()
+    }
+
+    pub(crate) async fn project(&mut self, request: ProjectRequest) -> ProjectResponse {
+        self.0.ready().await.unwrap();
+        let codec = ProstCodec::<ProjectRequest, ProjectResponse>::default();
+        let path = PathAndQuery::from_static(PROJECT);
         self.0.unary(Request::new(request), path, codec).await.unwrap().into_inner()
     }
 }

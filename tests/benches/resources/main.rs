@@ -1,5 +1,5 @@
 //! What the resource manager costs beside a bare echo, and beside etcd and Redis where they are installed: `scripts/bench-resources`
-//! prints it as one JSON document.
+//! prints it as one JSON document. With `--world` it is what the world pool costs (`scripts/bench-world`): [`world`].
 //!
 //! Every server is a process of its own, on TCP over loopback; the echo's messages are those of a block. What is compared is measured
 //! in turns, so that what else the machine does hits all alike.
@@ -22,6 +22,7 @@ mod load;
 mod process;
 mod redis;
 mod times;
+mod world;
 
 use etcd::Etcd;
 use futures::StreamExt;
@@ -52,6 +53,9 @@ fn main() {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
     if std::env::args().any(|argument| argument == "--echo") {
         return runtime.block_on(echo::serve());
+    }
+    if std::env::args().any(|argument| argument == "--world") {
+        return runtime.block_on(world::measure());
     }
     runtime.block_on(measure());
 }

@@ -39,14 +39,19 @@ pub(crate) fn echo() -> (Process, String) {
 
 /// A resource manager with a directory of its own.
 pub(crate) async fn manager(directory: &Path, durability: &str) -> (Process, String) {
+    daemon("resource-manager", directory, durability).await
+}
+
+/// A daemon that keeps a state, with a directory of its own.
+pub(crate) async fn daemon(role: &str, directory: &Path, durability: &str) -> (Process, String) {
     let child = Command::new(env!("CARGO_BIN_EXE_ratn-under-test"))
-        .args(["resource-manager", "--listen", "127.0.0.1:0", "--durability", durability, "--runtime-dir"])
+        .args([role, "--listen", "127.0.0.1:0", "--durability", durability, "--runtime-dir"])
         .arg(directory)
         .env("RATN_LOG", "warn")
         .spawn()
         .unwrap();
     let process = Process(child);
-    let file = directory.join("resource-manager.endpoint");
+    let file = directory.join(format!("{role}.endpoint"));
     let began = Instant::now();
     while began.elapsed() < PATIENCE {
         if let Ok(endpoint) = std::fs::read_to_string(&file)
@@ -56,7 +61,7 @@ pub(crate) async fn manager(directory: &Path, durability: &str) -> (Process, Str
         }
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
-    panic!("the resource manager did not come up");
+    panic!("the {role} did not come up");
 }
 
 /// Something installed that listens on a port of the loopback; nothing where it is not installed.

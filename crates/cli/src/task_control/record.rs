@@ -65,7 +65,9 @@ impl Recorder {
             let event = match record {
                 Record::Project { instance, attempt, base, changes, reads, lease } => {
                     let request = format!("{}/{instance}/{attempt}", self.run);
-                    self.project(instance, attempt, Projection { request, base, changes, reads, lease }).await
+                    let writers = Vec::new();
+                    let wanted = Projection { request, base, changes, writers, reads, lease };
+                    self.project(instance, attempt, wanted).await
                 }
                 Record::Commit { instance, changes, revision, writer } => {
                     let id = commit_request(&self.run, instance, revision);

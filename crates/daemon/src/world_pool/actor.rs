@@ -15,8 +15,10 @@ use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
 use ratn_model::ontology::Ontology;
 use ratn_model::time::Timestamp;
+use ratn_proto::types::Contradiction;
 use ratn_storage::{Fault, Progress};
 use ratn_world::world::{Fact, World};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot, watch};
@@ -45,7 +47,7 @@ pub(super) enum Message {
     },
     Commit {
         commit: Commit,
-        answer: Answer<Revision>,
+        answer: Answer<(Revision, Vec<Contradiction>)>,
     },
     Project {
         projection: NewProjection,
@@ -67,6 +69,10 @@ pub(super) enum Message {
         /// Unset, the root as it is.
         to: Option<Revision>,
         answer: Answer<(Vec<Difference>, Revision)>,
+    },
+    WatchProjection {
+        projection: ProjectionId,
+        answer: Answer<watch::Receiver<Option<Contradiction>>>,
     },
     Versions {
         key: FactKey,
@@ -95,6 +101,7 @@ pub(super) struct NewProjection {
     pub(super) request_id: String,
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
+    pub(super) writers: Vec<String>,
     pub(super) reads: Footprint,
     pub(super) lease: Option<LeaseId>,
 }
@@ -125,6 +132,10 @@ struct Actor {
     /// Nor is anything shown: it is not known what is on the disk.
     unreadable: bool,
     watchers: Vec<mpsc::Sender<Update>>,
+    /// Contradictions that are to be told.
+    contradicted: Vec<Contradiction>,
+    /// Projections that somebody watches.
+    watched: BTreeMap<ProjectionId, watch::Sender<Option<Contradiction>>>,
     leases: watch::Receiver<LiveLeases>,
     start: Instant,
 }
@@ -134,6 +145,8 @@ enum Outgoing {
     Answer(SendAnswer),
     /// To everybody who watches.
     News(Arc<Kept>),
+    /// To who watches the projection.
+    Contradicted(Contradiction),
     /// From here on it sees every revision.
     Watcher(mpsc::Sender<Update>),
 }
@@ -150,8 +163,19 @@ pub(super) fn start(
     // A pool that makes a projection every microsecond for as long as it lives would reach those of its successor.
     let pool = WorldPool::new(config.clone(), ontology, history, floor().saturating_mul(1_000));
     let (outbox, start) = (Outbox::default(), Instant::now());
-    let actor =
-        Actor { config, pool, journal, outbox, stopped: None, unreadable: false, watchers: Vec::new(), leases, start };
+    let actor = Actor {
+        config,
+        pool,
+        journal,
+        outbox,
+        stopped: None,
+        unreadable: false,
+        watchers: Vec::new(),
+        contradicted: Vec::new(),
+        watched: BTreeMap::new(),
+        leases,
+        start,
+    };
     (Handle { inbox }, tokio::spawn(actor.run(messages, over)))
 }
 
@@ -187,6 +211,8 @@ impl Actor {
                 },
             }
             self.deliver();
+            let pool = &self.pool;
+            self.watched.retain(|id, watched| pool.has(*id) && !watched.is_closed());
         }
     }
 
@@ -213,6 +239,9 @@ impl Actor {
                     Some(stopped) => Err(stopped.clone()),
                     None => self.pool.commit(now, &commit).map_err(|error| status::of_commit(&error)),
                 };
+                let contradictions = self.pool.take_contradictions();
+                self.contradicted.extend(contradictions.iter().cloned());
+                let committed = committed.map(|revision| (revision, contradictions));
                 tracing::debug!(id = commit.id, changes = commit.changes.len(), ?committed, "commit");
                 self.reply(answer, committed);
             }
@@ -232,6 +261,17 @@ impl Actor {
                 }
                 Err(refused) => self.reply(answer, Err(refused)),
             },
+            Message::WatchProjection { projection, answer } => {
+                let watch = match self.pool.contradiction(projection) {
+                    Ok(contradiction) => {
+                        let known = contradiction.cloned();
+                        let new = || watch::Sender::new(known);
+                        Ok(self.watched.entry(projection).or_insert_with(new).subscribe())
+                    }
+                    Err(error) => Err(status::of_query(&error)),
+                };
+                self.reply(answer, watch);
+            }
             Message::Diff { from, to, answer } => {
                 let to = to.unwrap_or(self.pool.root().revision());
                 let differences = self.pool.history.diff(from, to).map_err(status::of_revision);
@@ -264,6 +304,10 @@ impl Actor {
         let position = if written.is_ok() { self.journal.last() } else { self.journal.last().next() };
         for kept in self.pool.history.take_news() {
             self.outbox.hold(position, Outgoing::News(kept));
+        }
+        self.contradicted.extend(self.pool.take_contradictions());
+        for contradiction in self.contradicted.drain(..) {
+            self.outbox.hold(position, Outgoing::Contradicted(contradiction));
         }
         outgoing.into_iter().for_each(|outgoing| self.outbox.hold(position, outgoing));
         if let Err(error) = written {
@@ -307,7 +351,16 @@ impl Actor {
                     }
                 });
             }
-            Outgoing::Watcher(_) | Outgoing::News(_) => {}
+            Outgoing::Contradicted(contradiction) if refused.is_none() => {
+                if let Some(watched) = self.watched.get(&contradiction.projection) {
+                    watched.send_if_modified(|first| {
+                        let is_first = first.is_none();
+                        first.get_or_insert(contradiction);
+                        is_first
+                    });
+                }
+            }
+            Outgoing::Watcher(_) | Outgoing::News(_) | Outgoing::Contradicted(_) => {}
         }
     }
 
@@ -370,8 +423,8 @@ impl Actor {
                 Known::NotYet => unbound,
             },
         };
-        let NewProjection { request_id, base, changes, reads, .. } = new;
-        let request = ProjectRequest { request_id, base, changes, reads, held_by };
+        let NewProjection { request_id, base, changes, writers, reads, .. } = new;
+        let request = ProjectRequest { request_id, base, changes, writers, reads, held_by };
         self.pool.project(request).map_err(|error: ProjectError| status::of_project(&error))
     }
 }
@@ -388,6 +441,7 @@ impl std::fmt::Debug for Outgoing {
         f.write_str(match self {
             Outgoing::Answer(_) => "Answer",
             Outgoing::News(_) => "News",
+            Outgoing::Contradicted(_) => "Contradicted",
             Outgoing::Watcher(_) => "Watcher",
         })
     }

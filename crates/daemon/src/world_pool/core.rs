@@ -12,6 +12,9 @@ use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
 use ratn_model::ontology::Ontology;
 use ratn_model::time::Timestamp;
+use ratn_model::tolerance::{Tolerance, Tolerances};
+use ratn_proto::types::Contradiction;
+use ratn_world::reads::{Effect, Live};
 use ratn_world::world::{ChangeError, Fact, World};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -24,7 +27,12 @@ pub(super) struct WorldPool {
     pub(super) history: History,
     ontology: Option<Ontology>,
     expiry: Expiry,
+    tolerances: Tolerances,
     projections: BTreeMap<ProjectionId, Projection>,
+    /// What they show, to compare with what is committed.
+    live: Live<ProjectionId>,
+    /// Since [`WorldPool::take_contradictions`].
+    contradictions: Vec<Contradiction>,
     projected: Memory<ProjectionId>,
     by_lease: BTreeMap<LeaseId, BTreeSet<ProjectionId>>,
     last_projection: u64,
@@ -37,6 +45,8 @@ struct Projection {
     reads: Footprint,
     held_by: HeldBy,
     request_id: String,
+    /// The first that there was.
+    contradiction: Option<Contradiction>,
 }
 
 /// What a projection lives as long as.
@@ -54,8 +64,24 @@ pub(super) struct ProjectRequest {
     pub(super) request_id: String,
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
+    /// Who will make the change at the same place; empty or missing: nobody.
+    pub(super) writers: Vec<String>,
     pub(super) reads: Footprint,
     pub(super) held_by: HeldBy,
+}
+
+impl ProjectRequest {
+    fn effects(&self) -> impl Iterator<Item = Effect> {
+        self.changes.iter().enumerate().map(|(place, change)| {
+            let writer = self.writers.get(place).filter(|writer| !writer.is_empty());
+            Effect { writer: writer.map(|writer| Arc::from(writer.as_str())), change: change.clone() }
+        })
+    }
+}
+
+fn wire(found: ratn_world::reads::Contradiction<ProjectionId>, revision: Revision) -> Contradiction {
+    let ratn_world::reads::Contradiction { projection, fact, was, is } = found;
+    Contradiction { projection, fact, was, is, revision }
 }
 
 /// A projection that was not made.
@@ -94,6 +120,9 @@ impl WorldPool {
         let ttl = declared.chain(configured).map(|(name, ttl_s)| (name, Duration::from_secs_f64(ttl_s)));
         let mut pool = WorldPool {
             expiry: Expiry::new(ttl.collect()),
+            tolerances: ontology.as_ref().map(|known| known.tolerances(Tolerances::default())).unwrap_or_default(),
+            live: Live::default(),
+            contradictions: Vec::new(),
             ontology,
             history,
             projections: BTreeMap::new(),
@@ -112,13 +141,68 @@ impl WorldPool {
 
     /// All changes as the next revision, or none. An id committed before gets its answer again.
     pub(super) fn commit(&mut self, now: Timestamp, commit: &Commit) -> Result<Revision, CommitError> {
-        let before = self.root().revision();
+        let before = self.root().clone();
         let revision = self.history.commit(commit, self.ontology.as_ref())?;
         // An answer of before has written nothing now.
-        if let Some(kept) = self.history.newest().filter(|kept| kept.world.revision() > before) {
+        if let Some(kept) = self.history.newest().filter(|kept| kept.world.revision() > before.revision()) {
             self.expiry.written(now, &kept.written);
+            let tolerance = |predicate: &str| self.tolerances.of(predicate, Tolerance::EXACT);
+            let (writer, changes) = (commit.writer.as_deref(), &commit.changes);
+            let found = self.live.contradicted(&before, &kept.world, writer, changes, &tolerance);
+            for found in found {
+                let contradiction = wire(found, revision);
+                if let Some(projection) = self.projections.get_mut(&contradiction.projection) {
+                    projection.contradiction.get_or_insert_with(|| contradiction.clone());
+                }
+                self.contradictions.push(contradiction);
+            }
         }
         Ok(revision)
+    }
+
+    /// The projections that the revisions since the last call contradict.
+    pub(super) fn take_contradictions(&mut self) -> Vec<Contradiction> {
+        std::mem::take(&mut self.contradictions)
+    }
+
+    /// The first contradiction of a projection, if there was one.
+    pub(super) fn contradiction(&self, id: ProjectionId) -> Result<Option<&Contradiction>, QueryError> {
+        let projection = self.projections.get(&id).ok_or(QueryError::Unknown { id })?;
+        Ok(projection.contradiction.as_ref())
+    }
+
+    /// Whether a projection is there.
+    pub(super) fn has(&self, id: ProjectionId) -> bool {
+        self.projections.contains_key(&id)
+    }
+
+    /// What the revisions after its base have contradicted already, and which of its effects have not come true yet.
+    fn catch_up(
+        &self,
+        id: ProjectionId,
+        world: &World,
+        request: &ProjectRequest,
+    ) -> (Option<Contradiction>, Vec<Effect>) {
+        let mut effects: Vec<Effect> = request.effects().collect();
+        if request.base == self.root().revision() {
+            return (None, effects);
+        }
+        let mut alone: Live<ProjectionId> = Live::default();
+        alone.insert(id, request.base, world.clone(), effects.clone(), request.reads.clone());
+        let tolerance = |predicate: &str| self.tolerances.of(predicate, Tolerance::EXACT);
+        let mut first = None;
+        let Ok(mut before) = self.history.at(request.base) else { return (None, effects) };
+        let Ok(since) = self.history.after(request.base) else { return (None, effects) };
+        for kept in since {
+            let changes: Vec<Change> = kept.changes().collect();
+            let writer = kept.writer();
+            let found = alone.contradicted(before, &kept.world, writer, &changes, &tolerance);
+            let found = found.into_iter().map(|found| wire(found, kept.world.revision()));
+            first = first.or(found.into_iter().next());
+            effects.retain(|effect| writer.is_none() || effect.writer.as_deref() != writer);
+            before = &kept.world;
+        }
+        (first, effects)
     }
 
     /// When [`WorldPool::expire_facts`] has something to do.
@@ -162,7 +246,7 @@ impl WorldPool {
 
     /// The world at a revision with changes applied. A request made before gets its answer again, as long as it lives.
     pub(super) fn project(&mut self, request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
-        let fingerprint = fingerprint(&(request.base, &request.changes, &request.reads));
+        let fingerprint = fingerprint(&(request.base, &request.changes, &request.reads, &request.writers));
         if let Some(id) = self.projected.recall(&request.request_id, fingerprint)? {
             let ended = || ProjectError::Ended { request_id: request.request_id.clone() };
             return self.projections.contains_key(&id).then_some(id).ok_or_else(ended);
@@ -173,6 +257,8 @@ impl WorldPool {
         let world = self.history.at(request.base)?.project(&request.changes)?;
         self.last_projection += 1;
         let id = ProjectionId(self.last_projection);
+        let (contradiction, effects) = self.catch_up(id, &world, &request);
+        self.live.insert(id, request.base, world.clone(), effects, request.reads.clone());
         if let HeldBy::Lease(lease) = request.held_by {
             self.by_lease.entry(lease).or_default().insert(id);
         }
@@ -183,6 +269,7 @@ impl WorldPool {
             reads: request.reads,
             held_by: request.held_by,
             request_id: request.request_id,
+            contradiction,
         };
         self.projections.insert(id, projection);
         Ok(id)
@@ -223,6 +310,7 @@ impl WorldPool {
     /// Ends a projection; false when it had ended before.
     pub(super) fn release(&mut self, id: ProjectionId) -> bool {
         let Some(projection) = self.projections.remove(&id) else { return false };
+        self.live.remove(id);
         tracing::trace!(%id, request = projection.request_id, "projection ended");
         if let HeldBy::Lease(lease) = projection.held_by
             && let Some(ids) = self.by_lease.get_mut(&lease)
@@ -302,6 +390,7 @@ mod tests {
             request_id: request.to_owned(),
             base: Revision(base),
             changes: vec![set("box", 7)],
+            writers: Vec::new(),
             reads: Footprint::Patterns(vec![FactPattern::of(&key("box"))]),
             held_by: HeldBy::Lease(LeaseId(lease)),
         })
@@ -333,6 +422,7 @@ mod tests {
             request_id: "p".to_owned(),
             base: Revision(1),
             changes: vec![set("box", 7)],
+            writers: Vec::new(),
             reads: all,
             held_by: HeldBy::Until(Timestamp(5)),
         };
@@ -453,5 +543,61 @@ mod tests {
         assert_eq!(facts[1].1.measured, None);
         let none = Commit { id: "b".to_owned(), changes: vec![set("cup", 3)], ..commit };
         assert_eq!(pool.commit(Timestamp(0), &none), Err(CommitError::Evidence { fact: key("box") }));
+    }
+
+    #[test]
+    fn a_commit_says_which_projections_it_contradicts_in_which_fact() {
+        let mut pool = WorldPool::new(WorldPoolConfig::default(), None, History::new(&WorldPoolConfig::default()), 0);
+        commit(&mut pool, "a", &[set("box", 1), set("cup", 1)], None).unwrap();
+        let project = |pool: &mut WorldPool, base: u64, reads: &str| {
+            let request = ProjectRequest {
+                request_id: format!("{base}/{reads}"),
+                base: Revision(base),
+                changes: vec![set("box", 7)],
+                writers: vec!["place[1]".to_owned()],
+                reads: Footprint::Patterns(vec![FactPattern::of(&key(reads))]),
+                held_by: HeldBy::Until(Timestamp(9)),
+            };
+            pool.project(request).unwrap()
+        };
+        let (of_cup, of_box) = (project(&mut pool, 1, "cup"), project(&mut pool, 1, "box"));
+        commit(&mut pool, "b", &[set("cup", 2)], None).unwrap();
+        let found = pool.take_contradictions();
+        let expected = Contradiction {
+            projection: of_cup,
+            fact: key("cup"),
+            was: Some(Value::Int(1)),
+            is: Some(Value::Int(2)),
+            revision: Revision(2),
+        };
+        assert_eq!(found, vec![expected.clone()]);
+        assert_eq!(pool.contradiction(of_cup), Ok(Some(&expected)));
+        assert_eq!(pool.contradiction(of_box), Ok(None), "what it did not read is nothing to it");
+        // Made of a revision that is not the newest: what has happened since counts.
+        let of_all = ProjectRequest {
+            request_id: "late".to_owned(),
+            base: Revision(1),
+            changes: vec![set("box", 7)],
+            writers: vec!["place[1]".to_owned()],
+            reads: Footprint::Everything,
+            held_by: HeldBy::Until(Timestamp(9)),
+        };
+        let late = pool.project(of_all).unwrap();
+        assert_eq!(pool.contradiction(late), Ok(Some(&Contradiction { projection: late, ..expected })));
+        // What was predicted of a writer comes true, or otherwise.
+        let of = |id: &str, value| Commit {
+            id: id.to_owned(),
+            changes: vec![set("box", value)],
+            writer: Some("place[1]".to_owned()),
+            ..Commit::default()
+        };
+        pool.commit(Timestamp(0), &of("c", 7)).unwrap();
+        assert_eq!(pool.take_contradictions(), []);
+        commit(&mut pool, "d", &[set("box", 8)], None).unwrap();
+        let found: Vec<_> = pool.take_contradictions().into_iter().map(|found| (found.projection, found.is)).collect();
+        assert_eq!(found, [(of_box, Some(Value::Int(8))), (late, Some(Value::Int(8)))]);
+        assert!(pool.release(of_box));
+        commit(&mut pool, "e", &[set("box", 9)], None).unwrap();
+        assert!(pool.take_contradictions().iter().all(|found| found.projection == late), "the other has ended");
     }
 }

@@ -291,6 +291,19 @@ impl Journaled for History {
 }
 
 impl Kept {
+    /// What makes the revision before into this one.
+    pub(super) fn changes(&self) -> impl Iterator<Item = Change> {
+        self.written.iter().map(|(key, fact)| match fact {
+            Some(fact) => Change::Set { fact: key.as_ref().clone(), value: fact.value.clone() },
+            None => Change::Delete { pattern: FactPattern::of(key) },
+        })
+    }
+
+    /// Who committed it, where it wrote anything.
+    pub(super) fn writer(&self) -> Option<&str> {
+        self.written.values().flatten().next()?.writer.as_deref()
+    }
+
     /// As it was written down; its fingerprint is among what is remembered, if it still is.
     fn record(&self) -> CommitRecord {
         let gone = self.written.iter().filter(|(_, fact)| fact.is_none());

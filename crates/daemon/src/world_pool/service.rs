@@ -50,18 +50,20 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             writer: Some(request.writer).filter(|writer| !writer.is_empty()),
             evidence: each(request.evidence, "evidence")?,
         };
-        let revision = self.actor.ask(|answer| Message::Commit { commit, answer }).await?;
-        Ok(Response::new(v1::CommitResponse { revision: revision.0 }))
+        let (revision, contradictions) = self.actor.ask(|answer| Message::Commit { commit, answer }).await?;
+        Ok(Response::new(v1::CommitResponse { revision: revision.0, contradictions: all(contradictions) }))
     }
 
     async fn project(&self, request: Request<v1::ProjectRequest>) -> Result<Response<v1::ProjectResponse>, Status> {
         let request = request.into_inner();
         label(&request.request_id, "request_id")?;
+        request.writers.iter().try_for_each(|writer| label(writer, "writers"))?;
         let lease = (request.lease_id != 0).then_some(LeaseId(request.lease_id));
         let projection = NewProjection {
             request_id: request.request_id,
             base: Revision(request.base_revision),
             changes: each(request.changes, "changes")?,
+            writers: request.writers,
             reads: required(request.reads, "reads")?,
             lease,
         };
@@ -110,6 +112,20 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         });
         let stream = updates.take_until(self.shutdown.clone().cancelled_owned()).chain(last);
         Ok(Response::new(Box::pin(stream)))
+    }
+
+    type WatchProjectionStream = BoxStream<'static, Result<v1::WatchProjectionResponse, Status>>;
+
+    async fn watch_projection(
+        &self,
+        request: Request<v1::WatchProjectionRequest>,
+    ) -> Result<Response<Self::WatchProjectionStream>, Status> {
+        let projection = ProjectionId(request.into_inner().projection_id);
+        let validity = self.actor.ask(|answer| Message::WatchProjection { projection, answer }).await?;
+        let told = tokio_stream::wrappers::WatchStream::new(validity).map(|contradiction| {
+            Ok(v1::WatchProjectionResponse { contradiction: contradiction.map(v1::Contradiction::from) })
+        });
+        Ok(Response::new(Box::pin(told.take_until(self.shutdown.clone().cancelled_owned()))))
     }
 
     async fn diff(&self, request: Request<v1::DiffRequest>) -> Result<Response<v1::DiffResponse>, Status> {

@@ -257,6 +257,10 @@ proptest! {
         check::<_, v1::WorldPoolServiceWatchResponse>(&snapshot)?;
         let (before, after) = (Some(record.clone()), None);
         check::<_, v1::FactDifference>(&FactDifference { key: key.clone(), before, after })?;
+        let (was, is) = (Some(value.clone()), None);
+        let contradiction =
+            Contradiction { projection: ProjectionId(3), fact: key.clone(), was, is, revision: Revision(7) };
+        check::<_, v1::Contradiction>(&contradiction)?;
         check::<_, v1::FactVersion>(&FactVersion { revision: Revision(7), commit: String::new(), fact: Some(record) })?;
         check::<_, v1::Value>(&value)?;
         check::<_, v1::FactKey>(&key)?;

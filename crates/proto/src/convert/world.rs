@@ -1,10 +1,11 @@
 //! What is told of the root world: revisions as they are made, what differs between two, what a fact was.
 
 use super::{Malformed, all, each, label, missing_choice, required};
-use crate::types::{FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
+use crate::types::{Contradiction, FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
 use crate::v1;
 use crate::v1::world_pool_service_watch_response::Kind;
-use ratn_model::id::Revision;
+use ratn_model::id::{ProjectionId, Revision};
+use ratn_model::value::Value;
 
 impl From<WorldUpdate> for v1::WorldPoolServiceWatchResponse {
     fn from(update: WorldUpdate) -> v1::WorldPoolServiceWatchResponse {
@@ -86,6 +87,35 @@ impl TryFrom<v1::FactVersion> for FactVersion {
             revision: Revision(version.revision),
             commit: version.commit_id,
             fact: maybe(version.fact, "fact")?,
+        })
+    }
+}
+
+impl From<Contradiction> for v1::Contradiction {
+    fn from(contradiction: Contradiction) -> v1::Contradiction {
+        v1::Contradiction {
+            projection_id: contradiction.projection.0,
+            fact: Some(contradiction.fact.into()),
+            was: contradiction.was.map(v1::Value::from),
+            is: contradiction.is.map(v1::Value::from),
+            revision: contradiction.revision.0,
+        }
+    }
+}
+
+impl TryFrom<v1::Contradiction> for Contradiction {
+    type Error = Malformed;
+
+    fn try_from(contradiction: v1::Contradiction) -> Result<Contradiction, Malformed> {
+        let value = |value: Option<v1::Value>, field: &str| {
+            value.map(Value::try_from).transpose().map_err(|m: Malformed| m.within(field))
+        };
+        Ok(Contradiction {
+            projection: ProjectionId(contradiction.projection_id),
+            fact: required(contradiction.fact, "fact")?,
+            was: value(contradiction.was, "was")?,
+            is: value(contradiction.is, "is")?,
+            revision: Revision(contradiction.revision),
         })
     }
 }

@@ -13,7 +13,7 @@ pub use error::CallError;
 pub use health::{Health, wait_until_serving};
 pub use process::{ProcessClient, WorkerWatch};
 pub use resource::{AcquireOptions, DemandWatch, ResourceClient, ResourceWatch};
-pub use world::{Commit, Projection, WorldClient, WorldWatch};
+pub use world::{Commit, Projection, ProjectionWatch, WorldClient, WorldWatch};
 
 use crate::endpoint::{Endpoint, connect_lazily};
 use crate::trace::Traced;

@@ -8,7 +8,7 @@ use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::Measurement;
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::{all, each};
-use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldUpdate};
+use ratn_proto::types::{Contradiction, FactDifference, FactRecord, FactVersion, WorldUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::world_pool_service_client::WorldPoolServiceClient;
 use tonic::Streaming;
@@ -29,6 +29,9 @@ pub struct Projection {
     pub base: Revision,
     /// The changes over that, in order.
     pub changes: Vec<Change>,
+    /// Who will make the change at the same place, by the path of its instance: its commit is compared with what was predicted of
+    /// it. Empty or missing: nobody, and the change stands over whatever is committed.
+    pub writers: Vec<String>,
     /// What of it may be seen.
     pub reads: Footprint,
     /// The lease that holds the room for it, with its token.
@@ -55,6 +58,25 @@ pub struct Commit {
 pub struct WorldWatch {
     endpoint: Endpoint,
     stream: Streaming<v1::WorldPoolServiceWatchResponse>,
+}
+
+/// A running watch of a projection.
+#[derive(Debug)]
+pub struct ProjectionWatch {
+    endpoint: Endpoint,
+    stream: Streaming<v1::WatchProjectionResponse>,
+}
+
+impl ProjectionWatch {
+    /// Whether it holds at the start, then its first contradiction; `None` when it has ended.
+    ///
+    /// # Errors
+    /// [`CallError`] when it broke.
+    pub async fn next(&mut self) -> Result<Option<Option<Contradiction>>, CallError> {
+        let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
+        let told = message.map(|message| message.contradiction.map(Contradiction::try_from).transpose()).transpose();
+        told.map_err(|m| CallError::malformed(&self.endpoint, m))
+    }
 }
 
 impl WorldWatch {
@@ -107,14 +129,16 @@ impl WorldClient {
         changes: Vec<Change>,
         revision: Option<Revision>,
     ) -> Result<Revision, CallError> {
-        self.commit_as(Commit { id: commit.to_owned(), changes, revision, ..Commit::default() }).await
+        let commit = Commit { id: commit.to_owned(), changes, revision, ..Commit::default() };
+        self.commit_as(commit).await.map(|(revision, _)| revision)
     }
 
-    /// As [`WorldClient::commit`], with who writes and what measured what is written.
+    /// As [`WorldClient::commit`], with who writes and what measured what is written; and the projections that it contradicts, in the
+    /// order of ids (none where the same was committed before).
     ///
     /// # Errors
     /// [`CallError`].
-    pub async fn commit_as(&self, commit: Commit) -> Result<Revision, CallError> {
+    pub async fn commit_as(&self, commit: Commit) -> Result<(Revision, Vec<Contradiction>), CallError> {
         let question = v1::CommitRequest {
             commit_id: commit.id,
             changes: all(commit.changes),
@@ -122,8 +146,9 @@ impl WorldClient {
             writer: commit.writer,
             evidence: all(commit.evidence),
         };
-        let answer = self.client.clone().commit(question).await.map_err(|status| self.failed(&status))?;
-        Ok(Revision(answer.into_inner().revision))
+        let answer = self.client.clone().commit(question).await.map_err(|status| self.failed(&status))?.into_inner();
+        let contradictions = each(answer.contradictions, "contradictions");
+        Ok((Revision(answer.revision), contradictions.map_err(|m| CallError::malformed(&self.endpoint, m))?))
     }
 
     /// Makes a projection.
@@ -139,6 +164,7 @@ impl WorldClient {
             reads: Some(projection.reads.into()),
             lease_id: lease.0,
             token: token.0,
+            writers: projection.writers,
         };
         let answer = self.client.clone().project(question).await.map_err(|status| self.failed(&status))?;
         Ok(ProjectionId(answer.into_inner().projection_id))
@@ -216,6 +242,16 @@ impl WorldClient {
         let answer = answer.map_err(|status| self.failed(&status))?.into_inner();
         let versions = each(answer.versions, "versions").map_err(|m| CallError::malformed(&self.endpoint, m))?;
         Ok((versions, Revision(answer.oldest_revision)))
+    }
+
+    /// Tells whether a projection still holds, and once more when the root first contradicts it.
+    ///
+    /// # Errors
+    /// [`CallError`], also where the projection has ended.
+    pub async fn watch_projection(&self, projection: ProjectionId) -> Result<ProjectionWatch, CallError> {
+        let question = v1::WatchProjectionRequest { projection_id: projection.0 };
+        let answer = self.client.clone().watch_projection(question).await.map_err(|status| self.failed(&status))?;
+        Ok(ProjectionWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
     /// Ends a projection; false when it had ended before.

@@ -122,7 +122,7 @@ impl Asking {
         let evidence = measured.collect();
         changes.extend(facts.into_iter().map(|fact| Change::Set { fact: fact.key, value: fact.value }));
         let commit = Commit { id: fresh_id("load"), changes, revision, writer: WRITER.to_owned(), evidence };
-        let revision = self.client.commit_as(commit).await.with_context(|| format!("{name} is not loaded"))?;
+        let (revision, _) = self.client.commit_as(commit).await.with_context(|| format!("{name} is not loaded"))?;
         let json = serde_json::json!({ "revision": revision.0, "facts": count });
         Ok(self.show(&json, || format!("{count} facts, revision {}", revision.0))?)
     }
