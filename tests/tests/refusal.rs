@@ -114,6 +114,26 @@ fn a_log_or_a_chart_that_cannot_be_written_is_refused_before_the_run() -> anyhow
 }
 
 #[test]
+fn a_log_takes_the_place_of_nothing() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let (task, mine) = (repository("examples/fetch_boxes.yaml"), place.path().join("README.md"));
+    std::fs::write(&mine, "mine")?;
+    let (task, file) = (task.to_str().context("a path")?, mine.to_str().context("a path")?);
+    let output = place.ratn(&["run", task, "--log", file]).output()?;
+    let (_, err) = texts(&output);
+    ensure!(output.status.code() == Some(2) && err.contains(file) && err.contains("--resume"), "{err}");
+    ensure!(std::fs::read_to_string(&mine)? == "mine");
+    // And says what the system says of one that is not there.
+    for (arguments, reason) in
+        [(&["run", "--resume", "/nonex/log.jsonl"][..], "No such file"), (&["control", "pause"], "no run is under way")]
+    {
+        let (_, err) = texts(&place.ratn(arguments).output()?);
+        ensure!(err.contains(reason), "{arguments:?}: {err}");
+    }
+    Ok(())
+}
+
+#[test]
 fn what_cannot_be_resumed_is_refused() -> anyhow::Result<()> {
     let place = Place::new()?;
     let fixture = repository("crates/cli/src/report/fixtures/two_boxes.jsonl");

@@ -5,6 +5,32 @@ mod support;
 use anyhow::{Context, ensure};
 use support::{Place, repository, wait_for};
 
+/// A task that waits for what never comes.
+const WAITS: &str = r#"task: wait
+states:
+  - make: { action: gripper/release, resources: [Gripper, { create: Token, class: task, with: { who: alice } }] }
+  - want: { action: gripper/release, resources: [Gripper, { consume: Token, where: { who: bob } }] }
+"#;
+
+#[test]
+fn a_run_that_waits_for_what_never_comes_says_so_and_why() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let task = place.path().join("wait.yaml");
+    std::fs::write(&task, WAITS)?;
+    let log = place.path().join("log.jsonl");
+    let arguments = ["run", task.to_str().context("a path")?, "--log", log.to_str().context("a path")?];
+    let mut run = place.start(&arguments)?;
+    wait_for("what it waits for", || {
+        let said = run.said();
+        Ok(said.lines().any(|line| line.contains("waits  want  for") && line.contains("Token")).then_some(()))
+    })
+    .with_context(|| run.said())?;
+    run.signal(nix::sys::signal::Signal::SIGINT)?;
+    let (code, _, said) = run.finish()?;
+    ensure!(code == Some(1), "{code:?}\n{said}");
+    Ok(())
+}
+
 #[test]
 fn a_task_runs_on_the_system_that_is_up_and_leaves_it_running() -> anyhow::Result<()> {
     let place = Place::new()?;
@@ -25,7 +51,34 @@ fn a_task_runs_on_the_system_that_is_up_and_leaves_it_running() -> anyhow::Resul
     ensure!(out.contains("delivered = 1"), "{out}");
     ensure!(place.processes().len() == before, "{:?}", place.processes());
 
-    // A second system in the same place is refused.
+    // Once more, on a table like the first, of which nothing is known.
+    let output = place.ratn(&["reset"]).output()?;
+    let (out, err) = support::texts(&output);
+    ensure!(output.status.success() && out.contains("1 boxes") && !out.contains(" 0 facts"), "{out}{err}");
+    let again = ["run", task, "--set", "boxes=1", "--set", "budget=false"];
+    let (out, err) = support::texts(&place.ratn(&again).output()?);
+    ensure!(out.contains("delivered = 1"), "{out}{err}");
+
+    // One run at a time: a second is refused and leaves no log.
+    let waits = place.path().join("waits.yaml");
+    std::fs::write(&waits, WAITS)?;
+    let waits = waits.to_str().context("a path")?;
+    let mut first = place.start_as("first", &["run", waits])?;
+    wait_for("the first run", || {
+        let list = place.ratn(&["resource", "get", "run"]).output()?;
+        Ok(list.status.success().then_some(()))
+    })
+    .with_context(|| first.said())?;
+    let second = place.path().join("second.jsonl");
+    let output = place.ratn(&["run", waits, "--log", second.to_str().context("a path")?]).output()?;
+    let err = support::texts(&output).1;
+    ensure!(output.status.code() == Some(2) && err.contains("another run is under way") && !second.exists(), "{err}");
+    first.signal(nix::sys::signal::Signal::SIGINT)?;
+    first.finish()?;
+
+    // A second system in the same place is refused, and one in what is no folder.
+    let output = place.ratn(&["up", "--runtime-dir", waits]).output()?;
+    ensure!(output.status.code() == Some(2), "{}", support::texts(&output).1);
     let output = place.ratn(&["up", "--runtime-dir", directory]).output()?;
     ensure!(output.status.code() == Some(2), "{}", support::texts(&output).1);
 

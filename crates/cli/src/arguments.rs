@@ -27,6 +27,8 @@ pub(crate) enum Command {
     Run(RunArguments),
     /// Pause a run that is under way, let it go on, let it do one step, or end it
     Control(ControlArguments),
+    /// Lay a new table in the simulated cell of a running system, and forget every fact
+    Reset(ResetArguments),
     /// Check a task file without starting anything
     Check(CheckArguments),
     /// Say where the time of a run went, from its event log
@@ -344,6 +346,19 @@ pub(crate) struct ControlArguments {
     #[arg(value_enum)]
     pub(crate) word: Word,
     /// Where the endpoint files of the run's system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ResetArguments {
+    /// Boxes on the new table; as many as on the old one unless given
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=9))]
+    pub(crate) boxes: Option<u8>,
+    /// The same seed makes the same table; that of the old one unless given
+    #[arg(long, value_name = "N")]
+    pub(crate) seed: Option<u64>,
+    /// Where the endpoint files of the system are
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
 }

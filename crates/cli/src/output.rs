@@ -45,6 +45,18 @@ pub(crate) fn check_writable(path: &Path) -> Result<(), Failure> {
     writable.map_err(|error| Failure::Refused(format!("ratn: cannot write {}: {}", path.display(), error.desc())))
 }
 
+/// As [`check_writable`], for what is not to take the place of anything: a file with something in it is refused.
+pub(crate) fn check_new(path: &Path, help: &str) -> Result<(), Failure> {
+    check_writable(path)?;
+    match path.metadata() {
+        Ok(there) if there.is_file() && there.len() > 0 => Err(Failure::Refused(format!(
+            "ratn: {} is there already, nothing is written over it: {help}",
+            path.display()
+        ))),
+        _ => Ok(()),
+    }
+}
+
 fn write(to: &mut impl Write, text: &impl Display) -> anyhow::Result<()> {
     match to.write_all(format!("{text}\n").as_bytes()).and_then(|()| to.flush()) {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {

@@ -79,7 +79,17 @@ impl Cell {
     fn no_motion_of(&self, module: Module) -> Result<(), String> {
         match self.activities.get(&module) {
             None => Ok(()),
-            Some(other) => Err(format!("the {} is under way with goal {}", module.kind(), other.ticket.0)),
+            Some(other) => Err(format!(
+                "the {} is under way with goal {}: {}",
+                module.kind(),
+                other.ticket.0,
+                match module {
+                    Module::Arm | Module::Gripper =>
+                        "arm and gripper do not move at once, so let one of both states block `Arm` and `Gripper`",
+                    Module::PanTilt | Module::Camera =>
+                        "no picture is taken while the head moves, so let one of both states block `PanTilt` and `Camera`",
+                }
+            )),
         }
     }
 

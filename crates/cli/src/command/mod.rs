@@ -7,6 +7,7 @@ mod demo;
 mod plan;
 mod reload;
 mod report;
+mod reset;
 pub(crate) mod resource;
 mod roles;
 mod run;
@@ -36,6 +37,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Up(arguments) => up::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
         Command::Control(arguments) => control::run(&arguments),
+        Command::Reset(arguments) => reset::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Resource(arguments) => resource::run(&arguments),
         Command::World(arguments) => world::run(&arguments),

@@ -67,8 +67,11 @@ async fn begin(arguments: &RunArguments, task: &Path, directory: &Path, interrup
         let message = format!("ratn: a system runs in {}: its speed is its own", directory.display());
         return Err(Failure::Refused(message));
     }
-    for file in arguments.log.iter().chain(&arguments.gantt) {
-        output::check_writable(file)?;
+    if let Some(log) = &arguments.log {
+        output::check_new(log, "name another file; `ratn run --resume LOG` goes on with the run of an event log")?;
+    }
+    if let Some(chart) = &arguments.gantt {
+        output::check_writable(chart)?;
     }
     let learned = learn::from_files(&arguments.learn, &program.name)?;
     let log = arguments.log.clone().map_or_else(|| log_file(&program.name), Ok)?;

@@ -3,6 +3,7 @@
 pub(crate) mod config;
 mod launch;
 
+use crate::failure::Unbegun;
 use crate::task_control::Endpoints;
 use crate::task_control::shell::Place;
 use anyhow::Context;
@@ -56,8 +57,10 @@ impl System {
         directory: &Path,
         private: Option<tempfile::TempDir>,
     ) -> anyhow::Result<System> {
-        let directory = RuntimeDirectory::create(directory)
-            .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
+        let directory = RuntimeDirectory::create(directory).map_err(|error| {
+            let error = anyhow::Error::from(error);
+            Unbegun(format!("cannot make the runtime directory {}: {error:#}", directory.display()))
+        })?;
         let mut config = config;
         let kept = [&mut config.resource_manager.storage, &mut config.world_pool.storage];
         for (role, storage) in ROLES.iter().zip(kept).filter(|(_, storage)| storage.directory.is_none()) {

@@ -20,6 +20,8 @@ const MAX_LOG_BYTES: u64 = 4 << 30;
 pub(crate) enum LogError {
     #[error("cannot {what} the event log {}", path.display())]
     Io { what: &'static str, path: PathBuf, source: std::io::Error },
+    #[error("{} is there already, nothing is written over it", path.display())]
+    There { path: PathBuf },
     #[error("the event log {} is being written by a run that is under way", path.display())]
     UnderWay { path: PathBuf },
     #[error("the event log {} would grow beyond {MAX_LOG_BYTES} bytes; the run ends here", path.display())]
@@ -43,10 +45,14 @@ pub(crate) struct LogWriter {
 }
 
 impl LogWriter {
-    /// Creates the file, or empties it.
+    /// Creates the file; one with something in it stays as it is.
     pub(crate) fn create(path: &Path) -> Result<Self, LogError> {
         let mut writer = LogWriter::open(path, OpenOptions::new().write(true).create(true).truncate(false), "create")?;
-        writer.cut()?;
+        let length = writer.file.get_ref().metadata().map_err(|source| writer.io(source))?.len();
+        if writer.on_disk && length > 0 {
+            return Err(LogError::There { path: path.to_owned() });
+        }
+        writer.is_cut = true;
         if writer.on_disk {
             // The file's name has to be safe, too.
             let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -243,6 +249,14 @@ mod tests {
         assert!(matches!(LogWriter::create(file.path()), Err(LogError::UnderWay { .. })));
         assert!(matches!(LogWriter::go_on(file.path()), Err(LogError::UnderWay { .. })));
         assert_eq!(read(file.path()).unwrap().lines.len(), 1);
+    }
+
+    #[test]
+    fn nothing_is_written_over_a_file_with_something_in_it() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "mine").unwrap();
+        assert!(matches!(LogWriter::create(file.path()), Err(LogError::There { .. })));
+        assert_eq!(std::fs::read_to_string(file.path()).unwrap(), "mine");
     }
 
     #[test]

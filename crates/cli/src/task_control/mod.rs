@@ -12,6 +12,8 @@ mod replay;
 mod retry;
 pub(crate) mod shell;
 
+pub(crate) use performer::only_run as claim;
+
 use ratn_worker::endpoint::Endpoint;
 
 /// Where the daemons are that task control speaks with; everyone else is found by leases.

@@ -76,6 +76,14 @@ impl Progress {
                 Command::Note(Note::Expanded { instance, path, .. }) => {
                     self.paths.insert(*instance, path.clone());
                 }
+                // What ended without its provider: a `requires` that does not hold, a timeout.
+                Command::Note(Note::Finished { instance, outcome })
+                    if **outcome != *SUCCESS && !told(event, *instance) =>
+                {
+                    let path = self.path(*instance);
+                    let took = self.started.remove(instance).map_or(0.0, |s| at.since(s).as_secs_f64());
+                    say(at, &format!("{outcome} {path}  {took:.1} s, not by its provider"));
+                }
                 Command::Note(Note::Decided { path, decision, .. }) => say(at, &format!("decide {path}: {decision}")),
                 Command::Note(Note::Invalidated { instance, reason }) => {
                     self.started.remove(instance);
@@ -102,8 +110,21 @@ impl Progress {
         }
     }
 
+    /// What is known of an instance that waits for resources; `None` where nothing is printed.
+    pub(crate) fn waits(&self, instance: InstanceId) -> Option<String> {
+        (!self.quiet).then(|| self.path(instance))
+    }
+
     fn path(&self, instance: InstanceId) -> String {
         self.paths.get(&instance).cloned().unwrap_or_else(|| instance.to_string())
+    }
+}
+
+/// Whether what an event says of an instance is printed already.
+fn told(event: &Event, instance: InstanceId) -> bool {
+    match event {
+        Event::Finished { instance: of, .. } | Event::Refused { instance: of, .. } => *of == instance,
+        _ => false,
     }
 }
 

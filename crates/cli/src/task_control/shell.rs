@@ -30,11 +30,14 @@ use ratn_worker::robot_clock::RobotClock;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use tokio::sync::mpsc;
 
 /// Answers that the executive has not been given yet.
 pub(super) const MAX_PENDING_EVENTS: usize = 1024;
+
+/// How often a run says what it waits for, at the most.
+const LOOK: Duration = Duration::from_secs(5);
 
 /// A task to be run once.
 #[derive(Debug, Clone)]
@@ -80,10 +83,11 @@ pub(crate) struct Ended {
 /// When the system cannot be reached, the log cannot be written, or the user insists. A task that ends badly is no error: its
 /// outcome says so.
 pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
-    let log = LogWriter::create(&run.log)?;
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
     let id = fresh_id("run");
     let performer = Performer::connect(place, &id, &run.program.name, events).await.context("cannot begin the run")?;
+    // A run that is refused leaves no log.
+    let log = LogWriter::create(&run.log)?;
     let shell = Shell {
         executive: Executive::new(run.program.clone(), Tolerance::ROBOT),
         states: BTreeMap::new(),
@@ -96,6 +100,7 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
         advisor: advisor_of(run.mode, run.seed),
         lookout: Lookout::default(),
         ask_at: None,
+        look_at: Instant::now() + LOOK,
         performer,
         answers,
     };
@@ -144,6 +149,8 @@ struct Shell {
     lookout: Lookout,
     /// When it may be asked again.
     ask_at: Option<Instant>,
+    /// When what waits is looked at again.
+    look_at: Instant,
     performer: Performer,
     answers: mpsc::Receiver<performer::Answer>,
 }
@@ -270,6 +277,13 @@ impl Shell {
                 event = advised => return Ok(event),
                 () = to_ask => {
                     self.ask_for_advice();
+                    continue;
+                }
+                () = tokio::time::sleep_until(self.look_at.into()) => {
+                    self.look_at = Instant::now() + LOOK;
+                    if let Some(instance) = self.performer.waits() && let Some(path) = self.progress.waits(instance) {
+                        self.performer.say_why(self.clock.now(), instance, path);
+                    }
                     continue;
                 }
                 () = interrupt.asked_times(1), if !*asked_to_abort => {

@@ -28,7 +28,8 @@ pub(super) async fn run(
         output::check_writable(chart)?;
     }
     // From here on nobody else goes on with it.
-    let (writer, log) = LogWriter::go_on(file).map_err(|error| refused(&error))?;
+    let (writer, log) =
+        LogWriter::go_on(file).map_err(|error| refused(&format_args!("{:#}", anyhow::Error::from(error))))?;
     if let Some(line) = log.torn {
         output::progress(format_args!("{}:{line}: the last line is torn and is cut off", file.display()));
     }

@@ -12,6 +12,8 @@ use super::ledger::acquire_request;
 use super::record::{Cancelled, MAX_PENDING_RECORDS, Record, Recorder, said};
 use super::retry::{Attempts, patiently};
 use super::shell::Place;
+use crate::failure::Unbegun;
+use crate::output;
 use anyhow::bail;
 use futures::FutureExt;
 use goal::{Given, Performing};
@@ -20,6 +22,7 @@ use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::resource::{Requirement, ResourceClass};
+use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{self, Resource};
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
@@ -28,7 +31,7 @@ use ratn_worker::session::{DEFAULT_TTL, Session};
 use ratn_worker::trace::{self, TraceContext};
 use std::collections::BTreeMap;
 use std::sync::{Arc, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
@@ -37,6 +40,10 @@ use tokio_util::sync::CancellationToken;
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
 /// A task that waits this long for its resources has waited in vain.
 const ACQUIRE_DEADLINE: Duration = Duration::from_secs(3600);
+/// What waits longer than this while nothing is done is said, and
+const LONG_WHILE_IDLE: Duration = Duration::from_secs(4);
+/// what waits longer than this in any case.
+const LONG: Duration = Duration::from_secs(30);
 /// The resource that the one run of a system is.
 const RUN: &str = "run";
 /// At the end of a run, for everything that is still being given back.
@@ -72,7 +79,7 @@ pub(super) struct Performer {
     cancelled: Cancelled,
     /// The paths of the instances that may still commit.
     paths: BTreeMap<InstanceId, String>,
-    asking: BTreeMap<InstanceId, CancellationToken>,
+    asking: BTreeMap<InstanceId, Asking>,
     jobs: BTreeMap<InstanceId, Job>,
     giving_back: JoinSet<()>,
     acquires: u64,
@@ -81,6 +88,13 @@ pub(super) struct Performer {
     resumptions: u32,
     /// Of the run.
     trace: TraceContext,
+}
+
+/// An acquire under way.
+struct Asking {
+    request: String,
+    since: Instant,
+    withdrawn: CancellationToken,
 }
 
 struct Job {
@@ -167,7 +181,7 @@ impl Performer {
             }
             Command::Withdraw { instance } => {
                 if let Some(asking) = self.asking.remove(&instance) {
-                    asking.cancel();
+                    asking.withdrawn.cancel();
                 }
             }
             Command::Project { instance, attempt, base, changes, reads, lease } => {
@@ -233,9 +247,11 @@ impl Performer {
 
     fn acquire(&mut self, instance: InstanceId, number: u64, requirements: Vec<Requirement>, priority: i64) {
         let withdrawn = CancellationToken::new();
-        self.asking.insert(instance, withdrawn.clone());
+        let request = acquire_request(&self.run, instance, number, self.resumptions);
+        let asked = Asking { request: request.clone(), since: Instant::now(), withdrawn: withdrawn.clone() };
+        self.asking.insert(instance, asked);
         let options = AcquireOptions {
-            request: acquire_request(&self.run, instance, number, self.resumptions),
+            request,
             priority,
             deadline: ACQUIRE_DEADLINE,
             holder: format!("{} {instance}", self.task),
@@ -261,6 +277,28 @@ impl Performer {
         if asking.as_mut().now_or_never().is_none() {
             tokio::spawn(asking);
         }
+    }
+
+    /// Who waits for resources longest, if that is longer than somebody who watches the run takes for granted.
+    pub(super) fn waits(&self) -> Option<InstanceId> {
+        let idle = self.jobs.values().all(|job| job.ended.is_finished());
+        let bound = if idle { LONG_WHILE_IDLE } else { LONG };
+        let (instance, longest) = self.asking.iter().min_by_key(|(_, asking)| asking.since)?;
+        (longest.since.elapsed() >= bound).then_some(*instance)
+    }
+
+    /// Says what is in the way of an instance that waits, in the resource manager's words.
+    pub(super) fn say_why(&self, at: Timestamp, instance: InstanceId, path: String) {
+        let Some(Asking { request, since, .. }) = self.asking.get(&instance) else { return };
+        let (resources, request, waited_s) = (self.resources.clone(), request.clone(), since.elapsed().as_secs());
+        tokio::spawn(async move {
+            // One that has its answer by now does not wait any more.
+            let Ok(waiting) = resources.explain(&request).await else { return };
+            let obstacles: Vec<String> = waiting.into_iter().flat_map(|one| one.obstacles).collect();
+            let why = if obstacles.is_empty() { "its turn".to_owned() } else { obstacles.join("; ") };
+            let at = at.seconds();
+            output::progress(format_args!("{at:>8.1} s  waits  {path}  for {waited_s} s: {why}"));
+        });
     }
 
     /// The event of an answer; `None` when what it answers was withdrawn or cancelled: what crossed with that goes back.
@@ -370,12 +408,13 @@ impl Performer {
 
 /// Two runs would each change the world under the other's projections: a system has one at a time. The resource that says so
 /// goes with the run's session.
-async fn only_run(resources: &ResourceClient, task: &str) -> anyhow::Result<()> {
+pub(crate) async fn only_run(resources: &ResourceClient, task: &str) -> anyhow::Result<()> {
     let claim = Resource::new(RUN, ResourceClass::Task, "Run").with_attribute("task", Value::String(task.to_owned()));
     match patiently(Attempts::IDEMPOTENT, || resources.create(claim.clone())).await {
         Ok(_) => Ok(()),
         Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
-            bail!("another run is under way on this system: wait for its end, or use a system of your own")
+            let message = "another run is under way on this system: wait for its end, or use a system of your own";
+            Err(Unbegun(message.to_owned()).into())
         }
         Err(error) => bail!("cannot begin the run: {}", said(&error)),
     }

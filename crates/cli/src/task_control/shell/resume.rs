@@ -1,7 +1,7 @@
 //! Going on with a run from its event log: the executive is brought to where it was, what was open is taken up, and the loop goes
 //! on as ever.
 
-use super::{Ended, Place, Shell, advisor_of, unix_ms};
+use super::{Ended, LOOK, Place, Shell, advisor_of, unix_ms};
 use crate::interrupt::Interrupt;
 use crate::task_control::control::Control;
 use crate::task_control::log::LogWriter;
@@ -15,6 +15,7 @@ use ratn_executive::protocol::{Event, LogEntry, LogLine, Mode};
 use ratn_model::program::Program;
 use ratn_worker::robot_clock::RobotClock;
 use std::sync::Arc;
+use std::time::Instant;
 use tokio::sync::mpsc;
 
 /// A run to go on with, as its log has it.
@@ -68,6 +69,7 @@ pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &In
         advisor: advisor_of(mode, seed),
         lookout: Lookout::default(),
         ask_at: None,
+        look_at: Instant::now() + LOOK,
         performer: performer.context("cannot go on with the run")?,
         answers,
     };

@@ -1,0 +1,73 @@
+//! `ratn reset`: a new table, and a world model that knows nothing of the one before.
+//!
+//! The boxes of a new table have the names of the old ones, so facts about those would be taken for facts about these. The reset
+//! counts as a run: it is refused while one is under way, and none begins meanwhile.
+
+use super::blocking_on;
+use crate::arguments::ResetArguments;
+use crate::failure::Failure;
+use crate::output;
+use crate::system::public_directory;
+use crate::task_control::claim;
+use anyhow::Context;
+use ratn_daemon::{resource_manager, world_pool};
+use ratn_model::fact::{Change, FactPattern};
+use ratn_proto::v1::cell_service_client::CellServiceClient;
+use ratn_proto::v1::{GetGroundTruthRequest, ResetRequest};
+use ratn_worker::client::{Channels, Commit, ResourceClient, WorldClient, fresh_id};
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::session::{DEFAULT_TTL, Session};
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+/// A resource manager that opens no session within this time is not there.
+const SESSION_DEADLINE: Duration = Duration::from_secs(5);
+
+/// Lays the table anew and forgets every fact.
+pub(crate) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
+    blocking_on(tokio::runtime::Builder::new_current_thread(), async {
+        let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
+        let find = |role| directory.find(role).map_err(|error| Failure::Refused(format!("ratn: {error}")));
+        let (manager, pool, cell) = (find(resource_manager::ROLE)?, find(world_pool::ROLE)?, find(ratn_cell::ROLE)?);
+        let channels = Channels::new();
+        let session = Session::open(&channels, &manager, "ratn reset", DEFAULT_TTL);
+        session.alive(SESSION_DEADLINE).await?;
+        let resources = ResourceClient::new(&channels, &manager, session.id())?;
+        let done = match claim(&resources, "reset").await {
+            Ok(()) => {
+                let world = WorldClient::new(&channels, &pool)?;
+                reset(arguments, &world, CellServiceClient::new(channels.get(&cell)?)).await
+            }
+            Err(error) => Err(error),
+        };
+        session.close().await;
+        output::result(done?).map_err(Failure::from)
+    })
+}
+
+async fn reset(
+    arguments: &ResetArguments,
+    world: &WorldClient,
+    mut cell: CellServiceClient<tonic::transport::Channel>,
+) -> anyhow::Result<String> {
+    let before =
+        cell.get_ground_truth(GetGroundTruthRequest {}).await.context("the cell does not answer")?.into_inner();
+    let seed = arguments.seed.unwrap_or(before.seed);
+    let boxes = arguments.boxes.map_or(before.boxes.len(), usize::from);
+    let table = ResetRequest { seed, boxes: u32::try_from(boxes)? };
+    cell.reset(table).await.context("the table is not laid anew")?;
+    let (_, facts) = world.root().await.context("the table is new, the facts are not forgotten")?;
+    let every: BTreeSet<FactPattern> = facts
+        .iter()
+        .map(|fact| FactPattern {
+            predicate: fact.key.predicate.clone(),
+            arguments: vec![None; fact.key.arguments.len()],
+        })
+        .collect();
+    if !every.is_empty() {
+        let changes = every.into_iter().map(|pattern| Change::Delete { pattern }).collect();
+        let commit = Commit { id: fresh_id("reset"), changes, writer: "ratn reset".to_owned(), ..Commit::default() };
+        world.commit_as(commit).await.context("the table is new, the facts are not forgotten")?;
+    }
+    Ok(format!("a new table with {boxes} boxes, from seed {seed}; {} facts are forgotten", facts.len()))
+}
