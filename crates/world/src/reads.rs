@@ -14,13 +14,13 @@
 //! arguments has 2ⁿ; so a commit costs what it touches and who reads that, not the number of projections or facts. What a projection
 //! has read is not copied: it is the projection, which shares its store with the root.
 
-use crate::store::hash_of;
+use crate::table::hash_of;
 use crate::world::{World, increased, written};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::Revision;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Of a fact with more arguments, every pattern of its predicate is tried instead of those that can match it.
@@ -29,24 +29,52 @@ const MAX_ENUMERATED: usize = 6;
 /// Projections that something depends on, by an id of the caller.
 #[derive(Debug, Clone)]
 pub struct Live<Id> {
-    projections: BTreeMap<Id, Projection>,
-    /// Who has read by a pattern.
-    by_pattern: BTreeMap<FactPattern, BTreeSet<Id>>,
-    everything: BTreeSet<Id>,
-    /// Who waits for a writer's effects.
-    by_writer: BTreeMap<Arc<str>, BTreeSet<Id>>,
+    places: BTreeMap<Id, Place>,
+    /// By place; places of ended ones are taken again.
+    projections: Vec<Option<(Id, Projection)>>,
+    free: Vec<Place>,
+    /// Who has read by a pattern, in order.
+    by_pattern: BTreeMap<FactPattern, Vec<Place>>,
+    everything: Vec<Place>,
+    /// Who waits for a writer's effects, in order.
+    by_writer: BTreeMap<Arc<str>, Vec<Place>>,
 }
+
+/// Where a projection is among the others.
+type Place = usize;
 
 #[derive(Debug, Clone)]
 struct Projection {
     base: Revision,
     shown: World,
-    effects: Vec<Effect>,
-    /// Hashes of the keys that its effects ever wrote, in order: all others it shows as its base does.
-    written: Vec<u64>,
-    /// Whole patterns that its effects ever deleted.
+    effects: Vec<Predicted>,
+    /// The writers of its effects, and whether theirs have come true.
+    writers: Vec<(Arc<str>, bool)>,
+    /// What its effects write, in the order of hashes: all other facts it shows as its base does.
+    written: Vec<Written>,
+    /// Whole patterns that its effects delete.
     deleted: Vec<FactPattern>,
     reads: Footprint,
+}
+
+/// Keys of one hash that the effects of a projection write.
+#[derive(Debug, Clone, Copy)]
+struct Written {
+    hash: u64,
+    /// Which effect does.
+    effect: usize,
+    /// No other does, and none deletes anything.
+    alone: bool,
+}
+
+/// An effect of a projection.
+#[derive(Debug, Clone)]
+struct Predicted {
+    /// Of the key that it writes; 0 for a pattern that it deletes.
+    hash: u64,
+    /// Among the projection's writers.
+    writer: Option<usize>,
+    change: Change,
 }
 
 /// A predicted change, and who will make it.
@@ -73,67 +101,79 @@ pub struct Contradiction<Id> {
 
 impl<Id> Default for Live<Id> {
     fn default() -> Live<Id> {
-        let (projections, by_pattern, everything, by_writer) = Default::default();
-        Live { projections, by_pattern, everything, by_writer }
+        let (places, projections, free, by_pattern, everything, by_writer) = Default::default();
+        Live { places, projections, free, by_pattern, everything, by_writer }
     }
 }
 
 impl<Id: Ord + Copy> Live<Id> {
     /// How many there are.
     pub fn len(&self) -> usize {
-        self.projections.len()
+        self.places.len()
     }
 
     /// Whether there is none.
     pub fn is_empty(&self) -> bool {
-        self.projections.is_empty()
+        self.places.is_empty()
     }
 
     /// Adds what was read of `shown`, which is `base` with the effects; one of the same id ends. All bases are revisions of one
     /// history.
     pub fn insert(&mut self, id: Id, base: Revision, shown: World, effects: Vec<Effect>, reads: Footprint) {
         self.remove(id);
+        let place = self.free.pop().unwrap_or(self.projections.len());
         match &reads {
-            Footprint::Everything => drop(self.everything.insert(id)),
+            Footprint::Everything => put(&mut self.everything, place),
             Footprint::Patterns(patterns) => {
                 for pattern in patterns {
-                    self.by_pattern.entry(pattern.clone()).or_default().insert(id);
+                    put(self.by_pattern.entry(pattern.clone()).or_default(), place);
                 }
             }
         }
-        for writer in effects.iter().filter_map(|effect| effect.writer.as_ref()) {
-            self.by_writer.entry(Arc::clone(writer)).or_default().insert(id);
+        let mut projection = Projection {
+            base,
+            shown,
+            effects: Vec::with_capacity(effects.len()),
+            writers: Vec::new(),
+            written: Vec::new(),
+            deleted: Vec::new(),
+            reads,
+        };
+        effects.into_iter().for_each(|effect| projection.predict(effect));
+        projection.index();
+        for (writer, _) in &projection.writers {
+            put(self.by_writer.entry(Arc::clone(writer)).or_default(), place);
         }
-        let (mut written, mut deleted) = (Vec::new(), Vec::new());
-        for effect in &effects {
-            match &effect.change {
-                Change::Set { fact, .. } | Change::Increase { fact, .. } => written.push(hash_of(fact)),
-                Change::Delete { pattern } => deleted.push(pattern.clone()),
-            }
+        if place == self.projections.len() {
+            self.projections.push(None);
         }
-        written.sort_unstable();
-        self.projections.insert(id, Projection { base, shown, effects, written, deleted, reads });
+        self.projections[place] = Some((id, projection));
+        self.places.insert(id, place);
     }
 
     /// Nothing depends on it any more.
     pub fn remove(&mut self, id: Id) {
-        let Some(projection) = self.projections.remove(&id) else { return };
-        self.everything.remove(&id);
-        if let Footprint::Patterns(patterns) = &projection.reads {
-            patterns.iter().for_each(|pattern| take(&mut self.by_pattern, pattern, id));
+        let Some(place) = self.places.remove(&id) else { return };
+        let Some((_, projection)) = self.projections[place].take() else { return };
+        self.free.push(place);
+        match &projection.reads {
+            Footprint::Everything => take(&mut self.everything, place),
+            Footprint::Patterns(patterns) => {
+                patterns.iter().for_each(|pattern| take_from(&mut self.by_pattern, pattern, place));
+            }
         }
-        projection.effects.iter().filter_map(|effect| effect.writer.as_ref()).for_each(|writer| {
-            take(&mut self.by_writer, writer, id);
-        });
+        projection.writers.iter().for_each(|(writer, _)| take_from(&mut self.by_writer, writer, place));
     }
 
     /// What a projection showed.
     pub fn shown(&self, id: Id) -> Option<&World> {
-        self.projections.get(&id).map(|projection| &projection.shown)
+        let place = self.places.get(&id)?;
+        self.projections[*place].as_ref().map(|(_, projection)| &projection.shown)
     }
 
     /// The projections that a commit contradicts, in the order of ids. `before` and `after` are the root; `writer` is who
-    /// committed, whose effects are no longer to come. A difference within the tolerance of the predicate is none.
+    /// committed, whose effects are no longer to come. A difference within the tolerance of the predicate is none. Every commit is
+    /// judged by itself: who is told that a projection is contradicted removes it.
     pub fn contradicted(
         &mut self,
         before: &World,
@@ -143,70 +183,83 @@ impl<Id: Ord + Copy> Live<Id> {
         tolerance: &dyn Fn(&str) -> Tolerance,
     ) -> Vec<Contradiction<Id>> {
         let touched = written(before, changes);
-        let mut found: BTreeMap<Id, Contradiction<Id>> = BTreeMap::new();
-        let mut note = |contradiction: Contradiction<Id>| {
-            let first = found.entry(contradiction.projection).or_insert_with(|| contradiction.clone());
-            if contradiction.fact < first.fact {
-                *first = contradiction;
-            }
-        };
+        let mut hashes: Vec<u64> = touched.iter().map(hash_of).collect();
+        hashes.sort_unstable();
         // What was predicted of the writer and did not come is as much a difference as what came.
-        for (id, key) in self.come_true(writer, before) {
-            let Some(projection) = self.projections.get(&id) else { continue };
-            if !touched.contains(&key) && projection.reads.contains(&key) {
-                projection.compare(id, &key, hash_of(&key), &mut Shown::default(), after, tolerance).map(&mut note);
-            }
+        let alone = self.come_true(writer, before, &hashes);
+        let mut found: BTreeMap<Id, Contradiction<Id>> = BTreeMap::new();
+        for (place, key) in &alone {
+            let mut fact = Fact::of(key, after);
+            self.compare(*place, &mut fact, tolerance, &mut found);
         }
         for key in &touched {
-            let hash = hash_of(key);
-            let mut shown = Shown::default();
-            let mut look = |id: &Id| {
-                if let Some(projection) = self.projections.get(id) {
-                    projection.compare(*id, key, hash, &mut shown, after, tolerance).map(&mut note);
-                }
-            };
-            self.everything.iter().for_each(&mut look);
-            self.readers(key, &mut look);
+            let mut fact = Fact::of(key, after);
+            self.everything.iter().for_each(|place| self.compare(*place, &mut fact, tolerance, &mut found));
+            self.readers(key, &mut |place| self.compare(place, &mut fact, tolerance, &mut found));
         }
         found.into_values().collect()
     }
 
-    /// Ends the effects of a writer that were to come; the facts they were to write.
-    fn come_true(&mut self, writer: Option<&str>, before: &World) -> Vec<(Id, FactKey)> {
+    fn compare(
+        &self,
+        place: Place,
+        fact: &mut Fact<'_>,
+        tolerance: &dyn Fn(&str) -> Tolerance,
+        found: &mut BTreeMap<Id, Contradiction<Id>>,
+    ) {
+        let Some((id, projection)) = &self.projections[place] else { return };
+        let Some((was, is)) = projection.difference(fact, tolerance) else { return };
+        let contradiction = Contradiction { projection: *id, fact: fact.key.clone(), was, is };
+        match found.get_mut(id) {
+            Some(first) if first.fact <= contradiction.fact => {}
+            Some(first) => *first = contradiction,
+            None => drop(found.insert(*id, contradiction)),
+        }
+    }
+
+    /// Ends the effects of a writer that were to come; the facts they were to write and a commit of these keys did not.
+    fn come_true(&mut self, writer: Option<&str>, before: &World, touched: &[u64]) -> Vec<(Place, FactKey)> {
         let waiting = writer.and_then(|writer| self.by_writer.remove(writer)).unwrap_or_default();
-        let mut keys = Vec::new();
-        for id in waiting {
-            let Some(projection) = self.projections.get_mut(&id) else { continue };
-            let (come, still): (Vec<Effect>, Vec<Effect>) =
-                std::mem::take(&mut projection.effects).into_iter().partition(|e| e.writer.as_deref() == writer);
-            projection.effects = still;
-            for Effect { change, .. } in come {
+        let mut alone = Vec::new();
+        for place in waiting {
+            let Some((_, projection)) = &mut self.projections[place] else { continue };
+            let Some(own) = projection.writers.iter().position(|(of, _)| Some(of.as_ref()) == writer) else { continue };
+            projection.writers[own].1 = true;
+            for Predicted { hash, change, .. } in projection.effects.iter().filter(|e| e.writer == Some(own)) {
                 match change {
-                    Change::Set { fact, .. } | Change::Increase { fact, .. } => keys.push((id, fact)),
+                    Change::Set { fact, .. } | Change::Increase { fact, .. } => {
+                        // One of the same hash may be another: then it is compared once more.
+                        if touched.binary_search(hash).is_err() && projection.reads.contains(fact) {
+                            alone.push((place, fact.clone()));
+                        }
+                    }
                     Change::Delete { pattern } => {
-                        // Those that it hid.
-                        keys.extend(before.matching(&pattern).map(|(key, _)| (id, key.clone())));
+                        let hidden = before.matching(pattern).map(|(key, _)| key);
                         let to_come = projection.effects.iter().filter_map(|effect| match &effect.change {
                             Change::Set { fact, .. } | Change::Increase { fact, .. } => Some(fact),
                             Change::Delete { .. } => None,
                         });
-                        keys.extend(to_come.filter(|fact| pattern.matches(fact)).map(|fact| (id, fact.clone())));
+                        let to_come = to_come.filter(|fact| pattern.matches(fact));
+                        let read = hidden.chain(to_come).filter(|key| projection.reads.contains(key));
+                        alone.extend(read.map(|key| (place, key.clone())));
                     }
                 }
             }
         }
-        keys
+        alone
     }
 
     /// Calls `visit` for whoever has read a fact by a pattern.
-    fn readers(&self, key: &FactKey, visit: &mut dyn FnMut(&Id)) {
+    fn readers(&self, key: &FactKey, visit: &mut dyn FnMut(Place)) {
         let arity = key.arguments.len();
         let mut pattern = FactPattern::of(key);
         if arity > MAX_ENUMERATED {
             pattern.arguments.fill(None);
             pattern.arguments.clear();
             let of_predicate = self.by_pattern.range(pattern..).take_while(|(p, _)| p.predicate == key.predicate);
-            return of_predicate.filter(|(p, _)| p.matches(key)).for_each(|(_, ids)| ids.iter().for_each(&mut *visit));
+            return of_predicate
+                .filter(|(p, _)| p.matches(key))
+                .for_each(|(_, places)| places.iter().for_each(|place| visit(*place)));
         }
         for hidden in 0_usize..1 << arity {
             for (position, argument) in pattern.arguments.iter_mut().enumerate() {
@@ -215,66 +268,108 @@ impl<Id: Ord + Copy> Live<Id> {
                     *argument = (!is_hidden).then(|| key.arguments[position].clone());
                 }
             }
-            if let Some(ids) = self.by_pattern.get(&pattern) {
-                ids.iter().for_each(&mut *visit);
+            if let Some(places) = self.by_pattern.get(&pattern) {
+                places.iter().for_each(|place| visit(*place));
             }
         }
     }
 }
 
-/// What bases say of one fact: projections of one base say the same of what their effects leave alone.
-#[derive(Default)]
-struct Shown(Vec<(Revision, Option<Value>, bool)>);
+/// A fact that is compared.
+struct Fact<'a> {
+    key: &'a FactKey,
+    hash: u64,
+    now: Option<&'a Value>,
+    /// Bases that have been looked at, and how what they say of it differs: projections of one base say the same of what their
+    /// effects leave alone.
+    of_bases: Vec<(Revision, Option<Difference>)>,
+}
+
+/// Was, is.
+type Difference = (Option<Value>, Option<Value>);
+
+impl<'a> Fact<'a> {
+    fn of(key: &'a FactKey, after: &'a World) -> Fact<'a> {
+        Fact { key, hash: hash_of(key), now: after.get(key), of_bases: Vec::new() }
+    }
+}
 
 impl Projection {
-    /// The contradiction in a fact that it has read, if there is one.
-    fn compare<Id>(
-        &self,
-        id: Id,
-        key: &FactKey,
-        hash: u64,
-        of_bases: &mut Shown,
-        after: &World,
-        tolerance: &dyn Fn(&str) -> Tolerance,
-    ) -> Option<Contradiction<Id>> {
-        let touches = self.written.binary_search(&hash).is_ok() || self.deleted.iter().any(|p| p.matches(key));
-        if !touches {
-            if let Some((_, was, same)) = of_bases.0.iter().find(|(base, ..)| *base == self.base) {
-                let differs = || Contradiction {
-                    projection: id,
-                    fact: key.clone(),
-                    was: was.clone(),
-                    is: after.get(key).cloned(),
-                };
-                return (!same).then(differs);
+    fn predict(&mut self, Effect { writer, change }: Effect) {
+        let writer = writer.map(|writer| {
+            self.writers.iter().position(|(known, _)| *known == writer).unwrap_or_else(|| {
+                self.writers.push((writer, false));
+                self.writers.len() - 1
+            })
+        });
+        let hash = match &change {
+            Change::Set { fact, .. } | Change::Increase { fact, .. } => hash_of(fact),
+            Change::Delete { pattern } => {
+                self.deleted.push(pattern.clone());
+                0
             }
-            let (was, is) = (self.shown.get(key), after.get(key));
-            let same = same(was, is, || tolerance(&key.predicate));
-            of_bases.0.push((self.base, was.cloned(), same));
-            return (!same).then(|| Contradiction {
-                projection: id,
-                fact: key.clone(),
-                was: was.cloned(),
-                is: is.cloned(),
-            });
+        };
+        self.effects.push(Predicted { hash, writer, change });
+    }
+
+    fn index(&mut self) {
+        let writes =
+            self.effects.iter().enumerate().filter(|(_, effect)| !matches!(effect.change, Change::Delete { .. }));
+        let alone = self.deleted.is_empty();
+        self.written = writes.map(|(at, effect)| Written { hash: effect.hash, effect: at, alone }).collect();
+        self.written.sort_unstable_by_key(|written| written.hash);
+        self.written.dedup_by(|later, first| {
+            let same = later.hash == first.hash;
+            first.alone &= !same;
+            same
+        });
+    }
+
+    /// How what it would show of a fact now differs from what it showed.
+    fn difference(&self, fact: &mut Fact<'_>, tolerance: &dyn Fn(&str) -> Tolerance) -> Option<Difference> {
+        let deletes = self.deleted.iter().any(|pattern| pattern.matches(fact.key));
+        let differ = |was: Option<&Value>, is: Option<&Value>| {
+            (!same(was, is, || tolerance(&fact.key.predicate))).then(|| (was.cloned(), is.cloned()))
+        };
+        let written = self.written.binary_search_by_key(&fact.hash, |written| written.hash);
+        let is_to_come = |effect: &Predicted| effect.writer.is_none_or(|writer| !self.writers[writer].1);
+        if let Ok(at) = written
+            && let Written { effect, alone: true, .. } = self.written[at]
+            && let effect @ Predicted { change: Change::Set { fact: set, value }, .. } = &self.effects[effect]
+            && set == fact.key
+        {
+            // What is still to come hides whatever there is now.
+            return if is_to_come(effect) { None } else { differ(Some(value), fact.now) };
         }
-        let was = self.shown.get(key);
-        let mut is = after.get(key).cloned();
-        for Effect { change, .. } in &self.effects {
-            match change {
-                Change::Set { fact, value } if fact == key => is = Some(value.clone()),
+        if !deletes && written.is_err() {
+            if let Some((_, difference)) = fact.of_bases.iter().find(|(base, _)| *base == self.base) {
+                return difference.clone();
+            }
+            let difference = differ(self.shown.get(fact.key), fact.now);
+            fact.of_bases.push((self.base, difference.clone()));
+            return difference;
+        }
+        let mut own = self.effects.iter().filter(|effect| effect.hash == fact.hash || effect.hash == 0);
+        let was = match own.clone().next_back().map(|effect| &effect.change) {
+            Some(Change::Set { fact: set, value }) if set == fact.key => Some(value),
+            _ => self.shown.get(fact.key),
+        };
+        if !own.clone().any(is_to_come) {
+            return differ(was, fact.now);
+        }
+        let mut is = fact.now.cloned();
+        for effect in own.by_ref().filter(|effect| is_to_come(effect)) {
+            match &effect.change {
+                Change::Set { fact: set, value } if set == fact.key => is = Some(value.clone()),
                 // What cannot be increased fails when it comes true; until then it is as it is.
-                Change::Increase { fact, by } if fact == key => is = increased(fact, is.as_ref(), *by).ok().or(is),
-                Change::Delete { pattern } if pattern.matches(key) => is = None,
+                Change::Increase { fact: grown, by } if grown == fact.key => {
+                    is = increased(grown, is.as_ref(), *by).ok().or(is);
+                }
+                Change::Delete { pattern } if pattern.matches(fact.key) => is = None,
                 _ => {}
             }
         }
-        (!same(was, is.as_ref(), || tolerance(&key.predicate))).then(|| Contradiction {
-            projection: id,
-            fact: key.clone(),
-            was: was.cloned(),
-            is,
-        })
+        differ(was, is.as_ref())
     }
 }
 
@@ -285,10 +380,22 @@ fn same(was: Option<&Value>, is: Option<&Value>, tolerance: impl Fn() -> Toleran
     }
 }
 
-fn take<K: Ord + Clone, Id: Ord>(index: &mut BTreeMap<K, BTreeSet<Id>>, key: &K, id: Id) {
-    if let Some(ids) = index.get_mut(key) {
-        ids.remove(&id);
-        if ids.is_empty() {
+fn put(places: &mut Vec<Place>, place: Place) {
+    if let Err(at) = places.binary_search(&place) {
+        places.insert(at, place);
+    }
+}
+
+fn take(places: &mut Vec<Place>, place: Place) {
+    if let Ok(at) = places.binary_search(&place) {
+        places.remove(at);
+    }
+}
+
+fn take_from<K: Ord>(index: &mut BTreeMap<K, Vec<Place>>, key: &K, place: Place) {
+    if let Some(places) = index.get_mut(key) {
+        take(places, place);
+        if places.is_empty() {
             index.remove(key);
         }
     }

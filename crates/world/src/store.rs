@@ -1,27 +1,24 @@
-//! The facts that projections share: one table and two orders of it, all persistent.
+//! The facts that projections share: one table and two orders of it, all shared between versions.
 //!
-//! - by key, hashed: a point lookup;
+//! - by key, hashed: a point lookup (`table`);
 //! - by key, ordered, so that a predicate and its leading arguments (the subject) are a range;
 //! - by argument, ordered, so that a predicate and any later argument (the object) are a range, too.
 //!
 //! A clone takes constant time. A write copies the path to it in each of the three (Bagwell's hash tries and B-trees), unless
 //! nobody shares it: only commits pay that, projections write into an overlay of their own (`world`).
 
+use crate::table::Table;
 use crate::world::Fact;
-use imbl::shared_ptr::DefaultSharedPtr;
-use imbl::{GenericHashMap, OrdMap, OrdSet};
+use imbl::{OrdMap, OrdSet};
 use ratn_model::fact::{FactKey, FactPattern, Term};
 use std::cmp::Ordering;
-use std::hash::{BuildHasherDefault, Hash, Hasher};
 use std::ops::Bound;
 use std::sync::Arc;
-
-type Hashed = GenericHashMap<Arc<FactKey>, Arc<Fact>, BuildHasherDefault<KeyHasher>, DefaultSharedPtr>;
 
 /// A persistent set of facts.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Store {
-    by_key: Hashed,
+    by_key: Table,
     in_order: OrdMap<Arc<FactKey>, Arc<Fact>>,
     by_argument: OrdSet<ByArgument>,
 }
@@ -46,11 +43,11 @@ impl Store {
     }
 
     pub(crate) fn get(&self, key: &FactKey) -> Option<&Fact> {
-        self.by_key.get(key).map(Arc::as_ref)
+        self.by_key.get(key)
     }
 
     pub(crate) fn insert(&mut self, key: &Arc<FactKey>, fact: &Arc<Fact>) {
-        if self.by_key.insert(Arc::clone(key), Arc::clone(fact)).is_none() {
+        if self.by_key.insert(key, fact) {
             for position in 1..key.arguments.len() {
                 self.by_argument.insert(ByArgument { position, key: Arc::clone(key) });
             }
@@ -59,7 +56,7 @@ impl Store {
     }
 
     pub(crate) fn remove(&mut self, key: &Arc<FactKey>) {
-        if self.by_key.remove(key.as_ref()).is_some() {
+        if self.by_key.remove(key) {
             self.in_order.remove(key.as_ref());
             for position in 1..key.arguments.len() {
                 self.by_argument.remove(&ByArgument { position, key: Arc::clone(key) });
@@ -81,8 +78,7 @@ impl Store {
         let first = first_of(pattern);
         let bound = first.arguments.len();
         if bound == pattern.arguments.len() {
-            let found = self.by_key.get_key_value(&first);
-            return Box::new(found.into_iter().map(|(key, fact)| (key.as_ref(), fact.as_ref())));
+            return Box::new(self.by_key.get_key_value(&first).into_iter());
         }
         let later = pattern.arguments.iter().enumerate().find_map(|(at, term)| Some((at, term.as_ref()?)));
         match later {
@@ -148,58 +144,5 @@ impl equivalent::Comparable<ByArgument> for Place<'_> {
             .then_with(|| Some(self.argument).cmp(&entry.key.arguments.get(entry.position)))
             .then_with(|| self.predicate.cmp(&entry.key.predicate))
             .then(Ordering::Less)
-    }
-}
-
-/// A fixed hash of keys: eight bytes at a time by a rotation and a multiplication, mixed at the end (the finaliser of
-/// `splitmix64`). Not secret: keys that collide on purpose make a lookup slow, and are still told apart.
-#[derive(Debug, Default)]
-pub(crate) struct KeyHasher(u64);
-
-/// The hash of a key.
-pub(crate) fn hash_of(key: &FactKey) -> u64 {
-    let mut hasher = KeyHasher::default();
-    key.hash(&mut hasher);
-    hasher.finish()
-}
-
-const MULTIPLIER: u64 = 0x9e37_79b9_7f4a_7c15;
-
-impl KeyHasher {
-    fn word(&mut self, word: u64) {
-        self.0 = (self.0.rotate_left(23) ^ word).wrapping_mul(MULTIPLIER);
-    }
-}
-
-impl Hasher for KeyHasher {
-    fn write(&mut self, bytes: &[u8]) {
-        let (words, rest) = bytes.as_chunks::<8>();
-        for word in words {
-            self.word(u64::from_le_bytes(*word));
-        }
-        if !rest.is_empty() {
-            let mut last = [0; 8];
-            last[..rest.len()].copy_from_slice(rest);
-            self.word(u64::from_le_bytes(last) ^ ((rest.len() as u64) << 56));
-        }
-    }
-
-    fn write_u8(&mut self, byte: u8) {
-        self.word(u64::from(byte));
-    }
-
-    fn write_u64(&mut self, word: u64) {
-        self.word(word);
-    }
-
-    fn write_usize(&mut self, word: usize) {
-        self.word(word as u64);
-    }
-
-    fn finish(&self) -> u64 {
-        let mut hash = self.0;
-        hash = (hash ^ (hash >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        hash = (hash ^ (hash >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        hash ^ (hash >> 31)
     }
 }

@@ -1,0 +1,388 @@
+//! Facts by key: a flat table that worlds share, and what a world has changed since.
+//!
+//! A lookup that misses the caches costs what it misses: one line of the table, in which the key stands as bytes, and one of the
+//! fact. Keys too long for that are compared where they are. The table is open addressing with linear probing and backward
+//! shifts (Knuth, volume 3, 6.4, algorithm R), at most five eighths full.
+//!
+//! Who alone has a table writes into it. Who shares it writes beside it, into a persistent hash map of the changes since; when
+//! those are an eighth of the table, the two become a table of its own. So a write costs a constant amount, on average, and a
+//! clone always.
+
+use crate::world::Fact;
+use imbl::GenericHashMap;
+use imbl::shared_ptr::DefaultSharedPtr;
+use ratn_model::fact::{FactKey, Term};
+use std::hash::{BuildHasherDefault, Hash, Hasher};
+use std::sync::Arc;
+
+type Since = GenericHashMap<Arc<FactKey>, Option<Arc<Fact>>, BuildHasherDefault<KeyHasher>, DefaultSharedPtr>;
+
+/// Changes beside a shared table are no reason for one of its own while they are fewer.
+const MIN_SINCE: usize = 512;
+/// The bytes of a key that stand in the table.
+const TEXT: usize = 39;
+/// A key whose bytes do not.
+const LONG: u8 = u8::MAX;
+
+/// Facts by key.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Table {
+    flat: Arc<Flat>,
+    since: Since,
+    len: usize,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Flat {
+    /// A power of two of them, or none.
+    slots: Vec<Option<Slot>>,
+    len: usize,
+}
+
+/// One cache line.
+#[derive(Debug, Clone)]
+#[repr(align(64))]
+struct Slot {
+    hash: u64,
+    key: Arc<FactKey>,
+    fact: Arc<Fact>,
+    length: u8,
+    text: [u8; TEXT],
+}
+
+/// A key as it is looked for: its bytes, where they are few, and a hash of all of it.
+struct Wanted {
+    hash: u64,
+    length: u8,
+    text: [u8; TEXT],
+}
+
+impl Table {
+    pub(crate) fn len(&self) -> usize {
+        self.len
+    }
+
+    pub(crate) fn get(&self, key: &FactKey) -> Option<&Fact> {
+        self.get_key_value(key).map(|(_, fact)| fact)
+    }
+
+    /// The fact, with the key that it is kept under.
+    pub(crate) fn get_key_value(&self, key: &FactKey) -> Option<(&FactKey, &Fact)> {
+        if !self.since.is_empty()
+            && let Some((key, changed)) = self.since.get_key_value(key)
+        {
+            return changed.as_deref().map(|fact| (key.as_ref(), fact));
+        }
+        self.flat.get(&Wanted::of(key), key)
+    }
+
+    /// Whether the fact is new.
+    pub(crate) fn insert(&mut self, key: &Arc<FactKey>, fact: &Arc<Fact>) -> bool {
+        let is_new = self.get(key).is_none();
+        self.len += usize::from(is_new);
+        match self.own() {
+            Some(flat) => flat.insert(Wanted::of(key), key, fact),
+            None => drop(self.since.insert(Arc::clone(key), Some(Arc::clone(fact)))),
+        }
+        is_new
+    }
+
+    /// Whether the fact was there.
+    pub(crate) fn remove(&mut self, key: &Arc<FactKey>) -> bool {
+        let was_there = self.get(key).is_some();
+        if was_there {
+            self.len -= 1;
+            match self.own() {
+                Some(flat) => flat.remove(&Wanted::of(key), key),
+                None => drop(self.since.insert(Arc::clone(key), None)),
+            }
+        }
+        was_there
+    }
+
+    /// The table, to write into: where nobody shares it, or where enough has changed beside it for one of its own.
+    fn own(&mut self) -> Option<&mut Flat> {
+        if Arc::get_mut(&mut self.flat).is_none() && self.since.len() < MIN_SINCE.max(self.flat.len / 8) {
+            return None;
+        }
+        let flat = Arc::make_mut(&mut self.flat);
+        for (key, fact) in std::mem::take(&mut self.since) {
+            match fact {
+                Some(fact) => flat.insert(Wanted::of(&key), &key, &fact),
+                None => flat.remove(&Wanted::of(&key), &key),
+            }
+        }
+        Some(flat)
+    }
+}
+
+impl Flat {
+    fn get(&self, wanted: &Wanted, key: &FactKey) -> Option<(&FactKey, &Fact)> {
+        let at = self.find(wanted, key).ok()?;
+        self.slots[at].as_ref().map(|slot| (slot.key.as_ref(), slot.fact.as_ref()))
+    }
+
+    /// Where a key is, or where it would be.
+    fn find(&self, wanted: &Wanted, key: &FactKey) -> Result<usize, usize> {
+        if self.slots.is_empty() {
+            return Err(0);
+        }
+        let mask = self.slots.len() - 1;
+        let mut at = wanted.hash as usize & mask;
+        // A free slot comes within the table: it is never full.
+        loop {
+            match &self.slots[at] {
+                None => return Err(at),
+                Some(slot) if slot.is(wanted, key) => return Ok(at),
+                Some(_) => at = (at + 1) & mask,
+            }
+        }
+    }
+
+    fn insert(&mut self, wanted: Wanted, key: &Arc<FactKey>, fact: &Arc<Fact>) {
+        if self.slots.len() * 5 <= (self.len + 1) * 8 {
+            self.grow();
+        }
+        match self.find(&wanted, key) {
+            Ok(at) => {
+                if let Some(slot) = &mut self.slots[at] {
+                    slot.fact = Arc::clone(fact);
+                }
+            }
+            Err(at) => {
+                let Wanted { hash, length, text } = wanted;
+                let slot = Slot { hash, key: Arc::clone(key), fact: Arc::clone(fact), length, text };
+                self.slots[at] = Some(slot);
+                self.len += 1;
+            }
+        }
+    }
+
+    fn remove(&mut self, wanted: &Wanted, key: &FactKey) {
+        let Ok(mut free) = self.find(wanted, key) else { return };
+        let mask = self.slots.len() - 1;
+        self.slots[free] = None;
+        self.len -= 1;
+        let mut at = free;
+        loop {
+            at = (at + 1) & mask;
+            let Some(slot) = &self.slots[at] else { return };
+            // It moves into the gap unless that lies before the place where it is looked for first.
+            let home = slot.hash as usize & mask;
+            if at.wrapping_sub(home) & mask >= at.wrapping_sub(free) & mask {
+                self.slots.swap(free, at);
+                free = at;
+            }
+        }
+    }
+
+    fn grow(&mut self) {
+        let size = (self.slots.len() * 2).max(16);
+        let old = std::mem::replace(&mut self.slots, vec![None; size]);
+        for slot in old.into_iter().flatten() {
+            let mut at = slot.hash as usize & (size - 1);
+            while self.slots[at].is_some() {
+                at = (at + 1) & (size - 1);
+            }
+            self.slots[at] = Some(slot);
+        }
+    }
+}
+
+impl Slot {
+    fn is(&self, wanted: &Wanted, key: &FactKey) -> bool {
+        self.hash == wanted.hash
+            && self.length == wanted.length
+            && if self.length == LONG { *self.key == *key } else { self.text == wanted.text }
+    }
+}
+
+impl Wanted {
+    fn of(key: &FactKey) -> Wanted {
+        let mut bytes = Bytes { text: [0; TEXT], length: 0 };
+        if bytes.add(key).is_some() {
+            let Bytes { text, length } = bytes;
+            let mut hasher = KeyHasher::default();
+            let (words, rest) = text.as_chunks::<8>();
+            let used = length.div_ceil(8);
+            words.iter().take(used).for_each(|word| hasher.word(u64::from_le_bytes(*word)));
+            if used > words.len() {
+                hasher.write(rest);
+            }
+            return Wanted { hash: hasher.finish(), length: length as u8, text };
+        }
+        Wanted { hash: hash_of(key), length: LONG, text: [0; TEXT] }
+    }
+}
+
+/// A key as bytes: no two keys have the same.
+struct Bytes {
+    text: [u8; TEXT],
+    length: usize,
+}
+
+impl Bytes {
+    fn add(&mut self, key: &FactKey) -> Option<()> {
+        self.text(&key.predicate)?;
+        for argument in &key.arguments {
+            match argument {
+                Term::Int(i) => {
+                    self.bytes(&[LONG])?;
+                    self.bytes(&i.to_le_bytes())?;
+                }
+                Term::Name(name) => self.text(name)?,
+            }
+        }
+        Some(())
+    }
+
+    /// With its length, which is less than what marks a number.
+    fn text(&mut self, text: &str) -> Option<()> {
+        let length = u8::try_from(text.len()).ok().filter(|length| *length < LONG)?;
+        self.bytes(&[length])?;
+        self.bytes(text.as_bytes())
+    }
+
+    fn bytes(&mut self, bytes: &[u8]) -> Option<()> {
+        let end = self.length + bytes.len();
+        self.text.get_mut(self.length..end)?.copy_from_slice(bytes);
+        self.length = end;
+        Some(())
+    }
+}
+
+/// The hash of a key.
+pub(crate) fn hash_of(key: &FactKey) -> u64 {
+    let mut hasher = KeyHasher::default();
+    key.hash(&mut hasher);
+    hasher.finish()
+}
+
+/// A fixed hash of keys: eight bytes at a time by a rotation and a multiplication, mixed at the end (the finaliser of
+/// `splitmix64`). Not secret: keys that collide on purpose make a lookup slow, and are still told apart.
+#[derive(Debug, Default)]
+pub(crate) struct KeyHasher(u64);
+
+const MULTIPLIER: u64 = 0x9e37_79b9_7f4a_7c15;
+
+impl KeyHasher {
+    fn word(&mut self, word: u64) {
+        self.0 = (self.0.rotate_left(23) ^ word).wrapping_mul(MULTIPLIER);
+    }
+}
+
+impl Hasher for KeyHasher {
+    fn write(&mut self, bytes: &[u8]) {
+        let (words, rest) = bytes.as_chunks::<8>();
+        for word in words {
+            self.word(u64::from_le_bytes(*word));
+        }
+        if !rest.is_empty() {
+            let mut last = [0; 8];
+            last[..rest.len()].copy_from_slice(rest);
+            self.word(u64::from_le_bytes(last) ^ ((rest.len() as u64) << 56));
+        }
+    }
+
+    fn write_u8(&mut self, byte: u8) {
+        self.word(u64::from(byte));
+    }
+
+    fn write_u64(&mut self, word: u64) {
+        self.word(word);
+    }
+
+    fn write_usize(&mut self, word: usize) {
+        self.word(word as u64);
+    }
+
+    fn finish(&self) -> u64 {
+        let mut hash = self.0;
+        hash = (hash ^ (hash >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        hash = (hash ^ (hash >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        hash ^ (hash >> 31)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+    use super::*;
+    use proptest::prelude::*;
+    use ratn_model::id::Revision;
+    use ratn_model::value::Value;
+    use std::collections::{BTreeMap, BTreeSet};
+
+    /// Every third too long for the table, some of numbers.
+    fn key(i: u16) -> Arc<FactKey> {
+        let name =
+            if i.is_multiple_of(3) { format!("a_name_that_is_too_long_for_a_slot_{i}") } else { format!("o{i}") };
+        let arguments = if i.is_multiple_of(5) { vec![Term::Int(i64::from(i))] } else { vec![Term::Name(name)] };
+        Arc::new(FactKey { predicate: format!("p{}", i % 2), arguments })
+    }
+
+    fn fact(value: i64) -> Arc<Fact> {
+        let world = crate::world::World::from_facts([((*key(0)).clone(), Value::Int(value))], Revision(1));
+        Arc::new(world.fact(&key(0)).unwrap().clone())
+    }
+
+    /// Runs of inserts or removals of neighbouring keys, and what is kept or dropped meanwhile.
+    fn step() -> impl Strategy<Value = (u16, u16, bool, u8)> {
+        (0_u16..3000, 1_u16..800, prop::bool::weighted(0.6), 0_u8..4)
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 60, ..ProptestConfig::default() })]
+
+        #[test]
+        fn versions_shared_and_alone_are_what_maps_would_be(steps in prop::collection::vec(step(), 1..20)) {
+            let (mut table, mut model) = (Table::default(), BTreeMap::new());
+            let mut kept: Vec<(Table, BTreeMap<Arc<FactKey>, i64>)> = Vec::new();
+            for (round, (from, count, insert, keep)) in steps.into_iter().enumerate() {
+                match keep {
+                    0 => kept.push((table.clone(), model.clone())),
+                    1 => kept.clear(),
+                    _ => {}
+                }
+                let value = round as i64;
+                let new = fact(value);
+                for key in (from..from + count).map(key) {
+                    if insert {
+                        prop_assert_eq!(table.insert(&key, &new), model.insert(key, value).is_none());
+                    } else {
+                        prop_assert_eq!(table.remove(&key), model.remove(&key).is_some());
+                    }
+                }
+                for (table, model) in kept.iter().chain([&(table.clone(), model.clone())]) {
+                    prop_assert_eq!(table.len(), model.len());
+                    for key in (0..4000).step_by(7).map(key) {
+                        let found = table.get_key_value(&key).map(|(key, fact)| (key.clone(), fact.value.clone()));
+                        prop_assert_eq!(found, model.get(&key).map(|value| ((*key).clone(), Value::Int(*value))));
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn keys_that_read_alike_are_told_apart() {
+        let name = |text: &str| Term::Name(text.to_owned());
+        let key = |predicate: &str, arguments: Vec<Term>| FactKey { predicate: predicate.to_owned(), arguments };
+        let alike = [
+            key("ab", vec![name("c")]),
+            key("a", vec![name("bc")]),
+            key("abc", vec![]),
+            key("abc", vec![name("")]),
+            key("a", vec![name("b"), name("c")]),
+            key("a", vec![Term::Int(1)]),
+            key("a", vec![name("1")]),
+            key("a", vec![name("\u{1}\0\0\0\0\0\0\0")]),
+            key("a", vec![name(&"x".repeat(300))]),
+            key("a", vec![name(&"x".repeat(301))]),
+        ];
+        let texts: BTreeSet<(u64, u8, [u8; TEXT])> =
+            alike.iter().map(Wanted::of).map(|wanted| (wanted.hash, wanted.length, wanted.text)).collect();
+        assert_eq!(texts.len(), alike.len());
+    }
+}
