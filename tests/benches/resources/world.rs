@@ -95,6 +95,8 @@ async fn latency(directory: &Path, note: &mut impl FnMut(&str, f64)) {
     note("durable_commit_p99_us", durable_commit.at(0.99));
     note("resident_mib", (durable_pool.resident_bytes() / f64::from(1 << 20)).round());
     drop(durable_pool);
+    // A killed process leaves it behind.
+    std::fs::remove_file(directory.join("durable/world-pool.endpoint")).unwrap();
     let began = Instant::now();
     let (_again, at) = process::daemon("world-pool", &directory.join("durable"), "group").await;
     Pool::new(connect(&at).await)
