@@ -50,6 +50,22 @@ fn an_error_inside_a_quoted_expression_has_its_own_column() {
 }
 
 #[test]
+fn an_expression_that_a_comma_cut_off_wants_quotes() {
+    let look = "  - look: { action: pan_tilt/look_at, in: { target: pose(1, 2, 3) }, resources: [{block: PanTilt}] }\n";
+    assert!(check(&task(look)).contains("help: quote it"), "{}", check(&task(look)));
+}
+
+#[test]
+fn what_is_created_over_and_over_is_enough_for_any_number() {
+    let make = "{ action: gripper/release, resources: [Gripper, { create: Token, class: task }] }";
+    let wanted = "  - use: { action: gripper/release, resources: [Gripper, { consume: Token, count: 3 }] }\n";
+    let over_and_over = format!("  - for: n in [1, 2, 3]\n    do:\n      - make: {make}\n{wanted}");
+    assert!(!check(&task(&over_and_over)).contains("too-many-resources"), "{}", check(&task(&over_and_over)));
+    let twice = format!("  - make: {make}\n  - again: {make}\n{wanted}");
+    assert!(check(&task(&twice)).contains("the task creates at most 2"), "{}", check(&task(&twice)));
+}
+
+#[test]
 fn a_cycle_of_flows_is_told_from_a_wrong_order() {
     assert_snapshot!(check(include_str!("../../../tests/bad-tasks/unservable-flow.yaml")), @"task.yaml:5:39: error[unservable-flow] in move: `plan.trajectory` is written by `plan`, which comes later. help: move `plan` before `move`");
     assert_snapshot!(check(include_str!("../../../tests/bad-tasks/unservable-flow-cycle.yaml")), @"task.yaml:7:13: error[unservable-flow] in there: `back.end` is written by `back`, which comes later. help: each waits for the next: there → back → there; break the cycle");

@@ -83,6 +83,16 @@ fn a_task_that_says_everything_has_nothing_to_gain() {
 }
 
 #[test]
+fn the_chain_goes_on_over_what_ended_without_having_begun() {
+    let refused = "  - bad: { action: arm/move, requires: [\"door(open) = true\"], reads: [], effects: [], \
+         resources: [{ block: Arm }], duration: 3, transitions: { aborted: rescue } }\n";
+    let task = format!("task: t\nstates:\n{}{refused}{}", move_arm("go", "1", 3), move_arm("rescue", "2", 1));
+    let found = check(&task).unwrap();
+    let chain: Vec<&str> = found.chain.iter().map(|link| link.path.as_str()).collect();
+    assert_eq!(chain, ["go", "rescue"]);
+}
+
+#[test]
 fn an_action_without_a_duration_is_named() {
     let found =
         check("task: t\nstates:\n  - go: { action: arm/move, reads: [], effects: [], resources: [{ block: Arm }] }\n");

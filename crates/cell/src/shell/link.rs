@@ -26,7 +26,7 @@ const FIND_DEADLINE: Duration = Duration::from_secs(60);
 /// How often the battery is looked at, and whether the manager has moved.
 const LOOK_INTERVAL: Duration = Duration::from_millis(500);
 /// The battery's level is told again when it has changed by this much.
-const LEVEL_STEP: f64 = 0.001;
+const LEVEL_STEP: f64 = 0.01;
 
 pub(crate) struct Link {
     pub(crate) config: CellConfig,

@@ -2,6 +2,7 @@
 //! look cannot act.
 
 use super::Subject;
+use super::graph::Point;
 use crate::diagnostic::Findings;
 use crate::load::suggestion;
 use crate::program::{Nature, ResourceExpr, State, StateKind};
@@ -81,13 +82,38 @@ fn too_many(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
         }
     }
     for (kind, (count, i)) in own {
-        let Some(offer) = subject.catalogue.resources.get(kind) else { continue };
-        if count > offer.count {
-            let message = format!("this asks for {count} of `{kind}` at once; the system can have {}", offer.count);
+        let (most, who, help) = match subject.catalogue.resources.get(kind) {
+            Some(offer) => (offer.count, "the system can have", "ask for fewer, or offer more"),
+            None => match created_at_most(subject, kind) {
+                Some(most) => (most, "the task creates at most", "ask for fewer, or create more"),
+                None => continue,
+            },
+        };
+        if count > most {
+            let message = format!("this asks for {count} of `{kind}` at once; {who} {most}");
             let at = subject.place(state, &format!("resources.{i}"));
-            findings.error("too-many-resources", at, &state.path, message, "ask for fewer, or offer more");
+            findings.error("too-many-resources", at, &state.path, message, help);
         }
     }
+}
+
+/// How much of a kind that only the task creates there ever is; `None` where it is created over and over, or never.
+fn created_at_most(subject: &Subject<'_>, kind: &str) -> Option<Quantity> {
+    let mut most = Quantity::ZERO;
+    for state in &subject.program.states {
+        let lines = state.annotations.resources.iter();
+        let created = lines.filter(|line| line.operation == ResourceOperation::Create && line.kind == kind);
+        let created: Quantity = created.map(|line| line.count).sum();
+        if created.is_zero() {
+            continue;
+        }
+        let mut ends = (0..subject.control.outcomes(state.id).len()).map(|n| Point::End(state.id, n));
+        if ends.any(|end| subject.control.leads_to(end, Point::Begin(state.id))) {
+            return None;
+        }
+        most = [most, created].into_iter().sum();
+    }
+    (!most.is_zero()).then_some(most)
 }
 
 /// A part of a unit is asked for only of what is divisible: says the catalogue, or the task that creates it.

@@ -109,7 +109,8 @@ impl<'t, 'a> Fields<'t, 'a> {
             Ok(parsed) => Some(parsed),
             Err(error) => {
                 let at = node.place_in_text(self.task.source, offset + error.offset);
-                self.error(error.rule, at, error.message, error.help);
+                let help = if is_cut_off(text) { QUOTE.to_owned() } else { error.help };
+                self.error(error.rule, at, error.message, help);
                 None
             }
         }
@@ -196,4 +197,12 @@ impl<'t, 'a> Fields<'t, 'a> {
             }
         }
     }
+}
+
+/// For what stands within `{ }` or `[ ]` without quotes.
+const QUOTE: &str = "quote it: within { } and [ ] a comma ends a text, so write \"pose(1, 2, 3)\"";
+
+/// Whether a parenthesis is open at the end of a text.
+fn is_cut_off(text: &str) -> bool {
+    text.matches('(').count() > text.matches(')').count()
 }

@@ -71,6 +71,12 @@ pub(crate) fn read(source: &str) -> Result<Node, InvalidYaml> {
 /// The library's message without the place, which is said before it, and without advice to programmers.
 fn message(text: &str) -> String {
     let line = text.lines().next().unwrap_or("unreadable");
+    if line.contains("recursion limit exceeded") || line.contains("budget breached: Depth") {
+        return "lists and mappings are nested deeper here than a task file may nest them".to_owned();
+    }
+    if line.contains("budget breached") {
+        return "it has more values than a task file may have, each counted wherever an alias repeats it".to_owned();
+    }
     let line = line.rsplit_once(" at line ").map_or(line, |(message, _)| message);
     line.split_once(", set DuplicateKeyPolicy").map_or(line, |(message, _)| message).to_owned()
 }
@@ -226,7 +232,11 @@ mod tests {
             let error = read(source).unwrap_err();
             assert!(error.at.line >= 1 && !error.message.is_empty(), "{source}: {error:?}");
         }
-        let deep = "[".repeat(5_000);
-        assert!(read(&deep).is_err());
+        assert!(read(&"[".repeat(5_000)).is_err());
+        // What the library says of its own limits is said in the words of a task file.
+        for limit in ["recursion limit exceeded", "budget breached: Depth { depth: 65 } at line 1, column 3"] {
+            assert!(message(limit).contains("nested deeper"), "{limit}");
+        }
+        assert!(message("budget breached: Nodes { nodes: 250001 } at line 9").contains("more values"));
     }
 }

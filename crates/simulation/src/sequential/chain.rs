@@ -41,7 +41,9 @@ pub(super) fn chain(program: &Program, log: &[LogLine]) -> Vec<Link> {
         // What ended just then, the closest bond first. Of equals, the youngest.
         let before = visits
             .iter()
-            .filter(|(other, earlier)| **other != id && earlier.ended == Some(began) && earlier.began < Some(began))
+            .filter(|(other, earlier)| {
+                **other != id && earlier.ended == Some(began) && earlier.began.is_some_and(|b| b < began)
+            })
             .map(|(other, earlier)| (bond(program, earlier.state, visit.state), *other, earlier))
             .max_by_key(|(bond, other, _)| (std::cmp::Reverse(bond.clone()), *other));
         let because = match &before {
