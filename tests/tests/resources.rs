@@ -88,6 +88,52 @@ fn parts_of_what_is_divisible_are_held_and_what_is_not_renewable_is_gone() -> an
 }
 
 #[test]
+fn resources_are_selected_by_what_their_attributes_are_like() -> anyhow::Result<()> {
+    let manager = Manager::start()?;
+    for (id, payload, tool) in [("light", "1.5", "gripper"), ("heavy", "8", "welder")] {
+        let (payload, tool) = (format!("payload={payload}"), format!("tool={tool}"));
+        manager.json(&[
+            "create",
+            "Robot",
+            "--id",
+            id,
+            "--host",
+            "cell",
+            "--attribute",
+            &payload,
+            "--attribute",
+            &tool,
+        ])?;
+    }
+    manager.json(&["create", "Robot", "--id", "bare"])?;
+    let listed = |conditions: &[&str]| -> anyhow::Result<Vec<String>> {
+        let conditions = conditions.iter().flat_map(|condition| ["--where", *condition]);
+        let listed = manager.json(&["list", "Robot"].into_iter().chain(conditions).collect::<Vec<_>>())?;
+        let ids = listed.as_array().context("a list")?.iter().map(|one| one["id"].as_str().map(str::to_owned));
+        ids.collect::<Option<_>>().context("ids")
+    };
+    for (conditions, expected) in [
+        (&["payload = 8"][..], &["heavy"][..]),
+        (&["payload != 8"], &["light"]),
+        (&["payload < 8"], &["light"]),
+        (&["payload <= 8"], &["heavy", "light"]),
+        (&["payload > 1.5"], &["heavy"]),
+        (&["payload >= 1.5", "tool = gripper"], &["light"]),
+        (&["tool in [welder, drill]"], &["heavy"]),
+        (&["has tool", "host = cell"], &["heavy", "light"]),
+    ] {
+        let found = listed(conditions)?;
+        ensure!(found == expected, "{conditions:?}: {found:?}");
+    }
+    let (code, out, _) = manager.resource(&["block", "Robot", "--where", "payload > 2", "--", "true"])?;
+    ensure!(code == Some(0) && out.contains("heavy"), "{out}");
+    ensure!(manager.resource(&["exists", "Robot", "--where", "payload > 9"])?.0 == Some(1));
+    let (code, _, err) = manager.resource(&["list", "--where", "payload ~ 9"])?;
+    ensure!(code == Some(2) && err.contains("`payload ~ 9` is no condition on an attribute"), "{code:?} {err}");
+    Ok(())
+}
+
+#[test]
 fn a_block_holds_for_as_long_as_its_command_runs() -> anyhow::Result<()> {
     let manager = Manager::start()?;
     manager.json(&["create", "Fixture", "--id", "f1"])?;

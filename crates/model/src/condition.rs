@@ -4,10 +4,14 @@
 //! does one that cannot be compared. `host` is the host that a resource is on, unless it has an attribute of that name.
 
 use crate::expression::evaluate::compare;
+use crate::expression::parse::parse_expression;
+use crate::expression::scope::NothingKnown;
 use crate::expression::{BinaryOperator, EvaluateError, Expr, Scope};
+use crate::parameters::NoNames;
 use crate::value::Value;
 use serde::{Deserialize, Serialize};
 use std::fmt;
+use std::str::FromStr;
 
 /// How an attribute is looked at.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -95,7 +99,55 @@ impl Condition {
     }
 }
 
+/// A text that is no condition.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{text}` is no condition on an attribute: {problem}; write {}", ConditionExpr::WRITTEN)]
+pub struct InvalidCondition {
+    /// As it was written.
+    pub text: String,
+    /// What does not fit, and where.
+    pub problem: String,
+}
+
+impl FromStr for Condition {
+    type Err = InvalidCondition;
+
+    fn from_str(text: &str) -> Result<Condition, InvalidCondition> {
+        let invalid = |problem: String| InvalidCondition { text: text.to_owned(), problem };
+        let read = match ConditionExpr::presence(text) {
+            Some(condition) => condition,
+            None => {
+                let expression = parse_expression(text, &mut NoNames);
+                let expression =
+                    expression.map_err(|e| invalid(format!("{} at character {}", e.message, e.offset + 1)))?;
+                let problem = "it compares no attribute by its name";
+                ConditionExpr::comparison(expression).ok_or_else(|| invalid(problem.to_owned()))?
+            }
+        };
+        read.bind(&NothingKnown).map_err(|error| invalid(error.to_string()))
+    }
+}
+
 impl ConditionExpr {
+    /// How conditions are written.
+    pub(crate) const WRITTEN: &str =
+        "one attribute and what it must be like: `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`";
+
+    /// `has camera`, where it is that.
+    pub(crate) fn presence(text: &str) -> Option<ConditionExpr> {
+        let is_name =
+            |name: &&str| !name.is_empty() && name.chars().all(|c| c.is_alphanumeric() || c == '_' || c == '-');
+        let attribute = text.trim().strip_prefix("has ").map(str::trim).filter(is_name)?.to_owned();
+        Some(ConditionExpr { attribute, comparison: Comparison::Has, value: Expr::Literal(Value::Null) })
+    }
+
+    /// `payload >= 2.5`, where an expression is that.
+    pub(crate) fn comparison(expression: Expr) -> Option<ConditionExpr> {
+        let Expr::Binary(operator, left, right) = expression else { return None };
+        let Expr::Literal(Value::String(attribute)) = *left else { return None };
+        Some(ConditionExpr { attribute, comparison: Comparison::of(operator)?, value: *right })
+    }
+
     /// The condition with its value evaluated.
     ///
     /// # Errors
@@ -143,6 +195,26 @@ fn written(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn conditions_are_read_as_they_are_written_and_what_is_none_is_refused_with_its_place() {
+        for text in
+            ["payload >= 2.5", "tool in [gripper, welder]", "has camera", "host = compute", "a != true", "n < 3"]
+        {
+            assert_eq!(text.parse::<Condition>().map(|condition| condition.to_string()), Ok(text.to_owned()));
+        }
+        let why = |text: &str| text.parse::<Condition>().err().map(|error| error.to_string()).unwrap_or_default();
+        assert!(why("payload >=").contains("`payload >=` is no condition on an attribute: "), "{}", why("payload >="));
+        assert!(
+            why("payload").contains("it compares no attribute by its name; write one attribute"),
+            "{}",
+            why("payload")
+        );
+        assert!(why("2 < payload").contains("it compares no attribute by its name"), "{}", why("2 < payload"));
+        assert!(why("tool in 3").contains("takes a list"), "{}", why("tool in 3"));
+        assert!(why("a ~ 3").contains("at character"), "{}", why("a ~ 3"));
+        assert!(why("a = $x").contains("is no constant"), "{}", why("a = $x"));
+    }
 
     #[test]
     fn an_attribute_is_compared_as_in_expressions_and_what_cannot_be_compared_meets_nothing() {

@@ -98,7 +98,7 @@ fn read(text: &str, parameter: &Parameter) -> Result<Value, ParameterError> {
 }
 
 /// In a constant, a word is the individual of that name, and nothing else has a name.
-struct NoNames;
+pub(crate) struct NoNames;
 
 impl Names for NoNames {
     fn variable(&mut self, name: &str) -> Result<Expr, NameError> {

@@ -1,6 +1,7 @@
 //! What the services speak of and no core owns: resources as the resource manager lists them, facts with their revision,
 //! worker processes, goals and their results. Plain data.
 
+use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::Measurement;
@@ -190,6 +191,8 @@ pub struct ResourceFilter {
     pub attributes: BTreeMap<String, Value>,
     /// Only those that this session provides; empty for everybody's.
     pub session: String,
+    /// Only those whose attributes are like this; all of them.
+    pub conditions: Vec<Condition>,
 }
 
 /// What happened to a resource.

@@ -2,6 +2,7 @@
 
 use crate::id::{SessionId, Slot};
 use crate::lease::Leases;
+use ratn_model::condition::Condition;
 use ratn_model::id::{FencingToken, LeaseId, Revision};
 use ratn_model::resource::{LeasedResource, Quantity, Requirement, ResourceClass};
 use ratn_model::value::Value;
@@ -202,6 +203,11 @@ impl Description {
     /// Whether a requirement can be met with it, if it is of the right kind.
     pub(crate) fn fits(&self, requirement: &Requirement) -> bool {
         requirement.class.is_none_or(|class| class == self.class) && requirement.accepts(|name| self.attribute(name))
+    }
+
+    /// Whether its attributes are like this.
+    pub fn meets(&self, condition: &Condition) -> bool {
+        self.attribute(&condition.attribute).is_some_and(|value| condition.holds(&value))
     }
 
     /// An attribute; `host` is where it is, unless it says so itself.

@@ -76,6 +76,7 @@ pub(super) fn passes(view: &ResourceView, filter: &ResourceFilter) -> bool {
         && (filter.host.is_empty() || filter.host == view.host)
         && (filter.session.is_empty() || filter.session == owner)
         && filter.attributes.iter().all(|(name, value)| view.attributes.get(name) == Some(value))
+        && filter.conditions.iter().all(|condition| view.meets(condition))
 }
 
 pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {

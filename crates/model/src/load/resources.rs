@@ -2,11 +2,10 @@
 
 use super::fields::Fields;
 use super::yaml::{Content, Entry, Node};
-use crate::condition::{Comparison, ConditionExpr};
+use crate::condition::ConditionExpr;
 use crate::expression::Expr;
 use crate::program::{ResourceExpr, WORLD_MODEL};
 use crate::resource::{Quantity, ResourceClass, ResourceOperation};
-use crate::value::Value;
 
 const OPERATIONS: [(&str, ResourceOperation); 5] = [
     ("block", ResourceOperation::Block),
@@ -113,22 +112,15 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
 
 /// `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`.
 fn condition(fields: &mut Fields<'_, '_>, line: &Node) -> Option<ConditionExpr> {
-    let text = if let Content::Text(text) = &line.content { text.as_str() } else { "" };
-    if let Some(attribute) = text.strip_prefix("has ").map(str::trim).filter(|name| is_name(name)) {
-        let (attribute, value) = (attribute.to_owned(), Expr::Literal(Value::Null));
-        return Some(ConditionExpr { attribute, comparison: Comparison::Has, value });
-    }
-    if let Expr::Binary(operator, left, right) = fields.expression(line)?
-        && let Expr::Literal(Value::String(attribute)) = *left
-        && let Some(comparison) = Comparison::of(operator)
+    if let Content::Text(text) = &line.content
+        && let Some(condition) = ConditionExpr::presence(text)
     {
-        return Some(ConditionExpr { attribute, comparison, value: *right });
+        return Some(condition);
     }
-    let help = "one attribute and what it must be like: `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`";
+    if let Some(condition) = ConditionExpr::comparison(fields.expression(line)?) {
+        return Some(condition);
+    }
+    let help = ConditionExpr::WRITTEN;
     fields.error("invalid-expression", line.at, "this is no condition on an attribute", help);
     None
-}
-
-fn is_name(text: &str) -> bool {
-    !text.is_empty() && text.chars().all(|c| c.is_alphanumeric() || c == '_' || c == '-')
 }

@@ -447,6 +447,7 @@ impl From<ResourceFilter> for v1::ListRequest {
             host: filter.host,
             attributes: wire_ports(filter.attributes),
             session_id: filter.session,
+            conditions: all(filter.conditions),
         }
     }
 }
@@ -464,6 +465,7 @@ impl TryFrom<v1::ListRequest> for ResourceFilter {
             host: request.host,
             attributes: ports(request.attributes, "attributes")?,
             session: request.session_id,
+            conditions: each(request.conditions, "conditions")?,
         })
     }
 }

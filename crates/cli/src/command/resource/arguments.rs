@@ -2,6 +2,7 @@
 
 use crate::failure::Failure;
 use clap::{Args, Subcommand};
+use ratn_model::condition::Condition;
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::value::Value;
 use ratn_worker::endpoint::Endpoint;
@@ -54,6 +55,9 @@ pub(super) enum ResourceCommand {
         /// Only of these kinds
         #[arg(value_name = "KIND")]
         kinds: Vec<String>,
+        /// Only those that are like this, `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`; may be repeated
+        #[arg(long = "where", value_name = "CONDITION")]
+        conditions: Vec<Condition>,
     },
     /// Show everything about one resource
     Get {
@@ -123,6 +127,9 @@ pub(super) struct Selector {
     /// An attribute that they have, `reach=1.2`; may be repeated
     #[arg(long = "attribute", value_name = "NAME=VALUE", value_parser = attribute)]
     pub(super) attributes: Vec<(String, Value)>,
+    /// What they must be like besides, `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`; may be repeated
+    #[arg(long = "where", value_name = "CONDITION")]
+    pub(super) conditions: Vec<Condition>,
 }
 
 #[derive(Debug, Clone, Args)]

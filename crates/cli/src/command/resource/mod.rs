@@ -19,7 +19,7 @@ use anyhow::Context;
 use arguments::{ResourceCommand, Selector};
 use ratn_model::id::LeaseId;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
-use ratn_proto::types::Resource;
+use ratn_proto::types::{Resource, ResourceFilter};
 use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -98,9 +98,10 @@ impl Asking {
                     return Err(anyhow::anyhow!("there is not what would satisfy `{requirement}`").into());
                 }
             }
-            ResourceCommand::List { kinds } => {
-                let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
-                let resources = client.list(&kinds).await?;
+            ResourceCommand::List { kinds, conditions } => {
+                let (kinds, conditions) = (kinds.clone(), conditions.clone());
+                let filter = ResourceFilter { kinds, conditions, ..ResourceFilter::default() };
+                let resources = client.list_where(filter).await?;
                 self.show(&resources.iter().map(show::resource_json).collect(), || show::table(&resources))?;
             }
             ResourceCommand::Get { id } => {
@@ -206,6 +207,7 @@ impl Selector {
             class: self.class,
             attributes: arguments::attributes(&self.attributes)?,
             count: self.count,
+            conditions: self.conditions.clone(),
             ..Requirement::new(operation, &self.kind)
         })
     }
