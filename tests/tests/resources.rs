@@ -310,6 +310,9 @@ fn a_release_by_the_operator_and_every_other_mutation_is_in_the_audit_log() -> a
     let expected =
         [("create", "Ok"), ("acquire", "Ok"), ("release", "Ok"), ("release", "NotFound"), ("delete", "NotFound")];
     ensure!(told == expected, "{lines:?}");
+    // Each command is a trace; that of the block came over its session's stream.
+    let traces: std::collections::BTreeSet<&str> = lines.iter().filter_map(|line| line["trace"].as_str()).collect();
+    ensure!(traces.len() == lines.len() && traces.iter().all(|trace| trace.len() == 32), "{lines:?}");
     ensure!(
         lines[1]["token"].as_u64() > Some(0)
             && lines[0]["what"].as_str().is_some_and(|what| what.contains("the-fixture"))

@@ -1,5 +1,6 @@
 //! The command line.
 
+use crate::command::pool::{HostArguments, LogsArguments, PoolArguments};
 use crate::command::resource::ResourceArguments;
 use crate::command::world::WorldArguments;
 use crate::task_control::control::Word;
@@ -27,6 +28,12 @@ pub(crate) enum Command {
     Run(RunArguments),
     /// Pause a run that is under way, let it go on, let it do one step, or end it
     Control(ControlArguments),
+    /// Show the worker processes of a host
+    Ps(HostArguments),
+    /// Print what a worker of this host writes
+    Logs(LogsArguments),
+    /// Start and end workers of a host's pools
+    Pool(PoolArguments),
     /// Lay a new table in the simulated cell of a running system, and forget every fact
     Reset(ResetArguments),
     /// Check a task file without starting anything

@@ -1,9 +1,10 @@
-//! The audit log: one event of the tracing target `audit` per mutation, with who, what, the session, the fencing token and how it
-//! ended. Off unless the config names a file or the filter says `audit=info`: then it costs a comparison.
+//! The audit log: one event of the tracing target `audit` per mutation, with who, what, the session, the fencing token, how it
+//! ended and which trace it was a part of. Off unless the config names a file or the filter says `audit=info`: then it costs a comparison.
 
 use crate::access::Caller;
 use crate::{details, metrics};
 use ratn_model::id::FencingToken;
+use ratn_worker::trace;
 use tonic::{Code, Status};
 
 /// The tracing target.
@@ -37,6 +38,7 @@ impl Mutation<'_> {
             Err(status) => (status.code(), status.message(), 0),
         };
         let Mutation { caller, operation, request, what } = self;
-        tracing::info!(target: TARGET, who = %caller, operation, request, what, token, ?code, reason);
+        let trace = trace::current().map(|context| context.trace_id().to_string()).unwrap_or_default();
+        tracing::info!(target: TARGET, who = %caller, operation, request, what, token, ?code, reason, trace);
     }
 }

@@ -73,6 +73,17 @@ impl Pool {
         self
     }
 
+    /// The same pool, restored from a log whose end may be lost: revisions are above `floor` from now on, so that none means two
+    /// things, and who watched before is told to begin anew.
+    #[must_use]
+    pub fn with_revisions_above(mut self, floor: Revision) -> Pool {
+        if floor > self.revision {
+            self.revision = floor;
+            self.history = History::default();
+        }
+        self
+    }
+
     /// From now on other bounds hold; what is there beyond them stays.
     pub fn set_limits(&mut self, limits: Limits) {
         self.limits = limits;

@@ -5,6 +5,7 @@ mod check;
 mod control;
 mod demo;
 mod plan;
+pub(crate) mod pool;
 mod reload;
 mod report;
 mod reset;
@@ -37,6 +38,9 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Up(arguments) => up::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
         Command::Control(arguments) => control::run(&arguments),
+        Command::Ps(arguments) => pool::ps(&arguments),
+        Command::Logs(arguments) => pool::logs(&arguments),
+        Command::Pool(arguments) => pool::run(&arguments),
         Command::Reset(arguments) => reset::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Resource(arguments) => resource::run(&arguments),

@@ -124,11 +124,12 @@ impl Statistics {
             reason: run.reason.clone(),
             makespan_s: run.end_s,
             time,
-            work_s: jobs.iter().map(|job| job.to_s - job.from_s).sum(),
+            // The sum of nothing would be -0.
+            work_s: jobs.iter().map(|job| job.to_s - job.from_s).fold(0.0, |all, one| all + one),
             overlap_s,
-            paused_s: run.pauses.iter().map(Span::length_s).sum(),
+            paused_s: run.pauses.iter().map(Span::length_s).fold(0.0, |all, one| all + one),
             steps: run.steps,
-            away_s: run.absences.iter().map(Span::length_s).sum(),
+            away_s: run.absences.iter().map(Span::length_s).fold(0.0, |all, one| all + one),
             imprecise: run
                 .beside
                 .iter()

@@ -1,9 +1,10 @@
 //! The pool in its journal: what it was from a snapshot and the entries after it.
 
 use super::ROLE;
-use crate::config::StorageConfig;
+use crate::config::{Durability, StorageConfig};
 use crate::journal::{Journal, JournalError, Journaled, floor};
 use bytes::Bytes;
+use ratn_model::id::Revision;
 use ratn_resources::{DecodeError, Limits, Pool, Record, RestoreError, Snapshot, decode, encode};
 use ratn_storage::{MakeSnapshot, Position, Recovered};
 use std::path::Path;
@@ -31,9 +32,15 @@ impl Journaled for Pool {
     }
 }
 
-/// Takes the place of the one writer, and restores the pool.
+/// Events a millisecond that no manager makes: revisions that a start has skipped to are above all of the one before.
+const EVENTS_PER_MS: u64 = 1_000;
+
+/// Takes the place of the one writer, and restores the pool. Without durability somebody may have heard of revisions that are lost.
 pub(super) fn open(config: &StorageConfig, directory: &Path, limits: Limits) -> Result<(Pool, Journal), JournalError> {
-    Journal::open(ROLE, config, directory, |recovered| restore(recovered, limits))
+    let (pool, journal) = Journal::open(ROLE, config, directory, |recovered| restore(recovered, limits))?;
+    let may_have_lost = config.durability == Durability::None && pool.revision() > Revision(0);
+    let floor = if may_have_lost { floor().saturating_mul(EVENTS_PER_MS) } else { 0 };
+    Ok((pool.with_revisions_above(Revision(floor)), journal))
 }
 
 /// The pool as the log has it.
@@ -53,4 +60,32 @@ fn restore(recovered: Recovered, limits: Limits) -> Result<Pool, NoPool> {
     }
     let pool = Pool::restore(limits, ratn_model::time::Timestamp(0), snapshot, records).map_err(NoPool::Restore)?;
     Ok(pool.above(floor()))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_model::resource::ResourceClass;
+    use ratn_model::time::Timestamp;
+    use ratn_resources::ResourceSpec;
+
+    #[test]
+    fn without_durability_a_revision_never_comes_again_after_a_restart() {
+        let place = tempfile::tempdir().unwrap();
+        for (durability, skips) in [(Durability::None, true), (Durability::Group, false)] {
+            let config = StorageConfig { durability, ..StorageConfig::default() };
+            let directory = place.path().join(durability.to_string());
+            let start = || open(&config, &directory, Limits::default()).unwrap();
+            let (mut pool, mut journal) = start();
+            assert_eq!(pool.revision(), Revision(0), "nobody has heard of any");
+            pool.create(Timestamp(0), None, ResourceSpec::new(ResourceClass::Module, "Tool")).unwrap();
+            journal.write(&mut pool).unwrap();
+            let told = pool.revision();
+            drop(journal);
+            let (pool, _journal) = start();
+            assert_eq!(pool.revision() > told, skips, "{durability}");
+            assert_eq!(pool.changes_after(told).is_err(), skips, "{durability}");
+        }
+    }
 }

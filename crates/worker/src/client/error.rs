@@ -68,10 +68,44 @@ impl CallError {
             Some(source) => chain(source),
             None => format!("{} ({:?})", status.message(), status.code()),
         };
+        let reason = format!("{reason}{}", about_tls(&endpoint, &reason));
         CallError::Broken { endpoint, reason }
     }
 
     pub(crate) fn malformed(endpoint: &Endpoint, source: Malformed) -> CallError {
         CallError::Malformed { endpoint: endpoint.clone(), source }
+    }
+}
+
+/// What to do where a connection failed for TLS, as far as its error tells (those of rustls and h2).
+fn about_tls(endpoint: &Endpoint, reason: &str) -> &'static str {
+    match endpoint {
+        Endpoint::Tls { .. } if reason.contains("UnknownIssuer") => {
+            "; who serves there has a certificate of an authority that is not trusted here: RATN_TLS_CA names its file"
+        }
+        Endpoint::Tls { .. } if reason.contains("CertificateRequired") || reason.contains("DecryptError") => {
+            "; who connects has to show a certificate of the system's authority: RATN_TLS_CERT and RATN_TLS_KEY name its files"
+        }
+        Endpoint::Tcp { .. } if reason.contains("frame with invalid size") => {
+            "; it seems to serve with TLS: then its address begins with https://"
+        }
+        _ => "",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn an_error_of_tls_says_which_file_is_missing() {
+        let said = |endpoint: &str, message: &str| {
+            CallError::from_status(&endpoint.parse().unwrap(), &Status::unavailable(message)).to_string()
+        };
+        assert!(said("https://a:1", "invalid peer certificate: UnknownIssuer").contains("RATN_TLS_CA names"));
+        assert!(said("https://a:1", "received fatal alert: CertificateRequired").contains("RATN_TLS_CERT"));
+        assert!(said("http://a:1", "frame with invalid size").contains("https://"));
+        assert!(!said("http://a:1", "connection refused").contains("TLS"));
     }
 }
