@@ -16,7 +16,7 @@ use ratn_worker::session::Session;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
-use support::crashes::{Daemon, Random, number};
+use support::crashes::{AGAIN, Daemon, PATIENCE, Random, number, wait_until};
 use tokio_util::sync::CancellationToken;
 
 const CLIENTS: usize = 32;
@@ -24,9 +24,6 @@ const CLIENTS: usize = 32;
 const TOOLS: usize = 12;
 /// Longer than everything together that a session may not be heard for.
 const TTL: Duration = Duration::from_secs(60);
-/// For whatever has to become possible again after a restart.
-const PATIENCE: Duration = Duration::from_secs(60);
-const AGAIN: Duration = Duration::from_millis(5);
 /// Of the resources that a client made it keeps at most so many.
 const KEPT: usize = 4;
 
@@ -184,23 +181,6 @@ async fn verify(shared: &Shared, endpoint: &Endpoint) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Waits until the clients have come so far; none may end before it is told to.
-async fn wait_until(
-    shared: &Shared,
-    clients: &mut tokio::task::JoinSet<anyhow::Result<()>>,
-    far_enough: impl Fn(&mut Told) -> bool,
-) -> anyhow::Result<()> {
-    let begin = Instant::now();
-    while !told(shared, &far_enough) {
-        ensure!(begin.elapsed() < PATIENCE, "the clients come to nothing");
-        if let Some(ended) = clients.try_join_next() {
-            ended??;
-        }
-        tokio::time::sleep(AGAIN).await;
-    }
-    Ok(())
-}
-
 #[tokio::test]
 async fn a_manager_that_is_killed_again_and_again_loses_nothing_acknowledged_and_grants_nothing_twice()
 -> anyhow::Result<()> {
@@ -234,15 +214,14 @@ async fn a_manager_that_is_killed_again_and_again_loses_nothing_acknowledged_and
         verify(&shared, &endpoint).await.with_context(|| format!("after crash {crash}: {}", manager.said()))?;
         slowest = slowest.max(begin.elapsed());
         // It is of use again, and not only there.
-        let enough = |told: &mut Told| told.grants >= before + CLIENTS;
-        wait_until(&shared, &mut clients, enough)
+        wait_until(&mut clients, || told(&shared, |told| told.grants >= before + CLIENTS))
             .await
             .with_context(|| format!("after crash {crash}: {}", manager.said()))?;
         let failures = told(&shared, |told| told.failures.clone());
         ensure!(failures.is_empty(), "after crash {crash}, seed {seed}: {failures:#?}");
     }
     end.cancel();
-    wait_until(&shared, &mut clients, |told| told.ended == CLIENTS).await?;
+    wait_until(&mut clients, || told(&shared, |told| told.ended == CLIENTS)).await?;
     verify(&shared, &endpoint).await?;
     leave.cancel();
     while let Some(ended) = clients.join_next().await {

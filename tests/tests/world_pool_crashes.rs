@@ -15,15 +15,12 @@ use ratn_worker::endpoint::Endpoint;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
-use support::crashes::{Daemon, Random, number};
+use support::crashes::{AGAIN, Daemon, PATIENCE, Random, number, wait_until};
 use tokio_util::sync::CancellationToken;
 
 const CLIENTS: usize = 16;
 /// Every commit writes so many facts that have to agree.
 const COPIES: u64 = 4;
-/// For whatever has to become possible again after a restart.
-const PATIENCE: Duration = Duration::from_secs(60);
-const AGAIN: Duration = Duration::from_millis(5);
 
 /// What the clients were told.
 #[derive(Debug, Default)]
@@ -136,23 +133,6 @@ async fn verify(shared: &Shared, endpoint: &Endpoint) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Waits until the clients have come so far; none may end before it is told to.
-async fn wait_until(
-    shared: &Shared,
-    clients: &mut tokio::task::JoinSet<anyhow::Result<()>>,
-    commits: usize,
-) -> anyhow::Result<()> {
-    let begin = Instant::now();
-    while told(shared, |told| told.commits) < commits {
-        ensure!(begin.elapsed() < PATIENCE, "the clients come to nothing");
-        if let Some(ended) = clients.try_join_next() {
-            ended??;
-        }
-        tokio::time::sleep(AGAIN).await;
-    }
-    Ok(())
-}
-
 #[tokio::test]
 async fn a_pool_that_is_killed_again_and_again_makes_every_commit_whole_and_once_and_loses_none_acknowledged()
 -> anyhow::Result<()> {
@@ -177,7 +157,7 @@ async fn a_pool_that_is_killed_again_and_again_makes_every_commit_whole_and_once
         pool.start()?;
         verify(&shared, &endpoint).await.with_context(|| format!("after crash {crash}, {seed}: {}", pool.said()))?;
         slowest = slowest.max(begin.elapsed());
-        wait_until(&shared, &mut clients, before + CLIENTS)
+        wait_until(&mut clients, || told(&shared, |told| told.commits >= before + CLIENTS))
             .await
             .with_context(|| format!("after crash {crash}, {seed}: {}", pool.said()))?;
     }

@@ -68,17 +68,20 @@ fn compaction_beside_appends_loses_nothing_and_frees_what_it_stands_for() {
         }
     }
     compacted(&*writer);
-    // It begins a segment, so that the next snapshot stands for all before it.
-    let last = append_durably(&mut *writer, &0_u64.to_le_bytes());
-    let state = Bytes::copy_from_slice(&sum.to_le_bytes());
-    writer.compact(last, Box::new(move || state)).unwrap();
-    compacted(&*writer);
+    // The segment that a compaction begins is begun by the next batch, which may hold records from before it. With nothing waiting the
+    // first of these begins a segment behind all records, and the second stands for all before its own.
+    for _ in 0..2 {
+        let last = append_durably(&mut *writer, &0_u64.to_le_bytes());
+        let state = Bytes::copy_from_slice(&sum.to_le_bytes());
+        writer.compact(last, Box::new(move || state)).unwrap();
+        compacted(&*writer);
+    }
     writer.close().unwrap();
     let read = small.read().unwrap();
     let state = read.snapshot.as_ref().map_or(0, |state| u64::from_le_bytes(state.payload[..].try_into().unwrap()));
     let rest: u64 = read.records.iter().map(|record| u64::from_le_bytes(record.payload[..].try_into().unwrap())).sum();
     assert_eq!(state + rest, sum);
-    assert_eq!(read.last(), Position(5_001));
+    assert_eq!(read.last(), Position(5_002));
     let left: u64 = segments(directory.path()).iter().map(|path| fs::metadata(path).unwrap().len()).sum();
     assert!(left < 1_000, "{left} bytes are left");
 }

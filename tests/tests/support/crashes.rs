@@ -6,6 +6,13 @@ use nix::sys::signal::Signal;
 use ratn_worker::endpoint::Endpoint;
 use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
+use std::time::{Duration, Instant};
+use tokio::task::JoinSet;
+
+/// After this long without what is waited for something is wrong.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+/// The pause before something is looked at again.
+pub(crate) const AGAIN: Duration = Duration::from_millis(5);
 
 /// Numbers from a seed (xorshift64*).
 pub(crate) struct Random(pub(crate) u64);
@@ -77,4 +84,20 @@ impl Daemon {
 /// What a variable of the environment says.
 pub(crate) fn number(variable: &str, otherwise: u64) -> u64 {
     std::env::var(variable).ok().and_then(|text| text.parse().ok()).unwrap_or(otherwise)
+}
+
+/// Waits until the clients have come so far; none may end before it is told to.
+pub(crate) async fn wait_until(
+    clients: &mut JoinSet<anyhow::Result<()>>,
+    far_enough: impl Fn() -> bool,
+) -> anyhow::Result<()> {
+    let begin = Instant::now();
+    while !far_enough() {
+        ensure!(begin.elapsed() < PATIENCE, "the clients come to nothing");
+        if let Some(ended) = clients.try_join_next() {
+            ended??;
+        }
+        tokio::time::sleep(AGAIN).await;
+    }
+    Ok(())
 }

@@ -258,13 +258,8 @@ impl Window {
     /// A motion that has ended, and whose path was left before it could retire: what it did stands.
     pub(super) fn retire_orphan(&mut self, context: &mut Context<'_>, id: InstanceId) {
         self.make_real(context, id);
-        let line = self.instances.get(id).map(|instance| instance.line);
+        self.leave_head(id);
         self.remove_retired(context, id);
-        if let Some(thread) = line.and_then(|line| self.threads.get_mut(&line))
-            && thread.head == Some(id)
-        {
-            thread.head = None;
-        }
     }
 
     /// Takes a retired instance out of the window: its line, its position, whether its line had passed it before.

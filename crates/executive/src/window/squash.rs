@@ -177,12 +177,8 @@ impl Window {
         self.wake_waiters(id);
         self.detached.remove(&id);
         self.joins.remove(&id);
+        self.leave_head(id);
         let Some(instance) = self.instances.remove(id) else { return };
-        if let Some(thread) = self.threads.get_mut(&instance.line)
-            && thread.head == Some(id)
-        {
-            thread.head = None;
-        }
         if instance.role == Role::Node {
             context.note(Note::Squashed { instance: id });
         }
@@ -193,9 +189,14 @@ impl Window {
         instance.detached = true;
         instance.arms.clear();
         instance.users.clear();
-        let line = instance.line;
         self.detached.insert(id);
-        if let Some(thread) = self.threads.get_mut(&line)
+        self.leave_head(id);
+    }
+
+    /// It is not the oldest of its line any more, if it was.
+    pub(super) fn leave_head(&mut self, id: InstanceId) {
+        let line = self.instances.get(id).map(|instance| instance.line);
+        if let Some(thread) = line.and_then(|line| self.threads.get_mut(&line))
             && thread.head == Some(id)
         {
             thread.head = None;

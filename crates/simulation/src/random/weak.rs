@@ -106,10 +106,8 @@ fn inputs_were_final(program: &Program, cdtn: &Run) -> Option<String> {
             LogEntry::Command(Command::Note(Note::Invalidated { instance, .. })) => {
                 let Some((state, path)) = states.get(instance) else { continue };
                 let younger = used.get(state).into_iter().flatten().filter(|user| *user > instance);
-                // What is inside of another iteration, or beside, has its outputs from another visit.
-                let around = path.rfind('/').map_or("", |end| &path[..=end]);
                 let mut users = younger.filter_map(|user| states.get(user)).map(|(_, path)| path);
-                if let Some(user) = users.find(|user| user.starts_with(around)) {
+                if let Some(user) = users.find(|user| !is_in_an_older_iteration(user, path)) {
                     return Some(format!("{path} was computed again after {user} had started with its outputs"));
                 }
             }
@@ -117,4 +115,32 @@ fn inputs_were_final(program: &Program, cdtn: &Run) -> Option<String> {
         }
     }
     None
+}
+
+/// Whether a path lies in an older iteration of a loop than another: what is there has its outputs from another visit, although the
+/// instances inside of a routine get their numbers late.
+fn is_in_an_older_iteration(path: &str, other: &str) -> bool {
+    let iteration = |segment: &str| -> Option<(String, usize)> {
+        let (state, number) = segment.strip_suffix(']')?.split_once('[')?;
+        Some((state.to_owned(), number.parse().ok()?))
+    };
+    let differing = path.split('/').zip(other.split('/')).find(|(a, b)| a != b);
+    match differing.and_then(|(a, b)| iteration(a).zip(iteration(b))) {
+        Some(((state, number), (same, later))) => state == same && number < later,
+        None => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_same_loop_has_older_iterations() {
+        assert!(is_in_an_older_iteration("each[0]/part/move", "each[1]/plan"));
+        assert!(!is_in_an_older_iteration("each[1]/part/move", "each[0]/plan"), "it may have come from there");
+        assert!(!is_in_an_older_iteration("each[0]/part/move", "each[0]/plan"));
+        assert!(!is_in_an_older_iteration("each[0]/move", "other[1]/plan"));
+        assert!(!is_in_an_older_iteration("move", "plan"));
+    }
 }
