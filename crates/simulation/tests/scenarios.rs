@@ -769,6 +769,28 @@ states:
 }
 
 #[test]
+fn a_barrier_that_aborts_says_in_both_modes_which_regions_did_and_why() {
+    let task = "
+task: regions
+states:
+  - both:
+      concurrency: barrier
+      regions:
+        - look: { action: brain/think, resources: [{ block: Brain }] }
+        - turn: { action: head/turn, pia: true, reads: [], effects: [], resources: [{ block: Head }] }
+        - move: { action: arm/move, pia: true, reads: [], effects: [], resources: [{ block: Arm }] }
+";
+    let [hsm, cdtn] = [Mode::Hsm, Mode::Cdtn].map(|mode| {
+        let outcomes = BTreeMap::from([("both/look", "aborted"), ("both/turn", "aborted")]);
+        let run = simulate(task, mode, &mut Script { outcomes, ..Script::default() });
+        assert_eq!(run.outcome, "aborted");
+        run.reason
+    });
+    assert!(hsm.contains("both/look") && hsm.contains("both/turn") && !hsm.contains("both/move"), "{hsm}");
+    assert_eq!(hsm, cdtn);
+}
+
+#[test]
 fn the_first_of_preemptive_regions_stops_the_others() {
     let task = "
 task: race

@@ -35,6 +35,8 @@ pub(crate) struct RegionExit {
     pub(crate) end: InstanceId,
     environment: Environment,
     producer: Arc<Producer>,
+    /// Why the path left otherwise than by success.
+    because: Option<Arc<str>>,
 }
 
 /// A fork whose join has not retired.
@@ -116,7 +118,8 @@ impl Window {
         let end = self.append(context, index, state, Role::RegionEnd, 1, None, number);
         let line = self.cursors[index].line;
         self.cursors[index].todo = Todo::Done;
-        let environment = self.cursors[index].environment.clone();
+        let Cursor { environment, because, .. } = self.cursors[index].clone();
+        let because = because.filter(|_| outcome != SUCCESS);
         let Some(instance) = self.instances.get_mut(end) else { return };
         let outputs = [("outcome".to_owned(), Value::String(outcome.to_owned()))];
         instance.status = Status::Finished;
@@ -125,7 +128,7 @@ impl Window {
         if let Some(fork) = self.forks.get_mut(&fork)
             && let Some(region) = fork.regions.iter().position(|other| *other == line)
         {
-            fork.ends[region].push(RegionExit { end, environment, producer });
+            fork.ends[region].push(RegionExit { end, environment, producer, because });
         }
     }
 
@@ -183,6 +186,10 @@ impl Window {
                     cursor.environment.variables.assign(&name, binding);
                 }
             }
+        }
+        let reasons: Vec<&str> = ends.iter().filter_map(|end| end.because.as_deref()).collect();
+        if !reasons.is_empty() {
+            self.cursors[index].because = Some(reasons.join("; ").into());
         }
         let join = self.append(context, index, state, Role::Join, visit, None, 0);
         for (predicate, links) in &merged {
