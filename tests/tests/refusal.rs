@@ -174,3 +174,31 @@ fn what_the_command_line_cannot_mean_is_refused() -> anyhow::Result<()> {
     }
     Ok(())
 }
+
+#[test]
+fn a_daemon_that_may_not_listen_or_has_no_state_of_its_own_is_refused() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let refused = |arguments: &[&str], why: &str| {
+        let output = place.ratn(arguments).output()?;
+        let (_, err) = texts(&output);
+        ensure!(output.status.code() == Some(2) && err.contains(why), "{arguments:?}: {:?}, {err}", output.status);
+        Ok(())
+    };
+    for role in ["resource-manager", "process-manager", "cell"] {
+        refused(&[role, "--listen", "0.0.0.0:0"], "has no TLS")?;
+    }
+    refused(&["worker", "detector", "--listen", "0.0.0.0:0"], "has no TLS")?;
+    let config = place.path().join("ratn.toml");
+    std::fs::write(&config, "[service.tls]\ncert = \"/no/a.pem\"\nkey = \"/no/a.key\"\nclient_ca = \"/no/ca.pem\"\n")?;
+    let config = config.to_str().context("a path")?;
+    refused(&["world-pool", "--config", config], "cannot read the TLS file")?;
+    refused(&["cell", "--metrics", "0.0.0.0:0"], "--insecure")?;
+    let state = place.path().join("state");
+    let state = state.to_str().context("a path")?;
+    let _first = place.start(&["resource-manager", "--state-dir", state])?;
+    let endpoint = place.path().join("run/resource-manager.endpoint");
+    support::wait_for("the first manager", || Ok(endpoint.exists().then_some(())))?;
+    let elsewhere = place.path().join("run2");
+    let elsewhere = elsewhere.to_str().context("a path")?;
+    refused(&["resource-manager", "--state-dir", state, "--runtime-dir", elsewhere], "has a writer already")
+}

@@ -1,6 +1,6 @@
 //! The command line.
 
-use crate::command::pool::{HostArguments, LogsArguments, PoolArguments};
+use crate::command::pool::{DrainArguments, HostArguments, LogsArguments, PoolArguments, RestartArguments};
 use crate::command::resource::ResourceArguments;
 use crate::command::world::WorldArguments;
 use crate::task_control::control::Word;
@@ -28,12 +28,16 @@ pub(crate) enum Command {
     Run(RunArguments),
     /// Pause a run that is under way, let it go on, let it do one step, or end it
     Control(ControlArguments),
-    /// Show the worker processes of a host
+    /// Show the worker processes of all hosts
     Ps(HostArguments),
-    /// Print what a worker of this host writes
+    /// Print what a worker writes, on whichever host it is
     Logs(LogsArguments),
-    /// Start and end workers of a host's pools
+    /// Start and end workers of a host's pools, and change how many there are
     Pool(PoolArguments),
+    /// Replace workers, each once its successor is ready
+    Restart(RestartArguments),
+    /// Let a host take no new work: each of its workers ends once nobody holds it
+    Drain(DrainArguments),
     /// Lay a new table in the simulated cell of a running system, and forget every fact
     Reset(ResetArguments),
     /// Check a task file without starting anything

@@ -105,7 +105,10 @@ const METHODS: [(&str, &[Row]); 5] = [
             (Project, &["Project", "Release"]),
         ],
     ),
-    ("ratn.v1.ProcessService", &[(Look, &["ListPools", "Watch"]), (Administer, &["Spawn", "Stop"])]),
+    (
+        "ratn.v1.ProcessService",
+        &[(Look, &["ListPools", "ReadLog", "Watch"]), (Administer, &["Drain", "Restart", "Scale", "Spawn", "Stop"])],
+    ),
     ("ratn.v1.ActionService", &[(Look, &["Describe"]), (Perform, &["Execute", "Cancel"])]),
     ("ratn.v1.CellService", &[(Look, &["GetGroundTruth"]), (Administer, &["Reset"])]),
 ];

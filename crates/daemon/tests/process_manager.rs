@@ -8,7 +8,7 @@ use nix::unistd::Pid;
 use ratn_daemon::process_manager::{Liveness, Template};
 use ratn_model::resource::Requirement;
 use ratn_model::value::Value;
-use ratn_proto::types::{Resource, ResourceEvent, ResourceEventKind, WorkerState};
+use ratn_proto::types::{HostPools, Resource, ResourceEvent, ResourceEventKind, WorkerState};
 use ratn_worker::client::AcquireOptions;
 use std::time::Duration;
 use support::{DEADLINE, TestSystem, block, in_time};
@@ -60,7 +60,7 @@ async fn a_killed_worker_is_withdrawn_and_replaced_under_a_new_id_and_endpoint()
     let second = watch.created("PathPlanner").await;
     assert_eq!(second.id, "planner-2@compute");
     assert_ne!(second.endpoint(), first.endpoint());
-    let (host, pools) = system.processes(&processes).pools().await.unwrap();
+    let HostPools { host, pools, .. } = system.processes(&processes).pools().await.unwrap();
     assert_eq!((host.as_str(), pools[0].workers.len(), pools[0].failure.as_str()), ("compute", 1, ""));
     assert!(pools[0].workers[0].resident_bytes > 0);
 
@@ -93,7 +93,7 @@ async fn workers_are_started_and_stopped_as_asked_within_the_pools_bounds() {
     };
     assert_eq!((exited.id.as_str(), exited.reason.as_str()), (one.id.as_str(), "exited with status 0"));
     gone(pid(&one)).await;
-    assert_eq!(client.pools().await.unwrap().1[0].workers.len(), 2);
+    assert_eq!(client.pools().await.unwrap().pools[0].workers.len(), 2);
     processes.end().await;
     gone(pid(&two)).await;
 }
@@ -124,7 +124,7 @@ async fn a_pool_whose_workers_crash_in_a_row_fails_with_their_last_words() {
     let client = system.processes(&processes);
     let failure = in_time(async {
         loop {
-            let pool = client.pools().await.unwrap().1.remove(0);
+            let pool = client.pools().await.unwrap().pools.remove(0);
             if !pool.failure.is_empty() {
                 break pool.failure;
             }
@@ -146,7 +146,7 @@ async fn what_waits_for_more_workers_than_there_are_makes_them_start_and_who_gav
     let lease = in_time(client.resources.acquire(vec![two], AcquireOptions::default())).await.unwrap();
     assert_eq!(lease.resources.len(), 2);
     assert!(client.resources.release(lease.id).await.unwrap());
-    let workers = async || system.processes(&processes).pools().await.unwrap().1[0].workers.len();
+    let workers = async || system.processes(&processes).pools().await.unwrap().pools[0].workers.len();
     assert_eq!(workers().await, 2, "started for it, and they stay");
     // More than there may be: the caller is told.
     let four = Requirement { count: 4.into(), ..block("PathPlanner") };
@@ -270,7 +270,7 @@ async fn of_two_hosts_that_offer_the_same_one_starts_a_worker_for_a_demand() {
     let second = system.process_manager_of(&manager, "control", of_none()).await;
     let client = system.client(&manager, "task").await;
     let workers = async || {
-        let of = async |host| system.processes(host).pools().await.unwrap().1[0].workers.len();
+        let of = async |host| system.processes(host).pools().await.unwrap().pools[0].workers.len();
         (of(&first).await, of(&second).await)
     };
     let one = client.resources.acquire(vec![block("PathPlanner")], AcquireOptions::default());

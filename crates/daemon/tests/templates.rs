@@ -36,7 +36,7 @@ async fn failure(system: &TestSystem, processes: &Daemon) -> String {
     let client = system.processes(processes);
     in_time(async {
         loop {
-            let pool = client.pools().await.unwrap().1.remove(0);
+            let pool = client.pools().await.unwrap().pools.remove(0);
             if !pool.failure.is_empty() {
                 break pool.failure;
             }
@@ -72,7 +72,7 @@ async fn a_worker_gets_its_parameters_a_clean_environment_its_directory_and_its_
     assert_eq!(worker.endpoint(), "", "it is no server");
     let log = std::fs::read_to_string(system.directory.path().join("logs/shell-1@compute.log")).unwrap();
     assert!(log.starts_with("mode=fast manifest=none package=ratn-daemon level=7\nin=/usr\n"), "{log}");
-    let status = system.processes(&processes).pools().await.unwrap().1[0].workers[0].clone();
+    let status = system.processes(&processes).pools().await.unwrap().pools[0].workers[0].clone();
     assert_eq!(status.limits, "cpus not limited: no cgroup, 77 open files (rlimit)");
     let limits = std::fs::read_to_string(format!("/proc/{}/limits", status.pid)).unwrap();
     let files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();

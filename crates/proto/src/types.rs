@@ -362,6 +362,8 @@ pub enum WorkerState {
     Starting,
     /// Its health is SERVING and its resource exists.
     Ready,
+    /// It is to end: once nobody holds it, or right now.
+    Stopping,
     /// The process is gone.
     Exited,
 }
@@ -387,6 +389,10 @@ pub struct WorkerStatus {
     pub cpu_millicores: u32,
     /// What it may use of the machine, and what keeps it to that; empty without limits.
     pub limits: String,
+    /// How long its process has been there, in seconds; only where pools are listed.
+    pub age_s: u64,
+    /// Whether somebody holds its resource.
+    pub held: bool,
 }
 
 /// A pool of workers of one template.
@@ -404,6 +410,34 @@ pub struct PoolStatus {
     pub workers: Vec<WorkerStatus>,
     /// Why no more workers are started; empty while all is well.
     pub failure: String,
+    /// So many more than are held are kept ready.
+    pub spares: u32,
+    /// Workers that ended without being asked to, since the process manager began.
+    pub crashes: u64,
+    /// How the last worker ended that did; empty while none has.
+    pub last_exit: String,
+}
+
+/// The pools of a host.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct HostPools {
+    /// The host's name.
+    pub host: String,
+    /// It takes no new work.
+    pub draining: bool,
+    /// In the order of templates.
+    pub pools: Vec<PoolStatus>,
+}
+
+/// How many workers a template is to have; what is `None` stays as it is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Scale {
+    /// At least so many are kept.
+    pub min: Option<u32>,
+    /// At most so many are started.
+    pub max: Option<u32>,
+    /// So many more than are held are kept ready.
+    pub spares: Option<u32>,
 }
 
 /// A goal as a provider gets it.

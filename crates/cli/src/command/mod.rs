@@ -41,6 +41,8 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Ps(arguments) => pool::ps(&arguments),
         Command::Logs(arguments) => pool::logs(&arguments),
         Command::Pool(arguments) => pool::run(&arguments),
+        Command::Restart(arguments) => pool::restart(&arguments),
+        Command::Drain(arguments) => pool::drain(&arguments),
         Command::Reset(arguments) => reset::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Resource(arguments) => resource::run(&arguments),

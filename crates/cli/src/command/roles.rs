@@ -13,9 +13,10 @@ use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::service::LiveAccess;
 use ratn_daemon::supervisor::Supervisor;
 use ratn_daemon::{metrics, process_manager, resource_manager, telemetry, world_pool};
+use ratn_storage::OpenError;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::server::{Exposure, Serving};
+use ratn_worker::server::{BindError, Exposure, Serving};
 use ratn_worker::worker::WorkerOptions;
 use ratn_worker::{shutdown, tls};
 use std::path::PathBuf;
@@ -97,10 +98,10 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
     let speed = arguments.speed;
     blocking(async {
         match arguments.worker {
-            WorkerKind::PathPlanner => ratn_workers::path_planner::run(options, speed).await?,
-            WorkerKind::Detector => ratn_workers::detector::run(options, speed).await?,
+            WorkerKind::PathPlanner => ratn_workers::path_planner::run(options, speed).await,
+            WorkerKind::Detector => ratn_workers::detector::run(options, speed).await,
         }
-        Ok(())
+        .map_err(unbegun)
     })
 }
 
@@ -140,8 +141,10 @@ fn daemon_on(
     let running = SystemConfig::load(arguments.config.as_deref())?;
     let mut service = system.service.clone();
     service.insecure |= arguments.insecure;
-    service.trust().context("[service.tls]")?;
-    let logs = telemetry::start_as(&service.log, service.audit_file.as_deref())?;
+    let refused = |error: anyhow::Error| Failure::Refused(format!("ratn: {error:#}"));
+    service.trust().context("[service.tls]").map_err(refused)?;
+    let logs = telemetry::start_as(&service.log, service.audit_file.as_deref());
+    let logs = logs.map_err(|error| refused(error.into()))?;
     blocking_on(runtime, async {
         let shutdown = CancellationToken::new();
         let patience = Duration::from_millis(service.drain_ms) + EXIT_PATIENCE;
@@ -154,7 +157,8 @@ fn daemon_on(
         let directory = RuntimeDirectory::create(&directory)
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
         if let Some(address) = arguments.metrics.or_else(|| service.metrics.get(role).copied()) {
-            let address = metrics::listen(metrics::install(role), address, service.insecure).await?;
+            let listening = metrics::listen(metrics::install(role), address, service.insecure).await;
+            let address = listening.map_err(|error| refused(error.into()))?;
             tracing::info!("metrics are at http://{address}/metrics");
         }
         let (access, bounds) =
@@ -166,6 +170,12 @@ fn daemon_on(
         let followed = tokio::spawn(followed);
         let ended = run(system, host).await;
         let _ = followed.await;
-        Ok(ended?)
+        ended.map_err(unbegun)
     })
+}
+
+/// Refused where it could not listen or had no state of its own: it has not begun then. Failed otherwise.
+fn unbegun(error: anyhow::Error) -> Failure {
+    let unbegun = error.chain().any(|cause| cause.is::<BindError>() || cause.is::<OpenError>());
+    if unbegun { Failure::Refused(format!("ratn: {error:#}")) } else { Failure::Failed(error) }
 }

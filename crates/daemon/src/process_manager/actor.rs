@@ -1,7 +1,8 @@
 //! The one task that owns the pools: performs their commands, and tells them what became of it.
 
 use super::config::ProcessManagerConfig;
-use super::pools::{Command, Event, PoolError, Pools};
+use super::drained::Drained;
+use super::pools::{Command, Event, PoolError, Pools, Restart};
 use super::processes::{Processes, Told};
 use super::spawner::Outcome;
 use super::usage::Usage;
@@ -11,7 +12,7 @@ use nix::sys::signal::Signal;
 use ratn_model::resource::ResourceClass;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use ratn_proto::types::{Demand, PoolStatus, Resource, WorkerStatus};
+use ratn_proto::types::{Demand, HostPools, PoolStatus, Resource, Scale, WorkerStatus};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::collections::{BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
@@ -34,7 +35,11 @@ const KILL_PATIENCE: Duration = Duration::from_millis(400);
 /// What the service asks of the actor.
 #[derive(Debug)]
 pub(super) enum Message {
-    List { answer: oneshot::Sender<Vec<PoolStatus>> },
+    List { answer: oneshot::Sender<HostPools> },
+    Restart { which: Restart, answer: oneshot::Sender<Result<Vec<String>, PoolError>> },
+    Scale { template: String, scale: Scale, answer: oneshot::Sender<Result<PoolStatus, PoolError>> },
+    Drain { draining: bool, answer: oneshot::Sender<std::io::Result<Vec<String>>> },
+    Lives { id: String, answer: oneshot::Sender<bool> },
     Spawn { template: String, count: u32, answer: oneshot::Sender<Result<Vec<String>, PoolError>> },
     Stop { id: String, answer: oneshot::Sender<Result<(), PoolError>> },
     Watch { answer: oneshot::Sender<Option<mpsc::Receiver<WorkerStatus>>> },
@@ -74,12 +79,14 @@ struct Actor {
     short: watch::Sender<Shortages>,
     watchers: Vec<mpsc::Sender<WorkerStatus>>,
     usage: Usage,
+    drained: Drained,
 }
 
 /// Starts the actor; it ends with the token, once every worker has.
 pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Result<(Handle, JoinHandle<()>)> {
     let (inbox, messages) = mpsc::channel(INBOX);
     let Parts { config, directory, wanted, leaves, there, uses, demand, short } = parts;
+    let drained = Drained::of(&directory);
     let (processes, told) = Processes::start(&config, directory)?;
     let actor = Actor {
         pools: Pools::new(&config.host, config.templates),
@@ -91,6 +98,7 @@ pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Resul
         short,
         watchers: Vec::new(),
         usage: Usage::new(),
+        drained,
     };
     let inputs = Inputs { messages, told, there, uses, demand };
     Ok((Handle { inbox }, tokio::spawn(actor.run(inputs, shutdown))))
@@ -114,6 +122,11 @@ struct Inputs {
 
 impl Actor {
     async fn run(mut self, mut inputs: Inputs, shutdown: CancellationToken) {
+        if self.drained.is_set() {
+            tracing::warn!("the host is drained: no worker is started until `ratn drain --undo`");
+            let commands = self.pools.drain(self.now(), true);
+            self.perform(commands);
+        }
         self.handle(Event::Time);
         loop {
             let deadline = self.pools.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
@@ -167,8 +180,19 @@ impl Actor {
             Message::List { answer } => {
                 let mut pools = self.pools.status();
                 self.usage.fill_in(&mut pools);
-                let _ = answer.send(pools);
+                let draining = self.pools.is_draining();
+                let _ = answer.send(HostPools { host: self.host.clone(), draining, pools });
             }
+            Message::Lives { id, answer } => drop(answer.send(self.pools.knows(&id))),
+            Message::Restart { which, answer } => {
+                let restarted = self.pools.restart(now, &which);
+                let _ = answer.send(self.performed(restarted));
+            }
+            Message::Scale { template, scale, answer } => {
+                let scaled = self.pools.scale(now, &template, scale);
+                let _ = answer.send(self.performed(scaled));
+            }
+            Message::Drain { draining, answer } => drop(answer.send(self.drain(draining))),
             Message::Spawn { template, count, answer } => {
                 let spawned = self.pools.spawn(now, &template, count);
                 let _ = answer.send(self.performed(spawned));
@@ -179,6 +203,16 @@ impl Actor {
             }
             Message::Watch { answer } => drop(answer.send(self.watch())),
         }
+    }
+
+    /// The ids of the workers that are still there.
+    fn drain(&mut self, draining: bool) -> std::io::Result<Vec<String>> {
+        self.drained.set(draining)?;
+        let commands = self.pools.drain(self.now(), draining);
+        self.perform(commands);
+        tracing::info!(draining, "the host was told whether it takes work");
+        let workers = self.pools.status().into_iter().flat_map(|pool| pool.workers);
+        Ok(workers.map(|worker| worker.id).collect())
     }
 
     fn watch(&mut self) -> Option<mpsc::Receiver<WorkerStatus>> {

@@ -1,6 +1,7 @@
 //! The output of a worker: into a bounded file, with its end kept at hand for whoever asks why it died. Of the workers that
 //! have ended, the logs of the last ones are kept.
 
+use super::log_file::previous;
 use std::collections::VecDeque;
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -60,11 +61,6 @@ impl EndedLogs {
             let _ = fs::remove_file(oldest);
         }
     }
-}
-
-/// Where what was written before a log was begun anew is kept.
-fn previous(path: &Path) -> PathBuf {
-    path.with_extension("log.1")
 }
 
 impl Log {

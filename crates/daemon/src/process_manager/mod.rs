@@ -10,9 +10,12 @@
 
 mod actor;
 mod config;
+mod drained;
 mod environment;
 mod limits;
 mod log;
+pub mod log_file;
+mod log_stream;
 mod order;
 mod parameter;
 pub mod pools;
@@ -33,7 +36,11 @@ pub use template::{Liveness, Template};
 use crate::demand::{DemandLink, Shortages};
 use crate::link::{Link, Manager, Turnover, Wanted};
 use anyhow::Context;
+use ratn_model::resource::ResourceClass;
+use ratn_model::value::Value;
+use ratn_proto::types::Resource;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
+use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
 use std::collections::BTreeSet;
@@ -47,6 +54,9 @@ pub const ROLE: &str = "process-manager";
 const THERE: usize = 1_024;
 /// States of the demand that the actor was not told of yet.
 const DEMANDS: usize = 16;
+
+/// The kind of the resource that a host is: by its endpoint the host's process manager is found.
+pub const HOST_KIND: &str = "Host";
 
 /// Serves until `shutdown` is cancelled, and returns once every worker is gone.
 ///
@@ -87,10 +97,11 @@ pub async fn run_as(
         demand: Some(DemandLink { kinds: config.kinds(), heard, shortages, used }),
     };
     let linked = tokio::spawn(link.keep(shutdown.clone()));
-    let host = config.host.clone();
+    let host = host_resource(&config, &endpoint);
+    wanted.send_modify(|wanted| drop(wanted.insert(host.id.clone(), host)));
     let parts = actor::Parts { config, directory: directory.clone(), wanted, leaves, there, uses, demand, short };
     let (actor, ended) = actor::start(parts, shutdown.clone()).context("cannot start workers")?;
-    let service = ProcessServiceServer::new(service::Service { actor, host, shutdown: shutdown.clone() });
+    let service = ProcessServiceServer::new(service::Service::new(actor, directory.clone(), shutdown.clone()));
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
     let served = bound.serve_as(Services::new().with(service), serving, shutdown.clone()).await;
@@ -98,4 +109,12 @@ pub async fn run_as(
     shutdown.cancel();
     let _ = tokio::join!(linked, ended);
     Ok(served?)
+}
+
+/// This host, as everybody finds it at the resource manager.
+fn host_resource(config: &ProcessManagerConfig, endpoint: &Endpoint) -> Resource {
+    Resource::new(format!("host@{}", config.host), ResourceClass::System, HOST_KIND)
+        .with_endpoint(endpoint)
+        .with_attribute("host", Value::String(config.host.clone()))
+        .on_host(&config.host)
 }

@@ -3,6 +3,7 @@
 use super::config::ProcessManagerConfig;
 use super::environment;
 use super::log::{Awaited, EndedLogs};
+use super::log_file::log_file;
 use super::parameter;
 use super::readiness::{Readiness, Signs};
 use super::spawner::{self, Job, Outcome};
@@ -177,7 +178,7 @@ impl Processes {
     }
 
     fn log_file(&self, id: &str) -> PathBuf {
-        self.directory.path().join("logs").join(format!("{id}.log"))
+        log_file(&self.directory, id)
     }
 }
 

@@ -24,6 +24,7 @@ impl Usage {
         for worker in pools.iter_mut().flat_map(|pool| &mut pool.workers) {
             if let Some(process) = system.process(Pid::from_u32(worker.pid)) {
                 worker.resident_bytes = process.memory();
+                worker.age_s = process.run_time();
                 // Percent of one core, as tenths of a percent.
                 worker.cpu_millicores = (process.cpu_usage() * 10.0).round() as u32;
             }

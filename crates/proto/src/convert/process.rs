@@ -1,7 +1,7 @@
 //! Worker processes and pools.
 
 use super::{Malformed, all, each, label, name};
-use crate::types::{PoolStatus, WorkerState, WorkerStatus};
+use crate::types::{HostPools, PoolStatus, WorkerState, WorkerStatus};
 use crate::v1;
 
 impl From<WorkerStatus> for v1::WorkerStatus {
@@ -9,6 +9,7 @@ impl From<WorkerStatus> for v1::WorkerStatus {
         let state = match worker.state {
             WorkerState::Starting => v1::WorkerState::Starting,
             WorkerState::Ready => v1::WorkerState::Ready,
+            WorkerState::Stopping => v1::WorkerState::Stopping,
             WorkerState::Exited => v1::WorkerState::Exited,
         };
         v1::WorkerStatus {
@@ -21,6 +22,8 @@ impl From<WorkerStatus> for v1::WorkerStatus {
             resident_bytes: worker.resident_bytes,
             cpu_millicores: worker.cpu_millicores,
             limits: worker.limits,
+            age_s: worker.age_s,
+            held: worker.held,
         }
     }
 }
@@ -35,6 +38,7 @@ impl TryFrom<v1::WorkerStatus> for WorkerStatus {
         let state = match v1::WorkerState::try_from(worker.state) {
             Ok(v1::WorkerState::Starting) => WorkerState::Starting,
             Ok(v1::WorkerState::Ready) => WorkerState::Ready,
+            Ok(v1::WorkerState::Stopping) => WorkerState::Stopping,
             Ok(v1::WorkerState::Exited) => WorkerState::Exited,
             Ok(v1::WorkerState::Unspecified) => return Err(Malformed::new("state", "is not set")),
             Err(_) => return Err(Malformed::new("state", format!("{} is no worker state", worker.state))),
@@ -49,6 +53,8 @@ impl TryFrom<v1::WorkerStatus> for WorkerStatus {
             resident_bytes: worker.resident_bytes,
             cpu_millicores: worker.cpu_millicores,
             limits: worker.limits,
+            age_s: worker.age_s,
+            held: worker.held,
         })
     }
 }
@@ -62,6 +68,9 @@ impl From<PoolStatus> for v1::Pool {
             max: pool.max,
             workers: all(pool.workers),
             failure: pool.failure,
+            spares: pool.spares,
+            crashes: pool.crashes,
+            last_exit: pool.last_exit,
         }
     }
 }
@@ -79,6 +88,24 @@ impl TryFrom<v1::Pool> for PoolStatus {
             max: pool.max,
             workers: each(pool.workers, "workers")?,
             failure: pool.failure,
+            spares: pool.spares,
+            crashes: pool.crashes,
+            last_exit: pool.last_exit,
         })
+    }
+}
+
+impl From<HostPools> for v1::ListPoolsResponse {
+    fn from(host: HostPools) -> v1::ListPoolsResponse {
+        v1::ListPoolsResponse { host: host.host, pools: all(host.pools), draining: host.draining }
+    }
+}
+
+impl TryFrom<v1::ListPoolsResponse> for HostPools {
+    type Error = Malformed;
+
+    fn try_from(answer: v1::ListPoolsResponse) -> Result<HostPools, Malformed> {
+        name(&answer.host, "host")?;
+        Ok(HostPools { host: answer.host, draining: answer.draining, pools: each(answer.pools, "pools")? })
     }
 }

@@ -286,7 +286,7 @@ proptest! {
 
 #[test]
 fn workers_and_pools_come_back_the_same() {
-    for state in [WorkerState::Starting, WorkerState::Ready, WorkerState::Exited] {
+    for state in [WorkerState::Starting, WorkerState::Ready, WorkerState::Stopping, WorkerState::Exited] {
         let worker = WorkerStatus {
             id: "path-planner-1@compute".to_owned(),
             template: "path-planner".to_owned(),
@@ -297,6 +297,8 @@ fn workers_and_pools_come_back_the_same() {
             resident_bytes: 1 << 20,
             cpu_millicores: 1500,
             limits: "memory 64 MiB (cgroup)".to_owned(),
+            age_s: 1_500,
+            held: true,
         };
         let pool = PoolStatus {
             template: worker.template.clone(),
@@ -305,8 +307,12 @@ fn workers_and_pools_come_back_the_same() {
             max: 4,
             workers: vec![worker],
             failure: "crashes in a loop".to_owned(),
+            spares: 1,
+            crashes: 7,
+            last_exit: "path-planner-0@compute: killed by signal 9".to_owned(),
         };
-        assert_eq!(PoolStatus::try_from(v1::Pool::from(pool.clone())), Ok(pool));
+        let host = HostPools { host: "compute".to_owned(), draining: true, pools: vec![pool] };
+        assert_eq!(HostPools::try_from(v1::ListPoolsResponse::from(host.clone())), Ok(host));
     }
 }
 

@@ -3,8 +3,8 @@
 use super::{CallError, Channels};
 use crate::endpoint::Endpoint;
 use crate::trace::Traced;
-use ratn_proto::convert::{each, required};
-use ratn_proto::types::{PoolStatus, WorkerStatus};
+use ratn_proto::convert::required;
+use ratn_proto::types::{HostPools, PoolStatus, Scale, WorkerStatus};
 use ratn_proto::v1;
 use ratn_proto::v1::process_service_client::ProcessServiceClient;
 use tonic::Streaming;
@@ -23,6 +23,13 @@ pub struct WorkerWatch {
     stream: Streaming<v1::ProcessServiceWatchResponse>,
 }
 
+/// A log, piece by piece.
+#[derive(Debug)]
+pub struct LogPieces {
+    endpoint: Endpoint,
+    stream: Streaming<v1::ReadLogResponse>,
+}
+
 impl ProcessClient {
     /// The client of the process manager at `endpoint`.
     ///
@@ -33,15 +40,14 @@ impl ProcessClient {
         Ok(ProcessClient { endpoint: endpoint.clone(), client })
     }
 
-    /// The host's name and its pools.
+    /// The host with its pools.
     ///
     /// # Errors
     /// [`CallError`].
-    pub async fn pools(&self) -> Result<(String, Vec<PoolStatus>), CallError> {
+    pub async fn pools(&self) -> Result<HostPools, CallError> {
         let answer = self.client.clone().list_pools(v1::ListPoolsRequest {}).await;
         let answer = answer.map_err(|status| self.failed(&status))?.into_inner();
-        let pools = each(answer.pools, "pools").map_err(|m| CallError::malformed(&self.endpoint, m))?;
-        Ok((answer.host, pools))
+        answer.try_into().map_err(|m| CallError::malformed(&self.endpoint, m))
     }
 
     /// Starts `count` workers of a template; their ids.
@@ -62,6 +68,60 @@ impl ProcessClient {
         let question = v1::StopRequest { worker_id: worker.to_owned() };
         self.client.clone().stop(question).await.map_err(|status| self.failed(&status))?;
         Ok(())
+    }
+
+    /// Replaces the workers of a template, each once its successor is ready; the ids of those that will go.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn restart_template(&self, template: &str) -> Result<Vec<String>, CallError> {
+        self.restart(v1::restart_request::Target::Template(template.to_owned())).await
+    }
+
+    /// Replaces a worker once its successor is ready; the ids of those that will go.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn restart_worker(&self, worker: &str) -> Result<Vec<String>, CallError> {
+        self.restart(v1::restart_request::Target::WorkerId(worker.to_owned())).await
+    }
+
+    async fn restart(&self, target: v1::restart_request::Target) -> Result<Vec<String>, CallError> {
+        let question = v1::RestartRequest { target: Some(target) };
+        let answer = self.client.clone().restart(question).await.map_err(|status| self.failed(&status))?;
+        Ok(answer.into_inner().worker_ids)
+    }
+
+    /// Changes how many workers a template has; the pool as it is then.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn scale(&self, template: &str, scale: Scale) -> Result<PoolStatus, CallError> {
+        let Scale { min, max, spares } = scale;
+        let question = v1::ScaleRequest { template: template.to_owned(), min, max, spares };
+        let answer = self.client.clone().scale(question).await.map_err(|status| self.failed(&status))?;
+        required(answer.into_inner().pool, "pool").map_err(|m| CallError::malformed(&self.endpoint, m))
+    }
+
+    /// The host takes no new work, or does again; the ids of the workers that are still there.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn drain(&self, draining: bool) -> Result<Vec<String>, CallError> {
+        let question = v1::DrainRequest { undo: !draining };
+        let answer = self.client.clone().drain(question).await.map_err(|status| self.failed(&status))?;
+        Ok(answer.into_inner().worker_ids)
+    }
+
+    /// What a worker has written, and with `follow` what it goes on to write until it ends.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn log(&self, worker: &str, follow: bool) -> Result<LogPieces, CallError> {
+        let question = v1::ReadLogRequest { worker_id: worker.to_owned(), follow };
+        let answer = self.client.clone().read_log(question).await;
+        let stream = answer.map_err(|status| self.failed(&status))?.into_inner();
+        Ok(LogPieces { endpoint: self.endpoint.clone(), stream })
     }
 
     /// Tells of every worker and every change.
@@ -89,5 +149,16 @@ impl WorkerWatch {
         let Some(message) = message else { return Ok(None) };
         let worker = required(message.worker, "worker").map_err(|m| CallError::malformed(&self.endpoint, m))?;
         Ok(Some(worker))
+    }
+}
+
+impl LogPieces {
+    /// The next bytes; `None` at its end.
+    ///
+    /// # Errors
+    /// [`CallError`] when it broke.
+    pub async fn next(&mut self) -> Result<Option<Vec<u8>>, CallError> {
+        let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
+        Ok(message.map(|message| message.chunk))
     }
 }

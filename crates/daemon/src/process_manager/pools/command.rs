@@ -154,6 +154,20 @@ pub enum PoolError {
         /// How many were asked for.
         count: u32,
     },
+    /// The config does not allow a pool of this size.
+    #[error("`{template}` stays as it is: {why}")]
+    Size {
+        /// The template.
+        template: String,
+        /// Which rule is broken.
+        why: String,
+    },
+    /// The host takes no new work.
+    #[error("the host `{host}` is drained: `ratn drain --undo {host}` lets it take work again")]
+    Drained {
+        /// Which.
+        host: String,
+    },
     /// The process manager is ending.
     #[error("the process manager is ending")]
     Ending,

@@ -21,16 +21,27 @@ pub use command::{Command, Event, PoolError};
 use super::template::Template;
 use pool::Pool;
 use ratn_model::time::Timestamp;
-use ratn_proto::types::{Demand, PoolStatus};
+use ratn_proto::types::{Demand, PoolStatus, Scale};
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use worker::Worker;
+
+/// Who is to be replaced.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Restart {
+    /// All workers of a template.
+    Template(String),
+    /// This one.
+    Worker(String),
+}
 
 /// All pools of a host.
 #[derive(Debug)]
 pub struct Pools {
     host: String,
     pools: BTreeMap<String, Pool>,
+    /// It takes no new work.
+    draining: bool,
     ending: bool,
 }
 
@@ -39,7 +50,7 @@ impl Pools {
     pub fn new(host: impl Into<String>, templates: impl IntoIterator<Item = Template>) -> Pools {
         let host = host.into();
         let pools = templates.into_iter().map(|template| (template.name.clone(), Pool::new(template, &host))).collect();
-        Pools { host, pools, ending: false }
+        Pools { host, pools, draining: false, ending: false }
     }
 
     /// Takes in what has happened; what to do now, in order.
@@ -58,9 +69,7 @@ impl Pools {
                 }
             }
             Event::Offered { id } => {
-                if let Some(worker) = self.worker(&id) {
-                    worker.offered(now, &mut commands);
-                }
+                self.about(now, &id, &mut commands, |pool, number, c| pool.offered(now, number, c));
                 self.let_follow(now, &mut commands);
             }
             Event::Exited { id, reason, last_words } => {
@@ -109,9 +118,7 @@ impl Pools {
         template: &str,
         count: u32,
     ) -> Result<(Vec<String>, Vec<Command>), PoolError> {
-        if self.ending {
-            return Err(PoolError::Ending);
-        }
+        self.takes_work()?;
         let mut commands = Vec::new();
         let started = self.pool(template)?.spawn(now, count, &mut commands)?;
         Ok((started, commands))
@@ -130,6 +137,64 @@ impl Pools {
         Ok(commands)
     }
 
+    /// Lets other workers take the place of a template's, or of one worker, each once its successor is ready; the ids of those that
+    /// will go, and what to do.
+    ///
+    /// # Errors
+    /// Who is not known, a host that is drained, or the end.
+    pub fn restart(&mut self, now: Timestamp, which: &Restart) -> Result<(Vec<String>, Vec<Command>), PoolError> {
+        self.takes_work()?;
+        let mut commands = Vec::new();
+        let (pool, only) = match which {
+            Restart::Template(name) => (self.pool(name)?, None),
+            Restart::Worker(id) => {
+                let unknown = PoolError::UnknownWorker { id: id.clone() };
+                let (pool, number) = self.find(id).ok_or(unknown)?;
+                (pool, Some(number))
+            }
+        };
+        let going = pool.restart(only);
+        pool.fill(now, &mut commands);
+        Ok((going, commands))
+    }
+
+    /// Changes how many workers a template has; the pool as it is then.
+    ///
+    /// # Errors
+    /// An unknown template, or more than its config allows.
+    pub fn scale(
+        &mut self,
+        now: Timestamp,
+        template: &str,
+        scale: Scale,
+    ) -> Result<(PoolStatus, Vec<Command>), PoolError> {
+        let mut commands = Vec::new();
+        let takes_work = self.takes_work().is_ok();
+        let pool = self.pool(template)?;
+        let status = pool.scale(now, scale, &mut commands)?;
+        if takes_work {
+            pool.fill(now, &mut commands);
+        }
+        Ok((status, commands))
+    }
+
+    /// Starts no worker any more and ends those there are, each once nobody holds it; or takes work again.
+    pub fn drain(&mut self, now: Timestamp, draining: bool) -> Vec<Command> {
+        self.draining = draining;
+        let mut commands = Vec::new();
+        if draining {
+            self.pools.values_mut().for_each(|pool| pool.drain(now, &mut commands));
+        } else {
+            self.advance(now, &mut commands);
+        }
+        commands
+    }
+
+    /// Whether it takes no new work.
+    pub fn is_draining(&self) -> bool {
+        self.draining
+    }
+
     /// Ends every worker, and starts none any more. What has not ended after `patience` is killed.
     pub fn shut_down(&mut self, now: Timestamp, patience: Duration) -> Vec<Command> {
         self.ending = true;
@@ -140,12 +205,19 @@ impl Pools {
 
     /// Why there are no more workers of a kind, by kind.
     pub fn shortages(&self) -> BTreeMap<String, String> {
-        self.pools.values().filter_map(|pool| Some((pool.template().kind.clone(), pool.shortage()?))).collect()
+        let drained = self.draining.then(|| format!("the host `{}` is drained", self.host));
+        let shortage = |pool: &Pool| drained.clone().or_else(|| pool.shortage());
+        self.pools.values().filter_map(|pool| Some((pool.template().kind.clone(), shortage(pool)?))).collect()
     }
 
     /// Whether no worker is left.
     pub fn is_empty(&self) -> bool {
         self.pools.values().all(Pool::is_empty)
+    }
+
+    /// Whether there is a worker of that id.
+    pub fn knows(&mut self, id: &str) -> bool {
+        self.find(id).is_some()
     }
 
     /// Every pool with its workers, the oldest first.
@@ -158,10 +230,19 @@ impl Pools {
         self.pools.get(name).map(Pool::template)
     }
 
+    fn takes_work(&self) -> Result<(), PoolError> {
+        match (self.ending, self.draining) {
+            (true, _) => Err(PoolError::Ending),
+            (false, true) => Err(PoolError::Drained { host: self.host.clone() }),
+            (false, false) => Ok(()),
+        }
+    }
+
     fn advance(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        let takes_work = self.takes_work().is_ok();
         for pool in self.pools.values_mut() {
             pool.advance(now, commands);
-            if !self.ending {
+            if takes_work {
                 pool.fill(now, commands);
             }
         }
@@ -171,9 +252,10 @@ impl Pools {
     fn let_follow(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         let ready: BTreeSet<String> =
             self.pools.iter().filter(|(_, pool)| pool.has_ready()).map(|(name, _)| name.clone()).collect();
+        let takes_work = self.takes_work().is_ok();
         for pool in self.pools.values_mut().filter(|pool| pool.waits()) {
             pool.follow(&ready);
-            if !self.ending {
+            if takes_work {
                 pool.fill(now, commands);
             }
         }
@@ -208,10 +290,10 @@ impl Pools {
         commands: &mut Vec<Command>,
         act: impl FnOnce(&mut Pool, u64, &mut Vec<Command>),
     ) -> bool {
-        let ending = self.ending;
+        let takes_work = self.takes_work().is_ok();
         let Some((pool, number)) = self.find(id) else { return false };
         act(pool, number, commands);
-        if !ending {
+        if takes_work {
             pool.fill(now, commands);
         }
         true

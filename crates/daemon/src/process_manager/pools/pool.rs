@@ -4,9 +4,10 @@ use super::command::{Command, PoolError};
 use super::restart::Restarts;
 use super::size::{Size, retiring};
 use super::worker::Worker;
+use crate::process_manager::readiness::Readiness;
 use crate::process_manager::template::Template;
 use ratn_model::time::Timestamp;
-use ratn_proto::types::PoolStatus;
+use ratn_proto::types::{PoolStatus, Scale};
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
@@ -21,6 +22,9 @@ pub(super) struct Pool {
     /// By number: the youngest is the last.
     workers: BTreeMap<u64, Worker>,
     last_number: u64,
+    /// Workers that ended unasked, and how the last one did.
+    crashes: u64,
+    last_exit: String,
 }
 
 impl Pool {
@@ -31,6 +35,8 @@ impl Pool {
             waits_for: template.after.clone(),
             workers: BTreeMap::new(),
             last_number: 0,
+            crashes: 0,
+            last_exit: String::new(),
             host: host.to_owned(),
             template,
         }
@@ -49,13 +55,17 @@ impl Pool {
     }
 
     pub(super) fn status(&self) -> PoolStatus {
+        let (min, max, spares) = self.size.bounds();
         PoolStatus {
             template: self.template.name.clone(),
             kind: self.template.kind.clone(),
-            min: self.template.min,
-            max: self.template.max_workers(),
+            min,
+            max,
             workers: self.workers.values().map(Worker::status).collect(),
             failure: self.restarts.failure().to_owned(),
+            spares,
+            crashes: self.crashes,
+            last_exit: self.last_exit.clone(),
         }
     }
 
@@ -66,9 +76,7 @@ impl Pool {
             "" if self.waits() && self.wanted() > 0 => {
                 Some(format!("`{name}` waits until there is a worker of {}", self.waits_for.join(", ")))
             }
-            "" if self.size.is_short() => {
-                Some(format!("`{name}` has {} workers at the most", self.template.max_workers()))
-            }
+            "" if self.size.is_short() => Some(format!("`{name}` has {} workers at the most", self.size.bounds().1)),
             "" => None,
             failure => Some(format!("`{name}` crash-loops: {failure}")),
         }
@@ -83,6 +91,7 @@ impl Pool {
 
     /// Does what is due: kills, asks, and ends those that have been too many for long enough.
     pub(super) fn advance(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        self.restarts.advance(now);
         self.workers.values_mut().for_each(|worker| worker.advance(now, &self.template, commands));
         for number in self.retiring(now).0 {
             if let Some(worker) = self.workers.get_mut(&number) {
@@ -93,7 +102,7 @@ impl Pool {
 
     /// Who ends now because there are too many, and when the next one does.
     fn retiring(&self, now: Timestamp) -> (Vec<u64>, Option<Timestamp>) {
-        let surplus = self.there().saturating_sub(self.wanted());
+        let surplus = self.there().saturating_sub(self.wanted() + self.surge());
         let idle = self.workers.iter().filter_map(|(number, worker)| Some((worker.idle_since()?, *number)));
         retiring(idle, surplus, self.template.idle(), now)
     }
@@ -112,8 +121,9 @@ impl Pool {
         self.workers.values().any(Worker::is_ready)
     }
 
-    /// Starts what is missing, unless it has to wait; the ids.
+    /// Starts what is missing, unless it has to wait; the ids. Of those that are to be replaced the next one goes where it may.
     pub(super) fn fill(&mut self, now: Timestamp, commands: &mut Vec<Command>) -> Vec<String> {
+        self.roll(now, commands);
         if !self.restarts.allow(now) {
             return Vec::new();
         }
@@ -147,6 +157,8 @@ impl Pool {
         if !worker.is_stopping() {
             let words = if last_words.is_empty() { String::new() } else { format!("; its last words: {last_words}") };
             let what = format!("{id}: {reason}{words}");
+            self.crashes += 1;
+            self.last_exit = format!("{id}: {reason}");
             self.restarts.crashed(now, &self.template, worker.serves_since(), &what);
         }
     }
@@ -155,6 +167,13 @@ impl Pool {
     pub(super) fn serving(&mut self, now: Timestamp, number: u64, endpoint: &str, commands: &mut Vec<Command>) {
         if let Some(worker) = self.workers.get_mut(&number) {
             worker.serving(now, endpoint, &self.template.kind, commands);
+        }
+    }
+
+    /// A worker's resource is there.
+    pub(super) fn offered(&mut self, now: Timestamp, number: u64, commands: &mut Vec<Command>) {
+        if let Some(worker) = self.workers.get_mut(&number) {
+            worker.offered(now, commands);
         }
     }
 
@@ -169,7 +188,7 @@ impl Pool {
         let wanted = if self.restarts.has_failed() { self.there() } else { self.size.asked() };
         if !self.size.ask(wanted, count) {
             let template = self.template.name.clone();
-            return Err(PoolError::TooMany { template, wanted, max: self.template.max_workers(), count });
+            return Err(PoolError::TooMany { template, wanted, max: self.size.bounds().1, count });
         }
         self.restarts.forgive();
         let mut started = self.fill(now, commands);
@@ -211,6 +230,70 @@ impl Pool {
         }
     }
 
+    /// Other workers are to take the place of this one, or of all; the ids of those that will go. A failed pool is tried again.
+    pub(super) fn restart(&mut self, only: Option<u64>) -> Vec<String> {
+        self.restarts.forgive();
+        let chosen = |number: &u64| only.is_none_or(|only| only == *number);
+        let workers = self.workers.iter_mut().filter(|(number, _)| chosen(number));
+        workers.filter_map(|(_, worker)| worker.outdate().then(|| worker.id().to_owned())).collect()
+    }
+
+    /// One that is to be replaced ends once there is one more than is wanted, and all of them are ready. One at a time.
+    fn roll(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        let leaving = self.workers.values().any(Worker::is_leaving);
+        let ready = self.workers.values().all(Worker::is_ready);
+        let spared = self.there() > self.wanted() || self.is_single();
+        let next =
+            self.workers.values_mut().filter(|worker| worker.is_outdated()).min_by_key(|worker| worker.is_held());
+        let (until, kill_at) = (now + self.template.drain(), now + self.template.stop_timeout());
+        if let Some(worker) = next.filter(|_| !leaving && ready && spared) {
+            worker.drain(until, kill_at, commands);
+        }
+    }
+
+    /// One more than is wanted is started where it is to take the place of another.
+    fn surge(&self) -> u32 {
+        let leaving = self.workers.values().any(Worker::is_leaving);
+        let surges = !leaving && !self.is_single() && self.workers.values().any(Worker::is_outdated);
+        u32::from(surges)
+    }
+
+    /// Whether there cannot be two at the same time, not even for a moment.
+    fn is_single(&self) -> bool {
+        matches!(self.template.readiness, Readiness::Port { .. })
+    }
+
+    /// From now on it has another size. What is above the new maximum ends now, or once nobody holds it.
+    ///
+    /// # Errors
+    /// [`PoolError::Size`].
+    pub(super) fn scale(
+        &mut self,
+        now: Timestamp,
+        scale: Scale,
+        commands: &mut Vec<Command>,
+    ) -> Result<PoolStatus, PoolError> {
+        let template = || self.template.name.clone();
+        self.size.scale(scale).map_err(|why| PoolError::Size { template: template(), why })?;
+        let (_, max, _) = self.size.bounds();
+        let surplus = self.there().saturating_sub(max) as usize;
+        let (until, kill_at) = (now + self.template.drain(), now + self.template.stop_timeout());
+        let mut there: Vec<&mut Worker> = self.workers.values_mut().filter(|worker| !worker.is_leaving()).collect();
+        there.sort_by_key(|worker| worker.is_held());
+        for worker in there.into_iter().take(surplus) {
+            worker.drain(until, kill_at, commands);
+        }
+        Ok(self.status())
+    }
+
+    /// Ends every worker, each once nobody holds it.
+    pub(super) fn drain(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        let (until, kill_at) = (now + self.template.drain(), now + self.template.stop_timeout());
+        for worker in self.workers.values_mut() {
+            worker.drain(until, kill_at, commands);
+        }
+    }
+
     /// Ends every worker. What has not ended after `patience` is killed.
     pub(super) fn shut_down(&mut self, now: Timestamp, patience: Duration, commands: &mut Vec<Command>) {
         let kill_at = now + patience.min(self.template.stop_timeout());
@@ -228,7 +311,9 @@ impl Pool {
     }
 
     fn missing(&self) -> u32 {
-        if self.restarts.has_failed() || self.waits() { 0 } else { self.wanted().saturating_sub(self.there()) }
+        let there = if self.is_single() { self.count(|_| true) } else { self.there() };
+        let wanted = self.wanted() + self.surge();
+        if self.restarts.has_failed() || self.waits() { 0 } else { wanted.saturating_sub(there) }
     }
 
     fn count(&self, of: impl Fn(&Worker) -> bool) -> u32 {

@@ -72,9 +72,14 @@ impl Restarts {
         !self.failure.is_empty()
     }
 
+    /// A pause that is over is forgotten.
+    pub(super) fn advance(&mut self, now: Timestamp) {
+        self.not_before = self.not_before.filter(|at| *at > now);
+    }
+
     /// Whether a worker may be started now: neither has it failed, nor is it pausing.
     pub(super) fn allow(&mut self, now: Timestamp) -> bool {
-        self.not_before = self.not_before.filter(|at| *at > now);
+        self.advance(now);
         !self.has_failed() && self.not_before.is_none()
     }
 

@@ -6,6 +6,7 @@
 //! Those above it end when they have been idle for long enough, the longest idle ones first; who is held never does.
 
 use ratn_model::time::Timestamp;
+use ratn_proto::types::Scale;
 use std::time::Duration;
 
 /// See the module.
@@ -14,6 +15,8 @@ pub(super) struct Size {
     min: u32,
     max: u32,
     spares: u32,
+    /// As the config has it: more there never are.
+    most: u32,
     /// What is kept without any demand.
     asked: u32,
     /// How many there should be for those who wait; 0 when nobody does.
@@ -24,7 +27,34 @@ pub(super) struct Size {
 
 impl Size {
     pub(super) fn new(min: u32, max: u32, spares: u32) -> Size {
-        Size { min, max, spares, asked: min, demanded: 0, short: false }
+        Size { min, max, spares, most: max, asked: min, demanded: 0, short: false }
+    }
+
+    /// At least so many are kept, at most so many started, and so many kept ready beside those that are held.
+    pub(super) fn bounds(&self) -> (u32, u32, u32) {
+        (self.min, self.max, self.spares)
+    }
+
+    /// From now on it is so; what was asked for is forgotten where there is a new minimum.
+    ///
+    /// # Errors
+    /// In words, where the config does not allow it; nothing is changed then.
+    pub(super) fn scale(&mut self, scale: Scale) -> Result<(), String> {
+        let (min, max) = (scale.min.unwrap_or(self.min), scale.max.unwrap_or(self.max));
+        let spares = scale.spares.unwrap_or(self.spares);
+        if max > self.most {
+            return Err(format!("max = {max} is more than its config's {}", self.most));
+        }
+        if min > max {
+            return Err(format!("min = {min} is above max = {max}"));
+        }
+        if spares > 0 && min.saturating_add(spares) > max {
+            return Err(format!("min + spares = {} is above max = {max}", min.saturating_add(spares)));
+        }
+        self.asked = if scale.min.is_some() { min } else { self.asked.min(max) };
+        self.demanded = self.demanded.min(max);
+        (self.min, self.max, self.spares) = (min, max, spares);
+        Ok(())
     }
 
     /// How many there shall be now that so many are held.
@@ -83,6 +113,7 @@ pub(super) fn retiring(
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
 
     #[test]
@@ -113,6 +144,21 @@ mod tests {
         let size = Size::new(2, 5, 1);
         let wanted = (0..=5).map(|held| size.wanted(held));
         assert_eq!(wanted.collect::<Vec<_>>(), [3, 3, 3, 4, 5, 5]);
+    }
+
+    #[test]
+    fn it_is_scaled_within_what_the_config_allows() {
+        let mut size = Size::new(1, 4, 0);
+        size.ask(1, 3);
+        let scaled = |min, max, spares| Scale { min, max, spares };
+        assert_eq!(size.scale(scaled(None, Some(5), None)).unwrap_err(), "max = 5 is more than its config's 4");
+        assert_eq!(size.scale(scaled(Some(3), Some(2), None)).unwrap_err(), "min = 3 is above max = 2");
+        assert_eq!(size.scale(scaled(Some(2), None, Some(3))).unwrap_err(), "min + spares = 5 is above max = 4");
+        assert_eq!((size.bounds(), size.wanted(0)), ((1, 4, 0), 4), "nothing has changed");
+        size.scale(scaled(None, Some(3), None)).unwrap();
+        assert_eq!(size.wanted(0), 3);
+        size.scale(scaled(Some(0), None, Some(1))).unwrap();
+        assert_eq!((size.bounds(), size.wanted(0), size.wanted(9)), ((0, 3, 1), 1, 3));
     }
 
     #[test]

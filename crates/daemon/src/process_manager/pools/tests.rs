@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use super::*;
+use crate::process_manager::readiness::Readiness;
 use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_model::value::Value;
 use ratn_proto::types::WorkerState;
@@ -420,4 +421,86 @@ fn a_template_starts_after_those_it_waits_for() {
     pools.exited(at(2.0), "c-1@compute", "killed by signal 9", "");
     pools.bring_up(at(3.0), "b-1@compute");
     assert_eq!(started(&mut pools), ["c-2@compute", "a-1@compute"]);
+}
+
+#[test]
+fn those_that_are_replaced_go_one_by_one_each_once_its_successor_is_ready() {
+    let mut pools = pools(|template| {
+        template.min = 2;
+        template.max = Some(2);
+    });
+    for id in ["planner-1@compute", "planner-2@compute"] {
+        pools.bring_up(at(0.0), id);
+    }
+    pools.used(at(1.0), "planner-1@compute", true);
+    pools.take_commands();
+    let (going, commands) = pools.pools.restart(at(1.0), &Restart::Template("planner".into())).unwrap();
+    assert_eq!(going, ["planner-1@compute", "planner-2@compute"]);
+    assert!(matches!(&commands[..], [Command::Start { id, .. }] if id == "planner-3@compute"), "{commands:?}");
+    pools.bring_up(at(2.0), "planner-3@compute");
+    let retired = |pools: &mut Rig| {
+        let commands = pools.take_commands().into_iter();
+        commands.filter(|c| matches!(c, Command::Retire { .. } | Command::Start { .. })).collect::<Vec<_>>()
+    };
+    let retire = |id: &str| Command::Retire { id: id.to_owned() };
+    assert_eq!(retired(&mut pools), [retire("planner-2@compute")], "who is not held goes first");
+    pools.handle(at(2.0), Event::Withdrawn { id: "planner-2@compute".into() });
+    assert_eq!(retired(&mut pools), [], "one at a time");
+    pools.exited(at(3.0), "planner-2@compute", "exited with status 0", "");
+    assert!(matches!(&retired(&mut pools)[..], [Command::Start { id, .. }] if id == "planner-4@compute"));
+    pools.bring_up(at(4.0), "planner-4@compute");
+    assert_eq!(retired(&mut pools), [retire("planner-1@compute")]);
+    pools.used(at(5.0), "planner-1@compute", false);
+    pools.handle(at(5.0), Event::Withdrawn { id: "planner-1@compute".into() });
+    pools.exited(at(5.0), "planner-1@compute", "exited with status 0", "");
+    assert_eq!(pools.ids(), ["planner-3@compute", "planner-4@compute"]);
+    assert_eq!(pools.status()[0].crashes, 0);
+}
+
+#[test]
+fn where_the_new_ones_crash_the_old_ones_stay() {
+    let mut pools = pools(|template| template.crash_limit = 2);
+    pools.bring_up(at(0.0), "planner-1@compute");
+    pools.pools.restart(at(1.0), &Restart::Template("planner".into())).unwrap();
+    pools.exited(at(1.0), "planner-2@compute", "exited with status 1", "");
+    pools.run_until(at(2.0));
+    pools.exited(at(2.0), "planner-3@compute", "exited with status 1", "");
+    pools.run_until(at(90.0));
+    let pool = pools.status().remove(0);
+    assert!(pool.failure.starts_with("2 crashes in a row"), "{pool:?}");
+    assert_eq!((pools.ids(), pool.workers[0].state), (vec!["planner-1@compute".to_owned()], WorkerState::Ready));
+    assert_eq!((pool.crashes, pool.last_exit.as_str()), (2, "planner-3@compute: exited with status 1"));
+}
+
+#[test]
+fn of_those_that_cannot_be_two_the_old_one_goes_before_the_new_one_is_started() {
+    let mut pools = pools(|template| template.readiness = Readiness::Port { port: 7_000 });
+    pools.bring_up(at(0.0), "planner-1@compute");
+    pools.take_commands();
+    let (_, commands) = pools.pools.restart(at(1.0), &Restart::Worker("planner-1@compute".into())).unwrap();
+    assert_eq!(commands, [Command::Retire { id: "planner-1@compute".into() }]);
+    pools.handle(at(1.0), Event::Withdrawn { id: "planner-1@compute".into() });
+    assert_eq!(started(&mut pools), [] as [&str; 0]);
+    pools.exited(at(1.5), "planner-1@compute", "exited with status 0", "");
+    assert_eq!(started(&mut pools), ["planner-2@compute"]);
+}
+
+#[test]
+fn a_drained_host_starts_nothing_whoever_asks_and_all_of_it_again_when_that_is_over() {
+    let mut pools = pools(|template| template.max = Some(3));
+    pools.bring_up(at(0.0), "planner-1@compute");
+    pools.used(at(0.0), "planner-1@compute", true);
+    pools.take_commands();
+    let commands = pools.pools.drain(at(1.0), true);
+    assert_eq!(commands, [Command::Retire { id: "planner-1@compute".into() }]);
+    assert_eq!(pools.pools.spawn(at(1.0), "planner", 1), Err(PoolError::Drained { host: "compute".into() }));
+    assert_eq!(pools.shortages()["PathPlanner"], "the host `compute` is drained");
+    pools.demanded(at(2.0), &demand(0, 2));
+    pools.used(at(3.0), "planner-1@compute", false);
+    pools.handle(at(3.0), Event::Withdrawn { id: "planner-1@compute".into() });
+    pools.exited(at(3.0), "planner-1@compute", "exited with status 0", "");
+    pools.run_until(at(100.0));
+    assert_eq!((pools.ids(), started(&mut pools)), (Vec::<String>::new(), Vec::new()));
+    let commands = pools.pools.drain(at(100.0), false);
+    assert_eq!(commands.len(), 2, "what is demanded is started: {commands:?}");
 }

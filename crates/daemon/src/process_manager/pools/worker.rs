@@ -26,6 +26,8 @@ pub(super) struct Worker {
     /// Since when nobody holds its resource; `None` while somebody does.
     idle_since: Option<Timestamp>,
     liveness: liveness::Liveness,
+    /// Another one is to take its place.
+    outdated: bool,
     pid: u32,
     /// What it may use of the machine, for people.
     limits: String,
@@ -63,6 +65,7 @@ impl Worker {
             serves_since: None,
             idle_since: Some(now),
             liveness: liveness::Liveness::of(template),
+            outdated: false,
             pid: 0,
             limits: String::new(),
             endpoint: String::new(),
@@ -161,6 +164,12 @@ impl Worker {
         }
     }
 
+    /// Another one is to take its place. False where it is ending already.
+    pub(super) fn outdate(&mut self) -> bool {
+        self.outdated = !self.is_leaving();
+        self.outdated
+    }
+
     /// Ends it now: killed if it has not ended at `kill_at`. False where it is ending already.
     pub(super) fn stop(&mut self, kill_at: Timestamp, commands: &mut Vec<Command>) -> bool {
         if matches!(self.phase, Phase::Stopping { .. }) {
@@ -237,6 +246,11 @@ impl Worker {
         matches!(self.phase, Phase::Leaving { .. } | Phase::Stopping { .. })
     }
 
+    /// Whether another one is to take its place, and it does not end yet.
+    pub(super) fn is_outdated(&self) -> bool {
+        self.outdated && !self.is_leaving()
+    }
+
     /// Whether its exit is what was asked for.
     pub(super) fn is_stopping(&self) -> bool {
         matches!(self.phase, Phase::Stopping { .. })
@@ -263,8 +277,10 @@ impl Worker {
 
     pub(super) fn status(&self) -> WorkerStatus {
         let state = match self.phase {
-            Phase::Ready | Phase::Leaving { .. } => WorkerState::Ready,
-            _ => WorkerState::Starting,
+            Phase::Starting { .. } | Phase::Serving => WorkerState::Starting,
+            // Where somebody holds it in the same moment it stays.
+            Phase::Ready | Phase::Leaving { until: None } => WorkerState::Ready,
+            Phase::Leaving { until: Some(_) } | Phase::Failed { .. } | Phase::Stopping { .. } => WorkerState::Stopping,
         };
         WorkerStatus {
             id: self.id.clone(),
@@ -276,6 +292,8 @@ impl Worker {
             resident_bytes: 0,
             cpu_millicores: 0,
             limits: self.limits.clone(),
+            age_s: 0,
+            held: self.is_held(),
         }
     }
 

@@ -1,0 +1,229 @@
+//! `ratn ps`, `logs`, `pool`, `restart` and `drain`: the worker processes of all hosts, for people and scripts.
+
+mod hosts;
+mod logs;
+mod show;
+
+use super::blocking_on;
+use crate::failure::Failure;
+use crate::output;
+use anyhow::Context;
+use clap::{Args, Subcommand};
+use hosts::Answered;
+use ratn_proto::types::{HostPools, Scale};
+use ratn_worker::endpoint::Endpoint;
+use serde_json::json;
+use std::path::PathBuf;
+
+/// Which process managers, and how their answers are shown.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct HostArguments {
+    /// Where endpoint files are; $RATN_RUNTIME_DIR, $XDG_RUNTIME_DIR/ratn or /tmp/ratn-UID unless given
+    #[arg(long, value_name = "DIR", global = true)]
+    runtime_dir: Option<PathBuf>,
+    /// Where the resource manager is, which knows every host, instead: `unix:/path`, `https://host:port`
+    #[arg(long, value_name = "ADDRESS", global = true)]
+    resource_manager: Option<Endpoint>,
+    /// Ask this process manager alone: `unix:/path`, `https://host:port`
+    #[arg(long, value_name = "ADDRESS", global = true, conflicts_with = "resource_manager")]
+    manager: Option<Endpoint>,
+    /// Only this host
+    #[arg(long, value_name = "NAME", global = true)]
+    host: Option<String>,
+    /// Print one JSON document on standard output
+    #[arg(long, global = true)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct LogsArguments {
+    /// A worker's id, as `ps` shows it: `path-planner-1@compute`; or a template: then every line says whose it is
+    name: String,
+    /// Go on with what is written from now on: of a worker until it ends, of a template also of the workers to come
+    #[arg(short, long)]
+    follow: bool,
+    #[command(flatten)]
+    host: HostArguments,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PoolArguments {
+    #[command(subcommand)]
+    command: PoolCommand,
+    #[command(flatten)]
+    host: HostArguments,
+}
+
+#[derive(Debug, Clone, Subcommand)]
+enum PoolCommand {
+    /// Start more workers of a template, which then are kept; also where it has failed
+    Start {
+        /// The template's name
+        template: String,
+        /// How many more
+        #[arg(default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+        count: u32,
+    },
+    /// End workers, each once nobody holds it; a template never keeps less than its minimum
+    Stop {
+        /// Their ids
+        #[arg(required = true)]
+        workers: Vec<String>,
+    },
+    /// Change how many workers a template has, until its process manager ends; within what its config allows
+    Scale {
+        /// The template's name
+        template: String,
+        #[command(flatten)]
+        size: SizeArguments,
+    },
+}
+
+#[derive(Debug, Clone, Args)]
+#[group(required = true, multiple = true)]
+struct SizeArguments {
+    /// At least so many are kept; what was started on request beyond it is not
+    #[arg(long, value_name = "N")]
+    min: Option<u32>,
+    /// At most so many are started
+    #[arg(long, value_name = "N")]
+    max: Option<u32>,
+    /// So many more than are held are kept ready
+    #[arg(long, value_name = "N")]
+    spares: Option<u32>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct RestartArguments {
+    /// A template, on every host that has it, or a worker's id
+    name: String,
+    #[command(flatten)]
+    host: HostArguments,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct DrainArguments {
+    /// The host's name
+    name: String,
+    /// Let it take work again
+    #[arg(long)]
+    undo: bool,
+    #[command(flatten)]
+    host: HostArguments,
+}
+
+/// Shows the workers of all hosts; fails where one does not answer.
+pub(super) fn ps(arguments: &HostArguments) -> Result<(), Failure> {
+    asking(async {
+        let mut answered = hosts::ask_all(hosts::find(arguments).await?).await;
+        answered.retain(|one| arguments.host.as_deref().is_none_or(|host| host == one.name()));
+        if let Some(host) = arguments.host.as_deref().filter(|_| answered.is_empty()) {
+            return Err(Failure::Refused(format!("ratn: there is no host `{host}`; `ratn ps` shows all")));
+        }
+        let pools: Vec<&HostPools> = answered.iter().filter_map(|one| one.pools.as_ref().ok()).collect();
+        match arguments.json {
+            true => output::result(show::in_json(&answered))?,
+            false => output::result(show::table(&pools))?,
+        }
+        let problems: Vec<String> = answered.iter().filter_map(Answered::problem).collect();
+        if problems.is_empty() { Ok(()) } else { Err(anyhow::anyhow!(problems.join("\nratn: ")).into()) }
+    })
+}
+
+/// Prints what workers wrote.
+pub(super) fn logs(arguments: &LogsArguments) -> Result<(), Failure> {
+    asking(logs::print(arguments))
+}
+
+/// Starts and ends workers, and changes how many there are.
+pub(super) fn run(arguments: &PoolArguments) -> Result<(), Failure> {
+    let host = &arguments.host;
+    asking(async {
+        match &arguments.command {
+            PoolCommand::Start { template, count } => {
+                let one = hosts::the_one(host, &format!("template `{template}`"), has(template)).await?;
+                ids(host, &one.client.spawn(template, *count).await.context("not started")?)
+            }
+            PoolCommand::Stop { workers } => {
+                for id in workers {
+                    let one = hosts::the_one(host, &format!("worker `{id}`"), runs(id)).await?;
+                    one.client.stop(id).await.with_context(|| format!("`{id}` is not ended"))?;
+                }
+                ids(host, workers)
+            }
+            PoolCommand::Scale { template, size } => {
+                let one = hosts::the_one(host, &format!("template `{template}`"), has(template)).await?;
+                let scale = Scale { min: size.min, max: size.max, spares: size.spares };
+                let pool = one.client.scale(template, scale).await?;
+                if host.json {
+                    return Ok(output::result(show::pool_json(&pool))?);
+                }
+                Ok(output::result(format!("{template}: {} to {}, {} spares", pool.min, pool.max, pool.spares))?)
+            }
+        }
+    })
+}
+
+/// Replaces workers.
+pub(super) fn restart(arguments: &RestartArguments) -> Result<(), Failure> {
+    let (name, host) = (arguments.name.as_str(), &arguments.host);
+    asking(async {
+        let mut answered = hosts::ask_all(hosts::find(host).await?).await;
+        answered.retain(|one| host.host.as_deref().is_none_or(|wanted| wanted == one.name()));
+        let with = |one: &&Answered| one.pools.as_ref().is_ok_and(has(name));
+        let mut going = Vec::new();
+        let on: Vec<&Answered> = answered.iter().filter(with).collect();
+        for one in &on {
+            let restarted = one.host.client.restart_template(name).await;
+            going.extend(restarted.with_context(|| format!("`{name}` on {} is not restarted", one.name()))?);
+        }
+        if on.is_empty() {
+            let one = hosts::the_one(host, &format!("template or worker `{name}`"), runs(name)).await?;
+            going = one.client.restart_worker(name).await.with_context(|| format!("`{name}` is not restarted"))?;
+        }
+        ids(host, &going)
+    })
+}
+
+/// Lets a host take no new work, or take it again.
+pub(super) fn drain(arguments: &DrainArguments) -> Result<(), Failure> {
+    let (name, host) = (arguments.name.as_str(), &arguments.host);
+    asking(async {
+        let one = hosts::the_one(host, &format!("host `{name}`"), |pools| pools.host == name).await?;
+        let left = one.client.drain(!arguments.undo).await?;
+        if host.json {
+            return Ok(output::result(json!({ "host": name, "draining": !arguments.undo, "workers": left }))?);
+        }
+        let text = match (arguments.undo, left.is_empty()) {
+            (true, _) => format!("{name} takes work again"),
+            (false, true) => format!("{name} is drained; it has no workers"),
+            (false, false) => {
+                format!("{name} takes no new work; these end once nobody holds them: {}", left.join(", "))
+            }
+        };
+        Ok(output::result(text)?)
+    })
+}
+
+fn has(template: &str) -> impl Fn(&HostPools) -> bool {
+    move |pools| pools.pools.iter().any(|pool| pool.template == template)
+}
+
+fn runs(worker: &str) -> impl Fn(&HostPools) -> bool {
+    move |pools| pools.pools.iter().flat_map(|pool| &pool.workers).any(|known| known.id == worker)
+}
+
+fn ids(arguments: &HostArguments, ids: &[String]) -> Result<(), Failure> {
+    if arguments.json {
+        output::result(json!(ids))?
+    } else if ids.is_empty() {
+        output::progress("there is no worker now")
+    } else {
+        output::result(ids.join("\n"))?
+    }
+    Ok(())
+}
+
+fn asking(ask: impl Future<Output = Result<(), Failure>>) -> Result<(), Failure> {
+    blocking_on(tokio::runtime::Builder::new_current_thread(), ask)
+}
