@@ -2,6 +2,7 @@
 
 pub mod boxes;
 pub mod cell;
+pub mod environment;
 pub mod grasping;
 pub mod picture;
 pub mod placement;

@@ -1,0 +1,431 @@
+//! The bodies and their steps.
+
+use super::object::{Kind, Model, Part};
+use rapier3d::math::{Pose as Pose32, Vector};
+use rapier3d::parry::query::contact;
+use rapier3d::prelude::{
+    BroadPhaseBvh, CCDSolver, ColliderBuilder, ColliderHandle, ColliderSet, Group, ImpulseJointSet,
+    IntegrationParameters, InteractionGroups, InteractionTestMode, IslandManager, MultibodyJointSet, NarrowPhase,
+    PhysicsPipeline, RigidBodyBuilder, RigidBodyHandle, RigidBodySet, RigidBodyType, SoftBodySet,
+};
+use ratn_model::pose::Pose;
+use ratn_model::time::Timestamp;
+use ratn_motion::robot::{Configuration, Robot, to_f32};
+use ratn_world::digest::{Digest, Digester};
+use serde::{Deserialize, Serialize};
+use std::time::Duration;
+
+/// The fixed step.
+pub const STEP: Duration = Duration::from_millis(4);
+/// The floor's name.
+pub const FLOOR: &str = "floor";
+/// The floor, in metres; its top is at z = 0.
+const FLOOR_SIZE: [f64; 3] = [12.0, 12.0, 0.1];
+/// m/s².
+pub const GRAVITY: f64 = 9.81;
+/// The size of what rapier's tolerances are made for: it lets bodies sink into each other by 0.5 % of it and pushes them apart with
+/// at most three of it a second.
+const LENGTH_UNIT_M: f32 = 0.1;
+/// What moves slower than a twentieth of the length unit a second for so long stands still.
+const STILL_S: f32 = 0.3;
+/// How near something must be to what it rests on, in metres.
+const TOUCH_M: f32 = 0.003;
+/// How steep a support may be: the least upward part of its normal.
+const LEVEL: f32 = 0.7;
+/// What fell out of the world is not followed any farther, in metres below the floor.
+const LOST_M: f32 = -5.0;
+/// How much fingers and links rub.
+const ROBOT_FRICTION: f32 = 0.6;
+
+const OF_ROBOT: Group = Group::GROUP_1;
+const OF_OBJECTS: Group = Group::GROUP_2;
+const OF_FURNITURE: Group = Group::GROUP_3;
+
+/// Something that never moves, made of boxes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Furniture {
+    /// Its name.
+    pub name: String,
+    /// Centres, in the world frame, and edges in metres.
+    pub parts: Vec<(Pose, [f64; 3])>,
+}
+
+/// Where an object is and how it moves.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ObjectState {
+    /// Its frame, in the world frame.
+    pub pose: Pose,
+    /// Metres per second.
+    pub velocity: [f64; 3],
+    /// Radians per second.
+    pub spin: [f64; 3],
+    /// It has stood still for a while.
+    pub at_rest: bool,
+    /// It goes where it is put, [`Environment::carry`].
+    pub carried: bool,
+}
+
+/// What an environment can be made of again: see [`Environment::save`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Saved {
+    /// Steps since the beginning.
+    pub steps: u64,
+    /// All objects, in order.
+    pub objects: Vec<(Model, ObjectState)>,
+}
+
+/// Rigid bodies in a cell.
+pub struct Environment {
+    gravity: Vector,
+    parameters: IntegrationParameters,
+    pipeline: PhysicsPipeline,
+    islands: IslandManager,
+    broad_phase: BroadPhaseBvh,
+    narrow_phase: NarrowPhase,
+    bodies: RigidBodySet,
+    colliders: ColliderSet,
+    joints: ImpulseJointSet,
+    multibodies: MultibodyJointSet,
+    soft_bodies: SoftBodySet,
+    ccd: CCDSolver,
+    steps: u64,
+    furniture: Vec<Furniture>,
+    /// What can be stood on: collider and name.
+    supports: Vec<(ColliderHandle, String)>,
+    links: Vec<RobotBody>,
+    fingers_solid: bool,
+    objects: Vec<Body>,
+}
+
+/// One body of a robot's link.
+#[derive(Clone)]
+struct RobotBody {
+    body: RigidBodyHandle,
+    collider: ColliderHandle,
+    finger: bool,
+    at: Pose32,
+}
+
+#[derive(Clone)]
+struct Body {
+    model: Model,
+    body: RigidBodyHandle,
+    parts: Vec<ColliderHandle>,
+}
+
+impl Environment {
+    /// Furniture, a robot, and objects that stand still until something touches them.
+    pub fn new(
+        robot: &Robot,
+        configuration: &Configuration,
+        furniture: &[Furniture],
+        objects: &[(Model, Pose)],
+    ) -> Environment {
+        let state = |pose: &Pose| ObjectState {
+            pose: *pose,
+            velocity: [0.0; 3],
+            spin: [0.0; 3],
+            at_rest: true,
+            carried: false,
+        };
+        let objects = objects.iter().map(|(model, pose)| (model.clone(), state(pose))).collect();
+        Environment::restore(robot, configuration, furniture, &Saved { steps: 0, objects })
+    }
+
+    /// The environment that was saved. What goes on from it does so as where it was saved, to the last bit.
+    pub fn restore(
+        robot: &Robot,
+        configuration: &Configuration,
+        furniture: &[Furniture],
+        saved: &Saved,
+    ) -> Environment {
+        let parameters = IntegrationParameters {
+            dt: STEP.as_secs_f32(),
+            length_unit: LENGTH_UNIT_M,
+            ..IntegrationParameters::default()
+        };
+        let mut environment = Environment {
+            gravity: Vector::new(0.0, 0.0, -GRAVITY as f32),
+            parameters,
+            pipeline: PhysicsPipeline::new(),
+            islands: IslandManager::new(),
+            broad_phase: BroadPhaseBvh::default(),
+            narrow_phase: NarrowPhase::new(),
+            bodies: RigidBodySet::new(),
+            colliders: ColliderSet::new(),
+            joints: ImpulseJointSet::new(),
+            multibodies: MultibodyJointSet::new(),
+            soft_bodies: SoftBodySet::new(),
+            ccd: CCDSolver::new(),
+            steps: saved.steps,
+            furniture: furniture.to_vec(),
+            supports: Vec::new(),
+            links: Vec::new(),
+            fingers_solid: true,
+            objects: Vec::new(),
+        };
+        environment.furnish();
+        environment.add_robot(robot, configuration);
+        for (model, state) in &saved.objects {
+            environment.add(model, state);
+        }
+        environment
+    }
+
+    /// What it can be restored from. It is itself made again from that, so that both go on alike: what the solver remembers of
+    /// past contacts is not part of the state.
+    pub fn save(&mut self, robot: &Robot, configuration: &Configuration) -> Saved {
+        let saved = Saved { steps: self.steps, objects: self.states().collect() };
+        let solid = self.fingers_solid;
+        *self = Environment::restore(robot, configuration, &self.furniture, &saved);
+        self.set_fingers_solid(solid);
+        saved
+    }
+
+    /// The time of the last step.
+    pub fn now(&self) -> Timestamp {
+        Timestamp::default() + STEP * u32::try_from(self.steps).unwrap_or(u32::MAX)
+    }
+
+    /// The time of the next step.
+    pub fn next_step(&self) -> Timestamp {
+        self.now() + STEP
+    }
+
+    /// Whether every object stands still, or goes only where it is carried.
+    pub fn is_at_rest(&self) -> bool {
+        self.objects.iter().all(|o| {
+            let body = &self.bodies[o.body];
+            body.is_sleeping() || !body.is_dynamic() || body.translation().z < LOST_M
+        })
+    }
+
+    /// Time goes on and nothing happens, up to the last step that is not after `until`: for when all is at rest.
+    pub fn skip_until(&mut self, until: Timestamp) {
+        let steps = until.since(Timestamp::default()).as_nanos() / STEP.as_nanos();
+        self.steps = self.steps.max(u64::try_from(steps).unwrap_or(u64::MAX));
+    }
+
+    /// One step, in which the robot's joints come to `configuration`.
+    pub fn step(&mut self, robot: &Robot, configuration: &Configuration) {
+        for (link, (_, pose, _)) in self.links.iter_mut().zip(robot.shapes(configuration)) {
+            if link.at != pose {
+                link.at = pose;
+                self.bodies[link.body].set_next_kinematic_position(pose);
+            }
+        }
+        self.pipeline.step(
+            self.gravity,
+            &self.parameters,
+            &mut self.islands,
+            &mut self.broad_phase,
+            &mut self.narrow_phase,
+            &mut self.bodies,
+            &mut self.colliders,
+            &mut self.joints,
+            &mut self.multibodies,
+            &mut self.soft_bodies,
+            &mut self.ccd,
+            &(),
+            &(),
+        );
+        self.steps += 1;
+    }
+
+    /// Where an object is and how it moves.
+    pub fn state(&self, object: usize) -> ObjectState {
+        let body = &self.bodies[self.objects[object].body];
+        ObjectState {
+            pose: to_f64(body.position()),
+            velocity: body.linvel().to_array().map(f64::from),
+            spin: body.angvel().to_array().map(f64::from),
+            at_rest: body.is_sleeping(),
+            carried: body.is_kinematic(),
+        }
+    }
+
+    /// What an object is.
+    pub fn model(&self, object: usize) -> &Model {
+        &self.objects[object].model
+    }
+
+    /// How many objects there are.
+    pub fn len(&self) -> usize {
+        self.objects.len()
+    }
+
+    /// Whether there is no object.
+    pub fn is_empty(&self) -> bool {
+        self.objects.is_empty()
+    }
+
+    /// An object goes where it is put from now on, and is at `pose` after the next step. What it meets it pushes.
+    pub fn carry(&mut self, object: usize, pose: &Pose) {
+        let body = &mut self.bodies[self.objects[object].body];
+        if !body.is_kinematic() {
+            body.set_body_type(RigidBodyType::KinematicPositionBased, true);
+        }
+        body.set_next_kinematic_position(to_f32(pose));
+    }
+
+    /// An object is left to itself where it is, moving as it was told.
+    pub fn let_go(&mut self, object: usize, pose: &Pose, velocity: [f64; 3]) {
+        let body = &mut self.bodies[self.objects[object].body];
+        body.set_body_type(RigidBodyType::Dynamic, true);
+        body.set_position(to_f32(pose), true);
+        body.set_linvel(Vector::from_array(velocity.map(|v| v as f32)), true);
+        body.set_angvel(Vector::ZERO, true);
+    }
+
+    /// Something outside puts an object there; it is left to itself.
+    pub fn put(&mut self, object: usize, pose: &Pose) {
+        let was = to_f64(self.bodies[self.objects[object].body].position());
+        self.let_go(object, pose, [0.0; 3]);
+        // What stood on it does not notice by itself.
+        let reach = self.objects.iter().map(|o| (o.body, self.bodies[o.body].translation()));
+        let near: Vec<RigidBodyHandle> = reach
+            .filter(|(_, at)| (*at - Vector::from_array(was.position.map(|c| c as f32))).length() < 4.0 * LENGTH_UNIT_M)
+            .map(|(body, _)| body)
+            .collect();
+        for body in near {
+            self.bodies[body].wake_up(true);
+        }
+    }
+
+    /// Whether fingers push what they meet. While they close they do not: `grip` decides what comes of that.
+    pub fn set_fingers_solid(&mut self, solid: bool) {
+        if self.fingers_solid == solid {
+            return;
+        }
+        self.fingers_solid = solid;
+        let groups = if solid { robot_groups() } else { InteractionGroups::none() };
+        for link in self.links.iter().filter(|link| link.finger) {
+            self.colliders[link.collider].set_collision_groups(groups);
+        }
+    }
+
+    /// On what an object rests: the deepest level contact. `None` in the air.
+    pub fn rests_on(&self, object: usize) -> Option<Support<'_>> {
+        let mine = &self.objects[object];
+        let others = self.objects.iter().enumerate().filter(|(i, _)| *i != object);
+        let others = others.flat_map(|(i, o)| o.parts.iter().map(move |part| (*part, Support::Object(i))));
+        let fixed = self.supports.iter().map(|(collider, name)| (*collider, Support::Named(name)));
+        let mut best: Option<(f32, Support<'_>)> = None;
+        for (collider, support) in fixed.chain(others) {
+            let below = &self.colliders[collider];
+            for part in &mine.parts {
+                let part = &self.colliders[*part];
+                let (a, b) = (self.place(part), self.place(below));
+                let Ok(Some(touch)) = contact(&a, part.shape(), &b, below.shape(), TOUCH_M) else { continue };
+                if touch.normal2.z >= LEVEL && best.is_none_or(|(dist, _)| touch.dist < dist) {
+                    best = Some((touch.dist, support));
+                }
+            }
+        }
+        best.map(|(_, support)| support)
+    }
+
+    /// What all objects come to, and the time.
+    pub fn digest(&self) -> Digest {
+        let mut digester = Digester::default();
+        digester.number(self.steps);
+        for object in &self.objects {
+            let body = &self.bodies[object.body];
+            let (at, turned) = (body.translation().to_array(), body.rotation().to_array());
+            let moves = [body.linvel().to_array(), body.angvel().to_array()];
+            let numbers = at.iter().chain(&turned).chain(moves.as_flattened());
+            numbers.for_each(|x| digester.number(u64::from(x.to_bits())));
+            digester.number(u64::from(body.is_sleeping()));
+        }
+        digester.finish()
+    }
+
+    /// A collider's place; its body's, since the last step, may be newer than its own.
+    fn place(&self, collider: &rapier3d::prelude::Collider) -> Pose32 {
+        let parent = collider.parent().map(|body| *self.bodies[body].position());
+        parent.map_or(*collider.position(), |body| {
+            body * collider.position_wrt_parent().copied().unwrap_or(Pose32::IDENTITY)
+        })
+    }
+
+    fn states(&self) -> impl Iterator<Item = (Model, ObjectState)> + '_ {
+        (0..self.objects.len()).map(|i| (self.objects[i].model.clone(), self.state(i)))
+    }
+
+    fn furnish(&mut self) {
+        let floor = (Pose::at(0.0, 0.0, -FLOOR_SIZE[2] / 2.0), FLOOR_SIZE);
+        let floor = Furniture { name: FLOOR.to_owned(), parts: vec![floor] };
+        for piece in std::iter::once(&floor).chain(&self.furniture) {
+            for (pose, size) in &piece.parts {
+                let [x, y, z] = size.map(|edge| edge as f32 / 2.0);
+                let collider = ColliderBuilder::cuboid(x, y, z)
+                    .position(to_f32(pose))
+                    .friction(ROBOT_FRICTION)
+                    .collision_groups(groups(OF_FURNITURE, OF_OBJECTS));
+                self.supports.push((self.colliders.insert(collider), piece.name.clone()));
+            }
+        }
+    }
+
+    fn add_robot(&mut self, robot: &Robot, configuration: &Configuration) {
+        for (link, pose, shape) in robot.shapes(configuration) {
+            let name = &robot.links[link].name;
+            let body = self.bodies.insert(RigidBodyBuilder::kinematic_position_based().pose(pose));
+            let collider = ColliderBuilder::new(shape).friction(ROBOT_FRICTION).collision_groups(robot_groups());
+            let collider = self.colliders.insert_with_parent(collider, body, &mut self.bodies);
+            self.supports.push((collider, name.clone()));
+            self.links.push(RobotBody { body, collider, finger: name.starts_with("finger"), at: pose });
+        }
+    }
+
+    fn add(&mut self, model: &Model, state: &ObjectState) {
+        let vector = |v: [f64; 3]| Vector::from_array(v.map(|c| c as f32));
+        let kind = if state.carried { RigidBodyType::KinematicPositionBased } else { RigidBodyType::Dynamic };
+        let mut body = RigidBodyBuilder::new(kind)
+            .pose(to_f32(&state.pose))
+            .linvel(vector(state.velocity))
+            .angvel(vector(state.spin))
+            // Thin things do not fall through thin boards.
+            .ccd_enabled(model.kind == Kind::Fork || model.kind == Kind::Plate)
+            .sleeping(state.at_rest)
+            .build();
+        body.activation_mut().time_until_sleep = STILL_S;
+        let body = self.bodies.insert(body);
+        let parts = model.parts();
+        let volume: f32 = parts.iter().map(|(_, shape)| shape.mass_properties(1.0).mass()).sum();
+        let density = model.mass_kg() as f32 / volume;
+        let parts = parts.into_iter().map(|(pose, shape): Part| {
+            let collider = ColliderBuilder::new(shape)
+                .position(pose)
+                .density(density)
+                .friction(model.kind.friction() as f32)
+                .collision_groups(groups(OF_OBJECTS, OF_OBJECTS | OF_ROBOT | OF_FURNITURE));
+            self.colliders.insert_with_parent(collider, body, &mut self.bodies)
+        });
+        let parts = parts.collect();
+        self.objects.push(Body { model: model.clone(), body, parts });
+    }
+}
+
+/// What something rests on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Support<'a> {
+    /// The floor, a piece of furniture, a link of the robot.
+    Named(&'a str),
+    /// Another object.
+    Object(usize),
+}
+
+fn groups(of: Group, with: Group) -> InteractionGroups {
+    InteractionGroups::new(of, with, InteractionTestMode::And)
+}
+
+fn robot_groups() -> InteractionGroups {
+    groups(OF_ROBOT, OF_OBJECTS)
+}
+
+fn to_f64(pose: &Pose32) -> Pose {
+    let quaternion = pose.rotation.to_array().map(f64::from);
+    let length = quaternion.iter().map(|c| c * c).sum::<f64>().sqrt();
+    Pose { position: pose.translation.to_array().map(f64::from), quaternion_xyzw: quaternion.map(|c| c / length) }
+}
