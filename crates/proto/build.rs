@@ -4,7 +4,7 @@ use prost::Message;
 use std::error::Error;
 use std::path::PathBuf;
 
-const FILES: [&str; 6] = ["value", "resources", "world", "processes", "action", "cell"];
+const FILES: [&str; 7] = ["value", "resources", "world", "processes", "action", "cell", "safety"];
 
 fn main() -> Result<(), Box<dyn Error>> {
     let root = PathBuf::from(std::env::var("CARGO_MANIFEST_DIR")?).join("../../proto");

@@ -17,6 +17,7 @@ use ratn_motion::plan::{Goal, Request as PlanRequest, plan};
 use ratn_motion::robot::Joints;
 use ratn_perception::camera::Camera;
 use ratn_perception::detection::{BoxEstimate, Region, locate, segment};
+use ratn_worker::safety::SafetyState;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::PI;
 use std::time::Duration;
@@ -383,4 +384,66 @@ fn nothing_begins_under_a_lease_that_has_ended_or_may_have() {
     assert!(refused(&mut bench, 4));
     bench.cell.handle(bench.now, Event::LeasesAre { living: [LeaseId(4)].into(), youngest: LeaseId(8) });
     assert!(!refused(&mut bench, 4));
+}
+
+fn safety(bench: &mut Bench, state: SafetyState) -> Vec<Command> {
+    bench.cell.handle(bench.now, Event::Safety { state })
+}
+
+#[test]
+fn a_held_motion_stands_still_and_then_takes_the_rest_of_its_time() {
+    let observation = || Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 };
+    let whole_s = {
+        let mut bench = Bench::new(1, 1);
+        bench.done(observation());
+        bench.now.seconds()
+    };
+    let mut bench = Bench::new(1, 1);
+    let (ticket, none) = bench.start(None, observation());
+    assert!(none.is_empty() && bench.pass(whole_s / 2.0).is_empty());
+    assert!(safety(&mut bench, SafetyState::Held { reason: "a look".to_owned() }).is_empty());
+    let here = bench.arm();
+    assert_eq!(bench.cell.next_wake(), None);
+    assert!(bench.pass(3600.0).is_empty());
+    assert_eq!(bench.arm(), here);
+    // What is begun meanwhile does not move either.
+    let (head, none) = bench.start(None, Request::LookAt { target: [0.8, 0.0, 0.7] });
+    let looks = bench.cell.configuration().pan;
+    assert!(none.is_empty() && bench.pass(60.0).is_empty() && bench.cell.configuration().pan == looks);
+
+    assert!(safety(&mut bench, SafetyState::Ready).is_empty());
+    assert_eq!(bench.arm(), here);
+    assert!(!bench.pass(whole_s / 2.0 - 0.001).iter().any(|Command::Ended { ticket: ended, .. }| *ended == ticket));
+    let mut ended = Vec::new();
+    while let Some(wake) = bench.cell.next_wake() {
+        bench.now = wake;
+        ended.extend(bench.cell.handle(wake, Event::Tick));
+    }
+    let done = |ticket| {
+        let is = |command: &&Command| matches!(command, Command::Ended { ticket: of, ending: Ending::Done(_) } if *of == ticket);
+        ended.iter().filter(is).count() == 1
+    };
+    assert!(done(ticket) && bench.arm() == aimm::OBSERVATION, "{ended:?}");
+    assert!(done(head), "{ended:?}");
+}
+
+#[test]
+fn an_emergency_stop_ends_whatever_moves_and_whatever_is_begun_until_it_is_cleared() {
+    let mut bench = Bench::new(1, 1);
+    let (arm, _) = bench.start(None, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 });
+    let (head, _) = bench.start(None, Request::LookAt { target: [0.8, 0.0, 0.7] });
+    bench.pass(0.2);
+    let stop = SafetyState::Stopped { reason: "a hand".to_owned() };
+    let stopped = |ticket| Command::Ended { ticket, ending: Ending::Stopped("a hand".to_owned()) };
+    assert_eq!(safety(&mut bench, stop.clone()), [stopped(arm), stopped(head)]);
+    let here = bench.arm();
+    assert!(bench.pass(60.0).is_empty() && bench.arm() == here);
+    assert!(safety(&mut bench, stop).is_empty());
+    let (late, refused) = bench.start(None, Request::Release);
+    assert_eq!(refused, [stopped(late)]);
+
+    // What was stopped does not go on by itself.
+    safety(&mut bench, SafetyState::Ready);
+    assert!(bench.pass(60.0).is_empty() && bench.arm() == here);
+    bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 });
 }

@@ -16,6 +16,7 @@ use ratn_proto::v1::cell_service_client::CellServiceClient;
 use ratn_worker::client::{AcquireOptions, ActionClient, CallError, Channels, ResourceClient, fresh_id};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::safety::{SafetyClient, SafetyState};
 use ratn_worker::session::Session;
 use ratn_worker::worker::WorkerOptions;
 use std::time::Duration;
@@ -332,5 +333,54 @@ async fn a_goal_under_a_lease_that_has_ended_is_refused_though_nobody_has_a_newe
     }
     let outcome = system.execute(&lease, "Arm", "move_to", to_observation()).await;
     assert!(!outcome.is_ok_and(|outcome| outcome.is_success()));
+    system.end.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_motion_is_held_and_goes_on_and_an_emergency_stop_ends_it_also_for_a_cell_that_is_started_again() {
+    let system = system(1.0, 1).await;
+    let lease = system.acquire(&["Arm"]).await;
+    let driver = SafetyClient::new(&system.channels, &system.cell).unwrap();
+    let moving = system.execute(&lease, "Arm", "move_to", to_observation());
+    let holding = async {
+        system.under_way().await;
+        assert!(matches!(driver.hold("a look").await.unwrap(), SafetyState::Held { .. }));
+        let here = system.arm().await;
+        assert!(distance(&here, &aimm::OBSERVATION) > 0.1);
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        assert_eq!(system.arm().await, here);
+        assert_eq!(driver.go_on().await.unwrap(), SafetyState::Ready);
+    };
+    let (outcome, ()) = tokio::join!(moving, holding);
+    assert!(outcome.unwrap().is_success());
+
+    let back = [("joints", Value::Joints(aimm::HOME.to_vec())), ("speed", Value::Float(0.3))];
+    let moving = system.execute(&lease, "Arm", "move_to", back);
+    let stopping = async {
+        while distance(&system.arm().await, &aimm::OBSERVATION) < 0.02 {
+            tokio::task::yield_now().await;
+        }
+        driver.stop("a hand").await.unwrap();
+        system.arm().await
+    };
+    let (outcome, here) = tokio::join!(moving, stopping);
+    let outcome = outcome.unwrap();
+    assert_eq!((outcome.outcome.as_str(), outcome.reason.as_str()), ("stopped", "emergency stop: a hand"));
+    assert_eq!(system.arm().await, here);
+    let refused = system.execute(&lease, "Arm", "move_to", to_observation()).await.unwrap();
+    assert_eq!(refused.outcome, "stopped");
+    assert!(driver.go_on().await.is_err_and(|error| !error.is_crash()));
+
+    // Another process of the same cell.
+    system.cell_end.cancel();
+    let directory = RuntimeDirectory::at(system._directory.path());
+    while directory.find(ratn_cell::ROLE).is_ok() {
+        tokio::task::yield_now().await;
+    }
+    tokio::spawn(ratn_cell::run(CellConfig::default(), directory.clone(), system.end.clone()));
+    let cell = directory.wait_for(ratn_cell::ROLE, DEADLINE).await.unwrap();
+    let driver = SafetyClient::new(&system.channels, &cell).unwrap();
+    assert_eq!(driver.state().await.unwrap(), SafetyState::Stopped { reason: "a hand".to_owned() });
+    assert_eq!(driver.clear().await.unwrap(), SafetyState::Ready);
     system.end.cancel();
 }

@@ -38,6 +38,12 @@ pub(crate) enum Command {
     Restart(RestartArguments),
     /// Let a host take no new work: each of its workers ends once nobody holds it
     Drain(DrainArguments),
+    /// Emergency stop: whatever moves stops, and nothing begins until it is cleared
+    Stop(StopArguments),
+    /// Pause whatever moves, and whatever would begin to
+    Hold(HoldArguments),
+    /// End a hold: motions go on where they paused
+    GoOn(GoOnArguments),
     /// Lay a new table in the simulated cell of a running system, and forget every fact
     Reset(ResetArguments),
     /// Check a task file without starting anything
@@ -359,6 +365,47 @@ pub(crate) struct ControlArguments {
     /// Where the endpoint files of the run's system are
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+/// Which drivers of what moves are asked.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct SafetyArguments {
+    /// A driver that no resource manager tells of; may be given again
+    #[arg(long, value_name = "ENDPOINT")]
+    pub(crate) endpoint: Vec<Endpoint>,
+    /// Where the endpoint files of the system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct StopArguments {
+    /// Why, for whoever reads the outcome of what was stopped
+    #[arg(long, value_name = "TEXT", conflicts_with_all = ["clear", "show"])]
+    pub(crate) reason: Option<String>,
+    /// End the emergency stop: goals are performed again, what was stopped does not go on
+    #[arg(long, conflicts_with = "show")]
+    pub(crate) clear: bool,
+    /// Change nothing, say what is in force
+    #[arg(long)]
+    pub(crate) show: bool,
+    #[command(flatten)]
+    pub(crate) drivers: SafetyArguments,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct HoldArguments {
+    /// Why, for whoever asks
+    #[arg(long, value_name = "TEXT")]
+    pub(crate) reason: Option<String>,
+    #[command(flatten)]
+    pub(crate) drivers: SafetyArguments,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct GoOnArguments {
+    #[command(flatten)]
+    pub(crate) drivers: SafetyArguments,
 }
 
 #[derive(Debug, Clone, Args)]

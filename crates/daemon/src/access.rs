@@ -84,7 +84,7 @@ pub const TABLE: [(Operation, &[Role]); 12] = [
 type Row = (Operation, &'static [&'static str]);
 
 /// The methods of the wire, by service and name.
-const METHODS: [(&str, &[Row]); 5] = [
+const METHODS: [(&str, &[Row]); 6] = [
     (
         "ratn.v1.ResourceService",
         &[
@@ -111,6 +111,15 @@ const METHODS: [(&str, &[Row]); 5] = [
     ),
     ("ratn.v1.ActionService", &[(Look, &["Describe"]), (Perform, &["Execute", "Cancel"])]),
     ("ratn.v1.CellService", &[(Look, &["GetGroundTruth"]), (Administer, &["Reset"])]),
+    (
+        "ratn.v1.SafetyService",
+        &[
+            (Look, &["GetSafety"]),
+            // Whoever may move it may stop it.
+            (Perform, &["EmergencyStop", "Hold"]),
+            (Administer, &["ClearEmergencyStop", "GoOn"]),
+        ],
+    ),
 ];
 
 impl Operation {

@@ -11,6 +11,7 @@ use messages::{Schema, spelt};
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_worker::action::ActionServer;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::safety::Safety;
 use ratn_worker::server::{Services, bind};
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -93,7 +94,8 @@ async fn channels(system: &TestSystem) -> (BTreeMap<&'static str, Channel>, Vec<
         (system.resource_manager().await, system.world_pool(4).await, system.process_manager(Vec::new()).await);
     let (end, bound) = (CancellationToken::new(), bind(&Endpoint::loopback()).await.unwrap());
     let provider = bound.endpoint().clone();
-    let actions = Services::new().with(ActionServer::builder("").build().into_service());
+    let actions =
+        Services::new().with(ActionServer::builder("").build().into_service()).with(Safety::default().into_service());
     tokio::spawn(bound.serve(actions, end.clone()));
     let channel = |endpoint: &Endpoint| system.channels.get(endpoint).unwrap();
     let channels = BTreeMap::from([
@@ -101,6 +103,7 @@ async fn channels(system: &TestSystem) -> (BTreeMap<&'static str, Channel>, Vec<
         ("WorldPoolService", channel(&pool.endpoint)),
         ("ProcessService", channel(&processes.endpoint)),
         ("ActionService", channel(&provider)),
+        ("SafetyService", channel(&provider)),
     ]);
     (channels, vec![manager, pool, processes], end)
 }

@@ -19,6 +19,8 @@ pub const SUCCESS: &str = "success";
 pub const ABORTED: &str = "aborted";
 /// The outcome of a state that was told to stop.
 pub const PREEMPTED: &str = "preempted";
+/// The outcome of a goal that an emergency stop ended. It is `preempted` to a state whose action has none of this name.
+pub const STOPPED: &str = "stopped";
 
 /// A loaded task program.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

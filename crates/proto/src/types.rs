@@ -492,6 +492,11 @@ impl GoalOutcome {
         GoalOutcome { reason: reason.into(), ..GoalOutcome::named(ratn_model::program::PREEMPTED) }
     }
 
+    /// An emergency stop ended it.
+    pub fn stopped(reason: impl Into<String>) -> GoalOutcome {
+        GoalOutcome { reason: reason.into(), ..GoalOutcome::named(ratn_model::program::STOPPED) }
+    }
+
     /// An outcome of the action's own.
     pub fn named(outcome: &str) -> GoalOutcome {
         GoalOutcome { outcome: outcome.to_owned(), ..GoalOutcome::default() }

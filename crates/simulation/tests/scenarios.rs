@@ -37,6 +37,7 @@ actions.look = { optional = { a = "any" }, outputs = { x = "any", list = "list<a
 [providers.arm]
 resource = "Arm"
 actions.move = { optional = { a = "any", b = "any" }, outputs = { x = "any" } }
+actions.lift = { outcomes = ["stopped"] }
 
 [providers.head]
 resource = "Head"
@@ -907,5 +908,38 @@ states:
     for mode in [Mode::Hsm, Mode::Cdtn] {
         let run = simulate(counts, mode, &mut Script::default());
         assert_eq!((run.outcome.as_str(), run.reason.as_str()), ("success", ""), "{mode:?}");
+    }
+}
+
+#[test]
+fn an_emergency_stop_preempts_whoever_has_no_outcome_of_that_name() {
+    let task = "
+task: stopped
+states:
+  - first: { action: arm/move, pia: true, effects: [], resources: [{ block: Arm }], retry: 3 }
+  - second: { action: head/turn, pia: true, effects: [], resources: [{ block: Head }] }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let mut script = Script { outcomes: [("first", "stopped")].into(), ..Script::default() };
+        let run = simulate(task, mode, &mut script);
+        assert_eq!(run.outcome, "preempted");
+        let starts: Vec<String> = transcript(&run).into_iter().filter(|line| line.contains("start")).collect();
+        assert_eq!(starts, ["0 start first"], "not tried again, and nothing after it");
+    }
+}
+
+#[test]
+fn who_has_an_outcome_stopped_is_asked_where_an_emergency_stop_leads() {
+    let task = "
+task: stopped
+states:
+  - first: { action: arm/lift, pia: true, effects: [], resources: [{ block: Arm }], transitions: { success: done, stopped: rest } }
+  - rest: { action: head/turn, pia: true, effects: [], resources: [{ block: Head }] }
+  - done: { action: head/turn, pia: true, effects: [], resources: [{ block: Head }] }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let mut script = Script { outcomes: [("first", "stopped")].into(), ..Script::default() };
+        let run = simulate(task, mode, &mut script);
+        assert_eq!(at(&run, "start rest"), 1.0);
     }
 }

@@ -16,6 +16,7 @@
 //! - [`action::ActionServer`]: fencing, idempotent goals, one at a time where asked, cancel, bounded results; for leases that
 //!   end: `end_lease(id, reason)`.
 //! - [`worker::Worker`]: all of it in one builder, for `ratn worker …`.
+//! - [`safety::Safety`]: emergency stop and hold, for drivers of what moves; [`safety::SafetyClient`] asks for them.
 //!
 //! # Asking others
 //! - [`client::Channels`] keeps one channel per endpoint; [`client::ActionClient`], [`client::ResourceClient`],
@@ -33,6 +34,7 @@ pub mod gate;
 pub mod provider;
 pub mod robot_clock;
 pub mod runtime_directory;
+pub mod safety;
 pub mod server;
 pub mod session;
 pub mod shutdown;

@@ -9,6 +9,7 @@ use crate::client::{CallError, Channels};
 use crate::endpoint::Endpoint;
 use crate::provider::Provider;
 use crate::runtime_directory::publish_file;
+use crate::safety::Safety;
 use crate::server::{BindError, Exposure, ServeError, Services, bind_as};
 use crate::session::{DEFAULT_TTL, Session};
 use crate::shutdown;
@@ -82,6 +83,7 @@ pub enum WorkerError {
 pub struct Worker {
     options: WorkerOptions,
     actions: ActionServerBuilder,
+    safety: Option<Safety>,
     shutdown: CancellationToken,
 }
 
@@ -89,13 +91,20 @@ impl Worker {
     /// A worker without actions that takes one goal at a time.
     pub fn new(options: WorkerOptions) -> Worker {
         let actions = ActionServer::builder(options.id.clone()).one_at_a_time();
-        Worker { options, actions, shutdown: CancellationToken::new() }
+        Worker { options, actions, safety: None, shutdown: CancellationToken::new() }
     }
 
     /// With an action.
     #[must_use]
     pub fn action(mut self, action: impl Action) -> Worker {
         self.actions = self.actions.action(action);
+        self
+    }
+
+    /// With emergency stop and hold: a driver of something that moves.
+    #[must_use]
+    pub fn safety(mut self, safety: Safety) -> Worker {
+        self.safety = Some(safety);
         self
     }
 
@@ -111,7 +120,7 @@ impl Worker {
     /// # Errors
     /// [`WorkerError`].
     pub async fn run(self) -> Result<(), WorkerError> {
-        let Worker { options, actions, shutdown } = self;
+        let Worker { options, mut actions, safety, shutdown } = self;
         let system = |what: &str| {
             let what = what.to_owned();
             move |source| WorkerError::System { what, source }
@@ -121,10 +130,16 @@ impl Worker {
             shutdown::exit_with_parent(&shutdown).map_err(system("watch its parent"))?;
         }
         let channels = Channels::new();
+        if let Some(safety) = &safety {
+            actions = actions.safety(safety.clone());
+        }
         let server = actions.channels(channels.clone()).build();
         let bound = bind_as(&options.listen, &options.exposure).await?;
         let endpoint = bound.endpoint().clone();
-        let services = Services::new().with(server.clone().into_service());
+        let mut services = Services::new().with(server.clone().into_service());
+        if let Some(safety) = safety {
+            services = services.with(safety.into_service());
+        }
         let ends = shutdown.clone();
         let serving = tokio::spawn(async move {
             let served = bound.serve(services, ends.clone()).await;

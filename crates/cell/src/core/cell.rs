@@ -3,10 +3,11 @@
 //! ```text
 //! module:  idle ──Start──▶ active ──its time is over──▶ idle      (Ended: done, or aborted with the reason)
 //!                            ├──Stop──▶ idle, holds where it is   (Ended: preempted)
-//!                            └──LeaseEnded──▶ idle, holds         (Ended: aborted)
+//!                            ├──LeaseEnded──▶ idle, holds         (Ended: aborted)
+//!                            └──emergency stop──▶ idle, holds     (Ended: stopped)
 //! ```
 //! Time is the robot's and comes in with every event; what should have happened since the last one happens first, in its
-//! order. [`Cell::next_wake`] says when the next thing will happen by itself.
+//! order. What moves has a time of its own, which stands still during a hold. [`Cell::next_wake`] says when the next thing will happen by itself.
 
 use super::activity::{Activity, Kind, seconds};
 use super::battery::Battery;
@@ -21,6 +22,7 @@ use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::aimm;
 use ratn_motion::robot::{Configuration, Robot};
+use ratn_worker::safety::SafetyState;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::collections::BTreeMap;
 
@@ -31,6 +33,9 @@ pub struct Cell {
     pub(super) config: CellConfig,
     pub(super) pads: Pads,
     pub(super) now: Timestamp,
+    /// The time of what moves: as much behind `now` as everything was held.
+    pub(super) motion_time: Timestamp,
+    pub(super) safety: SafetyState,
     pub(super) resting: Configuration,
     pub(super) activities: BTreeMap<Module, Activity>,
     pub(super) leases: Leases,
@@ -59,7 +64,22 @@ impl Cell {
         let resting = first_posture(&config);
         let (battery, seed) = (Battery::new(config.battery), config.seed);
         let (now, activities, leases) = (Timestamp::default(), BTreeMap::new(), Leases::default());
-        Ok(Cell { robot, config, pads, now, resting, activities, leases, boxes, battery, seed, frames_taken: 0 })
+        let (motion_time, safety) = (now, SafetyState::Ready);
+        Ok(Cell {
+            robot,
+            config,
+            pads,
+            now,
+            motion_time,
+            safety,
+            resting,
+            activities,
+            leases,
+            boxes,
+            battery,
+            seed,
+            frames_taken: 0,
+        })
     }
 
     /// Time goes on to `now`, and then the event happens.
@@ -68,9 +88,11 @@ impl Cell {
         self.advance(now, &mut out);
         match event {
             Event::Start { ticket, lease, request } => {
-                if let Err(reason) = self.start(ticket, lease, request) {
-                    out.push(Command::Ended { ticket, ending: Ending::Aborted(reason) });
-                }
+                let refused = match &self.safety {
+                    SafetyState::Stopped { reason } => Some(Ending::Stopped(reason.clone())),
+                    _ => self.start(ticket, lease, request).err().map(Ending::Aborted),
+                };
+                out.extend(refused.map(|ending| Command::Ended { ticket, ending }));
             }
             Event::Stop { ticket, reason } => {
                 self.hold(|a| a.ticket == ticket, |_| Ending::Preempted(reason.clone()), &mut out);
@@ -91,6 +113,12 @@ impl Cell {
                 self.hold(|a| a.lease.is_some_and(|lease| !living.contains(&lease)), ending, &mut out);
                 self.leases.are(living, youngest);
             }
+            Event::Safety { state } => {
+                if let SafetyState::Stopped { reason } = &state {
+                    self.hold(|_| true, |_| Ending::Stopped(reason.clone()), &mut out);
+                }
+                self.safety = state;
+            }
             Event::Reset { seed, boxes } => self.reset(seed, boxes, &mut out),
             Event::Tick => {}
         }
@@ -99,17 +127,18 @@ impl Cell {
 
     /// When something will happen by itself.
     pub fn next_wake(&self) -> Option<Timestamp> {
-        self.activities.values().map(|a| a.ends).min()
+        let ends = self.activities.values().map(|a| a.ends).min()?;
+        if self.is_held() { None } else { Some(self.real_time(ends)) }
     }
 
     /// Where the joints are.
     pub fn configuration(&self) -> Configuration {
         let mut configuration = self.resting;
         for activity in self.activities.values() {
-            configuration.arm = activity.arm(self.now).unwrap_or(configuration.arm);
-            configuration.finger = activity.finger(self.now).unwrap_or(configuration.finger);
+            configuration.arm = activity.arm(self.motion_time).unwrap_or(configuration.arm);
+            configuration.finger = activity.finger(self.motion_time).unwrap_or(configuration.finger);
             [configuration.pan, configuration.tilt] =
-                activity.head(self.now).unwrap_or([configuration.pan, configuration.tilt]);
+                activity.head(self.motion_time).unwrap_or([configuration.pan, configuration.tilt]);
         }
         configuration
     }
@@ -158,11 +187,21 @@ impl Cell {
         Scene { base: Pose::IDENTITY, objects: boxes.chain([placement::table()]).collect() }
     }
 
+    fn is_held(&self) -> bool {
+        matches!(self.safety, SafetyState::Held { .. })
+    }
+
+    /// When the time of what moves will be that, unless it is held.
+    fn real_time(&self, motion_time: Timestamp) -> Timestamp {
+        motion_time + self.now.since(self.motion_time)
+    }
+
     fn advance(&mut self, now: Timestamp, out: &mut Vec<Command>) {
         loop {
             let frame = self.activities.get(&Module::Camera).and_then(next_frame);
-            let due = self.next_wake().into_iter().chain(frame).min().filter(|t| *t <= now);
-            self.pass_until(due.unwrap_or(now));
+            let due = self.activities.values().map(|a| a.ends).chain(frame).min();
+            let due = due.filter(|due| !self.is_held() && self.real_time(*due) <= now);
+            self.pass_until(due.map_or(now, |due| self.real_time(due)));
             let Some(due) = due else { break };
             if frame.is_some_and(|f| f <= due) {
                 self.expose();
@@ -179,8 +218,12 @@ impl Cell {
     }
 
     fn pass_until(&mut self, time: Timestamp) {
-        self.battery.drain(time.since(self.now), self.is_active(Module::Arm));
+        let passed = time.since(self.now);
+        self.battery.drain(passed, self.is_active(Module::Arm) && !self.is_held());
         self.now = self.now.max(time);
+        if !self.is_held() {
+            self.motion_time = self.motion_time + passed;
+        }
     }
 
     fn finish(&mut self, module: Module, out: &mut Vec<Command>) {

@@ -7,6 +7,7 @@ use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
 use ratn_motion::robot::Joints;
 use ratn_perception::camera::Camera;
+use ratn_worker::safety::SafetyState;
 use std::collections::BTreeSet;
 
 /// What happens to the cell.
@@ -51,6 +52,11 @@ pub enum Event {
         living: BTreeSet<LeaseId>,
         /// The last that was given, living or not.
         youngest: LeaseId,
+    },
+    /// An emergency stop or a hold is in force from now on, or neither.
+    Safety {
+        /// Which.
+        state: SafetyState,
     },
     /// A new table; the robot goes back to its first posture.
     Reset {
@@ -120,6 +126,8 @@ pub enum Ending {
     Aborted(String),
     /// It was stopped. The module holds.
     Preempted(String),
+    /// By an emergency stop, before or after it began. The module holds.
+    Stopped(String),
 }
 
 /// What comes of a goal.

@@ -66,12 +66,12 @@ impl Cell {
                 }
                 let camera = Camera { intrinsics: self.config.camera.intrinsics, pose: self.robot.camera_pose(&here) };
                 let period = 1.0 / self.config.camera.frames_per_s;
-                let next = self.now + seconds(period);
+                let next = self.motion_time + seconds(period);
                 let kind = Kind::Capture { camera, frames, taken: 0, next, exposures: Vec::new() };
                 (kind, period * f64::from(frames))
             }
         };
-        let (started, ends) = (self.now, self.now + seconds(lasts_s));
+        let (started, ends) = (self.motion_time, self.motion_time + seconds(lasts_s));
         self.activities.insert(module, Activity { ticket, lease, started, ends, kind });
         Ok(())
     }

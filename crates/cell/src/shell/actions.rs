@@ -8,6 +8,7 @@ use ratn_model::value::Value;
 use ratn_perception::noise::MAX_FRAMES;
 use ratn_worker::action::{Action, ActionFailure, ActionResult, ActionServer, GoalContext, GoalOutcome};
 use ratn_worker::client::Channels;
+use ratn_worker::safety::Safety;
 
 /// How fast `move_to` goes unless told otherwise, as a fraction of the limits: a line that nobody planned is taken with care.
 const MOVE_TO_SPEED: f64 = 0.2;
@@ -24,8 +25,8 @@ pub(crate) fn resource_id(module: Module, host: &str) -> String {
 }
 
 /// The server of all modules. Each takes one goal at a time, under a lease of its own resource.
-pub(crate) fn server(keeper: &Keeper, config: &CellConfig, channels: Channels) -> ActionServer {
-    let mut builder = ActionServer::builder("").one_at_a_time().channels(channels);
+pub(crate) fn server(keeper: &Keeper, config: &CellConfig, channels: Channels, safety: Safety) -> ActionServer {
+    let mut builder = ActionServer::builder("").one_at_a_time().channels(channels).safety(safety);
     for (module, name, description, read) in ACTIONS {
         builder = builder.action(ModuleAction {
             name,
@@ -91,7 +92,7 @@ impl Action for ModuleAction {
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let request = (self.read)(&goal)?;
-        goal.checkpoint()?;
+        goal.while_held().await?;
         let mut motion = self.keeper.perform(goal.lease.as_ref().map(|lease| lease.id), request)?;
         let ending = tokio::select! {
             biased;
@@ -106,6 +107,7 @@ impl Action for ModuleAction {
             Ending::Done(product) => self.outcome(product).await,
             Ending::Aborted(reason) => Err(ActionFailure::Aborted(reason)),
             Ending::Preempted(reason) => Err(ActionFailure::Preempted(reason)),
+            Ending::Stopped(reason) => Err(ActionFailure::emergency_stop(&reason)),
         }
     }
 }

@@ -11,6 +11,7 @@ use ratn_motion::robot::{Joints, Robot};
 use ratn_perception::camera::{Camera, DepthImage};
 use ratn_perception::noise::Noise;
 use ratn_worker::robot_clock::RobotClock;
+use ratn_worker::safety::{Brakes, SafetyState};
 use std::collections::BTreeMap;
 use std::io;
 use std::sync::Arc;
@@ -78,6 +79,7 @@ struct Letter {
 enum Message {
     Start { ticket: Ticket, lease: Option<LeaseId>, request: Request, ended: oneshot::Sender<Ending> },
     Happened(Event),
+    Safety { state: SafetyState, applied: oneshot::Sender<()> },
     Reset { seed: u64, boxes: usize, state: oneshot::Sender<State> },
     State(oneshot::Sender<State>),
 }
@@ -142,6 +144,17 @@ impl Keeper {
     }
 }
 
+#[tonic::async_trait]
+impl Brakes for Keeper {
+    /// Never refused for want of room.
+    async fn apply(&self, state: &SafetyState) -> Result<(), String> {
+        let (applied, done) = oneshot::channel();
+        let message = Message::Safety { state: state.clone(), applied };
+        self.messages.send(Letter { message, _room: None }).map_err(|_| KeeperError::Ended.to_string())?;
+        done.await.map_err(|_| KeeperError::Ended.to_string())
+    }
+}
+
 impl Motion {
     /// How it ends.
     pub(crate) async fn ended(&mut self) -> Result<Ending, KeeperError> {
@@ -182,8 +195,13 @@ fn keep(mut cell: Cell, clock: RobotClock, inbox: &Receiver<Letter>) {
             Err(RecvTimeoutError::Disconnected) => return,
         };
         let now = clock.now();
+        let mut safety = None;
         let (event, asked) = match message {
             None => (Event::Tick, None),
+            Some(Message::Safety { state, applied }) => {
+                safety = Some(applied);
+                (Event::Safety { state }, None)
+            }
             Some(Message::Start { ticket, lease, request, ended }) => {
                 waiting.insert(ticket, ended);
                 (Event::Start { ticket, lease, request }, None)
@@ -197,6 +215,9 @@ fn keep(mut cell: Cell, clock: RobotClock, inbox: &Receiver<Letter>) {
                 // Whoever asked may be gone.
                 let _ = ended.send(ending);
             }
+        }
+        if let Some(applied) = safety {
+            let _ = applied.send(());
         }
         if let Some(state) = asked {
             let _ = state.send(state_of(&cell, now));

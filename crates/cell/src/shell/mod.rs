@@ -20,11 +20,15 @@ use ratn_proto::v1::cell_service_server::CellServiceServer;
 use ratn_worker::client::Channels;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::safety::Safety;
 use ratn_worker::server::{Services, Serving, bind_as};
 use tokio_util::sync::CancellationToken;
 
 /// The role's name: of its endpoint file, its command and its section of a config.
 pub const ROLE: &str = "cell";
+
+/// In the runtime directory while an emergency stop is in force: a cell that is started again is still stopped.
+const STOPPED_FILE: &str = "cell.stopped";
 
 /// Serves until `shutdown` is cancelled. The modules' resources are there as soon as the resource manager is.
 ///
@@ -52,9 +56,13 @@ pub async fn run_as(
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let channels = Channels::new();
-    let server = actions::server(&keeper, &config, channels.clone());
+    let stopped = directory.path().join(STOPPED_FILE);
+    let safety = Safety::kept_in(stopped.clone(), keeper.clone()).await;
+    let safety = safety.with_context(|| format!("cannot tell from {} whether it is stopped", stopped.display()))?;
+    let server = actions::server(&keeper, &config, channels.clone(), safety.clone());
     let services = Services::new()
         .with(server.clone().into_service())
+        .with(safety.into_service())
         .with(CellServiceServer::new(service::Service::new(keeper.clone())));
     let link =
         link::Link { config, directory: directory.clone(), channels, endpoint: endpoint.clone(), keeper, server };

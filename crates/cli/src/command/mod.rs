@@ -12,6 +12,7 @@ mod reset;
 pub(crate) mod resource;
 mod roles;
 mod run;
+mod safety;
 mod simulate;
 mod state;
 mod tables;
@@ -43,6 +44,9 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Pool(arguments) => pool::run(&arguments),
         Command::Restart(arguments) => pool::restart(&arguments),
         Command::Drain(arguments) => pool::drain(&arguments),
+        Command::Stop(arguments) => safety::stop(&arguments),
+        Command::Hold(arguments) => safety::hold(&arguments),
+        Command::GoOn(arguments) => safety::go_on(&arguments),
         Command::Reset(arguments) => reset::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Resource(arguments) => resource::run(&arguments),

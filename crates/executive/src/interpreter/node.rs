@@ -10,7 +10,7 @@ use crate::protocol::{Command, Goal, Note};
 use ratn_model::expression::FactExpr;
 use ratn_model::fact::{FactKey, Footprint};
 use ratn_model::id::StateId;
-use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, StateKind, WORLD_MODEL};
+use ratn_model::program::{ABORTED, PREEMPTED, STOPPED, SUCCESS, StateKind, WORLD_MODEL};
 use ratn_model::resource::Lease;
 use ratn_model::value::Value;
 
@@ -217,6 +217,9 @@ impl Interpreter {
         {
             outputs.clear();
             aborted(&mut outcome, problem);
+        }
+        if outcome == STOPPED && !program.outcomes(id).any(|known| known == STOPPED) {
+            PREEMPTED.clone_into(&mut outcome);
         }
         if !program.outcomes(id).any(|known| known == outcome) {
             let problem = format!("it ended with `{outcome}`, which is no outcome of its action");

@@ -48,7 +48,7 @@ use instance::{Changed, Ended, Instance, Line, Role, Segment, Status, Wait};
 use instances::Instances;
 use plan::{Plan, Predicate};
 use ratn_model::id::InstanceId;
-use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind};
+use ratn_model::program::{ABORTED, PREEMPTED, Program, STOPPED, SUCCESS, StateKind};
 use ratn_model::resource::Quantity;
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
@@ -514,6 +514,9 @@ impl Window {
             && let Some(problem) = binding::missing_output(outputs, &ended.outputs)
         {
             ended = Ended { changes: ended.changes, ..Ended::aborted(problem) };
+        }
+        if &*ended.outcome == STOPPED && self.plan.state(instance.state).outcome(STOPPED).is_none() {
+            ended.outcome = PREEMPTED.into();
         }
         if self.plan.state(instance.state).outcome(&ended.outcome).is_none() {
             let problem = format!("it ended with `{}`, which is no outcome of its action", ended.outcome);

@@ -4,6 +4,7 @@ use super::goal::GoalEntry;
 use super::{ActionFailure, InputError, Port};
 use crate::client::{ActionClient, CallError, Channels, WorldClient};
 use crate::endpoint::{Endpoint, EndpointError};
+use crate::safety::{Safety, SafetyState};
 use ratn_model::fact::{Change, FactPattern};
 use ratn_model::id::ProjectionId;
 use ratn_model::pose::Pose;
@@ -37,6 +38,7 @@ pub struct GoalContext {
     pub cancelled: CancellationToken,
     world_pool: String,
     channels: Channels,
+    pub(super) safety: Safety,
     entry: Arc<GoalEntry>,
     calls: AtomicU32,
 }
@@ -104,7 +106,7 @@ pub enum CallFailure {
 }
 
 impl GoalContext {
-    pub(crate) fn new(goal: Goal, entry: Arc<GoalEntry>, channels: Channels) -> GoalContext {
+    pub(crate) fn new(goal: Goal, entry: Arc<GoalEntry>, channels: Channels, safety: Safety) -> GoalContext {
         GoalContext {
             id: goal.id,
             action: goal.action,
@@ -115,6 +117,7 @@ impl GoalContext {
             cancelled: entry.cancelled.clone(),
             world_pool: goal.world_pool,
             channels,
+            safety,
             entry,
             calls: AtomicU32::new(0),
         }
@@ -201,7 +204,20 @@ impl GoalContext {
         if self.cancelled.is_cancelled() { Err(self.stopped()) } else { Ok(()) }
     }
 
-    /// What a goal that was told to stop comes to: `preempted`, or `aborted` where its lease ended.
+    /// Returns at once where no hold is in force, else when it is over: for an action that moves something in steps, between them.
+    ///
+    /// # Errors
+    /// [`GoalContext::stopped`].
+    pub async fn while_held(&self) -> Result<(), ActionFailure> {
+        let mut state = self.safety.watch();
+        let over = async {
+            // The sender is in the goal's server.
+            let _ = state.wait_for(|state| !matches!(state, SafetyState::Held { .. })).await;
+        };
+        self.unless_cancelled(over).await
+    }
+
+    /// What a goal that was told to stop comes to: `preempted`, `aborted` where its lease ended, `stopped` by an emergency stop.
     pub fn stopped(&self) -> ActionFailure {
         self.entry.stopped()
     }

@@ -31,6 +31,8 @@ pub(crate) enum StopCause {
     LeaseEnded(String),
     /// The provider ends.
     ShuttingDown,
+    /// An emergency stop, and why.
+    EmergencyStop(String),
 }
 
 /// How a goal ended.
@@ -59,6 +61,7 @@ impl StopCause {
             }
             StopCause::LeaseEnded(reason) => ActionFailure::Aborted(format!("the lease ended: {reason}")),
             StopCause::ShuttingDown => ActionFailure::Aborted("the provider shuts down".to_owned()),
+            StopCause::EmergencyStop(reason) => ActionFailure::emergency_stop(reason),
         }
     }
 }

@@ -2,8 +2,8 @@
 //!
 //! ```text
 //! execute ─ unknown action, stale token, busy ──────────────→ refused (a gRPC status)
-//!    └→ accepted → progress* → result: success | the action's own | aborted | preempted
-//!                      └─ cancel, deadline, lease over, nobody listens: `cancelled` fires, the action ends itself
+//!    └→ accepted → progress* → result: success | the action's own | aborted | preempted | stopped
+//!                      └─ cancel, deadline, lease over, nobody listens, emergency stop: `cancelled` fires, the action ends itself
 //! ```
 //!
 //! An [`Action`] gets a [`GoalContext`] and returns an outcome; `?` on anything that is an error makes it `aborted` with
@@ -59,12 +59,19 @@ pub enum ActionFailure {
     Aborted(String),
     /// It was told to stop: the outcome is `preempted`.
     Preempted(String),
+    /// An emergency stop is in force: the outcome is `stopped`.
+    Stopped(String),
 }
 
 impl ActionFailure {
     /// It failed, and why.
     pub fn aborted(reason: impl Into<String>) -> ActionFailure {
         ActionFailure::Aborted(reason.into())
+    }
+
+    /// An emergency stop is in force, and why.
+    pub fn emergency_stop(reason: &str) -> ActionFailure {
+        ActionFailure::Stopped(format!("emergency stop: {reason}"))
     }
 }
 
@@ -79,6 +86,7 @@ impl From<ActionFailure> for GoalOutcome {
         match failure {
             ActionFailure::Aborted(reason) => GoalOutcome::aborted(reason),
             ActionFailure::Preempted(reason) => GoalOutcome::preempted(reason),
+            ActionFailure::Stopped(reason) => GoalOutcome::stopped(reason),
         }
     }
 }

@@ -5,6 +5,7 @@ use super::goal::{Ending, GoalEntry, StopCause};
 use super::service::Messages;
 use super::{Action, ActionFailure, ActionResult, GoalContext};
 use crate::client::Channels;
+use crate::safety::{Safety, SafetyState};
 use crate::trace;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_proto::types::{Goal, GoalOutcome};
@@ -38,6 +39,7 @@ pub struct ActionServerBuilder {
     one_at_a_time: bool,
     results_kept: Option<usize>,
     channels: Channels,
+    safety: Safety,
 }
 
 pub(super) struct Inner {
@@ -46,6 +48,7 @@ pub(super) struct Inner {
     one_at_a_time: bool,
     results_kept: usize,
     channels: Channels,
+    safety: Safety,
     state: Mutex<State>,
 }
 
@@ -98,6 +101,13 @@ impl ActionServerBuilder {
         self
     }
 
+    /// Its goals end, and further ones are not begun, while an emergency stop is in force: for what moves something.
+    #[must_use]
+    pub fn safety(mut self, safety: Safety) -> ActionServerBuilder {
+        self.safety = safety;
+        self
+    }
+
     /// The server.
     pub fn build(self) -> ActionServer {
         ActionServer {
@@ -107,6 +117,7 @@ impl ActionServerBuilder {
                 one_at_a_time: self.one_at_a_time,
                 results_kept: self.results_kept.unwrap_or(RESULTS_KEPT),
                 channels: self.channels,
+                safety: self.safety,
                 state: Mutex::default(),
             }),
         }
@@ -181,7 +192,8 @@ impl ActionServer {
                     // Listens before the action can say anything.
                     let messages = Messages::of(&entry, false);
                     let deadline_ms = goal.deadline_ms;
-                    let context = GoalContext::new(goal, Arc::clone(&entry), self.inner.channels.clone());
+                    let (channels, safety) = (self.inner.channels.clone(), self.inner.safety.clone());
+                    let context = GoalContext::new(goal, Arc::clone(&entry), channels, safety);
                     let running = run(Arc::clone(&self.inner), entry, action, context, deadline_ms);
                     tokio::spawn(trace::within_any(trace::current(), running).in_current_span());
                     return Ok(messages);
@@ -270,7 +282,12 @@ async fn run(
     deadline_ms: u64,
 ) {
     tracing::debug!(goal = %entry.id, action = %context.action, "begun");
-    let performing = trace::within_any(trace::current(), async move { action.execute(context).await });
+    let performing = trace::within_any(trace::current(), async move {
+        match context.safety.state() {
+            SafetyState::Stopped { reason } => Err(ActionFailure::emergency_stop(&reason)),
+            _ => action.execute(context).await,
+        }
+    });
     let mut performing = tokio::spawn(performing.in_current_span());
     let deadline = async {
         if deadline_ms > 0 {
@@ -278,6 +295,10 @@ async fn run(
             entry.stop(StopCause::Deadline);
         }
         // It only tells the goal to stop; the goal ends by itself, or is overdue.
+        std::future::pending::<Infallible>().await
+    };
+    let stopped = async {
+        entry.stop(StopCause::EmergencyStop(server.safety.stopped().await));
         std::future::pending::<Infallible>().await
     };
     let overdue = async {
@@ -289,10 +310,17 @@ async fn run(
         performed = &mut performing => outcome_of(performed),
         () = overdue => {
             performing.abort();
-            let (ActionFailure::Aborted(cause) | ActionFailure::Preempted(cause)) = entry.stopped();
+            let (ActionFailure::Aborted(cause) | ActionFailure::Preempted(cause) | ActionFailure::Stopped(cause)) =
+                entry.stopped();
             GoalOutcome::aborted(format!("{cause}; it did not stop within {} s", STOP_GRACE.as_secs()))
         }
         never = deadline => match never {},
+        never = stopped => match never {},
+    };
+    let outcome = match entry.cause() {
+        // Whatever the action makes of being stopped.
+        Some(cause @ StopCause::EmergencyStop(_)) if !outcome.is_success() => cause.failure().into(),
+        _ => outcome,
     };
     tracing::debug!(goal = %entry.id, outcome = %outcome.outcome, reason = %outcome.reason, "ended");
     // No longer running before anybody hears of its end: the next goal must find its place free.

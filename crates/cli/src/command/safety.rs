@@ -1,0 +1,138 @@
+//! `ratn stop`, `ratn hold`, `ratn go-on`: emergency stop and hold of every driver of a system.
+//!
+//! Drivers are the cell of this machine, which is asked at once, and whoever offers a resource of class module, as the resource
+//! manager tells: without it the cell is stopped all the same. Exit code 0 only where everybody has confirmed.
+
+use super::blocking_on;
+use crate::arguments::{GoOnArguments, HoldArguments, SafetyArguments, StopArguments};
+use crate::columns::columns;
+use crate::failure::Failure;
+use crate::output;
+use crate::system::public_directory;
+use anyhow::anyhow;
+use futures::future::join_all;
+use ratn_daemon::resource_manager;
+use ratn_model::resource::ResourceClass;
+use ratn_proto::types::ResourceFilter;
+use ratn_worker::client::{CallError, Channels, ResourceClient};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::safety::{SafetyClient, SafetyState};
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+use tokio::time::timeout;
+
+/// Who has not answered by then has not confirmed.
+const ANSWER_DEADLINE: Duration = Duration::from_secs(3);
+
+/// What is asked of every driver.
+#[derive(Debug, Clone)]
+enum Question {
+    Stop(String),
+    Clear,
+    Hold(String),
+    GoOn,
+    Show,
+}
+
+type Answers = BTreeMap<Endpoint, Result<SafetyState, String>>;
+
+/// `ratn stop`
+pub(crate) fn stop(arguments: &StopArguments) -> Result<(), Failure> {
+    let question = match (arguments.clear, arguments.show) {
+        (true, _) => Question::Clear,
+        (_, true) => Question::Show,
+        _ => Question::Stop(reason(&arguments.reason)),
+    };
+    ask_all(&arguments.drivers, &question)
+}
+
+/// `ratn hold`
+pub(crate) fn hold(arguments: &HoldArguments) -> Result<(), Failure> {
+    ask_all(&arguments.drivers, &Question::Hold(reason(&arguments.reason)))
+}
+
+/// `ratn go-on`
+pub(crate) fn go_on(arguments: &GoOnArguments) -> Result<(), Failure> {
+    ask_all(&arguments.drivers, &Question::GoOn)
+}
+
+fn reason(said: &Option<String>) -> String {
+    said.clone().unwrap_or_else(|| format!("by the user with uid {}", nix::unistd::getuid()))
+}
+
+fn ask_all(arguments: &SafetyArguments, question: &Question) -> Result<(), Failure> {
+    blocking_on(tokio::runtime::Builder::new_current_thread(), async {
+        let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
+        let channels = Channels::new();
+        let known: BTreeSet<Endpoint> =
+            arguments.endpoint.iter().cloned().chain(directory.find(ratn_cell::ROLE)).collect();
+        // Whoever is known is asked while the others are looked for.
+        let (mut answers, offered) = tokio::join!(ask(&channels, question, &known), drivers(&channels, &directory));
+        let others = match offered {
+            Ok(offered) => offered.difference(&known).cloned().collect(),
+            Err(reason) if known.is_empty() => {
+                return Err(Failure::Refused(format!("ratn: no driver is known: {reason}")));
+            }
+            Err(reason) => {
+                output::progress(format_args!("only the drivers of this machine are asked: {reason}"));
+                BTreeSet::new()
+            }
+        };
+        answers.extend(ask(&channels, question, &others).await);
+        if answers.is_empty() {
+            return Err(Failure::Refused("ratn: no driver of this system offers anything that moves".to_owned()));
+        }
+        output::result(table(&answers))?;
+        let silent = answers.values().filter(|answer| answer.is_err()).count();
+        match silent {
+            0 => Ok(()),
+            _ => Err(anyhow!("{silent} of {} drivers did not confirm: go and look", answers.len()).into()),
+        }
+    })
+}
+
+/// Where the modules of the system are served.
+async fn drivers(channels: &Channels, directory: &RuntimeDirectory) -> Result<BTreeSet<Endpoint>, String> {
+    let manager = directory.find(resource_manager::ROLE).map_err(|error| error.to_string())?;
+    let client = ResourceClient::new(channels, &manager, "").map_err(|error| error.to_string())?;
+    let modules = ResourceFilter { class: Some(ResourceClass::Module), ..ResourceFilter::default() };
+    let listed = timeout(ANSWER_DEADLINE, client.list_where(modules)).await;
+    let listed = listed.map_err(|_| "the resource manager does not answer".to_owned())?;
+    let listed = listed.map_err(|error| error.to_string())?;
+    Ok(listed.iter().filter_map(|resource| resource.endpoint().parse().ok()).collect())
+}
+
+async fn ask(channels: &Channels, question: &Question, drivers: &BTreeSet<Endpoint>) -> Answers {
+    let one = async |endpoint: &Endpoint| {
+        let answer = timeout(ANSWER_DEADLINE, put(channels, question, endpoint)).await;
+        let late = || format!("no answer within {} s", ANSWER_DEADLINE.as_secs());
+        let answer = answer.map_err(|_| late()).and_then(|answer| answer.map_err(|error| error.to_string()));
+        (endpoint.clone(), answer)
+    };
+    join_all(drivers.iter().map(one)).await.into_iter().collect()
+}
+
+async fn put(channels: &Channels, question: &Question, endpoint: &Endpoint) -> Result<SafetyState, CallError> {
+    let driver = SafetyClient::new(channels, endpoint)?;
+    match question {
+        Question::Stop(reason) => driver.stop(reason).await,
+        Question::Clear => driver.clear().await,
+        Question::Hold(reason) => driver.hold(reason).await,
+        Question::GoOn => driver.go_on().await,
+        Question::Show => driver.state().await,
+    }
+}
+
+fn table(answers: &Answers) -> String {
+    let row = |(endpoint, answer): (&Endpoint, &Result<SafetyState, String>)| {
+        let (state, reason) = match answer {
+            Ok(SafetyState::Ready) => ("ready", ""),
+            Ok(SafetyState::Held { reason }) => ("held", reason.as_str()),
+            Ok(SafetyState::Stopped { reason }) => ("stopped", reason.as_str()),
+            Err(reason) => ("NOT CONFIRMED", reason.as_str()),
+        };
+        [endpoint.to_string(), state.to_owned(), reason.to_owned()]
+    };
+    columns(&["DRIVER", "STATE", "REASON"], answers.iter().map(row).collect())
+}
