@@ -2,20 +2,22 @@
 //!
 //! A [`Checker`] is made once per scene: what stands still (objects, base, mast) becomes a flat array of obstacles, what the
 //! arm moves (links, hand, fingers, the held object) an array of moving shapes. Bounding spheres decide most pairs, parry3d
-//! decides the rest. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
+//! decides the rest. It says what touches what and how deep, and where contact is allowed; free motions are searched with the
+//! vector checks of `arm` and `space`. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
 //! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is.
 
+use crate::arm::{finger_around_held, is_neighbour};
 use crate::frame::compose;
 use crate::robot::{Body, Configuration, Geometry, Joints, Robot, to_f32};
 use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::query;
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
-use ratn_world::scene::{Placement, Scene, Shape};
+use ratn_world::scene::{Placement, Scene};
 use std::fmt;
 
-/// How much room the planner keeps around the moving shapes, in metres.
-pub const PADDING_M: f64 = 0.01;
+/// How much room the planner keeps around the moving shapes where it begins and ends, in metres.
+pub const PADDING_M: f64 = crate::arm::REACH_M;
 
 /// How deep the fingers and the held object may press into what they touch where contact is allowed, in metres: poses are
 /// measured, the arm is compliant.
@@ -108,8 +110,7 @@ impl<'a> Checker<'a> {
     /// A checker of `robot` in `scene`, with the pan-tilt unit at rest. The fingers are taken to be around what is held, else
     /// open.
     pub fn new(robot: &'a Robot, scene: &Scene, padding: f64) -> Checker<'a> {
-        let finger = held_width(scene).map_or(robot.finger().upper, |w| (w / 2.0).min(robot.finger().upper));
-        Checker::with_finger(robot, scene, padding, finger)
+        Checker::with_finger(robot, scene, padding, finger_around_held(robot, scene))
     }
 
     /// As [`Checker::new`], with each finger at `finger` metres from the middle.
@@ -203,40 +204,18 @@ impl<'a> Checker<'a> {
         for i in 0..self.moving.len() {
             let a = &self.moving[i];
             let obstacles = (0..self.obstacles.len())
-                .filter(|o| self.obstacles[*o].link.is_none_or(|link| !self.neighbours(a.link, link)))
+                .filter(|o| self.obstacles[*o].link.is_none_or(|link| !is_neighbour(self.robot, a.link, link)))
                 .collect();
             for j in i + 1..self.moving.len() {
                 let b = &self.moving[j];
                 let gripper = |m: &Moving| m.part != Part::Arm;
-                let touching = self.neighbours(a.link, b.link) || gripper(a) && gripper(b);
+                let touching = is_neighbour(self.robot, a.link, b.link) || gripper(a) && gripper(b);
                 if !touching {
                     self.pairs.push((i, j));
                 }
             }
             self.moving[i].obstacles = obstacles;
         }
-    }
-
-    /// Whether two links are at most one link with a shape apart.
-    fn neighbours(&self, a: usize, b: usize) -> bool {
-        let solid_parent = |mut link: usize| {
-            while let Some(parent) = self.robot.links[link].parent {
-                if !self.robot.links[parent].bodies.is_empty() {
-                    return Some(parent);
-                }
-                link = parent;
-            }
-            None
-        };
-        // A short link between two long ones hides their contact: the wrist's ball, the flange.
-        let close = |child: usize, parent: usize| {
-            solid_parent(child) == Some(parent)
-                || solid_parent(child).is_some_and(|middle| {
-                    let small = self.robot.links[middle].bodies.iter().all(|body| body.geometry.radius() < 0.07);
-                    small && solid_parent(middle) == Some(parent)
-                })
-        };
-        a == b || close(a, b) || close(b, a)
     }
 
     fn find_reach(&mut self) {
@@ -386,19 +365,12 @@ pub fn distance(a: &Joints, b: &Joints) -> f64 {
     (0..7).map(|j| (a[j] - b[j]).powi(2)).sum::<f64>().sqrt()
 }
 
+/// The length of a path, in radians.
+pub fn length(path: &[Joints]) -> f64 {
+    path.windows(2).map(|pair| distance(&pair[0], &pair[1])).sum()
+}
+
 /// Pairs that parry3d cannot decide count as touching; there are none among the primitives.
 fn intersects(pose_a: &Pose32, a: &SharedShape, pose_b: &Pose32, b: &SharedShape) -> bool {
     query::intersection_test(pose_a, &**a, pose_b, &**b).is_ok_and(|r| r.intersecting)
-}
-
-/// The extent of what is held along the tool's y axis.
-fn held_width(scene: &Scene) -> Option<f64> {
-    scene.objects.iter().find_map(|object| match (&object.placement, &object.shape) {
-        (Placement::Gripper(pose), Shape::Box { size }) => {
-            let axis = pose.inverse().rotate([0.0, 1.0, 0.0]);
-            Some((0..3).map(|i| axis[i].abs() * size[i]).sum())
-        }
-        (Placement::Gripper(_), Shape::Cylinder { radius, .. }) => Some(2.0 * radius),
-        _ => None,
-    })
 }

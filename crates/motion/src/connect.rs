@@ -101,7 +101,9 @@ pub fn connect(
         }
     }
     let ends: Vec<State> = free.iter().map(|g| goals[*g]).collect();
-    let (path, iterations) = grow(space, start, &ends, budget, control)?;
+    let (lower, upper) = (*space.limits().0, *space.limits().1);
+    let mut samples = Halton::new(space.joints(), budget.seed);
+    let (path, iterations) = grow(space, start, &ends, budget.iterations, || samples.next(&lower, &upper), control)?;
     let last = path[path.len() - 1];
     let goal = free.iter().copied().find(|g| goals[*g] == last).unwrap_or(free[0]);
     Ok(Route { path, goal, iterations })
@@ -137,16 +139,16 @@ pub fn mend(
     Ok(whole)
 }
 
-fn grow(
+/// Grows a tree from the start and one from all ends, which are free, until they meet; gives the path and the iterations.
+pub(crate) fn grow(
     space: &mut Space,
     start: &State,
     ends: &[State],
-    budget: Budget,
+    iterations: usize,
+    mut sample: impl FnMut() -> State,
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<(Vec<State>, usize), ConnectError> {
     let joints = space.joints();
-    let (lower, upper) = (*space.limits().0, *space.limits().1);
-    let mut samples = Halton::new(joints, budget.seed);
     let mut trees = [Tree::new(space.isa(), joints), Tree::new(space.isa(), joints)];
     trees[0].push(*start, 0);
     for (i, end) in ends.iter().enumerate() {
@@ -156,7 +158,7 @@ fn grow(
     let mut growing = 1;
     // Where nothing may be left between postures, an iteration takes as long as many others.
     let poll = if space.is_swept() { 1 } else { POLL };
-    for iteration in 1..=budget.iterations {
+    for iteration in 1..=iterations {
         if iteration % poll == 0 {
             match control(iteration) {
                 Control::Continue => {}
@@ -168,7 +170,7 @@ fn grow(
         if own.abs_diff(others) < own {
             growing = 1 - growing;
         }
-        let sample = samples.next(&lower, &upper);
+        let sample = sample();
         let (first, second) = trees.split_at_mut(1);
         let (tree, other) = if growing == 0 { (&mut first[0], &second[0]) } else { (&mut second[0], &first[0]) };
         let (near, far) = tree.nearest(&sample);
@@ -210,5 +212,5 @@ fn grow(
             return Ok((path, iteration));
         }
     }
-    Err(ConnectError::Exhausted { iterations: budget.iterations })
+    Err(ConnectError::Exhausted { iterations })
 }

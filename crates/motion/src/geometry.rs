@@ -41,6 +41,13 @@ pub enum Geometry {
     },
 }
 
+impl Body {
+    /// Its pose with the axis along z, for cylinders too.
+    pub(crate) fn upright(&self) -> Pose {
+        self.pose.compose(&self.geometry.turn().inverse())
+    }
+}
+
 impl Geometry {
     /// The shape for parry3d, grown by `padding` metres on every side.
     pub fn shape(&self, padding: f64) -> SharedShape {

@@ -4,7 +4,7 @@
 //! iterations the step is also drawn towards a preferred posture within the null space. Restarts from random postures give
 //! further solutions. Deterministic: the randomness comes from the caller.
 
-use crate::collision::{between, distance};
+use crate::collision::distance;
 use crate::frame::{compose, cross, difference, norm, rotate};
 use crate::robot::{Configuration, Joints, Motion, Robot};
 use rand::{Rng, RngExt};
@@ -88,15 +88,6 @@ impl<'a> Solver<'a> {
     pub fn random(&self, random: &mut impl Rng) -> Joints {
         let joints = self.robot.arm_joints();
         std::array::from_fn(|j| random.random_range(joints[j].lower..joints[j].upper))
-    }
-
-    /// A random posture within limits and within `room` radians per joint of the point `along` (0 to 1) of a straight line.
-    pub(crate) fn near_line(&self, from: &Joints, to: &Joints, along: f64, room: f64, random: &mut impl Rng) -> Joints {
-        let mut posture = between(from, to, along);
-        for q in &mut posture {
-            *q += room * random.random_range(-1.0..=1.0);
-        }
-        self.robot.clamp(&posture)
     }
 
     /// Up to `wanted` different postures for one pose from at most `attempts` descents, nearest to `near` first.

@@ -4,23 +4,23 @@
 //! hands in the seed.
 
 pub mod aimm;
+pub mod arm;
 pub mod collision;
 pub mod connect;
+mod ellipsoid;
 pub mod exact;
 mod frame;
 pub mod geometry;
 mod halton;
-mod improve;
 pub mod inverse;
 pub mod line;
 pub mod mechanism;
 pub mod pace;
 pub mod plan;
 pub mod problems;
+pub mod refine;
 mod request;
 pub mod robot;
-mod search;
-pub mod shorten;
 mod simd;
 pub mod simplify;
 pub mod space;

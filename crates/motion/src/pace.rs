@@ -35,6 +35,15 @@ pub(crate) enum Stop {
     Cancelled,
 }
 
+impl From<Control> for Stop {
+    fn from(control: Control) -> Stop {
+        match control {
+            Control::Cancelled => Stop::Cancelled,
+            Control::Continue | Control::TimeUp => Stop::TimeUp,
+        }
+    }
+}
+
 pub(crate) struct Pace<'c> {
     control: &'c mut dyn FnMut(Progress) -> Control,
     /// Iterations of search and improvement so far.
@@ -52,6 +61,11 @@ impl<'c> Pace<'c> {
             Control::TimeUp => Err(Stop::TimeUp),
             Control::Cancelled => Err(Stop::Cancelled),
         }
+    }
+
+    /// What the caller says, for those who ask it themselves.
+    pub(crate) fn answer(&mut self) -> Control {
+        (self.control)(Progress::Working)
     }
 
     pub(crate) fn poll(&mut self) -> Result<(), Stop> {

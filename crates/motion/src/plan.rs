@@ -5,20 +5,23 @@
 //! ```
 //!
 //! A goal is a list of alternatives, and a pose has many postures: every posture from which the approach is free is a
-//! candidate end of the free path. On straight parts the fingers and what they hold may touch their surroundings, the
-//! arm may not; on the free path nothing touches anything.
+//! candidate end of the free path. On straight parts, checked by exact shapes, the fingers and what they hold may touch their
+//! surroundings, the arm may not. On the free path nothing touches anything: it is searched with the vector checks, between
+//! postures that have room for them; where the start or a candidate has less, a short way out of there comes first.
 
-use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M, distance};
-use crate::improve::improve;
+use crate::arm::{self, finger_around_held, joints, state};
+use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M, distance, length};
+use crate::connect::{Budget, ConnectError, connect};
 use crate::inverse::{Solver, is_same};
 use crate::line::{LineError, line};
 use crate::pace::{Control, Pace, Progress, Stop};
+use crate::refine::{End, Refinement};
 pub use crate::request::{Goal, MAX_GOALS, MAX_STRAIGHT_M, MIN_SPEED, Request};
 use crate::robot::{Configuration, Joints, Robot};
-use crate::search::search;
-use crate::shorten::{length, shortcut};
+use crate::simplify::{path_length, shortened};
+use crate::space::{Space, State};
 use crate::timing::{Part, parameterise};
-use rand::SeedableRng;
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
@@ -33,8 +36,18 @@ const SOLUTIONS: [(usize, usize); 2] = [(4, 8), (8, 80)];
 /// Iterations of the search before it gives up by itself.
 const MAX_SEARCH_ITERATIONS: usize = 20_000;
 
-/// Shortcuts tried on the first path before anything else.
-const FIRST_SHORTCUTS: usize = 100;
+/// Postures tried around one that has no room, and how far away the last of them are, in radians per joint.
+const WAYS_OUT: usize = 100;
+const WAY_OUT_RAD: f64 = 0.4;
+
+/// The most candidates.
+const MAX_CANDIDATES: usize = 64;
+
+/// Of a hundred steps of improvement, those that look for a new candidate.
+const NEW_CANDIDATES: i32 = 8;
+
+/// A path must have become this much shorter to be worth a word, in radians.
+const LEAST_REPORT_RAD: f32 = 1e-3;
 
 /// A motion.
 #[derive(Debug, Clone, PartialEq)]
@@ -80,6 +93,12 @@ pub enum PlanError {
         /// What is in the way.
         reason: String,
     },
+    /// The start is free, but nothing around it.
+    #[error("at the start {reason}")]
+    NoRoom {
+        /// What is close.
+        reason: String,
+    },
     /// No alternative of the goal has a posture that is free.
     #[error("none of the {goals} goals can be reached: {}", reasons.join("; "))]
     NoGoal {
@@ -110,35 +129,32 @@ pub enum PlanError {
 
 /// A posture at the goal, with the straight part that leads to it.
 #[derive(Debug, Clone)]
-pub(crate) struct Candidate {
-    /// From the end of the free path to the goal; at least one posture.
-    pub(crate) approach: Vec<Joints>,
-    /// Length of the approach.
-    pub(crate) length_rad: f64,
+struct Candidate {
+    /// Where the free path ends.
+    door: State,
+    /// From there to the goal: the way in where the approach begins with little room, and the approach; at least one posture.
+    way_in: Option<Joints>,
+    approach: Vec<Joints>,
+    /// Length of both.
+    length_rad: f64,
 }
 
 impl Candidate {
-    /// Where the free path ends.
-    pub(crate) fn entry(&self) -> &Joints {
-        &self.approach[0]
+    fn end(&self) -> End {
+        End { state: self.door, rest: self.length_rad as f32 }
     }
 }
 
-/// A free path and the candidate it leads to.
-#[derive(Debug, Clone)]
-pub(crate) struct Way {
-    pub(crate) path: Vec<Joints>,
-    pub(crate) candidate: usize,
-}
-
 /// The tools and the knowledge of one planning.
-pub(crate) struct Planning<'a> {
-    pub(crate) checker: Checker<'a>,
-    pub(crate) solver: Solver<'a>,
-    pub(crate) random: ChaCha8Rng,
-    pub(crate) goals: Vec<Goal>,
-    pub(crate) approach_m: f64,
-    pub(crate) candidates: Vec<Candidate>,
+struct Planning<'a> {
+    robot: &'a Robot,
+    checker: Checker<'a>,
+    space: Space,
+    solver: Solver<'a>,
+    random: ChaCha8Rng,
+    goals: Vec<Goal>,
+    approach_m: f64,
+    candidates: Vec<Candidate>,
 }
 
 /// Plans a motion of the arm in a scene; `control` is asked at least every millisecond or so whether to go on.
@@ -154,7 +170,9 @@ pub fn plan(
     request.check(robot)?;
     let mut pace = Pace::new(control);
     let mut planning = Planning {
+        robot,
         checker: Checker::new(robot, scene, PADDING_M),
+        space: arm::space(robot, scene, finger_around_held(robot, scene)),
         solver: Solver::new(robot, &scene.base),
         random: ChaCha8Rng::seed_from_u64(request.seed),
         goals: request.goals.clone(),
@@ -169,29 +187,27 @@ pub fn plan(
         depart => depart?,
     };
     let start = depart[depart.len() - 1];
+    let door = planning.door(&start).ok_or_else(|| planning.no_room(&start))?;
+    let way_out = if door == state(&start) { 0.0 } else { distance(&start, &joints(robot, &door)) };
+    let before = length(&depart) + way_out;
     planning.find_candidates(&start, &mut pace)?;
 
-    let first = planning.first_way(&start, &mut pace)?;
-    let total = |planning: &Planning<'_>, way: &Way| {
-        length(&depart) + length(&way.path) + planning.candidates[way.candidate].length_rad
+    let (path, candidate) = planning.first_path(&start, &door, request.seed, &mut pace)?;
+    let first_length_rad = before + f64::from(path_length(&path)) + planning.candidates[candidate].length_rad;
+    let (path, candidate) = match pace.report(Progress::FirstPath { length_rad: first_length_rad }) {
+        Ok(()) => planning.improve(path, candidate, before, request, &mut pace)?,
+        Err(Stop::TimeUp) => (path, candidate),
+        Err(Stop::Cancelled) => return Err(PlanError::Cancelled),
     };
-    let first_length_rad = total(&planning, &first);
-    let mut best = first;
-    let improved = match pace.report(Progress::FirstPath { length_rad: first_length_rad }) {
-        Ok(()) => planning.shorten_first(&mut best, &mut pace),
-        stopped => stopped,
-    };
-    let improved = improved
-        .and_then(|()| improve(&mut planning, &mut best, length(&depart), request.improvement_iterations, &mut pace));
-    if let Err(Stop::Cancelled) = improved {
-        return Err(PlanError::Cancelled);
-    }
 
-    let length_rad = total(&planning, &best);
-    let approach = planning.candidates[best.candidate].approach.clone();
-    let end = approach[approach.len() - 1];
-    let parts = [Part::Straight(depart), Part::Free(best.path), Part::Straight(approach)];
-    let trajectory = parameterise(&mut planning.checker, &parts, request.speed);
+    let chosen = planning.candidates[candidate].clone();
+    let length_rad = before + f64::from(path_length(&path)) + chosen.length_rad;
+    let end = chosen.approach[chosen.approach.len() - 1];
+    let free = planning.whole(&start, &path, &chosen);
+    let parts = [Part::Straight(depart), Part::Free(free), Part::Straight(chosen.approach)];
+    let space = &mut planning.space;
+    let trajectory =
+        parameterise(robot, &parts, request.speed, &mut |from, to| space.is_free_motion(&state(from), &state(to)));
     let end_pose = robot.tool_pose(&Configuration { arm: end, ..Configuration::ZERO.with_base(&scene.base) });
     Ok(Plan { trajectory, end, end_pose, first_length_rad, length_rad, iterations: pace.iterations })
 }
@@ -258,7 +274,7 @@ impl Planning<'_> {
                 }
             }
             if !self.candidates.is_empty() {
-                let cost = |c: &Candidate| distance(near, c.entry()) + c.length_rad;
+                let cost = |c: &Candidate| distance(near, &joints(self.robot, &c.door)) + c.length_rad;
                 self.candidates.sort_by(|a, b| cost(a).total_cmp(&cost(b)));
                 return Ok(());
             }
@@ -293,7 +309,7 @@ impl Planning<'_> {
     }
 
     /// The goal posture with its approach, or why it is none.
-    pub(crate) fn candidate(&mut self, goal: &Joints) -> Result<Candidate, String> {
+    fn candidate(&mut self, goal: &Joints) -> Result<Candidate, String> {
         let mut approach = vec![*goal];
         if self.approach_m > 0.0 {
             let up = [0.0, 0.0, self.approach_m];
@@ -306,40 +322,147 @@ impl Planning<'_> {
         match self.checker.collision(&approach[0], Contact::None) {
             Some(collision) if self.approach_m > 0.0 => Err(format!("before the approach, {collision}")),
             Some(collision) => Err(format!("at the goal, {collision}")),
-            None => Ok(Candidate { length_rad: length(&approach), approach }),
+            None => self.with_door(approach),
         }
     }
 
-    /// The straight way where it is free, else what the search finds.
-    fn first_way(&mut self, start: &Joints, pace: &mut Pace<'_>) -> Result<Way, PlanError> {
-        for (i, candidate) in self.candidates.iter().enumerate() {
-            pace.iteration()?;
-            if self.checker.edge_is_free(start, candidate.entry(), Contact::None) {
-                return Ok(Way { path: vec![*start, *candidate.entry()], candidate: i });
-            }
+    fn with_door(&mut self, approach: Vec<Joints>) -> Result<Candidate, String> {
+        let entry = approach[0];
+        let door = self.door(&entry).ok_or_else(|| "there is too little room before the goal".to_owned())?;
+        let way_in = (door != state(&entry)).then(|| joints(self.robot, &door));
+        let length_rad = length(&approach) + way_in.map_or(0.0, |way_in| distance(&way_in, &entry));
+        Ok(Candidate { door, way_in, approach, length_rad })
+    }
+
+    /// The posture itself where the vector checks find room for it, else one close by that can be reached from it.
+    fn door(&mut self, posture: &Joints) -> Option<State> {
+        let here = state(posture);
+        if self.space.is_within(&here) && self.space.is_free(&here) {
+            return Some(here);
         }
-        let goals: Vec<Joints> = self.candidates.iter().map(|c| *c.entry()).collect();
-        let (solver, random) = (&self.solver, &mut self.random);
-        let mut sample = || solver.random(random);
-        match search(&mut self.checker, start, &goals, MAX_SEARCH_ITERATIONS, &mut sample, pace)? {
-            Some((path, candidate)) => Ok(Way { path, candidate }),
-            None => {
-                let collision = self.checker.edge_collision(start, &goals[0], Contact::None);
+        (1..=WAYS_OUT).find_map(|attempt| {
+            let radius = WAY_OUT_RAD * attempt as f64 / WAYS_OUT as f64;
+            let aside = posture.map(|q| q + radius * self.random.random_range(-1.0..=1.0));
+            let door = state(&self.robot.clamp(&aside));
+            let free = self.space.is_free(&door)
+                && self.checker.edge_is_free(posture, &joints(self.robot, &door), Contact::None);
+            free.then_some(door)
+        })
+    }
+
+    /// From the door at the start to that of a candidate.
+    fn first_path(
+        &mut self,
+        start: &Joints,
+        door: &State,
+        seed: u64,
+        pace: &mut Pace<'_>,
+    ) -> Result<(Vec<State>, usize), PlanError> {
+        let doors: Vec<State> = self.candidates.iter().map(|c| c.door).collect();
+        let budget = Budget { iterations: MAX_SEARCH_ITERATIONS, seed };
+        pace.iteration()?;
+        let route = connect(&mut self.space, door, &doors, budget, &mut |_| pace.answer());
+        match route {
+            Ok(route) => {
+                pace.iterations += route.iterations;
+                Ok((route.path, route.goal))
+            }
+            Err(ConnectError::Cancelled) => Err(PlanError::Cancelled),
+            Err(ConnectError::TimeUp { .. }) => Err(PlanError::TimeUp),
+            Err(_) => {
+                let collision = self.checker.edge_collision(start, &joints(self.robot, &doors[0]), Contact::None);
                 Err(PlanError::NoPath {
-                    postures: goals.len(),
-                    iterations: pace.iterations,
+                    postures: doors.len(),
+                    iterations: MAX_SEARCH_ITERATIONS,
                     collision: collision.map_or_else(|| "nothing is in the way".to_owned(), |c| c.to_string()),
                 })
             }
         }
     }
 
-    fn shorten_first(&mut self, way: &mut Way, pace: &mut Pace<'_>) -> Result<(), Stop> {
-        for _ in 0..FIRST_SHORTCUTS {
-            pace.iteration()?;
-            shortcut(&mut way.path, &mut self.checker, &mut self.random);
+    /// A shorter path and the candidate it leads to; `before` is the length of what lies before it.
+    fn improve(
+        &mut self,
+        path: Vec<State>,
+        candidate: usize,
+        before: f64,
+        request: &Request,
+        pace: &mut Pace<'_>,
+    ) -> Result<(Vec<State>, usize), PlanError> {
+        let short = match shortened(&mut self.space, &path, &mut |_| pace.answer()) {
+            Ok(short) => short,
+            Err(ConnectError::Cancelled) => return Err(PlanError::Cancelled),
+            Err(_) => path,
+        };
+        let ends = self.candidates.iter().map(Candidate::end).collect();
+        let mut refinement = Refinement::new(short, candidate, ends, request.seed);
+        let mut reported = refinement.length();
+        for _ in 0..request.improvement_iterations {
+            let stopped = pace.iteration().and_then(|()| {
+                if self.random.random_range(0..100) < NEW_CANDIDATES {
+                    self.find_another(&mut refinement);
+                } else {
+                    refinement.step(&mut self.space, &mut |_| pace.answer()).map_err(Stop::from)?;
+                }
+                let length = refinement.length();
+                if length < reported - LEAST_REPORT_RAD {
+                    reported = length;
+                    pace.report(Progress::Shorter { length_rad: before + f64::from(length) })?;
+                }
+                Ok(())
+            });
+            match stopped {
+                Ok(()) => {}
+                Err(Stop::TimeUp) => break,
+                Err(Stop::Cancelled) => return Err(PlanError::Cancelled),
+            }
         }
-        Ok(())
+        Ok((refinement.path().to_vec(), refinement.end()))
+    }
+
+    /// Looks for a posture at the goal that a shorter path could lead to.
+    fn find_another(&mut self, refinement: &mut Refinement) {
+        let goal = self.goals[self.random.random_range(0..self.goals.len())];
+        let Goal::Pose(pose) = goal else { return };
+        if self.candidates.len() >= MAX_CANDIDATES {
+            return;
+        }
+        let start = joints(self.robot, &refinement.path()[0]);
+        let along = self.random.random_range(0.0..=1.0) * path_length(refinement.path());
+        let near = joints(self.robot, &refinement.point(along).0);
+        let seed = near.map(|q| q + self.random.random_range(-0.5..0.5));
+        let bound = f64::from(refinement.length());
+        let Some(posture) = self.solver.descend(&pose, &seed, Some(&near)) else { return };
+        if distance(&start, &posture) >= bound * 1.1 {
+            return;
+        }
+        let Ok(candidate) = self.candidate(&posture) else { return };
+        if distance(&start, &joints(self.robot, &candidate.door)) + candidate.length_rad < bound {
+            refinement.add(candidate.end());
+            self.candidates.push(candidate);
+        }
+    }
+
+    /// The free path with its ways out and in, from the end of the departure to the beginning of the approach.
+    fn whole(&self, start: &Joints, path: &[State], candidate: &Candidate) -> Vec<Joints> {
+        let mut whole: Vec<Joints> = path.iter().map(|s| joints(self.robot, s)).collect();
+        if path[0] == state(start) {
+            whole[0] = *start;
+        } else {
+            whole.insert(0, *start);
+        }
+        let entry = candidate.approach[0];
+        match candidate.way_in {
+            None if whole.len() > 1 => *whole.last_mut().unwrap_or(&mut [0.0; 7]) = entry,
+            _ => whole.push(entry),
+        }
+        whole
+    }
+
+    fn no_room(&mut self, posture: &Joints) -> PlanError {
+        let collision = self.checker.collision(posture, Contact::None);
+        let reason = collision.map_or_else(|| "there is too little room to move".to_owned(), |c| c.to_string());
+        PlanError::NoRoom { reason }
     }
 }
 

@@ -55,7 +55,8 @@ pub fn simplify(
     short
 }
 
-fn shortened(
+/// As [`simplify`], as sure of what is between the postures as the space is.
+pub(crate) fn shortened(
     space: &mut Space,
     path: &[State],
     control: &mut dyn FnMut(usize) -> Control,

@@ -1,6 +1,6 @@
 //! Spheres that hold a shape: every point of it lies in one of them.
 //!
-//! A sphere stays itself. A round column is cut into slices, a box into cells; each piece gets its circumscribed sphere, so the
+//! A sphere stays itself. A round column is cut into slices, a box into cells; each piece gets a sphere around it, so the
 //! cover is complete by construction, and as tight as the pieces are small.
 
 use crate::geometry::{Body, Geometry};
@@ -22,41 +22,65 @@ pub struct Sphere {
 
 /// Spheres, in the link's frame, that hold a body.
 pub fn cover(body: &Body) -> Vec<Sphere> {
+    let least = match body.geometry {
+        Geometry::Box { half } => return placed(body, cells(half, least(half) * (1.0 + OVERSHOOT))),
+        Geometry::Cylinder { radius, half_length } if half_length < radius * OVERSHOOT => {
+            let half = [radius, half_length, radius];
+            return placed(body, cells(half, least(half) * (1.0 + OVERSHOOT)));
+        }
+        Geometry::Sphere { radius } | Geometry::Capsule { radius, .. } | Geometry::Cylinder { radius, .. } => radius,
+    };
+    cover_within(body, least * OVERSHOOT)
+}
+
+/// As [`cover`], standing out of the body by at most `overhang_m` metres, unless that takes too many pieces; the ends of a
+/// cylinder stand out further.
+pub fn cover_within(body: &Body, overhang_m: f64) -> Vec<Sphere> {
+    // A cube of half edge h stands out by (√3 - 1) h.
+    let cell = overhang_m / (3_f64.sqrt() - 1.0);
     let local = match body.geometry {
         Geometry::Sphere { radius } => vec![Sphere { centre: [0.0; 3], radius }],
-        Geometry::Box { half } => cells(half),
-        Geometry::Capsule { radius, half_length } => column(radius, half_length, 2),
-        Geometry::Cylinder { radius, half_length } => {
-            if half_length < radius * OVERSHOOT {
-                cells([radius, half_length, radius])
-            } else {
-                column(radius, half_length, 1)
-            }
+        Geometry::Box { half } => cells(half, cell),
+        Geometry::Capsule { radius, half_length } => beads(radius, half_length, overhang_m),
+        Geometry::Cylinder { radius, half_length } if half_length < radius * OVERSHOOT => {
+            cells([radius, half_length, radius], cell)
         }
+        Geometry::Cylinder { radius, half_length } => slices(radius, half_length, overhang_m),
     };
+    placed(body, local)
+}
+
+fn placed(body: &Body, local: Vec<Sphere>) -> Vec<Sphere> {
     local.into_iter().map(|s| Sphere { centre: body.pose.transform(s.centre), ..s }).collect()
 }
 
-/// Slices of a round column along the axis with this index; a cylinder's is parry's, y.
-fn column(radius: f64, half_length: f64, axis: usize) -> Vec<Sphere> {
-    // A slice of half height h stands out by sqrt(r² + h²) - r.
-    let reach = radius * ((1.0 + OVERSHOOT).powi(2) - 1.0).sqrt();
-    let pieces = pieces(half_length, reach);
-    let half = half_length / pieces as f64;
-    (0..pieces)
-        .map(|i| {
-            let mut centre = [0.0; 3];
-            centre[axis] = -half_length + half * (2 * i + 1) as f64;
-            // A capsule's caps are held because its last centres are at most `half` away from theirs.
-            let radius = if axis == 2 { radius + half } else { radius.hypot(half) };
-            Sphere { centre, radius }
-        })
-        .collect()
+fn least(half: [f64; 3]) -> f64 {
+    half.into_iter().fold(f64::INFINITY, f64::min)
 }
 
-fn cells(half: [f64; 3]) -> Vec<Sphere> {
-    let least = half.into_iter().fold(f64::INFINITY, f64::min);
-    let wanted = (least * (1.0 + OVERSHOOT)).max(half.into_iter().fold(0.0, f64::max) / MAX_PIECES as f64);
+/// Half the height of a slice of a round column that stands out by so much.
+fn slice(radius: f64, overhang: f64) -> f64 {
+    ((radius + overhang).powi(2) - radius.powi(2)).sqrt()
+}
+
+/// A capsule along z: spheres from the centre of one end to that of the other.
+fn beads(radius: f64, half_length: f64, overhang: f64) -> Vec<Sphere> {
+    let pieces = pieces(half_length, slice(radius, overhang));
+    let half = half_length / pieces as f64;
+    let at = |i: usize| -half_length + half * (2 * i) as f64;
+    (0..=pieces).map(|i| Sphere { centre: [0.0, 0.0, at(i)], radius: radius.hypot(half) }).collect()
+}
+
+/// A cylinder along y, as parry has it.
+fn slices(radius: f64, half_length: f64, overhang: f64) -> Vec<Sphere> {
+    let pieces = pieces(half_length, slice(radius, overhang));
+    let half = half_length / pieces as f64;
+    let at = |i: usize| -half_length + half * (2 * i + 1) as f64;
+    (0..pieces).map(|i| Sphere { centre: [0.0, at(i), 0.0], radius: radius.hypot(half) }).collect()
+}
+
+fn cells(half: [f64; 3], wanted: f64) -> Vec<Sphere> {
+    let wanted = wanted.max(half.into_iter().fold(0.0, f64::max) / MAX_PIECES as f64);
     let counts = half.map(|h| pieces(h, wanted));
     let cell: [f64; 3] = std::array::from_fn(|i| half[i] / counts[i] as f64);
     let radius = cell.iter().map(|c| c * c).sum::<f64>().sqrt();

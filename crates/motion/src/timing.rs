@@ -5,9 +5,8 @@
 //! steps of path length s, and the fastest ds/dt that breaks no limit is found by one sweep forwards and one backwards over
 //! the phase plane, as in time-optimal path parameterisation (Bobrow, 1985; Kunz and Stilman, 2012).
 
-use crate::collision::{Checker, Contact, between, distance};
+use crate::collision::{between, distance, length};
 use crate::robot::{Joint, Joints, Robot};
-use crate::shorten::length;
 use crate::trajectory::{ArmTrajectory, Knot};
 use ratn_model::value::Trajectory;
 
@@ -38,13 +37,18 @@ pub enum Part {
     Straight(Vec<Joints>),
 }
 
-/// The trajectory along the parts at a fraction `speed` of the limits; velocities and accelerations keep within it.
-pub fn parameterise(checker: &mut Checker<'_>, parts: &[Part], speed: f64) -> Trajectory {
-    let robot = checker.robot();
+/// The trajectory along the parts at a fraction `speed` of the limits; velocities and accelerations keep within it. Corners are
+/// rounded where `is_free` finds the straight motions from point to point of the curve free.
+pub fn parameterise(
+    robot: &Robot,
+    parts: &[Part],
+    speed: f64,
+    is_free: &mut dyn FnMut(&Joints, &Joints) -> bool,
+) -> Trajectory {
     let mut pieces = Vec::new();
     for part in parts {
         match part {
-            Part::Free(path) => pieces.extend(rounded(checker, path)),
+            Part::Free(path) => pieces.extend(rounded(path, is_free)),
             Part::Straight(path) => pieces.push(path.clone()),
         }
     }
@@ -59,7 +63,7 @@ pub fn parameterise(checker: &mut Checker<'_>, parts: &[Part], speed: f64) -> Tr
 }
 
 /// The path with rounded corners, cut where the arm has to stop.
-fn rounded(checker: &mut Checker<'_>, path: &[Joints]) -> Vec<Vec<Joints>> {
+fn rounded(path: &[Joints], is_free: &mut dyn FnMut(&Joints, &Joints) -> bool) -> Vec<Vec<Joints>> {
     let mut pieces = Vec::new();
     let mut piece = vec![path[0]];
     for window in path.windows(3) {
@@ -74,7 +78,7 @@ fn rounded(checker: &mut Checker<'_>, path: &[Joints]) -> Vec<Vec<Joints>> {
             let from = between(&corner, &before, width / near);
             let to = between(&corner, &after, width / far);
             let points = bezier(&from, &corner, &to);
-            if is_free(checker, &points) {
+            if is_free_along(&points, is_free) {
                 curve = Some(points);
                 break;
             }
@@ -101,10 +105,10 @@ fn bezier(from: &Joints, corner: &Joints, to: &Joints) -> Vec<Joints> {
     (0..=BLEND_POINTS).map(point).collect()
 }
 
-fn is_free(checker: &mut Checker<'_>, curve: &[Joints]) -> bool {
+fn is_free_along(curve: &[Joints], is_free: &mut dyn FnMut(&Joints, &Joints) -> bool) -> bool {
     // Every eighth point: the chords between them stay within a fraction of a milliradian of the curve.
     let points: Vec<&Joints> = curve.iter().step_by(8).collect();
-    points.windows(2).all(|pair| checker.edge_is_free(pair[0], pair[1], Contact::None))
+    points.windows(2).all(|pair| is_free(pair[0], pair[1]))
 }
 
 /// A smooth piece from rest to rest; the first knot is at time 0.

@@ -34,7 +34,7 @@ impl Cell {
             Request::MoveTo { joints, speed } => {
                 self.no_motion_of(Module::Gripper)?;
                 let scene = self.scene();
-                let line = trajectory::straight(&self.robot, &scene, &here.arm, &joints, speed)?;
+                let line = trajectory::straight(&self.robot, &here.arm, &joints, speed)?;
                 let trajectory = trajectory::check(&self.robot, &scene, &here, &line)?;
                 let lasts_s = trajectory.duration_s();
                 (Kind::Follow { trajectory }, lasts_s)

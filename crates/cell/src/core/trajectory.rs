@@ -1,7 +1,7 @@
 //! Which motions the arm follows: those that ratn-motion finds nothing wrong with in the *true* scene.
 
 use ratn_model::value::Trajectory;
-use ratn_motion::collision::{Checker, Contact};
+use ratn_motion::collision::Contact;
 use ratn_motion::plan::MIN_SPEED;
 use ratn_motion::robot::{Configuration, Joints, Robot};
 use ratn_motion::timing::{Part, parameterise};
@@ -41,16 +41,10 @@ pub(crate) fn check(
 ///
 /// # Errors
 /// When the speed is none.
-pub(crate) fn straight(
-    robot: &Robot,
-    scene: &Scene,
-    from: &Joints,
-    to: &Joints,
-    speed: f64,
-) -> Result<Trajectory, String> {
+pub(crate) fn straight(robot: &Robot, from: &Joints, to: &Joints, speed: f64) -> Result<Trajectory, String> {
     if !(MIN_SPEED..=1.0).contains(&speed) {
         return Err(format!("a speed of {speed} is none: it is a fraction of the limits, from {MIN_SPEED} to 1"));
     }
-    let mut checker = Checker::new(robot, scene, 0.0);
-    Ok(parameterise(&mut checker, &[Part::Free(vec![*from, *to])], speed))
+    // A line without corners to round.
+    Ok(parameterise(robot, &[Part::Straight(vec![*from, *to])], speed, &mut |_, _| false))
 }
