@@ -1,5 +1,6 @@
 //! The command line.
 
+use crate::command::doctor::DoctorArguments;
 use crate::command::pool::{DrainArguments, HostArguments, LogsArguments, PoolArguments, RestartArguments};
 use crate::command::resource::ResourceArguments;
 use crate::command::world::WorldArguments;
@@ -44,6 +45,8 @@ pub(crate) enum Command {
     Hold(HoldArguments),
     /// End a hold: motions go on where they paused
     GoOn(GoOnArguments),
+    /// Say what is missing on this machine or in this config, and what to do about it
+    Doctor(DoctorArguments),
     /// Lay a new table in the simulated cell of a running system, and forget every fact
     Reset(ResetArguments),
     /// Check a task file without starting anything

@@ -3,7 +3,7 @@
 
 use crate::demand::DemandLink;
 use crate::resource_manager;
-use ratn_proto::types::Resource;
+use ratn_proto::types::{Resource, ResourceFilter};
 use ratn_worker::client::{CallError, Channels};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::provider::Provider;
@@ -53,6 +53,8 @@ pub(crate) struct Link {
     pub(crate) manager: Manager,
     /// Who this is, for people.
     pub(crate) client: String,
+    /// The session's id; a fresh one for every manager without.
+    pub(crate) session: Option<String>,
     pub(crate) ttl: Duration,
     pub(crate) wanted: watch::Receiver<Wanted>,
     /// Hears of each resource once it is there, and gives back those that are free.
@@ -94,7 +96,10 @@ impl Link {
                 endpoint = self.manager.find() => endpoint,
                 () = shutdown.cancelled() => return,
             };
-            let session = Session::open(&channels, &endpoint, &self.client, self.ttl);
+            let session = match self.session.clone() {
+                Some(id) => Session::open_as(&channels, &endpoint, id, &self.client, self.ttl),
+                None => Session::open(&channels, &endpoint, &self.client, self.ttl),
+            };
             tokio::select! {
                 kept = self.keep_at(&channels, &endpoint, &session) => if let Err(error) = kept {
                     tracing::error!(%endpoint, "no link to the resource manager: {error}");
@@ -117,6 +122,9 @@ impl Link {
             }
         }
         let provider = Provider::start(channels, endpoint, session)?;
+        if session.state().borrow().found {
+            self.withdraw_left(&provider, session.id()).await?;
+        }
         let mut offered = Wanted::new();
         let mut refused = Wanted::new();
         loop {
@@ -154,6 +162,17 @@ impl Link {
                 () = tokio::time::sleep(LOOK_INTERVAL) => if self.manager.has_moved_from(endpoint) { return Ok(()) },
             }
         }
+    }
+
+    /// Withdraws what a process before this one offered in the same session, and what is not wanted now.
+    async fn withdraw_left(&mut self, provider: &Provider, session: &str) -> Result<(), CallError> {
+        let own = ResourceFilter { session: session.to_owned(), ..ResourceFilter::default() };
+        for left in provider.client().list_where(own).await? {
+            if !self.wanted.borrow().contains_key(&left.id) {
+                provider.withdraw(&left.id).await?;
+            }
+        }
+        Ok(())
     }
 
     /// Withdraws those that leave and that nobody holds; those that leave.

@@ -425,6 +425,8 @@ pub struct HostPools {
     pub host: String,
     /// It takes no new work.
     pub draining: bool,
+    /// What the clock of the host's wall showed when it answered, in microseconds since 1970.
+    pub clock_us: u64,
     /// In the order of templates.
     pub pools: Vec<PoolStatus>,
 }

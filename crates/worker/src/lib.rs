@@ -28,6 +28,7 @@
 //! What it deliberately does not do: decide anything. No retries of goals, no choice of resources.
 
 pub mod action;
+pub mod adoption;
 pub mod client;
 pub mod endpoint;
 pub mod gate;

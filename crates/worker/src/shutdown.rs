@@ -1,6 +1,7 @@
 //! When a process ends: a signal, or the end of its parent. Both only cancel a token; the server drains by it. What does
 //! not drain in time is ended hard, so that nothing outlives its parent.
 
+use crate::adoption::Adoption;
 use std::io::{self, Read};
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
@@ -59,22 +60,18 @@ pub fn on_signals_within(token: &CancellationToken, patience: Duration) -> io::R
 }
 
 /// Watches standard input, a pipe that the parent holds open, in a thread of its own (a busy runtime cannot starve it);
-/// when it ends, cancels `token` and, [`EXIT_GRACE`] later, the process.
+/// when it ends, cancels `token` and, [`EXIT_GRACE`] later, the process. One that is to be adopted ([`crate::adoption`]) waits for a
+/// successor of its parent first.
 ///
 /// # Errors
-/// Where the thread cannot be started.
+/// Where the thread cannot be started, or no successor could find it.
 pub fn exit_with_parent(token: &CancellationToken) -> io::Result<()> {
     let token = token.clone();
+    let adoption = Adoption::from_environment()?;
     let watch = move || {
-        let mut ignored = [0_u8; 256];
-        let mut input = io::stdin().lock();
-        loop {
-            match input.read(&mut ignored) {
-                Ok(0) => break,
-                Ok(_) => {}
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(_) => break,
-            }
+        until_it_ends(&mut io::stdin().lock());
+        while let Some(mut successor) = adoption.as_ref().and_then(Adoption::successor) {
+            until_it_ends(&mut successor);
         }
         token.cancel();
         std::thread::sleep(EXIT_GRACE);
@@ -82,4 +79,16 @@ pub fn exit_with_parent(token: &CancellationToken) -> io::Result<()> {
     };
     std::thread::Builder::new().name("exit-with-parent".to_owned()).spawn(watch)?;
     Ok(())
+}
+
+fn until_it_ends(input: &mut impl Read) {
+    let mut ignored = [0_u8; 256];
+    loop {
+        match input.read(&mut ignored) {
+            Ok(0) => return,
+            Ok(_) => {}
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(_) => return,
+        }
+    }
 }

@@ -4,6 +4,7 @@ mod certs;
 mod check;
 mod control;
 mod demo;
+pub(crate) mod doctor;
 mod plan;
 pub(crate) mod pool;
 mod reload;
@@ -47,6 +48,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Stop(arguments) => safety::stop(&arguments),
         Command::Hold(arguments) => safety::hold(&arguments),
         Command::GoOn(arguments) => safety::go_on(&arguments),
+        Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Reset(arguments) => reset::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Resource(arguments) => resource::run(&arguments),

@@ -66,11 +66,23 @@ impl KeptRoleArguments {
 
 /// `ratn process-manager`
 pub(super) fn process_manager(arguments: &RoleArguments) -> Result<(), Failure> {
+    if arguments.check_config {
+        startable(&SystemConfig::load(arguments.config.as_deref())?)?;
+    }
     daemon(arguments, process_manager::ROLE, async |system, host| {
         let mut config = system.process_manager_config();
         config.listen = host.listen.unwrap_or(config.listen);
         process_manager::run_as(config, host.directory, host.serving, host.shutdown).await
     })
+}
+
+/// Refused where a template cannot be started on this machine.
+pub(super) fn startable(config: &SystemConfig) -> Result<(), Failure> {
+    let obstacles = config.process_manager.obstacles();
+    if obstacles.is_empty() {
+        return Ok(());
+    }
+    Err(Failure::Refused(format!("ratn: [process-manager] {}", obstacles.join("; "))))
 }
 
 /// `ratn cell`
@@ -174,8 +186,10 @@ fn daemon_on(
     })
 }
 
-/// Refused where it could not listen or had no state of its own: it has not begun then. Failed otherwise.
+/// Refused where it could not listen, or another one has its state or its place: it has not begun then. Failed otherwise.
 fn unbegun(error: anyhow::Error) -> Failure {
-    let unbegun = error.chain().any(|cause| cause.is::<BindError>() || cause.is::<OpenError>());
+    let unbegun = error
+        .chain()
+        .any(|cause| cause.is::<BindError>() || cause.is::<OpenError>() || cause.is::<process_manager::RosterError>());
     if unbegun { Failure::Refused(format!("ratn: {error:#}")) } else { Failure::Failed(error) }
 }

@@ -1,6 +1,6 @@
 //! `ratn up`: a whole system in the foreground.
 
-use super::{blocking, run::starting};
+use super::{blocking, roles::startable, run::starting};
 use crate::arguments::UpArguments;
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
@@ -13,6 +13,7 @@ use ratn_daemon::supervisor;
 pub(crate) fn run(arguments: &UpArguments) -> Result<(), Failure> {
     let mut config = SystemConfig::load(arguments.config.as_deref())?;
     config.apply(&arguments.system);
+    startable(&config)?;
     blocking(async {
         let interrupt = Interrupt::listen()?;
         let directory = public_directory(arguments.runtime_dir.as_deref());

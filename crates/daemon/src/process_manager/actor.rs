@@ -2,20 +2,21 @@
 
 use super::config::ProcessManagerConfig;
 use super::drained::Drained;
+use super::offered;
 use super::pools::{Command, Event, PoolError, Pools, Restart};
+use super::predecessor::Adopted;
 use super::processes::{Processes, Told};
+use super::roster::Roster;
 use super::spawner::Outcome;
 use super::usage::Usage;
 use crate::demand::{Shortages, Use};
 use crate::link::{Offering, Wanted};
 use nix::sys::signal::Signal;
-use ratn_model::resource::ResourceClass;
 use ratn_model::time::Timestamp;
-use ratn_model::value::Value;
-use ratn_proto::types::{Demand, HostPools, PoolStatus, Resource, Scale, WorkerStatus};
+use ratn_proto::types::{Demand, HostPools, PoolStatus, Scale, WorkerStatus};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::collections::{BTreeSet, VecDeque};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -55,6 +56,11 @@ pub(super) struct Handle {
 pub(super) struct Parts {
     pub(super) config: ProcessManagerConfig,
     pub(super) directory: RuntimeDirectory,
+    pub(super) roster: Roster,
+    /// The ids of the workers that a process manager before this one left.
+    pub(super) before: Vec<String>,
+    /// Those of them that were taken over.
+    pub(super) adopted: Vec<Adopted>,
     /// What the link shall offer.
     pub(super) wanted: watch::Sender<Wanted>,
     /// What of it is to go as soon as nobody holds it.
@@ -85,11 +91,13 @@ struct Actor {
 /// Starts the actor; it ends with the token, once every worker has.
 pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Result<(Handle, JoinHandle<()>)> {
     let (inbox, messages) = mpsc::channel(INBOX);
-    let Parts { config, directory, wanted, leaves, there, uses, demand, short } = parts;
+    let Parts { config, directory, roster, before, adopted, wanted, leaves, there, uses, demand, short } = parts;
     let drained = Drained::of(&directory);
-    let (processes, told) = Processes::start(&config, directory)?;
+    let (processes, told) = Processes::start(&config, directory, roster)?;
+    let mut pools = Pools::new(&config.host, config.templates);
+    pools.go_on_after(&before);
     let actor = Actor {
-        pools: Pools::new(&config.host, config.templates),
+        pools,
         processes,
         host: config.host,
         start: Instant::now(),
@@ -101,7 +109,7 @@ pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Resul
         drained,
     };
     let inputs = Inputs { messages, told, there, uses, demand };
-    Ok((Handle { inbox }, tokio::spawn(actor.run(inputs, shutdown))))
+    Ok((Handle { inbox }, tokio::spawn(actor.run(adopted, inputs, shutdown))))
 }
 
 impl Handle {
@@ -121,7 +129,10 @@ struct Inputs {
 }
 
 impl Actor {
-    async fn run(mut self, mut inputs: Inputs, shutdown: CancellationToken) {
+    async fn run(mut self, adopted: Vec<Adopted>, mut inputs: Inputs, shutdown: CancellationToken) {
+        for worker in adopted {
+            self.adopt(worker);
+        }
         if self.drained.is_set() {
             tracing::warn!("the host is drained: no worker is started until `ratn drain --undo`");
             let commands = self.pools.drain(self.now(), true);
@@ -132,7 +143,10 @@ impl Actor {
             let deadline = self.pools.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
             tokio::select! {
                 Some(outcome) = inputs.told.outcomes.recv() => self.became(outcome),
-                Some((id, endpoint)) = inputs.told.serving.recv() => self.handle(Event::Serving { id, endpoint }),
+                Some((id, endpoint)) = inputs.told.serving.recv() => {
+                    self.processes.serves(&id, &endpoint);
+                    self.handle(Event::Serving { id, endpoint });
+                }
                 Some(health) = inputs.told.health.recv() => self.handle(match health {
                     (id, Ok(())) => Event::Answered { id },
                     (id, Err(why)) => Event::Unanswered { id, why },
@@ -150,6 +164,13 @@ impl Actor {
             }
         }
         self.end(&mut inputs.told.outcomes).await;
+    }
+
+    fn adopt(&mut self, adopted: Adopted) {
+        let (worker, outdated) = (adopted.status(), adopted.outdated);
+        let Some(commands) = self.pools.adopt(self.now(), &worker, outdated) else { return };
+        self.processes.adopt(adopted);
+        self.perform(commands);
     }
 
     /// Ends every worker, whatever it takes.
@@ -181,7 +202,7 @@ impl Actor {
                 let mut pools = self.pools.status();
                 self.usage.fill_in(&mut pools);
                 let draining = self.pools.is_draining();
-                let _ = answer.send(HostPools { host: self.host.clone(), draining, pools });
+                let _ = answer.send(HostPools { host: self.host.clone(), draining, clock_us: wall_clock_us(), pools });
             }
             Message::Lives { id, answer } => drop(answer.send(self.pools.knows(&id))),
             Message::Restart { which, answer } => {
@@ -230,9 +251,9 @@ impl Actor {
 
     fn became(&mut self, outcome: Outcome) {
         match outcome {
-            Outcome::Spawned { id, pid, limits } => {
+            Outcome::Spawned { id, pid, limits, group } => {
                 tracing::info!(id, pid, limits, "worker started");
-                self.processes.spawned(&id, pid);
+                self.processes.spawned(&id, pid, &limits, group);
                 self.handle(Event::Spawned { id, pid, limits });
             }
             Outcome::Exited { id, reason, last_words } => {
@@ -292,17 +313,18 @@ impl Actor {
     }
 
     fn offer(&self, worker: &WorkerStatus, kind: &str) {
-        let resource = Resource::new(&worker.id, ResourceClass::Process, kind);
-        // One that is no server has none.
-        let resource = if worker.endpoint.is_empty() { resource } else { resource.with_endpoint(&worker.endpoint) };
-        let resource = resource
-            .with_attribute("host", Value::String(self.host.clone()))
-            .with_attribute("pid", Value::Int(i64::from(worker.pid)))
-            .on_host(&self.host);
+        let resource = offered::worker(&self.host, worker, kind);
         self.wanted.send_modify(|wanted| {
             wanted.insert(worker.id.clone(), resource);
         });
     }
+}
+
+/// What the clock of the wall shows; nothing is decided by it.
+#[allow(clippy::disallowed_methods, reason = "somebody asks how far the clocks of hosts are apart")]
+fn wall_clock_us() -> u64 {
+    let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since_1970.as_micros()).unwrap_or(u64::MAX)
 }
 
 async fn sleep_until(deadline: Option<Instant>) {

@@ -57,6 +57,14 @@ impl ProcessManagerConfig {
     }
 }
 
+impl ProcessManagerConfig {
+    /// Of each template that cannot be started on this machine which, and why.
+    pub fn obstacles(&self) -> Vec<String> {
+        let obstacle = |template: &Template| Some(format!("template `{}`: {}", template.name, template.obstacle()?));
+        self.templates.iter().filter_map(obstacle).collect()
+    }
+}
+
 impl Check for ProcessManagerConfig {
     fn check(&self) -> Result<(), ConfigError> {
         check_name("host", &self.host)?;

@@ -104,6 +104,16 @@ impl Limits {
 }
 
 impl InForce {
+    /// Those of a worker that was taken over, whose group goes with this.
+    pub(super) fn adopted(group: Option<PathBuf>) -> InForce {
+        InForce { words: Vec::new(), group: group.map(|path| Group { path }) }
+    }
+
+    /// The directory of its group.
+    pub(super) fn group(&self) -> Option<&Path> {
+        self.group.as_ref().map(|group| group.path.as_path())
+    }
+
     /// In words, for people; empty without limits.
     pub(super) fn words(&self) -> String {
         self.words.join(", ")
@@ -120,11 +130,15 @@ impl InForce {
 
 impl Drop for Group {
     fn drop(&mut self) {
-        // What it started and left behind ends with it. Gone where nobody is left.
-        let _ = std::fs::write(self.path.join("cgroup.kill"), "1");
-        if let Err(error) = std::fs::remove_dir(&self.path) {
-            tracing::debug!(group = %self.path.display(), %error, "a group of a worker stays");
-        }
+        end_group(&self.path);
+    }
+}
+
+/// What a worker started and left behind ends with it. The group is gone where nobody is left.
+pub(super) fn end_group(path: &Path) {
+    let _ = std::fs::write(path.join("cgroup.kill"), "1");
+    if let Err(error) = std::fs::remove_dir(path) {
+        tracing::debug!(group = %path.display(), %error, "a group of a worker stays");
     }
 }
 

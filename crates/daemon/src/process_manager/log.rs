@@ -4,9 +4,10 @@
 use super::log_file::previous;
 use std::collections::VecDeque;
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::sync::Notify;
 
@@ -16,6 +17,8 @@ const LAST_WORDS_BYTES: usize = 400;
 const CHUNK_BYTES: usize = 4_096;
 /// Bytes of a line that are looked at.
 const MAX_LINE_BYTES: usize = 4_096;
+/// How often a file is looked at that a worker writes to by itself.
+pub(super) const BOUND_INTERVAL: Duration = Duration::from_secs(1);
 /// So many ended workers leave a log.
 const ENDED_LOGS_KEPT: usize = 64;
 
@@ -74,6 +77,32 @@ impl Log {
         Ok(Log { inner: Arc::new(Mutex::new(inner)) })
     }
 
+    /// One that somebody else writes to, and goes on with when this process is gone.
+    pub(super) fn of_another(path: &Path, max_bytes: u64) -> io::Result<Log> {
+        let file = File::options().append(true).create(true).open(path)?;
+        let inner = Inner { path: path.to_owned(), file, written: 0, max_bytes, tail: VecDeque::new() };
+        Ok(Log { inner: Arc::new(Mutex::new(inner)) })
+    }
+
+    /// The file, for a process that writes to its end by itself.
+    pub(super) fn file(&self) -> io::Result<File> {
+        let inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
+        File::options().append(true).open(&inner.path)
+    }
+
+    /// Keeps a file bounded that somebody else writes to: what it has is copied away, and it is cut to nothing. Does not end.
+    pub(super) async fn keep_bounded(self, every: Duration) {
+        loop {
+            tokio::time::sleep(every).await;
+            let inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
+            let long = inner.file.metadata().is_ok_and(|file| file.len() > inner.max_bytes);
+            let cut = || fs::copy(&inner.path, previous(&inner.path)).and_then(|_| inner.file.set_len(0));
+            if long && let Err(error) = cut() {
+                tracing::warn!(file = %inner.path.display(), %error, "a worker's log is not kept bounded");
+            }
+        }
+    }
+
     /// Copies until the other side ends.
     pub(super) async fn capture(self, mut from: impl AsyncRead + Unpin, mut awaited: Option<Awaited>) {
         let mut chunk = vec![0; CHUNK_BYTES];
@@ -91,9 +120,20 @@ impl Log {
     pub(super) fn last_words(&self) -> String {
         let inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
         let (front, back) = inner.tail.as_slices();
-        let text = String::from_utf8_lossy(&[front, back].concat()).into_owned();
+        let tail = [front, back].concat();
+        let tail = if tail.is_empty() { end_of(&inner.path).unwrap_or_default() } else { tail };
+        let text = String::from_utf8_lossy(&tail).into_owned();
         text.lines().map(str::trim).filter(|line| !line.is_empty()).collect::<Vec<_>>().join(" | ")
     }
+}
+
+fn end_of(path: &Path) -> io::Result<Vec<u8>> {
+    let mut file = File::open(path)?;
+    let length = file.metadata()?.len();
+    file.seek(SeekFrom::Start(length.saturating_sub(LAST_WORDS_BYTES as u64)))?;
+    let mut end = Vec::new();
+    file.read_to_end(&mut end)?;
+    Ok(end)
 }
 
 impl Awaited {
@@ -166,6 +206,25 @@ mod tests {
         assert!(fs::metadata(path.with_extension("log.1")).unwrap().len() <= 10_000);
         assert!(log.last_words().ends_with("line 1998 | line 1999"));
         assert!(log.last_words().len() < 600);
+    }
+
+    #[tokio::test]
+    async fn a_log_that_a_worker_writes_by_itself_is_bounded_and_its_end_is_at_hand() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("planner-1@compute.log");
+        let log = Log::create(&path, 10_000).unwrap();
+        let mut worker = log.file().unwrap();
+        let bounded = tokio::spawn(log.clone().keep_bounded(Duration::from_millis(1)));
+        for i in 0..2_000 {
+            writeln!(worker, "line {i}").unwrap();
+        }
+        let length = || fs::metadata(&path).unwrap().len();
+        while length() > 0 {
+            tokio::task::yield_now().await;
+        }
+        writeln!(worker, "the last line").unwrap();
+        assert_eq!(log.last_words(), "the last line");
+        bounded.abort();
     }
 
     #[test]

@@ -1,9 +1,9 @@
 //! A worker's log as somebody reads it: what was kept of before, what there is, and what is written from then on, also when the file is
-//! begun anew.
+//! begun anew or cut to nothing.
 
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::fs::File;
-use std::io::{self, Read};
+use std::io::{self, Read, Seek};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
@@ -54,6 +54,10 @@ impl LogReader {
             self.before = None;
         }
         let bytes = next(&mut self.file)?;
+        if bytes.is_empty() && self.file.stream_position()? > self.file.metadata()?.len() {
+            self.file.rewind()?;
+            return next(&mut self.file);
+        }
         // Of the one before all has been read only now.
         if bytes.is_empty() && std::fs::metadata(&self.path).is_ok_and(|now| now.ino() != self.inode) {
             *self = LogReader { before: None, ..LogReader::open(&self.path)? };
@@ -87,6 +91,11 @@ mod tests {
         std::fs::rename(&path, previous(&path)).unwrap();
         std::fs::write(&path, "three\n").unwrap();
         assert_eq!([reader.read().unwrap(), reader.read().unwrap()], [b"two\n".to_vec(), b"three\n".to_vec()]);
+        File::options().write(true).open(&path).unwrap().set_len(0).unwrap();
+        assert_eq!(reader.read().unwrap(), b"");
+        std::fs::write(&path, "4\n").unwrap();
+        assert_eq!(reader.read().unwrap(), b"4\n");
+        std::fs::write(&path, "three\n").unwrap();
         let mut again = LogReader::open(&path).unwrap();
         let read = [again.read().unwrap(), again.read().unwrap(), again.read().unwrap()];
         assert_eq!(read, [b"one\ntwo\n".to_vec(), b"three\n".to_vec(), Vec::new()]);

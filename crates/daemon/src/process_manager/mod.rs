@@ -16,11 +16,14 @@ mod limits;
 mod log;
 pub mod log_file;
 mod log_stream;
+mod offered;
 mod order;
 mod parameter;
 pub mod pools;
+mod predecessor;
 mod processes;
 mod readiness;
+mod roster;
 mod service;
 mod spawner;
 mod status;
@@ -31,18 +34,17 @@ pub use config::ProcessManagerConfig;
 pub use limits::Limits;
 pub use parameter::Parameter;
 pub use readiness::Readiness;
+pub use roster::RosterError;
 pub use template::{Liveness, Template};
 
 use crate::demand::{DemandLink, Shortages};
 use crate::link::{Link, Manager, Turnover, Wanted};
 use anyhow::Context;
-use ratn_model::resource::ResourceClass;
-use ratn_model::value::Value;
-use ratn_proto::types::Resource;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
-use ratn_worker::endpoint::Endpoint;
+use ratn_worker::client::fresh_id;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
+use roster::Roster;
 use std::collections::BTreeSet;
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
@@ -80,9 +82,20 @@ pub async fn run_as(
     serving: Serving,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
+    for obstacle in config.obstacles() {
+        tracing::warn!("{obstacle}: its workers cannot be started");
+    }
+    let (mut roster, left) = Roster::take(&directory)?;
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
+    // Before anything is offered: what the last process manager offered goes where it is not wanted any more.
+    let before: Vec<String> = left.iter().map(|entry| entry.id.clone()).collect();
+    let adopted = predecessor::settle(left, &config.templates, &directory).await;
+    roster.keep_only(&adopted.iter().map(|one| one.entry.id.as_str()).collect());
     let (wanted, to_offer) = watch::channel(Wanted::new());
+    let workers = adopted.iter().map(|one| offered::worker(&config.host, &one.status(), &one.entry.template.kind));
+    let offered = workers.chain([offered::host(&config, &endpoint)]);
+    wanted.send_modify(|wanted| wanted.extend(offered.map(|resource| (resource.id.clone(), resource))));
     let (told, there) = mpsc::channel(THERE);
     let (leaves, leaving) = watch::channel(BTreeSet::new());
     let (used, uses) = mpsc::channel(THERE);
@@ -91,15 +104,26 @@ pub async fn run_as(
     let link = Link {
         manager: Manager { configured: config.resource_manager.clone(), directory: directory.clone() },
         client: format!("{ROLE}@{}", config.host),
+        session: Some(session_of(&directory).context("cannot keep the session's name")?),
         ttl: Duration::from_millis(config.session_ttl_ms),
         wanted: to_offer,
         there: Some(Turnover { told, leaving }),
         demand: Some(DemandLink { kinds: config.kinds(), heard, shortages, used }),
     };
     let linked = tokio::spawn(link.keep(shutdown.clone()));
-    let host = host_resource(&config, &endpoint);
-    wanted.send_modify(|wanted| drop(wanted.insert(host.id.clone(), host)));
-    let parts = actor::Parts { config, directory: directory.clone(), wanted, leaves, there, uses, demand, short };
+    let parts = actor::Parts {
+        config,
+        directory: directory.clone(),
+        roster,
+        before,
+        adopted,
+        wanted,
+        leaves,
+        there,
+        uses,
+        demand,
+        short,
+    };
     let (actor, ended) = actor::start(parts, shutdown.clone()).context("cannot start workers")?;
     let service = ProcessServiceServer::new(service::Service::new(actor, directory.clone(), shutdown.clone()));
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
@@ -111,10 +135,16 @@ pub async fn run_as(
     Ok(served?)
 }
 
-/// This host, as everybody finds it at the resource manager.
-fn host_resource(config: &ProcessManagerConfig, endpoint: &Endpoint) -> Resource {
-    Resource::new(format!("host@{}", config.host), ResourceClass::System, HOST_KIND)
-        .with_endpoint(endpoint)
-        .with_attribute("host", Value::String(config.host.clone()))
-        .on_host(&config.host)
+/// The name of the session of a runtime directory's process manager: a successor of one that was killed goes on with it, so that
+/// leases of workers that it adopts hold.
+fn session_of(directory: &RuntimeDirectory) -> std::io::Result<String> {
+    let file = directory.path().join("process-manager.session");
+    match std::fs::read_to_string(&file) {
+        Ok(known) if !known.trim().is_empty() => Ok(known.trim().to_owned()),
+        _ => {
+            let fresh = fresh_id(ROLE);
+            std::fs::write(&file, &fresh)?;
+            Ok(fresh)
+        }
+    }
 }

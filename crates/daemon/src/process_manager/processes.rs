@@ -5,10 +5,13 @@ use super::environment;
 use super::log::{Awaited, EndedLogs};
 use super::log_file::log_file;
 use super::parameter;
-use super::readiness::{Readiness, Signs};
+use super::predecessor::{self, Adopted, adopt_socket};
+use super::readiness::{Pulse, Readiness, Signs};
+use super::roster::{Entry, Roster};
 use super::spawner::{self, Job, Outcome};
 use super::template::Template;
 use nix::sys::signal::Signal;
+use ratn_worker::adoption;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::collections::BTreeMap;
 use std::io;
@@ -54,6 +57,8 @@ pub(super) struct Processes {
     /// What a template without a program runs.
     this_program: PathBuf,
     jobs: mpsc::Sender<Job>,
+    outcomes: mpsc::Sender<Outcome>,
+    roster: Roster,
     tell: Tell,
     by_id: BTreeMap<String, Process>,
     ended_logs: EndedLogs,
@@ -68,12 +73,18 @@ struct Tell {
 #[derive(Debug, Default)]
 struct Process {
     pid: u32,
+    /// As it was started from, until that is in the roster.
+    template: Option<Template>,
     attended: Option<(AbortHandle, mpsc::Sender<Duration>)>,
 }
 
 impl Processes {
     /// None yet. Needs a tokio runtime.
-    pub(super) fn start(config: &ProcessManagerConfig, directory: RuntimeDirectory) -> io::Result<(Processes, Told)> {
+    pub(super) fn start(
+        config: &ProcessManagerConfig,
+        directory: RuntimeDirectory,
+        roster: Roster,
+    ) -> io::Result<(Processes, Told)> {
         let (told, outcomes) = mpsc::channel(OUTCOMES);
         let (serving, served) = mpsc::channel(OUTCOMES);
         let (health, answered) = mpsc::channel(OUTCOMES);
@@ -83,7 +94,9 @@ impl Processes {
             groups: config.cgroup.clone(),
             directory,
             this_program: std::env::current_exe()?,
-            jobs: spawner::start(told)?,
+            jobs: spawner::start(told.clone())?,
+            outcomes: told,
+            roster,
             tell: Tell { serving, health },
             by_id: BTreeMap::new(),
             ended_logs: EndedLogs::default(),
@@ -109,6 +122,10 @@ impl Processes {
         let signs = signs.map_err(|error| BeginError::Socket { socket: socket.clone(), reason: error.to_string() })?;
         let mut env = environment::passed(std::env::vars_os(), &template.pass_env);
         env.extend(template.env.iter().map(|(name, value)| (name.into(), fill(value).into())));
+        if template.adopt {
+            env.insert(adoption::SOCKET_VARIABLE.into(), adopt_socket(&self.directory, id).into());
+            env.insert(adoption::GRACE_VARIABLE.into(), template.adopt_grace_s.to_string().into());
+        }
         if let Signs::Notify(_) = signs {
             env.insert("NOTIFY_SOCKET".into(), socket.into());
         }
@@ -126,6 +143,7 @@ impl Processes {
             awaited,
             log: self.log_file(id),
             max_log_bytes: self.max_log_bytes,
+            outlives: template.adopt,
             program: template.program.clone().unwrap_or_else(|| self.this_program.clone()),
         };
         self.jobs.try_send(job).map_err(|_| BeginError::Busy)?;
@@ -133,13 +151,40 @@ impl Processes {
         let within = template.start_timeout();
         let attended = attend(self.directory.clone(), id.to_owned(), (signs, within), questions, self.tell.clone());
         let attended = tokio::spawn(attended).abort_handle();
-        self.by_id.entry(id.to_owned()).or_default().attended = Some((attended, ask));
+        let process = Process { pid: 0, template: Some(template.clone()), attended: Some((attended, ask)) };
+        self.by_id.insert(id.to_owned(), process);
         Ok(())
     }
 
     /// Its process is there.
-    pub(super) fn spawned(&mut self, id: &str, pid: u32) {
-        self.by_id.entry(id.to_owned()).or_default().pid = pid;
+    pub(super) fn spawned(&mut self, id: &str, pid: u32, limits: &str, group: Option<PathBuf>) {
+        let process = self.by_id.entry(id.to_owned()).or_default();
+        process.pid = pid;
+        if let (Some(template), Some(began)) = (process.template.take(), predecessor::began(pid)) {
+            let limits = limits.to_owned();
+            self.roster.began(Entry { id: id.to_owned(), pid, began, endpoint: None, limits, group, template });
+        }
+    }
+
+    /// Where it serves.
+    pub(super) fn serves(&mut self, id: &str, endpoint: &str) {
+        self.roster.serves(id, endpoint);
+    }
+
+    /// One that was taken over is watched from now on.
+    pub(super) fn adopt(&mut self, adopted: Adopted) {
+        let entry = adopted.entry.clone();
+        let id = entry.id.clone();
+        let (ask, questions) = mpsc::channel(1);
+        let endpoint = entry.endpoint.clone().unwrap_or_default();
+        let attended = entry.template.readiness.pulse(&self.notify_socket(&id), &endpoint).map(|pulse| {
+            let answered = answer(pulse, id.clone(), questions, self.tell.health.clone());
+            (tokio::spawn(answered).abort_handle(), ask)
+        });
+        let process = Process { pid: entry.pid, template: None, attended };
+        self.by_id.insert(id.clone(), process);
+        self.roster.began(entry);
+        spawner::watch_adopted(adopted, &self.log_file(&id), self.max_log_bytes, self.outcomes.clone());
     }
 
     /// Its process is gone.
@@ -150,6 +195,8 @@ impl Processes {
         // One that was killed could not take it back itself.
         let _ = std::fs::remove_file(self.directory.endpoint_file(id));
         let _ = std::fs::remove_file(self.notify_socket(id));
+        let _ = std::fs::remove_file(adopt_socket(&self.directory, id));
+        self.roster.gone(id);
         self.ended_logs.add(self.log_file(id));
     }
 
@@ -188,19 +235,29 @@ async fn attend(
     directory: RuntimeDirectory,
     id: String,
     (signs, within): (Signs, Duration),
-    mut questions: mpsc::Receiver<Duration>,
+    questions: mpsc::Receiver<Duration>,
     tell: Tell,
 ) {
-    let mut pulse = match signs.ready(&directory, &id, within).await {
+    let pulse = match signs.ready(&directory, &id, within).await {
         Ok((endpoint, pulse)) => {
             drop(tell.serving.send((id.clone(), endpoint)).await);
             pulse
         }
         Err(reason) => return tracing::debug!(id, reason, "a worker is not ready"),
     };
+    answer(pulse, id, questions, tell.health).await;
+}
+
+/// Tells whether it still serves whenever that is asked.
+async fn answer(
+    mut pulse: Pulse,
+    id: String,
+    mut questions: mpsc::Receiver<Duration>,
+    health: mpsc::Sender<(String, Result<(), String>)>,
+) {
     while let Some(within) = questions.recv().await {
         let answer = pulse.beats(within).await;
-        if tell.health.send((id.clone(), answer)).await.is_err() {
+        if health.send((id.clone(), answer)).await.is_err() {
             return;
         }
     }

@@ -7,7 +7,7 @@ use ratn_worker::runtime_directory::RuntimeDirectory;
 use serde::{Deserialize, Serialize};
 use std::io;
 use std::net::Ipv4Addr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpStream, UnixDatagram};
@@ -78,6 +78,15 @@ impl Readiness {
     /// Whether a worker that is ready can be asked whether it still is.
     pub(super) fn can_be_asked(&self) -> bool {
         matches!(self, Readiness::Health | Readiness::Port { .. })
+    }
+
+    /// What is asked of one that has been ready before; nothing where it cannot be.
+    pub(super) fn pulse(&self, _socket: &Path, endpoint: &str) -> Option<Pulse> {
+        match self {
+            Readiness::Health => Some(Pulse::Health(Health::of(endpoint.parse().ok()?))),
+            Readiness::Port { port } => Some(Pulse::Port(*port)),
+            Readiness::Notify | Readiness::Line { .. } => None,
+        }
     }
 
     /// What to look at; before the worker is started. `socket` is where it may notify.

@@ -4,7 +4,8 @@
 //! pipe that nobody writes to: it ends with the process manager, however that ends. Nothing runs in the child before exec.
 
 use super::limits::{InForce, Limits};
-use super::log::{Awaited, Log};
+use super::log::{Awaited, BOUND_INTERVAL, Log};
+use super::predecessor::Adopted;
 use crate::supervisor::command_of;
 use nix::errno::Errno;
 use nix::sys::signal::{Signal, killpg};
@@ -13,12 +14,13 @@ use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io;
 use std::os::unix::process::ExitStatusExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 use tokio::process::Child;
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
+use tokio_util::task::AbortOnDropHandle;
 
 /// Processes that wait to be started.
 const QUEUE: usize = 1_024;
@@ -41,6 +43,8 @@ pub(super) struct Job {
     pub(super) awaited: Option<Awaited>,
     pub(super) log: PathBuf,
     pub(super) max_log_bytes: u64,
+    /// It is to outlive this process: then it writes its log by itself.
+    pub(super) outlives: bool,
 }
 
 /// What becomes of a job, in this order.
@@ -52,6 +56,8 @@ pub(super) enum Outcome {
         pid: u32,
         /// What it may use, for people.
         limits: String,
+        /// Its group of cgroups.
+        group: Option<PathBuf>,
     },
     /// It is gone, or never was.
     Exited { id: String, reason: String, last_words: String },
@@ -69,11 +75,13 @@ pub(super) fn start(outcomes: mpsc::Sender<Outcome>) -> io::Result<mpsc::Sender<
                 Ok((child, log)) => {
                     let pid = child.id().unwrap_or(0);
                     let force = job.limits.enforce(&id, pid, job.groups.as_deref());
-                    let spawned = Outcome::Spawned { id: id.clone(), pid, limits: force.words() };
+                    let group = force.group().map(Path::to_owned);
+                    let spawned = Outcome::Spawned { id: id.clone(), pid, limits: force.words(), group };
                     if outcomes.blocking_send(spawned).is_err() {
                         return;
                     }
-                    let worker = Watched { id, pid, child, log, awaited: job.awaited.take(), force };
+                    let worker =
+                        Watched { id, pid, child, log, awaited: job.awaited.take(), force, bounds: job.outlives };
                     runtime.spawn(watch(worker, outcomes.clone()));
                 }
                 Err(error) => {
@@ -108,13 +116,16 @@ fn spawn(job: &Job) -> io::Result<(Child, Log)> {
             .ok_or_else(|| io::Error::other(format!("there is no directory {}", directory.display())))?;
         command.current_dir(directory);
     }
+    if job.outlives {
+        command.stdout(log.file()?).stderr(log.file()?);
+    } else {
+        command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    }
     let child = command
         .args(&job.args)
         .env_clear()
         .envs(&job.env)
         .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
         .process_group(0)
         .kill_on_drop(true)
         .spawn()?;
@@ -128,10 +139,13 @@ struct Watched {
     log: Log,
     awaited: Option<Awaited>,
     force: InForce,
+    /// Its log is to be kept bounded: it writes it by itself.
+    bounds: bool,
 }
 
 async fn watch(worker: Watched, outcomes: mpsc::Sender<Outcome>) {
-    let Watched { id, pid, mut child, log, awaited, force } = worker;
+    let Watched { id, pid, mut child, log, awaited, force, bounds } = worker;
+    let bounding = bounds.then(|| AbortOnDropHandle::new(tokio::spawn(log.clone().keep_bounded(BOUND_INTERVAL))));
     let out = child.stdout.take().map(|out| tokio::spawn(log.clone().capture(out, awaited)));
     let err = child.stderr.take().map(|err| tokio::spawn(log.clone().capture(err, None)));
     // `wait` would close the pipe that tells the worker that its parent lives.
@@ -140,7 +154,7 @@ async fn watch(worker: Watched, outcomes: mpsc::Sender<Outcome>) {
         Ok(status) => describe(status),
         Err(error) => format!("cannot be waited for: {error}"),
     };
-    drop(parent_lives);
+    drop((parent_lives, bounding));
     signal(pid, Signal::SIGKILL);
     drop(force);
     let captured = async {
@@ -150,6 +164,24 @@ async fn watch(worker: Watched, outcomes: mpsc::Sender<Outcome>) {
     };
     let _ = tokio::time::timeout(LAST_WORDS_PATIENCE, captured).await;
     let _ = outcomes.send(Outcome::Exited { id, reason, last_words: log.last_words() }).await;
+}
+
+/// Watches one that was taken over until its end; how that was nobody says who is not its parent.
+pub(super) fn watch_adopted(adopted: Adopted, log: &Path, max_log_bytes: u64, outcomes: mpsc::Sender<Outcome>) {
+    let Adopted { entry, parent_lives, exit, .. } = adopted;
+    let log = Log::of_another(log, max_log_bytes).inspect_err(|error| tracing::warn!(id = entry.id, %error, "no log"));
+    tokio::spawn(async move {
+        let bounding =
+            log.as_ref().ok().map(|log| AbortOnDropHandle::new(tokio::spawn(log.clone().keep_bounded(BOUND_INTERVAL))));
+        let force = InForce::adopted(entry.group);
+        exit.wait().await;
+        drop((parent_lives, bounding));
+        signal(entry.pid, Signal::SIGKILL);
+        drop(force);
+        let reason = "ended, how is not known: it was adopted".to_owned();
+        let last_words = log.map(|log| log.last_words()).unwrap_or_default();
+        let _ = outcomes.send(Outcome::Exited { id: entry.id, reason, last_words }).await;
+    });
 }
 
 fn describe(status: ExitStatus) -> String {

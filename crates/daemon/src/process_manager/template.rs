@@ -5,9 +5,10 @@ use super::limits::Limits;
 use super::parameter::{self, Parameter};
 use super::readiness::Readiness;
 use crate::config::{ConfigError, rule};
+use nix::unistd::{AccessFlags, access};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// A pool has at most so many workers.
@@ -72,6 +73,12 @@ pub struct Template {
     /// A worker that is to stop while it is held is given this long to be released, in seconds; then its holder loses it.
     #[serde(default = "half_a_minute")]
     pub drain_s: f64,
+    /// Whether workers outlive a process manager that was killed, for a successor to adopt them. Else they end with it.
+    #[serde(default)]
+    pub adopt: bool,
+    /// A worker that nobody has adopted after this long ends, in seconds.
+    #[serde(default = "ten")]
+    pub adopt_grace_s: f64,
     /// A worker that has not ended this long after SIGTERM is killed, in seconds.
     #[serde(default = "two")]
     pub stop_timeout_s: f64,
@@ -138,6 +145,8 @@ impl Template {
             start_timeout_s: ten(),
             liveness: Liveness::default(),
             drain_s: half_a_minute(),
+            adopt: false,
+            adopt_grace_s: ten(),
             stop_timeout_s: two(),
             backoff_ms: backoff(),
             max_backoff_ms: max_backoff(),
@@ -171,6 +180,45 @@ impl Template {
         Duration::from_secs_f64(self.stable_s)
     }
 
+    /// Whether a worker of this one is started as one of `other` is: how many there are and what follows a crash does not count.
+    pub(crate) fn starts_the_same_as(&self, other: &Template) -> bool {
+        let of_the_process = |template: &Template| Template {
+            name: String::new(),
+            kind: template.kind.clone(),
+            program: template.program.clone(),
+            args: template.args.clone(),
+            parameters: template.parameters.clone(),
+            env: template.env.clone(),
+            pass_env: template.pass_env.clone(),
+            directory: template.directory.clone(),
+            limits: template.limits,
+            readiness: template.readiness.clone(),
+            adopt: template.adopt,
+            adopt_grace_s: template.adopt_grace_s,
+            ..Template::new("", "")
+        };
+        of_the_process(self) == of_the_process(other)
+    }
+
+    /// What is missing on this machine for a worker to be started, in words.
+    pub fn obstacle(&self) -> Option<String> {
+        if let Some(directory) = self.directory.as_ref().filter(|directory| !directory.is_dir()) {
+            return Some(format!("there is no directory {}", directory.display()));
+        }
+        let program = self.program.as_ref()?;
+        let runs = |file: &Path| file.is_file() && access(file, AccessFlags::X_OK).is_ok();
+        if program.components().count() > 1 {
+            return match (program.is_file(), runs(program)) {
+                (false, _) => Some(format!("there is no program {}", program.display())),
+                (true, false) => Some(format!("{} may not be executed", program.display())),
+                (true, true) => None,
+            };
+        }
+        let path = std::env::var_os("PATH").unwrap_or_default();
+        let found = std::env::split_paths(&path).any(|directory| runs(&directory.join(program)));
+        (!found).then(|| format!("there is no program {} in PATH", program.display()))
+    }
+
     /// Says what is wrong with it; `at` is its place in the config.
     pub(super) fn check(&self, at: &str) -> Result<(), ConfigError> {
         let key = |name: &str| format!("{at}.{name}");
@@ -184,6 +232,7 @@ impl Template {
         for (name, seconds) in [
             ("start_timeout_s", self.start_timeout_s),
             ("drain_s", self.drain_s),
+            ("adopt_grace_s", self.adopt_grace_s),
             ("stop_timeout_s", self.stop_timeout_s),
             ("stable_s", self.stable_s),
             ("idle_s", self.idle_s),
@@ -197,6 +246,12 @@ impl Template {
         rule(key("max_backoff_ms"), self.max_backoff_ms >= self.backoff_ms, "at least backoff_ms")?;
         let absolute = self.directory.as_ref().is_none_or(|directory| directory.is_absolute());
         rule(key("directory"), absolute, "an absolute path")?;
+        let line = matches!(self.readiness, Readiness::Line { .. });
+        rule(
+            key("adopt"),
+            !(self.adopt && line),
+            "who is ready by a line of its output cannot be adopted: nobody could ask it",
+        )?;
         self.limits.check(&key("limits"))?;
         self.readiness.check(&key("readiness"), self)?;
         for (name, parameter) in &self.parameters {

@@ -74,6 +74,7 @@ pub async fn run_as(
     let link = Link {
         manager: manager.clone(),
         client: format!("{ROLE}@{}", config.host),
+        session: None,
         ttl: Duration::from_millis(config.session_ttl_ms),
         wanted,
         there: None,

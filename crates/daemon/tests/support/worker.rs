@@ -1,10 +1,11 @@
 //! The worker that the process manager's tests start, kill and count. Test only.
 //!
 //! `ratn-test-worker serve ID KIND ENDPOINT_FILE` serves until its parent ends; `ratn-test-worker manage DIRECTORY` is a
-//! process manager of one such worker; `ratn-test-worker notify` says to systemd's socket that it is ready, `ratn-test-worker port N`
+//! process manager of one such worker, with `adopt GRACE_S` of one that is to be adopted, `adopt-other` of one that differs, `sleep` of one that
+//! does not look at its standard input; `ratn-test-worker notify` says to systemd's socket that it is ready, `ratn-test-worker port N`
 //! listens on a port of loopback, both until their standard input ends; `ratn-test-worker fail` says why and exits.
 
-use ratn_daemon::process_manager::{self, ProcessManagerConfig, Template};
+use ratn_daemon::process_manager::{self, ProcessManagerConfig, Readiness, Template};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::process::ExitCode;
@@ -16,7 +17,18 @@ async fn main() -> ExitCode {
     let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
     match words[..] {
         ["serve", id, kind, endpoint_file] => serve(id, kind, endpoint_file).await,
-        ["manage", directory] => manage(directory).await,
+        ["manage", directory] => manage(directory, Template::new("planner", "PathPlanner")).await,
+        ["manage", directory, "adopt", grace_s] => manage(directory, adoptable(grace_s)).await,
+        ["manage", directory, "adopt-other", grace_s] => {
+            let env = [("COLOUR".to_owned(), "blue".to_owned())].into();
+            manage(directory, Template { env, ..adoptable(grace_s) }).await
+        }
+        ["manage", directory, "sleep"] => {
+            let program = Some("/bin/sh".into());
+            let args = ["-c", "echo ready; sleep 1000 & wait"].map(str::to_owned).to_vec();
+            let readiness = Readiness::Line { contains: "ready".to_owned() };
+            manage(directory, Template { program, args, readiness, ..Template::new("planner", "PathPlanner") }).await
+        }
         ["notify"] => notify().await,
         ["port", port] => listen(port).await,
         _ => {
@@ -43,15 +55,21 @@ async fn until_input_ends() -> ExitCode {
     ExitCode::SUCCESS
 }
 
-async fn manage(directory: &str) -> ExitCode {
+fn adoptable(grace_s: &str) -> Template {
+    let adopt_grace_s = grace_s.parse().expect("a number");
+    Template { adopt: true, adopt_grace_s, ..Template::new("planner", "PathPlanner") }
+}
+
+async fn manage(directory: &str, template: Template) -> ExitCode {
     let args = ["serve", "{id}", "{kind}", "{endpoint_file}"].map(str::to_owned).to_vec();
-    let template = Template { args, ..Template::new("planner", "PathPlanner") };
-    let config = ProcessManagerConfig { session_ttl_ms: 300, templates: vec![template], ..Default::default() };
+    let template = if template.args.is_empty() { Template { args, ..template } } else { template };
+    let session_ttl_ms = if template.adopt { 5_000 } else { 300 };
+    let config = ProcessManagerConfig { session_ttl_ms, templates: vec![template], ..Default::default() };
     let run = process_manager::run(config, RuntimeDirectory::at(directory), CancellationToken::new());
     match run.await {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("{error}");
+            eprintln!("{error:#}");
             ExitCode::FAILURE
         }
     }

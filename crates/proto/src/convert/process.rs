@@ -97,7 +97,12 @@ impl TryFrom<v1::Pool> for PoolStatus {
 
 impl From<HostPools> for v1::ListPoolsResponse {
     fn from(host: HostPools) -> v1::ListPoolsResponse {
-        v1::ListPoolsResponse { host: host.host, pools: all(host.pools), draining: host.draining }
+        v1::ListPoolsResponse {
+            host: host.host,
+            pools: all(host.pools),
+            draining: host.draining,
+            clock_us: host.clock_us,
+        }
     }
 }
 
@@ -106,6 +111,7 @@ impl TryFrom<v1::ListPoolsResponse> for HostPools {
 
     fn try_from(answer: v1::ListPoolsResponse) -> Result<HostPools, Malformed> {
         name(&answer.host, "host")?;
-        Ok(HostPools { host: answer.host, draining: answer.draining, pools: each(answer.pools, "pools")? })
+        let pools = each(answer.pools, "pools")?;
+        Ok(HostPools { host: answer.host, draining: answer.draining, clock_us: answer.clock_us, pools })
     }
 }

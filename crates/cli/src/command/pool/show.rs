@@ -129,13 +129,14 @@ mod tests {
         let compute = HostPools {
             host: "compute".to_owned(),
             draining: false,
+            clock_us: 0,
             pools: vec![
                 pool("path-planner", workers, "", killed),
                 pool("detector", vec![], "", ""),
                 pool("script", vec![], "5 crashes", ""),
             ],
         };
-        let control = HostPools { host: "control".to_owned(), draining: true, pools: Vec::new() };
+        let control = HostPools { host: "control".to_owned(), draining: true, clock_us: 0, pools: Vec::new() };
         insta::assert_snapshot!(table(&[&compute, &control]), @r"
         WORKER                  KIND         STATE  PID  AGE  MEMORY  CPU      LIMITS
         path-planner-1@compute  PathPlanner  busy   42   2 h  24 MiB  101.5 %  -

@@ -26,6 +26,11 @@ impl Liveness {
         self.next.take_if(|next| *next <= now).map(|_| self.within)
     }
 
+    /// It is to be asked now, where it can be.
+    pub(super) fn ask_at_once(&mut self, now: Timestamp) {
+        self.next = self.pause.map(|_| now);
+    }
+
     /// It serves.
     pub(super) fn answered(&mut self, now: Timestamp) {
         self.next = self.pause.map(|pause| now + pause);

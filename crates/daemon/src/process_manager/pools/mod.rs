@@ -21,7 +21,7 @@ pub use command::{Command, Event, PoolError};
 use super::template::Template;
 use pool::Pool;
 use ratn_model::time::Timestamp;
-use ratn_proto::types::{Demand, PoolStatus, Scale};
+use ratn_proto::types::{Demand, PoolStatus, Scale, WorkerStatus};
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use worker::Worker;
@@ -106,6 +106,25 @@ impl Pools {
     /// The next moment at which time alone changes something: [`Event::Time`] is due then.
     pub fn next_deadline(&self) -> Option<Timestamp> {
         self.pools.values().filter_map(Pool::deadline).min()
+    }
+
+    /// New workers have other ids than these, which a process manager before this one gave away.
+    pub fn go_on_after(&mut self, ids: &[String]) {
+        for id in ids {
+            if let Some((template, number)) = self.parts_of(id)
+                && let Some(pool) = self.pools.get_mut(template)
+            {
+                pool.go_on_after(number);
+            }
+        }
+    }
+
+    /// Takes over a worker that serves already, of a process manager that is gone; what to do. Nothing where its pool is not known.
+    pub fn adopt(&mut self, now: Timestamp, worker: &WorkerStatus, outdated: bool) -> Option<Vec<Command>> {
+        let mut commands = Vec::new();
+        let (_, number) = self.parts_of(&worker.id)?;
+        self.pools.get_mut(&worker.template)?.adopt(now, number, worker, outdated, &mut commands);
+        Some(commands)
     }
 
     /// Starts more workers, also where the pool has failed; their ids, and what to do.
@@ -299,10 +318,16 @@ impl Pools {
         true
     }
 
+    /// Template and number of a worker's id.
+    fn parts_of<'i>(&self, id: &'i str) -> Option<(&'i str, u64)> {
+        let (name, number) = id.strip_suffix(self.host.as_str())?.strip_suffix('@')?.rsplit_once('-')?;
+        Some((name, number.parse().ok()?))
+    }
+
     /// The pool of a worker, and its number there.
     fn find(&mut self, id: &str) -> Option<(&mut Pool, u64)> {
-        let (name, number) = id.strip_suffix(self.host.as_str())?.strip_suffix('@')?.rsplit_once('-')?;
-        let (pool, number) = (self.pools.get_mut(name)?, number.parse().ok()?);
+        let (name, number) = self.parts_of(id)?;
+        let pool = self.pools.get_mut(name)?;
         pool.worker(number).is_some_and(|worker| worker.id() == id).then_some((pool, number))
     }
 

@@ -7,7 +7,7 @@ use super::worker::Worker;
 use crate::process_manager::readiness::Readiness;
 use crate::process_manager::template::Template;
 use ratn_model::time::Timestamp;
-use ratn_proto::types::{PoolStatus, Scale};
+use ratn_proto::types::{PoolStatus, Scale, WorkerStatus};
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
@@ -138,6 +138,31 @@ impl Pool {
         self.workers.insert(number, worker);
         commands.push(Command::Start { id: id.clone(), template: name.clone() });
         id
+    }
+
+    /// Later workers have later numbers.
+    pub(super) fn go_on_after(&mut self, number: u64) {
+        self.last_number = self.last_number.max(number);
+    }
+
+    /// One that serves already is one of its workers from now on.
+    pub(super) fn adopt(
+        &mut self,
+        now: Timestamp,
+        number: u64,
+        worker: &WorkerStatus,
+        outdated: bool,
+        commands: &mut Vec<Command>,
+    ) {
+        self.go_on_after(number);
+        let mut adopted = Worker::starting(now, worker.id.clone(), &self.template);
+        adopted.spawned(worker.pid, worker.limits.clone(), commands);
+        adopted.serving(now, &worker.endpoint, &self.template.kind, commands);
+        adopted.ask_at_once(now);
+        if outdated {
+            adopted.outdate();
+        }
+        self.workers.insert(number, adopted);
     }
 
     /// A worker's process is gone.

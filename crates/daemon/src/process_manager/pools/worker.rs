@@ -100,6 +100,11 @@ impl Worker {
         }
     }
 
+    /// Whether it still serves is to be asked now.
+    pub(super) fn ask_at_once(&mut self, now: Timestamp) {
+        self.liveness.ask_at_once(now);
+    }
+
     /// Its resource is there.
     pub(super) fn offered(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         if self.phase == Phase::Serving {

@@ -1,0 +1,191 @@
+//! The running system: who answers, whose clock is off, which host is drained, which pool has failed; where nothing runs, whether its
+//! ports are free.
+
+use super::Findings;
+use super::tls::listens;
+use crate::system::config::SystemConfig;
+use ratn_daemon::process_manager::HOST_KIND;
+use ratn_daemon::resource_manager;
+use ratn_proto::types::{HostPools, Resource};
+use ratn_worker::client::{Channels, Health, ProcessClient, ResourceClient};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::runtime_directory::{FindError, RuntimeDirectory};
+use std::io::ErrorKind;
+use std::net::TcpListener;
+use std::path::Path;
+use std::time::Duration;
+use time::OffsetDateTime;
+
+/// Who has not answered by then does not.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// Clocks that are further apart make charts and logs of several hosts hard to read …
+const SLIGHT_OFFSET_MS: i64 = 20;
+/// … and certificates and deadlines doubtful.
+const LARGE_OFFSET_MS: i64 = 5_000;
+
+pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, directory: &Path) {
+    let directory = RuntimeDirectory::at(directory);
+    let mut manager = None;
+    for (role, listen) in listens(config) {
+        match directory.find(role) {
+            Ok(endpoint) => {
+                let answers = role_answers(findings, role, &endpoint).await;
+                if answers && role == resource_manager::ROLE {
+                    manager = Some(endpoint);
+                }
+            }
+            Err(FindError::NotPublished { .. }) => free_port(findings, role, &listen),
+            Err(error) => findings.problem(role, error.to_string(), "remove the file, and start the role again"),
+        }
+    }
+    let elsewhere = [config.process_manager.resource_manager.clone(), config.cell.resource_manager.clone()];
+    if let Some(manager) = manager.or_else(|| elsewhere.into_iter().flatten().next()) {
+        hosts(findings, &manager).await;
+    }
+}
+
+async fn role_answers(findings: &mut Findings, role: &str, endpoint: &Endpoint) -> bool {
+    match Health::of(endpoint.clone()).serving(PATIENCE).await {
+        Ok(()) => {
+            findings.ok(role, format!("serves at {endpoint}"));
+            true
+        }
+        Err(error) => {
+            let help = format!(
+                "it was killed, hangs, or cannot be reached from here: start it again (`ratn {role}`), and look at its log"
+            );
+            findings.problem(role, format!("is published at {endpoint} and does not answer: {error}"), help);
+            false
+        }
+    }
+}
+
+/// Where a role would listen that does not run.
+fn free_port(findings: &mut Findings, role: &str, listen: &Endpoint) {
+    let (Endpoint::Tcp { host, port } | Endpoint::Tls { host, port }) = listen else {
+        return findings.ok(role, "does not run in this runtime directory");
+    };
+    match TcpListener::bind((host.as_str(), *port)) {
+        Ok(_) => findings.ok(role, format!("does not run here; {listen} is free for it")),
+        Err(error) if error.kind() == ErrorKind::AddrNotAvailable => {
+            findings.ok(role, format!("is another host's: {host} is no address of this machine"));
+        }
+        Err(error) if error.kind() == ErrorKind::AddrInUse => findings.problem(
+            role,
+            format!("does not run here, and {listen} is taken"),
+            "`ss -ltnp` says by whom: end that, or give another port to `listen`",
+        ),
+        Err(error) => findings.problem(
+            role,
+            format!("{listen} cannot be listened on: {error}"),
+            "the name has to resolve on every host: /etc/hosts or DNS",
+        ),
+    }
+}
+
+async fn hosts(findings: &mut Findings, manager: &Endpoint) {
+    let channels = Channels::new();
+    let listed = async { ResourceClient::new(&channels, manager, "")?.list(&[HOST_KIND]).await };
+    let hosts = match tokio::time::timeout(PATIENCE, listed).await {
+        Ok(Ok(hosts)) => hosts,
+        Ok(Err(error)) => {
+            let help = "is it running, does TLS let you in, has your certificate a role ([service.access])?";
+            return findings.problem("resource manager", format!("{manager}: {error}"), help);
+        }
+        Err(_) => {
+            let help = "is the network between the hosts well?";
+            return findings.problem("resource manager", format!("{manager} does not answer within 2 s"), help);
+        }
+    };
+    if hosts.is_empty() {
+        let help = "start `ratn process-manager` where workers are to run";
+        findings.warning("hosts", "no process manager has offered its host", help);
+    }
+    for host in hosts {
+        process_manager(findings, &channels, &host).await;
+    }
+}
+
+async fn process_manager(findings: &mut Findings, channels: &Channels, host: &Resource) {
+    let about = format!("host {}", host.host);
+    let Ok(endpoint) = host.endpoint().parse::<Endpoint>() else { return };
+    let asked = OffsetDateTime::now_utc();
+    let answer = async { ProcessClient::new(channels, &endpoint)?.pools().await };
+    let pools = match tokio::time::timeout(PATIENCE, answer).await {
+        Ok(Ok(pools)) => pools,
+        Ok(Err(error)) => {
+            let help = "one that listens on `local` is reached on its own host only: give it an address";
+            return findings.warning(about, format!("its process manager does not answer: {error}"), help);
+        }
+        Err(_) => {
+            return findings.problem(
+                about,
+                format!("{endpoint} does not answer within 2 s"),
+                "is that host well, and its network?",
+            );
+        }
+    };
+    let answered = OffsetDateTime::now_utc();
+    clock(findings, &about, asked, answered, pools.clock_us);
+    workers(findings, &about, &pools);
+}
+
+/// Its clock was read between question and answer; half of that is how well it is known (Cristian 1989).
+fn clock(findings: &mut Findings, about: &str, asked: OffsetDateTime, answered: OffsetDateTime, clock_us: u64) {
+    let micros = |at: OffsetDateTime| i64::try_from(at.unix_timestamp_nanos() / 1_000).unwrap_or(i64::MAX);
+    let middle = (micros(asked) + micros(answered)) / 2;
+    let doubt_ms = (micros(answered) - micros(asked)) / 2_000;
+    let offset_ms = (i64::try_from(clock_us).unwrap_or(i64::MAX) - middle) / 1_000;
+    let (far, about) = ((offset_ms.abs() - doubt_ms).max(0), format!("{about}, clock"));
+    let found = format!("{offset_ms:+} ms from this machine's, to {doubt_ms} ms");
+    let help = "synchronise the clocks (chrony, systemd-timesyncd)";
+    if far > LARGE_OFFSET_MS {
+        findings.problem(about, found, help);
+    } else if far > SLIGHT_OFFSET_MS {
+        findings.warning(about, found, help);
+    } else {
+        findings.ok(about, found);
+    }
+}
+
+fn workers(findings: &mut Findings, about: &str, host: &HostPools) {
+    if host.draining {
+        let help = format!("`ratn drain --undo {}` lets it take work again", host.host);
+        findings.warning(about, "is drained: it starts no workers", help);
+    }
+    for pool in &host.pools {
+        let about = format!("{about}, template {}", pool.template);
+        if !pool.failure.is_empty() {
+            let help = format!("`ratn logs {0}` says more; `ratn pool start {0}` tries again", pool.template);
+            findings.problem(about, format!("FAILED: {}", pool.failure), help);
+        } else if pool.crashes > 0 {
+            let found = format!("{} workers crashed, the last one: {}", pool.crashes, pool.last_exit);
+            findings.warning(about, found, format!("`ratn logs {}`", pool.template));
+        } else {
+            findings.ok(about, format!("{} workers, {} to {}", pool.workers.len(), pool.min, pool.max));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::command::doctor::Level;
+
+    #[test]
+    fn a_clock_is_off_only_by_what_the_answer_s_time_does_not_explain() {
+        let asked = OffsetDateTime::UNIX_EPOCH + Duration::from_secs(1_000);
+        let level = |took_ms: u64, offset_us: i64| {
+            let mut findings = Findings::default();
+            let middle = 1_000_000_000 + took_ms * 500;
+            let clock_us = u64::try_from(i64::try_from(middle).unwrap() + offset_us).unwrap();
+            clock(&mut findings, "host a", asked, asked + Duration::from_millis(took_ms), clock_us);
+            findings.0[0].level
+        };
+        assert_eq!(level(2, 10_000), Level::Ok);
+        assert_eq!(level(2, -50_000), Level::Warning);
+        assert_eq!(level(200, -50_000), Level::Ok, "the answer took longer than that");
+        assert_eq!(level(2, 60_000_000), Level::Problem);
+    }
+}

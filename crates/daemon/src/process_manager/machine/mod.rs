@@ -1,0 +1,179 @@
+//! This machine as resources of the class system (the paper's Section V-B): its processors, memory, disk, load and battery, created when
+//! the process manager starts and kept up to date, so that a task can require them; and room for workers.
+//!
+//! ```text
+//!   sample.rs (sysinfo, statvfs, /sys) ──Sample──▶ Told (what everybody knows, and what has changed enough) ──▶ offered resources
+//!                                         └────▶ the pools: is there room for one more worker?
+//! ```
+
+mod sample;
+
+pub use sample::Sample;
+
+use super::config::Labels;
+use super::offered;
+use crate::config::{ConfigError, rule};
+use crate::link::Wanted;
+use ratn_proto::types::Resource;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use sample::Sampler;
+use serde::{Deserialize, Serialize};
+use std::time::Duration;
+use tokio::sync::{mpsc, watch};
+
+/// What of this machine is offered. All keys are optional.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MachineConfig {
+    /// The pause between two looks, in seconds.
+    pub interval_s: f64,
+    /// So many processors are not offered as `Core`: what the daemons and everybody else need.
+    pub reserved_cores: u32,
+    /// Whether the battery that the kernel knows is offered as `Battery`, where there is one.
+    pub battery: bool,
+    /// A value is told again when it has changed by this share of what there can be.
+    pub step: f64,
+}
+
+impl Default for MachineConfig {
+    fn default() -> Self {
+        MachineConfig { interval_s: 2.0, reserved_cores: 0, battery: false, step: 0.05 }
+    }
+}
+
+impl MachineConfig {
+    pub(super) fn check(&self) -> Result<(), ConfigError> {
+        let seconds = (0.1..=3_600.0).contains(&self.interval_s);
+        rule("machine.interval_s", seconds, "from 0.1 s to an hour")?;
+        rule("machine.step", (0.001..=1.0).contains(&self.step), "from 0.001 to 1")
+    }
+}
+
+/// What was told last. A value that goes to and fro by less than a step is told once.
+#[derive(Debug)]
+pub(super) struct Told {
+    step: f64,
+    sample: Option<Sample>,
+}
+
+impl Told {
+    pub(super) fn new(step: f64) -> Told {
+        Told { step, sample: None }
+    }
+
+    /// What is to be told now: the sample with the old value of everything that has not changed enough; nothing where that is all.
+    pub(super) fn tell(&mut self, now: &Sample) -> Option<Sample> {
+        let Some(told) = &self.sample else {
+            self.sample = Some(now.clone());
+            return self.sample.clone();
+        };
+        let bytes = |was: u64, is: u64, of: u64| if far(was as f64, is as f64, self.step * of as f64) { is } else { was };
+        let numbers = |was: f64, is: f64| if far(was, is, self.step) { is } else { was };
+        let next = Sample {
+            cores: now.cores,
+            load_per_core: numbers(told.load_per_core, now.load_per_core),
+            idle_cores: numbers(told.idle_cores / f64::from(now.cores.max(1)), now.idle_cores / f64::from(now.cores.max(1)))
+                * f64::from(now.cores.max(1)),
+            memory_bytes: now.memory_bytes,
+            free_memory_bytes: bytes(told.free_memory_bytes, now.free_memory_bytes, now.memory_bytes),
+            disk_bytes: now.disk_bytes,
+            free_disk_bytes: bytes(told.free_disk_bytes, now.free_disk_bytes, now.disk_bytes),
+            battery: match (told.battery, now.battery) {
+                (Some(was), Some(is)) => Some(numbers(was, is)),
+                (_, is) => is,
+            },
+        };
+        (self.sample.as_ref() != Some(&next)).then(|| {
+            self.sample = Some(next.clone());
+            next
+        })
+    }
+}
+
+/// At least a step apart; so that nothing is lost at the ends, where there can be no step more, exactly nothing and exactly all are told.
+fn far(was: f64, is: f64, step: f64) -> bool {
+    (was - is).abs() >= step || (is == 0.0 && was != 0.0)
+}
+
+/// What is offered of this machine.
+pub(super) struct Machine {
+    pub(super) config: MachineConfig,
+    pub(super) labels: Labels,
+    /// The host without what changes.
+    pub(super) host: Resource,
+}
+
+impl Machine {
+    /// Keeps what is offered up to date, and tells the pools of every look. Does not end.
+    pub(super) async fn watch(
+        self,
+        directory: RuntimeDirectory,
+        wanted: watch::Sender<Wanted>,
+        looks: mpsc::Sender<Sample>,
+    ) {
+        let mut told = Told::new(self.config.step);
+        let mut sampler = Sampler::new(directory.path().to_owned(), self.config.battery);
+        loop {
+            let looked = tokio::task::spawn_blocking(move || {
+                let sample = sampler.look();
+                (sampler, sample)
+            });
+            let Ok((back, sample)) = looked.await else { return };
+            sampler = back;
+            if let Some(sample) = told.tell(&sample) {
+                let resources = self.resources(&sample);
+                wanted.send_modify(|wanted| wanted.extend(resources.into_iter().map(|one| (one.id.clone(), one))));
+            }
+            if looks.send(sample).await.is_err() {
+                return;
+            }
+            tokio::time::sleep(Duration::from_secs_f64(self.config.interval_s)).await;
+        }
+    }
+
+    fn resources(&self, sample: &Sample) -> Vec<Resource> {
+        let cores = sample.cores.saturating_sub(self.config.reserved_cores);
+        let mut resources = vec![offered::host_with(self.host.clone(), sample)];
+        resources.extend(offered::cores(&self.host.host, &self.labels, cores));
+        resources.extend(sample.battery.map(|level| offered::battery(&self.host.host, level)));
+        resources
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    fn sample(free_memory_mib: u64, battery: f64) -> Sample {
+        Sample {
+            cores: 4,
+            load_per_core: 0.5,
+            idle_cores: 2.0,
+            memory_bytes: 1_000 << 20,
+            free_memory_bytes: free_memory_mib << 20,
+            disk_bytes: 1 << 40,
+            free_disk_bytes: 1 << 39,
+            battery: Some(battery),
+        }
+    }
+
+    #[test]
+    fn what_goes_to_and_fro_is_told_once_and_a_step_is_told_at_once() {
+        let mut told = Told::new(0.05);
+        assert_eq!(told.tell(&sample(500, 0.8)), Some(sample(500, 0.8)));
+        for free in [520, 470, 540, 460] {
+            assert_eq!(told.tell(&sample(free, 0.8)), None, "{free}");
+        }
+        assert_eq!(told.tell(&sample(449, 0.8)), Some(sample(449, 0.8)));
+        assert_eq!(told.tell(&sample(495, 0.78)), None, "from 449 on");
+        assert_eq!(told.tell(&sample(495, 0.74)).unwrap(), sample(449, 0.74), "the rest stays as it was told");
+    }
+
+    #[test]
+    fn nothing_left_is_told_however_small_the_step() {
+        let mut told = Told::new(0.05);
+        told.tell(&sample(20, 0.5));
+        assert_eq!(told.tell(&sample(0, 0.5)), Some(sample(0, 0.5)));
+    }
+}

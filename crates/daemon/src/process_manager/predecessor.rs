@@ -1,0 +1,171 @@
+//! What becomes of the workers that a process manager left behind that was killed: adopted or ended, each as its template says, before
+//! any other is started.
+//!
+//! ```text
+//!   its process is gone ──▶ forgotten            it serves, its template says `adopt`, and it listens for a successor ──▶ adopted
+//!   everybody else ──▶ SIGTERM, after `stop_timeout_s` SIGKILL, and with it all that it started
+//! ```
+
+use super::limits::end_group;
+use super::roster::Entry;
+use super::spawner;
+use super::template::Template;
+use nix::sys::signal::Signal;
+use ratn_proto::types::{WorkerState, WorkerStatus};
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use std::os::fd::OwnedFd;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+use tokio::io::unix::AsyncFd;
+use tokio::net::UnixStream;
+use tokio::time::timeout;
+
+/// A worker that is to be adopted takes a connection at once.
+const GREETING_PATIENCE: Duration = Duration::from_secs(1);
+/// From SIGKILL to the end of a process of much memory.
+const KILL_PATIENCE: Duration = Duration::from_secs(5);
+
+/// A worker that was taken over.
+#[derive(Debug)]
+pub(super) struct Adopted {
+    pub(super) entry: Entry,
+    /// As long as this is open, it has a parent.
+    pub(super) parent_lives: UnixStream,
+    pub(super) exit: Exit,
+    /// Its template has changed: it is to be replaced.
+    pub(super) outdated: bool,
+}
+
+impl Adopted {
+    pub(super) fn status(&self) -> WorkerStatus {
+        WorkerStatus {
+            id: self.entry.id.clone(),
+            template: self.entry.template.name.clone(),
+            state: WorkerState::Ready,
+            pid: self.entry.pid,
+            endpoint: self.entry.endpoint.clone().unwrap_or_default(),
+            reason: String::new(),
+            resident_bytes: 0,
+            cpu_millicores: 0,
+            limits: self.entry.limits.clone(),
+            age_s: 0,
+            held: false,
+        }
+    }
+}
+
+/// The end of a process that is no child of this one.
+#[derive(Debug)]
+pub(super) struct Exit(AsyncFd<OwnedFd>);
+
+impl Exit {
+    /// Of the process that began then; nothing where it is gone.
+    fn of(entry: &Entry) -> Option<Exit> {
+        let pid = rustix::process::Pid::from_raw(i32::try_from(entry.pid).ok()?)?;
+        let fd = rustix::process::pidfd_open(pid, rustix::process::PidfdFlags::empty()).ok()?;
+        // Looked at after the descriptor was had: it is that process, or none.
+        (began(entry.pid)? == entry.began).then_some(())?;
+        #[allow(deprecated, reason = "an owned descriptor stays the same and open, which is what the warning is about")]
+        AsyncFd::with_interest(fd, tokio::io::Interest::READABLE).ok().map(Exit)
+    }
+
+    pub(super) async fn wait(&self) {
+        let _ = self.0.readable().await;
+    }
+}
+
+/// When a process began, in ticks of the kernel (`proc_pid_stat(5)`, field 22); nothing of one that has ended.
+pub(super) fn began(pid: u32) -> Option<u64> {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    // The name before may have spaces and parentheses.
+    let mut fields = stat.rsplit_once(')')?.1.split_whitespace();
+    let state = fields.next()?;
+    (state != "Z" && state != "X").then_some(())?;
+    fields.nth(18)?.parse().ok()
+}
+
+/// Where a worker listens for a successor.
+pub(super) fn adopt_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
+    directory.path().join(format!("{id}.adopt"))
+}
+
+/// Adopts or ends all of them; those that were adopted. Returns when the others are gone.
+pub(super) async fn settle(left: Vec<Entry>, templates: &[Template], directory: &RuntimeDirectory) -> Vec<Adopted> {
+    let settled = left.into_iter().map(async |entry| {
+        let adopted = match Exit::of(&entry) {
+            Some(exit) => match greet(&entry, exit, templates, directory).await {
+                Ok(adopted) => Some(adopted),
+                Err((exit, why)) => {
+                    tracing::info!(
+                        id = entry.id,
+                        pid = entry.pid,
+                        why,
+                        "a worker of the last process manager is ended"
+                    );
+                    end(&entry, &exit).await;
+                    None
+                }
+            },
+            None => {
+                // Nobody else has its number for as long as something that it started is in its group.
+                if !Path::new(&format!("/proc/{}", entry.pid)).exists() {
+                    spawner::signal(entry.pid, Signal::SIGKILL);
+                }
+                None
+            }
+        };
+        if adopted.is_none() {
+            clear_up(&entry, directory);
+        }
+        adopted
+    });
+    futures::future::join_all(settled).await.into_iter().flatten().collect()
+}
+
+async fn greet(
+    entry: &Entry,
+    exit: Exit,
+    templates: &[Template],
+    directory: &RuntimeDirectory,
+) -> Result<Adopted, (Exit, &'static str)> {
+    let Some(template) = templates.iter().find(|template| template.name == entry.template.name) else {
+        return Err((exit, "its template is gone"));
+    };
+    if !(template.adopt && entry.template.adopt) {
+        return Err((exit, "its template does not say `adopt`"));
+    }
+    if entry.endpoint.is_none() {
+        return Err((exit, "it was not ready yet"));
+    }
+    let socket = adopt_socket(directory, &entry.id);
+    match timeout(GREETING_PATIENCE, UnixStream::connect(socket)).await {
+        Ok(Ok(parent_lives)) => {
+            let outdated = !template.starts_the_same_as(&entry.template);
+            tracing::info!(id = entry.id, pid = entry.pid, outdated, "a worker of the last process manager is adopted");
+            Ok(Adopted { entry: entry.clone(), parent_lives, exit, outdated })
+        }
+        _ => Err((exit, "it does not listen for a successor")),
+    }
+}
+
+async fn end(entry: &Entry, exit: &Exit) {
+    spawner::signal(entry.pid, Signal::SIGTERM);
+    if timeout(entry.template.stop_timeout(), exit.wait()).await.is_err() {
+        spawner::signal(entry.pid, Signal::SIGKILL);
+        if timeout(KILL_PATIENCE, exit.wait()).await.is_err() {
+            tracing::error!(id = entry.id, pid = entry.pid, "a worker of the last process manager does not end");
+        }
+    }
+    // What it had started, in its group of processes.
+    spawner::signal(entry.pid, Signal::SIGKILL);
+}
+
+fn clear_up(entry: &Entry, directory: &RuntimeDirectory) {
+    if let Some(group) = &entry.group {
+        end_group(group);
+    }
+    let files = [directory.endpoint_file(&entry.id), adopt_socket(directory, &entry.id)];
+    for file in files {
+        let _ = std::fs::remove_file(file);
+    }
+}

@@ -1,0 +1,221 @@
+//! Which workers there are, in a file of the runtime directory, so that a process manager that is started after one that was killed
+//! knows whom that one left behind. Lines are appended as workers come and go; a lock keeps a second process manager away.
+
+use super::template::Template;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+/// Lines beyond those of the workers there are; then the file is written anew.
+const MOST_OLD_LINES: usize = 1_000;
+
+/// A worker as its process manager knew it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Entry {
+    pub(super) id: String,
+    pub(super) pid: u32,
+    /// When its process began, in ticks of the kernel: a process id alone may be another's by now.
+    pub(super) began: u64,
+    /// Where it serves; `None` while it did not.
+    pub(super) endpoint: Option<String>,
+    /// What it may use of the machine, for people.
+    pub(super) limits: String,
+    /// Its group of cgroups, if it has one.
+    pub(super) group: Option<PathBuf>,
+    /// As it was started from.
+    pub(super) template: Template,
+}
+
+/// What happened to a worker.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Line {
+    Began(Box<Entry>),
+    Serves { id: String, endpoint: String },
+    Gone { id: String },
+}
+
+/// A process manager that cannot be one.
+#[derive(Debug, thiserror::Error)]
+pub enum RosterError {
+    /// Another one has the place.
+    #[error("a process manager runs in {} already: end it, or say another --runtime-dir", directory.display())]
+    Taken {
+        /// The runtime directory.
+        directory: PathBuf,
+    },
+    /// The file cannot be had.
+    #[error("cannot keep a list of the workers in {}", file.display())]
+    Io {
+        /// Which.
+        file: PathBuf,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+}
+
+#[derive(Debug)]
+pub(super) struct Roster {
+    path: PathBuf,
+    file: File,
+    lines: usize,
+    there: BTreeMap<String, Entry>,
+    _lock: File,
+}
+
+impl Roster {
+    /// Takes the place of the one process manager of a runtime directory; whom the last one left behind.
+    pub(super) fn take(directory: &RuntimeDirectory) -> Result<(Roster, Vec<Entry>), RosterError> {
+        let directory = directory.path();
+        let path = directory.join("workers");
+        let failed = |source| RosterError::Io { file: path.clone(), source };
+        let mut options = OpenOptions::new();
+        let lock = options.create(true).write(true).truncate(false).open(directory.join("process-manager.lock"));
+        let lock = lock.map_err(failed)?;
+        match lock.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => return Err(RosterError::Taken { directory: directory.to_owned() }),
+            Err(TryLockError::Error(source)) => return Err(failed(source)),
+        }
+        let left = read(&path).map_err(failed)?;
+        let file = File::options().append(true).create(true).open(&path).map_err(failed)?;
+        let mut roster = Roster { path: path.clone(), file, lines: 0, there: left.clone(), _lock: lock };
+        roster.write_anew().map_err(failed)?;
+        Ok((roster, left.into_values().collect()))
+    }
+
+    /// All others are gone.
+    pub(super) fn keep_only(&mut self, kept: &BTreeSet<&str>) {
+        let gone: Vec<String> = self.there.keys().filter(|id| !kept.contains(id.as_str())).cloned().collect();
+        gone.iter().for_each(|id| self.gone(id));
+    }
+
+    pub(super) fn began(&mut self, entry: Entry) {
+        self.there.insert(entry.id.clone(), entry.clone());
+        self.append(&Line::Began(Box::new(entry)));
+    }
+
+    pub(super) fn serves(&mut self, id: &str, endpoint: &str) {
+        if let Some(entry) = self.there.get_mut(id) {
+            entry.endpoint = Some(endpoint.to_owned());
+            self.append(&Line::Serves { id: id.to_owned(), endpoint: endpoint.to_owned() });
+        }
+    }
+
+    pub(super) fn gone(&mut self, id: &str) {
+        if self.there.remove(id).is_some() {
+            self.append(&Line::Gone { id: id.to_owned() });
+        }
+    }
+
+    /// The workers go on where it cannot be written: only a successor would not know of them.
+    fn append(&mut self, line: &Line) {
+        self.lines += 1;
+        let written = if self.lines > self.there.len() * 2 + MOST_OLD_LINES {
+            self.write_anew()
+        } else {
+            write(&mut self.file, line)
+        };
+        if let Err(error) = written {
+            tracing::warn!(file = %self.path.display(), %error, "the list of workers is not written");
+        }
+    }
+
+    /// Beside the old one, so that there is always a whole one.
+    fn write_anew(&mut self) -> io::Result<()> {
+        let next = self.path.with_extension("new");
+        let mut file = File::create(&next)?;
+        for entry in self.there.values() {
+            write(&mut file, &Line::Began(Box::new(entry.clone())))?;
+        }
+        std::fs::rename(&next, &self.path)?;
+        (self.file, self.lines) = (file, self.there.len());
+        Ok(())
+    }
+}
+
+fn write(file: &mut File, line: &Line) -> io::Result<()> {
+    let mut text = serde_json::to_string(line).map_err(io::Error::other)?;
+    text.push('\n');
+    file.write_all(text.as_bytes())
+}
+
+/// A line that was cut off by the end of its writer says nothing.
+fn read(path: &Path) -> io::Result<BTreeMap<String, Entry>> {
+    let text = match std::fs::read_to_string(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => String::new(),
+        read => read?,
+    };
+    let mut there: BTreeMap<String, Entry> = BTreeMap::new();
+    for line in text.lines().filter_map(|line| serde_json::from_str(line).ok()) {
+        match line {
+            Line::Began(entry) => drop(there.insert(entry.id.clone(), *entry)),
+            Line::Serves { id, endpoint } => {
+                if let Some(entry) = there.get_mut(&id) {
+                    entry.endpoint = Some(endpoint);
+                }
+            }
+            Line::Gone { id } => drop(there.remove(&id)),
+        }
+    }
+    Ok(there)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    fn entry(id: &str) -> Entry {
+        Entry {
+            id: id.to_owned(),
+            pid: 42,
+            began: 7,
+            endpoint: None,
+            limits: String::new(),
+            group: None,
+            template: Template::new("planner", "PathPlanner"),
+        }
+    }
+
+    #[test]
+    fn a_successor_knows_whom_the_last_one_left_and_two_at_a_time_there_are_not() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
+        let (mut roster, left) = Roster::take(&directory).unwrap();
+        assert!(left.is_empty());
+        assert!(matches!(Roster::take(&directory), Err(RosterError::Taken { .. })));
+        for id in ["a", "b", "c"] {
+            roster.began(entry(id));
+        }
+        roster.serves("b", "unix:/b");
+        roster.gone("a");
+        roster.file.write_all(b"{\"gone\":{\"id\":\"b").unwrap();
+        drop(roster);
+        let (mut roster, left) = Roster::take(&directory).unwrap();
+        let served = Entry { endpoint: Some("unix:/b".to_owned()), ..entry("b") };
+        assert_eq!(left, [served.clone(), entry("c")]);
+        roster.keep_only(&["b"].into());
+        drop(roster);
+        assert_eq!(Roster::take(&directory).unwrap().1, [served]);
+    }
+
+    #[test]
+    fn it_does_not_grow_with_those_that_are_gone() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
+        let (mut roster, _) = Roster::take(&directory).unwrap();
+        roster.began(entry("stays"));
+        for i in 0..MOST_OLD_LINES {
+            roster.began(entry(&format!("w-{i}")));
+            roster.gone(&format!("w-{i}"));
+        }
+        assert!(roster.lines <= MOST_OLD_LINES + 3);
+        drop(roster);
+        assert_eq!(Roster::take(&directory).unwrap().1, [entry("stays")]);
+    }
+}
