@@ -1,5 +1,6 @@
 //! What a cell is made of, from TOML. Every key has a default; an unknown one is an error.
 
+use crate::core::faults::{Fault, MAX_FAULTS};
 use ratn_perception::camera::Intrinsics;
 use ratn_perception::noise::Noise;
 use ratn_worker::endpoint::Endpoint;
@@ -26,6 +27,8 @@ pub struct CellConfig {
     pub speed: f64,
     /// How long the session with the resource manager outlives the last keep-alive, in milliseconds.
     pub session_ttl_ms: u64,
+    /// What goes wrong: `grasp_slips:2` at the second grasp, `object_moved@12.5` at a time, `sensor_dropout~0.05` by chance.
+    pub faults: Vec<Fault>,
     /// The gripper.
     pub gripper: GripperConfig,
     /// The pan-tilt unit.
@@ -46,6 +49,8 @@ pub struct GripperConfig {
     pub close_s: f64,
     /// How long it takes to open, in the robot's seconds.
     pub open_s: f64,
+    /// How hard each finger presses, in newtons.
+    pub force_n: f64,
 }
 
 /// The pan-tilt unit.
@@ -116,6 +121,8 @@ impl CellConfig {
                 "0.02 to 0.11",
             ),
             ("gripper.close_s", self.gripper.close_s, (0.0..=60.0).contains(&self.gripper.close_s), "0 to 60"),
+            ("gripper.force_n", self.gripper.force_n, (0.1..=200.0).contains(&self.gripper.force_n), "0.1 to 200"),
+            ("faults", self.faults.len() as f64, self.faults.len() <= MAX_FAULTS, "at most 64"),
             ("gripper.open_s", self.gripper.open_s, (0.0..=60.0).contains(&self.gripper.open_s), "0 to 60"),
             (
                 "pan_tilt.speed",
@@ -171,6 +178,7 @@ impl Default for CellConfig {
             seed: 1,
             speed: 1.0,
             session_ttl_ms: 3000,
+            faults: Vec::new(),
             gripper: GripperConfig::default(),
             pan_tilt: PanTiltConfig::default(),
             camera: CameraConfig::default(),
@@ -181,7 +189,7 @@ impl Default for CellConfig {
 
 impl Default for GripperConfig {
     fn default() -> GripperConfig {
-        GripperConfig { opening_m: 0.11, close_s: 1.1, open_s: 0.8 }
+        GripperConfig { opening_m: 0.11, close_s: 1.1, open_s: 0.8, force_n: 40.0 }
     }
 }
 

@@ -6,6 +6,7 @@ use crate::command::resource::ResourceArguments;
 use crate::command::world::WorldArguments;
 use crate::task_control::control::Word;
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use ratn_cell::core::faults::Fault;
 use ratn_daemon::config::Durability;
 use ratn_worker::endpoint::Endpoint;
 use std::net::SocketAddr;
@@ -74,7 +75,7 @@ pub(crate) enum Command {
     /// Spawn and watch this host's worker processes
     ProcessManager(RoleArguments),
     /// Be the simulated cell: robot, table, boxes, sensors, controllers (host sim)
-    Cell(RoleArguments),
+    Cell(CellArguments),
     /// Be a worker process; the process manager starts these
     Worker(WorkerArguments),
 }
@@ -118,6 +119,24 @@ pub(crate) struct KeptRoleArguments {
     /// directory unless given
     #[arg(long, value_name = "DIR")]
     pub(crate) state_dir: Option<PathBuf>,
+}
+
+/// What the cell takes beside what every daemon takes.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct CellArguments {
+    #[command(flatten)]
+    pub(crate) role: RoleArguments,
+    #[command(flatten)]
+    pub(crate) faults: FaultArguments,
+}
+
+/// What shall go wrong.
+#[derive(Debug, Clone, Default, Args)]
+pub(crate) struct FaultArguments {
+    /// Something that goes wrong in the cell: KIND:N at the n-th occasion, KIND@SECONDS at a time of the robot, KIND~PROBABILITY by
+    /// chance; kinds are grasp_slips, object_moved, sensor_dropout, controller_abort and localisation_lost; can be given several times
+    #[arg(long, value_name = "FAULT")]
+    pub(crate) fault: Vec<Fault>,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -451,6 +470,8 @@ pub(crate) struct SystemArguments {
     /// What the boxes' places and the sensors' noise are derived from
     #[arg(long, value_name = "N")]
     pub(crate) seed: Option<u64>,
+    #[command(flatten)]
+    pub(crate) faults: FaultArguments,
 }
 
 /// What planners may do with their time.
@@ -481,6 +502,8 @@ pub(crate) struct DemoArguments {
     /// What everything random is derived from
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub(crate) seed: u64,
+    #[command(flatten)]
+    pub(crate) faults: FaultArguments,
     /// Print one JSON document on standard output
     #[arg(long)]
     pub(crate) json: bool,

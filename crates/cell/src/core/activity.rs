@@ -37,7 +37,7 @@ pub(crate) struct Activity {
 
 #[derive(Debug, Clone)]
 pub(crate) enum Kind {
-    Follow { trajectory: ArmTrajectory },
+    Follow { trajectory: ArmTrajectory, gives_up_s: Option<f64> },
     Close { from: f64, object: String, expected: Option<Pose> },
     Open { from: f64, to: f64 },
     Look { from: [f64; 2], to: [f64; 2] },
@@ -74,7 +74,7 @@ impl Activity {
     /// Where the arm is, if it moves the arm.
     pub(crate) fn arm(&self, now: Timestamp) -> Option<Joints> {
         match &self.kind {
-            Kind::Follow { trajectory } => Some(trajectory.sample(self.elapsed_s(now)).positions),
+            Kind::Follow { trajectory, .. } => Some(trajectory.sample(self.elapsed_s(now)).positions),
             _ => None,
         }
     }

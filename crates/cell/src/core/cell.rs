@@ -11,8 +11,12 @@
 
 use super::activity::{Activity, Kind, seconds};
 use super::battery::Battery;
-use super::boxes::{Place, SimulatedBox, TrueBox};
+use super::boxes::{Placed, TrueBox};
+use super::deviations::GAVE_UP;
+use super::environment::{Environment, Kind as ObjectKind};
+use super::faults::Faults;
 use super::grasping::Pads;
+use super::holding::Held;
 use super::leases::Leases;
 use super::picture::{Exposure, Scenery};
 use super::placement::{self, PlacementError};
@@ -27,7 +31,6 @@ use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::collections::BTreeMap;
 
 /// The simulated robot and its table.
-#[derive(Debug, Clone)]
 pub struct Cell {
     pub(super) robot: Robot,
     pub(super) config: CellConfig,
@@ -39,7 +42,15 @@ pub struct Cell {
     pub(super) resting: Configuration,
     pub(super) activities: BTreeMap<Module, Activity>,
     pub(super) leases: Leases,
-    pub(super) boxes: Vec<SimulatedBox>,
+    pub(super) environment: Environment,
+    /// The objects' names.
+    pub(super) ids: Vec<String>,
+    pub(super) held: Option<Held>,
+    pub(super) faults: Faults,
+    /// Until when the camera is blind.
+    pub(super) blind_until: Timestamp,
+    /// Until when the robot does not know where it stands.
+    pub(super) lost_until: Timestamp,
     pub(super) battery: Battery,
     pub(super) seed: u64,
     pub(super) frames_taken: u64,
@@ -62,23 +73,27 @@ impl Cell {
         let pads = Pads::of(&robot).expect("the gripper of the built-in robot has two fingers");
         let boxes = placement::boxes(&robot, config.boxes, config.seed)?;
         let resting = first_posture(&config);
-        let (battery, seed) = (Battery::new(config.battery), config.seed);
-        let (now, activities, leases) = (Timestamp::default(), BTreeMap::new(), Leases::default());
-        let (motion_time, safety) = (now, SafetyState::Ready);
+        let (environment, ids) = environment(&robot, &resting, &boxes);
+        let now = Timestamp::default();
         Ok(Cell {
-            robot,
-            config,
             pads,
             now,
-            motion_time,
-            safety,
+            motion_time: now,
+            safety: SafetyState::Ready,
             resting,
-            activities,
-            leases,
-            boxes,
-            battery,
-            seed,
+            activities: BTreeMap::new(),
+            leases: Leases::default(),
+            environment,
+            ids,
+            held: None,
+            faults: Faults::new(&config.faults, config.seed),
+            blind_until: now,
+            lost_until: now,
+            battery: Battery::new(config.battery),
+            seed: config.seed,
             frames_taken: 0,
+            robot,
+            config,
         })
     }
 
@@ -120,6 +135,7 @@ impl Cell {
                 self.safety = state;
             }
             Event::Reset { seed, boxes } => self.reset(seed, boxes, &mut out),
+            Event::Fault { fault } => self.faults.add(fault),
             Event::Tick => {}
         }
         out
@@ -127,8 +143,8 @@ impl Cell {
 
     /// When something will happen by itself.
     pub fn next_wake(&self) -> Option<Timestamp> {
-        let ends = self.activities.values().map(|a| a.ends).min()?;
-        if self.is_held() { None } else { Some(self.real_time(ends)) }
+        let ends = self.activities.values().map(|a| a.ends).min().filter(|_| !self.is_held());
+        ends.map(|ends| self.real_time(ends)).into_iter().chain(self.faults.next()).min()
     }
 
     /// Where the joints are.
@@ -146,12 +162,24 @@ impl Cell {
     /// What is true of every box.
     pub fn ground_truth(&self) -> Vec<TrueBox> {
         let tool = self.robot.tool_pose(&self.configuration());
-        self.boxes.iter().map(|b| b.truth(&tool)).collect()
+        let truth = |i: usize| {
+            let held = self.held.is_some_and(|held| held.object == i);
+            let on = if held { String::new() } else { self.support_of(i) };
+            let pose = self.pose_of(i, &tool);
+            let on_base = self.is_delivered(&pose, &on);
+            TrueBox { id: self.ids[i].clone(), size: self.size_of(i), pose, on_base, held, on }
+        };
+        (0..self.ids.len()).map(truth).collect()
     }
 
     /// How full the battery is, 0 to 1.
     pub fn battery(&self) -> f64 {
         self.battery.level()
+    }
+
+    /// How many faults are still to come; more than [`super::faults::MAX_FAULTS`] are not taken.
+    pub fn faults_to_come(&self) -> usize {
+        self.faults.len()
     }
 
     /// Whether a module is doing something.
@@ -176,18 +204,21 @@ impl Cell {
 
     /// What collides: the table and the boxes, held ones in the gripper.
     pub fn scene(&self) -> Scene {
-        let boxes = self.boxes.iter().map(|b| SceneObject {
-            name: b.id.clone(),
-            shape: Shape::Box { size: b.size },
-            placement: match &b.place {
-                Place::At { pose, .. } => Placement::World(*pose),
-                Place::Held { in_tool } => Placement::Gripper(*in_tool),
+        let objects = (0..self.ids.len()).map(|i| SceneObject {
+            name: self.ids[i].clone(),
+            shape: match (self.environment.model(i).kind, self.size_of(i)) {
+                (ObjectKind::Box | ObjectKind::Fork, size) => Shape::Box { size },
+                (_, [width, _, height]) => Shape::Cylinder { radius: width / 2.0, length: height },
+            },
+            placement: match self.held {
+                Some(held) if held.object == i => Placement::Gripper(held.in_tool),
+                _ => Placement::World(self.environment.state(i).pose),
             },
         });
-        Scene { base: Pose::IDENTITY, objects: boxes.chain([placement::table()]).collect() }
+        Scene { base: Pose::IDENTITY, objects: objects.chain([placement::table()]).collect() }
     }
 
-    fn is_held(&self) -> bool {
+    pub(super) fn is_held(&self) -> bool {
         matches!(self.safety, SafetyState::Held { .. })
     }
 
@@ -199,10 +230,18 @@ impl Cell {
     fn advance(&mut self, now: Timestamp, out: &mut Vec<Command>) {
         loop {
             let frame = self.activities.get(&Module::Camera).and_then(next_frame);
-            let due = self.activities.values().map(|a| a.ends).chain(frame).min();
-            let due = due.filter(|due| !self.is_held() && self.real_time(*due) <= now);
-            self.pass_until(due.map_or(now, |due| self.real_time(due)));
-            let Some(due) = due else { break };
+            let due = self.activities.values().map(|a| a.ends).chain(frame).min().filter(|_| !self.is_held());
+            let due = due.map(|due| self.real_time(due)).into_iter().chain(self.faults.next()).min();
+            let due = due.filter(|due| *due <= now);
+            self.pass_until(due.unwrap_or(now), out);
+            if due.is_none() {
+                break;
+            }
+            self.deviate(out);
+            if self.is_held() {
+                continue;
+            }
+            let due = self.motion_time;
             if frame.is_some_and(|f| f <= due) {
                 self.expose();
             }
@@ -217,19 +256,14 @@ impl Cell {
         }
     }
 
-    fn pass_until(&mut self, time: Timestamp) {
-        let passed = time.since(self.now);
-        self.battery.drain(passed, self.is_active(Module::Arm) && !self.is_held());
-        self.now = self.now.max(time);
-        if !self.is_held() {
-            self.motion_time = self.motion_time + passed;
-        }
-    }
-
     fn finish(&mut self, module: Module, out: &mut Vec<Command>) {
         let Some(activity) = self.activities.remove(&module) else { return };
         let ending = match activity.kind {
-            Kind::Follow { ref trajectory } => {
+            Kind::Follow { ref trajectory, gives_up_s: Some(gives_up_s) } => {
+                self.resting.arm = trajectory.sample(gives_up_s).positions;
+                Ending::Aborted(GAVE_UP.to_owned())
+            }
+            Kind::Follow { ref trajectory, gives_up_s: None } => {
                 let end = trajectory.end();
                 self.resting.arm = end;
                 Ending::Done(Product::Moved { end })
@@ -243,13 +277,16 @@ impl Cell {
                 (self.resting.pan, self.resting.tilt) = (pan, tilt);
                 Ending::Done(Product::Looking { pan, tilt })
             }
-            Kind::Capture { camera, exposures, .. } => Ending::Done(Product::Captured { camera, exposures }),
+            Kind::Capture { camera, exposures, .. } => match self.spoilt_picture(self.real_time(activity.started)) {
+                Some(reason) => Ending::Aborted(reason.to_owned()),
+                None => Ending::Done(Product::Captured { camera, exposures }),
+            },
         };
         out.push(Command::Ended { ticket: activity.ticket, ending });
     }
 
     /// Ends activities where they are: every joint stays where it has come to.
-    fn hold(
+    pub(super) fn hold(
         &mut self,
         which: impl Fn(&Activity) -> bool,
         ending: impl Fn(&Activity) -> Ending,
@@ -269,14 +306,17 @@ impl Cell {
         self.resting = first_posture(&self.config);
         self.seed = seed;
         // The request was checked before it became an event; a table that cannot be laid is an empty one.
-        self.boxes = placement::boxes(&self.robot, count.clamp(1, MAX_BOXES), seed).unwrap_or_default();
+        let boxes = placement::boxes(&self.robot, count.clamp(1, MAX_BOXES), seed).unwrap_or_default();
+        self.held = None;
+        (self.environment, self.ids) = environment(&self.robot, &self.resting, &boxes);
+        self.environment.skip_until(self.now);
     }
 
     /// One frame of the picture under way.
     fn expose(&mut self) {
         let configuration = self.configuration();
         let tool = self.robot.tool_pose(&configuration);
-        let boxes = self.boxes.iter().map(|b| (b.size, b.pose(&tool))).collect();
+        let boxes = (0..self.ids.len()).map(|i| (self.size_of(i), self.pose_of(i, &tool))).collect();
         let scenery = Scenery { configuration, boxes };
         let period = seconds(1.0 / self.config.camera.frames_per_s);
         let first_frame = self.frames_taken;
@@ -301,6 +341,13 @@ fn next_frame(activity: &Activity) -> Option<Timestamp> {
         Kind::Capture { frames, taken, next, .. } if taken < frames => Some((*next).min(activity.ends)),
         _ => None,
     }
+}
+
+/// Everything that stands there, and the names of what can be moved.
+fn environment(robot: &Robot, configuration: &Configuration, objects: &[Placed]) -> (Environment, Vec<String>) {
+    let models: Vec<_> = objects.iter().map(|o| (o.model.clone(), o.pose)).collect();
+    let environment = Environment::new(robot, configuration, &placement::furniture(), &models);
+    (environment, objects.iter().map(|o| o.id.clone()).collect())
 }
 
 fn first_posture(config: &CellConfig) -> Configuration {

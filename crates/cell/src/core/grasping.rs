@@ -108,6 +108,19 @@ impl Pads {
         grip.ok_or(NotGrasped::Nothing)
     }
 
+    /// What of a box lies between the closed pads: least and greatest x and z of the tool frame. `None` where that is too little to
+    /// hold it.
+    pub fn patch(&self, in_tool: &Pose, size: &[f64; 3]) -> Option<[[f64; 2]; 2]> {
+        let axes = axes(in_tool);
+        let across = (0..3).max_by(|a, b| axes[*a][1].abs().total_cmp(&axes[*b][1].abs())).unwrap_or(1);
+        let [x, z] = [(0, [-self.x, self.x]), (2, [self.z_from, self.z_to])].map(|(axis, [from, to])| {
+            let reach: f64 = (0..3).filter(|k| *k != across).map(|k| axes[k][axis].abs() * size[k] / 2.0).sum();
+            [(in_tool.position[axis] - reach).max(from), (in_tool.position[axis] + reach).min(to)]
+        });
+        let enough = [x, z].iter().all(|[low, high]| high - low >= MIN_HOLD_M);
+        enough.then_some([x, z])
+    }
+
     /// Whether a box is in the cuboid that the pads sweep: whether no axis of either separates the two.
     fn meets(&self, finger: f64, in_tool: &Pose, size: &[f64; 3]) -> bool {
         let half = [self.x, finger, (self.z_to - self.z_from) / 2.0];

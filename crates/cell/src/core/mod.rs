@@ -3,15 +3,17 @@
 pub mod boxes;
 pub mod cell;
 pub mod environment;
+pub mod faults;
 pub mod grasping;
 pub mod picture;
 pub mod placement;
 pub mod protocol;
-pub mod settling;
 
 mod activity;
 mod battery;
+mod deviations;
 mod holding;
 mod leases;
+mod passing;
 mod starting;
 mod trajectory;

@@ -1,7 +1,8 @@
 //! Boxes on the table at random, but so that the task can be done: apart from each other, within reach, and each of them
 //! graspable from above while all others still stand there. The same seed gives the same table.
 
-use super::boxes::{Place, SimulatedBox};
+use super::boxes::Placed;
+use super::environment::{Furniture, Kind, Model};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
@@ -39,7 +40,7 @@ pub const TABLE: &str = "table";
 ///
 /// # Errors
 /// [`PlacementError`] when there seems to be no feasible one.
-pub fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<SimulatedBox>, PlacementError> {
+pub fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<Placed>, PlacementError> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     for table in 0..MAX_TABLES {
         // Long boxes get rarer as the table gets fuller, and the more tries have failed.
@@ -62,6 +63,12 @@ pub fn table() -> SceneObject {
         shape: Shape::Box { size: aimm::TABLE_SIZE },
         placement: Placement::World(Pose::at(x, y, z)),
     }
+}
+
+/// The table as something that stands there.
+pub fn furniture() -> Vec<Furniture> {
+    let [x, y, z] = aimm::TABLE_CENTRE;
+    vec![Furniture { name: TABLE.to_owned(), parts: vec![(Pose::at(x, y, z), aimm::TABLE_SIZE)] }]
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -118,12 +125,9 @@ impl Footprint {
         Pose::from_rpy([x, y, aimm::TABLE_HEIGHT_M + self.size[2] / 2.0], 0.0, 0.0, self.yaw)
     }
 
-    fn as_box(&self, index: usize) -> SimulatedBox {
-        SimulatedBox {
-            id: format!("slc_{}", index + 1),
-            size: self.size,
-            place: Place::At { pose: self.pose(), on: TABLE.to_owned(), standing: true },
-        }
+    fn as_box(&self, index: usize) -> Placed {
+        let model = Model { kind: Kind::Box, size: self.size };
+        Placed { id: format!("slc_{}", index + 1), model, pose: self.pose() }
     }
 }
 

@@ -1,6 +1,7 @@
 //! What goes into the cell's core and comes out of it.
 
 pub use super::activity::{Module, Ticket};
+use super::faults::Fault;
 use super::picture::Exposure;
 use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
@@ -64,6 +65,11 @@ pub enum Event {
         seed: u64,
         /// With how many boxes.
         boxes: usize,
+    },
+    /// Something shall go wrong.
+    Fault {
+        /// What and when.
+        fault: Fault,
     },
     /// Only time has passed.
     Tick,

@@ -7,6 +7,7 @@ use super::trajectory;
 use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_motion::robot::Configuration;
+use ratn_motion::trajectory::ArmTrajectory;
 use ratn_perception::camera::Camera;
 use ratn_perception::noise::MAX_FRAMES;
 
@@ -28,21 +29,19 @@ impl Cell {
             Request::Follow { trajectory } => {
                 self.no_motion_of(Module::Gripper)?;
                 let trajectory = trajectory::check(&self.robot, &self.scene(), &here, &trajectory)?;
-                let lasts_s = trajectory.duration_s();
-                (Kind::Follow { trajectory }, lasts_s)
+                self.following(trajectory)
             }
             Request::MoveTo { joints, speed } => {
                 self.no_motion_of(Module::Gripper)?;
                 let scene = self.scene();
                 let line = trajectory::straight(&self.robot, &here.arm, &joints, speed)?;
                 let trajectory = trajectory::check(&self.robot, &scene, &here, &line)?;
-                let lasts_s = trajectory.duration_s();
-                (Kind::Follow { trajectory }, lasts_s)
+                self.following(trajectory)
             }
             Request::Grasp { object, expected } => {
                 self.no_motion_of(Module::Arm)?;
-                if let Some(held) = self.held() {
-                    return Err(format!("the gripper holds {} already", self.boxes[held].id));
+                if let Some(held) = self.held {
+                    return Err(format!("the gripper holds {} already", self.ids[held.object]));
                 }
                 (Kind::Close { from: here.finger, object, expected }, self.config.gripper.close_s)
             }
@@ -74,6 +73,13 @@ impl Cell {
         let (started, ends) = (self.motion_time, self.motion_time + seconds(lasts_s));
         self.activities.insert(module, Activity { ticket, lease, started, ends, kind });
         Ok(())
+    }
+
+    /// What the arm does, and for how long.
+    fn following(&mut self, trajectory: ArmTrajectory) -> (Kind, f64) {
+        let lasts_s = trajectory.duration_s();
+        let gives_up_s = self.giving_up_after(lasts_s);
+        (Kind::Follow { trajectory, gives_up_s }, gives_up_s.unwrap_or(lasts_s))
     }
 
     fn no_motion_of(&self, module: Module) -> Result<(), String> {

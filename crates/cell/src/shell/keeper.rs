@@ -3,6 +3,7 @@
 //! A thread, not a task: checking a trajectory takes milliseconds, and a motion has to stop on time whatever the runtime does.
 
 use crate::core::cell::Cell;
+use crate::core::faults::{Fault, MAX_FAULTS};
 use crate::core::picture::{Exposure, develop};
 use crate::core::protocol::{Command, Ending, Event, Request, Ticket};
 use ratn_model::id::LeaseId;
@@ -82,6 +83,7 @@ enum Message {
     Safety { state: SafetyState, applied: oneshot::Sender<()> },
     Reset { seed: u64, boxes: usize, state: oneshot::Sender<State> },
     State(oneshot::Sender<State>),
+    Fault { fault: Fault, taken: oneshot::Sender<bool> },
 }
 
 /// Starts the thread.
@@ -118,6 +120,13 @@ impl Keeper {
     pub(crate) async fn reset(&self, seed: u64, boxes: usize) -> Result<State, KeeperError> {
         let (state, answer) = oneshot::channel();
         self.ask(Message::Reset { seed, boxes, state })?;
+        answer.await.map_err(|_| KeeperError::Ended)
+    }
+
+    /// Something shall go wrong; false where too much is to go wrong already.
+    pub(crate) async fn inject(&self, fault: Fault) -> Result<bool, KeeperError> {
+        let (taken, answer) = oneshot::channel();
+        self.ask(Message::Fault { fault, taken })?;
         answer.await.map_err(|_| KeeperError::Ended)
     }
 
@@ -209,6 +218,10 @@ fn keep(mut cell: Cell, clock: RobotClock, inbox: &Receiver<Letter>) {
             Some(Message::Happened(event)) => (event, None),
             Some(Message::Reset { seed, boxes, state }) => (Event::Reset { seed, boxes }, Some(state)),
             Some(Message::State(state)) => (Event::Tick, Some(state)),
+            Some(Message::Fault { fault, taken }) => {
+                let _ = taken.send(cell.faults_to_come() < MAX_FAULTS);
+                (Event::Fault { fault }, None)
+            }
         };
         for Command::Ended { ticket, ending } in cell.handle(now, event) {
             if let Some(ended) = waiting.remove(&ticket) {

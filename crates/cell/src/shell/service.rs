@@ -3,6 +3,7 @@
 use super::keeper::{Keeper, KeeperError, State};
 use crate::config::MAX_BOXES;
 use crate::core::boxes::TrueBox;
+use crate::core::faults::{Fault, FaultError, MAX_FAULTS};
 use ratn_proto::v1;
 use ratn_proto::v1::cell_service_server::CellService;
 use tonic::{Request, Response, Status};
@@ -45,6 +46,22 @@ impl CellService for Service {
             return Err(Status::failed_precondition(message));
         }
         Ok(Response::new(v1::ResetResponse { boxes: boxes(state) }))
+    }
+
+    async fn inject_fault(
+        &self,
+        request: Request<v1::InjectFaultRequest>,
+    ) -> Result<Response<v1::InjectFaultResponse>, Status> {
+        let fault: Fault = request
+            .into_inner()
+            .fault
+            .parse()
+            .map_err(|error: FaultError| Status::invalid_argument(error.to_string()))?;
+        if self.keeper.inject(fault).await.map_err(status)? {
+            Ok(Response::new(v1::InjectFaultResponse {}))
+        } else {
+            Err(Status::resource_exhausted(format!("{MAX_FAULTS} faults are still to come: no more are taken")))
+        }
     }
 }
 

@@ -96,6 +96,7 @@ async fn one_run(
         planners: Some(plan.planners),
         speed: Some(arguments.speed),
         seed: Some(arguments.seed),
+        faults: arguments.faults.clone(),
     });
     let set = [("boxes".to_owned(), arguments.boxes.to_string()), ("budget".to_owned(), plan.budget.to_string())];
     let log_file = directory.join(format!("{}.jsonl", plan.file_stem()));

@@ -2,7 +2,7 @@
 
 use super::reload::Reloading;
 use super::{blocking, blocking_on};
-use crate::arguments::{KeptRoleArguments, RoleArguments, WorkerArguments, WorkerKind};
+use crate::arguments::{CellArguments, KeptRoleArguments, RoleArguments, WorkerArguments, WorkerKind};
 use crate::failure::Failure;
 use crate::output;
 use crate::system::config::SystemConfig;
@@ -86,9 +86,10 @@ pub(super) fn startable(config: &SystemConfig) -> Result<(), Failure> {
 }
 
 /// `ratn cell`
-pub(super) fn cell(arguments: &RoleArguments) -> Result<(), Failure> {
-    daemon(arguments, ratn_cell::ROLE, async |system, host| {
+pub(super) fn cell(arguments: &CellArguments) -> Result<(), Failure> {
+    daemon(&arguments.role, ratn_cell::ROLE, async |system, host| {
         let mut config = system.cell;
+        config.faults.extend(&arguments.faults.fault);
         config.listen = host.listen.unwrap_or(config.listen);
         ratn_cell::run_as(config, host.directory, host.serving, host.shutdown).await
     })

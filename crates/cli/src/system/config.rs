@@ -118,6 +118,7 @@ impl SystemConfig {
         self.speed = arguments.speed.unwrap_or(self.speed);
         self.cell.boxes = arguments.boxes.map_or(self.cell.boxes, |n| n as usize);
         self.cell.seed = arguments.seed.unwrap_or(self.cell.seed);
+        self.cell.faults.extend(&arguments.faults.fault);
         if let Some(planners) = arguments.planners {
             for template in self.process_manager.templates.iter_mut().filter(|t| t.kind == PATH_PLANNER) {
                 template.min = planners;
@@ -171,7 +172,13 @@ mod tests {
     #[test]
     fn the_command_line_overrides_it() {
         let mut config = SystemConfig::load(None).unwrap();
-        config.apply(&SystemArguments { boxes: Some(5), planners: Some(1), speed: Some(8.0), seed: Some(7) });
+        config.apply(&SystemArguments {
+            boxes: Some(5),
+            planners: Some(1),
+            speed: Some(8.0),
+            seed: Some(7),
+            ..SystemArguments::default()
+        });
         assert_eq!((config.cell.boxes, config.cell.seed, config.cell.speed), (5, 7, 8.0));
         assert_eq!(config.promised_resources()[PATH_PLANNER], 1);
         assert!(config.process_manager_config().templates[0].args.contains(&"8".to_owned()));

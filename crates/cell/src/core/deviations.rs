@@ -1,0 +1,111 @@
+//! What comes of a fault that occurs.
+
+use super::activity::{Activity, Kind as Doing, seconds};
+use super::cell::Cell;
+use super::faults::{Fault, Kind, When};
+use super::placement::TABLE;
+use super::protocol::{Command, Ending, Module};
+use rand::RngExt;
+use ratn_model::pose::Pose;
+use ratn_model::time::Timestamp;
+use ratn_motion::aimm;
+use std::f64::consts::PI;
+
+/// How long the camera stays blind, or the robot lost, in the robot's seconds.
+const OUTAGE_S: f64 = 2.0;
+/// Coulomb's coefficient of wet fingers.
+const SLIPPERY: f64 = 0.02;
+/// How far from all others an object is put, beyond both their radii, in metres: it shall be found and grasped there.
+const APART_M: f64 = 0.05;
+/// Places tried.
+const MAX_PLACES: usize = 400;
+
+impl Cell {
+    /// Faults whose time has come.
+    pub(super) fn deviate(&mut self, out: &mut Vec<Command>) {
+        for fault in self.faults.due(self.now) {
+            match fault.kind {
+                Kind::GraspSlips => {
+                    if let Some(held) = &mut self.held {
+                        held.set_friction(SLIPPERY);
+                    }
+                }
+                Kind::ObjectMoved => self.move_something(),
+                Kind::SensorDropout => self.blind_until = self.now + seconds(OUTAGE_S),
+                Kind::LocalisationLost => self.lost_until = self.now + seconds(OUTAGE_S),
+                Kind::ControllerAbort => self.give_up(out),
+            }
+        }
+    }
+
+    /// What is wrong with a picture that was taken since `started`.
+    pub(super) fn spoilt_picture(&mut self, started: Timestamp) -> Option<&'static str> {
+        if self.faults.occurs(Kind::SensorDropout).is_some() {
+            self.blind_until = self.now;
+        }
+        if self.faults.occurs(Kind::LocalisationLost).is_some() {
+            self.lost_until = self.now;
+        }
+        let within = |until: Timestamp| until > Timestamp::default() && started < until;
+        let spoilt = if within(self.blind_until) {
+            Some("the camera delivers no image: its connection broke; take another")
+        } else if within(self.lost_until) {
+            Some("the robot does not know where it stands: no picture can be placed in the world; take another")
+        } else {
+            None
+        };
+        if self.faults.occurs(Kind::ObjectMoved).is_some() {
+            self.move_something();
+        }
+        spoilt
+    }
+
+    /// How long a motion of `lasts_s` goes on before its controller gives up, where it does.
+    pub(super) fn giving_up_after(&mut self, lasts_s: f64) -> Option<f64> {
+        self.faults.occurs(Kind::ControllerAbort).map(|_| lasts_s / 2.0)
+    }
+
+    /// The arm's controller gives up now, or in the next motion.
+    fn give_up(&mut self, out: &mut Vec<Command>) {
+        if self.is_active(Module::Arm) {
+            let moves_the_arm = |a: &Activity| matches!(a.kind, Doing::Follow { .. });
+            self.hold(moves_the_arm, |_| Ending::Aborted(GAVE_UP.to_owned()), out);
+        } else {
+            // There is room: one was just taken out.
+            self.faults.add(Fault { kind: Kind::ControllerAbort, when: When::Nth(1) });
+        }
+    }
+
+    /// Somebody takes an object from the table and puts it down elsewhere on it, where it stands apart.
+    fn move_something(&mut self) {
+        let on_table: Vec<usize> = (0..self.ids.len())
+            .filter(|i| self.held.is_none_or(|held| held.object != *i) && self.support_of(*i) == TABLE)
+            .collect();
+        if on_table.is_empty() {
+            return;
+        }
+        let object = on_table[self.faults.random().random_range(0..on_table.len())];
+        let radius = |i: usize| self.size_of(i)[0].hypot(self.size_of(i)[1]) / 2.0;
+        let others: Vec<([f64; 3], f64)> = (0..self.ids.len())
+            .filter(|i| *i != object)
+            .map(|i| (self.environment.state(i).pose.position, radius(i)))
+            .collect();
+        let (mine, height) = (radius(object), aimm::TABLE_HEIGHT_M + self.size_of(object)[2] / 2.0);
+        let tool = self.robot.tool_pose(&self.configuration()).position;
+        let random = self.faults.random();
+        let place = (0..MAX_PLACES).find_map(|_| {
+            let [[x_low, x_high], [y_low, y_high]] = aimm::BOX_REGION;
+            let (x, y) = (random.random_range(x_low..=x_high), random.random_range(y_low..=y_high));
+            let yaw = random.random_range(-PI..PI);
+            let apart = |at: &[f64; 3], radius: f64| (at[0] - x).hypot(at[1] - y) > mine + radius + APART_M;
+            let free = others.iter().all(|(at, radius)| apart(at, *radius)) && apart(&tool, 0.0);
+            free.then(|| Pose::from_rpy([x, y, height], 0.0, 0.0, yaw))
+        });
+        if let Some(pose) = place {
+            self.environment.put(object, &pose);
+        }
+    }
+}
+
+/// Why a motion ended.
+pub(super) const GAVE_UP: &str = "the arm's controller gave up: its tracking error was too great; it holds";

@@ -1,0 +1,52 @@
+//! Time that passes: the environment's steps, what is held, the battery.
+
+use super::activity::{Activity, Kind};
+use super::cell::Cell;
+use super::protocol::{Command, Ending, Module};
+use ratn_model::time::Timestamp;
+
+/// How far the fingers may be from fully open and still count as open, in metres.
+const OPEN_M: f64 = 1e-4;
+
+impl Cell {
+    /// Time goes on to `time`, step by step where something moves.
+    pub(super) fn pass_until(&mut self, time: Timestamp, out: &mut Vec<Command>) {
+        while self.environment.next_step() <= time {
+            if self.environment.is_at_rest() && !self.may_move() {
+                self.environment.skip_until(time);
+                break;
+            }
+            self.drain_until(self.environment.next_step());
+            self.step(out);
+        }
+        self.drain_until(time);
+    }
+
+    fn step(&mut self, out: &mut Vec<Command>) {
+        let configuration = self.configuration();
+        let tool = self.robot.tool_pose(&configuration);
+        if let Some(lost) = self.keep_hold(&tool) {
+            let reason = format!("{} slipped out of the fingers; the arm holds", self.ids[lost]);
+            let moves_the_arm = |a: &Activity| matches!(a.kind, Kind::Follow { .. });
+            self.hold(moves_the_arm, |_| Ending::Aborted(reason.clone()), out);
+        }
+        let open = self.config.gripper.opening_m / 2.0 - configuration.finger < OPEN_M;
+        self.environment.set_fingers_solid(open);
+        self.environment.step(&self.robot, &configuration);
+    }
+
+    /// Whether something may move that the environment does not know of: the robot, or what it holds.
+    fn may_move(&self) -> bool {
+        let moves = [Module::Arm, Module::Gripper, Module::PanTilt].into_iter().any(|module| self.is_active(module));
+        (moves && !self.is_held()) || self.held.is_some_and(|held| !held.is_steady())
+    }
+
+    fn drain_until(&mut self, time: Timestamp) {
+        let passed = time.since(self.now);
+        self.battery.drain(passed, self.is_active(Module::Arm) && !self.is_held());
+        self.now = self.now.max(time);
+        if !self.is_held() {
+            self.motion_time = self.motion_time + passed;
+        }
+    }
+}

@@ -1,0 +1,98 @@
+//! A cell in virtual time, for tests.
+
+#![allow(dead_code, reason = "not every test uses all of it")]
+
+use ratn_cell::config::CellConfig;
+use ratn_cell::core::cell::Cell;
+use ratn_cell::core::protocol::{Command, Ending, Event, Product, Request, Ticket};
+use ratn_model::id::LeaseId;
+use ratn_model::time::Timestamp;
+use ratn_model::value::Trajectory;
+use ratn_motion::aimm;
+use ratn_motion::pace::Control;
+use ratn_motion::plan::{Goal, Request as PlanRequest, plan};
+use ratn_motion::robot::Joints;
+use ratn_world::scene::Scene;
+use std::time::Duration;
+
+/// A cell with a clock that only goes on when nothing else is left to do.
+pub(crate) struct Bench {
+    pub(crate) cell: Cell,
+    pub(crate) now: Timestamp,
+    tickets: u64,
+}
+
+impl Bench {
+    pub(crate) fn new(boxes: usize, seed: u64) -> Bench {
+        Bench::of(CellConfig { boxes, seed, ..CellConfig::default() })
+    }
+
+    pub(crate) fn of(config: CellConfig) -> Bench {
+        let cell = Cell::new(config).unwrap();
+        Bench { cell, now: Timestamp::default(), tickets: 0 }
+    }
+
+    pub(crate) fn start(&mut self, lease: Option<LeaseId>, request: Request) -> (Ticket, Vec<Command>) {
+        self.tickets += 1;
+        let ticket = Ticket(self.tickets);
+        (ticket, self.cell.handle(self.now, Event::Start { ticket, lease, request }))
+    }
+
+    pub(crate) fn pass(&mut self, seconds: f64) -> Vec<Command> {
+        self.now = self.now + Duration::from_secs_f64(seconds);
+        self.cell.handle(self.now, Event::Tick)
+    }
+
+    /// Performs a request to its end.
+    pub(crate) fn perform(&mut self, request: Request) -> Ending {
+        let (ticket, mut commands) = self.start(None, request);
+        while commands.is_empty() {
+            self.now = self.cell.next_wake().expect("the goal is under way");
+            commands = self.cell.handle(self.now, Event::Tick);
+        }
+        let [Command::Ended { ticket: ended, ending }] = &commands[..] else { panic!("{commands:?}") };
+        assert_eq!(*ended, ticket);
+        ending.clone()
+    }
+
+    pub(crate) fn done(&mut self, request: Request) -> Product {
+        match self.perform(request) {
+            Ending::Done(product) => product,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    pub(crate) fn arm(&self) -> Joints {
+        self.cell.configuration().arm
+    }
+
+    pub(crate) fn plan(&self, scene: &Scene, goals: Vec<Goal>, depart_m: f64, approach_m: f64) -> Trajectory {
+        let request = PlanRequest {
+            start: self.arm(),
+            goals,
+            depart_m,
+            approach_m,
+            speed: 0.5,
+            seed: 3,
+            improvement_iterations: 50,
+        };
+        plan(self.cell.robot(), scene, &request, &mut |_| Control::Continue).unwrap().trajectory
+    }
+
+    /// Moves the arm by a plan in the true scene.
+    pub(crate) fn go(&mut self, goals: Vec<Goal>, depart_m: f64, approach_m: f64) {
+        let trajectory = self.plan(&self.cell.scene(), goals, depart_m, approach_m);
+        self.done(Request::Follow { trajectory });
+    }
+
+    /// Stands with the fingers around the box.
+    pub(crate) fn reach_for(&mut self, index: usize) {
+        let truth = self.cell.ground_truth()[index].clone();
+        let goals = aimm::grasp_poses(&truth.pose, truth.size).map(Goal::Pose).to_vec();
+        self.go(goals, 0.0, 0.10);
+    }
+}
+
+pub(crate) fn grasp() -> Request {
+    Request::Grasp { object: "box_1".to_owned(), expected: None }
+}
