@@ -93,6 +93,13 @@ fn a_run_whose_task_control_is_killed_goes_on_and_repeats_no_motion() -> anyhow:
     let result: Value = serde_json::from_str(&out)?;
     ensure!(result["outcome"] == "success" && result["outputs"]["delivered"] == 2, "{result}");
 
+    // Whatever was committed before, in between and after says which node wrote it.
+    let (facts, _) = texts(&place.ratn(&["world", "facts", "--json"]).output()?);
+    let facts: Value = serde_json::from_str(&facts)?;
+    let facts = facts["facts"].as_array().context("facts")?;
+    let unwritten = facts.iter().find(|fact| fact["writer"].as_str().is_none_or(str::is_empty));
+    ensure!(!facts.is_empty() && unwritten.is_none(), "{unwritten:?}");
+
     let lines = lines(&log)?;
     ensure!(lines.len() > before && lines.iter().filter(|line| line["event"] == "resumed").count() == 2);
     // No motion was lost and none ran twice: neither by the log nor by the cell's own record.

@@ -259,7 +259,7 @@ async fn whoever_holds_a_projection_hears_when_a_commit_contradicts_it() {
         request: "run/i2/1".to_owned(),
         base: Revision(1),
         changes: vec![set("at", "box", 2)],
-        writers: vec!["place[1]".to_owned()],
+        writers: vec!["place[1]".into()],
         reads: Footprint::Patterns(vec![any("at")]),
         lease: None,
     };

@@ -148,6 +148,7 @@ impl Harness {
                 outcome: SUCCESS.to_owned(),
                 outputs: BTreeMap::from([("x".to_owned(), Value::Int(1))]),
                 measured: Vec::new(),
+                evidence: Vec::new(),
                 reason: String::new(),
             };
             let commands = self.executive.handle(Timestamp(self.now), event);

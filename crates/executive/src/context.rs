@@ -4,6 +4,7 @@ use crate::analysis::Analysis;
 use crate::protocol::{Command, Note};
 use ratn_model::fact::Change;
 use ratn_model::id::InstanceId;
+use ratn_model::measurement::Evidence;
 use ratn_model::program::Program;
 use ratn_model::time::Timestamp;
 use ratn_world::world::World;
@@ -35,20 +36,44 @@ impl Context<'_> {
     }
 
     /// Whether the task's ontology allows a world to change so; a task without one allows everything.
-    pub(crate) fn allows(&self, world: &World, changes: &[Change]) -> Result<(), String> {
+    pub(crate) fn allows(&self, world: &World, made: &Made) -> Result<(), String> {
         let Some(ontology) = &self.program.ontology else { return Ok(()) };
-        world.admits(ontology, changes).map_err(|violation| violation.to_string())
+        world.admits(ontology, &made.changes).map_err(|violation| violation.to_string())?;
+        for change in &made.changes {
+            if let Change::Set { fact, value } = change
+                && let Some((_, measured)) = made.evidence.iter().find(|(of, _)| of == fact)
+            {
+                ontology.check_measurement(fact, value, measured).map_err(|violation| violation.to_string())?;
+            }
+        }
+        Ok(())
     }
 
-    /// Makes changes real: in the mirror now, in the world pool by command.
-    pub(crate) fn commit(&mut self, instance: InstanceId, changes: Vec<Change>) -> Result<(), String> {
-        if changes.is_empty() {
+    /// Makes changes real: in the mirror now, in the world pool by command. `writer` is the path of who makes them.
+    pub(crate) fn commit(&mut self, instance: InstanceId, writer: String, made: Made) -> Result<(), String> {
+        if made.changes.is_empty() {
             return Ok(());
         }
-        self.allows(self.root, &changes)?;
+        self.allows(self.root, &made)?;
+        let Made { changes, mut evidence } = made;
         let revision = self.root.apply(&changes).map_err(|e| e.to_string())?;
-        self.commands.push(Command::Commit { instance, changes, revision });
+        // What is measured and then deleted, or was not declared, is not written.
+        evidence.retain(|(fact, _)| self.root.fact(fact).is_some_and(|fact| fact.revision == revision));
+        self.commands.push(Command::Commit { instance, writer, changes, evidence, revision });
         Ok(())
+    }
+}
+
+/// What a node has changed, and what measured which of it.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Made {
+    pub(crate) changes: Vec<Change>,
+    pub(crate) evidence: Evidence,
+}
+
+impl From<Vec<Change>> for Made {
+    fn from(changes: Vec<Change>) -> Made {
+        Made { changes, evidence: Evidence::new() }
     }
 }
 

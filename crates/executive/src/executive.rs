@@ -7,6 +7,7 @@ use crate::lookahead::Problem;
 use crate::protocol::{Command, Event, Mode};
 use crate::window::{End, Window};
 use ratn_model::expression::EffectExpr;
+use ratn_model::fact::FactKey;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS};
 use ratn_model::time::Timestamp;
@@ -158,6 +159,10 @@ impl Executive {
     }
 
     fn step(&mut self, now: Timestamp, event: Event, commands: &mut Vec<Command>) {
+        if let Event::WorldChanged { facts, .. } = &event {
+            let fact = |(fact, value): &(FactKey, Option<Value>)| (fact.clone(), value.clone());
+            self.root.overwrite(facts.iter().map(fact));
+        }
         let program = self.program.clone();
         let mut context = Context {
             program: &program,
@@ -242,7 +247,7 @@ fn commit_initial(context: &mut Context<'_>, parameters: &BTreeMap<String, Value
     let changes = interpreter
         .in_scope(context, |scope| EffectExpr::bind(&context.program.initial, scope))
         .map_err(|e| e.to_string())?;
-    context.commit(InstanceId(0), changes)
+    context.commit(InstanceId(0), context.program.name.clone(), changes.into())
 }
 
 fn end_of(context: &mut Context<'_>, interpreter: &Interpreter, progress: Progress) -> Option<End> {

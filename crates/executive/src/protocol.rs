@@ -2,6 +2,7 @@
 
 use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision, StateId};
+use ratn_model::measurement::Evidence;
 use ratn_model::resource::{Lease, Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -120,6 +121,13 @@ pub enum Event {
         /// Its id.
         projection: ProjectionId,
     },
+    /// Somebody else has changed the root world, or facts of it have expired.
+    WorldChanged {
+        /// The world pool's revision in which they are so.
+        revision: Revision,
+        /// What holds now of what is otherwise than the run knew; a fact without a value does not.
+        facts: Vec<(FactKey, Option<Value>)>,
+    },
     /// A goal says how far it is. Logged; changes nothing.
     Progressed {
         /// Which instance.
@@ -141,6 +149,9 @@ pub enum Event {
         outputs: BTreeMap<String, Value>,
         /// Facts as measured, where the provider measured any that its effects declare.
         measured: Vec<(FactKey, Value)>,
+        /// What measured them and how sure that is, as far as it is said.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        evidence: Evidence,
         /// Why, when the outcome is not success; else empty.
         reason: String,
     },
@@ -199,6 +210,9 @@ pub enum Command {
         base: Revision,
         /// The effects of the older instances that are not real yet, in program order.
         changes: Vec<Change>,
+        /// Who makes the change at the same place, by the path of its instance.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        writers: Vec<Arc<str>>,
         /// What of it may be seen.
         reads: Footprint,
         /// What holds the room for it: the instance's lease, or that of the routine it is in.
@@ -233,8 +247,14 @@ pub enum Command {
     Commit {
         /// Whose effects.
         instance: InstanceId,
+        /// The path of that instance, or of the state that is left; of the initial world the task's name.
+        #[serde(default)]
+        writer: String,
         /// In order. The root has revision `revision` afterwards.
         changes: Vec<Change>,
+        /// What measured which of the facts that are written.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        evidence: Evidence,
         /// What the root's revision will be.
         revision: Revision,
     },

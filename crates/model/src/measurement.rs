@@ -1,11 +1,15 @@
 //! Where a measured fact comes from, and how sure it is.
 
+use crate::fact::FactKey;
 use serde::{Deserialize, Serialize};
 
+/// What measured which of the facts that are written together.
+pub type Evidence = Vec<(FactKey, Measurement)>;
+
 /// What came with a fact that was measured.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Measurement {
-    /// What measured it, `detector-2` or `wrist camera`.
+    /// What measured it, `detector-2` or `wrist camera`; empty where nobody said.
     pub source: String,
     /// How sure it is, where the source says so.
     pub certainty: Option<Certainty>,
@@ -26,6 +30,14 @@ pub enum Certainty {
 pub const MAX_COVARIANCE_ROWS: usize = 64;
 
 impl Certainty {
+    /// Its kind, as an ontology names it.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Certainty::Confidence(_) => "confidence",
+            Certainty::Covariance(_) => "covariance",
+        }
+    }
+
     /// What is wrong with it: a confidence outside 0 to 1, a matrix that is not square or too large, a number that is none.
     ///
     /// # Errors

@@ -8,12 +8,14 @@
 //! | `unknown-predicate` | a predicate that is not declared |
 //! | `outside-domain` | as many arguments as a predicate does not have; an individual of no class, or of another class |
 //! | `outside-range` | a value of another type, or the name of an individual of another class |
+//! | `other-uncertainty` | a measurement that is sure in another way than a predicate declares, or a covariance of another width |
 //! | `not-functional` | a second fact of a functional predicate about one subject |
 
 pub mod turtle;
 
 use crate::fact::{Change, FactKey, FactPattern, Term};
 use crate::load::suggestion;
+use crate::measurement::{Certainty, Measurement};
 use crate::tolerance::{Deviation, Tolerances};
 use crate::value::{Type, Value};
 use serde::{Deserialize, Serialize};
@@ -234,6 +236,41 @@ impl Ontology {
         self.check_value(pattern, &step)
     }
 
+    /// Whether a fact with this value can have been measured so. A measurement may always leave open how sure it is.
+    ///
+    /// # Errors
+    /// `other-uncertainty`.
+    pub fn check_measurement(&self, fact: &FactKey, value: &Value, measured: &Measurement) -> Result<(), Violation> {
+        let Some(certainty) = &measured.certainty else { return Ok(()) };
+        let declared = self.predicate(&fact.predicate).and_then(|predicate| predicate.uncertainty);
+        let message = match (declared, certainty) {
+            (Some(Uncertainty::Confidence), Certainty::Confidence(_)) => return Ok(()),
+            (Some(Uncertainty::Covariance), Certainty::Covariance(entries)) => {
+                let rows = match value {
+                    Value::Pose(_) => 6,
+                    Value::Joints(joints) => joints.len(),
+                    _ => 1,
+                };
+                if entries.len() == rows * rows {
+                    return Ok(());
+                }
+                let found = entries.len();
+                format!("the covariance of `{fact}` has {rows} times {rows} entries, and {found} were measured")
+            }
+            (Some(declared), found) => {
+                format!("`{fact}` is measured with a {declared}, and this has a {}", found.name())
+            }
+            (None, found) => {
+                format!("`{}` declares no uncertainty, and {fact} was measured with a {}", fact.predicate, found.name())
+            }
+        };
+        let help = match declared {
+            None => format!("declare it (`ratn:uncertainty \"{}\"`)", certainty.name()),
+            Some(_) => String::new(),
+        };
+        Err(Violation { rule: "other-uncertainty", message, help })
+    }
+
     /// As [`Ontology::check_change`], for all of them.
     ///
     /// # Errors
@@ -281,6 +318,15 @@ impl Violation {
             ),
             help: format!("add the effect \"delete {beside}\", or one with `?` in the place of the last argument"),
         }
+    }
+}
+
+impl fmt::Display for Uncertainty {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Uncertainty::Confidence => "confidence",
+            Uncertainty::Covariance => "covariance",
+        })
     }
 }
 

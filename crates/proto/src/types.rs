@@ -4,7 +4,7 @@
 use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
-use ratn_model::measurement::Measurement;
+use ratn_model::measurement::{Certainty, Evidence, Measurement};
 use ratn_model::resource::{Lease, Quantity, Requirement, ResourceClass};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
@@ -474,6 +474,8 @@ pub struct GoalOutcome {
     pub outputs: BTreeMap<String, Value>,
     /// Facts as measured.
     pub measured: Vec<(FactKey, Value)>,
+    /// What measured them and how sure that is, of those of which it is said.
+    pub evidence: Evidence,
     /// Why, when the outcome is not success; else empty.
     pub reason: String,
 }
@@ -516,6 +518,13 @@ impl GoalOutcome {
     pub fn with_measured(mut self, fact: FactKey, value: Value) -> GoalOutcome {
         self.measured.push((fact, value));
         self
+    }
+
+    /// With a fact as measured, and how sure that is. What measured it is whoever says so.
+    #[must_use]
+    pub fn with_certain(mut self, fact: FactKey, value: Value, certainty: Certainty) -> GoalOutcome {
+        self.evidence.push((fact.clone(), Measurement { source: String::new(), certainty: Some(certainty) }));
+        self.with_measured(fact, value)
     }
 
     /// Whether it did what it should.

@@ -328,6 +328,10 @@ impl Simulation<'_> {
                 Event::Crashed { instance, attempt, reason: "its lease was lost".to_owned() }
             }
         };
+        if let Event::WorldChanged { facts, .. } = &event {
+            let revision = self.root.overwrite(facts.iter().cloned());
+            self.roots.insert(revision, self.root.clone());
+        }
         if let Event::Projected { projection, .. } = &event {
             self.told.insert(*projection);
         }
@@ -391,7 +395,10 @@ impl Simulation<'_> {
                 }
                 self.answers();
             }
-            Command::Project { instance, attempt, base, changes, lease, reads: _ } => {
+            Command::Project { instance, attempt, base, changes, writers, lease, reads: _ } => {
+                if writers.len() != changes.len() || writers.iter().any(|writer| writer.is_empty()) {
+                    return Err(self.broken(format!("of a change that {instance} builds on nobody is named")));
+                }
                 if let Some((lease, _)) = lease
                     && !self.leases.contains_key(&lease)
                 {
@@ -443,7 +450,10 @@ impl Simulation<'_> {
                 }
                 self.answers();
             }
-            Command::Commit { changes, revision, .. } => {
+            Command::Commit { changes, revision, writer, .. } => {
+                if writer.is_empty() {
+                    return Err(self.broken(format!("nobody is named who makes {revision}")));
+                }
                 let made = self.root.apply(&changes).map_err(|e| self.broken(e))?;
                 self.roots.insert(made, self.root.clone());
                 if made != revision {
@@ -496,7 +506,8 @@ impl Simulation<'_> {
         let event = match answer {
             Answer::Finished { outcome, outputs, measured } => {
                 let reason = if outcome == "success" { String::new() } else { format!("the oracle says {outcome}") };
-                Event::Finished { instance, attempt, outcome, outputs, measured, reason }
+                let evidence = Vec::new();
+                Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason }
             }
             Answer::Crashed => Event::Crashed { instance, attempt, reason: "the worker died".to_owned() },
             Answer::LeaseLost => {

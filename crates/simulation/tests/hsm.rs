@@ -7,7 +7,9 @@ use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, Goal, Learned, LogEntry, Mode, Note, Origin};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::expression::Expr;
+use ratn_model::fact::{FactKey, Term};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
+use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::program::{Program, StateKind, Target};
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
@@ -625,6 +627,7 @@ impl Bench {
             outcome: "success".to_owned(),
             outputs: BTreeMap::from([("x".to_owned(), Value::Int(1))]),
             measured: Vec::new(),
+            evidence: Vec::new(),
             reason: String::new(),
         });
     }
@@ -733,4 +736,40 @@ fn in_a_race_a_region_whose_worker_died_does_not_wait_for_the_others() {
     assert_eq!(bench.heard(), ["start 4.2 under 1"]);
     bench.finish(4, 2);
     assert_eq!(bench.heard(), ["release 1", "end success"]);
+}
+
+#[test]
+fn what_was_measured_is_committed_with_who_wrote_it_and_how_sure_it_is() {
+    let text = "states:
+  - part:
+      effects: { success: ['done() = true'] }
+      states: [ look: { THINK, senses: [], effects: ['seen(cup) = 1', 'guessed(cup) = 2'] } ]
+  - go: { MOVE }";
+    let cup = |predicate: &str| FactKey { predicate: predicate.to_owned(), arguments: vec![Term::Name("cup".into())] };
+    let certainty = Some(Certainty::Confidence(0.75));
+    let evidence = vec![(cup("seen"), Measurement { source: "camera-1".to_owned(), certainty })];
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let mut bench = Bench::new(text, mode);
+        let asked = bench.commands.iter().find_map(|command| match command {
+            Command::Acquire { instance, .. } => Some(instance.0),
+            _ => None,
+        });
+        let look = asked.unwrap();
+        bench.grant(look, 1);
+        bench.tell(Event::Finished {
+            instance: InstanceId(look),
+            attempt: 1,
+            outcome: "success".to_owned(),
+            outputs: BTreeMap::from([("x".to_owned(), Value::Int(1))]),
+            measured: vec![(cup("seen"), Value::Int(3))],
+            evidence: evidence.clone(),
+            reason: String::new(),
+        });
+        let committed = std::mem::take(&mut bench.commands).into_iter().filter_map(|command| match command {
+            Command::Commit { writer, changes, evidence, .. } => Some((writer, changes.len(), evidence)),
+            _ => None,
+        });
+        let expected = [("part/look".to_owned(), 2, evidence.clone()), ("part".to_owned(), 1, Vec::new())];
+        assert_eq!(committed.collect::<Vec<_>>(), expected, "{mode:?}");
+    }
 }

@@ -157,8 +157,9 @@ impl World {
     /// # Errors
     /// As [`World::apply`].
     pub fn apply_as(&mut self, writer: Option<&str>, changes: &[Change]) -> Result<Revision, ChangeError> {
+        let writer = writer.map(Arc::<str>::from);
         // Whoever holds a clone while the store is written makes it copy: so the overlay alone outlives the attempt.
-        let World { overlay, revision, .. } = self.changed(writer, changes)?;
+        let World { overlay, revision, .. } = self.changed(|_| writer.as_ref(), changes)?;
         self.overlay = overlay;
         self.revision = revision;
         self.settle();
@@ -171,7 +172,8 @@ impl World {
     /// As [`World::apply`].
     pub fn written_by(&self, writer: Option<&str>, changes: &[Change]) -> Result<Written, ChangeError> {
         debug_assert!(self.overlay.is_empty(), "a root has no overlay");
-        Ok(self.changed(writer, changes)?.overlay)
+        let writer = writer.map(Arc::<str>::from);
+        Ok(self.changed(|_| writer.as_ref(), changes)?.overlay)
     }
 
     /// The next revision, in which this is written.
@@ -182,19 +184,29 @@ impl World {
         self.revision
     }
 
+    /// The next revision, in which these facts say this, or do not hold.
+    pub fn overwrite(&mut self, facts: impl IntoIterator<Item = (FactKey, Option<Value>)>) -> Revision {
+        let revision = Revision(self.revision.0 + 1);
+        let of = |value| Arc::new(Fact { value, revision, writer: None, measured: None });
+        let written: Written = facts.into_iter().map(|(key, value)| (Arc::new(key), value.map(of))).collect();
+        self.write(&written)
+    }
+
     /// What the world will be with the changes applied; costs the changes, not the facts.
     ///
     /// # Errors
     /// As [`World::apply`].
     pub fn project(&self, changes: &[Change]) -> Result<World, ChangeError> {
-        self.project_as(None, changes)
+        self.project_as(&[], changes)
     }
 
-    /// As [`World::project`]; each fact written says that `writer`, a node's path, wrote it.
+    /// As [`World::project`]; each fact written says who wrote it: the writer, a node's path, at the place of the change. Empty or
+    /// missing: nobody.
     ///
     /// # Errors
     /// As [`World::apply`].
-    pub fn project_as(&self, writer: Option<&str>, changes: &[Change]) -> Result<World, ChangeError> {
+    pub fn project_as(&self, writers: &[Arc<str>], changes: &[Change]) -> Result<World, ChangeError> {
+        let writer = |place: usize| writers.get(place).filter(|writer| !writer.is_empty());
         let mut world = self.changed(writer, changes)?;
         if world.overlay.len() > OVERLAY_LIMIT {
             world.settle();
@@ -203,12 +215,19 @@ impl World {
     }
 
     /// A copy with the changes in its overlay.
-    fn changed(&self, writer: Option<&str>, changes: &[Change]) -> Result<World, ChangeError> {
+    fn changed<'a>(
+        &self,
+        writer: impl Fn(usize) -> Option<&'a Arc<str>>,
+        changes: &[Change],
+    ) -> Result<World, ChangeError> {
         let mut world = self.clone();
         world.revision = Revision(self.revision.0 + 1);
-        let (revision, writer) = (world.revision, writer.map(Arc::<str>::from));
-        let written = |value: Value| Some(Arc::new(Fact { value, revision, writer: writer.clone(), measured: None }));
-        for change in changes {
+        let revision = world.revision;
+        for (place, change) in changes.iter().enumerate() {
+            let written = |value: Value| {
+                let writer = writer(place).cloned();
+                Some(Arc::new(Fact { value, revision, writer, measured: None }))
+            };
             match change {
                 Change::Set { fact, value } => {
                     world.overlay.insert(Arc::new(fact.clone()), written(value.clone()));

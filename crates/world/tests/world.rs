@@ -7,6 +7,7 @@ use ratn_model::fact::{Change, FactKey, FactPattern, Term};
 use ratn_model::value::Value;
 use ratn_world::world::{ChangeError, OVERLAY_LIMIT, World};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 fn term() -> impl Strategy<Value = Term> {
     prop_oneof![(0_i64..3).prop_map(Term::Int), "[ab]{1,2}".prop_map(Term::Name)]
@@ -93,7 +94,8 @@ proptest! {
             if commit {
                 world.apply_as(Some("place"), changes).unwrap();
             } else {
-                world = world.project_as(Some("place"), changes).unwrap();
+                let writers = vec![Arc::from("place"); changes.len()];
+                world = world.project_as(&writers, changes).unwrap();
             }
             changes.iter().for_each(|change| apply(&mut model, change));
         }

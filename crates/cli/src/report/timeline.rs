@@ -210,6 +210,7 @@ impl Fold {
             }
             Event::Projected { .. }
             | Event::Progressed { .. }
+            | Event::WorldChanged { .. }
             | Event::RetirementFailed { .. }
             | Event::AbortRequested { .. }
             | Event::Resumed

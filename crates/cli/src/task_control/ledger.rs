@@ -1,12 +1,14 @@
 //! What a run has asked for and has not been answered yet, folded from its events and commands: what has to be asked again when
 //! task control was killed. A pure fold; what is done with it is [`super::resume`]'s.
 
+use super::record::Decided;
 use ratn_executive::protocol::{Command, Event, Goal, Origin};
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
 use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 /// The open items of a run.
 #[derive(Debug, Clone, Default)]
@@ -34,7 +36,7 @@ pub(super) struct Ledger {
     /// Goals under way.
     pub(super) goals: BTreeMap<InstanceId, (u32, Goal)>,
     /// Every commit, in order.
-    pub(super) commits: Vec<(InstanceId, Vec<Change>, Revision)>,
+    pub(super) commits: Vec<Decided>,
     /// Everything that was created, deleted and consumed at retirements, in order, with its number.
     pub(super) operated: Vec<(u64, InstanceId, Vec<Requirement>)>,
     /// When the executive wants to be woken.
@@ -59,6 +61,7 @@ pub(super) struct Projecting {
     pub(super) attempt: u32,
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
+    pub(super) writers: Vec<Arc<str>>,
     pub(super) reads: Footprint,
     pub(super) lease: Option<(LeaseId, FencingToken)>,
 }
@@ -126,9 +129,9 @@ impl Ledger {
             Command::Withdraw { instance } => {
                 self.withdrawn.extend(self.waiting.remove(instance).map(|asked| asked.request));
             }
-            Command::Project { instance, attempt, base, changes, reads, lease } => {
-                let (attempt, base, changes) = (*attempt, *base, changes.clone());
-                let asked = Projecting { attempt, base, changes, reads: reads.clone(), lease: *lease };
+            Command::Project { instance, attempt, base, changes, writers, reads, lease } => {
+                let (attempt, base, changes, writers) = (*attempt, *base, changes.clone(), writers.clone());
+                let asked = Projecting { attempt, base, changes, writers, reads: reads.clone(), lease: *lease };
                 self.projecting.insert(*instance, asked);
             }
             Command::Start { instance, attempt, goal } => {
@@ -143,8 +146,10 @@ impl Ledger {
                     self.held.remove(lease);
                 }
             }
-            Command::Commit { instance, changes, revision } => {
-                self.commits.push((*instance, changes.clone(), *revision));
+            Command::Commit { instance, writer, changes, evidence, revision } => {
+                let (instance, revision, writer) = (*instance, *revision, writer.clone());
+                let (changes, evidence) = (changes.clone(), evidence.clone());
+                self.commits.push(Decided { instance, writer, changes, evidence, revision });
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;

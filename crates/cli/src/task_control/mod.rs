@@ -5,6 +5,7 @@ pub(crate) mod control;
 pub(crate) mod learn;
 mod ledger;
 pub(crate) mod log;
+mod outside;
 mod performer;
 mod progress;
 mod record;

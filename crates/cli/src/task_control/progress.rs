@@ -7,6 +7,9 @@ use ratn_model::program::{SUCCESS, WORLD_MODEL};
 use ratn_model::time::Timestamp;
 use std::collections::BTreeMap;
 
+/// Of one change from outside so many facts are said.
+const MOST_FACTS: usize = 5;
+
 /// Follows events and commands and prints.
 #[derive(Debug, Default)]
 pub(crate) struct Progress {
@@ -60,6 +63,17 @@ impl Progress {
                 say(at, &format!("failed to make {} real: {reason}", self.path(*instance)));
             }
             Event::AbortRequested { reason } => say(at, &format!("abort: {reason}")),
+            Event::WorldChanged { facts, .. } => {
+                for (fact, value) in facts.iter().take(MOST_FACTS) {
+                    match value {
+                        Some(value) => say(at, &format!("world  {fact} = {value}, from outside")),
+                        None => say(at, &format!("world  {fact} is gone, from outside")),
+                    }
+                }
+                if facts.len() > MOST_FACTS {
+                    say(at, &format!("world  and {} more facts", facts.len() - MOST_FACTS));
+                }
+            }
             Event::Resumed => say(at, "task control goes on"),
             Event::PauseRequested => say(at, "pause"),
             Event::ResumeRequested => say(at, "resume"),

@@ -2,11 +2,12 @@
 //! creation and deletion of task resources. One task, one request at a time.
 
 use super::ledger::operation_request;
-use super::performer::{Answer, commit_request};
+use super::performer::Answer;
 use super::retry::{Attempts, patiently};
 use ratn_executive::protocol::Event;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
+use ratn_model::measurement::Evidence;
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_proto::types::Resource;
 use ratn_worker::client::{CallError, Commit, Projection, ResourceClient, WorldClient};
@@ -17,6 +18,9 @@ use tokio::sync::{mpsc, oneshot};
 /// How far the world pool may be behind before the run is given up.
 pub(super) const MAX_PENDING_RECORDS: usize = 65_536;
 
+/// Others who write without a pause do not hold up a commit more often than this.
+const MAX_OVERTAKEN: u32 = 100;
+
 /// One thing to do, in order.
 #[derive(Debug)]
 pub(super) enum Record {
@@ -25,16 +29,14 @@ pub(super) enum Record {
         attempt: u32,
         base: Revision,
         changes: Vec<Change>,
+        /// Who makes the change at the same place, by path.
+        writers: Vec<Arc<str>>,
         reads: Footprint,
         lease: Option<(LeaseId, FencingToken)>,
     },
-    Commit {
-        instance: InstanceId,
-        changes: Vec<Change>,
-        revision: Revision,
-        /// The instance's path; empty where it is not known.
-        writer: String,
-    },
+    Commit(Decided),
+    /// The pool's root is at this revision, or has been.
+    Known(Revision),
     Operate {
         instance: InstanceId,
         /// Its number in the run.
@@ -43,6 +45,32 @@ pub(super) enum Record {
     },
     /// Answers once everything before it is done: with the first failure of the run, if there was one.
     Flush(oneshot::Sender<Result<(), String>>),
+}
+
+/// What an instance has changed, to become real.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Decided {
+    pub(super) instance: InstanceId,
+    /// By path.
+    pub(super) writer: String,
+    pub(super) changes: Vec<Change>,
+    pub(super) evidence: Evidence,
+    /// What the run's root becomes: the pool's, as long as nobody else writes into it.
+    pub(super) revision: Revision,
+}
+
+impl Decided {
+    /// As the world pool is asked for it by the run.
+    pub(super) fn commit(self, run: &str) -> Commit {
+        let id = self.id(run);
+        let Decided { writer, changes, evidence, .. } = self;
+        Commit { id, changes, revision: None, writer, evidence }
+    }
+
+    /// The commit's id. One instance may commit more than once (the parts of a routine); the revision tells its commits apart.
+    pub(super) fn id(&self, run: &str) -> String {
+        format!("{run}/{}/{}", self.instance, self.revision)
+    }
 }
 
 /// Attempts whose projection nobody waits for any more.
@@ -55,24 +83,27 @@ pub(super) struct Recorder {
     pub(super) resources: ResourceClient,
     pub(super) cancelled: Cancelled,
     pub(super) events: mpsc::Sender<Answer>,
+    /// The pool's root as far as it is known: what the run's own revisions come to there, and what it was told of others'.
+    pub(super) root: Revision,
 }
 
 impl Recorder {
     /// Until nobody can ask any more.
-    pub(super) async fn work(self, mut records: mpsc::Receiver<Record>) {
+    pub(super) async fn work(mut self, mut records: mpsc::Receiver<Record>) {
         let mut recorded = Ok(());
         while let Some(record) = records.recv().await {
             let event = match record {
-                Record::Project { instance, attempt, base, changes, reads, lease } => {
+                Record::Project { instance, attempt, base, changes, writers, reads, lease } => {
                     let request = format!("{}/{instance}/{attempt}", self.run);
-                    let writers = Vec::new();
+                    // What the run knows is real there by now, whatever number it has.
+                    let base = base.max(self.root);
                     let wanted = Projection { request, base, changes, writers, reads, lease };
                     self.project(instance, attempt, wanted).await
                 }
-                Record::Commit { instance, changes, revision, writer } => {
-                    let id = commit_request(&self.run, instance, revision);
-                    let commit = Commit { id, changes, revision: Some(revision), writer, ..Commit::default() };
-                    self.commit(instance, commit).await
+                Record::Commit(decided) => self.commit(decided.instance, decided.commit(&self.run)).await,
+                Record::Known(revision) => {
+                    self.root = self.root.max(revision);
+                    None
                 }
                 Record::Operate { instance, number, operations } => self.operate(instance, number, operations).await,
                 Record::Flush(done) => {
@@ -109,9 +140,12 @@ impl Recorder {
         }
     }
 
-    async fn commit(&self, instance: InstanceId, commit: Commit) -> Option<Event> {
-        match patiently(Attempts::IDEMPOTENT, || self.world.commit_as(commit.clone())).await {
-            Ok(_) => None,
+    async fn commit(&mut self, instance: InstanceId, commit: Commit) -> Option<Event> {
+        match commit_next(&self.world, self.root, commit).await {
+            Ok(revision) => {
+                self.root = self.root.max(revision);
+                None
+            }
             Err(error) => Some(Event::RetirementFailed {
                 instance,
                 reason: format!("the world pool did not take its effects: {}", said(&error)),
@@ -128,6 +162,31 @@ impl Recorder {
             }
         }
         None
+    }
+}
+
+/// Commits on top of whatever others have committed; the pool's root with it. `known` is a revision that the pool has had: one that
+/// has lost it takes nothing.
+pub(super) async fn commit_next(
+    world: &WorldClient,
+    mut known: Revision,
+    mut commit: Commit,
+) -> Result<Revision, CallError> {
+    let mut attempts = MAX_OVERTAKEN;
+    loop {
+        commit.revision = Some(Revision(known.0 + 1));
+        match patiently(Attempts::IDEMPOTENT, || world.commit_as(commit.clone())).await {
+            Ok((revision, _)) => return Ok(revision),
+            Err(error) if error.code() == Some(tonic::Code::FailedPrecondition) && attempts > 0 => {
+                attempts -= 1;
+                let (_, root) = patiently(Attempts::IDEMPOTENT, || world.diff(known, None, &[])).await?;
+                if root == known {
+                    return Err(error);
+                }
+                known = root;
+            }
+            Err(error) => return Err(error),
+        }
     }
 }
 

@@ -15,6 +15,13 @@ impl Attempts {
     pub(super) const IDEMPOTENT: Attempts = Attempts { count: 6, between: Duration::from_millis(250) };
 }
 
+impl Attempts {
+    /// Between two of them.
+    pub(super) fn pause(self) -> Duration {
+        self.between
+    }
+}
+
 /// Repeats a call whose answer was lost; a refusal is an answer.
 pub(super) async fn patiently<T, F>(attempts: Attempts, mut call: impl FnMut() -> F) -> Result<T, CallError>
 where

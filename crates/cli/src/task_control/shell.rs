@@ -297,7 +297,7 @@ impl Shell {
                 }
                 () = interrupt.asked_times(2) => bail!("interrupted twice: the run was left where it was"),
             };
-            if let Some(event) = self.performer.accept(answer) {
+            if let Some(event) = self.performer.accept(answer, self.executive.root())? {
                 return Ok(event);
             }
         }

@@ -101,7 +101,7 @@ pub(super) struct NewProjection {
     pub(super) request_id: String,
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
-    pub(super) writers: Vec<String>,
+    pub(super) writers: Vec<Arc<str>>,
     pub(super) reads: Footprint,
     pub(super) lease: Option<LeaseId>,
 }

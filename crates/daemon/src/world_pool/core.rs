@@ -65,7 +65,7 @@ pub(super) struct ProjectRequest {
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
     /// Who will make the change at the same place; empty or missing: nobody.
-    pub(super) writers: Vec<String>,
+    pub(super) writers: Vec<Arc<str>>,
     pub(super) reads: Footprint,
     pub(super) held_by: HeldBy,
 }
@@ -74,7 +74,7 @@ impl ProjectRequest {
     fn effects(&self) -> impl Iterator<Item = Effect> {
         self.changes.iter().enumerate().map(|(place, change)| {
             let writer = self.writers.get(place).filter(|writer| !writer.is_empty());
-            Effect { writer: writer.map(|writer| Arc::from(writer.as_str())), change: change.clone() }
+            Effect { writer: writer.cloned(), change: change.clone() }
         })
     }
 }
@@ -254,7 +254,7 @@ impl WorldPool {
         if self.projections.len() >= self.config.max_projections {
             return Err(ProjectError::TooMany { limit: self.config.max_projections });
         }
-        let world = self.history.at(request.base)?.project(&request.changes)?;
+        let world = self.history.at(request.base)?.project_as(&request.writers, &request.changes)?;
         self.last_projection += 1;
         let id = ProjectionId(self.last_projection);
         let (contradiction, effects) = self.catch_up(id, &world, &request);
@@ -521,6 +521,13 @@ mod tests {
         let mut pool = WorldPool::new(config, Some(ontology), history, 0);
         let refused = commit(&mut pool, "a", &[set("box", 1)], None).unwrap_err();
         assert!(matches!(refused, CommitError::Violation(_)), "{refused}");
+        // Sure in a way that the predicate does not declare.
+        let fact = FactKey { predicate: "full".to_owned(), ..key("box") };
+        let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
+        let measured = Measurement { source: "scale".to_owned(), certainty: Some(Certainty::Confidence(0.9)) };
+        let with = Commit { id: "m".to_owned(), changes, evidence: vec![(fact, measured)], ..Commit::default() };
+        let refused = pool.commit(Timestamp(0), &with).unwrap_err();
+        assert!(refused.to_string().contains("[other-uncertainty]"), "{refused}");
         assert_eq!(pool.root().revision(), Revision(0));
     }
 
@@ -541,6 +548,20 @@ mod tests {
         assert!(facts.iter().all(|(_, fact)| fact.writer.as_deref() == Some("detect[1]")));
         assert_eq!(facts[0].1.measured.as_deref(), Some(&measured));
         assert_eq!(facts[1].1.measured, None);
+        // In a projection each fact says who will have written it.
+        let request = ProjectRequest {
+            request_id: "p".to_owned(),
+            base: Revision(1),
+            changes: vec![set("box", 7), set("cup", 8)],
+            writers: vec!["place[1]".into(), "".into()],
+            reads: Footprint::Everything,
+            held_by: HeldBy::Until(Timestamp(9)),
+        };
+        let id = pool.project(request).unwrap();
+        let (facts, _) = pool.query(Some(id), None, &[]).unwrap();
+        let writers: Vec<_> = facts.iter().map(|(_, fact)| fact.writer.as_deref()).collect();
+        assert_eq!(writers, [Some("place[1]"), None]);
+        assert!(facts.iter().all(|(_, fact)| fact.measured.is_none()), "it is predicted");
         let none = Commit { id: "b".to_owned(), changes: vec![set("cup", 3)], ..commit };
         assert_eq!(pool.commit(Timestamp(0), &none), Err(CommitError::Evidence { fact: key("box") }));
     }
@@ -554,7 +575,7 @@ mod tests {
                 request_id: format!("{base}/{reads}"),
                 base: Revision(base),
                 changes: vec![set("box", 7)],
-                writers: vec!["place[1]".to_owned()],
+                writers: vec!["place[1]".into()],
                 reads: Footprint::Patterns(vec![FactPattern::of(&key(reads))]),
                 held_by: HeldBy::Until(Timestamp(9)),
             };
@@ -578,7 +599,7 @@ mod tests {
             request_id: "late".to_owned(),
             base: Revision(1),
             changes: vec![set("box", 7)],
-            writers: vec!["place[1]".to_owned()],
+            writers: vec!["place[1]".into()],
             reads: Footprint::Everything,
             held_by: HeldBy::Until(Timestamp(9)),
         };

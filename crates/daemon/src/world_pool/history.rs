@@ -167,6 +167,9 @@ impl History {
         for (key, measured) in evidence {
             let fact = written.get_mut(key).and_then(Option::as_mut);
             let fact = fact.ok_or_else(|| CommitError::Evidence { fact: key.clone() })?;
+            if let Some(ontology) = ontology {
+                ontology.check_measurement(key, &fact.value, measured)?;
+            }
             Arc::make_mut(fact).measured = Some(Arc::new(measured.clone()));
         }
         let deleted = changes.iter().filter_map(|change| match change {

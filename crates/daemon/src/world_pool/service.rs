@@ -12,6 +12,7 @@ use ratn_proto::convert::{Malformed, all, each, label, name, required};
 use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
 use ratn_proto::v1;
 use ratn_world::world::Fact;
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -63,7 +64,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             request_id: request.request_id,
             base: Revision(request.base_revision),
             changes: each(request.changes, "changes")?,
-            writers: request.writers,
+            writers: request.writers.into_iter().map(Arc::from).collect(),
             reads: required(request.reads, "reads")?,
             lease,
         };

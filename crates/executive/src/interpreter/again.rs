@@ -2,15 +2,13 @@
 //!
 //! A cancelled or crashed goal changes nothing: nobody knows how far it came.
 
+use super::node::GoalEnd;
 use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase};
 use crate::analysis::NodeNature;
-use crate::binding::Outputs;
 use crate::context::Context;
 use crate::protocol::Command;
-use ratn_model::fact::FactKey;
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Program, StateKind};
-use ratn_model::value::Value;
 use std::time::Duration;
 
 impl Interpreter {
@@ -35,17 +33,9 @@ impl Interpreter {
     }
 
     /// A goal has ended: that is the result, unless it is tried again.
-    pub(super) fn goal_ended(
-        &mut self,
-        context: &mut Context<'_>,
-        thread: u64,
-        outcome: String,
-        outputs: Outputs,
-        measured: &[(FactKey, Value)],
-        reason: String,
-    ) {
-        if outcome != ABORTED || !self.is_tried_again(context, thread) {
-            self.finish(context, thread, outcome, outputs, measured, reason);
+    pub(super) fn goal_ended(&mut self, context: &mut Context<'_>, thread: u64, end: GoalEnd) {
+        if end.outcome != ABORTED || !self.is_tried_again(context, thread) {
+            self.finish(context, thread, end);
         }
     }
 

@@ -2,12 +2,13 @@
 
 use super::{Interpreter, Target};
 use crate::binding::{self, Outputs};
-use crate::context::Context;
+use crate::context::{Context, Made};
 use crate::effects;
-use ratn_model::fact::Change;
+use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind};
 use ratn_model::value::Value;
+use std::sync::Arc;
 
 impl Interpreter {
     /// A composite state is left. What fails on the way makes it `aborted`.
@@ -23,7 +24,7 @@ impl Interpreter {
         mut reason: String,
     ) {
         let state = context.program.state(id);
-        let result = self.boundary(context, thread, state, variables, &outcome);
+        let result = self.boundary(context, thread, state, path, variables, &outcome);
         // The task's own variables are seen by its outputs.
         if id != Program::ROOT
             && let Some(thread) = self.threads.get_mut(&thread)
@@ -46,6 +47,7 @@ impl Interpreter {
         context: &mut Context<'_>,
         thread: u64,
         state: &State,
+        path: &str,
         variables: usize,
         outcome: &str,
     ) -> Result<Vec<(String, Value)>, String> {
@@ -72,7 +74,7 @@ impl Interpreter {
             }
         }
         let assigned = if good { self.assigned(context, thread, state, &written)? } else { Vec::new() };
-        self.change(context, thread, state, outcome, &written)?;
+        self.change(context, thread, state, path, outcome, &written)?;
         if outcome == SUCCESS {
             self.operate(context, thread, state, InstanceId(0), &written)?;
         }
@@ -88,6 +90,7 @@ impl Interpreter {
         context: &mut Context<'_>,
         thread: u64,
         state: &State,
+        path: &str,
         outcome: &str,
         outputs: &Outputs,
     ) -> Result<(), String> {
@@ -95,7 +98,7 @@ impl Interpreter {
         let changes = self
             .with_scope(context, thread, Some(outputs), |s| effects::actual(Some(declared), outcome, &[], s))
             .map_err(|error| error.to_string())?;
-        self.apply(context, InstanceId(0), changes)
+        self.apply(context, InstanceId(0), path, changes.into())
     }
 
     /// The values that a state assigns to variables.
@@ -127,14 +130,20 @@ impl Interpreter {
         &mut self,
         context: &mut Context<'_>,
         instance: InstanceId,
-        changes: Vec<Change>,
+        path: &str,
+        made: Made,
     ) -> Result<(), String> {
         match &mut self.target {
-            Target::Actual => context.commit(instance, changes),
-            Target::Projection { changes: all, world, .. } => {
-                context.allows(world, &changes)?;
-                world.apply(&changes).map_err(|e| e.to_string())?;
-                all.extend(changes);
+            Target::Actual => context.commit(instance, path.to_owned(), made),
+            Target::Projection { changes, writers, evidence, world, .. } => {
+                context.allows(world, &made)?;
+                world.apply(&made.changes).map_err(|e| e.to_string())?;
+                writers.extend(std::iter::repeat_n(Arc::from(path), made.changes.len()));
+                // What is written again was measured anew, or not at all.
+                let again = |fact: &FactKey| made.changes.iter().any(|change| change.pattern().matches(fact));
+                evidence.retain(|(fact, _)| !again(fact));
+                evidence.extend(made.evidence);
+                changes.extend(made.changes);
                 Ok(())
             }
         }

@@ -18,11 +18,13 @@ mod stop;
 mod walk;
 
 use crate::binding::{Bindings, Names, Outputs};
-use crate::context::Context;
+use crate::context::{Context, Made};
 use crate::hold::Hold;
 use crate::protocol::Event;
+use node::GoalEnd;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, Revision, StateId};
+use ratn_model::measurement::Evidence;
 use ratn_model::program::StateKind;
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
@@ -30,6 +32,7 @@ use ratn_model::value::Value;
 use ratn_world::world::World;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 pub(crate) use routine::Routine;
 
@@ -37,6 +40,7 @@ pub(crate) use routine::Routine;
 pub(crate) const DEFAULT_ATTEMPTS: u32 = 3;
 
 /// Where effects go.
+#[expect(clippy::large_enum_variant, reason = "an interpreter has one")]
 pub(crate) enum Target {
     /// Into the root world.
     Actual,
@@ -46,8 +50,12 @@ pub(crate) enum Target {
         base: Revision,
         /// What was changed since, in order: first what older instances will have changed, then what this one has.
         changes: Vec<Change>,
+        /// The path of who makes each.
+        writers: Vec<Arc<str>>,
         /// How many of them are the older instances'.
         before: usize,
+        /// What measured which of this one's.
+        evidence: Evidence,
         /// The result.
         world: World,
     },
@@ -222,10 +230,12 @@ impl Interpreter {
     }
 
     /// The changes it has made to its projection; none in the actual world, where they are real already.
-    pub(crate) fn into_changes(self) -> Vec<Change> {
+    pub(crate) fn into_made(self) -> Made {
         match self.target {
-            Target::Actual => Vec::new(),
-            Target::Projection { changes, before, .. } => changes[before..].to_vec(),
+            Target::Actual => Made::default(),
+            Target::Projection { changes, before, evidence, .. } => {
+                Made { changes: changes[before..].to_vec(), evidence }
+            }
         }
     }
 
@@ -273,11 +283,12 @@ impl Interpreter {
                     self.crashed(context, thread, &reason);
                 }
             }
-            Event::Finished { instance, attempt, outcome, outputs, measured, reason } => {
+            Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason } => {
                 if let Some(thread) = of(self, instance, Some(attempt))
                     && self.phase(thread) == Some(Phase::Running)
                 {
-                    self.goal_ended(context, thread, outcome, outputs, &measured, reason);
+                    let end = GoalEnd { outcome, outputs, measured, evidence, reason };
+                    self.goal_ended(context, thread, end);
                 }
             }
             Event::PauseRequested => self.hold = Hold::Paused(0),

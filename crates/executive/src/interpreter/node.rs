@@ -4,15 +4,25 @@ use super::again::duration;
 use super::{Current, Interpreter, Phase, Target};
 use crate::analysis::NodeNature;
 use crate::binding::{self, Outputs};
-use crate::context::Context;
+use crate::context::{Context, Made};
 use crate::effects;
 use crate::protocol::{Command, Goal, Note};
 use ratn_model::expression::FactExpr;
 use ratn_model::fact::{FactKey, Footprint};
 use ratn_model::id::StateId;
+use ratn_model::measurement::Evidence;
 use ratn_model::program::{ABORTED, PREEMPTED, STOPPED, SUCCESS, StateKind, WORLD_MODEL};
 use ratn_model::resource::Lease;
 use ratn_model::value::Value;
+
+/// How a goal has ended, as its provider says.
+pub(super) struct GoalEnd {
+    pub(super) outcome: String,
+    pub(super) outputs: Outputs,
+    pub(super) measured: Vec<(FactKey, Value)>,
+    pub(super) evidence: Evidence,
+    pub(super) reason: String,
+}
 
 impl Interpreter {
     pub(super) fn begin(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: &str) {
@@ -135,12 +145,12 @@ impl Interpreter {
             None => Footprint::Everything,
             Some(reads) => self.with_scope(context, thread, None, |s| FactExpr::footprint(reads, s)),
         };
-        let (base, changes) = match &self.target {
-            Target::Actual => (context.root.revision(), Vec::new()),
-            Target::Projection { base, changes, .. } => (*base, changes.clone()),
+        let (base, changes, writers) = match &self.target {
+            Target::Actual => (context.root.revision(), Vec::new(), Vec::new()),
+            Target::Projection { base, changes, writers, .. } => (*base, changes.clone(), writers.clone()),
         };
         self.set_phase(thread, Phase::Projecting);
-        context.commands.push(Command::Project { instance, attempt, base, changes, reads, lease });
+        context.commands.push(Command::Project { instance, attempt, base, changes, writers, reads, lease });
     }
 
     pub(super) fn run(&mut self, context: &mut Context<'_>, thread: u64) {
@@ -194,15 +204,8 @@ impl Interpreter {
         self.ended(thread, current.state, ABORTED, format!("{}: {reason}", current.path));
     }
 
-    pub(super) fn finish(
-        &mut self,
-        context: &mut Context<'_>,
-        thread: u64,
-        mut outcome: String,
-        mut outputs: Outputs,
-        measured: &[(FactKey, Value)],
-        mut reason: String,
-    ) {
+    pub(super) fn finish(&mut self, context: &mut Context<'_>, thread: u64, end: GoalEnd) {
+        let GoalEnd { mut outcome, mut outputs, measured, evidence, mut reason } = end;
         let Some(current) = self.threads.get_mut(&thread).and_then(|thread| thread.current.take()) else { return };
         let program = context.program;
         let state = program.state(current.state);
@@ -240,8 +243,9 @@ impl Interpreter {
         let nature = context.analysis.state(id).nature;
         let declared = effects::declared(state, nature, &outcome);
         let changes =
-            self.with_scope(context, thread, Some(&outputs), |s| effects::actual(declared, &outcome, measured, s));
-        let made = changes.map_err(|e| e.to_string()).and_then(|changes| self.apply(context, instance, changes));
+            self.with_scope(context, thread, Some(&outputs), |s| effects::actual(declared, &outcome, &measured, s));
+        let made = changes.map(|changes| Made { changes, evidence }).map_err(|e| e.to_string());
+        let made = made.and_then(|made| self.apply(context, instance, &current.path, made));
         if let Err(problem) = made {
             aborted(&mut outcome, problem);
         } else if outcome == SUCCESS

@@ -58,7 +58,7 @@ impl Interpreter {
         path: &str,
     ) -> Result<(), String> {
         let state = context.program.state(state);
-        let changed = self.change(context, thread, state, PREEMPTED, &Outputs::new());
+        let changed = self.change(context, thread, state, path, PREEMPTED, &Outputs::new());
         changed.map_err(|problem| format!("{path}: {problem}"))
     }
 

@@ -10,10 +10,12 @@ use crate::context::Context;
 use crate::interpreter::{Interpreter, Routine, Target};
 use crate::protocol::{Command, Goal, Note};
 use ratn_model::expression::Scope;
-use ratn_model::fact::Footprint;
+use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::InstanceId;
+use ratn_model::measurement::Evidence;
 use ratn_model::program::{ABORTED, StateKind};
 use ratn_model::resource::Requirement;
+use std::sync::Arc;
 
 impl Window {
     /// Looks at a node that has not begun.
@@ -194,14 +196,15 @@ impl Window {
                 Some(facts) => ratn_model::expression::FactExpr::footprint(facts, &view),
                 None => Footprint::Everything,
             };
-            let Ok(changes) = view.changes(&reads) else {
+            let Ok(by_writer) = view.changes_by_writer(&reads) else {
                 let wait = view.blocker().map_or(Wait::Order, Wait::World);
                 return self.step_back(context, id, wait);
             };
             let lease = instance.lease.as_ref().map(|l| (l.id, l.token));
             let base = context.root.revision();
+            let (writers, changes) = self.named(context, by_writer);
             self.set_status(id, Status::Projecting, Wait::Nothing);
-            context.commands.push(Command::Project { instance: id, attempt, base, changes, reads, lease });
+            context.commands.push(Command::Project { instance: id, attempt, base, changes, writers, reads, lease });
             return;
         }
         if is_routine {
@@ -244,6 +247,18 @@ impl Window {
         context.commands.push(Command::Start { instance: id, attempt, goal: Box::new(goal) });
     }
 
+    /// Each change with the path of who makes it.
+    fn named(&self, context: &Context<'_>, by_writer: Vec<(InstanceId, Vec<Change>)>) -> (Vec<Arc<str>>, Vec<Change>) {
+        let mut writers = Vec::new();
+        let mut all = Vec::new();
+        for (writer, changes) in by_writer {
+            let path: Arc<str> = self.path(context.program, writer).into();
+            writers.extend(std::iter::repeat_n(path, changes.len()));
+            all.extend(changes);
+        }
+        (writers, all)
+    }
+
     fn start_routine(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.instances.get(id) else { return };
         let sight = self.sight(context);
@@ -272,10 +287,11 @@ impl Window {
                 Some(facts) => ratn_model::expression::FactExpr::footprint(facts, &view),
                 None => Footprint::Everything,
             };
-            let changes = view.changes(&reads).unwrap_or_default();
+            let (writers, changes) = self.named(context, view.changes_by_writer(&reads).unwrap_or_default());
             let world = context.root.project(&changes).unwrap_or_else(|_| context.root.clone());
             let before = changes.len();
-            Target::Projection { base: context.root.revision(), changes, before, world }
+            let base = context.root.revision();
+            Target::Projection { base, changes, writers, before, evidence: Evidence::new(), world }
         };
         let requirements = match binding::requirements(state, &analysis.requirements, &view) {
             Ok(requirements) => requirements,

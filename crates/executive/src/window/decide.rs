@@ -5,7 +5,7 @@ use super::cursor::Todo;
 use super::environment::{ASSIGNED, assigned};
 use super::instance::{Ended, Role, Seen, Wait, gives_outputs};
 use super::ready::{facts_of, not_bound};
-use super::{End, Window};
+use super::{End, Window, outside};
 use crate::binding::{BindError, Outputs};
 use crate::context::Context;
 use crate::protocol::Note;
@@ -66,7 +66,9 @@ impl Window {
         drop(view);
         let path = self.path(context.program, id);
         context.note(Note::Decided { instance: id, path, decision: elements.len().to_string() });
-        self.end_instance(id, Ended::success(Outputs::new()));
+        let looked = !collection.fact_expressions().is_empty();
+        let outputs = looked.then(|| outside::remembered(&elements)).into_iter().collect();
+        self.end_instance(id, Ended::success(outputs));
         self.unroll(context, id, elements);
     }
 

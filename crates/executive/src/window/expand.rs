@@ -180,16 +180,61 @@ impl Window {
                     }
                 }
             }
-            StateKind::Condition { then, otherwise, .. } => {
+            StateKind::Condition { .. } => {
                 let instance = self.append(context, index, state, Role::Condition, visit, None, 0);
-                let decisions = [(0, "then"), (1, "else")];
-                for (cursor, taken) in self.branch(context, index, instance, id, &decisions) {
-                    let list = if taken == 0 { then } else { otherwise };
-                    self.begin_list(cursor, id, visit, path.clone(), base, list);
-                }
+                self.branch_on_condition(context, index, instance, visit);
             }
             StateKind::Concurrency { regions, .. } => {
                 self.fork(context, index, state, visit, &path, base, regions);
+            }
+        }
+    }
+
+    /// Both lists of a condition, from where it stands.
+    pub(super) fn branch_on_condition(
+        &mut self,
+        context: &Context<'_>,
+        index: usize,
+        instance: InstanceId,
+        visit: u32,
+    ) {
+        let Some(id) = self.instances.get(instance).map(|instance| instance.state) else { return };
+        let state = context.program.state(id);
+        let StateKind::Condition { then, otherwise, .. } = &state.kind else { return };
+        let environment = &self.cursors[index].environment;
+        let path: Arc<str> = environment.path(&state.name, visit, None).into();
+        let base = environment.variables.len() - state.variables.len();
+        let decisions = [(0, "then"), (1, "else")];
+        for (cursor, taken) in self.branch(context, index, instance, id, &decisions) {
+            let list = if taken == 0 { then } else { otherwise };
+            self.begin_list(cursor, id, visit, path.clone(), base, list);
+        }
+    }
+
+    /// Another iteration of a `while`, and its end, from where its test stands.
+    pub(super) fn branch_on_test(
+        &mut self,
+        context: &Context<'_>,
+        index: usize,
+        test: InstanceId,
+        visit: u32,
+        number: usize,
+    ) {
+        let Some(owner) = self.instances.get(test).map(|test| test.state) else { return };
+        let state = context.program.state(owner);
+        let environment = &self.cursors[index].environment;
+        let path: Arc<str> = environment.path(&state.name, visit, None).into();
+        let path = if owner == Program::ROOT { Arc::from("") } else { path };
+        let base = environment.variables.len();
+        let inside = self.frame(index, owner, visit, path, base, Some(Iteration { index: number, elements: None }));
+        let decisions = [(0, "again"), (1, "done")];
+        for (cursor, taken) in self.branch(context, index, test, owner, &decisions) {
+            if taken == 0 {
+                self.cursors[cursor].environment.frames = Some(inside.clone());
+                self.begin_iteration(cursor, context.program);
+            } else {
+                let ended = &mut self.cursors[cursor];
+                ended.todo = Todo::Exit { state: owner, visit, outcome: 0, variables: base };
             }
         }
     }
@@ -286,16 +331,7 @@ impl Window {
                 environment.test = Some(Box::new((owner, Iteration { index: number, elements: None })));
                 let test = self.append(context, index, state, Role::Test, visit, Some(number), 0);
                 self.cursors[index].environment.test = None;
-                let decisions = [(0, "again"), (1, "done")];
-                for (cursor, taken) in self.branch(context, index, test, owner, &decisions) {
-                    if taken == 0 {
-                        self.cursors[cursor].environment.frames = inside.clone();
-                        self.begin_iteration(cursor, program);
-                    } else {
-                        let ended = &mut self.cursors[cursor];
-                        ended.todo = Todo::Exit { state: owner, visit, outcome: 0, variables: base };
-                    }
-                }
+                self.branch_on_test(context, index, test, visit, number);
             }
         }
     }
@@ -458,7 +494,7 @@ impl Window {
         }
     }
 
-    fn single_arm(&mut self, index: usize, instance: InstanceId) {
+    pub(super) fn single_arm(&mut self, index: usize, instance: InstanceId) {
         let segment = self.cursors[index].segment;
         if let Some(instance) = self.instances.get_mut(instance) {
             instance.arms = smallvec![Arm { outcomes: 1, outcome: 0, next: None, segment }];

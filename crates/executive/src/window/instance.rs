@@ -4,9 +4,11 @@ use super::environment::{Environment, Producer};
 use super::plan::{Outcome, Outcomes};
 use crate::analysis::NodeNature;
 use crate::binding::Outputs;
+use crate::context::Made;
 use crate::interpreter::Interpreter;
-use ratn_model::fact::{Change, FactKey, Footprint};
+use ratn_model::fact::{FactKey, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, StateId};
+use ratn_model::measurement::Evidence;
 use ratn_model::program::{ABORTED, SUCCESS};
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
@@ -112,16 +114,21 @@ pub(crate) struct Ended {
 /// What an ended instance changes when it retires.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Changed {
-    /// What it declares for its outcome, with what was measured.
-    Declared(Vec<(FactKey, Value)>),
+    /// What it declares for its outcome, with what was measured, and what is known of how.
+    Declared(Vec<(FactKey, Value)>, Evidence),
     /// Exactly this: a routine on a projection (or nothing: a routine in the actual world has made its changes already,
     /// and what was never executed has none).
-    Exactly(Vec<Change>),
+    Exactly(Made),
 }
 
 impl Ended {
     pub(crate) fn with(outcome: impl Into<Arc<str>>, outputs: Outputs) -> Ended {
-        Ended { outcome: outcome.into(), outputs, reason: String::new(), changes: Changed::Declared(Vec::new()) }
+        Ended {
+            outcome: outcome.into(),
+            outputs,
+            reason: String::new(),
+            changes: Changed::Declared(Vec::new(), Evidence::new()),
+        }
     }
 
     pub(crate) fn success(outputs: Outputs) -> Ended {
@@ -130,7 +137,7 @@ impl Ended {
 
     /// It was never executed, or nobody knows how far: it changes nothing.
     pub(crate) fn aborted(reason: String) -> Ended {
-        let changes = Changed::Exactly(Vec::new());
+        let changes = Changed::Exactly(Made::default());
         Ended { outcome: ABORTED.into(), outputs: Outputs::new(), reason, changes }
     }
 }

@@ -12,7 +12,7 @@
 //! |---|---|
 //! | growing | [`cursor`], [`expand`], [`concurrency`], [`environment`] |
 //! | beginning | [`ready`], [`begin`], [`priority`], [`timers`] |
-//! | ending | [`decide`], [`settle`], [`retire`], [`revalidate`], [`squash`], [`twins`] |
+//! | ending | [`decide`], [`settle`], [`retire`], [`revalidate`], [`outside`], [`squash`], [`twins`] |
 
 mod begin;
 mod concurrency;
@@ -22,6 +22,7 @@ mod environment;
 mod expand;
 mod instance;
 mod instances;
+mod outside;
 mod plan;
 mod priority;
 mod ready;
@@ -206,17 +207,17 @@ impl Window {
                     _ => self.in_routine(context, Event::Projected { instance, attempt, projection }),
                 }
             }
-            Event::Finished { instance, attempt, outcome, outputs, measured, reason } => {
+            Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason } => {
                 match self.instances.get(instance).filter(|running| running.status == Status::Running) {
                     Some(running) if running.attempt == attempt && running.routine.is_none() => {
-                        let changes = Changed::Declared(measured);
+                        let changes = Changed::Declared(measured, evidence);
                         let own = self.plan.state(running.state);
                         let known = own.outcome(&outcome).map(|number| own.outcomes[number].clone());
                         let outcome = known.unwrap_or_else(|| outcome.into());
                         self.goal_ended(context, instance, Ended { outcome, outputs, reason, changes });
                     }
                     _ => {
-                        let event = Event::Finished { instance, attempt, outcome, outputs, measured, reason };
+                        let event = Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason };
                         self.in_routine(context, event);
                     }
                 }
@@ -241,6 +242,7 @@ impl Window {
                 self.look_at_those_held();
             }
             Event::Advised { urgency_s } => self.advise(context, &urgency_s),
+            Event::WorldChanged { facts, .. } => self.world_changed(context, facts.iter().map(|(fact, _)| fact)),
             Event::Woken => self.wake_routines(context),
             Event::Started { .. } | Event::Progressed { .. } | Event::Resumed => {}
         }
@@ -474,7 +476,7 @@ impl Window {
         for name in &self.plan.state(instance.state).assigns {
             outputs.extend(routine.variable(name).map(|value| (assigned(name), value.clone())));
         }
-        let changes = Changed::Exactly(routine.into_changes());
+        let changes = Changed::Exactly(routine.into_made());
         self.finish(context, id, Ended { outcome: outcome.into(), outputs, reason, changes });
     }
 

@@ -9,7 +9,7 @@ use super::instance::{Changed, Instance, Line, Role, Status, Wait, gives_outputs
 use super::plan::{Effects, Outcome};
 use crate::analysis::NodeNature;
 use crate::binding;
-use crate::context::Context;
+use crate::context::{Context, Made};
 use crate::effects;
 use crate::protocol::{Command, Note};
 use ratn_model::id::InstanceId;
@@ -209,10 +209,11 @@ impl Window {
             Some(Effects::Declared(declared)) => Some(declared.as_slice()),
             _ => None,
         };
-        let changes = match &ended.changes {
-            Changed::Exactly(changes) => Ok(changes.clone()),
-            Changed::Declared(_) if is_routine => Ok(Vec::new()),
-            Changed::Declared(measured) => effects::actual(declared, &outcome, measured, &view),
+        let made = match &ended.changes {
+            Changed::Exactly(made) => Ok(made.clone()),
+            Changed::Declared(..) if is_routine => Ok(Made::default()),
+            Changed::Declared(measured, evidence) => effects::actual(declared, &outcome, measured, &view)
+                .map(|changes| Made { changes, evidence: evidence.clone() }),
         };
         let wanted = &analysis.state(instance.state).operations;
         let operations = if is_routine || wanted.is_empty() || outcome.as_ref() != SUCCESS {
@@ -222,9 +223,10 @@ impl Window {
             binding::requirements(state, wanted, &view)
         };
         drop(view);
-        match changes {
-            Ok(changes) => {
-                if let Err(problem) = context.commit(id, changes) {
+        match made {
+            Ok(made) => {
+                let writer = self.path(program, id);
+                if let Err(problem) = context.commit(id, writer, made) {
                     return aborted(problem);
                 }
             }

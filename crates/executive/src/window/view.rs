@@ -117,6 +117,11 @@ impl<'a> View<'a> {
 
     /// The effects of older instances on the facts of a footprint, in program order.
     pub(crate) fn changes(&self, footprint: &Footprint) -> Result<Vec<Change>, Blocked> {
+        Ok(self.changes_by_writer(footprint)?.into_iter().flat_map(|(_, changes)| changes).collect())
+    }
+
+    /// The same, with whose effects they are.
+    pub(crate) fn changes_by_writer(&self, footprint: &Footprint) -> Result<Vec<(InstanceId, Vec<Change>)>, Blocked> {
         let mut by_writer: Vec<(InstanceId, Vec<Change>)> = Vec::new();
         if footprint.is_nothing() {
             return Ok(Vec::new());
@@ -153,7 +158,7 @@ impl<'a> View<'a> {
         }
         by_writer.sort_by_key(|(id, _)| *id);
         self.check_increases(&by_writer)?;
-        Ok(by_writer.into_iter().flat_map(|(_, changes)| changes).collect())
+        Ok(by_writer)
     }
 
     /// An increase of what is no number will fail when it becomes real; until then nobody may build on it.
@@ -297,8 +302,8 @@ impl<'a> View<'a> {
             return self.predicted(writer, declared, None, footprint, known);
         };
         match &ended.changes {
-            Changed::Exactly(changes) => Ok(changes.iter().filter(|change| touches(change)).cloned().collect()),
-            Changed::Declared(measured) => {
+            Changed::Exactly(made) => Ok(made.changes.iter().filter(|change| touches(change)).cloned().collect()),
+            Changed::Declared(measured, _) => {
                 let outcome = plan.outcome(&ended.outcome).unwrap_or(link.outcome);
                 let mut changes = match &plan.effects[outcome] {
                     Effects::Unknown => Vec::new(),

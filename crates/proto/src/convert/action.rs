@@ -1,10 +1,11 @@
 //! Goals and their results.
 
-use super::{Malformed, facts, label, name, ports, wire_facts, wire_ports};
-use crate::types::{Goal, GoalOutcome};
+use super::{Malformed, each, label, name, ports, wire_ports};
+use crate::types::{FactRecord, Goal, GoalOutcome};
 use crate::v1;
 use ratn_model::id::ProjectionId;
 use ratn_model::resource::Lease;
+use std::collections::BTreeMap;
 
 impl From<Goal> for v1::Goal {
     fn from(goal: Goal) -> v1::Goal {
@@ -45,10 +46,18 @@ impl TryFrom<v1::Goal> for Goal {
 
 impl From<GoalOutcome> for v1::GoalResult {
     fn from(outcome: GoalOutcome) -> v1::GoalResult {
+        let evidence: BTreeMap<_, _> = outcome.evidence.into_iter().collect();
+        let fact = |(key, value)| v1::Fact {
+            measurement: evidence.get(&key).cloned().map(v1::Measurement::from),
+            key: Some(v1::FactKey::from(key)),
+            value: Some(v1::Value::from(value)),
+            ..v1::Fact::default()
+        };
+        let measured = outcome.measured.into_iter().map(fact).collect();
         v1::GoalResult {
             outcome: outcome.outcome,
             outputs: wire_ports(outcome.outputs),
-            measured: wire_facts(outcome.measured),
+            measured,
             reason: outcome.reason,
             orphaned: false,
         }
@@ -60,10 +69,13 @@ impl TryFrom<v1::GoalResult> for GoalOutcome {
 
     fn try_from(result: v1::GoalResult) -> Result<GoalOutcome, Malformed> {
         name(&result.outcome, "outcome")?;
+        let records: Vec<FactRecord> = each(result.measured, "measured")?;
+        let of = |record: &FactRecord| Some((record.key.clone(), record.measured.as_deref()?.clone()));
         Ok(GoalOutcome {
+            evidence: records.iter().filter_map(of).collect(),
             outcome: result.outcome,
             outputs: ports(result.outputs, "outputs")?,
-            measured: facts(result.measured, "measured")?,
+            measured: records.into_iter().map(|record| (record.key, record.value)).collect(),
             reason: result.reason,
         })
     }

@@ -10,7 +10,6 @@ mod resource;
 mod value;
 mod world;
 
-use ratn_model::fact::FactKey;
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -100,25 +99,6 @@ pub fn ports(fields: BTreeMap<String, v1::Value>, field: &str) -> Result<BTreeMa
 /// Ports or attributes onto the wire.
 pub fn wire_ports(fields: BTreeMap<String, Value>) -> BTreeMap<String, v1::Value> {
     fields.into_iter().map(|(name, value)| (name, value.into())).collect()
-}
-
-/// Facts with their revisions dropped.
-///
-/// # Errors
-/// [`Malformed`] of the first that is none.
-pub fn facts(facts: Vec<v1::Fact>, field: &str) -> Result<Vec<(FactKey, Value)>, Malformed> {
-    let records: Vec<crate::types::FactRecord> = each(facts, field)?;
-    Ok(records.into_iter().map(|record| (record.key, record.value)).collect())
-}
-
-/// Facts without a revision onto the wire.
-pub fn wire_facts(facts: Vec<(FactKey, Value)>) -> Vec<v1::Fact> {
-    let fact = |(key, value): (FactKey, Value)| v1::Fact {
-        key: Some(key.into()),
-        value: Some(value.into()),
-        ..v1::Fact::default()
-    };
-    facts.into_iter().map(fact).collect()
 }
 
 /// A name that must be there: not empty, not endless, nothing in it that a terminal would obey.

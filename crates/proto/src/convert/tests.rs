@@ -7,7 +7,7 @@ use proptest::collection::{btree_map, vec};
 use proptest::prelude::*;
 use prost::Message;
 use ratn_model::condition::{Comparison, Condition};
-use ratn_model::fact::{Change, FactPattern, Footprint, Term};
+use ratn_model::fact::{Change, FactKey, FactPattern, Footprint, Term};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::pose::Pose;
@@ -199,11 +199,14 @@ fn update() -> impl Strategy<Value = ResourceUpdate> {
     prop_oneof![event, snapshot]
 }
 
-fn record() -> impl Strategy<Value = FactRecord> {
+fn measurement() -> impl Strategy<Value = Measurement> {
     let certainty =
         prop_oneof![(0.0..=1.0).prop_map(Certainty::Confidence), vec(-1.0..1.0, 9).prop_map(Certainty::Covariance),];
-    let measured = (a_name(), prop::option::of(certainty))
-        .prop_map(|(source, certainty)| Arc::new(Measurement { source, certainty }));
+    (a_name(), prop::option::of(certainty)).prop_map(|(source, certainty)| Measurement { source, certainty })
+}
+
+fn record() -> impl Strategy<Value = FactRecord> {
+    let measured = measurement().prop_map(Arc::new);
     (key(), value(), any::<u64>(), prop::option::of(a_name()), prop::option::of(measured)).prop_map(
         |(key, value, revision, writer, measured)| FactRecord {
             key,
@@ -233,8 +236,15 @@ fn goal() -> impl Strategy<Value = Goal> {
 }
 
 fn outcome() -> impl Strategy<Value = GoalOutcome> {
-    (a_name(), btree_map(a_name(), value(), 0..3), vec((key(), value()), 0..3), ".{0,9}")
-        .prop_map(|(outcome, outputs, measured, reason)| GoalOutcome { outcome, outputs, measured, reason })
+    let fact = (value(), prop::option::of(measurement()));
+    (a_name(), btree_map(a_name(), value(), 0..3), btree_map(key(), fact, 0..3), ".{0,9}").prop_map(
+        |(outcome, outputs, facts, reason)| {
+            let of = |(key, (_, by)): (&FactKey, &(Value, Option<Measurement>))| Some((key.clone(), by.clone()?));
+            let evidence = facts.iter().filter_map(of).collect();
+            let measured = facts.into_iter().map(|(key, (value, _))| (key, value)).collect();
+            GoalOutcome { outcome, outputs, measured, evidence, reason }
+        },
+    )
 }
 
 proptest! {

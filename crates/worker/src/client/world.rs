@@ -5,12 +5,13 @@ use crate::endpoint::Endpoint;
 use crate::trace::Traced;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
-use ratn_model::measurement::Measurement;
+use ratn_model::measurement::Evidence;
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::{all, each};
 use ratn_proto::types::{Contradiction, FactDifference, FactRecord, FactVersion, WorldUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::world_pool_service_client::WorldPoolServiceClient;
+use std::sync::Arc;
 use tonic::Streaming;
 
 /// Asks one world pool.
@@ -31,7 +32,7 @@ pub struct Projection {
     pub changes: Vec<Change>,
     /// Who will make the change at the same place, by the path of its instance: its commit is compared with what was predicted of
     /// it. Empty or missing: nobody, and the change stands over whatever is committed.
-    pub writers: Vec<String>,
+    pub writers: Vec<Arc<str>>,
     /// What of it may be seen.
     pub reads: Footprint,
     /// The lease that holds the room for it, with its token.
@@ -50,7 +51,7 @@ pub struct Commit {
     /// The node that writes, by the path of its instance; may be empty.
     pub writer: String,
     /// What measured which of the facts that are written.
-    pub evidence: Vec<(FactKey, Measurement)>,
+    pub evidence: Evidence,
 }
 
 /// A running watch of the root.
@@ -164,7 +165,7 @@ impl WorldClient {
             reads: Some(projection.reads.into()),
             lease_id: lease.0,
             token: token.0,
-            writers: projection.writers,
+            writers: projection.writers.iter().map(ToString::to_string).collect(),
         };
         let answer = self.client.clone().project(question).await.map_err(|status| self.failed(&status))?;
         Ok(ProjectionId(answer.into_inner().projection_id))

@@ -3,7 +3,9 @@
 use super::Answer;
 use crate::task_control::record::said;
 use ratn_executive::protocol::Event;
+use ratn_model::fact::FactKey;
 use ratn_model::id::InstanceId;
+use ratn_model::measurement::Measurement;
 use ratn_model::program::{ABORTED, PREEMPTED};
 use ratn_model::value::Value;
 use ratn_proto::types::{Goal, GoalOutcome};
@@ -37,6 +39,8 @@ pub(super) struct Performing {
     pub(super) instance: InstanceId,
     pub(super) attempt: u32,
     pub(super) endpoint: Result<Endpoint, String>,
+    /// The provider's id: what measures, where it names nothing itself.
+    pub(super) source: String,
     pub(super) timeout_s: Option<f64>,
     pub(super) speed: f64,
     pub(super) actions: ActionClient,
@@ -134,7 +138,16 @@ impl Performing {
     }
 
     fn finished(&self, done: GoalOutcome) -> Event {
+        let said: BTreeMap<FactKey, Measurement> = done.evidence.into_iter().collect();
+        let by = |fact: &FactKey| {
+            let mut measured = said.get(fact).cloned().unwrap_or_default();
+            if measured.source.is_empty() {
+                measured.source.clone_from(&self.source);
+            }
+            (fact.clone(), measured)
+        };
         Event::Finished {
+            evidence: done.measured.iter().map(|(fact, _)| by(fact)).collect(),
             instance: self.instance,
             attempt: self.attempt,
             outcome: done.outcome,
@@ -205,6 +218,7 @@ mod tests {
                 instance: InstanceId(1),
                 attempt: 1,
                 endpoint: Ok(self.endpoint.clone()),
+                source: "worker-1".to_owned(),
                 timeout_s,
                 speed: 10.0,
                 actions: ActionClient::new(Channels::new()),
@@ -221,7 +235,10 @@ mod tests {
         }
 
         async fn event(&mut self) -> Option<Event> {
-            Some(self.answers.recv().await?.event)
+            match self.answers.recv().await? {
+                Answer::Event { event, .. } => Some(*event),
+                Answer::World(_) => None,
+            }
         }
     }
 

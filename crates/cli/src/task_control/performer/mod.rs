@@ -5,11 +5,13 @@ mod goal;
 mod resume;
 #[cfg(test)]
 mod tests;
+mod watch;
 
-pub(super) use resume::{check_world, commit_request};
+pub(super) use resume::check_world;
 
 use super::ledger::acquire_request;
-use super::record::{Cancelled, MAX_PENDING_RECORDS, Record, Recorder, said};
+use super::outside::Outside;
+use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorder, said};
 use super::retry::{Attempts, patiently};
 use super::shell::Place;
 use crate::failure::Unbegun;
@@ -17,24 +19,25 @@ use crate::output;
 use anyhow::bail;
 use futures::FutureExt;
 use goal::{Given, Performing};
-use ratn_executive::protocol::{Command, Event, Goal, Note};
+use ratn_executive::protocol::{Command, Event, Goal};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
-use ratn_model::resource::{Requirement, ResourceClass};
+use ratn_model::resource::{LeasedResource, Requirement, ResourceClass};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use ratn_proto::types::{self, Resource};
+use ratn_proto::types::{self, Resource, WorldChange};
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
-use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::{DEFAULT_TTL, Session};
 use ratn_worker::trace::{self, TraceContext};
+use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
 
 /// A resource manager that does not open a session within this time is not there.
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
@@ -49,17 +52,22 @@ const RUN: &str = "run";
 /// At the end of a run, for everything that is still being given back.
 const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
 
-/// An event on its way to the executive.
+/// What is on its way to the executive.
 #[derive(Debug)]
-pub(super) struct Answer {
-    event: Event,
-    /// Of an acquire: whether it was withdrawn meanwhile.
-    withdrawn: Option<CancellationToken>,
+pub(super) enum Answer {
+    /// An event.
+    Event {
+        event: Box<Event>,
+        /// Of an acquire: whether it was withdrawn meanwhile.
+        withdrawn: Option<CancellationToken>,
+    },
+    /// A revision of the root: the run's own, or another's.
+    World(WorldChange),
 }
 
 impl From<Event> for Answer {
     fn from(event: Event) -> Answer {
-        Answer { event, withdrawn: None }
+        Answer::Event { event: Box::new(event), withdrawn: None }
     }
 }
 
@@ -76,9 +84,10 @@ pub(super) struct Performer {
     session: Session,
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
+    outside: Outside,
+    /// Hears of the root's revisions.
+    following: Option<AbortOnDropHandle<()>>,
     cancelled: Cancelled,
-    /// The paths of the instances that may still commit.
-    paths: BTreeMap<InstanceId, String>,
     asking: BTreeMap<InstanceId, Asking>,
     jobs: BTreeMap<InstanceId, Job>,
     giving_back: JoinSet<()>,
@@ -130,6 +139,7 @@ impl Performer {
             resources: resources.clone(),
             cancelled: cancelled.clone(),
             events: events.clone(),
+            root: Revision::default(),
         };
         let trace = TraceContext::fresh();
         tracing::debug!(run, trace = %trace.trace_id(), "calls of this run are of one trace");
@@ -145,8 +155,9 @@ impl Performer {
             session,
             events,
             records,
+            outside: Outside::default(),
+            following: None,
             cancelled,
-            paths: BTreeMap::new(),
             asking: BTreeMap::new(),
             jobs: BTreeMap::new(),
             giving_back: JoinSet::new(),
@@ -157,10 +168,19 @@ impl Performer {
         })
     }
 
-    /// The root world as it is now.
-    pub(super) async fn root(&self) -> anyhow::Result<(Revision, Vec<(FactKey, Value)>)> {
+    /// The root world as it is now; of every revision after it [`Performer::accept`] will hear.
+    pub(super) async fn root(&mut self) -> anyhow::Result<(Revision, Vec<(FactKey, Value)>)> {
         let (revision, facts) = patiently(Attempts::IDEMPOTENT, || self.world.root()).await?;
+        self.follow(revision)?;
         Ok((revision, facts.into_iter().map(|fact| (fact.key, fact.value)).collect()))
+    }
+
+    /// Hears of every revision of the root after this one.
+    fn follow(&mut self, after: Revision) -> anyhow::Result<()> {
+        self.record(Record::Known(after))?;
+        let following = watch::follow(self.world.clone(), after, self.events.clone());
+        self.following = Some(AbortOnDropHandle::new(tokio::spawn(following)));
+        Ok(())
     }
 
     /// Resolves when the session with the resource manager, and with it every lease, is lost.
@@ -173,8 +193,7 @@ impl Performer {
         while self.giving_back.try_join_next().is_some() {}
         match command {
             // Waking is the shell's: it has the clock.
-            Command::Note(note) => self.follow(note),
-            Command::End { .. } | Command::Wake { .. } => {}
+            Command::Note(_) | Command::End { .. } | Command::Wake { .. } => {}
             Command::Acquire { instance, requirements, priority } => {
                 self.acquires += 1;
                 self.acquire(instance, self.acquires, requirements, priority);
@@ -184,8 +203,8 @@ impl Performer {
                     asking.withdrawn.cancel();
                 }
             }
-            Command::Project { instance, attempt, base, changes, reads, lease } => {
-                self.record(Record::Project { instance, attempt, base, changes, reads, lease })?;
+            Command::Project { instance, attempt, base, changes, writers, reads, lease } => {
+                self.record(Record::Project { instance, attempt, base, changes, writers, reads, lease })?;
             }
             Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now),
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
@@ -195,9 +214,10 @@ impl Performer {
                 }
             },
             Command::Release { instance, lease, projection } => self.release(instance, lease, projection),
-            Command::Commit { instance, changes, revision } => {
-                let writer = self.paths.get(&instance).cloned().unwrap_or_default();
-                self.record(Record::Commit { instance, changes, revision, writer })?;
+            Command::Commit { instance, writer, changes, evidence, revision } => {
+                let decided = Decided { instance, writer, changes, evidence, revision };
+                self.outside.decided(&self.run, &decided);
+                self.record(Record::Commit(decided))?;
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
@@ -227,14 +247,6 @@ impl Performer {
             Ok(Ok(())) => Ok(()),
             Ok(Err(reason)) => bail!("what the run did is not all recorded: {reason}"),
             Err(_) => bail!("what the run did is not all recorded: the world pool has not answered in time"),
-        }
-    }
-
-    fn follow(&mut self, note: Note) {
-        match note {
-            Note::Expanded { instance, path, .. } => drop(self.paths.insert(instance, path)),
-            Note::Retired { instance } | Note::Squashed { instance } => drop(self.paths.remove(&instance)),
-            _ => {}
         }
     }
 
@@ -271,7 +283,7 @@ impl Performer {
                 Ok(lease) => Event::Granted { instance, lease },
                 Err(error) => Event::Refused { instance, reason: said(&error) },
             };
-            let _ = events.send(Answer { event, withdrawn: Some(withdrawn) }).await;
+            let _ = events.send(Answer::Event { event: Box::new(event), withdrawn: Some(withdrawn) }).await;
         }));
         // The request leaves here and now: tasks would be run, and requests arrive, in any order.
         if asking.as_mut().now_or_never().is_none() {
@@ -302,9 +314,18 @@ impl Performer {
     }
 
     /// The event of an answer; `None` when what it answers was withdrawn or cancelled: what crossed with that goes back.
-    pub(super) fn accept(&mut self, answer: Answer) -> Option<Event> {
-        let withdrawn = answer.withdrawn.is_some_and(|withdrawn| withdrawn.is_cancelled());
-        match answer.event {
+    ///
+    /// # Errors
+    /// Where nothing can be recorded any more.
+    pub(super) fn accept(&mut self, answer: Answer, mirror: &World) -> anyhow::Result<Option<Event>> {
+        let (event, withdrawn) = match answer {
+            Answer::Event { event, withdrawn } => (*event, withdrawn.is_some_and(|token| token.is_cancelled())),
+            Answer::World(change) => {
+                self.record(Record::Known(change.revision))?;
+                return Ok(self.outside.told(change, mirror));
+            }
+        };
+        Ok(match event {
             Event::Granted { instance, lease } if withdrawn => {
                 self.give_back(instance, Vec::new(), Some(lease.id), None);
                 None
@@ -321,7 +342,7 @@ impl Performer {
                 }
                 Some(event)
             }
-        }
+        })
     }
 
     fn was_cancelled(&self, instance: InstanceId, attempt: u32) -> bool {
@@ -332,10 +353,19 @@ impl Performer {
     fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal, given: Given) {
         let stop = CancellationToken::new();
         let lease = goal.lease.as_ref().map(|lease| lease.id);
+        let provider = self.provider_of(&goal);
+        let (source, endpoint) = match provider {
+            Ok(resource) => (
+                resource.id.clone(),
+                resource.endpoint.parse().map_err(|error| format!("{} has no usable endpoint: {error}", resource.id)),
+            ),
+            Err(reason) => (String::new(), Err(reason)),
+        };
         let performing = Performing {
             instance,
             attempt,
-            endpoint: self.endpoint_of(&goal),
+            endpoint,
+            source,
             timeout_s: goal.timeout_s,
             speed: self.speed,
             actions: self.actions.clone(),
@@ -357,19 +387,18 @@ impl Performer {
         self.jobs.insert(instance, Job { attempt, lease, stop, ended });
     }
 
-    /// Where the provider of a goal is: the leased resource of its kind.
-    fn endpoint_of(&self, goal: &Goal) -> Result<Endpoint, String> {
+    /// The provider of a goal: the leased resource of its kind.
+    fn provider_of<'a>(&self, goal: &'a Goal) -> Result<&'a LeasedResource, String> {
         let Some(provider) = self.catalogue.providers.get(&*goal.provider) else {
             return Err(format!("the system's catalogue has no provider `{}`", goal.provider));
         };
         let leased = goal.lease.as_ref().and_then(|lease| lease.resource(&provider.resource));
-        let Some(resource) = leased else {
-            return Err(format!(
+        leased.ok_or_else(|| {
+            format!(
                 "`{}` is done by a {}, and none is leased: add `block: {}` to the state's resources",
                 goal.provider, provider.resource, provider.resource
-            ));
-        };
-        resource.endpoint.parse().map_err(|error| format!("{} has no usable endpoint: {error}", resource.id))
+            )
+        })
     }
 
     fn release(&mut self, instance: InstanceId, lease: Option<LeaseId>, projection: Option<ProjectionId>) {

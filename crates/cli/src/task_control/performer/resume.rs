@@ -8,22 +8,21 @@ use super::Performer;
 use super::goal::Given;
 use crate::task_control::Endpoints;
 use crate::task_control::ledger::Ledger;
-use crate::task_control::record::{Record, operate_once, said};
+use crate::task_control::outside;
+use crate::task_control::record::{Record, commit_next, operate_once, said};
 use crate::task_control::retry::{Attempts, patiently};
 use anyhow::bail;
+use ratn_executive::protocol::Event;
+use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, Revision};
-use ratn_proto::types::Resource;
+use ratn_proto::types::{Resource, WorldUpdate};
 use ratn_worker::client::{Channels, WorldClient};
 use ratn_world::world::World;
 use std::cmp::Reverse;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
-/// Refuses a world that is not the run's, or that somebody has changed since. Changes nothing.
-pub(in crate::task_control) async fn check_world(
-    endpoints: &Endpoints,
-    ledger: &Ledger,
-    mirror: &World,
-) -> anyhow::Result<()> {
+/// Refuses a world that is not the run's. Changes nothing.
+pub(in crate::task_control) async fn check_world(endpoints: &Endpoints, ledger: &Ledger) -> anyhow::Result<()> {
     let world = WorldClient::new(&Channels::new(), &endpoints.world_pool)?;
     let (root, _) = patiently(Attempts::IDEMPOTENT, || world.root()).await?;
     if root < ledger.first_revision {
@@ -33,24 +32,21 @@ pub(in crate::task_control) async fn check_world(
             ledger.first_revision
         );
     }
-    if root > mirror.revision() {
-        bail!(
-            "the world pool's root is at {root}, and the run had come to {}: somebody else has changed the world since; run \
-               the task again",
-            mirror.revision()
-        );
-    }
     Ok(())
 }
 
 impl Performer {
-    /// Takes up everything that is open, in the order in which it was decided.
+    /// Takes up everything that is open, in the order in which it was decided; what has changed from outside meanwhile.
     ///
     /// # Errors
     /// Where the run cannot go on.
-    pub(in crate::task_control) async fn take_up(&mut self, ledger: Ledger, mirror: &World) -> anyhow::Result<()> {
+    pub(in crate::task_control) async fn take_up(
+        &mut self,
+        ledger: Ledger,
+        mirror: &World,
+    ) -> anyhow::Result<Option<Event>> {
         (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
-        self.commit_again(&ledger, mirror).await?;
+        let changed = self.commit_again(&ledger, mirror).await?;
         if self.session.state().borrow().found {
             for (number, instance, operations) in &ledger.operated {
                 let (number, instance, operations) = (*number, *instance, operations.clone());
@@ -66,8 +62,9 @@ impl Performer {
         }
         for (instance, asked) in ledger.projecting {
             let attempt = asked.attempt;
-            let (base, changes, reads, lease) = (asked.base, asked.changes, asked.reads, asked.lease);
-            self.record(Record::Project { instance, attempt, base, changes, reads, lease })?;
+            let (base, changes, writers) = (asked.base, asked.changes, asked.writers);
+            let (reads, lease) = (asked.reads, asked.lease);
+            self.record(Record::Project { instance, attempt, base, changes, writers, reads, lease })?;
         }
         for (instance, (attempt, goal)) in ledger.goals {
             self.start(instance, attempt, goal, Given::Before);
@@ -77,37 +74,51 @@ impl Performer {
         for (instance, asked) in waiting {
             self.acquire(instance, asked.number, asked.requirements, asked.priority);
         }
-        Ok(())
+        Ok(changed)
     }
 
-    /// Every commit that the world pool does not have, then a comparison of the two worlds.
-    async fn commit_again(&self, ledger: &Ledger, mirror: &World) -> anyhow::Result<()> {
-        let (root, _) = patiently(Attempts::IDEMPOTENT, || self.world.root()).await?;
-        for (instance, changes, revision) in ledger.commits.iter().filter(|(_, _, revision)| *revision > root) {
-            let commit = commit_request(&self.run, *instance, *revision);
-            let ask = || self.world.commit(&commit, changes.clone(), Some(*revision));
-            if let Err(error) = patiently(Attempts::IDEMPOTENT, ask).await {
-                bail!("the world pool does not take what the run had decided: {}", said(&error));
+    /// Makes every commit that the world pool does not have, and compares the two worlds: what is otherwise in the pool was changed
+    /// from outside.
+    async fn commit_again(&mut self, ledger: &Ledger, mirror: &World) -> anyhow::Result<Option<Event>> {
+        let (mut root, _) = patiently(Attempts::IDEMPOTENT, || self.world.root()).await?;
+        let there = self.commits_there(ledger, root).await?;
+        for decided in &ledger.commits[there..] {
+            let commit = decided.clone().commit(&self.run);
+            match commit_next(&self.world, root, commit).await {
+                Ok(revision) => root = revision,
+                Err(error) => bail!("the world pool does not take what the run had decided: {}", said(&error)),
             }
         }
-        let (_, facts) = patiently(Attempts::IDEMPOTENT, || self.world.root()).await?;
-        let differs = facts.iter().find(|fact| mirror.get(&fact.key) != Some(&fact.value));
-        if let Some(fact) = differs {
-            bail!(
-                "the world pool has `{} = {}`, which is not what the run knows: somebody else has changed the world; run the \
-                   task again",
-                fact.key,
-                fact.value
-            );
+        let (revision, facts) = self.root().await?;
+        let pool = World::from_facts(facts, revision);
+        let facts = outside::differences(&pool, mirror);
+        Ok((!facts.is_empty()).then_some(Event::WorldChanged { revision, facts }))
+    }
+
+    /// How many of the run's commits the pool has: they were made in order, so those up to the youngest that it tells of.
+    async fn commits_there(&self, ledger: &Ledger, root: Revision) -> anyhow::Result<usize> {
+        // Any fact says how far back the pool can tell.
+        let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
+        let (_, oldest) = patiently(Attempts::IDEMPOTENT, || self.world.history(any.clone())).await?;
+        let after = oldest.max(ledger.first_revision);
+        let ids: BTreeMap<String, usize> =
+            ledger.commits.iter().enumerate().map(|(place, decided)| (decided.id(&self.run), place + 1)).collect();
+        let mut watch = patiently(Attempts::IDEMPOTENT, || self.world.watch(Some(after), &[])).await?;
+        let (mut told, mut there) = (after, None);
+        while told < root {
+            let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
+                bail!("the world pool does not tell of its revisions up to {root}");
+            };
+            told = change.revision;
+            there = ids.get(&change.commit).copied().or(there);
         }
-        if facts.len() != mirror.iter().count() {
-            bail!(
-                "the world pool has {} facts, and the run knows {}: somebody else has changed the world; run the task again",
-                facts.len(),
-                mirror.iter().count()
-            );
+        match there {
+            None if oldest > ledger.first_revision && !ids.is_empty() => bail!(
+                "the world pool keeps no revision of this run any more (the oldest is {oldest}): what it has of the run's commits \
+                   is not known; run the task again"
+            ),
+            there => Ok(there.unwrap_or(0)),
         }
-        Ok(())
     }
 
     /// Gives back what the session holds and the run does not know of: grants that nobody heard of.
@@ -138,9 +149,4 @@ impl Performer {
         }
         Ok(())
     }
-}
-
-/// The id of a commit. One instance may commit more than once (the parts of a routine); the revision tells its commits apart.
-pub(in crate::task_control) fn commit_request(run: &str, instance: InstanceId, revision: Revision) -> String {
-    format!("{run}/{instance}/{revision}")
 }

@@ -3,6 +3,7 @@
 use super::*;
 use crate::task_control::Endpoints;
 use crate::task_control::ledger::Ledger;
+use anyhow::Context;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_executive::protocol::Origin;
@@ -77,7 +78,7 @@ impl Bench {
     async fn event(&mut self) -> Option<Event> {
         loop {
             let answer = self.answers.recv().await?;
-            if let Some(event) = self.performer.accept(answer) {
+            if let Some(event) = self.performer.accept(answer, &World::default()).ok()? {
                 return Some(event);
             }
         }
@@ -140,10 +141,17 @@ async fn a_second_run_is_refused_before_anything_is_started() -> anyhow::Result<
 #[tokio::test]
 async fn a_run_whose_effects_are_not_all_recorded_does_not_end_well() -> anyhow::Result<()> {
     let mut bench = Bench::new().await?;
-    // The world pool's root will not have this revision.
+    // Nothing can be added to it.
     let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
-    let changes = vec![Change::Set { fact, value: Value::Bool(true) }];
-    bench.performer.perform(Command::Commit { instance: InstanceId(1), changes, revision: Revision(99) })?;
+    let mut changes = done();
+    changes.push(Change::Increase { fact, by: 1.0 });
+    bench.performer.perform(Command::Commit {
+        instance: InstanceId(1),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes,
+        revision: Revision(99),
+    })?;
     let ended = bench.performer.close().await;
     assert!(ended.is_err_and(|error| error.to_string().contains("not all recorded")));
     Ok(())
@@ -160,13 +168,14 @@ async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> 
         attempt,
         base: Revision(0),
         changes: Vec::new(),
+        writers: Vec::new(),
         reads: reads.clone(),
         lease: None,
     };
     bench.performer.perform(project(1))?;
     let made = bench.answers.recv().await;
     bench.performer.perform(Command::Cancel { instance, attempt: 1 })?;
-    assert_eq!(made.and_then(|answer| bench.performer.accept(answer)), None);
+    assert_eq!(bench.performer.accept(made.context("no answer")?, &World::default())?, None);
     assert!(bench.performer.cancelled.lock().is_ok_and(|cancelled| cancelled.is_empty()));
     bench.performer.perform(project(2))?;
     assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 2, .. })));
@@ -180,7 +189,7 @@ async fn a_grant_that_crosses_its_withdrawal_goes_back() -> anyhow::Result<()> {
     bench.ask(instance)?;
     let granted = bench.answers.recv().await;
     bench.performer.perform(Command::Withdraw { instance })?;
-    assert_eq!(granted.and_then(|answer| bench.performer.accept(answer)), None);
+    assert_eq!(bench.performer.accept(granted.context("no answer")?, &World::default())?, None);
 
     // Nobody holds the arm: the same instance gets it when it asks again.
     bench.ask(instance)?;
@@ -210,7 +219,13 @@ async fn who_comes_back_to_a_living_session_does_nothing_twice() -> anyhow::Resu
     let mut bench = Bench::new().await?;
     let run = bench.performer.run.clone();
     let operate = Command::Operate { instance: InstanceId(1), operations: vec![create("Box", 2)] };
-    let commit = Command::Commit { instance: InstanceId(1), changes: done(), revision: Revision(1) };
+    let commit = Command::Commit {
+        instance: InstanceId(1),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    };
     bench.performer.perform(commit.clone())?;
     bench.performer.perform(operate.clone())?;
     // A grant that was on its way when task control was killed.
@@ -244,25 +259,36 @@ async fn who_comes_back_too_late_makes_anew_what_went_with_the_session() -> anyh
 }
 
 #[tokio::test]
-async fn a_commit_that_did_not_leave_is_made_and_another_world_is_refused() -> anyhow::Result<()> {
+async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another_world_is_refused() -> anyhow::Result<()>
+{
     let mut bench = Bench::new().await?;
     let run = bench.performer.run.clone();
-    let commit = Command::Commit { instance: InstanceId(1), changes: done(), revision: Revision(1) };
+    let commit = Command::Commit {
+        instance: InstanceId(1),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    };
     let open = ledger(&run, &[commit]);
     let mut mirror = World::default();
     mirror.apply(&done())?;
-    check_world(&bench.endpoints, &open, &mirror).await?;
-    bench.performer.take_up(open.clone(), &mirror).await?;
+    check_world(&bench.endpoints, &open).await?;
+    assert_eq!(bench.performer.take_up(open.clone(), &mirror).await?, None);
     let (revision, facts) = bench.performer.root().await?;
     assert_eq!((revision, facts.len()), (Revision(1), 1));
 
-    // Somebody else changes it.
-    bench.performer.world.commit("other/1/2", done(), None).await?;
-    let refused = check_world(&bench.endpoints, &open, &mirror).await;
-    assert!(refused.is_err_and(|error| error.to_string().contains("somebody else has changed the world")));
+    // Somebody else changes it, and nothing is committed twice.
+    let fact = FactKey { predicate: "other".to_owned(), arguments: Vec::new() };
+    let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
+    bench.performer.world.commit("other/1/2", changes, None).await?;
+    check_world(&bench.endpoints, &open).await?;
+    let changed = bench.performer.take_up(open.clone(), &mirror).await?;
+    let facts = vec![(fact, Some(Value::Int(1)))];
+    assert_eq!(changed, Some(Event::WorldChanged { revision: Revision(2), facts }));
     // A pool that began anew.
     let later = Ledger { first_revision: Revision(9), ..open };
-    let refused = check_world(&bench.endpoints, &later, &mirror).await;
+    let refused = check_world(&bench.endpoints, &later).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("lost its state")));
     bench.performer.close().await
 }

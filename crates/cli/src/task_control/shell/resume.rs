@@ -11,7 +11,7 @@ use crate::task_control::replay::{self, ReplayError, Replayed};
 use crate::task_control::shell::MAX_PENDING_EVENTS;
 use anyhow::Context;
 use ratn_executive::lookahead::Lookout;
-use ratn_executive::protocol::{Event, LogEntry, LogLine, Mode};
+use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Mode};
 use ratn_model::program::Program;
 use ratn_worker::robot_clock::RobotClock;
 use std::sync::Arc;
@@ -54,7 +54,7 @@ impl Resumption {
 pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
     let Resumption { program, mode, seed, replayed, progress, log } = resumption;
     let Replayed { executive, mut ledger, missing, states } = replayed;
-    performer::check_world(&place.endpoints, &ledger, executive.root()).await?;
+    performer::check_world(&place.endpoints, &ledger).await?;
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
     let performer = Performer::connect(place, &ledger.origin.run, &program.name, events).await;
     let shell = Shell {
@@ -80,8 +80,14 @@ pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &In
         let (now, commands) = shell.decide(&Event::Resumed)?;
         shell.log.make_durable()?;
         ledger.event(now, &Event::Resumed);
-        shell.performer.take_up(ledger, &mirror).await?;
-        shell.perform(now, missing.into_iter().chain(commands))
+        let changed = shell.performer.take_up(ledger, &mirror).await?;
+        // Commits are there by now.
+        let missing = missing.into_iter().filter(|command| !matches!(command, Command::Commit { .. }));
+        let ended = shell.perform(now, missing.chain(commands))?;
+        match changed {
+            Some(changed) if ended.is_none() => shell.step(changed),
+            _ => Ok(ended),
+        }
     };
     shell.run_to_its_end(begin, interrupt).await
 }
