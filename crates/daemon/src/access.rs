@@ -100,7 +100,7 @@ const METHODS: [(&str, &[Row]); 6] = [
     (
         "ratn.v1.WorldPoolService",
         &[
-            (Look, &["Diff", "GetFactHistory", "GetRoot", "Query", "Watch", "WatchProjection"]),
+            (Look, &["Diff", "GetFactHistory", "GetRoot", "GetScene", "Query", "Watch", "WatchProjection"]),
             (Commit, &["Commit"]),
             (Project, &["Project", "Release"]),
         ],

@@ -220,7 +220,7 @@ async fn a_measured_fact_says_what_measured_it_and_is_gone_after_its_time() {
     let text = "@prefix ratn: <urn:ratn:ontology#> .
         @prefix owl: <http://www.w3.org/2002/07/owl#> .
         @prefix : <urn:robot#> .
-        :seen a ratn:Predicate ; ratn:arguments ( owl:Thing ) ; ratn:value \"int\" .
+        :seen a ratn:Predicate ; ratn:arguments ( owl:Thing ) ; ratn:value \"int\" ; ratn:uncertainty \"covariance\" .
         :full a ratn:Predicate ; ratn:arguments ( owl:Thing ) ; ratn:value \"int\" .";
     std::fs::write(&ontology, text).unwrap();
     let ttl_s = [("seen".to_owned(), 0.05)].into();

@@ -75,12 +75,15 @@ async fn a_restarted_pool_has_every_commit_that_it_acknowledged_and_no_projectio
         assert_eq!(values(&world, None).await.unwrap(), ["at(box) = a", "at(cup) = b"]);
         let (revision, facts) = world.root().await.unwrap();
         let written: Vec<Revision> = facts.iter().map(|fact| fact.revision).collect();
-        assert_eq!((revision, written), (Revision(2), vec![Revision(1), Revision(2)]));
+        assert_eq!(written, [Revision(1), Revision(2)]);
+        // Without durability somebody may have heard of revisions that are lost: they do not come again.
+        let leaps = durability == Durability::None;
+        assert!(if leaps { revision > Revision(2) } else { revision == Revision(2) }, "{durability}: {revision}");
         assert_eq!(values(&world, Some(before)).await, Err(Code::NotFound), "projections are not kept");
-        let after = world.project(projection("run/i3/1", 1)).await.unwrap();
+        let after = world.project(projection("run/i3/1", if leaps { revision.0 } else { 1 })).await.unwrap();
         assert!(after > before, "an id of before means nothing new");
         assert_eq!(values(&world, Some(after)).await.unwrap(), ["at(box) = a", "at(cup) = projected"]);
-        assert_eq!(world.commit("run/i4", vec![set("box", "d")], None).await.unwrap(), Revision(3));
+        assert_eq!(world.commit("run/i4", vec![set("box", "d")], None).await.unwrap(), Revision(revision.0 + 1));
         pool.end().await;
     }
 }
@@ -90,7 +93,7 @@ async fn a_snapshot_takes_the_place_of_many_commits_and_revisions_are_kept_over_
     let system = TestSystem::new();
     let place = tempfile::tempdir().unwrap();
     let with_snapshots = || {
-        let mut config = config(&system, place.path(), Durability::None);
+        let mut config = config(&system, place.path(), Durability::Group);
         (config.storage.compact_bytes, config.revisions_kept) = (1 << 16, 50);
         config
     };

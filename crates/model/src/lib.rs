@@ -21,3 +21,4 @@ pub mod resource;
 pub mod time;
 pub mod tolerance;
 pub mod value;
+pub mod versioned;

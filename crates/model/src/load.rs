@@ -39,7 +39,8 @@ use crate::diagnostic::{Diagnostic, Findings, Severity};
 use crate::expression::EffectExpr;
 use crate::expression::scope::NothingKnown;
 use crate::id::StateId;
-use crate::ontology::{Ontology, turtle};
+use crate::ontology::Ontology;
+use crate::ontology::turtle::{self, OntologyError};
 use crate::program::{Parameter, Program, StateKind, TaskOutput};
 use crate::value::{Type, Value};
 use fields::{Fields, Output};
@@ -247,13 +248,24 @@ fn ontology(node: &Node, loading: &Loading<'_>, findings: &mut Findings) -> Opti
             refuse(format!("`{path}` cannot be read: {why}"), "the path is relative to this file");
             None
         }
-        Ok((name, text)) => match turtle::read(&text) {
-            Ok(ontology) => Some((ontology, text)),
-            Err(error) => {
-                refuse(format!("{name}: {error}"), "");
-                None
+        Ok((name, text)) => {
+            let read = |using: &str, path: &str| loading.files.read(using, path);
+            match turtle::imports::read_with(&name, &text, &read) {
+                Ok(ontology) => Some(ontology),
+                Err(error) => {
+                    refuse(format!("{name}: {}", said(&error)), "");
+                    None
+                }
             }
-        },
+        }
+    }
+}
+
+/// An error with the files in which it was found.
+fn said(error: &OntologyError) -> String {
+    match error {
+        OntologyError::Import { file, source } => format!("{file}: {}", said(source)),
+        other => other.to_string(),
     }
 }
 

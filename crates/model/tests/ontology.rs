@@ -6,8 +6,11 @@
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::{Change, FactKey, FactPattern, Term};
 use ratn_model::load::{Files, MAX_SOURCE, load_with};
-use ratn_model::ontology::turtle::{MAX_CLASSES, MAX_STATEMENTS, read};
+use ratn_model::measurement::{Certainty, Measurement};
+use ratn_model::ontology::turtle::imports::{MAX_FILES, read_with};
+use ratn_model::ontology::turtle::{MAX_CLASSES, MAX_STATEMENTS, OntologyError, read};
 use ratn_model::ontology::{Ontology, Uncertainty};
+use ratn_model::pose::Pose;
 use ratn_model::tolerance::{Deviation, Tolerance, Tolerances};
 use ratn_model::value::Value;
 use std::time::{Duration, Instant};
@@ -265,4 +268,106 @@ fn the_scene_and_the_tolerances_of_a_task_are_those_of_its_ontology() {
     assert_eq!(of("place"), Tolerance { number: 0.1, position_m: 0.02, ..Tolerance::ROBOT });
     let refused = load_with(task, "task.yaml", &Catalogue::standard(), &Shop("false")).unwrap_err();
     assert_eq!((refused.len(), refused[0].rule.as_str()), (1, "unknown-predicate"), "{}", refused[0]);
+}
+
+struct Folder(&'static [(&'static str, &'static str)]);
+
+impl Folder {
+    fn read(&self, first: &str) -> Result<Ontology, String> {
+        let file = |_: &str, path: &str| {
+            let found = self.0.iter().find(|(name, _)| *name == path).ok_or("there is no such file")?;
+            Ok((path.to_owned(), format!("{PREFIXES}{}", found.1)))
+        };
+        let (name, text) = file("", first)?;
+        let error = |error: OntologyError| {
+            let sources = std::iter::successors(Some(&error as &dyn std::error::Error), |error| error.source());
+            sources.map(ToString::to_string).collect::<Vec<_>>().join(": ")
+        };
+        read_with(&name, &text, &file).map(|(ontology, _)| ontology).map_err(error)
+    }
+}
+
+#[test]
+fn an_ontology_of_several_files_is_one() {
+    let folder = Folder(&[
+        ("task.ttl", "<> a owl:Ontology ; owl:imports <robot.ttl> , \"../things.ttl\" . :cup a :Object ."),
+        (
+            "robot.ttl",
+            "_:a a owl:Ontology ; owl:imports \"../things.ttl\" . :Arm a owl:Class . :arm a :Arm .
+            :held a ratn:Predicate ; ratn:arguments ( :Arm ) ; ratn:value :Object .",
+        ),
+        (
+            "../things.ttl",
+            "_:a a owl:Ontology . :Object a owl:Class . :at a ratn:Predicate ; ratn:arguments ( :Object ) ; ratn:value \"pose\" .",
+        ),
+    ]);
+    let ontology = folder.read("task.ttl").unwrap();
+    ontology.check_change(&set("held", &["arm"], Value::String("cup".to_owned()))).unwrap();
+    ontology.check_change(&set("at", &["cup"], Value::Null)).unwrap();
+    assert!(ontology.check_change(&set("at", &["arm"], Value::Null)).is_err());
+}
+
+#[test]
+fn what_cannot_be_imported_is_refused_with_where() {
+    let refusal = |files| Folder(files).read("a.ttl").unwrap_err();
+    let circle = refusal(&[
+        ("a.ttl", "[] a owl:Ontology ; owl:imports <b.ttl> ."),
+        ("b.ttl", "[] a owl:Ontology ; owl:imports <c.ttl> ."),
+        ("c.ttl", "[] a owl:Ontology ; owl:imports <b.ttl> ."),
+    ]);
+    assert!(circle.contains("`a.ttl` imports `b.ttl` imports `c.ttl` imports `b.ttl`"), "{circle}");
+    let missing = refusal(&[("a.ttl", "[] a owl:Ontology ; owl:imports <b.ttl> .")]);
+    assert!(missing.contains("`b.ttl`: it is imported and cannot be read: there is no such file"), "{missing}");
+    let far = refusal(&[("a.ttl", "[] a owl:Ontology ; owl:imports <http://example.org/b> .")]);
+    assert!(far.contains("names a file beside this one"), "{far}");
+    let within = refusal(&[("a.ttl", "[] a owl:Ontology ; owl:imports <b.ttl> ."), ("b.ttl", ":x :y .")]);
+    assert!(within.starts_with("b.ttl: line "), "{within}");
+}
+
+#[test]
+fn files_that_import_each_other_without_end_are_refused_soon() {
+    let began = Instant::now();
+    let chain = |_: &str, path: &str| {
+        let number: usize = path.parse().map_err(|_| "no number".to_owned())?;
+        Ok((path.to_owned(), format!("{PREFIXES}[] a owl:Ontology ; owl:imports \"{}\" .", number + 1)))
+    };
+    let first = format!("{PREFIXES}[] a owl:Ontology ; owl:imports \"1\" .");
+    let refused = read_with("0", &first, &chain).unwrap_err();
+    assert!(format!("{refused:?}").contains("at most 8 deep"), "{refused:?}");
+    let wide: String = (0..MAX_FILES).map(|i| format!("[] a owl:Ontology ; owl:imports \"{i}\" .")).collect();
+    let leaf = |_: &str, path: &str| Ok((path.to_owned(), String::new()));
+    let refused = read_with("first", &format!("{PREFIXES}{wide}"), &leaf).unwrap_err();
+    assert!(format!("{refused:?}").contains("files"), "{refused:?}");
+    assert!(began.elapsed() < SOON);
+}
+
+#[test]
+fn a_measurement_is_as_sure_as_its_predicate_declares() {
+    let ontology = ontology(
+        ":Thing a owl:Class ; ratn:named \"box\" .
+         :at a ratn:Predicate ; ratn:arguments ( :Thing ) ; ratn:value \"pose\" ; ratn:uncertainty \"covariance\" .
+         :full a ratn:Predicate ; ratn:arguments ( :Thing ) ; ratn:value \"bool\" ; ratn:uncertainty \"confidence\" .
+         :on a ratn:Predicate ; ratn:arguments ( :Thing ) ; ratn:value \"bool\" .",
+    );
+    let check = |predicate: &str, value: Value, certainty: Option<Certainty>| {
+        let measured = Measurement { source: "camera".to_owned(), certainty };
+        ontology
+            .check_measurement(&key(predicate, &["box_1"]), &value, &measured)
+            .map_err(|refused| refused.to_string())
+    };
+    let (pose, covariance) = (Value::Pose(Pose::IDENTITY), |n: usize| Some(Certainty::Covariance(vec![0.1; n])));
+    check("at", pose.clone(), covariance(36)).unwrap();
+    check("at", pose.clone(), None).unwrap();
+    check("full", Value::Bool(true), Some(Certainty::Confidence(0.5))).unwrap();
+    for (refused, why) in [
+        (check("at", pose.clone(), covariance(9)), "has 6 times 6 entries, and 9 were measured"),
+        (
+            check("at", pose, Some(Certainty::Confidence(0.5))),
+            "is measured with a covariance, and this has a confidence",
+        ),
+        (check("on", Value::Bool(true), Some(Certainty::Confidence(0.5))), "declares no uncertainty"),
+    ] {
+        let refused = refused.unwrap_err();
+        assert!(refused.starts_with("[other-uncertainty]") && refused.contains(why), "{refused}");
+    }
 }

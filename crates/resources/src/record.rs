@@ -12,6 +12,7 @@ use crate::memory::Remembered;
 use crate::resource::Description;
 use ratn_model::id::LeaseId;
 use ratn_model::resource::Quantity;
+use ratn_model::versioned::{self, DecodeError};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 use std::time::Duration;
@@ -50,24 +51,8 @@ pub(crate) enum Effect {
     Returned { session: SessionId, slot: Slot, amount: Quantity },
 }
 
-/// Bytes that are no records, or of a version that is not known here.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum DecodeError {
-    /// Written by another version.
-    #[error(
-        "format {found} of the resource pool's records is not known (this is {FORMAT}): use the version that wrote it"
-    )]
-    Version {
-        /// The first byte.
-        found: u8,
-    },
-    /// Not what [`encode`] writes.
-    #[error("these are no records of a resource pool: {reason}")]
-    Broken {
-        /// What is wrong.
-        reason: String,
-    },
-}
+/// What its bytes are, in messages.
+const RECORDS: &str = "records of a resource pool";
 
 /// The records of one call, as one entry of a log.
 pub fn encode(records: &[Record]) -> Vec<u8> {
@@ -83,16 +68,9 @@ pub fn decode(bytes: &[u8]) -> Result<Vec<Record>, DecodeError> {
 }
 
 pub(crate) fn to_bytes<T: Serialize>(value: &T) -> Vec<u8> {
-    // Nothing that is written here can fail to serialise: no maps of unknown length, no foreign types.
-    postcard::to_extend(value, vec![FORMAT]).unwrap_or_default()
+    versioned::encode(FORMAT, value)
 }
 
 pub(crate) fn from_bytes<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<T, DecodeError> {
-    let broken = |reason: String| DecodeError::Broken { reason };
-    let (version, rest) = bytes.split_first().ok_or_else(|| broken("no bytes".to_owned()))?;
-    if *version != FORMAT {
-        return Err(DecodeError::Version { found: *version });
-    }
-    let (value, rest) = postcard::take_from_bytes(rest).map_err(|error| broken(error.to_string()))?;
-    if rest.is_empty() { Ok(value) } else { Err(broken(format!("{} bytes too many", rest.len()))) }
+    versioned::decode(FORMAT, RECORDS, bytes)
 }

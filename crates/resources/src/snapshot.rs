@@ -11,11 +11,12 @@ use crate::lease::LeaseRecord;
 use crate::limits::Limits;
 use crate::memory::Remembered;
 use crate::pool::Pool;
-use crate::record::{DecodeError, Record, from_bytes, to_bytes};
+use crate::record::{Record, from_bytes, to_bytes};
 use crate::resource::Resource;
 use crate::session::Session;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::time::Timestamp;
+use ratn_model::versioned::DecodeError;
 use serde::{Deserialize, Serialize};
 use std::time::Duration;
 

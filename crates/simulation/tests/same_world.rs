@@ -8,7 +8,9 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "a test may panic and print its seed")]
 
 use ratn_executive::protocol::Mode;
-use ratn_simulation::random::{Conditions, Features, Shrunk, Verdict, execute, listing, program, shrink, trial};
+use ratn_simulation::random::{
+    Conditions, Features, Shrunk, Verdict, execute, listing, program, shrink, trial, trial_from_outside,
+};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -167,4 +169,44 @@ fn without_the_theorem_s_assumptions_what_acts_is_still_decided_and_final() {
     let programs = number("RATN_PROGRAMS", 2000) / 4;
     let sum = try_programs(1 << 40, programs, &Features::WEAK);
     assert!(sum.failed.is_empty(), "the programs of these seeds fail: {:?}", sum.failed);
+}
+
+/// A program of a seed, disturbed from outside, and what comes of it.
+fn disturbed(seed: u64) -> Verdict {
+    let features = Features { regions: false, preemptive: false, ..Features::ALL };
+    let (made, conditions) = (Arc::new(program(seed, &features)), Conditions::of(seed, &features));
+    let verdict = trial_from_outside(&made, &conditions);
+    if let Verdict::Differs(problem) = &verdict {
+        eprintln!("seed {seed}: {problem}\n{conditions:?}\n{}", listing(&made));
+    }
+    verdict
+}
+
+#[test]
+fn random_programs_leave_the_same_world_in_both_modes_although_it_changes_from_outside() {
+    let (first, count) = (number("RATN_FIRST", 0), number("RATN_PROGRAMS", 2000) / 2);
+    let next = AtomicU64::new(first);
+    let compared = AtomicU64::new(0);
+    let failed = std::sync::Mutex::new(Vec::new());
+    let processors = std::thread::available_parallelism().map_or(1, usize::from);
+    std::thread::scope(|scope| {
+        for _ in 0..processors {
+            scope.spawn(|| {
+                loop {
+                    let seed = next.fetch_add(1, Ordering::Relaxed);
+                    if seed >= first + count || failed.lock().unwrap().len() >= 3 {
+                        return;
+                    }
+                    match disturbed(seed) {
+                        Verdict::Same { .. } => drop(compared.fetch_add(1, Ordering::Relaxed)),
+                        Verdict::LeftOut => {}
+                        Verdict::Differs(_) => failed.lock().unwrap().push(seed),
+                    }
+                }
+            });
+        }
+    });
+    let failed = failed.into_inner().unwrap();
+    assert!(failed.is_empty(), "the programs of these seeds fail: {failed:?}");
+    assert!(compared.into_inner() * 2 > count, "most are compared");
 }

@@ -1,6 +1,6 @@
 //! The path planner worker: one action, `plan`.
 //!
-//! It reads the facts of the goal's projection that make the scene, plans on a thread of its own and answers with a timed
+//! It has the scene of the goal's projection sent, as what it differs by from one that it knows, plans on a thread of its own and answers with a timed
 //! trajectory. All durations in its goals and answers are in the robot's seconds; `clock` knows how many of them pass in
 //! one of ours. Where `budget_s` is given, planning takes exactly that long and gets a shorter path for it.
 
@@ -11,9 +11,8 @@ use clock::{Clock, Figures};
 use ratn_model::value::Value;
 use ratn_motion::plan::{Plan, PlanError, plan};
 use ratn_motion::robot::Robot;
-use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome};
+use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, SceneCache};
 use ratn_worker::worker::{Worker, WorkerOptions};
-use ratn_world::scene::Scene;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
@@ -23,6 +22,7 @@ use std::time::Instant;
 pub struct PlanAction {
     robot: Arc<Robot>,
     speed: f64,
+    scenes: SceneCache,
 }
 
 /// Runs the worker until it is told to stop; `speed` is how many of the robot's seconds pass in one of ours.
@@ -36,7 +36,7 @@ pub async fn run(options: WorkerOptions, speed: f64) -> anyhow::Result<()> {
 impl PlanAction {
     /// For our robot.
     pub fn new(speed: f64) -> PlanAction {
-        PlanAction { robot: Arc::new(Robot::aimm()), speed }
+        PlanAction { robot: Arc::new(Robot::aimm()), speed, scenes: SceneCache::default() }
     }
 }
 
@@ -54,8 +54,7 @@ impl Action for PlanAction {
         let begin = Instant::now();
         let (request, budget_s) = goal::request(&goal)?;
         // Whatever the task declared that this plan depends on, and no more.
-        let world = goal.unless_cancelled(goal.world(&[])).await??;
-        let scene = Scene::of(&world)?;
+        let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
 
         let (robot, goal) = (Arc::clone(&self.robot), Arc::new(goal));
         let mut clock = Clock::new(begin, self.speed, budget_s, Arc::clone(&goal));

@@ -137,6 +137,26 @@ fn commit_of_twenty_effects_beside_a_projection(bencher: Bencher<'_, '_>, facts:
     });
 }
 
+/// One commit after the other while somebody holds the first world and, as the pool does, the one before: the slowest is what
+/// a commit can take when it copies a shard of the table.
+#[divan::bench(args = FACTS, sample_count = 10_000, sample_size = 1)]
+fn commits_in_a_row_beside_who_holds_the_first(bencher: Bencher<'_, '_>, facts: usize) {
+    let first = world(facts);
+    let mut root = first.clone();
+    let mut seed = 0;
+    bencher
+        .with_inputs(|| {
+            seed += 1;
+            effects(facts, seed)
+        })
+        .bench_local_values(|effects| {
+            let before = root.clone();
+            root.apply(&effects).unwrap();
+            before
+        });
+    assert_eq!(first.len(), facts);
+}
+
 /// A node's commit of its 20 effects, checked against 100 live projections that predicted them: all read where anything is (`at(?)`),
 /// and each the weights of 20 objects.
 #[divan::bench(args = FACTS)]

@@ -4,9 +4,10 @@
 //! fact. Keys too long for that are compared where they are. The table is open addressing with linear probing and backward
 //! shifts (Knuth, volume 3, 6.4, algorithm R), at most five eighths full.
 //!
-//! Who alone has a table writes into it. Who shares it writes beside it, into a persistent hash map of the changes since; when
-//! those are an eighth of the table, the two become a table of its own. So a write costs a constant amount, on average, and a
-//! clone always.
+//! The table is in shards, by the first bits of the hash: a shard that grows too large is divided, and nothing but it is touched
+//! (extendible hashing: Fagin, Nievergelt, Pippenger, Strong, ACM TODS 1979). Who alone has a shard writes into it. Who shares it writes
+//! beside it, into a persistent hash map of the changes since; when those are an eighth of the shard, the two become a shard of its
+//! own. So a write costs a constant amount, on average, and at most a shard; a clone always costs nothing.
 
 use crate::world::Fact;
 use imbl::GenericHashMap;
@@ -19,6 +20,10 @@ type Since = GenericHashMap<Arc<FactKey>, Option<Arc<Fact>>, BuildHasherDefault<
 
 /// Changes beside a shared table are no reason for one of its own while they are fewer.
 const MIN_SINCE: usize = 512;
+/// A shard with more facts is divided: it is what one write may have to copy.
+const MAX_SHARD: usize = 16_384;
+/// Shards are told apart by so many bits at the most. Beyond, or where hashes are alike on purpose, they grow.
+const MAX_BITS: u32 = 12;
 /// The bytes of a key that stand in the table.
 const TEXT: usize = 39;
 /// A key whose bytes do not.
@@ -27,9 +32,26 @@ const LONG: u8 = u8::MAX;
 /// Facts by key.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Table {
+    parts: Arc<Parts>,
+    len: usize,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Parts {
+    /// Which shard the hashes are in that begin with these bits; none as long as there are no facts.
+    directory: Vec<u32>,
+    shards: Vec<Shard>,
+    /// How many bits those are.
+    bits: u32,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Shard {
     flat: Arc<Flat>,
     since: Since,
     len: usize,
+    /// How many of the first bits all its hashes have in common.
+    depth: u32,
 }
 
 #[derive(Debug, Clone, Default)]
@@ -68,39 +90,102 @@ impl Table {
 
     /// The fact, with the key that it is kept under.
     pub(crate) fn get_key_value(&self, key: &FactKey) -> Option<(&FactKey, &Fact)> {
-        if !self.since.is_empty()
-            && let Some((key, changed)) = self.since.get_key_value(key)
-        {
-            return changed.as_deref().map(|fact| (key.as_ref(), fact));
-        }
-        self.flat.get(&Wanted::of(key), key)
+        let wanted = Wanted::of(key);
+        self.parts.shards[self.parts.find(wanted.hash)?].get_key_value(&wanted, key)
     }
 
     /// Whether the fact is new.
     pub(crate) fn insert(&mut self, key: &Arc<FactKey>, fact: &Arc<Fact>) -> bool {
-        let is_new = self.get(key).is_none();
+        let wanted = Wanted::of(key);
+        let parts = Arc::make_mut(&mut self.parts);
+        let at = parts.find_or_begin(wanted.hash);
+        let shard = &mut parts.shards[at];
+        let is_new = shard.insert(wanted, key, fact);
         self.len += usize::from(is_new);
-        match self.own() {
-            Some(flat) => flat.insert(Wanted::of(key), key, fact),
-            None => drop(self.since.insert(Arc::clone(key), Some(Arc::clone(fact)))),
+        if shard.len > MAX_SHARD && shard.depth < MAX_BITS {
+            parts.divide(at);
         }
         is_new
     }
 
     /// Whether the fact was there.
     pub(crate) fn remove(&mut self, key: &Arc<FactKey>) -> bool {
-        let was_there = self.get(key).is_some();
+        let wanted = Wanted::of(key);
+        let Some(at) = self.parts.find(wanted.hash) else { return false };
+        let was_there = Arc::make_mut(&mut self.parts).shards[at].remove(&wanted, key);
+        self.len -= usize::from(was_there);
+        was_there
+    }
+}
+
+impl Parts {
+    /// Where the shard of a hash is.
+    fn find(&self, hash: u64) -> Option<usize> {
+        let first = hash.checked_shr(u64::BITS - self.bits).unwrap_or(0) as usize;
+        self.directory.get(first).map(|shard| *shard as usize)
+    }
+
+    fn find_or_begin(&mut self, hash: u64) -> usize {
+        if self.shards.is_empty() {
+            self.shards.push(Shard::default());
+            self.directory.push(0);
+        }
+        self.find(hash).unwrap_or(0)
+    }
+
+    /// Two shards instead of one, by the next bit of their hashes.
+    fn divide(&mut self, at: usize) {
+        let depth = self.shards[at].depth;
+        if depth == self.bits {
+            self.directory = self.directory.iter().flat_map(|shard| [*shard, *shard]).collect();
+            self.bits += 1;
+        }
+        let (zeros, ones) = std::mem::take(&mut self.shards[at]).halves(depth);
+        self.shards[at] = zeros;
+        self.shards.push(ones);
+        let new = (self.shards.len() - 1) as u32;
+        let bit = self.bits - depth - 1;
+        for (first, shard) in self.directory.iter_mut().enumerate() {
+            if *shard as usize == at && (first >> bit) & 1 == 1 {
+                *shard = new;
+            }
+        }
+    }
+}
+
+impl Shard {
+    fn get_key_value(&self, wanted: &Wanted, key: &FactKey) -> Option<(&FactKey, &Fact)> {
+        if !self.since.is_empty()
+            && let Some((key, changed)) = self.since.get_key_value(key)
+        {
+            return changed.as_deref().map(|fact| (key.as_ref(), fact));
+        }
+        self.flat.get(wanted, key)
+    }
+
+    fn insert(&mut self, wanted: Wanted, key: &Arc<FactKey>, fact: &Arc<Fact>) -> bool {
+        let is_new = self.get_key_value(&wanted, key).is_none();
+        self.len += usize::from(is_new);
+        match self.own() {
+            Some(flat) => flat.insert(wanted, key, fact),
+            None => drop(self.since.insert(Arc::clone(key), Some(Arc::clone(fact)))),
+        }
+        is_new
+    }
+
+    fn remove(&mut self, wanted: &Wanted, key: &Arc<FactKey>) -> bool {
+        let was_there = self.get_key_value(wanted, key).is_some();
         if was_there {
             self.len -= 1;
             match self.own() {
-                Some(flat) => flat.remove(&Wanted::of(key), key),
+                Some(flat) => flat.remove(wanted, key),
                 None => drop(self.since.insert(Arc::clone(key), None)),
             }
         }
         was_there
     }
 
-    /// The table, to write into: where nobody shares it, or where enough has changed beside it for one of its own.
+    /// The shard, to write into: where nobody shares it, or where enough has changed beside it for one of its own.
     fn own(&mut self) -> Option<&mut Flat> {
         if Arc::get_mut(&mut self.flat).is_none() && self.since.len() < MIN_SINCE.max(self.flat.len / 8) {
             return None;
@@ -113,6 +198,28 @@ impl Table {
             }
         }
         Some(flat)
+    }
+
+    /// Those of its facts whose hashes have a zero behind the first bits, and those with a one.
+    fn halves(self, depth: u32) -> (Shard, Shard) {
+        let mut halves = [Flat::default(), Flat::default()];
+        let mut put = |key: &Arc<FactKey>, fact: &Arc<Fact>| {
+            let wanted = Wanted::of(key);
+            let bit = (wanted.hash >> (u64::BITS - 1 - depth)) & 1;
+            halves[bit as usize].insert(wanted, key, fact);
+        };
+        for slot in self.flat.slots.iter().flatten().filter(|slot| !self.since.contains_key(&slot.key)) {
+            put(&slot.key, &slot.fact);
+        }
+        for (key, fact) in &self.since {
+            if let Some(fact) = fact {
+                put(key, fact);
+            }
+        }
+        let shard =
+            |flat: Flat| Shard { len: flat.len, flat: Arc::new(flat), since: Since::default(), depth: depth + 1 };
+        let [zeros, ones] = halves;
+        (shard(zeros), shard(ones))
     }
 }
 
@@ -363,6 +470,35 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_table_that_grows_is_divided_and_nothing_is_lost() {
+        let key = |i: u64| {
+            let arguments = vec![Term::Int(i.cast_signed())];
+            Arc::new(FactKey { predicate: "p".to_owned(), arguments })
+        };
+        let (old, new) = (fact(1), fact(2));
+        let (count, mut table) = (4 * MAX_SHARD as u64, Table::default());
+        let mut before = Table::default();
+        for i in 0..count {
+            assert!(table.insert(&key(i), &old));
+            if i == count / 2 {
+                before = table.clone();
+            }
+        }
+        let largest = |table: &Table| table.parts.shards.iter().map(|shard| shard.len).max();
+        assert!(table.parts.shards.len() >= 4 && largest(&table) <= Some(MAX_SHARD));
+        for i in (0..count).step_by(3) {
+            assert!(!table.insert(&key(i), &new));
+            assert!(table.remove(&key(i + 1)) == (i + 1 < count));
+        }
+        for i in 0..count {
+            let expected = [Some(2), None, Some(1)][(i % 3) as usize];
+            assert_eq!(table.get(&key(i)).map(|fact| fact.value.clone()), expected.map(Value::Int), "{i}");
+            assert_eq!(before.get(&key(i)).is_some(), i <= count / 2, "{i}");
+        }
+        assert_eq!(table.len(), table.parts.shards.iter().map(|shard| shard.len).sum::<usize>());
     }
 
     #[test]

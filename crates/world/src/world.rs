@@ -78,6 +78,12 @@ impl World {
         self.revision
     }
 
+    /// The same facts, at another revision.
+    #[must_use]
+    pub fn numbered(self, revision: Revision) -> World {
+        World { revision, ..self }
+    }
+
     /// How many facts hold; costs the overlay.
     pub fn len(&self) -> usize {
         let mut len = self.store.len();

@@ -17,6 +17,8 @@ use ratn_model::ontology::Ontology;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::Contradiction;
 use ratn_storage::{Fault, Progress};
+use ratn_world::digest::Digest;
+use ratn_world::scene::delta::SceneDelta;
 use ratn_world::world::{Fact, World};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -78,6 +80,11 @@ pub(super) enum Message {
         key: FactKey,
         limit: usize,
         answer: Answer<(Vec<Version>, Revision)>,
+    },
+    Scene {
+        projection: Option<ProjectionId>,
+        bases: Vec<Digest>,
+        answer: Answer<SceneDelta>,
     },
     Release {
         projection: ProjectionId,
@@ -280,6 +287,10 @@ impl Actor {
             Message::Versions { key, limit, answer } => {
                 let versions = self.pool.history.versions(&key, limit);
                 self.reply(answer, Ok(versions));
+            }
+            Message::Scene { projection, bases, answer } => {
+                let scene = self.pool.scene(projection, &bases).map_err(|error| status::of_query(&error));
+                self.reply(answer, scene);
             }
             Message::Release { projection, answer } => {
                 let released = self.pool.release(projection);

@@ -5,13 +5,14 @@
 
 use super::WorldPoolConfig;
 use super::memory::{Memory, Reused, fingerprint};
-use super::record::{CommitRecord, DecodeError, FactRecord, Names, PatternRecord, SnapshotRecord, decode, encode};
+use super::record::{CommitRecord, FactRecord, Names, PatternRecord, SnapshotRecord, decode, encode};
 use crate::journal::Journaled;
 use bytes::Bytes;
 use ratn_model::fact::{Change, FactKey, FactPattern};
 use ratn_model::id::Revision;
 use ratn_model::measurement::Measurement;
 use ratn_model::ontology::{Ontology, Violation};
+use ratn_model::versioned::DecodeError;
 use ratn_storage::{MakeSnapshot, Position, Recovered};
 use ratn_world::world::{ChangeError, Fact, World, Written};
 use std::collections::{BTreeSet, VecDeque};
@@ -137,11 +138,30 @@ impl History {
                 decode(&entry.payload).map_err(|source| RestoreError::Entry { position: entry.position, source })?;
             for commit in commits {
                 let (id, fingerprint, revision) = (commit.id.clone(), commit.fingerprint, Revision(commit.revision));
+                let is_leap = commit.is_leap();
                 history.make_again(commit, &mut names)?;
-                history.commits.insert(&id, fingerprint, revision);
+                if !is_leap {
+                    history.commits.insert(&id, fingerprint, revision);
+                }
             }
         }
         Ok(history)
+    }
+
+    /// What comes next is above `floor`: revisions that somebody may have heard of, and that are lost, do not come again. What was
+    /// before is not known any more.
+    pub(super) fn with_revisions_above(mut self, floor: Revision) -> History {
+        if self.root().revision() < floor {
+            self.go_on_from(floor);
+            self.records.push(CommitRecord { revision: floor.0, ..CommitRecord::default() });
+        }
+        self
+    }
+
+    fn go_on_from(&mut self, revision: Revision) {
+        let world = self.root().clone().numbered(revision);
+        self.revisions = VecDeque::from([Arc::new(Kept { world, commit: Arc::from(""), written: Written::new() })]);
+        self.written = 0;
     }
 
     pub(super) fn root(&self) -> &World {
@@ -255,6 +275,10 @@ impl History {
 
     fn make_again(&mut self, commit: CommitRecord, names: &mut Names) -> Result<(), RestoreError> {
         let expected = self.root().revision().0 + 1;
+        if commit.is_leap() && commit.revision > expected {
+            self.go_on_from(Revision(commit.revision));
+            return Ok(());
+        }
         if commit.revision != expected {
             return Err(RestoreError::Gap { found: commit.revision, expected });
         }
@@ -457,6 +481,6 @@ mod tests {
         assert_eq!(refused, RestoreError::Gap { found: 3, expected: 2 });
         kept.entries[2][0] = 9;
         let refused = History::restore(kept.recovered(), &config()).unwrap_err();
-        assert!(matches!(refused, RestoreError::Entry { source: DecodeError::Version { found: 9 }, .. }));
+        assert!(matches!(refused, RestoreError::Entry { source: DecodeError::Version { found: 9, .. }, .. }));
     }
 }

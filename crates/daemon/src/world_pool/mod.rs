@@ -16,14 +16,18 @@ mod history;
 mod leases;
 mod memory;
 mod record;
+mod scenes;
 mod service;
 mod status;
 
 pub use config::WorldPoolConfig;
 
-use crate::journal::Journal;
+use crate::config::Durability;
+use crate::journal::{Journal, JournalError, floor};
 use crate::link::{Link, Manager};
 use anyhow::Context;
+use history::History;
+use ratn_model::id::Revision;
 use ratn_model::ontology::{Ontology, turtle};
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
@@ -62,8 +66,7 @@ pub async fn run_as(
 ) -> anyhow::Result<()> {
     let ontology = config.ontology.as_deref().map(ontology).transpose()?;
     let storage = config.storage.directory_of(ROLE, directory.path());
-    let restore = |recovered| history::History::restore(recovered, &config);
-    let kept = Journal::open(ROLE, &config.storage, &storage, restore)?;
+    let kept = open(&config, &storage)?;
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let manager = Manager { configured: config.resource_manager.clone(), directory: directory.clone() };
@@ -101,8 +104,67 @@ pub async fn run_as(
     Ok(served?)
 }
 
+/// Commits a millisecond that no pool makes: revisions that a start has skipped to are above all of the one before.
+const COMMITS_PER_MS: u64 = 1_000;
+
+/// Takes the place of the one writer, and restores the history. Without durability somebody may have heard of revisions that are lost.
+fn open(config: &WorldPoolConfig, directory: &Path) -> Result<(History, Journal), JournalError> {
+    let restore = |recovered| History::restore(recovered, config);
+    let (history, journal) = Journal::open(ROLE, &config.storage, directory, restore)?;
+    let may_have_lost = config.storage.durability == Durability::None && history.root().revision() > Revision(0);
+    let floor = if may_have_lost { floor().saturating_mul(COMMITS_PER_MS) } else { 0 };
+    Ok((history.with_revisions_above(Revision(floor)), journal))
+}
+
 fn ontology(file: &Path) -> anyhow::Result<Ontology> {
     let place = file.display();
     let text = std::fs::read_to_string(file).with_context(|| format!("cannot read the ontology {place}"))?;
-    turtle::read(&text).with_context(|| format!("the ontology {place}"))
+    let beside = |using: &str, path: &str| {
+        let other = Path::new(using).parent().unwrap_or(Path::new("")).join(path);
+        // By its own name it is known again.
+        let other = other.canonicalize().map_err(|error| error.to_string())?;
+        let text = std::fs::read_to_string(&other).map_err(|error| error.to_string())?;
+        Ok((other.display().to_string(), text))
+    };
+    let name = file.canonicalize().unwrap_or_else(|_| file.to_owned());
+    let read = turtle::imports::read_with(&name.display().to_string(), &text, &beside);
+    Ok(read.with_context(|| format!("the ontology {place}"))?.0)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::config::StorageConfig;
+    use history::Commit;
+    use ratn_model::fact::{Change, FactKey};
+    use ratn_model::value::Value;
+
+    #[test]
+    fn without_durability_a_revision_never_comes_again_after_a_restart() {
+        let place = tempfile::tempdir().unwrap();
+        let fact = FactKey { predicate: "full".to_owned(), arguments: Vec::new() };
+        for (durability, skips) in [(Durability::None, true), (Durability::Group, false)] {
+            let storage = StorageConfig { durability, ..StorageConfig::default() };
+            let config = WorldPoolConfig { storage, ..WorldPoolConfig::default() };
+            let directory = place.path().join(durability.to_string());
+            let start = || open(&config, &directory).unwrap();
+            let mut told = Revision(0);
+            for round in 0..3 {
+                let (mut history, mut journal) = start();
+                let root = history.root().revision();
+                assert_eq!(root > told, skips && round > 0, "{durability} {round}");
+                assert_eq!(history.root().get(&fact), (round > 0).then_some(&Value::Int(round - 1)));
+                if round > 0 {
+                    assert_eq!(history.at(told).is_err(), skips);
+                }
+                let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(round) }];
+                let commit = Commit { id: round.to_string(), changes, ..Commit::default() };
+                told = history.commit(&commit, None).unwrap();
+                assert_eq!(told.0, root.0 + 1);
+                journal.write(&mut history).unwrap();
+                journal.close().unwrap();
+            }
+        }
+    }
 }

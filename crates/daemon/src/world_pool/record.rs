@@ -7,6 +7,7 @@ use ratn_model::fact::{FactKey, FactPattern, Term};
 use ratn_model::id::Revision;
 use ratn_model::measurement::Measurement;
 use ratn_model::value::Value;
+use ratn_model::versioned::{self, DecodeError};
 use ratn_world::world::Fact;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -16,8 +17,8 @@ use std::sync::Arc;
 /// new number.
 const FORMAT: u8 = 1;
 
-/// One commit.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// One commit. Without an id and without changes: the revisions before it are lost, and go on from it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct CommitRecord {
     pub(super) revision: u64,
     pub(super) id: String,
@@ -61,30 +62,19 @@ enum TermRecord {
     Name(String),
 }
 
-/// Bytes that are no records, or of a version that is not known here.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(super) enum DecodeError {
-    #[error(
-        "format {found} of the world pool's records is not known (this is {FORMAT}): use the version that wrote it"
-    )]
-    Version { found: u8 },
-    #[error("these are no records of a world pool: {reason}")]
-    Broken { reason: String },
-}
-
 pub(super) fn encode<T: Serialize>(value: &T) -> Vec<u8> {
-    // Nothing that is written here can fail to serialise: no maps of unknown length, no foreign types.
-    postcard::to_extend(value, vec![FORMAT]).unwrap_or_default()
+    versioned::encode(FORMAT, value)
 }
 
 pub(super) fn decode<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<T, DecodeError> {
-    let broken = |reason: String| DecodeError::Broken { reason };
-    let (version, rest) = bytes.split_first().ok_or_else(|| broken("no bytes".to_owned()))?;
-    if *version != FORMAT {
-        return Err(DecodeError::Version { found: *version });
+    versioned::decode(FORMAT, "records of a world pool", bytes)
+}
+
+impl CommitRecord {
+    /// Whether it only says where revisions go on.
+    pub(super) fn is_leap(&self) -> bool {
+        self.id.is_empty() && self.deleted.is_empty() && self.written.is_empty()
     }
-    let (value, rest) = postcard::take_from_bytes(rest).map_err(|error| broken(error.to_string()))?;
-    if rest.is_empty() { Ok(value) } else { Err(broken(format!("{} bytes too many", rest.len()))) }
 }
 
 impl FactRecord {

@@ -8,9 +8,10 @@ use futures::StreamExt;
 use futures::stream::BoxStream;
 use ratn_model::fact::{FactKey, FactPattern};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
-use ratn_proto::convert::{Malformed, all, each, label, name, required};
+use ratn_proto::convert::{Malformed, all, digest, each, label, name, required};
 use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
 use ratn_proto::v1;
+use ratn_world::digest::Digest;
 use ratn_world::world::Fact;
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,6 +21,9 @@ use tonic::{Code, Request, Response, Status};
 
 /// A grant may reach the client before the watch tells of it: so long a projection waits for that.
 const LEASE_PATIENCE: Duration = Duration::from_secs(1);
+
+/// Scenes that a client may say that it has.
+const MOST_BASES: usize = 16;
 
 /// Of a fact's history.
 const MOST_VERSIONS: usize = 1_000;
@@ -158,6 +162,18 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             fact: fact.map(|fact| record((key.clone(), fact.as_ref().clone()))),
         });
         Ok(Response::new(v1::GetFactHistoryResponse { versions: all(versions), oldest_revision: oldest.0 }))
+    }
+
+    async fn get_scene(&self, request: Request<v1::GetSceneRequest>) -> Result<Response<v1::GetSceneResponse>, Status> {
+        let request = request.into_inner();
+        let projection = request.projection_id.map(ProjectionId);
+        if request.bases.len() > MOST_BASES {
+            return Err(Malformed::new("bases", format!("at most {MOST_BASES} are looked at")).into());
+        }
+        let bases: Result<Vec<Digest>, Malformed> = request.bases.iter().map(|base| digest(base, "bases")).collect();
+        let bases = bases?;
+        let scene = self.actor.ask(|answer| Message::Scene { projection, bases, answer }).await?;
+        Ok(Response::new(scene.into()))
     }
 
     async fn release(

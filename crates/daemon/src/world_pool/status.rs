@@ -48,6 +48,7 @@ pub(super) fn of_project(error: &ProjectError) -> Status {
 
 pub(super) fn of_query(error: &QueryError) -> Status {
     match error {
+        QueryError::Scene(_) => status(Code::FailedPrecondition, "NO_SCENE", error.to_string()),
         QueryError::Unknown { .. } => status(Code::NotFound, "PROJECTION_UNKNOWN", error.to_string()),
         QueryError::Revision(error) => of_revision(*error),
         QueryError::Hidden { .. } => status(Code::PermissionDenied, "NOT_AMONG_READS", error.to_string()),

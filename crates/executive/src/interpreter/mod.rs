@@ -40,7 +40,6 @@ pub(crate) use routine::Routine;
 pub(crate) const DEFAULT_ATTEMPTS: u32 = 3;
 
 /// Where effects go.
-#[expect(clippy::large_enum_variant, reason = "an interpreter has one")]
 pub(crate) enum Target {
     /// Into the root world.
     Actual,

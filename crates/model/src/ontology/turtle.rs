@@ -15,16 +15,17 @@
 //! A name in a task is the part of an IRI after its last `#`, `/` or `:`. An argument is a class, `owl:Thing` (anything) or
 //! `xsd:integer`; a value is a type in the words of task files, or a class: then it is the name of an individual. What else a
 //! predicate may say is in [`said`]. Labels and comments are for people; any other property is refused, as it would say
-//! something that is not checked.
+//! something that is not checked. What an ontology imports is read with it ([`imports`]).
 //!
 //! Reading is bounded: by the size of the text, by the number of statements, and by a check for circles among subclasses.
 
+pub mod imports;
 pub mod said;
 
 use super::{Domain, Ontology, Predicate, Range};
 use crate::load::MAX_SOURCE;
 use oxrdf::vocab::{rdf, rdfs, xsd};
-use oxrdf::{NamedOrBlankNode, Term as Node, Triple};
+use oxrdf::{BlankNode, NamedOrBlankNode, Term as Node, Triple};
 use oxttl::TurtleParser;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -55,6 +56,14 @@ pub enum OntologyError {
         /// Of what.
         of: &'static str,
     },
+    /// In a file that it imports.
+    #[error("{file}")]
+    Import {
+        /// What it is called where it is imported.
+        file: String,
+        /// What is wrong there.
+        source: Box<OntologyError>,
+    },
     /// A statement that is not understood, or contradicts another.
     #[error("`{subject}`: {message}")]
     Statement {
@@ -68,28 +77,54 @@ pub enum OntologyError {
 /// What is said of one subject, in the order of the text.
 type Statements = BTreeMap<String, Vec<(String, Node)>>;
 
-/// Reads an ontology.
+/// Reads an ontology of one text, which imports nothing.
 ///
 /// # Errors
 /// [`OntologyError`] for the first thing that is wrong.
 pub fn read(text: &str) -> Result<Ontology, OntologyError> {
+    let nothing = |_: &str, _: &str| Err("there are no other files here".to_owned());
+    imports::read_with("", text, &nothing).map(|(ontology, _)| ontology)
+}
+
+/// What one text says, the `number`th of an ontology in which `before` statements were read already.
+fn parse(text: &str, number: usize, before: usize) -> Result<Statements, OntologyError> {
     if text.len() > MAX_SOURCE {
         return Err(OntologyError::TooLarge { limit: MAX_SOURCE, of: "bytes" });
     }
+    let base = |error| wrong(imports::BASE, format!("{error}"));
+    let parser = TurtleParser::new().with_base_iri(imports::BASE).map_err(base)?;
     let mut statements = Statements::new();
-    for (number, triple) in TurtleParser::new().for_slice(text.as_bytes()).enumerate() {
+    for (place, triple) in parser.for_slice(text.as_bytes()).enumerate() {
         let Triple { subject, predicate, object } = triple.map_err(|error| OntologyError::Syntax {
             line: error.location().start.line + 1,
             message: error.message().to_owned(),
         })?;
-        if number >= MAX_STATEMENTS {
+        if before + place >= MAX_STATEMENTS {
             return Err(OntologyError::TooLarge { limit: MAX_STATEMENTS, of: "statements" });
         }
-        statements.entry(key(&subject)).or_default().push((predicate.into_string(), object));
+        // A blank node is known within its text only.
+        let object = match object {
+            Node::BlankNode(blank) => Node::BlankNode(BlankNode::new_unchecked(own(&blank, number))),
+            other => other,
+        };
+        let subject = match subject {
+            NamedOrBlankNode::NamedNode(iri) => iri.into_string(),
+            NamedOrBlankNode::BlankNode(blank) => format!("_:{}", own(&blank, number)),
+        };
+        statements.entry(subject).or_default().push((predicate.into_string(), object));
     }
-    let reader = Reader { statements: &statements };
+    Ok(statements)
+}
+
+/// The ontology that all statements make.
+fn assemble(statements: &Statements) -> Result<Ontology, OntologyError> {
+    let reader = Reader { statements };
     reader.names_are_unique()?;
     reader.read()
+}
+
+fn own(blank: &BlankNode, number: usize) -> String {
+    format!("t{number}.{}", blank.as_str())
 }
 
 struct Reader<'a> {
@@ -270,13 +305,6 @@ fn is_for_people(property: &str) -> bool {
 
 fn ours(term: &str) -> String {
     format!("{OURS}{term}")
-}
-
-fn key(subject: &NamedOrBlankNode) -> String {
-    match subject {
-        NamedOrBlankNode::NamedNode(iri) => iri.as_str().to_owned(),
-        NamedOrBlankNode::BlankNode(blank) => blank.to_string(),
-    }
 }
 
 fn name(iri: &str) -> String {

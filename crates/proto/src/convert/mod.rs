@@ -7,6 +7,7 @@ mod action;
 mod fact;
 mod process;
 mod resource;
+mod scene;
 mod value;
 mod world;
 
@@ -15,6 +16,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use crate::v1;
+pub use scene::digest;
 
 /// Lists and maps nest at most this deep.
 pub const MAX_DEPTH: usize = 16;

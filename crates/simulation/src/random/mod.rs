@@ -8,7 +8,7 @@
 //! |---|---|
 //! | programs | `generator`, `annotations`, `features`, `listing` |
 //! | their world | `oracle`, `dice` |
-//! | both modes beside each other | `trial`, `story`, `weak` |
+//! | both modes beside each other | `trial`, `outside`, `story`, `weak` |
 //! | smaller programs that fail alike | `shrink`, `rewrite` |
 
 mod annotations;
@@ -17,6 +17,7 @@ mod features;
 mod generator;
 mod listing;
 mod oracle;
+mod outside;
 mod rewrite;
 mod shrink;
 mod story;
@@ -29,6 +30,7 @@ pub use features::Features;
 pub use generator::program;
 pub use listing::listing;
 pub use oracle::HashOracle;
+pub use outside::trial_from_outside;
 pub use shrink::{Shrunk, shrink};
 pub use trial::{Conditions, Verdict, execute, trial};
 

@@ -81,13 +81,18 @@ impl Conditions {
 
 /// Runs the program in both modes and compares.
 pub fn trial(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
-    let hsm = match execute(program, conditions, Mode::Hsm, MAX_HSM_EVENTS) {
+    compare(program, conditions, &[])
+}
+
+/// The same, while this comes from outside.
+pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: &[(Trigger, Event)]) -> Verdict {
+    let hsm = match execute_under(program, conditions, Mode::Hsm, MAX_HSM_EVENTS, outside.to_vec()) {
         Ok(run) => run,
         Err(RunError::Endless(_)) => return Verdict::LeftOut,
         Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
     };
     let events = MAX_CDTN_EVENTS * hsm.log.len() + 10_000;
-    let cdtn = match execute(program, conditions, Mode::Cdtn, events) {
+    let cdtn = match execute_under(program, conditions, Mode::Cdtn, events, outside.to_vec()) {
         Ok(run) => run,
         Err(problem) => return Verdict::Differs(format!("CDTN mode: {problem}")),
     };
@@ -104,6 +109,16 @@ pub fn execute(
     conditions: &Conditions,
     mode: Mode,
     max_events: usize,
+) -> Result<Run, RunError> {
+    execute_under(program, conditions, mode, max_events, Vec::new())
+}
+
+pub(super) fn execute_under(
+    program: &Arc<Program>,
+    conditions: &Conditions,
+    mode: Mode,
+    max_events: usize,
+    mut outside: Vec<(Trigger, Event)>,
 ) -> Result<Run, RunError> {
     let seed = conditions.seed;
     let setup = Setup {
@@ -128,8 +143,11 @@ pub fn execute(
     };
     let percent = conditions.mischief_percent;
     let mischief = Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent };
-    let events = if conditions.pauses { pauses(seed) } else { Vec::new() };
-    run_under(setup, &mut oracle, Circumstances { orders: conditions.orders, max_events, events, mischief })
+    if conditions.pauses {
+        outside.extend(pauses(seed));
+    }
+    let circumstances = Circumstances { orders: conditions.orders, max_events, events: outside, mischief };
+    run_under(setup, &mut oracle, circumstances)
 }
 
 /// A pause, a step and what ends both.

@@ -13,6 +13,7 @@ use ratn_model::value::{Trajectory, Value};
 use ratn_proto::convert::wire_ports;
 use ratn_proto::types::{FactRecord, Goal, GoalOutcome};
 use ratn_proto::v1;
+use ratn_world::scene::delta::DeltaError;
 use ratn_world::world::{ChangeError, World};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -58,6 +59,9 @@ pub enum WorldFailure {
     /// The facts make no world.
     #[error("the projection's facts")]
     Facts(#[from] ChangeError),
+    /// What the world pool sent makes no scene.
+    #[error("the projection's scene")]
+    Scene(#[from] DeltaError),
 }
 
 /// Another provider's action did not come to an outcome.
@@ -239,15 +243,18 @@ impl GoalContext {
     /// # Errors
     /// [`WorldFailure`].
     pub async fn facts(&self, patterns: &[FactPattern]) -> Result<Vec<FactRecord>, WorldFailure> {
+        Ok(self.world_client()?.query(self.projection, patterns).await?)
+    }
+
+    pub(super) fn world_client(&self) -> Result<WorldClient, WorldFailure> {
         if self.world_pool.is_empty() {
             return Err(WorldFailure::NoWorldPool);
         }
         let world_pool: Endpoint = self.world_pool.parse()?;
-        let client = WorldClient::new(&self.channels, &world_pool)?;
-        Ok(client.query(self.projection, patterns).await?)
+        Ok(WorldClient::new(&self.channels, &world_pool)?)
     }
 
-    /// As [`GoalContext::facts`], as a world: `Scene::of(&goal.world(&patterns).await?)`.
+    /// As [`GoalContext::facts`], as a world.
     ///
     /// # Errors
     /// [`WorldFailure`].

@@ -13,12 +13,14 @@ mod context;
 mod fence;
 mod goal;
 mod port;
+mod scene;
 mod server;
 mod service;
 
 pub use context::{CallFailure, GoalContext, WorldFailure};
 pub use port::{InputError, Port};
 pub use ratn_proto::types::{Goal, GoalOutcome};
+pub use scene::SceneCache;
 pub use server::{ActionServer, ActionServerBuilder};
 
 use crate::client::chain;

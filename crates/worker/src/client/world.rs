@@ -11,6 +11,8 @@ use ratn_proto::convert::{all, each};
 use ratn_proto::types::{Contradiction, FactDifference, FactRecord, FactVersion, WorldUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::world_pool_service_client::WorldPoolServiceClient;
+use ratn_world::digest::Digest;
+use ratn_world::scene::delta::SceneDelta;
 use std::sync::Arc;
 use tonic::Streaming;
 
@@ -253,6 +255,18 @@ impl WorldClient {
         let question = v1::WatchProjectionRequest { projection_id: projection.0 };
         let answer = self.client.clone().watch_projection(question).await.map_err(|status| self.failed(&status))?;
         Ok(ProjectionWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
+    }
+
+    /// The scene of a projection, or of the root: what it differs by from one of the bases (scenes that the caller has, the likeliest
+    /// first, at most 16), or all of it.
+    ///
+    /// # Errors
+    /// [`CallError`], also where a geometric fact makes no geometry.
+    pub async fn scene(&self, projection: Option<ProjectionId>, bases: &[Digest]) -> Result<SceneDelta, CallError> {
+        let bases = bases.iter().map(|base| base.as_bytes().to_vec()).collect();
+        let question = v1::GetSceneRequest { projection_id: projection.map(|projection| projection.0), bases };
+        let answer = self.client.clone().get_scene(question).await.map_err(|status| self.failed(&status))?;
+        SceneDelta::try_from(answer.into_inner()).map_err(|m| CallError::malformed(&self.endpoint, m))
     }
 
     /// Ends a projection; false when it had ended before.

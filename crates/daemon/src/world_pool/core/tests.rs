@@ -1,0 +1,265 @@
+//! The pool's state machine, without its shell.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+use super::*;
+use ratn_model::fact::Term;
+use ratn_model::measurement::{Certainty, Measurement};
+use ratn_model::value::Value;
+
+fn key(name: &str) -> FactKey {
+    FactKey { predicate: "at".to_owned(), arguments: vec![Term::Name(name.to_owned())] }
+}
+
+fn set(name: &str, value: i64) -> Change {
+    Change::Set { fact: key(name), value: Value::Int(value) }
+}
+
+fn pool() -> WorldPool {
+    let config = WorldPoolConfig { revisions_kept: 3, max_projections: 2, ..WorldPoolConfig::default() };
+    let history = History::new(&config);
+    WorldPool::new(config, None, history, 0)
+}
+
+fn commit(
+    pool: &mut WorldPool,
+    id: &str,
+    changes: &[Change],
+    expected: Option<Revision>,
+) -> Result<Revision, CommitError> {
+    let commit = Commit { id: id.to_owned(), changes: changes.to_vec(), expected, ..Commit::default() };
+    pool.commit(Timestamp(0), &commit)
+}
+
+fn project(pool: &mut WorldPool, request: &str, base: u64, lease: u64) -> Result<ProjectionId, ProjectError> {
+    pool.project(ProjectRequest {
+        request_id: request.to_owned(),
+        base: Revision(base),
+        changes: vec![set("box", 7)],
+        writers: Vec::new(),
+        reads: Footprint::Patterns(vec![FactPattern::of(&key("box"))]),
+        held_by: HeldBy::Lease(LeaseId(lease)),
+    })
+}
+
+fn value(pool: &WorldPool, id: Option<ProjectionId>, name: &str) -> Result<Option<Value>, QueryError> {
+    let (facts, _) = pool.query(id, None, &[FactPattern::of(&key(name))])?;
+    Ok(facts.into_iter().next().map(|(_, fact)| fact.value))
+}
+
+#[test]
+fn a_commit_is_made_once_and_only_as_the_revision_expected() {
+    let mut pool = pool();
+    assert_eq!(commit(&mut pool, "a", &[set("box", 1)], Some(Revision(1))), Ok(Revision(1)));
+    assert_eq!(commit(&mut pool, "a", &[set("box", 1)], Some(Revision(1))), Ok(Revision(1)));
+    let wrong = commit(&mut pool, "b", &[set("box", 2)], Some(Revision(3)));
+    assert_eq!(wrong, Err(CommitError::Revision { root: 1, next: 2, expected: 3 }));
+    assert_eq!(value(&pool, None, "box"), Ok(Some(Value::Int(1))));
+    assert_eq!(commit(&mut pool, "b", &[set("box", 2)], None), Ok(Revision(2)));
+}
+
+#[test]
+fn a_projection_is_of_its_base_whatever_was_committed_since() {
+    let mut pool = pool();
+    commit(&mut pool, "a", &[set("box", 1), set("cup", 1)], None).unwrap();
+    commit(&mut pool, "b", &[set("box", 2), set("cup", 2)], None).unwrap();
+    let all = Footprint::Everything;
+    let request = ProjectRequest {
+        request_id: "p".to_owned(),
+        base: Revision(1),
+        changes: vec![set("box", 7)],
+        writers: Vec::new(),
+        reads: all,
+        held_by: HeldBy::Until(Timestamp(5)),
+    };
+    let id = pool.project(request).unwrap();
+    assert_eq!(value(&pool, Some(id), "box"), Ok(Some(Value::Int(7))));
+    assert_eq!(value(&pool, Some(id), "cup"), Ok(Some(Value::Int(1))));
+    assert_eq!(value(&pool, None, "box"), Ok(Some(Value::Int(2))), "the root is as it was");
+    pool.expire(Timestamp(4));
+    assert_eq!(pool.projections(), 1);
+    pool.expire(Timestamp(5));
+    assert_eq!(pool.projections(), 0);
+}
+
+#[test]
+fn a_projection_shows_its_declared_reads_and_nothing_else() {
+    let mut pool = pool();
+    commit(&mut pool, "a", &[set("cup", 1)], None).unwrap();
+    let id = project(&mut pool, "p", 1, 1).unwrap();
+    assert_eq!(value(&pool, Some(id), "box"), Ok(Some(Value::Int(7))));
+    let hidden = value(&pool, Some(id), "cup").unwrap_err();
+    assert_eq!(
+        hidden.to_string(),
+        "projection-1 does not show at(cup): it is not among the reads declared for it; declare it (reads: […])"
+    );
+    let wider = FactPattern { predicate: "at".to_owned(), arguments: vec![None] };
+    assert!(matches!(pool.query(Some(id), None, &[wider]), Err(QueryError::Hidden { .. })));
+    let (all, _) = pool.query(Some(id), None, &[]).unwrap();
+    assert_eq!(all.iter().map(|(key, _)| key.to_string()).collect::<Vec<_>>(), ["at(box)"]);
+}
+
+#[test]
+fn revisions_outside_those_kept_are_refused() {
+    let mut pool = pool();
+    for i in 1..=4 {
+        commit(&mut pool, &i.to_string(), &[set("box", i)], None).unwrap();
+    }
+    assert_eq!(project(&mut pool, "p", 1, 1), Err(RevisionError::Forgotten { wanted: 1, oldest: 2, root: 4 }.into()));
+    assert_eq!(project(&mut pool, "p", 5, 1), Err(RevisionError::Future { root: 4, wanted: 5 }.into()));
+    assert!(project(&mut pool, "p", 2, 1).is_ok(), "a refused request can be asked again");
+}
+
+#[test]
+fn projections_end_with_their_lease_and_are_bounded() {
+    let mut pool = pool();
+    let first = project(&mut pool, "p", 0, 1).unwrap();
+    assert_eq!(project(&mut pool, "p", 0, 1), Ok(first), "asked twice, made once");
+    project(&mut pool, "q", 0, 2).unwrap();
+    assert_eq!(project(&mut pool, "r", 0, 2), Err(ProjectError::TooMany { limit: 2 }));
+    assert_eq!(pool.end_lease(LeaseId(1)), 1);
+    assert_eq!(value(&pool, Some(first), "box"), Err(QueryError::Unknown { id: first }));
+    assert_eq!(project(&mut pool, "p", 0, 1), Err(ProjectError::Ended { request_id: "p".to_owned() }));
+    assert_eq!(pool.keep_leases(|lease| lease == LeaseId(2)), 0);
+    assert_eq!(pool.keep_leases(|_| false), 1);
+    assert_eq!(pool.projections(), 0);
+    assert!(pool.by_lease.is_empty());
+}
+
+#[test]
+fn a_fact_with_a_time_to_live_is_gone_after_it_unless_it_was_written_again() {
+    let second = |n: f64| Timestamp::from_seconds(n);
+    let config = WorldPoolConfig { ttl_s: [("at".to_owned(), 2.0)].into(), ..WorldPoolConfig::default() };
+    let history = History::new(&config);
+    let mut pool = WorldPool::new(config, None, history, 0);
+    let of = |id: &str, changes: Vec<Change>| Commit { id: id.to_owned(), changes, ..Commit::default() };
+    let full = Change::Set { fact: FactKey { predicate: "full".to_owned(), ..key("box") }, value: Value::Int(1) };
+    pool.commit(second(0.0), &of("a", vec![set("box", 1), set("cup", 1), full])).unwrap();
+    pool.commit(second(1.0), &of("b", vec![set("cup", 1)])).unwrap();
+    // Asked again: it is as old as it was.
+    pool.commit(second(1.5), &of("a", vec![set("box", 1), set("cup", 1)])).unwrap_err();
+    assert_eq!(pool.next_expiry(), Some(second(2.0)));
+    pool.expire_facts(second(1.9));
+    assert_eq!(pool.root().revision(), Revision(2));
+    pool.expire_facts(second(2.0));
+    assert_eq!(pool.root().revision(), Revision(3), "a revision as any other");
+    let names: Vec<String> = pool.root().iter().map(|(key, _)| key.to_string()).collect();
+    assert_eq!(names, ["at(cup)", "full(box)"]);
+    let news: Vec<u64> = pool.history.take_news().iter().map(|kept| kept.world.revision().0).collect();
+    assert_eq!(news, [1, 2, 3], "watchers hear of it");
+    pool.commit(second(2.5), &of("c", vec![Change::Delete { pattern: FactPattern::of(&key("cup")) }])).unwrap();
+    assert_eq!(pool.next_expiry(), None);
+}
+
+#[test]
+fn what_does_not_fit_the_ontology_is_not_committed() {
+    let text = "
+        @prefix ratn: <urn:ratn:ontology#> .
+        @prefix owl: <http://www.w3.org/2002/07/owl#> .
+        @prefix : <urn:robot#> .
+        :full a ratn:Predicate ; ratn:arguments ( owl:Thing ) ; ratn:value \"int\" .";
+    let ontology = ratn_model::ontology::turtle::read(text).unwrap();
+    let config = WorldPoolConfig::default();
+    let history = History::new(&config);
+    let mut pool = WorldPool::new(config, Some(ontology), history, 0);
+    let refused = commit(&mut pool, "a", &[set("box", 1)], None).unwrap_err();
+    assert!(matches!(refused, CommitError::Violation(_)), "{refused}");
+    // Sure in a way that the predicate does not declare.
+    let fact = FactKey { predicate: "full".to_owned(), ..key("box") };
+    let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
+    let measured = Measurement { source: "scale".to_owned(), certainty: Some(Certainty::Confidence(0.9)) };
+    let with = Commit { id: "m".to_owned(), changes, evidence: vec![(fact, measured)], ..Commit::default() };
+    let refused = pool.commit(Timestamp(0), &with).unwrap_err();
+    assert!(refused.to_string().contains("[other-uncertainty]"), "{refused}");
+    assert_eq!(pool.root().revision(), Revision(0));
+}
+
+#[test]
+fn a_fact_says_who_wrote_it_and_what_measured_it() {
+    let mut pool = pool();
+    let measured = Measurement { source: "camera".to_owned(), certainty: Some(Certainty::Confidence(0.9)) };
+    let evidence = vec![(key("box"), measured.clone())];
+    let commit = Commit {
+        id: "a".to_owned(),
+        changes: vec![set("box", 1), set("cup", 2)],
+        writer: Some("detect[1]".to_owned()),
+        evidence,
+        ..Commit::default()
+    };
+    pool.commit(Timestamp(0), &commit).unwrap();
+    let (facts, _) = pool.query(None, None, &[]).unwrap();
+    assert!(facts.iter().all(|(_, fact)| fact.writer.as_deref() == Some("detect[1]")));
+    assert_eq!(facts[0].1.measured.as_deref(), Some(&measured));
+    assert_eq!(facts[1].1.measured, None);
+    // In a projection each fact says who will have written it.
+    let request = ProjectRequest {
+        request_id: "p".to_owned(),
+        base: Revision(1),
+        changes: vec![set("box", 7), set("cup", 8)],
+        writers: vec!["place[1]".into(), "".into()],
+        reads: Footprint::Everything,
+        held_by: HeldBy::Until(Timestamp(9)),
+    };
+    let id = pool.project(request).unwrap();
+    let (facts, _) = pool.query(Some(id), None, &[]).unwrap();
+    let writers: Vec<_> = facts.iter().map(|(_, fact)| fact.writer.as_deref()).collect();
+    assert_eq!(writers, [Some("place[1]"), None]);
+    assert!(facts.iter().all(|(_, fact)| fact.measured.is_none()), "it is predicted");
+    let none = Commit { id: "b".to_owned(), changes: vec![set("cup", 3)], ..commit };
+    assert_eq!(pool.commit(Timestamp(0), &none), Err(CommitError::Evidence { fact: key("box") }));
+}
+
+#[test]
+fn a_commit_says_which_projections_it_contradicts_in_which_fact() {
+    let mut pool = WorldPool::new(WorldPoolConfig::default(), None, History::new(&WorldPoolConfig::default()), 0);
+    commit(&mut pool, "a", &[set("box", 1), set("cup", 1)], None).unwrap();
+    let project = |pool: &mut WorldPool, base: u64, reads: &str| {
+        let request = ProjectRequest {
+            request_id: format!("{base}/{reads}"),
+            base: Revision(base),
+            changes: vec![set("box", 7)],
+            writers: vec!["place[1]".into()],
+            reads: Footprint::Patterns(vec![FactPattern::of(&key(reads))]),
+            held_by: HeldBy::Until(Timestamp(9)),
+        };
+        pool.project(request).unwrap()
+    };
+    let (of_cup, of_box) = (project(&mut pool, 1, "cup"), project(&mut pool, 1, "box"));
+    commit(&mut pool, "b", &[set("cup", 2)], None).unwrap();
+    let found = pool.take_contradictions();
+    let expected = Contradiction {
+        projection: of_cup,
+        fact: key("cup"),
+        was: Some(Value::Int(1)),
+        is: Some(Value::Int(2)),
+        revision: Revision(2),
+    };
+    assert_eq!(found, vec![expected.clone()]);
+    assert_eq!(pool.contradiction(of_cup), Ok(Some(&expected)));
+    assert_eq!(pool.contradiction(of_box), Ok(None), "what it did not read is nothing to it");
+    // Made of a revision that is not the newest: what has happened since counts.
+    let of_all = ProjectRequest {
+        request_id: "late".to_owned(),
+        base: Revision(1),
+        changes: vec![set("box", 7)],
+        writers: vec!["place[1]".into()],
+        reads: Footprint::Everything,
+        held_by: HeldBy::Until(Timestamp(9)),
+    };
+    let late = pool.project(of_all).unwrap();
+    assert_eq!(pool.contradiction(late), Ok(Some(&Contradiction { projection: late, ..expected })));
+    // What was predicted of a writer comes true, or otherwise.
+    let of = |id: &str, value| Commit {
+        id: id.to_owned(),
+        changes: vec![set("box", value)],
+        writer: Some("place[1]".to_owned()),
+        ..Commit::default()
+    };
+    pool.commit(Timestamp(0), &of("c", 7)).unwrap();
+    assert_eq!(pool.take_contradictions(), []);
+    commit(&mut pool, "d", &[set("box", 8)], None).unwrap();
+    let found: Vec<_> = pool.take_contradictions().into_iter().map(|found| (found.projection, found.is)).collect();
+    assert_eq!(found, [(of_box, Some(Value::Int(8))), (late, Some(Value::Int(8)))]);
+    assert!(pool.release(of_box));
+    commit(&mut pool, "e", &[set("box", 9)], None).unwrap();
+    assert!(pool.take_contradictions().iter().all(|found| found.projection == late), "the other has ended");
+}

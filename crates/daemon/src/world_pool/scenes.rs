@@ -1,0 +1,229 @@
+//! Scenes for planners: each sent as what it differs by from one that the planner has.
+//!
+//! A projection's scene is that of its base with what its effects move, and the base's is that of a revision before it with what was
+//! written since: so a scene costs what it does not share with one that is known. Scenes that were sent are kept for a while, by
+//! digest; a planner with none of them is sent all of it.
+
+use super::core::{QueryError, WorldPool};
+use super::history::History;
+use ratn_model::fact::{Change, FactPattern, Footprint, SCENE_PREDICATES};
+use ratn_model::id::{ProjectionId, Revision};
+use ratn_world::digest::Digest;
+use ratn_world::scene::delta::SceneDelta;
+use ratn_world::scene::live::LiveScene;
+use ratn_world::world::World;
+use std::collections::{BTreeMap, VecDeque};
+
+/// Scenes that were sent and are kept; they share what they have in common.
+const MAX_SENT: usize = 64;
+/// Revisions whose scenes are kept, to go on from.
+const MAX_FOLLOWED: usize = 16;
+
+/// The scenes that are kept.
+#[derive(Debug, Default)]
+pub(super) struct Scenes {
+    /// The one sent last comes last.
+    sent: VecDeque<(Digest, LiveScene)>,
+    followed: BTreeMap<Revision, LiveScene>,
+}
+
+impl WorldPool {
+    /// The scene of a projection, or of the root, from the first of the bases that is kept here, else from nothing.
+    pub(super) fn scene(&mut self, id: Option<ProjectionId>, bases: &[Digest]) -> Result<SceneDelta, QueryError> {
+        let scene = match id {
+            None => {
+                let root = self.root().revision();
+                self.scenes.follow(&self.history, root)?
+            }
+            Some(id) => {
+                let projection = self.projections.get(&id).ok_or(QueryError::Unknown { id })?;
+                if shows_all(&projection.reads) {
+                    let mut scene = self.scenes.follow(&self.history, projection.base)?;
+                    scene.update(self.history.at(projection.base)?, &projection.world, &projection.moves)?;
+                    scene
+                } else {
+                    LiveScene::of(&shown(&projection.world, &projection.reads))?
+                }
+            }
+        };
+        Ok(self.scenes.delta(scene, bases))
+    }
+}
+
+impl Scenes {
+    /// Nothing is known of the revisions of another history.
+    pub(super) fn forget(&mut self) {
+        self.followed.clear();
+    }
+
+    /// The scene of a revision, from the one before it that is kept.
+    fn follow(&mut self, history: &History, revision: Revision) -> Result<LiveScene, QueryError> {
+        let world = history.at(revision)?;
+        let known = self.followed.range(..=revision).next_back();
+        let scene = match known.filter(|(known, _)| history.at(**known).is_ok()) {
+            Some((known, scene)) => {
+                let mut scene = scene.clone();
+                let mut before = history.at(*known)?;
+                for kept in history.after(*known)?.take_while(|kept| kept.world.revision() <= revision) {
+                    let changes: Vec<Change> = kept.changes().collect();
+                    scene.update(before, &kept.world, &changes)?;
+                    before = &kept.world;
+                }
+                scene
+            }
+            None => LiveScene::of(world)?,
+        };
+        self.followed.insert(revision, scene.clone());
+        if self.followed.len() > MAX_FOLLOWED {
+            self.followed.pop_first();
+        }
+        Ok(scene)
+    }
+
+    fn delta(&mut self, scene: LiveScene, bases: &[Digest]) -> SceneDelta {
+        let kept = |base: &Digest| self.sent.iter().find(|(digest, _)| digest == base);
+        let delta = match bases.iter().find_map(kept) {
+            Some((_, base)) => SceneDelta::between(base, &scene),
+            None => SceneDelta::whole(&scene),
+        };
+        self.sent.retain(|(digest, _)| *digest != delta.to);
+        self.sent.push_back((delta.to, scene));
+        if self.sent.len() > MAX_SENT {
+            self.sent.pop_front();
+        }
+        delta
+    }
+}
+
+/// What of the changes moves anything.
+pub(super) fn moves(changes: &[Change]) -> Vec<Change> {
+    let is_geometric = |change: &&Change| {
+        let pattern = change.pattern();
+        SCENE_PREDICATES.contains(&(pattern.predicate.as_str(), pattern.arguments.len()))
+    };
+    changes.iter().filter(is_geometric).cloned().collect()
+}
+
+/// Whether a projection with these reads shows the whole scene.
+fn shows_all(reads: &Footprint) -> bool {
+    let Footprint::Patterns(reads) = reads else { return true };
+    SCENE_PREDICATES.into_iter().all(|(predicate, arity)| {
+        let all = FactPattern { predicate: predicate.to_owned(), arguments: vec![None; arity] };
+        reads.iter().any(|read| read.covers(&all))
+    })
+}
+
+/// What of a world is shown.
+fn shown(world: &World, reads: &Footprint) -> World {
+    let Footprint::Patterns(reads) = reads else { return world.clone() };
+    let facts = reads.iter().flat_map(|read| world.matching(read));
+    World::from_facts(facts.map(|(key, fact)| (key.clone(), fact.value.clone())), world.revision())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::world_pool::WorldPoolConfig;
+    use crate::world_pool::core::{HeldBy, ProjectRequest};
+    use crate::world_pool::history::Commit;
+    use prost::Message;
+    use ratn_model::fact::{FactKey, Term};
+    use ratn_model::pose::Pose;
+    use ratn_model::time::Timestamp;
+    use ratn_model::value::Value;
+    use ratn_proto::v1;
+    use ratn_world::scene::{Scene, Shape};
+
+    /// What a planner with a scene of as many objects has to be sent at the most when one of them is elsewhere.
+    const OBJECTS: usize = 1_000;
+    const MOST_BYTES: usize = 512;
+
+    fn fact(predicate: &str, object: usize) -> FactKey {
+        FactKey { predicate: predicate.to_owned(), arguments: vec![Term::Name(format!("box_{object}"))] }
+    }
+
+    fn at(object: usize, x: f64) -> Change {
+        let pose = Pose { position: [x, 0.5, 0.0], ..Pose::IDENTITY };
+        Change::Set { fact: fact("at", object), value: Value::Pose(pose) }
+    }
+
+    fn pool() -> WorldPool {
+        let config = WorldPoolConfig::default();
+        let history = History::new(&config);
+        let mut pool = WorldPool::new(config, None, history, 0);
+        let shape = Shape::Box { size: [0.1, 0.2, 0.3] }.to_value();
+        let of = |object| [at(object, 0.0), Change::Set { fact: fact("shape", object), value: shape.clone() }];
+        commit(&mut pool, "all", (0..OBJECTS).flat_map(of).collect());
+        pool
+    }
+
+    fn commit(pool: &mut WorldPool, id: &str, changes: Vec<Change>) {
+        pool.commit(Timestamp(0), &Commit { id: id.to_owned(), changes, ..Commit::default() }).unwrap();
+    }
+
+    fn project(pool: &mut WorldPool, base: u64, changes: Vec<Change>, reads: Footprint) -> ProjectionId {
+        let request = ProjectRequest {
+            request_id: format!("{base} {changes:?} {reads:?}"),
+            base: Revision(base),
+            changes,
+            writers: Vec::new(),
+            reads,
+            held_by: HeldBy::Until(Timestamp(9)),
+        };
+        pool.project(request).unwrap()
+    }
+
+    fn bytes(delta: &SceneDelta) -> usize {
+        v1::GetSceneResponse::from(delta.clone()).encoded_len()
+    }
+
+    #[test]
+    fn of_a_thousand_objects_only_what_moved_is_sent() {
+        let mut pool = pool();
+        let mut planner = ratn_world::scene::delta::Scenes::new(4);
+        let whole = pool.scene(None, &[]).unwrap();
+        assert_eq!((whole.from, whole.len()), (None, OBJECTS));
+        assert!(bytes(&whole) > 50_000, "{}", bytes(&whole));
+        planner.apply(&whole).unwrap();
+        commit(&mut pool, "one", vec![at(3, 1.0)]);
+        for (number, changes) in [vec![at(5, 2.0)], vec![at(5, 3.0), at(7, 3.0)], Vec::new()].into_iter().enumerate() {
+            let id = project(&mut pool, 2, changes, Footprint::Everything);
+            let bases: Vec<Digest> = planner.digests().collect();
+            let delta = pool.scene(Some(id), &bases).unwrap();
+            assert_eq!(delta.from, Some(bases[0]), "{number}: from the scene used last");
+            assert!(delta.len() <= 3 && bytes(&delta) <= MOST_BYTES, "{number}: {} bytes", bytes(&delta));
+            let expected = Scene::of(&pool.projections[&id].world).unwrap();
+            assert_eq!(*planner.apply(&delta).unwrap(), expected, "{number}");
+        }
+    }
+
+    #[test]
+    fn who_has_no_scene_that_is_kept_is_sent_all_of_it() {
+        let mut pool = pool();
+        let first = pool.scene(None, &[]).unwrap().to;
+        for number in 0..MAX_SENT {
+            commit(&mut pool, &number.to_string(), vec![at(0, 1.0 + number as f64)]);
+            pool.scene(None, &[first]).unwrap();
+        }
+        let late = pool.scene(None, &[first]).unwrap();
+        assert_eq!((late.from, late.len()), (None, OBJECTS));
+        assert!(pool.scenes.sent.len() <= MAX_SENT && pool.scenes.followed.len() <= MAX_FOLLOWED);
+        let unknown = pool.scene(None, &[Digest::default()]).unwrap();
+        assert_eq!(unknown.from, None);
+    }
+
+    #[test]
+    fn a_scene_is_made_of_what_is_shown_and_of_nothing_else() {
+        let mut pool = pool();
+        let reads = Footprint::Patterns(vec![FactPattern::of(&fact("at", 1)), FactPattern::of(&fact("shape", 1))]);
+        let id = project(&mut pool, 1, vec![at(1, 4.0), at(2, 4.0)], reads);
+        let delta = pool.scene(Some(id), &[]).unwrap();
+        assert_eq!(delta.changed.len(), 1);
+        assert_eq!(delta.changed[0].1.name, "box_1");
+        assert!(pool.release(id));
+        assert_eq!(pool.scene(Some(id), &[]), Err(QueryError::Unknown { id }));
+        commit(&mut pool, "bad", vec![Change::Set { fact: fact("at", 1), value: Value::Int(1) }]);
+        assert!(matches!(pool.scene(None, &[]), Err(QueryError::Scene(_))));
+    }
+}

@@ -1,0 +1,45 @@
+//! The scene of a goal's projection: fetched as what it differs by from one that the worker has.
+
+use super::GoalContext;
+use super::context::WorldFailure;
+use ratn_world::digest::Digest;
+use ratn_world::scene::Scene;
+use ratn_world::scene::delta::Scenes;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Scenes that a worker keeps, to be sent only what is otherwise in the next.
+const MAX_KEPT: usize = 8;
+
+/// The scenes that an action used last; it has one for as long as it lives.
+#[derive(Debug)]
+pub struct SceneCache(Mutex<Scenes>);
+
+impl Default for SceneCache {
+    fn default() -> SceneCache {
+        SceneCache(Mutex::new(Scenes::new(MAX_KEPT)))
+    }
+}
+
+impl SceneCache {
+    fn kept(&self) -> MutexGuard<'_, Scenes> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl GoalContext {
+    /// The geometric scene of the goal's projection (of the root, where it has none), made of the facts that it shows.
+    ///
+    /// # Errors
+    /// [`WorldFailure`]; also where a geometric fact makes no geometry.
+    pub async fn scene(&self, cache: &SceneCache) -> Result<Arc<Scene>, WorldFailure> {
+        let client = self.world_client()?;
+        let bases: Vec<Digest> = cache.kept().digests().collect();
+        let delta = client.scene(self.projection, &bases).await?;
+        if let Ok(scene) = cache.kept().apply(&delta) {
+            return Ok(scene);
+        }
+        // Other goals have used others meanwhile.
+        let whole = client.scene(self.projection, &[]).await?;
+        Ok(cache.kept().apply(&whole)?)
+    }
+}
