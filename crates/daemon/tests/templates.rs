@@ -3,7 +3,9 @@
 
 mod support;
 
-use ratn_daemon::process_manager::{Limits, Parameter, Readiness, Template};
+use ratn_daemon::process_manager::{Limits, Liveness, Parameter, Readiness, Template};
+use ratn_proto::types::ResourceEventKind;
+use std::time::Duration;
 use support::{Daemon, TestSystem, in_time};
 
 /// A shell that runs `script`.
@@ -85,7 +87,7 @@ async fn a_worker_is_ready_when_it_notifies() {
     let system = TestSystem::new();
     let manager = system.resource_manager().await;
     let mut watch = system.watch(&manager, &["Quiet"]).await;
-    let processes = system.process_manager(vec![test_worker(&["notify"], Readiness::Notify)]).await;
+    let processes = system.process_manager(vec![test_worker(&["notify"], Readiness::Notify { watchdog: false })]).await;
     watch.created("Quiet").await;
     assert!(system.directory.path().join("quiet-1@compute.notify").exists());
     processes.end().await;
@@ -133,7 +135,8 @@ async fn a_template_is_started_after_those_it_waits_for() {
     let manager = system.resource_manager().await;
     let mut watch = system.watch(&manager, &["Quiet", "Shell"]).await;
     let second = Template { after: vec!["quiet".to_owned()], ..shell("echo here; exec cat", line("here")) };
-    let processes = system.process_manager(vec![second, test_worker(&["notify"], Readiness::Notify)]).await;
+    let processes =
+        system.process_manager(vec![second, test_worker(&["notify"], Readiness::Notify { watchdog: false })]).await;
     let mut kinds = Vec::new();
     while kinds.len() < 2 {
         kinds
@@ -141,4 +144,43 @@ async fn a_template_is_started_after_those_it_waits_for() {
     }
     assert_eq!(kinds, ["Quiet", "Shell"]);
     processes.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_does_not_say_any_more_that_it_lives_has_hung() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut watch = system.watch(&manager, &["Quiet"]).await;
+    let liveness = Liveness { interval_s: 0.1, timeout_s: 0.4 };
+    let template = Template { liveness, ..test_worker(&["watchdog", "8"], Readiness::Notify { watchdog: true }) };
+    let processes = system.process_manager(vec![template]).await;
+    let began = std::time::Instant::now();
+    watch.created("Quiet").await;
+    watch.event(|event| event.kind == ResourceEventKind::Deleted).await;
+    assert!(began.elapsed() > Duration::from_millis(700), "it lived while it said so: {:?}", began.elapsed());
+    let pool = system.processes(&processes).pools().await.unwrap().pools.remove(0);
+    assert!(pool.last_exit.contains("hung: no WATCHDOG=1 within 0.4 s"), "{pool:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_worker_runs_as_the_user_that_its_template_says_without_other_groups() {
+    if !nix::unistd::geteuid().is_root() {
+        eprintln!("skipped: only root may run workers as another user");
+        return;
+    }
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut watch = system.watch(&manager, &["Test"]).await;
+    let program = Some("/bin/sh".into());
+    let text = "echo as $(id -un) $(id -G) $USER; echo x > {endpoint_file}.mine && echo ready; exec cat";
+    let args = vec!["-c".to_owned(), text.to_owned()];
+    let user = Some("nobody".to_owned());
+    let readiness = Readiness::Line { contains: "ready".to_owned() };
+    let template = Template { program, args, user, readiness, ..Template::new("test", "Test") };
+    let processes = system.process_manager(vec![template]).await;
+    let worker = watch.created("Test").await;
+    let mut log = system.processes(&processes).log(&worker.id, false).await.unwrap();
+    let text = String::from_utf8(in_time(log.next()).await.unwrap().unwrap()).unwrap();
+    let group = nix::unistd::User::from_name("nobody").unwrap().unwrap().gid;
+    assert_eq!(text, format!("as nobody {group} nobody\nready\n"), "and it can write its endpoint file");
 }

@@ -37,7 +37,9 @@ pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
         let interrupt = Interrupt::listen()?;
         for plan in plans(arguments) {
             output::progress(format_args!("\n{}", plan.announcement(arguments)));
-            let outcome = one_run(&plan, arguments, &config, &program, &directory, &interrupt).await;
+            let run = one_run(&plan, arguments, &config, &program, &directory, &interrupt);
+            // A config is large.
+            let outcome = Box::pin(run).await;
             let outcome = outcome.with_context(|| plan.name())?;
             let (end, delivered) = (outcome.end.clone(), outcome.delivered);
             demonstration.outcomes.push(outcome);

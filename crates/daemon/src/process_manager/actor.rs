@@ -1,7 +1,8 @@
 //! The one task that owns the pools: performs their commands, and tells them what became of it.
 
-use super::config::ProcessManagerConfig;
+use super::config::{Labels, ProcessManagerConfig};
 use super::drained::Drained;
+use super::machine::Sample;
 use super::offered;
 use super::pools::{Command, Event, PoolError, Pools, Restart};
 use super::predecessor::Adopted;
@@ -73,10 +74,13 @@ pub(super) struct Parts {
     pub(super) demand: mpsc::Receiver<Vec<Demand>>,
     /// Why there is no more.
     pub(super) short: watch::Sender<Shortages>,
+    /// What the machine has.
+    pub(super) looks: mpsc::Receiver<Sample>,
 }
 
 struct Actor {
     host: String,
+    labels: Labels,
     pools: Pools,
     processes: Processes,
     start: Instant,
@@ -91,15 +95,16 @@ struct Actor {
 /// Starts the actor; it ends with the token, once every worker has.
 pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Result<(Handle, JoinHandle<()>)> {
     let (inbox, messages) = mpsc::channel(INBOX);
-    let Parts { config, directory, roster, before, adopted, wanted, leaves, there, uses, demand, short } = parts;
+    let Parts { config, directory, roster, before, adopted, wanted, leaves, there, uses, demand, short, looks } = parts;
     let drained = Drained::of(&directory);
     let (processes, told) = Processes::start(&config, directory, roster)?;
-    let mut pools = Pools::new(&config.host, config.templates);
+    let mut pools = Pools::new(&config.host, config.templates).with_labels(config.labels.clone());
     pools.go_on_after(&before);
     let actor = Actor {
         pools,
         processes,
         host: config.host,
+        labels: config.labels,
         start: Instant::now(),
         wanted,
         leaves,
@@ -108,7 +113,7 @@ pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Resul
         usage: Usage::new(),
         drained,
     };
-    let inputs = Inputs { messages, told, there, uses, demand };
+    let inputs = Inputs { messages, told, there, uses, demand, looks };
     Ok((Handle { inbox }, tokio::spawn(actor.run(adopted, inputs, shutdown))))
 }
 
@@ -126,6 +131,7 @@ struct Inputs {
     there: mpsc::Receiver<Offering>,
     uses: mpsc::Receiver<Use>,
     demand: mpsc::Receiver<Vec<Demand>>,
+    looks: mpsc::Receiver<Sample>,
 }
 
 impl Actor {
@@ -158,6 +164,7 @@ impl Actor {
                 }),
                 Some(Use { id, held }) = inputs.uses.recv() => self.handle(Event::Used { id, held }),
                 Some(demand) = inputs.demand.recv() => self.handle(Event::Demanded(demand)),
+                Some(sample) = inputs.looks.recv() => self.handle(Event::Looked(sample)),
                 Some(message) = inputs.messages.recv() => self.receive(message),
                 () = sleep_until(deadline) => self.handle(Event::Time),
                 () = shutdown.cancelled() => break,
@@ -251,9 +258,9 @@ impl Actor {
 
     fn became(&mut self, outcome: Outcome) {
         match outcome {
-            Outcome::Spawned { id, pid, limits, group } => {
+            Outcome::Spawned { id, pid, limits, groups } => {
                 tracing::info!(id, pid, limits, "worker started");
-                self.processes.spawned(&id, pid, &limits, group);
+                self.processes.spawned(&id, pid, &limits, groups);
                 self.handle(Event::Spawned { id, pid, limits });
             }
             Outcome::Exited { id, reason, last_words } => {
@@ -313,7 +320,7 @@ impl Actor {
     }
 
     fn offer(&self, worker: &WorkerStatus, kind: &str) {
-        let resource = offered::worker(&self.host, worker, kind);
+        let resource = offered::worker(&self.host, &self.labels, worker, kind);
         self.wanted.send_modify(|wanted| {
             wanted.insert(worker.id.clone(), resource);
         });

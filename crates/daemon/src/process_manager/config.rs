@@ -1,15 +1,49 @@
 //! The process manager's config: which workers it may start, and how. A client names a template, never a command.
 
+use super::limits::GroupsV1;
+use super::machine::MachineConfig;
 use super::order;
 use super::template::Template;
 use crate::config::{Check, ConfigError, rule};
+use ratn_model::value::Value;
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
+/// Names that labels cannot have.
+const TAKEN: [&str; 9] =
+    ["host", "pid", "endpoint", "cores", "load_per_core", "idle_cores", "free_memory_mib", "free_disk_mib", "level"];
 /// A name of a template or a host has at most so many bytes: ids are made of both.
 const MAX_NAME_BYTES: usize = 48;
+
+/// What is said of a host, by name.
+pub type Labels = BTreeMap<String, Label>;
+
+/// Something that is said of a host.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Label {
+    /// Yes or no.
+    Bool(bool),
+    /// A whole number.
+    Int(i64),
+    /// A number.
+    Float(f64),
+    /// A word.
+    Text(String),
+}
+
+impl From<&Label> for Value {
+    fn from(label: &Label) -> Value {
+        match label {
+            Label::Bool(value) => Value::Bool(*value),
+            Label::Int(value) => Value::Int(*value),
+            Label::Float(value) => Value::Float(*value),
+            Label::Text(value) => Value::String(value.clone()),
+        }
+    }
+}
 
 /// All keys are optional.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -26,6 +60,12 @@ pub struct ProcessManagerConfig {
     /// A directory of cgroup v2 that is the process manager's to divide, `/sys/fs/cgroup/ratn`: then `limits` are kept by a group for
     /// each worker, and with all that it starts.
     pub cgroup: Option<PathBuf>,
+    /// Directories of cgroup v1 that are the process manager's to divide, one for each controller; where `cgroup` is not given.
+    pub cgroup_v1: GroupsV1,
+    /// What else is to be said of this host and its workers, for tasks that choose by it: `gpu = true`.
+    pub labels: Labels,
+    /// What of this machine is offered.
+    pub machine: MachineConfig,
     /// A worker's log file is begun anew beyond this size, in bytes (the one before is kept as `.log.1`).
     pub max_log_bytes: u64,
     /// The pools.
@@ -41,6 +81,9 @@ impl Default for ProcessManagerConfig {
             resource_manager: None,
             session_ttl_ms: 3_000,
             cgroup: None,
+            cgroup_v1: GroupsV1::default(),
+            labels: Labels::new(),
+            machine: MachineConfig::default(),
             max_log_bytes: 16 * 1024 * 1024,
             templates: Vec::new(),
         }
@@ -70,6 +113,13 @@ impl Check for ProcessManagerConfig {
         check_name("host", &self.host)?;
         rule("session_ttl_ms", self.session_ttl_ms >= 100, "at least 100 ms")?;
         rule("max_log_bytes", self.max_log_bytes >= 4_096, "at least 4096")?;
+        self.machine.check()?;
+        for (name, label) in &self.labels {
+            let key = format!("labels.{name}");
+            check_name(&key, name)?;
+            rule(&key, !TAKEN.contains(&name.as_str()), "is said of every host already")?;
+            rule(&key, !matches!(label, Label::Float(value) if !value.is_finite()), "a finite number")?;
+        }
         let mut names = BTreeSet::new();
         for (i, template) in self.templates.iter().enumerate() {
             let key = format!("template[{i}]");

@@ -1,5 +1,5 @@
 //! What a worker may use of the machine: kept by a group of cgroup v2 of its own where the config names a directory for them, else by
-//! the limits of its process (`setrlimit(2)`), as far as these go. What is in force is said, never assumed.
+//! groups of cgroup v1, one for each controller that it names a directory for, else by the limits of its process (`setrlimit(2)`), as far as these go. What is in force is said, never assumed.
 //!
 //! They are set right after the process is started: nothing may run in the child before its program does.
 
@@ -27,11 +27,30 @@ pub struct Limits {
     pub open_files: Option<u64>,
 }
 
-/// What is in force for a worker; its group goes with this.
+/// Directories of cgroup v1, by controller. All keys are optional.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GroupsV1 {
+    /// For `memory_mib`: `/sys/fs/cgroup/memory/ratn`.
+    pub memory: Option<PathBuf>,
+    /// For `cpus`.
+    pub cpu: Option<PathBuf>,
+    /// For `processes`.
+    pub pids: Option<PathBuf>,
+}
+
+/// Where groups are made.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Groups {
+    pub(super) v2: Option<PathBuf>,
+    pub(super) v1: GroupsV1,
+}
+
+/// What is in force for a worker; its groups go with this.
 #[derive(Debug, Default)]
 pub(super) struct InForce {
     words: Vec<String>,
-    group: Option<Group>,
+    groups: Vec<Group>,
 }
 
 #[derive(Debug)]
@@ -48,42 +67,83 @@ impl Limits {
         rule(key("open_files"), self.open_files.is_none_or(|count| (16..=1 << 30).contains(&count)), "at least 16")
     }
 
-    /// Puts them on a process that has just been started; `groups` is where groups are made.
-    pub(super) fn enforce(&self, id: &str, pid: u32, groups: Option<&Path>) -> InForce {
+    /// Puts them on a process that has just been started.
+    pub(super) fn enforce(&self, id: &str, pid: u32, groups: &Groups) -> InForce {
         let mut force = InForce::default();
-        let grouped = groups.filter(|_| self.memory_mib.or(self.processes).is_some() || self.cpus.is_some());
-        let grouped = grouped.map(|groups| self.group(groups, id, pid));
-        match grouped {
-            Some(Ok(group)) => {
-                force.group = Some(group);
-                force.words.extend(self.memory_mib.map(|mib| format!("memory {mib} MiB (cgroup)")));
-                force.words.extend(self.cpus.map(|cpus| format!("{cpus} cpus (cgroup)")));
-                force.words.extend(self.processes.map(|count| format!("{count} processes (cgroup)")));
-            }
-            failed => {
-                if let Some(Err(error)) = failed {
-                    tracing::warn!(id, %error, "no group for a worker");
+        let needed = self.memory_mib.or(self.processes).is_some() || self.cpus.is_some();
+        let mut missing = *self;
+        if let Some(v2) = groups.v2.as_deref().filter(|_| needed) {
+            match self.group(v2, id, pid) {
+                Ok(group) => {
+                    force.say("cgroup", self);
+                    force.groups.push(group);
+                    missing = Limits { open_files: None, ..Limits::default() };
                 }
-                force.limit(pid, Resource::Data, self.memory_mib.map(|mib| mib * MIB), |_| {
-                    format!("data {} MiB (rlimit)", self.memory_mib.unwrap_or_default())
-                });
-                force.words.extend(self.cpus.map(|_| "cpus not limited: no cgroup".to_owned()));
-                force.words.extend(self.processes.map(|_| "processes not limited: no cgroup".to_owned()));
+                Err(error) => tracing::warn!(id, %error, "no group for a worker"),
             }
         }
+        for (place, alone) in missing.by_controller(&groups.v1) {
+            match alone.group_v1(&place, id, pid) {
+                Ok(group) => {
+                    force.say("cgroup v1", &alone);
+                    force.groups.push(group);
+                    missing = missing.without(&alone);
+                }
+                Err(error) => tracing::warn!(id, %error, "no group of cgroup v1 for a worker"),
+            }
+        }
+        force.limit(pid, Resource::Data, missing.memory_mib.map(|mib| mib * MIB), |bytes| {
+            format!("data {} MiB (rlimit)", bytes / MIB)
+        });
+        force.words.extend(missing.cpus.map(|_| "cpus not limited: no cgroup".to_owned()));
+        force.words.extend(missing.processes.map(|_| "processes not limited: no cgroup".to_owned()));
         force.limit(pid, Resource::Nofile, self.open_files, |count| format!("{count} open files (rlimit)"));
         force
+    }
+
+    /// Each that cgroup v1 has a directory for, alone, with that directory.
+    fn by_controller(&self, v1: &GroupsV1) -> Vec<(PathBuf, Limits)> {
+        let none = Limits::default();
+        let memory =
+            self.memory_mib.and(v1.memory.clone()).map(|place| (place, Limits { memory_mib: self.memory_mib, ..none }));
+        let cpu = self.cpus.and(v1.cpu.clone()).map(|place| (place, Limits { cpus: self.cpus, ..none }));
+        let pids =
+            self.processes.and(v1.pids.clone()).map(|place| (place, Limits { processes: self.processes, ..none }));
+        [memory, cpu, pids].into_iter().flatten().collect()
+    }
+
+    fn without(self, other: &Limits) -> Limits {
+        Limits {
+            memory_mib: self.memory_mib.filter(|_| other.memory_mib.is_none()),
+            cpus: self.cpus.filter(|_| other.cpus.is_none()),
+            processes: self.processes.filter(|_| other.processes.is_none()),
+            open_files: self.open_files,
+        }
+    }
+
+    /// A group of cgroup v1 with the one limit that is there, and the process in it.
+    fn group_v1(&self, place: &Path, id: &str, pid: u32) -> io::Result<Group> {
+        let group = Group { path: place.join(id) };
+        std::fs::create_dir_all(&group.path)?;
+        if let Some(mib) = self.memory_mib {
+            group.write("memory.limit_in_bytes", (mib * MIB).to_string())?;
+        }
+        if let Some(cpus) = self.cpus {
+            group.write("cpu.cfs_period_us", PERIOD_US.to_string())?;
+            group.write("cpu.cfs_quota_us", (cpus * PERIOD_US as f64).round().to_string())?;
+        }
+        if let Some(count) = self.processes {
+            group.write("pids.max", count.to_string())?;
+        }
+        group.write("cgroup.procs", pid.to_string())?;
+        Ok(group)
     }
 
     /// A group with these limits, and the process in it.
     fn group(&self, groups: &Path, id: &str, pid: u32) -> io::Result<Group> {
         let group = Group { path: groups.join(id) };
         std::fs::create_dir_all(&group.path)?;
-        let write = |file: &str, text: String| {
-            let path = group.path.join(file);
-            std::fs::write(&path, text)
-                .map_err(|error| io::Error::new(error.kind(), format!("{}: {error}", path.display())))
-        };
+        let write = |file: &str, text: String| group.write(file, text);
         if let Some(mib) = self.memory_mib {
             write("memory.max", (mib * MIB).to_string())?;
             write("memory.swap.max", "0".to_owned()).or_else(|error| match error.kind() {
@@ -104,14 +164,20 @@ impl Limits {
 }
 
 impl InForce {
-    /// Those of a worker that was taken over, whose group goes with this.
-    pub(super) fn adopted(group: Option<PathBuf>) -> InForce {
-        InForce { words: Vec::new(), group: group.map(|path| Group { path }) }
+    /// Those of a worker that was taken over, whose groups go with this.
+    pub(super) fn adopted(groups: Vec<PathBuf>) -> InForce {
+        InForce { words: Vec::new(), groups: groups.into_iter().map(|path| Group { path }).collect() }
     }
 
-    /// The directory of its group.
-    pub(super) fn group(&self) -> Option<&Path> {
-        self.group.as_ref().map(|group| group.path.as_path())
+    /// The directories of its groups.
+    pub(super) fn groups(&self) -> Vec<PathBuf> {
+        self.groups.iter().map(|group| group.path.clone()).collect()
+    }
+
+    fn say(&mut self, by: &str, limits: &Limits) {
+        self.words.extend(limits.memory_mib.map(|mib| format!("memory {mib} MiB ({by})")));
+        self.words.extend(limits.cpus.map(|cpus| format!("{cpus} cpus ({by})")));
+        self.words.extend(limits.processes.map(|count| format!("{count} processes ({by})")));
     }
 
     /// In words, for people; empty without limits.
@@ -128,6 +194,14 @@ impl InForce {
     }
 }
 
+impl Group {
+    fn write(&self, file: &str, text: String) -> io::Result<()> {
+        let path = self.path.join(file);
+        std::fs::write(&path, text)
+            .map_err(|error| io::Error::new(error.kind(), format!("{}: {error}", path.display())))
+    }
+}
+
 impl Drop for Group {
     fn drop(&mut self) {
         end_group(&self.path);
@@ -136,7 +210,13 @@ impl Drop for Group {
 
 /// What a worker started and left behind ends with it. The group is gone where nobody is left.
 pub(super) fn end_group(path: &Path) {
-    let _ = std::fs::write(path.join("cgroup.kill"), "1");
+    if std::fs::write(path.join("cgroup.kill"), "1").is_err() {
+        // Of cgroup v1.
+        let left = std::fs::read_to_string(path.join("cgroup.procs")).unwrap_or_default();
+        for pid in left.split_whitespace().filter_map(|pid| Pid::from_raw(pid.parse().ok()?)) {
+            let _ = rustix::process::kill_process(pid, rustix::process::Signal::KILL);
+        }
+    }
     if let Err(error) = std::fs::remove_dir(path) {
         tracing::debug!(group = %path.display(), %error, "a group of a worker stays");
     }
@@ -149,6 +229,51 @@ mod tests {
 
     const ALL: Limits = Limits { memory_mib: Some(64), cpus: Some(1.5), processes: Some(8), open_files: Some(100) };
 
+    fn v2(place: &Path) -> Groups {
+        Groups { v2: Some(place.to_owned()), v1: GroupsV1::default() }
+    }
+
+    #[test]
+    fn of_cgroup_v1_each_controller_has_a_group_and_what_has_none_is_limited_otherwise_or_said() {
+        let places = tempfile::tempdir().unwrap();
+        let place = |name: &str| Some(places.path().join(name));
+        let groups = Groups { v2: None, v1: GroupsV1 { memory: place("memory"), cpu: place("cpu"), pids: None } };
+        let mut child = child();
+        let force = ALL.enforce("planner-1@compute", child.id(), &groups);
+        let of = |file: &str| std::fs::read_to_string(places.path().join(file)).unwrap();
+        assert_eq!(of("memory/planner-1@compute/memory.limit_in_bytes"), "67108864");
+        assert_eq!(of("memory/planner-1@compute/cgroup.procs"), child.id().to_string());
+        assert_eq!(of("cpu/planner-1@compute/cpu.cfs_quota_us"), "150000");
+        let words = "memory 64 MiB (cgroup v1), 1.5 cpus (cgroup v1), processes not limited: no cgroup, \
+                     100 open files (rlimit)";
+        assert_eq!(force.words(), words);
+        // These are files of a disk, and the child is in none of them.
+        child.kill().unwrap();
+        child.wait().unwrap();
+    }
+
+    /// The kernel's own, where this machine has them and they may be divided.
+    #[test]
+    fn a_group_of_the_kernel_s_cgroup_v1_holds_and_goes_with_its_worker() {
+        let place = PathBuf::from(format!("/sys/fs/cgroup/pids/ratn-test-{}", std::process::id()));
+        if !Path::new("/sys/fs/cgroup/pids/cgroup.procs").exists() || std::fs::create_dir(&place).is_err() {
+            eprintln!("skipped: no cgroup v1 that may be divided here");
+            return;
+        }
+        let groups = Groups { v2: None, v1: GroupsV1 { pids: Some(place.clone()), ..GroupsV1::default() } };
+        let mut child = child();
+        let force =
+            Limits { processes: Some(3), ..Limits::default() }.enforce("planner-1@compute", child.id(), &groups);
+        let of = |file: &str| std::fs::read_to_string(place.join("planner-1@compute").join(file)).unwrap();
+        assert_eq!((force.words().as_str(), of("pids.max").trim()), ("3 processes (cgroup v1)", "3"));
+        assert_eq!(of("cgroup.procs").trim(), child.id().to_string());
+        end_group(&place.join("planner-1@compute"));
+        assert!(!child.wait().unwrap().success(), "whoever is left in it is ended");
+        drop(force);
+        assert!(!place.join("planner-1@compute").exists());
+        std::fs::remove_dir(&place).unwrap();
+    }
+
     fn child() -> std::process::Child {
         std::process::Command::new("sleep").arg("60").spawn().unwrap()
     }
@@ -156,7 +281,7 @@ mod tests {
     #[test]
     fn without_groups_the_process_itself_is_limited_and_what_is_not_is_said() {
         let mut child = child();
-        let force = ALL.enforce("planner-1@compute", child.id(), None);
+        let force = ALL.enforce("planner-1@compute", child.id(), &Groups::default());
         let limits = std::fs::read_to_string(format!("/proc/{}/limits", child.id())).unwrap();
         child.kill().unwrap();
         child.wait().unwrap();
@@ -173,7 +298,7 @@ mod tests {
     fn with_groups_each_worker_has_one_of_its_own() {
         let groups = tempfile::tempdir().unwrap();
         let mut child = child();
-        let force = ALL.enforce("planner-1@compute", child.id(), Some(groups.path()));
+        let force = ALL.enforce("planner-1@compute", child.id(), &v2(groups.path()));
         let of = |file: &str| std::fs::read_to_string(groups.path().join("planner-1@compute").join(file)).unwrap();
         assert_eq!((of("memory.max"), of("cpu.max")), ("67108864".to_owned(), "150000 100000".to_owned()));
         assert_eq!((of("pids.max"), of("cgroup.procs")), ("8".to_owned(), child.id().to_string()));
@@ -185,7 +310,7 @@ mod tests {
     #[test]
     fn where_no_group_can_be_made_the_process_is_limited() {
         let mut child = child();
-        let force = ALL.enforce("planner-1@compute", child.id(), Some(Path::new("/proc/no/groups")));
+        let force = ALL.enforce("planner-1@compute", child.id(), &v2(Path::new("/proc/no/groups")));
         child.kill().unwrap();
         child.wait().unwrap();
         assert!(force.words().starts_with("data 64 MiB (rlimit)"), "{}", force.words());

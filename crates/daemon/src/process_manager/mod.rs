@@ -8,6 +8,7 @@
 //! ```
 //! What the workers do, and who uses them, it does not know.
 
+mod account;
 mod actor;
 mod config;
 mod drained;
@@ -16,6 +17,7 @@ mod limits;
 mod log;
 pub mod log_file;
 mod log_stream;
+mod machine;
 mod offered;
 mod order;
 mod parameter;
@@ -30,16 +32,18 @@ mod status;
 mod template;
 mod usage;
 
-pub use config::ProcessManagerConfig;
-pub use limits::Limits;
+pub use config::{Label, Labels, ProcessManagerConfig};
+pub use limits::{GroupsV1, Limits};
+pub use machine::{MachineConfig, Sample};
 pub use parameter::Parameter;
 pub use readiness::Readiness;
 pub use roster::RosterError;
-pub use template::{Liveness, Template};
+pub use template::{Liveness, Needs, Template};
 
 use crate::demand::{DemandLink, Shortages};
 use crate::link::{Link, Manager, Turnover, Wanted};
 use anyhow::Context;
+use machine::Machine;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
 use ratn_worker::client::fresh_id;
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -49,6 +53,7 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
 
 /// The role's name: of its endpoint file, its command and its section of a config.
 pub const ROLE: &str = "process-manager";
@@ -93,8 +98,11 @@ pub async fn run_as(
     let adopted = predecessor::settle(left, &config.templates, &directory).await;
     roster.keep_only(&adopted.iter().map(|one| one.entry.id.as_str()).collect());
     let (wanted, to_offer) = watch::channel(Wanted::new());
-    let workers = adopted.iter().map(|one| offered::worker(&config.host, &one.status(), &one.entry.template.kind));
-    let offered = workers.chain([offered::host(&config, &endpoint)]);
+    let workers = adopted
+        .iter()
+        .map(|one| offered::worker(&config.host, &config.labels, &one.status(), &one.entry.template.kind));
+    let host = offered::host(&config, &endpoint);
+    let offered = workers.chain([host.clone()]);
     wanted.send_modify(|wanted| wanted.extend(offered.map(|resource| (resource.id.clone(), resource))));
     let (told, there) = mpsc::channel(THERE);
     let (leaves, leaving) = watch::channel(BTreeSet::new());
@@ -111,6 +119,10 @@ pub async fn run_as(
         demand: Some(DemandLink { kinds: config.kinds(), heard, shortages, used }),
     };
     let linked = tokio::spawn(link.keep(shutdown.clone()));
+    let machine = Machine { config: config.machine.clone(), labels: config.labels.clone(), host };
+    let (look, looks) = mpsc::channel(1);
+    let watching = machine.watch(directory.clone(), wanted.clone(), look);
+    let watching = AbortOnDropHandle::new(tokio::spawn(watching));
     let parts = actor::Parts {
         config,
         directory: directory.clone(),
@@ -123,13 +135,14 @@ pub async fn run_as(
         uses,
         demand,
         short,
+        looks,
     };
     let (actor, ended) = actor::start(parts, shutdown.clone()).context("cannot start workers")?;
     let service = ProcessServiceServer::new(service::Service::new(actor, directory.clone(), shutdown.clone()));
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
     let served = bound.serve_as(Services::new().with(service), serving, shutdown.clone()).await;
-    drop(published);
+    drop((published, watching));
     shutdown.cancel();
     let _ = tokio::join!(linked, ended);
     Ok(served?)

@@ -1,27 +1,56 @@
-//! What a process manager offers to the resource manager: its host, and every worker that is ready.
+//! What a process manager offers to the resource manager: its host with what the machine has, and every worker that is ready.
 
 use super::HOST_KIND;
-use super::config::ProcessManagerConfig;
+use super::config::{Labels, ProcessManagerConfig};
+use super::machine::Sample;
 use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
 use ratn_proto::types::{Resource, WorkerStatus};
 use ratn_worker::endpoint::Endpoint;
 
+const MIB: u64 = 1 << 20;
+
 /// This host, by whose endpoint its process manager is found.
 pub(super) fn host(config: &ProcessManagerConfig, endpoint: &Endpoint) -> Resource {
-    Resource::new(format!("host@{}", config.host), ResourceClass::System, HOST_KIND)
-        .with_endpoint(endpoint)
-        .with_attribute("host", Value::String(config.host.clone()))
-        .on_host(&config.host)
+    let host = of_host(format!("host@{}", config.host), ResourceClass::System, HOST_KIND, &config.host, &config.labels);
+    host.with_endpoint(endpoint)
+}
+
+/// With what there is of it now: memory and disk in MiB, load and idle processors rounded to hundredths.
+pub(super) fn host_with(host: Resource, sample: &Sample) -> Resource {
+    let mib = |bytes: u64| Value::Int(i64::try_from(bytes / MIB).unwrap_or(i64::MAX));
+    host.with_attribute("cores", Value::Int(sample.cores.into()))
+        .with_attribute("load_per_core", rounded(sample.load_per_core))
+        .with_attribute("idle_cores", rounded(sample.idle_cores))
+        .with_attribute("free_memory_mib", mib(sample.free_memory_bytes))
+        .with_attribute("free_disk_mib", mib(sample.free_disk_bytes))
+}
+
+/// Its processors, for who wants some to itself; nothing where there are none.
+pub(super) fn cores(host: &str, labels: &Labels, cores: u32) -> Option<Resource> {
+    let resource = of_host(format!("cores@{host}"), ResourceClass::System, "Core", host, labels);
+    (cores > 0).then(|| resource.with_capacity(cores))
+}
+
+/// Its battery, as the simulated cell offers its own.
+pub(super) fn battery(host: &str, level: f64) -> Resource {
+    let resource = Resource::new(format!("battery@{host}"), ResourceClass::System, "Battery").divisible();
+    resource.with_attribute("level", rounded(level)).on_host(host)
 }
 
 /// A worker, as a resource of `kind`.
-pub(super) fn worker(host: &str, worker: &WorkerStatus, kind: &str) -> Resource {
-    let resource = Resource::new(&worker.id, ResourceClass::Process, kind);
+pub(super) fn worker(host: &str, labels: &Labels, worker: &WorkerStatus, kind: &str) -> Resource {
+    let resource = of_host(worker.id.clone(), ResourceClass::Process, kind, host, labels);
     // One that is no server has none.
     let resource = if worker.endpoint.is_empty() { resource } else { resource.with_endpoint(&worker.endpoint) };
-    resource
-        .with_attribute("host", Value::String(host.to_owned()))
-        .with_attribute("pid", Value::Int(i64::from(worker.pid)))
-        .on_host(host)
+    resource.with_attribute("pid", Value::Int(i64::from(worker.pid)))
+}
+
+fn of_host(id: String, class: ResourceClass, kind: &str, host: &str, labels: &Labels) -> Resource {
+    let resource = Resource::new(id, class, kind).with_attribute("host", Value::String(host.to_owned())).on_host(host);
+    labels.iter().fold(resource, |resource, (name, label)| resource.with_attribute(name, label.into()))
+}
+
+fn rounded(number: f64) -> Value {
+    Value::Float((number * 100.0).round() / 100.0)
 }

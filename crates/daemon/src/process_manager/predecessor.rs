@@ -6,6 +6,7 @@
 //!   everybody else ──▶ SIGTERM, after `stop_timeout_s` SIGKILL, and with it all that it started
 //! ```
 
+use super::account;
 use super::limits::end_group;
 use super::roster::Entry;
 use super::spawner;
@@ -137,7 +138,7 @@ async fn greet(
     if entry.endpoint.is_none() {
         return Err((exit, "it was not ready yet"));
     }
-    let socket = adopt_socket(directory, &entry.id);
+    let socket = adopt_socket(&account::directory_of(directory, &entry.template), &entry.id);
     match timeout(GREETING_PATIENCE, UnixStream::connect(socket)).await {
         Ok(Ok(parent_lives)) => {
             let outdated = !template.starts_the_same_as(&entry.template);
@@ -161,9 +162,8 @@ async fn end(entry: &Entry, exit: &Exit) {
 }
 
 fn clear_up(entry: &Entry, directory: &RuntimeDirectory) {
-    if let Some(group) = &entry.group {
-        end_group(group);
-    }
+    entry.groups.iter().for_each(|group| end_group(group));
+    let directory = &account::directory_of(directory, &entry.template);
     let files = [directory.endpoint_file(&entry.id), adopt_socket(directory, &entry.id)];
     for file in files {
         let _ = std::fs::remove_file(file);

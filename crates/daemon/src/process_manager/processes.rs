@@ -1,7 +1,9 @@
 //! The processes of the workers: begins them from their templates, signals them, waits until they serve, and clears up behind them.
 
+use super::account::{self, Account};
 use super::config::ProcessManagerConfig;
 use super::environment;
+use super::limits::Groups;
 use super::log::{Awaited, EndedLogs};
 use super::log_file::log_file;
 use super::parameter;
@@ -38,6 +40,9 @@ pub(super) enum BeginError {
     /// Too many processes are being started at once.
     #[error("cannot be started: too many processes are being started")]
     Busy,
+    /// It cannot run as the user that its template says.
+    #[error("cannot be started: {0}")]
+    User(String),
     /// Its socket cannot be made.
     #[error("cannot be started: no socket {} for it to notify: {reason}", socket.display())]
     Socket {
@@ -52,7 +57,7 @@ pub(super) struct Processes {
     host: String,
     max_log_bytes: u64,
     /// Where groups of processes are made.
-    groups: Option<PathBuf>,
+    groups: Groups,
     directory: RuntimeDirectory,
     /// What a template without a program runs.
     this_program: PathBuf,
@@ -70,8 +75,10 @@ struct Tell {
     health: mpsc::Sender<(String, Result<(), String>)>,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Process {
+    /// Where its files are.
+    directory: RuntimeDirectory,
     pid: u32,
     /// As it was started from, until that is in the roster.
     template: Option<Template>,
@@ -91,7 +98,7 @@ impl Processes {
         let processes = Processes {
             host: config.host.clone(),
             max_log_bytes: config.max_log_bytes,
-            groups: config.cgroup.clone(),
+            groups: Groups { v2: config.cgroup.clone(), v1: config.cgroup_v1.clone() },
             directory,
             this_program: std::env::current_exe()?,
             jobs: spawner::start(told.clone())?,
@@ -106,28 +113,42 @@ impl Processes {
 
     /// Begins a worker of a template.
     pub(super) fn begin(&mut self, id: &str, template: &Template) -> Result<(), BeginError> {
-        let endpoint_file = self.directory.endpoint_file(id);
+        let directory = account::directory_of(&self.directory, template);
+        let account = template.user.as_deref().map(Account::named).transpose().map_err(BeginError::User)?;
+        if let Some(Err(error)) = account.as_ref().map(|account| account.make_directory(&self.directory, &directory)) {
+            return Err(BeginError::User(format!(
+                "no directory {} for its files: {error}",
+                directory.path().display()
+            )));
+        }
+        let endpoint_file = directory.endpoint_file(id);
         let builtin = |name: &str| match name {
             "id" => Some(id.to_owned()),
             "kind" => Some(template.kind.clone()),
             "host" => Some(self.host.clone()),
-            "runtime_dir" => Some(self.directory.path().display().to_string()),
+            "runtime_dir" => Some(directory.path().display().to_string()),
             "endpoint_file" => Some(endpoint_file.display().to_string()),
             _ => None,
         };
         let fill = |text: &str| parameter::fill(text, &builtin, &template.parameters);
         let _ = std::fs::remove_file(&endpoint_file);
-        let socket = self.notify_socket(id);
-        let signs = template.readiness.signs(&socket);
+        let socket = notify_socket(&directory, id);
+        let signs = template.readiness.signs(&socket).and_then(|signs| match (&signs, &account) {
+            (Signs::Notify { .. }, Some(account)) => account.give(&socket).map(|()| signs),
+            _ => Ok(signs),
+        });
         let signs = signs.map_err(|error| BeginError::Socket { socket: socket.clone(), reason: error.to_string() })?;
         let mut env = environment::passed(std::env::vars_os(), &template.pass_env);
+        env.extend(account.iter().flat_map(Account::environment));
         env.extend(template.env.iter().map(|(name, value)| (name.into(), fill(value).into())));
         if template.adopt {
-            env.insert(adoption::SOCKET_VARIABLE.into(), adopt_socket(&self.directory, id).into());
+            env.insert(adoption::SOCKET_VARIABLE.into(), adopt_socket(&directory, id).into());
             env.insert(adoption::GRACE_VARIABLE.into(), template.adopt_grace_s.to_string().into());
         }
-        if let Signs::Notify(_) = signs {
+        if let Signs::Notify { watchdog, .. } = signs {
             env.insert("NOTIFY_SOCKET".into(), socket.into());
+            let patience_us = template.liveness.timeout().as_micros().to_string();
+            env.extend(watchdog.then(|| ("WATCHDOG_USEC".into(), patience_us.into())));
         }
         let awaited = match (&signs, &template.readiness) {
             (Signs::Line(seen), Readiness::Line { contains }) => Some(Awaited::new(contains, seen.clone())),
@@ -138,6 +159,7 @@ impl Processes {
             args: template.args.iter().map(|arg| fill(arg)).collect(),
             env,
             directory: template.directory.clone(),
+            account,
             limits: template.limits,
             groups: self.groups.clone(),
             awaited,
@@ -149,20 +171,20 @@ impl Processes {
         self.jobs.try_send(job).map_err(|_| BeginError::Busy)?;
         let (ask, questions) = mpsc::channel(1);
         let within = template.start_timeout();
-        let attended = attend(self.directory.clone(), id.to_owned(), (signs, within), questions, self.tell.clone());
+        let attended = attend(directory.clone(), id.to_owned(), (signs, within), questions, self.tell.clone());
         let attended = tokio::spawn(attended).abort_handle();
-        let process = Process { pid: 0, template: Some(template.clone()), attended: Some((attended, ask)) };
+        let process = Process { directory, pid: 0, template: Some(template.clone()), attended: Some((attended, ask)) };
         self.by_id.insert(id.to_owned(), process);
         Ok(())
     }
 
     /// Its process is there.
-    pub(super) fn spawned(&mut self, id: &str, pid: u32, limits: &str, group: Option<PathBuf>) {
-        let process = self.by_id.entry(id.to_owned()).or_default();
+    pub(super) fn spawned(&mut self, id: &str, pid: u32, limits: &str, groups: Vec<PathBuf>) {
+        let Some(process) = self.by_id.get_mut(id) else { return };
         process.pid = pid;
         if let (Some(template), Some(began)) = (process.template.take(), predecessor::began(pid)) {
             let limits = limits.to_owned();
-            self.roster.began(Entry { id: id.to_owned(), pid, began, endpoint: None, limits, group, template });
+            self.roster.began(Entry { id: id.to_owned(), pid, began, endpoint: None, limits, groups, template });
         }
     }
 
@@ -177,11 +199,19 @@ impl Processes {
         let id = entry.id.clone();
         let (ask, questions) = mpsc::channel(1);
         let endpoint = entry.endpoint.clone().unwrap_or_default();
-        let attended = entry.template.readiness.pulse(&self.notify_socket(&id), &endpoint).map(|pulse| {
+        let directory = account::directory_of(&self.directory, &entry.template);
+        let account = entry.template.user.as_deref().and_then(|user| Account::named(user).ok());
+        let socket = notify_socket(&directory, &id);
+        let pulse = entry.template.readiness.pulse(&socket, &endpoint);
+        if let Some(account) = account {
+            // Where it is not one that notifies there is none.
+            let _ = account.give(&socket);
+        }
+        let attended = pulse.map(|pulse| {
             let answered = answer(pulse, id.clone(), questions, self.tell.health.clone());
             (tokio::spawn(answered).abort_handle(), ask)
         });
-        let process = Process { pid: entry.pid, template: None, attended };
+        let process = Process { directory, pid: entry.pid, template: None, attended };
         self.by_id.insert(id.clone(), process);
         self.roster.began(entry);
         spawner::watch_adopted(adopted, &self.log_file(&id), self.max_log_bytes, self.outcomes.clone());
@@ -189,13 +219,16 @@ impl Processes {
 
     /// Its process is gone.
     pub(super) fn exited(&mut self, id: &str) {
-        if let Some((attended, _)) = self.by_id.remove(id).and_then(|process| process.attended) {
-            attended.abort();
+        if let Some(Process { directory, attended, .. }) = self.by_id.remove(id) {
+            if let Some((attended, _)) = attended {
+                attended.abort();
+            }
+            // One that was killed could not take them back itself.
+            let left = [directory.endpoint_file(id), notify_socket(&directory, id), adopt_socket(&directory, id)];
+            for file in left {
+                let _ = std::fs::remove_file(file);
+            }
         }
-        // One that was killed could not take it back itself.
-        let _ = std::fs::remove_file(self.directory.endpoint_file(id));
-        let _ = std::fs::remove_file(self.notify_socket(id));
-        let _ = std::fs::remove_file(adopt_socket(&self.directory, id));
         self.roster.gone(id);
         self.ended_logs.add(self.log_file(id));
     }
@@ -220,13 +253,13 @@ impl Processes {
         self.by_id.values().for_each(|process| spawner::signal(process.pid, Signal::SIGKILL));
     }
 
-    fn notify_socket(&self, id: &str) -> PathBuf {
-        self.directory.path().join(format!("{id}.notify"))
-    }
-
     fn log_file(&self, id: &str) -> PathBuf {
         log_file(&self.directory, id)
     }
+}
+
+fn notify_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
+    directory.path().join(format!("{id}.notify"))
 }
 
 /// Tells once a worker is ready, and whether it still is whenever that is asked. One that never is is the pools' business: they

@@ -7,11 +7,12 @@ use ratn_worker::runtime_directory::RuntimeDirectory;
 use serde::{Deserialize, Serialize};
 use std::io;
 use std::net::Ipv4Addr;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpStream, UnixDatagram};
 use tokio::sync::Notify;
+use tokio_util::task::AbortOnDropHandle;
 
 /// The pause between two tries of a port.
 const TRY_AGAIN_AFTER: Duration = Duration::from_millis(20);
@@ -28,7 +29,11 @@ pub enum Readiness {
     #[default]
     Health,
     /// It says `READY=1` to the socket of `NOTIFY_SOCKET` (`sd_notify(3)`).
-    Notify,
+    Notify {
+        /// It also says `WATCHDOG=1` there, more often than every `WATCHDOG_USEC` (`sd_watchdog_enabled(3)`); one that does not has hung.
+        #[serde(default)]
+        watchdog: bool,
+    },
     /// A line of its standard output has this in it.
     Line {
         /// What.
@@ -45,7 +50,7 @@ pub enum Readiness {
 #[derive(Debug)]
 pub(super) enum Signs {
     Health,
-    Notify(UnixDatagram),
+    Notify { socket: UnixDatagram, watchdog: bool },
     Line(Arc<Notify>),
     Port(u16),
 }
@@ -55,6 +60,7 @@ pub(super) enum Signs {
 pub(super) enum Pulse {
     Health(Health),
     Port(u16),
+    Watchdog(Watchdog),
     /// Nothing: it says so once.
     None,
 }
@@ -62,7 +68,7 @@ pub(super) enum Pulse {
 impl Readiness {
     pub(super) fn check(&self, at: &str, template: &Template) -> Result<(), ConfigError> {
         match self {
-            Readiness::Health | Readiness::Notify => Ok(()),
+            Readiness::Health | Readiness::Notify { .. } => Ok(()),
             Readiness::Line { contains } => {
                 let holds = (1..=MAX_LINE_BYTES).contains(&contains.len()) && !contains.contains(char::is_control);
                 rule(format!("{at}.contains"), holds, format!("1 to {MAX_LINE_BYTES} bytes of one line"))
@@ -77,26 +83,26 @@ impl Readiness {
 
     /// Whether a worker that is ready can be asked whether it still is.
     pub(super) fn can_be_asked(&self) -> bool {
-        matches!(self, Readiness::Health | Readiness::Port { .. })
+        matches!(self, Readiness::Health | Readiness::Port { .. } | Readiness::Notify { watchdog: true })
     }
 
     /// What is asked of one that has been ready before; nothing where it cannot be.
-    pub(super) fn pulse(&self, _socket: &Path, endpoint: &str) -> Option<Pulse> {
+    pub(super) fn pulse(&self, socket: &Path, endpoint: &str) -> Option<Pulse> {
         match self {
             Readiness::Health => Some(Pulse::Health(Health::of(endpoint.parse().ok()?))),
             Readiness::Port { port } => Some(Pulse::Port(*port)),
-            Readiness::Notify | Readiness::Line { .. } => None,
+            Readiness::Notify { watchdog: true } => {
+                bind(socket).ok().map(|socket| Pulse::Watchdog(Watchdog::on(socket)))
+            }
+            Readiness::Notify { watchdog: false } | Readiness::Line { .. } => None,
         }
     }
 
     /// What to look at; before the worker is started. `socket` is where it may notify.
-    pub(super) fn signs(&self, socket: &PathBuf) -> io::Result<Signs> {
+    pub(super) fn signs(&self, socket: &Path) -> io::Result<Signs> {
         Ok(match self {
             Readiness::Health => Signs::Health,
-            Readiness::Notify => {
-                let _ = std::fs::remove_file(socket);
-                Signs::Notify(UnixDatagram::bind(socket)?)
-            }
+            Readiness::Notify { watchdog } => Signs::Notify { socket: bind(socket)?, watchdog: *watchdog },
             Readiness::Line { .. } => Signs::Line(Arc::default()),
             Readiness::Port { port } => Signs::Port(*port),
         })
@@ -120,14 +126,10 @@ impl Signs {
                 health.serving(within).await.map_err(|error| error.to_string())?;
                 Ok((endpoint.to_string(), Pulse::Health(health)))
             }
-            Signs::Notify(socket) => {
-                let mut message = vec![0; MESSAGE_BYTES];
-                loop {
-                    let length = socket.recv(&mut message).await.map_err(|error| error.to_string())?;
-                    if message[..length].split(|byte| *byte == b'\n').any(|line| line == b"READY=1") {
-                        return Ok((endpoint(), Pulse::None));
-                    }
-                }
+            Signs::Notify { socket, watchdog } => {
+                heard(&socket, b"READY=1").await.map_err(|error| error.to_string())?;
+                let pulse = if watchdog { Pulse::Watchdog(Watchdog::on(socket)) } else { Pulse::None };
+                Ok((endpoint(), pulse))
             }
             Signs::Line(seen) => {
                 seen.notified().await;
@@ -157,7 +159,48 @@ impl Pulse {
                     .await
                     .map_err(|_| format!("no connection to port {port} within {:.1} s", within.as_secs_f64()))
             }
+            Pulse::Watchdog(watchdog) => {
+                let heard = tokio::time::timeout(within, watchdog.heard.notified()).await;
+                heard.map_err(|_| format!("no WATCHDOG=1 within {:.1} s", within.as_secs_f64()))
+            }
             Pulse::None => Ok(()),
+        }
+    }
+}
+
+/// Listens to one that says again and again that it lives; read at once, so that who says it never has to wait.
+#[derive(Debug)]
+pub(super) struct Watchdog {
+    /// It has, since somebody asked last.
+    heard: Arc<Notify>,
+    _listening: AbortOnDropHandle<()>,
+}
+
+impl Watchdog {
+    fn on(socket: UnixDatagram) -> Watchdog {
+        let known: Arc<Notify> = Arc::default();
+        let tell = known.clone();
+        let listening = tokio::spawn(async move {
+            while heard(&socket, b"WATCHDOG=1").await.is_ok() {
+                tell.notify_one();
+            }
+        });
+        Watchdog { heard: known, _listening: AbortOnDropHandle::new(listening) }
+    }
+}
+
+fn bind(socket: &Path) -> io::Result<UnixDatagram> {
+    let _ = std::fs::remove_file(socket);
+    UnixDatagram::bind(socket)
+}
+
+/// Returns once a message has this line.
+async fn heard(socket: &UnixDatagram, wanted: &[u8]) -> io::Result<()> {
+    let mut message = vec![0; MESSAGE_BYTES];
+    loop {
+        let length = socket.recv(&mut message).await?;
+        if message[..length].split(|byte| *byte == b'\n').any(|line| line == wanted) {
+            return Ok(());
         }
     }
 }

@@ -23,8 +23,8 @@ pub(super) struct Entry {
     pub(super) endpoint: Option<String>,
     /// What it may use of the machine, for people.
     pub(super) limits: String,
-    /// Its group of cgroups, if it has one.
-    pub(super) group: Option<PathBuf>,
+    /// Its groups of cgroups, if it has any.
+    pub(super) groups: Vec<PathBuf>,
     /// As it was started from.
     pub(super) template: Template,
 }
@@ -177,7 +177,7 @@ mod tests {
             began: 7,
             endpoint: None,
             limits: String::new(),
-            group: None,
+            groups: Vec::new(),
             template: Template::new("planner", "PathPlanner"),
         }
     }

@@ -3,7 +3,8 @@
 //! Each worker leads a process group of its own, so that it can be ended with all that it started. Its standard input is a
 //! pipe that nobody writes to: it ends with the process manager, however that ends. Nothing runs in the child before exec.
 
-use super::limits::{InForce, Limits};
+use super::account::Account;
+use super::limits::{Groups, InForce, Limits};
 use super::log::{Awaited, BOUND_INTERVAL, Log};
 use super::predecessor::Adopted;
 use crate::supervisor::command_of;
@@ -36,9 +37,11 @@ pub(super) struct Job {
     /// All of it.
     pub(super) env: BTreeMap<OsString, OsString>,
     pub(super) directory: Option<PathBuf>,
+    /// The user that it runs as, where that is another one than this process's.
+    pub(super) account: Option<Account>,
     pub(super) limits: Limits,
     /// Where groups of processes are made.
-    pub(super) groups: Option<PathBuf>,
+    pub(super) groups: Groups,
     /// A line of its standard output that is waited for.
     pub(super) awaited: Option<Awaited>,
     pub(super) log: PathBuf,
@@ -56,8 +59,8 @@ pub(super) enum Outcome {
         pid: u32,
         /// What it may use, for people.
         limits: String,
-        /// Its group of cgroups.
-        group: Option<PathBuf>,
+        /// Its groups of cgroups.
+        groups: Vec<PathBuf>,
     },
     /// It is gone, or never was.
     Exited { id: String, reason: String, last_words: String },
@@ -74,9 +77,9 @@ pub(super) fn start(outcomes: mpsc::Sender<Outcome>) -> io::Result<mpsc::Sender<
             match spawn(&job) {
                 Ok((child, log)) => {
                     let pid = child.id().unwrap_or(0);
-                    let force = job.limits.enforce(&id, pid, job.groups.as_deref());
-                    let group = force.group().map(Path::to_owned);
-                    let spawned = Outcome::Spawned { id: id.clone(), pid, limits: force.words(), group };
+                    let force = job.limits.enforce(&id, pid, &job.groups);
+                    let groups = force.groups();
+                    let spawned = Outcome::Spawned { id: id.clone(), pid, limits: force.words(), groups };
                     if outcomes.blocking_send(spawned).is_err() {
                         return;
                     }
@@ -115,6 +118,10 @@ fn spawn(job: &Job) -> io::Result<(Child, Log)> {
             .then_some(())
             .ok_or_else(|| io::Error::other(format!("there is no directory {}", directory.display())))?;
         command.current_dir(directory);
+    }
+    if let Some(account) = &job.account {
+        // With it go the supplementary groups.
+        command.uid(account.uid.as_raw()).gid(account.gid.as_raw());
     }
     if job.outlives {
         command.stdout(log.file()?).stderr(log.file()?);
@@ -173,7 +180,7 @@ pub(super) fn watch_adopted(adopted: Adopted, log: &Path, max_log_bytes: u64, ou
     tokio::spawn(async move {
         let bounding =
             log.as_ref().ok().map(|log| AbortOnDropHandle::new(tokio::spawn(log.clone().keep_bounded(BOUND_INTERVAL))));
-        let force = InForce::adopted(entry.group);
+        let force = InForce::adopted(entry.groups);
         exit.wait().await;
         drop((parent_lives, bounding));
         signal(entry.pid, Signal::SIGKILL);

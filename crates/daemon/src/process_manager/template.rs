@@ -1,7 +1,9 @@
 //! A pool of equal workers, as the config has it: what is run, how many, and how it is watched and ended.
 
+use super::account::Account;
 use super::config::check_name;
 use super::limits::Limits;
+use super::machine::Sample;
 use super::parameter::{self, Parameter};
 use super::readiness::Readiness;
 use crate::config::{ConfigError, rule};
@@ -43,9 +45,15 @@ pub struct Template {
     /// Where it runs; without it, where the process manager does.
     #[serde(default)]
     pub directory: Option<PathBuf>,
+    /// The user that it runs as, without supplementary groups; only root may say another one than its own.
+    #[serde(default)]
+    pub user: Option<String>,
     /// What it may use of the machine.
     #[serde(default)]
     pub limits: Limits,
+    /// What of the machine has to be free for one more than `min`; another host is asked where it is not.
+    #[serde(default)]
+    pub needs: Needs,
     /// When it is ready.
     #[serde(default)]
     pub readiness: Readiness,
@@ -113,6 +121,32 @@ impl Default for Liveness {
     }
 }
 
+/// What of the machine has to be free for one more worker. All keys are optional.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Needs {
+    /// Memory, in MiB.
+    pub free_memory_mib: Option<u64>,
+    /// Processors that do nothing.
+    pub idle_cores: Option<f64>,
+}
+
+impl Needs {
+    /// How many more there is room for; nothing where it needs nothing.
+    pub(crate) fn room(&self, sample: &Sample) -> Option<u32> {
+        let fits = |free: f64, of_one: f64| (free / of_one).floor().clamp(0.0, f64::from(MAX_WORKERS)) as u32;
+        let memory = self.free_memory_mib.map(|mib| fits((sample.free_memory_bytes >> 20) as f64, mib as f64));
+        let cores = self.idle_cores.map(|cores| fits(sample.idle_cores, cores));
+        memory.into_iter().chain(cores).min()
+    }
+
+    pub(crate) fn words(&self) -> String {
+        let memory = self.free_memory_mib.map(|mib| format!("{mib} MiB of free memory"));
+        let cores = self.idle_cores.map(|cores| format!("{cores} idle cores"));
+        memory.into_iter().chain(cores).collect::<Vec<_>>().join(" and ")
+    }
+}
+
 impl Liveness {
     pub(crate) fn interval(self) -> Duration {
         Duration::from_secs_f64(self.interval_s)
@@ -135,7 +169,9 @@ impl Template {
             env: BTreeMap::new(),
             pass_env: Vec::new(),
             directory: None,
+            user: None,
             limits: Limits::default(),
+            needs: Needs::default(),
             readiness: Readiness::default(),
             after: Vec::new(),
             min: one(),
@@ -191,6 +227,7 @@ impl Template {
             env: template.env.clone(),
             pass_env: template.pass_env.clone(),
             directory: template.directory.clone(),
+            user: template.user.clone(),
             limits: template.limits,
             readiness: template.readiness.clone(),
             adopt: template.adopt,
@@ -204,6 +241,9 @@ impl Template {
     pub fn obstacle(&self) -> Option<String> {
         if let Some(directory) = self.directory.as_ref().filter(|directory| !directory.is_dir()) {
             return Some(format!("there is no directory {}", directory.display()));
+        }
+        if let Some(Err(why)) = self.user.as_deref().map(Account::named) {
+            return Some(why);
         }
         let program = self.program.as_ref()?;
         let runs = |file: &Path| file.is_file() && access(file, AccessFlags::X_OK).is_ok();
@@ -246,6 +286,9 @@ impl Template {
         rule(key("max_backoff_ms"), self.max_backoff_ms >= self.backoff_ms, "at least backoff_ms")?;
         let absolute = self.directory.as_ref().is_none_or(|directory| directory.is_absolute());
         rule(key("directory"), absolute, "an absolute path")?;
+        if let Some(user) = &self.user {
+            check_name(&key("user"), user)?;
+        }
         let line = matches!(self.readiness, Readiness::Line { .. });
         rule(
             key("adopt"),
@@ -253,6 +296,9 @@ impl Template {
             "who is ready by a line of its output cannot be adopted: nobody could ask it",
         )?;
         self.limits.check(&key("limits"))?;
+        rule(key("needs.free_memory_mib"), self.needs.free_memory_mib != Some(0), "at least 1 MiB")?;
+        let cores = self.needs.idle_cores.is_none_or(|cores| (0.01..=4_096.0).contains(&cores));
+        rule(key("needs.idle_cores"), cores, "from 0.01 to 4096")?;
         self.readiness.check(&key("readiness"), self)?;
         for (name, parameter) in &self.parameters {
             parameter.check(&key(&format!("parameters.{name}")), name)?;

@@ -2,7 +2,8 @@
 //!
 //! `ratn-test-worker serve ID KIND ENDPOINT_FILE` serves until its parent ends; `ratn-test-worker manage DIRECTORY` is a
 //! process manager of one such worker, with `adopt GRACE_S` of one that is to be adopted, `adopt-other` of one that differs, `sleep` of one that
-//! does not look at its standard input; `ratn-test-worker notify` says to systemd's socket that it is ready, `ratn-test-worker port N`
+//! does not look at its standard input; `ratn-test-worker notify` says to systemd's socket that it is ready, `ratn-test-worker watchdog N` besides N times
+//! that it lives, `ratn-test-worker port N`
 //! listens on a port of loopback, both until their standard input ends; `ratn-test-worker fail` says why and exits.
 
 use ratn_daemon::process_manager::{self, ProcessManagerConfig, Readiness, Template};
@@ -30,6 +31,7 @@ async fn main() -> ExitCode {
             manage(directory, Template { program, args, readiness, ..Template::new("planner", "PathPlanner") }).await
         }
         ["notify"] => notify().await,
+        ["watchdog", times] => watchdog(times).await,
         ["port", port] => listen(port).await,
         _ => {
             eprintln!("cannot open the model\nof the world");
@@ -42,6 +44,17 @@ async fn notify() -> ExitCode {
     sd_notify::notify(&[sd_notify::NotifyState::Status("starting")]).expect("somebody listens");
     sd_notify::notify(&[sd_notify::NotifyState::Ready, sd_notify::NotifyState::Status("on")])
         .expect("somebody listens");
+    until_input_ends().await
+}
+
+/// Says so often that it lives, and then no more.
+async fn watchdog(times: &str) -> ExitCode {
+    sd_notify::notify(&[sd_notify::NotifyState::Ready]).expect("somebody listens");
+    let patience = sd_notify::watchdog_enabled().expect("a watchdog");
+    for _ in 0..times.parse().expect("a number") {
+        tokio::time::sleep(patience / 4).await;
+        sd_notify::notify(&[sd_notify::NotifyState::Watchdog]).expect("somebody listens");
+    }
     until_input_ends().await
 }
 

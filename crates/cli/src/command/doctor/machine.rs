@@ -6,7 +6,7 @@ use crate::system::variable;
 use nix::sys::resource::{Resource, getrlimit};
 use nix::sys::statvfs::statvfs;
 use nix::unistd::{AccessFlags, access, geteuid};
-use ratn_daemon::process_manager::ProcessManagerConfig;
+use ratn_daemon::process_manager::{GroupsV1, ProcessManagerConfig};
 use ratn_daemon::{resource_manager, world_pool};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -131,7 +131,26 @@ fn groups(findings: &mut Findings, config: &ProcessManagerConfig) {
         .map(|template| template.name.as_str())
         .collect();
     let about = "cgroup";
+    let v1 = [("memory", &config.cgroup_v1.memory), ("cpu", &config.cgroup_v1.cpu), ("pids", &config.cgroup_v1.pids)];
+    for (controller, place) in v1 {
+        let Some(place) = place else { continue };
+        let (about, shown) = (format!("cgroup v1, {controller}"), place.display());
+        if !place.join("cgroup.procs").is_file() {
+            findings.problem(about, format!("{shown} is no group"), "make it (mkdir below /sys/fs/cgroup)");
+        } else if access(place, AccessFlags::W_OK).is_err() {
+            findings.problem(
+                about,
+                format!("{shown}: you may not make groups there"),
+                "chown it to who runs the process manager",
+            );
+        } else {
+            findings.ok(about, format!("{shown} is writable"));
+        }
+    }
     let Some(place) = &config.cgroup else {
+        if config.cgroup_v1 != GroupsV1::default() {
+            return;
+        }
         match limited.as_slice() {
             [] => findings.ok(about, "none is named, and no template needs one"),
             names => findings.warning(

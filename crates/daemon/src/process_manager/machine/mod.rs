@@ -67,13 +67,16 @@ impl Told {
             self.sample = Some(now.clone());
             return self.sample.clone();
         };
-        let bytes = |was: u64, is: u64, of: u64| if far(was as f64, is as f64, self.step * of as f64) { is } else { was };
+        let bytes =
+            |was: u64, is: u64, of: u64| if far(was as f64, is as f64, self.step * of as f64) { is } else { was };
         let numbers = |was: f64, is: f64| if far(was, is, self.step) { is } else { was };
         let next = Sample {
             cores: now.cores,
             load_per_core: numbers(told.load_per_core, now.load_per_core),
-            idle_cores: numbers(told.idle_cores / f64::from(now.cores.max(1)), now.idle_cores / f64::from(now.cores.max(1)))
-                * f64::from(now.cores.max(1)),
+            idle_cores: numbers(
+                told.idle_cores / f64::from(now.cores.max(1)),
+                now.idle_cores / f64::from(now.cores.max(1)),
+            ) * f64::from(now.cores.max(1)),
             memory_bytes: now.memory_bytes,
             free_memory_bytes: bytes(told.free_memory_bytes, now.free_memory_bytes, now.memory_bytes),
             disk_bytes: now.disk_bytes,

@@ -85,7 +85,8 @@ fn battery(supplies: &Path) -> Option<f64> {
     let supplies = fs::read_dir(supplies).ok()?.flatten();
     let word = |path: &Path, name: &str| fs::read_to_string(path.join(name)).ok().map(|text| text.trim().to_owned());
     let charge = |path: PathBuf| {
-        (word(&path, "type")? == "Battery" && word(&path, "scope").is_none_or(|scope| scope != "Device")).then_some(())?;
+        (word(&path, "type")? == "Battery" && word(&path, "scope").is_none_or(|scope| scope != "Device"))
+            .then_some(())?;
         word(&path, "capacity")?.parse::<f64>().ok()
     };
     let charges = supplies.filter_map(|supply| charge(supply.path()));

@@ -1,5 +1,6 @@
 //! What the pools hear, what they answer with, and what they refuse.
 
+use crate::process_manager::machine::Sample;
 use ratn_proto::types::{Demand, WorkerStatus};
 use std::time::Duration;
 
@@ -69,6 +70,8 @@ pub enum Event {
     },
     /// What waits for more than exists, as it is now.
     Demanded(Vec<Demand>),
+    /// What of the machine is free now.
+    Looked(Sample),
 }
 
 /// What the shell shall do.

@@ -18,6 +18,7 @@ mod worker;
 
 pub use command::{Command, Event, PoolError};
 
+use super::config::Labels;
 use super::template::Template;
 use pool::Pool;
 use ratn_model::time::Timestamp;
@@ -39,6 +40,7 @@ pub enum Restart {
 #[derive(Debug)]
 pub struct Pools {
     host: String,
+    labels: Labels,
     pools: BTreeMap<String, Pool>,
     /// It takes no new work.
     draining: bool,
@@ -50,7 +52,13 @@ impl Pools {
     pub fn new(host: impl Into<String>, templates: impl IntoIterator<Item = Template>) -> Pools {
         let host = host.into();
         let pools = templates.into_iter().map(|template| (template.name.clone(), Pool::new(template, &host))).collect();
-        Pools { host, pools, draining: false, ending: false }
+        Pools { host, labels: Labels::new(), pools, draining: false, ending: false }
+    }
+
+    /// On a host of which this is said.
+    #[must_use]
+    pub fn with_labels(self, labels: Labels) -> Pools {
+        Pools { labels, ..self }
     }
 
     /// Takes in what has happened; what to do now, in order.
@@ -99,6 +107,10 @@ impl Pools {
                 }
             }
             Event::Demanded(demands) => self.demanded(now, &demands, &mut commands),
+            Event::Looked(sample) => {
+                self.pools.values_mut().for_each(|pool| pool.looked(&sample));
+                self.advance(now, &mut commands);
+            }
         }
         commands
     }
@@ -290,7 +302,7 @@ impl Pools {
         for pool in self.pools.values_mut() {
             // Of several templates of a kind the first meets what is asked for.
             let kind = pool.template().kind.clone();
-            let count = demand::demanded(demands, &kind, &self.host);
+            let count = demand::demanded(demands, &kind, (&self.host, &self.labels));
             pool.demanded(now, if taken.insert(kind) { count } else { 0 }, commands);
         }
         self.advance(now, commands);

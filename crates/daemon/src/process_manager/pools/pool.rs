@@ -4,6 +4,7 @@ use super::command::{Command, PoolError};
 use super::restart::Restarts;
 use super::size::{Size, retiring};
 use super::worker::Worker;
+use crate::process_manager::machine::Sample;
 use crate::process_manager::readiness::Readiness;
 use crate::process_manager::template::Template;
 use ratn_model::time::Timestamp;
@@ -22,6 +23,8 @@ pub(super) struct Pool {
     /// By number: the youngest is the last.
     workers: BTreeMap<u64, Worker>,
     last_number: u64,
+    /// For so many more than the minimum the machine has room; `None` where none is needed.
+    room: Option<u32>,
     /// Workers that ended unasked, and how the last one did.
     crashes: u64,
     last_exit: String,
@@ -35,6 +38,7 @@ impl Pool {
             waits_for: template.after.clone(),
             workers: BTreeMap::new(),
             last_number: 0,
+            room: None,
             crashes: 0,
             last_exit: String::new(),
             host: host.to_owned(),
@@ -73,6 +77,9 @@ impl Pool {
     pub(super) fn shortage(&self) -> Option<String> {
         let name = &self.template.name;
         match self.restarts.failure() {
+            "" if self.room == Some(0) && self.wanted() > self.there() => {
+                Some(format!("`{name}` needs {} for one more worker", self.template.needs.words()))
+            }
             "" if self.waits() && self.wanted() > 0 => {
                 Some(format!("`{name}` waits until there is a worker of {}", self.waits_for.join(", ")))
             }
@@ -107,6 +114,12 @@ impl Pool {
         retiring(idle, surplus, self.template.idle(), now)
     }
 
+    /// What of the machine is free now; those that are starting have not taken theirs yet.
+    pub(super) fn looked(&mut self, sample: &Sample) {
+        let starting = self.count(Worker::is_starting);
+        self.room = self.template.needs.room(sample).map(|room| room.saturating_sub(starting));
+    }
+
     /// Whether it waits for other templates still.
     pub(super) fn waits(&self) -> bool {
         !self.waits_for.is_empty()
@@ -132,6 +145,7 @@ impl Pool {
 
     fn start(&mut self, now: Timestamp, commands: &mut Vec<Command>) -> String {
         self.last_number += 1;
+        self.room = self.room.map(|room| room.saturating_sub(1));
         let (name, number) = (&self.template.name, self.last_number);
         let id = format!("{name}-{number}@{}", self.host);
         let worker = Worker::starting(now, id.clone(), &self.template);
@@ -338,7 +352,9 @@ impl Pool {
     fn missing(&self) -> u32 {
         let there = if self.is_single() { self.count(|_| true) } else { self.there() };
         let wanted = self.wanted() + self.surge();
-        if self.restarts.has_failed() || self.waits() { 0 } else { wanted.saturating_sub(there) }
+        let kept = self.size.bounds().0.saturating_sub(there);
+        let possible = self.room.map_or(u32::MAX, |room| room.max(kept));
+        if self.restarts.has_failed() || self.waits() { 0 } else { wanted.saturating_sub(there).min(possible) }
     }
 
     fn count(&self, of: impl Fn(&Worker) -> bool) -> u32 {

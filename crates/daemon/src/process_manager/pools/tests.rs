@@ -2,7 +2,9 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use super::*;
+use crate::process_manager::machine::Sample;
 use crate::process_manager::readiness::Readiness;
+use crate::process_manager::template::Needs;
 use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_model::value::Value;
 use ratn_proto::types::WorkerState;
@@ -503,4 +505,41 @@ fn a_drained_host_starts_nothing_whoever_asks_and_all_of_it_again_when_that_is_o
     assert_eq!((pools.ids(), started(&mut pools)), (Vec::<String>::new(), Vec::new()));
     let commands = pools.pools.drain(at(100.0), false);
     assert_eq!(commands.len(), 2, "what is demanded is started: {commands:?}");
+}
+
+#[test]
+fn more_than_the_minimum_are_started_only_where_the_machine_has_room() {
+    let mut pools = pools(|template| {
+        template.max = Some(5);
+        template.needs = Needs { free_memory_mib: Some(2_048), idle_cores: None };
+    });
+    assert_eq!(started(&mut pools), ["planner-1@compute"], "the minimum, whatever there is");
+    pools.bring_up(at(0.0), "planner-1@compute");
+    pools.used(at(0.0), "planner-1@compute", true);
+    let free = |mib: u64| {
+        Event::Looked(Sample {
+            cores: 4,
+            load_per_core: 0.0,
+            idle_cores: 4.0,
+            memory_bytes: 16 << 30,
+            free_memory_bytes: mib << 20,
+            disk_bytes: 1,
+            free_disk_bytes: 1,
+            battery: None,
+        })
+    };
+    pools.handle(at(1.0), free(1_000));
+    pools.demanded(at(1.0), &demand(1, 3));
+    assert_eq!(started(&mut pools), [] as [&str; 0]);
+    assert_eq!(pools.shortages()["PathPlanner"], "`planner` needs 2048 MiB of free memory for one more worker");
+    pools.handle(at(2.0), free(5_000));
+    assert_eq!(started(&mut pools), ["planner-2@compute", "planner-3@compute"]);
+    pools.handle(at(3.0), free(5_000));
+    assert_eq!(started(&mut pools), [] as [&str; 0], "those have not taken theirs yet");
+    for id in ["planner-2@compute", "planner-3@compute"] {
+        pools.bring_up(at(4.0), id);
+    }
+    pools.handle(at(5.0), free(3_000));
+    assert_eq!(started(&mut pools), ["planner-4@compute"]);
+    assert!(pools.shortages().is_empty());
 }

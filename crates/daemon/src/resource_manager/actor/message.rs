@@ -1,0 +1,154 @@
+//! What the service asks of the actor, and how it gets there.
+
+use crate::details::ending;
+use crate::resource_manager::Granted;
+use ratn_model::id::{LeaseId, Revision};
+use ratn_model::resource::Requirement;
+use ratn_proto::types::{Demand, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition};
+use ratn_resources::{AcquireRequest, Quantity, Reply, Request, ResourceView, SessionId};
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::{mpsc, oneshot, watch};
+use tonic::Status;
+
+/// What a keep-alive came to.
+#[derive(Debug)]
+pub(in super::super) struct KeptAlive {
+    pub(in super::super) ttl: Duration,
+    pub(in super::super) created: bool,
+    pub(in super::super) revision: Revision,
+}
+
+/// A ping of a session.
+#[derive(Debug)]
+pub(super) struct Ping {
+    pub(super) session: SessionId,
+    pub(super) client: String,
+    pub(super) ttl: Duration,
+    pub(super) answer: Answer<KeptAlive>,
+}
+
+/// What the service asks of the actor.
+#[derive(Debug)]
+pub(in super::super) enum Message {
+    Perform {
+        request_id: String,
+        request: Request,
+        answer: Answer<(Reply, Revision)>,
+    },
+    Acquire {
+        ticket: u64,
+        request_id: String,
+        request: AcquireRequest,
+        wait: Duration,
+        answer: oneshot::Sender<Granted>,
+    },
+    /// The call with this ticket was dropped before its answer.
+    Abandon {
+        ticket: u64,
+    },
+    Withdraw {
+        session: SessionId,
+        request_id: String,
+        answer: Answer<bool>,
+    },
+    /// The call was dropped after its answer and before it was read.
+    Return {
+        lease: LeaseId,
+    },
+    Find {
+        requirement: Requirement,
+        answer: oneshot::Sender<(Quantity, Vec<String>)>,
+    },
+    Get {
+        id: String,
+        answer: oneshot::Sender<Option<ResourceView>>,
+    },
+    List {
+        answer: oneshot::Sender<(Vec<ResourceView>, Revision)>,
+    },
+    Revision {
+        answer: oneshot::Sender<Revision>,
+    },
+    Sessions {
+        answer: oneshot::Sender<Vec<SessionStatus>>,
+    },
+    /// Why the acquire of a request id waits, or the first of the queue; and how many wait.
+    Explain {
+        request_id: String,
+        answer: Answer<(Vec<WaitingAcquire>, usize)>,
+    },
+    WatchDemand {
+        session: SessionId,
+        /// What it can provide: kinds, and how many of each at the most.
+        kinds: BTreeMap<String, u32>,
+        answer: Answer<watch::Receiver<Vec<Demand>>>,
+    },
+    ReportShortage {
+        session: SessionId,
+        kind: String,
+        reason: String,
+        answer: Answer<()>,
+    },
+    Watch {
+        /// Without a snapshot: what happened after this.
+        after: Option<WatchPosition>,
+        answer: Answer<mpsc::Receiver<Arc<ResourceUpdate>>>,
+    },
+}
+
+pub(in super::super) type Answer<T> = oneshot::Sender<Result<T, Status>>;
+
+/// Sends messages to the actor.
+#[derive(Debug, Clone)]
+pub(in super::super) struct Handle {
+    pub(super) inbox: mpsc::Sender<Message>,
+    pub(super) pings: mpsc::Sender<Ping>,
+}
+
+impl Handle {
+    /// Sends a message and waits for the answer that it is to be given.
+    pub(in super::super) async fn ask<T>(
+        &self,
+        message: impl FnOnce(oneshot::Sender<T>) -> Message,
+    ) -> Result<T, Status> {
+        let (answer, answered) = oneshot::channel();
+        self.send(message(answer)).await?;
+        answered.await.map_err(|_| ending())
+    }
+
+    pub(in super::super) async fn keep_alive(
+        &self,
+        session: SessionId,
+        client: String,
+        ttl: Duration,
+    ) -> Result<KeptAlive, Status> {
+        let (answer, answered) = oneshot::channel();
+        let ping = Ping { session, client, ttl, answer };
+        self.pings.send(ping).await.map_err(|_| ending())?;
+        answered.await.map_err(|_| ending())?
+    }
+
+    pub(in super::super) async fn send(&self, message: Message) -> Result<(), Status> {
+        self.inbox.send(message).await.map_err(|_| ending())
+    }
+
+    /// Sends a message from where nothing can be waited for.
+    pub(in super::super) fn send_later(&self, message: Message) {
+        if let Err(mpsc::error::TrySendError::Full(message)) = self.inbox.try_send(message) {
+            let inbox = self.inbox.clone();
+            tokio::spawn(async move { inbox.send(message).await });
+        }
+    }
+}
+
+/// Calls that arrive together are handled by separate tasks, so in no order of their own: the most urgent acquire goes first,
+/// and what is given back comes after those who ask for it. The rest keeps its order.
+pub(super) fn most_urgent_first(messages: &mut [Message]) {
+    messages.sort_by_key(|message| match message {
+        Message::Acquire { request, .. } => (0, Reverse(request.priority)),
+        _ => (1, Reverse(0)),
+    });
+}
