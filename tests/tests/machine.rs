@@ -46,14 +46,15 @@ fn a_host_says_what_it_has_and_what_is_said_of_it() -> anyhow::Result<()> {
     let there = wait_for("the host", || {
         let output = place.ratn(&["resource", "list", "Host", "Core", "--json"]).output()?;
         let listed = serde_json::from_slice::<Vec<Value>>(&output.stdout).unwrap_or_default();
-        Ok((listed.len() == 2).then_some(listed))
+        let told = listed.iter().any(|resource| resource["attributes"]["free_memory_mib"].is_number());
+        Ok((listed.len() == 2 && told).then_some(listed))
     })?;
     let of = |id: &str| there.iter().find(|resource| resource["id"] == id).with_context(|| format!("{there:?}"));
     let (host, cores) = (of("host@here")?, of("cores@here")?);
     let attributes = &host["attributes"];
     ensure!(attributes["gpu"] == true && attributes["free_memory_mib"].as_i64() > Some(0), "{host}");
     ensure!(attributes["cores"].as_f64() == cores["capacity"].as_f64(), "{host} {cores}");
-    let held = place.ratn(&["resource", "block", "Core", "--where", "gpu=true", "--", "true"]).output()?;
+    let held = place.ratn(&["resource", "block", "Core", "--where", "gpu = true", "--", "true"]).output()?;
     ensure!(held.status.success(), "{:?}", texts(&held));
     Ok(())
 }
