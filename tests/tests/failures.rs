@@ -3,7 +3,9 @@
 mod support;
 
 use anyhow::{Context, ensure};
-use support::{Place, Process, repository, wait_for};
+use std::process::Command;
+use support::host::Host;
+use support::{Place, Process, Started, repository, wait_for};
 
 const TEMPLATE: &str = "worker path-planner";
 
@@ -45,4 +47,117 @@ fn a_planner_that_is_killed_is_replaced_and_the_task_goes_on() -> anyhow::Result
     let again = text.lines().any(|line| line.contains("\"command\":\"start\"") && line.contains("\"attempt\":2"));
     ensure!(crashed && again, "no second attempt\n{said}");
     place.wait_until_empty()
+}
+
+/// A run of one box on a host, once the arm has begun to move.
+fn run_until_a_motion(host: &Host) -> anyhow::Result<Started> {
+    let task = repository("examples/fetch_boxes.yaml");
+    let log = host.place.path().join("log.jsonl");
+    let (task, log) = (task.to_str().context("a path")?, log.to_str().context("a path")?);
+    let config = host.config();
+    let settings = ["--set", "boxes=1", "--set", "budget=false", &config, "--log", log];
+    let run = host.place.start_as("run", &[["run", task].as_slice(), &settings].concat())?;
+    wait_for("a motion", || Ok((!host.begun()?.is_empty()).then_some(()))).with_context(|| run.said())?;
+    Ok(run)
+}
+
+#[test]
+fn a_run_whose_resource_manager_stays_away_ends_preempted_and_the_robot_holds() -> anyhow::Result<()> {
+    let mut host = Host::start()?;
+    let mut run = run_until_a_motion(&host)?;
+    host.kill("resource-manager")?;
+    let (code, out, err) = run.finish()?;
+    ensure!(code == Some(1) && out.contains("preempted"), "{code:?} {out}{err}");
+    ensure!(out.contains("the session with the resource manager, and every lease, is lost"), "{out}{err}");
+    wait_for("the robot to hold", || Ok((host.begun()?.len() == host.ended()?).then_some(())))?;
+    // What was interrupted is over; the next run finds everything free again.
+    host.start_role("resource-manager")?;
+    host.is_whole()
+}
+
+#[test]
+fn a_run_whose_world_pool_stays_away_ends_and_says_that_not_all_is_recorded() -> anyhow::Result<()> {
+    let mut host = Host::start()?;
+    let mut run = run_until_a_motion(&host)?;
+    host.kill("world-pool")?;
+    let (code, out, err) = run.finish()?;
+    ensure!(code == Some(1), "{code:?} {out}{err}");
+    ensure!(format!("{out}{err}").contains("world pool"), "{out}{err}");
+    wait_for("the robot to hold", || Ok((host.begun()?.len() == host.ended()?).then_some(())))?;
+    host.start_role("world-pool")?;
+    host.is_whole()
+}
+
+#[test]
+fn a_run_whose_cell_dies_aborts_at_the_motion_and_begins_no_other() -> anyhow::Result<()> {
+    let mut host = Host::start()?;
+    let mut run = run_until_a_motion(&host)?;
+    let begun = host.begun()?.len();
+    host.kill("cell")?;
+    let (code, out, err) = run.finish()?;
+    ensure!(code == Some(1) && out.contains("aborted") && out.contains("crashed in attempt 1"), "{code:?} {out}{err}");
+    ensure!(host.begun()?.len() <= begun + 1, "{out}{err}");
+    Ok(())
+}
+
+#[test]
+fn a_run_whose_process_manager_dies_waits_for_another_one() -> anyhow::Result<()> {
+    let mut host = Host::start()?;
+    let mut run = run_until_a_motion(&host)?;
+    let before = host.workers();
+    host.kill("process-manager")?;
+    wait_for("its workers to end", || {
+        let now = host.workers();
+        Ok(before.iter().all(|old| now.iter().all(|new| new.pid != old.pid)).then_some(()))
+    })?;
+    host.start_role("process-manager")?;
+    let (code, out, err) = run.finish()?;
+    ensure!(code == Some(0) && out.contains("delivered = 1"), "{code:?} {out}{err}");
+    host.has_no_orphan()?;
+    host.end()
+}
+
+/// A disk of its own, full after so many bytes; needs root.
+struct SmallDisk {
+    _place: tempfile::TempDir,
+    path: std::path::PathBuf,
+}
+
+impl SmallDisk {
+    fn mount(bytes: u64) -> anyhow::Result<Option<SmallDisk>> {
+        let place = tempfile::tempdir()?;
+        let path = place.path().join("disk");
+        std::fs::create_dir(&path)?;
+        let size = format!("size={bytes}");
+        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs"]).arg(&path).output();
+        let there = mounted.is_ok_and(|output| output.status.success());
+        Ok(there.then_some(SmallDisk { _place: place, path }))
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("--lazy").arg(&self.path).status();
+    }
+}
+
+#[test]
+fn a_run_whose_event_log_finds_no_room_ends_before_the_next_motion_and_gives_everything_back() -> anyhow::Result<()> {
+    let Some(disk) = SmallDisk::mount(64 << 10)? else {
+        println!("skipped: a small disk cannot be mounted (needs root)");
+        return Ok(());
+    };
+    let host = Host::start()?;
+    let task = repository("examples/fetch_boxes.yaml");
+    let log = disk.path.join("log.jsonl");
+    let (task, log) = (task.to_str().context("a path")?, log.to_str().context("a path")?);
+    let config = host.config();
+    let settings = ["--set", "boxes=1", "--set", "budget=false", &config, "--log", log];
+    let mut run = host.place.start_as("run", &[["run", task].as_slice(), &settings].concat())?;
+    let (code, out, err) = run.finish()?;
+    ensure!(code == Some(1) && err.contains(log), "{code:?} {out}{err}");
+    ensure!(err.contains("No space left"), "{out}{err}");
+    wait_for("the robot to hold", || Ok((host.begun()?.len() == host.ended()?).then_some(())))?;
+    host.is_whole()?;
+    host.end()
 }

@@ -4,13 +4,19 @@ mod support;
 
 use anyhow::{Context, ensure};
 use serde_json::Value;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::Path;
+use support::motions::{begun_in, lines, motions, starts};
 use support::{Place, Started, repository, texts, wait_for};
 
 /// What a debug build can follow, with motions that are long enough to be killed in.
 const SPEED: &str = "8";
+
+/// The cell's own record.
+fn begun_in_the_cell(place: &Place) -> anyhow::Result<Vec<String>> {
+    begun_in(&place.path().join("run/cell.log"))
+}
 
 /// A system that outlives its runs, and says which goals its providers begin.
 fn up(place: &Place, speed: &str, boxes: &str) -> anyhow::Result<Started> {
@@ -21,11 +27,6 @@ fn up(place: &Place, speed: &str, boxes: &str) -> anyhow::Result<Started> {
     Ok(up)
 }
 
-fn lines(log: &Path) -> anyhow::Result<Vec<Value>> {
-    let text = std::fs::read_to_string(log)?;
-    text.lines().map(|line| serde_json::from_str(line).with_context(|| line.to_owned())).collect()
-}
-
 /// Waits until a log has a line like this; what is torn there is not looked at.
 fn wait_for_line(log: &Path, what: &str, is: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
     wait_for(what, || {
@@ -33,36 +34,6 @@ fn wait_for_line(log: &Path, what: &str, is: impl Fn(&Value) -> bool) -> anyhow:
         let whole = text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
         Ok(whole.into_iter().find(&is))
     })
-}
-
-fn starts(line: &Value, provider: &str) -> bool {
-    line["command"] == "start" && line["goal"]["provider"] == provider
-}
-
-/// Ids of the goals that the cell has begun, by its own record.
-fn begun_in_the_cell(place: &Place) -> anyhow::Result<Vec<String>> {
-    let record = std::fs::read_to_string(place.path().join("run/cell.log"))?;
-    let begun = record.lines().filter(|line| line.contains("begun"));
-    let id = |line: &str| Some(line.split_once("goal=")?.1.split_whitespace().next()?.to_owned());
-    begun.map(|line| id(line).with_context(|| line.to_owned())).collect()
-}
-
-/// Every motion that the log has, by its goal id: no path twice.
-fn motions(lines: &[Value]) -> anyhow::Result<BTreeMap<String, String>> {
-    let run = lines[0]["origin"]["run"].as_str().context("no run")?;
-    let mut paths = BTreeMap::new();
-    let mut motions = BTreeMap::new();
-    for line in lines {
-        if line["note"] == "expanded" {
-            paths.insert(line["instance"].as_u64(), line["path"].as_str().unwrap_or_default().to_owned());
-        }
-        if ["arm", "gripper", "pan_tilt"].iter().any(|provider| starts(line, provider)) {
-            let path = paths.get(&line["instance"].as_u64()).cloned().context("an instance without a path")?;
-            ensure!(!motions.values().any(|other| *other == path), "{path} was begun twice");
-            motions.insert(format!("{run}/i{}/{}", line["instance"], line["attempt"]), path);
-        }
-    }
-    Ok(motions)
 }
 
 #[test]

@@ -3,6 +3,8 @@
 #![allow(dead_code, reason = "every test file uses some of it")]
 
 pub(crate) mod crashes;
+pub(crate) mod host;
+pub(crate) mod motions;
 
 use anyhow::{Context, bail};
 use std::path::{Path, PathBuf};

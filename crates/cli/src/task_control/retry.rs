@@ -11,8 +11,8 @@ pub(super) struct Attempts {
 }
 
 impl Attempts {
-    /// For whatever is idempotent: long enough for a daemon to come back.
-    pub(super) const IDEMPOTENT: Attempts = Attempts { count: 6, between: Duration::from_millis(250) };
+    /// For whatever is idempotent: for longer than a session lives, so that a daemon that comes back while the run's lives is met.
+    pub(super) const IDEMPOTENT: Attempts = Attempts { count: 16, between: Duration::from_millis(250) };
 }
 
 impl Attempts {

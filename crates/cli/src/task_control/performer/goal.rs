@@ -4,12 +4,12 @@ use super::Answer;
 use crate::task_control::record::said;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
-use ratn_model::id::InstanceId;
+use ratn_model::id::{InstanceId, LeaseId};
 use ratn_model::measurement::Measurement;
 use ratn_model::program::{ABORTED, PREEMPTED};
 use ratn_model::value::Value;
 use ratn_proto::types::{Goal, GoalOutcome};
-use ratn_worker::client::{ActionClient, CallError};
+use ratn_worker::client::{ActionClient, CallError, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::DEFAULT_TTL;
 use std::collections::BTreeMap;
@@ -22,6 +22,13 @@ const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
 /// How long a goal goes on without task control, so that a run that is resumed finds it under way: as long as its lease would
 /// live.
 pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
+/// How long the resource of a provider that is gone may still be there: its process manager withdraws it at once, and where that one is
+/// gone too it ends with its session.
+const WITHDRAWAL_DEADLINE: Duration = Duration::from_secs(DEFAULT_TTL.as_secs() + 1);
+/// How often that is looked at.
+const WITHDRAWAL_POLL: Duration = Duration::from_millis(100);
+/// How much longer than its time a session may be seen.
+const SESSION_SLACK: Duration = Duration::from_millis(500);
 /// The executive ends a goal that takes too long. The provider does so this much later, where nobody tells it to.
 const DEADLINE_SLACK: Duration = Duration::from_millis(500);
 
@@ -44,6 +51,7 @@ pub(super) struct Performing {
     pub(super) timeout_s: Option<f64>,
     pub(super) speed: f64,
     pub(super) actions: ActionClient,
+    pub(super) resources: ResourceClient,
     pub(super) events: mpsc::Sender<Answer>,
     pub(super) stop: CancellationToken,
     pub(super) goal: Goal,
@@ -90,33 +98,88 @@ impl Performing {
 
     async fn ending(&self, endpoint: &Endpoint, given: Given) -> Event {
         if given == Given::Now {
-            match self.actions.execute(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
-                Ok(outcome) => return self.finished(outcome),
-                // What was wrong with the goal is wrong with it the next time, too.
-                Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => return self.aborted(said(&error)),
-                Err(error @ CallError::Broken { .. }) => {
-                    // Only the connection may have broken; the goal is still there then.
-                    return self.attached(endpoint, &error).await;
-                }
-                Err(error) => return self.crashed(said(&error)),
-            }
+            return self.given(endpoint).await;
         }
         match self.actions.attach(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
             Ok(fate) if fate.orphaned => {
                 self.crashed(format!("it was stopped while task control was gone: {}", fate.outcome.reason))
             }
             Ok(fate) => self.finished(fate.outcome),
+            // Task control was killed when it had written down that it gives the goal, and before it did.
+            Err(error) if error.code() == Some(tonic::Code::NotFound) && self.would_be_known(endpoint).await => {
+                self.given(endpoint).await
+            }
             Err(error) => {
                 self.crashed(format!("nobody knows what became of it while task control was gone: {}", said(&error)))
             }
         }
     }
 
+    async fn given(&self, endpoint: &Endpoint) -> Event {
+        match self.actions.execute(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
+            Ok(outcome) => self.finished(outcome),
+            // What was wrong with the goal is wrong with it the next time, too.
+            Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => self.aborted(said(&error)),
+            // Only the connection may have broken; the goal is still there then.
+            Err(error @ CallError::Broken { .. }) => self.attached(endpoint, &error).await,
+            Err(error) => self.gone(endpoint, &error).await,
+        }
+    }
+
+    /// Whether a provider that does not know the goal was never given it. It could also be another process since, or have forgotten
+    /// it; but then the session that the resource is bound to would not live on, and under the goal's lease nobody else gives it any.
+    async fn would_be_known(&self, endpoint: &Endpoint) -> bool {
+        let Some((lease, provider)) = self.provider(endpoint) else { return false };
+        let owner = async || {
+            let resource = self.resources.get(&provider).await.ok()?;
+            let held = resource.holdings.iter().any(|holding| holding.lease == lease);
+            held.then_some(resource.session)
+        };
+        let lives = async {
+            let owned_by = owner().await?;
+            let sessions = self.resources.sessions().await.ok()?;
+            let ttl_ms = sessions.iter().find(|session| session.id == owned_by)?.ttl_ms;
+            tokio::time::sleep(Duration::from_millis(ttl_ms) + SESSION_SLACK).await;
+            Some(owner().await? == owned_by)
+        };
+        tokio::select! {
+            lives = lives => lives == Some(true),
+            () = self.stop.cancelled() => false,
+        }
+    }
+
+    /// The lease under which the goal is given, and the id of the resource that performs it.
+    fn provider(&self, endpoint: &Endpoint) -> Option<(LeaseId, String)> {
+        let (lease, there) = (self.goal.lease.as_ref()?, endpoint.to_string());
+        let resource = lease.resources.iter().find(|resource| resource.endpoint == there)?;
+        Some((lease.id, resource.id.clone()))
+    }
+
     async fn attached(&self, endpoint: &Endpoint, broken: &CallError) -> Event {
         match self.actions.attach(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
             Ok(fate) if !fate.orphaned => self.finished(fate.outcome),
-            _ => self.crashed(said(broken)),
+            _ => self.gone(endpoint, broken).await,
         }
+    }
+
+    /// Who tries again at once would be given the same provider again, and nothing would come of any of its attempts: it is over when
+    /// nobody can be given that one any more. Its lease is not given back before.
+    async fn gone(&self, endpoint: &Endpoint, error: &CallError) -> Event {
+        if let Some((_, provider)) = self.provider(endpoint)
+            && error.is_crash()
+        {
+            let there = endpoint.to_string();
+            let withdrawn = async {
+                while self.resources.get(&provider).await.is_ok_and(|resource| resource.endpoint() == there) {
+                    tokio::time::sleep(WITHDRAWAL_POLL).await;
+                }
+            };
+            tokio::select! {
+                _ = tokio::time::timeout(WITHDRAWAL_DEADLINE, withdrawn) => {}
+                () = self.stop.cancelled() => {}
+            }
+        }
+        self.crashed(said(error))
     }
 
     /// What the provider ended at its deadline has failed, whatever the provider calls that.
@@ -196,6 +259,7 @@ mod tests {
     struct Bench {
         endpoint: Endpoint,
         server: ActionServer,
+        resources: ResourceClient,
         events: mpsc::Sender<Answer>,
         answers: mpsc::Receiver<Answer>,
         _place: tempfile::TempDir,
@@ -210,7 +274,8 @@ mod tests {
             let (endpoint, shutdown) = (bound.endpoint().clone(), CancellationToken::new());
             tokio::spawn(bound.serve(Services::new().with(server.clone().into_service()), shutdown.clone()));
             let (events, answers) = mpsc::channel(8);
-            Ok(Bench { endpoint, server, events, answers, _place: place, _shutdown: shutdown.drop_guard() })
+            let resources = ResourceClient::new(&Channels::new(), &endpoint, "")?;
+            Ok(Bench { endpoint, server, resources, events, answers, _place: place, _shutdown: shutdown.drop_guard() })
         }
 
         fn performing(&self, action: &str, timeout_s: Option<f64>, grace_ms: u64) -> Performing {
@@ -222,6 +287,7 @@ mod tests {
                 timeout_s,
                 speed: 10.0,
                 actions: ActionClient::new(Channels::new()),
+                resources: self.resources.clone(),
                 events: self.events.clone(),
                 stop: CancellationToken::new(),
                 goal: Goal {

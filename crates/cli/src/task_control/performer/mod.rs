@@ -369,6 +369,7 @@ impl Performer {
             timeout_s: goal.timeout_s,
             speed: self.speed,
             actions: self.actions.clone(),
+            resources: self.resources.clone(),
             events: self.events.clone(),
             stop: stop.clone(),
             goal: types::Goal {
