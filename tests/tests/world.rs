@@ -57,6 +57,11 @@ fn facts_are_loaded_asked_for_compared_and_dumped() -> anyhow::Result<()> {
     ensure!(table.lines().count() == 3 && table.contains("ratn world load"), "{table}");
     let answers = world.done(&["query", "weight(?box) = ?w, ?w < 2"])?;
     ensure!(answers.lines().nth(1) == Some("box_1  1.5"), "{answers}");
+    let sparql = "SELECT ?kg { ?f world:predicate 'weight' ; world:argument1 'box_1' ; world:value ?kg }";
+    let answers = world.done(&["query", "--sparql", sparql])?;
+    ensure!(answers.lines().collect::<Vec<_>>() == ["?kg", "1.5"], "{answers}");
+    let (code, _, err) = world.ratn(&["query", "--sparql", "SELECT"])?;
+    ensure!(code == Some(2) && err.contains("not SPARQL"), "{code:?} {err}");
     let second = r#"{"facts": [{"predicate": "weight", "arguments": ["box_2"], "value": {"float": 0.1}}]}"#;
     ensure!(world.load("second.json", second, &["--replace"])?.0 == Some(0));
     let difference = world.done(&["diff", "1"])?;

@@ -21,8 +21,9 @@
 //! | 1,000 projections of 20 effects, beside the facts | | 5.2 MB | |
 //! | scene of 1,000 objects: 20 move, and the delta is made | 53 µs | | |
 //!
-//! A check against live projections costs about 50 ns for each that has read a fact that is written. A table of facts that worlds share
-//! is copied when an eighth of it has changed beside it: such a commit takes time in proportion to the facts, the others do not.
+//! A check against live projections costs about 50 ns for each that has read a fact that is written. Of the table of facts that worlds
+//! share, a shard of at most 16,384 is copied when an eighth of it has changed beside it: no commit waits for more than what it writes
+//! and a shard.
 
 pub mod digest;
 mod functional;

@@ -34,9 +34,12 @@ pub(super) enum WorldCommand {
     },
     /// Answer a query, `at(?box) = ?pose, not in_gripper(?box)`
     Query {
-        /// The conditions, as in a task file
+        /// The conditions, as in a task file; with `--sparql` a SELECT or an ASK over what `dump --format turtle` writes
         #[arg(value_name = "QUERY")]
         query: String,
+        /// The query is SPARQL
+        #[arg(long)]
+        sparql: bool,
         /// Of the root as it was at this revision
         #[arg(long, value_name = "REVISION")]
         at: Option<u64>,

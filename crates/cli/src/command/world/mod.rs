@@ -7,6 +7,7 @@ mod arguments;
 mod dump;
 mod pattern;
 mod show;
+mod sparql;
 mod turtle;
 
 pub(crate) use arguments::WorldArguments;
@@ -65,7 +66,12 @@ impl Asking {
                 let (revision, facts) = client.root_at(at.map(Revision), patterns).await?;
                 self.show(&dump::json(revision, &facts), || show::facts(&facts))?;
             }
-            WorldCommand::Query { query, at, limit } => self.query(query, at.map(Revision), *limit).await?,
+            WorldCommand::Query { query, sparql: true, at, limit } => {
+                self.sparql(query, at.map(Revision), *limit).await?;
+            }
+            WorldCommand::Query { query, sparql: false, at, limit } => {
+                self.query(query, at.map(Revision), *limit).await?;
+            }
             WorldCommand::Diff { from, to, patterns } => {
                 let (differences, to) = client.diff(Revision(*from), to.map(Revision), patterns).await?;
                 let json = show::differences_json(Revision(*from), to, &differences);
@@ -96,6 +102,13 @@ impl Asking {
         let world = World::from_facts(facts.into_iter().map(|fact| (fact.key, fact.value)), revision);
         let rows = query.run(&world, &BTreeMap::new(), limit).map_err(refused)?;
         Ok(self.show(&show::rows_json(revision, &rows), || show::rows(&rows))?)
+    }
+
+    async fn sparql(&self, text: &str, at: Option<Revision>, limit: usize) -> Result<(), Failure> {
+        let (revision, facts) = self.client.root_at(at, &[]).await?;
+        let answer = sparql::answer(text, &facts, limit);
+        let answer = answer.map_err(|error| Failure::Refused(format!("ratn: {error:#}")))?;
+        Ok(self.show(&sparql::json(revision, &answer), || sparql::table(&answer))?)
     }
 
     async fn load(&self, file: &Path, replace: bool) -> Result<(), Failure> {

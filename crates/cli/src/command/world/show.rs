@@ -101,19 +101,25 @@ pub(super) fn rows(rows: &Rows) -> String {
     if rows.variables.is_empty() {
         return if rows.rows.is_empty() { "no" } else { "yes" }.to_owned();
     }
-    let widths: Vec<usize> = (0..rows.variables.len())
+    let cells = rows.rows.iter().map(|row| row.iter().map(ToString::to_string).collect());
+    table(&rows.variables, cells.collect(), rows.more)
+}
+
+/// What variables are in each row; `more` says that there are more rows.
+pub(super) fn table(variables: &[String], rows: Vec<Vec<String>>, more: bool) -> String {
+    let widths: Vec<usize> = (0..variables.len())
         .map(|i| {
-            let cells = rows.rows.iter().map(|row| row[i].to_string().chars().count());
-            cells.chain([rows.variables[i].chars().count() + 1]).max().unwrap_or(0)
+            let cells = rows.iter().map(|row| row[i].chars().count());
+            cells.chain([variables[i].chars().count() + 1]).max().unwrap_or(0)
         })
         .collect();
     let line = |cells: Vec<String>| {
         let cells: Vec<String> = cells.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}")).collect();
         cells.join("  ").trim_end().to_owned()
     };
-    let mut lines = vec![line(rows.variables.iter().map(|name| format!("?{name}")).collect())];
-    lines.extend(rows.rows.iter().map(|row| line(row.iter().map(ToString::to_string).collect())));
-    if rows.more {
+    let mut lines = vec![line(variables.iter().map(|name| format!("?{name}")).collect())];
+    lines.extend(rows.into_iter().map(line));
+    if more {
         lines.push("(there are more: --limit)".to_owned());
     }
     lines.join("\n")

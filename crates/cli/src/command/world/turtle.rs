@@ -10,7 +10,7 @@
 use super::dump;
 use anyhow::{Context, bail, ensure};
 use oxrdf::vocab::xsd;
-use oxrdf::{BlankNode, Literal, NamedNode, NamedNodeRef, NamedOrBlankNode, Term as RdfTerm, TripleRef};
+use oxrdf::{BlankNode, Literal, NamedNode, NamedNodeRef, NamedOrBlankNode, Term as RdfTerm, Triple};
 use oxttl::{TurtleParser, TurtleSerializer};
 use ratn_model::fact::{FactKey, Term};
 use ratn_model::id::Revision;
@@ -21,7 +21,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Of the properties.
-const WORLD: &str = "urn:ratn:world#";
+pub(super) const WORLD: &str = "urn:ratn:world#";
+pub(super) const RDF: &str = "http://www.w3.org/1999/02/22-rdf-syntax-ns#";
+pub(super) const XSD: &str = "http://www.w3.org/2001/XMLSchema#";
 const PREDICATE: &str = "predicate";
 const VALUE: &str = "value";
 const MEASURED: &str = "measured";
@@ -35,28 +37,50 @@ const MAX_ARGUMENTS: usize = 64;
 /// All facts as one document.
 pub(super) fn write(facts: &[FactRecord]) -> anyhow::Result<String> {
     let serializer = TurtleSerializer::new().with_prefix("world", WORLD)?;
-    let serializer = serializer.with_prefix("rdf", "http://www.w3.org/1999/02/22-rdf-syntax-ns#")?;
-    let mut writer = serializer.with_prefix("xsd", "http://www.w3.org/2001/XMLSchema#")?.for_writer(Vec::new());
+    let serializer = serializer.with_prefix("rdf", RDF)?;
+    let mut writer = serializer.with_prefix("xsd", XSD)?.for_writer(Vec::new());
     for (number, fact) in facts.iter().enumerate() {
-        let subject = BlankNode::new(format!("fact{number}"))?;
-        let mut say = |property: &str, object: RdfTerm| -> anyhow::Result<()> {
-            let property = NamedNode::new(format!("{WORLD}{property}"))?;
-            Ok(writer.serialize_triple(TripleRef::new(&subject, &property, &object))?)
-        };
-        say(PREDICATE, Literal::new_simple_literal(&fact.key.predicate).into())?;
-        for (position, argument) in fact.key.arguments.iter().enumerate() {
-            let literal = match argument {
-                Term::Int(whole) => Literal::new_typed_literal(whole.to_string(), xsd::INTEGER),
-                Term::Name(name) => Literal::new_simple_literal(name),
-            };
-            say(&format!("{ARGUMENT}{}", position + 1), literal.into())?;
-        }
-        say(VALUE, object(&fact.value)?)?;
-        if let Some(measured) = &fact.measured {
-            say(MEASURED, json(measured.as_ref())?)?;
+        for triple in triples(number, fact)? {
+            writer.serialize_triple(&triple)?;
         }
     }
     Ok(String::from_utf8(writer.finish()?)?)
+}
+
+/// What is said of a fact, the `number`th.
+pub(super) fn triples(number: usize, fact: &FactRecord) -> anyhow::Result<Vec<Triple>> {
+    let argument = |(position, argument): (usize, &Term)| {
+        let literal = match argument {
+            Term::Int(whole) => Literal::new_typed_literal(whole.to_string(), xsd::INTEGER),
+            Term::Name(name) => Literal::new_simple_literal(name),
+        };
+        (format!("{ARGUMENT}{}", position + 1), literal.into())
+    };
+    let mut said: Vec<(String, RdfTerm)> =
+        vec![(PREDICATE.to_owned(), Literal::new_simple_literal(&fact.key.predicate).into())];
+    said.extend(fact.key.arguments.iter().enumerate().map(argument));
+    said.push((VALUE.to_owned(), object(&fact.value)?));
+    if let Some(measured) = &fact.measured {
+        said.push((MEASURED.to_owned(), json(measured.as_ref())?));
+    }
+    of_fact(number, said)
+}
+
+/// Who wrote a fact when; a dump says nothing of that, for it is not loaded.
+pub(super) fn origin(number: usize, fact: &FactRecord) -> anyhow::Result<Vec<Triple>> {
+    let revision = Literal::new_typed_literal(fact.revision.0.to_string(), xsd::INTEGER);
+    let mut said: Vec<(String, RdfTerm)> = vec![("revision".to_owned(), revision.into())];
+    let writer = fact.writer.as_deref().map(Literal::new_simple_literal);
+    said.extend(writer.map(|writer| ("writer".to_owned(), writer.into())));
+    of_fact(number, said)
+}
+
+fn of_fact(number: usize, said: Vec<(String, RdfTerm)>) -> anyhow::Result<Vec<Triple>> {
+    let subject = BlankNode::new(format!("fact{number}"))?;
+    let triple = |(property, object): (String, RdfTerm)| {
+        Ok(Triple::new(subject.clone(), NamedNode::new(format!("{WORLD}{property}"))?, object))
+    };
+    said.into_iter().map(triple).collect()
 }
 
 /// What [`write()`] wrote. Revisions and writers are not in it.
