@@ -25,9 +25,16 @@ const FIRST_ARM_JOINT: usize = 3;
 /// The degrees of freedom that the fingers follow.
 const FINGER: usize = 12;
 
-/// The arm in a scene, each finger `finger` metres from the middle, the camera looking ahead; motions that it finds free are
-/// free also between their postures.
-pub fn space(robot: &Robot, scene: &Scene, finger: f64) -> Space {
+/// The arm in a scene; motions that the space finds free are free also between their postures.
+pub fn space(mechanism: &Mechanism, obstacles: &[Obstacle]) -> Space {
+    let mut space = Space::new(mechanism, obstacles);
+    space.set_swept(true);
+    space
+}
+
+/// The arm and what is around it, in the frame of the base, each finger `finger` metres from the middle, the camera looking
+/// ahead.
+pub fn in_scene(robot: &Robot, scene: &Scene, finger: f64) -> (Mechanism, Vec<Obstacle>) {
     let mut obstacles = Vec::new();
     let resting = robot.poses(&Configuration { finger, ..Configuration::ZERO });
     let mut links = Vec::new();
@@ -57,8 +64,7 @@ pub fn space(robot: &Robot, scene: &Scene, finger: f64) -> Space {
             obstacles.push(Obstacle { name, pose: resting[index].compose(&body.upright()), geometry: body.geometry });
         }
     }
-    let [x, y, yaw] = Configuration::ZERO.with_base(&scene.base).base;
-    let inverse = Pose::from_rpy([x, y, 0.0], 0.0, 0.0, yaw).inverse();
+    let inverse = on_floor(&scene.base).inverse();
     let mut grips: Vec<usize> = (0..links.len()).filter(|l| is_gripper(robot, *l)).collect();
     for object in &scene.objects {
         let geometry = Geometry::from(&object.shape);
@@ -80,10 +86,13 @@ pub fn space(robot: &Robot, scene: &Scene, finger: f64) -> Space {
         grips.contains(&a) && grips.contains(&b) || neighbours(a, b)
     };
     let disabled = pairs.filter(touching).collect();
-    let mechanism = Mechanism { name: "arm".to_owned(), joints, links, disabled, allowed };
-    let mut space = Space::new(&mechanism, &obstacles);
-    space.set_swept(true);
-    space
+    (Mechanism { name: "arm".to_owned(), joints, links, disabled, allowed }, obstacles)
+}
+
+/// The base's place and heading on the floor.
+pub fn on_floor(base: &Pose) -> Pose {
+    let [x, y, yaw] = Configuration::ZERO.with_base(base).base;
+    Pose::from_rpy([x, y, 0.0], 0.0, 0.0, yaw)
 }
 
 /// Where the fingers are around what is held, else open: each this far from the middle, in metres.

@@ -6,8 +6,11 @@
 
 use crate::halton::Halton;
 use crate::pace::Control;
+use crate::reach::{Reach, Target};
 use crate::space::{Space, State, between, difference, distance, length};
 use crate::tree::Tree;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 
 /// How far a tree grows at once, in radians.
 const RANGE: f32 = 1.0;
@@ -19,6 +22,10 @@ const DOMAIN_CHANGE: f32 = 1e-4;
 
 /// Iterations between two questions to the caller: some tens of microseconds.
 const POLL: usize = 32;
+
+/// Postures looked for per target, and attempts at them.
+const POSTURES: usize = 8;
+const ATTEMPTS: usize = 24;
 
 /// Samples drawn at most to mend one motion.
 const MENDING_ITERATIONS: usize = 2_000;
@@ -57,6 +64,12 @@ pub enum ConnectError {
     Goal {
         /// How many there are.
         goals: usize,
+    },
+    /// A posture breaks the constraint that the whole path is to keep.
+    #[error("the {which} does not keep the constraint of the path")]
+    Constraint {
+        /// Start, or every free goal.
+        which: &'static str,
     },
     /// The iterations are used up.
     #[error("no path found in {iterations} iterations; give more, or look whether there is a way at all")]
@@ -109,6 +122,45 @@ pub fn connect(
     Ok(Route { path, goal, iterations })
 }
 
+/// Searches a path from `start` to a posture that meets one of `targets`: several postures for each, all of them roots of one
+/// search. The route's `goal` is the index of the target.
+///
+/// # Errors
+/// As [`connect`]; [`ConnectError::Goal`] also where no posture meets a target.
+pub fn connect_to_targets(
+    space: &mut Space,
+    reach: &Reach,
+    start: &State,
+    targets: &[Target],
+    budget: Budget,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<Route, ConnectError> {
+    let near = start.map(f64::from);
+    let mut random = ChaCha8Rng::seed_from_u64(budget.seed);
+    let mut goals: Vec<(usize, State)> = Vec::new();
+    for (index, target) in targets.iter().enumerate() {
+        go_on(control, 0)?;
+        let solutions = reach.solutions(target, &near, POSTURES, ATTEMPTS, &mut random);
+        let states = solutions.into_iter().map(|q| (index, q.map(|q| q as f32)));
+        goals.extend(states.filter(|(_, state)| space.is_within(state) && space.is_free(state)));
+    }
+    let states: Vec<State> = goals.iter().map(|(_, state)| *state).collect();
+    let route = match connect(space, start, &states, budget, control) {
+        Err(ConnectError::Goal { .. }) => return Err(ConnectError::Goal { goals: targets.len() }),
+        other => other?,
+    };
+    Ok(Route { goal: goals[route.goal].0, ..route })
+}
+
+/// What the caller's answer means for the search.
+fn go_on(control: &mut dyn FnMut(usize) -> Control, iterations: usize) -> Result<(), ConnectError> {
+    match control(iterations) {
+        Control::Continue => Ok(()),
+        Control::TimeUp => Err(ConnectError::TimeUp { iterations }),
+        Control::Cancelled => Err(ConnectError::Cancelled),
+    }
+}
+
 /// Makes sure that a path whose postures are free is free also between them: motions that are not are searched anew, finely.
 ///
 /// # Errors
@@ -122,6 +174,7 @@ pub fn mend(
     let mut whole = vec![path[0]];
     let mut mended = 0;
     for pair in path.windows(2) {
+        go_on(control, 0)?;
         if space.is_swept_free_too(&pair[0], &pair[1]) {
             whole.push(pair[1]);
             continue;
@@ -160,11 +213,7 @@ pub(crate) fn grow(
     let poll = if space.is_swept() { 1 } else { POLL };
     for iteration in 1..=iterations {
         if iteration % poll == 0 {
-            match control(iteration) {
-                Control::Continue => {}
-                Control::TimeUp => return Err(ConnectError::TimeUp { iterations: iteration }),
-                Control::Cancelled => return Err(ConnectError::Cancelled),
-            }
+            go_on(control, iteration)?;
         }
         let (own, others) = (trees[growing].len(), trees[1 - growing].len());
         if own.abs_diff(others) < own {

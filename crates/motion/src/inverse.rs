@@ -6,6 +6,7 @@
 
 use crate::collision::distance;
 use crate::frame::{compose, cross, difference, norm, rotate};
+use crate::reach::{rotation_vector, solve};
 use crate::robot::{Configuration, Joints, Motion, Robot};
 use rand::{Rng, RngExt};
 use ratn_model::pose::Pose;
@@ -144,12 +145,8 @@ pub(crate) fn is_same(a: &Joints, b: &Joints) -> bool {
 /// Position and rotation vector from `have` to `want`, in the world frame.
 fn pose_error(have: &Pose, want: &Pose) -> Vector6 {
     let [x, y, z] = difference(want.position, have.position);
-    let turn = compose(want, &have.inverse()).quaternion_xyzw;
-    let [i, j, k, w] = if turn[3] < 0.0 { turn.map(|c| -c) } else { turn };
-    let sine = norm([i, j, k]);
-    // The rotation vector is the axis times the angle; near zero the angle is twice the sine of its half.
-    let scale = if sine > 1e-9 { 2.0 * sine.atan2(w) / sine } else { 2.0 };
-    [x, y, z, i * scale, j * scale, k * scale]
+    let [i, j, k] = rotation_vector(&compose(want, &have.inverse()));
+    [x, y, z, i, j, k]
 }
 
 /// Jᵀ (J Jᵀ + λ I)⁻¹ e; `None` where the system is singular.
@@ -164,28 +161,4 @@ fn damped_step(jacobian: &[[f64; 7]; 6], error: &Vector6, damping: f64) -> Optio
     }
     let solved = solve(&mut system)?;
     Some(std::array::from_fn(|j| (0..6).map(|row| jacobian[row][j] * solved[row]).sum()))
-}
-
-/// Gauss elimination with partial pivoting; the right side is the last column.
-fn solve(system: &mut [[f64; 7]; 6]) -> Option<Vector6> {
-    for column in 0..6 {
-        let pivot = (column..6).max_by(|a, b| system[*a][column].abs().total_cmp(&system[*b][column].abs()))?;
-        system.swap(column, pivot);
-        if system[column][column].abs() < 1e-15 {
-            return None;
-        }
-        for row in column + 1..6 {
-            let factor = system[row][column] / system[column][column];
-            let above = system[column];
-            for (value, other) in system[row].iter_mut().zip(above).skip(column) {
-                *value -= factor * other;
-            }
-        }
-    }
-    let mut solution = [0.0; 6];
-    for row in (0..6).rev() {
-        let known: f64 = (row + 1..6).map(|k| system[row][k] * solution[k]).sum();
-        solution[row] = (system[row][6] - known) / system[row][row];
-    }
-    Some(solution)
 }

@@ -6,7 +6,7 @@
 
 use crate::frame::compose;
 use crate::geometry::Body;
-use crate::robot::Joint;
+use crate::robot::{Joint, jerk};
 use crate::spheres::{self, Sphere};
 use crate::urdf::{self, RobotError};
 use ratn_model::pose::Pose;
@@ -261,8 +261,9 @@ fn limits(urdf: &urdf_rs::Robot, name: &str) -> Result<Joint, RobotError> {
     } else {
         let velocity = if limit.velocity > 0.0 { limit.velocity } else { 1.0 };
         let given = limit.acceleration;
-        let acceleration = if given > 0.0 { given } else { velocity / TIME_TO_SPEED_S };
-        return Ok(Joint { name: name.to_owned(), lower, upper, velocity, acceleration });
+        let acceleration = if given > 0.0 && given.is_finite() { given } else { velocity / TIME_TO_SPEED_S };
+        let jerk = jerk(limit.jerk, acceleration);
+        return Ok(Joint { name: name.to_owned(), lower, upper, velocity, acceleration, jerk });
     };
     Err(RobotError::Unsupported { what: "joint", name: name.to_owned(), reason })
 }

@@ -7,20 +7,23 @@
 //! A goal is a list of alternatives, and a pose has many postures: every posture from which the approach is free is a
 //! candidate end of the free path. On straight parts, checked by exact shapes, the fingers and what they hold may touch their
 //! surroundings, the arm may not. On the free path nothing touches anything: it is searched with the vector checks, between
-//! postures that have room for them; where the start or a candidate has less, a short way out of there comes first.
+//! postures that have room for them; where the start or a candidate has less, a short way out of there comes first. Where the
+//! tool is to stay upright, the free path keeps it so (`constrained`), and the straight parts do anyway.
 
 use crate::arm::{self, finger_around_held, joints, state};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M, distance, length};
 use crate::connect::{Budget, ConnectError, connect};
+use crate::constrained::{self, Constraint};
 use crate::inverse::{Solver, is_same};
 use crate::line::{LineError, line};
 use crate::pace::{Control, Pace, Progress, Stop};
+use crate::reach::{Positions, Reach, Target};
 use crate::refine::{End, Refinement};
 pub use crate::request::{Goal, MAX_GOALS, MAX_STRAIGHT_M, MIN_SPEED, Request};
 use crate::robot::{Configuration, Joints, Robot};
 use crate::simplify::{path_length, shortened};
 use crate::space::{Space, State};
-use crate::timing::{Part, parameterise};
+use crate::timing::{Part, PhasePlane, parameterise};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
@@ -30,8 +33,11 @@ use ratn_world::scene::Scene;
 /// The padding where the start is too close to something for the usual one, in metres.
 const TIGHT_PADDING_M: f64 = 0.002;
 
-/// Postures looked for per goal pose, and descents spent on it: at first, and once more if there were none.
-const SOLUTIONS: [(usize, usize); 2] = [(4, 8), (8, 80)];
+/// Postures looked for per goal pose, and attempts spent on it: at first, and once more if there were none.
+const SOLUTIONS: [(usize, usize); 2] = [(6, 8), (40, 80)];
+
+/// Postures taken from one attempt: the nearest that it gives.
+const SOLUTIONS_PER_ATTEMPT: usize = 2;
 
 /// Iterations of the search before it gives up by itself.
 const MAX_SEARCH_ITERATIONS: usize = 20_000;
@@ -64,6 +70,8 @@ pub struct Plan {
     pub length_rad: f64,
     /// Iterations of search and improvement.
     pub iterations: usize,
+    /// The caller's time was up before all iterations of improvement were done: with more of it the path may differ.
+    pub time_up: bool,
 }
 
 /// Why there is no plan.
@@ -145,11 +153,22 @@ impl Candidate {
     }
 }
 
+/// A free path from the door at the start to that of a candidate.
+struct Way {
+    path: Vec<State>,
+    candidate: usize,
+}
+
 /// The tools and the knowledge of one planning.
 struct Planning<'a> {
     robot: &'a Robot,
     checker: Checker<'a>,
     space: Space,
+    /// The tool, in the frame of the base, which is at `base`.
+    reach: Reach,
+    base: Pose,
+    /// What the free path keeps.
+    constraint: Option<Constraint>,
     solver: Solver<'a>,
     random: ChaCha8Rng,
     goals: Vec<Goal>,
@@ -169,10 +188,14 @@ pub fn plan(
 ) -> Result<Plan, PlanError> {
     request.check(robot)?;
     let mut pace = Pace::new(control);
+    let (mechanism, obstacles) = arm::in_scene(robot, scene, finger_around_held(robot, scene));
     let mut planning = Planning {
         robot,
         checker: Checker::new(robot, scene, PADDING_M),
-        space: arm::space(robot, scene, finger_around_held(robot, scene)),
+        space: arm::space(&mechanism, &obstacles),
+        reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
+        base: arm::on_floor(&scene.base),
+        constraint: None,
         solver: Solver::new(robot, &scene.base),
         random: ChaCha8Rng::seed_from_u64(request.seed),
         goals: request.goals.clone(),
@@ -187,6 +210,11 @@ pub fn plan(
         depart => depart?,
     };
     let start = depart[depart.len() - 1];
+    planning.constraint = request.upright_rad.map(|tolerance| {
+        let up = planning.reach.pose(&positions(&start)).inverse().rotate([0.0, 0.0, 1.0]);
+        let frame = crate::space::align(up);
+        Constraint::new(Reach::new(&mechanism, robot.tool, frame), Target::upright(Pose::IDENTITY, tolerance))
+    });
     let door = planning.door(&start).ok_or_else(|| planning.no_room(&start))?;
     let way_out = if door == state(&start) { 0.0 } else { distance(&start, &joints(robot, &door)) };
     let before = length(&depart) + way_out;
@@ -194,22 +222,29 @@ pub fn plan(
 
     let (path, candidate) = planning.first_path(&start, &door, request.seed, &mut pace)?;
     let first_length_rad = before + f64::from(path_length(&path)) + planning.candidates[candidate].length_rad;
-    let (path, candidate) = match pace.report(Progress::FirstPath { length_rad: first_length_rad }) {
-        Ok(()) => planning.improve(path, candidate, before, request, &mut pace)?,
-        Err(Stop::TimeUp) => (path, candidate),
-        Err(Stop::Cancelled) => return Err(PlanError::Cancelled),
-    };
+    let mut way = Way { path, candidate };
+    let improved = pace
+        .report(Progress::FirstPath { length_rad: first_length_rad })
+        .and_then(|()| planning.improve(&mut way, before, request, &mut pace));
+    if improved == Err(Stop::Cancelled) {
+        return Err(PlanError::Cancelled);
+    }
+    let Way { path, candidate } = way;
 
     let chosen = planning.candidates[candidate].clone();
     let length_rad = before + f64::from(path_length(&path)) + chosen.length_rad;
     let end = chosen.approach[chosen.approach.len() - 1];
     let free = planning.whole(&start, &path, &chosen);
-    let parts = [Part::Straight(depart), Part::Free(free), Part::Straight(chosen.approach)];
+    // A path that keeps a constraint is followed as it is.
+    let free = if planning.constraint.is_some() { Part::Straight(free) } else { Part::Free(free) };
+    let parts = [Part::Straight(depart), free, Part::Straight(chosen.approach)];
     let space = &mut planning.space;
-    let trajectory =
-        parameterise(robot, &parts, request.speed, &mut |from, to| space.is_free_motion(&state(from), &state(to)));
+    let trajectory = parameterise(robot, &parts, request.speed, &PhasePlane, &mut |from, to| {
+        space.is_free_motion(&state(from), &state(to))
+    });
     let end_pose = robot.tool_pose(&Configuration { arm: end, ..Configuration::ZERO.with_base(&scene.base) });
-    Ok(Plan { trajectory, end, end_pose, first_length_rad, length_rad, iterations: pace.iterations })
+    let (iterations, time_up) = (pace.iterations, improved.is_err());
+    Ok(Plan { trajectory, end, end_pose, first_length_rad, length_rad, iterations, time_up })
 }
 
 impl From<Stop> for PlanError {
@@ -284,7 +319,7 @@ impl Planning<'_> {
         Err(PlanError::NoGoal { goals: self.goals.len(), reasons: reasons.into_iter().take(MAX_REASONS).collect() })
     }
 
-    /// As [`Solver::solutions`], asking between the attempts whether to go on.
+    /// As [`Reach::solutions`], asking between the attempts whether to go on.
     fn postures(
         &mut self,
         pose: &Pose,
@@ -293,15 +328,15 @@ impl Planning<'_> {
         attempts: usize,
         pace: &mut Pace<'_>,
     ) -> Result<Vec<Joints>, Stop> {
+        let target = Target::at(self.base.inverse().compose(pose));
         let mut found: Vec<Joints> = Vec::new();
         for attempt in 0..attempts {
             pace.poll()?;
-            if let Some(posture) = self.solver.attempt(pose, near, attempt, &mut self.random)
-                && found.iter().all(|other| !is_same(other, &posture))
-            {
-                found.push(posture);
-                if found.len() == wanted {
-                    break;
+            let postures = self.reach.attempt(&target, &positions(near), attempt, &mut self.random);
+            for posture in postures.into_iter().take(SOLUTIONS_PER_ATTEMPT) {
+                let posture: Joints = std::array::from_fn(|j| posture[j]);
+                if found.len() < wanted && found.iter().all(|other| !is_same(other, &posture)) {
+                    found.push(posture);
                 }
             }
         }
@@ -329,6 +364,9 @@ impl Planning<'_> {
     fn with_door(&mut self, approach: Vec<Joints>) -> Result<Candidate, String> {
         let entry = approach[0];
         let door = self.door(&entry).ok_or_else(|| "there is too little room before the goal".to_owned())?;
+        if let Some(constraint) = self.constraint.as_ref().filter(|c| !c.holds(&door)) {
+            return Err(format!("at the goal the tool is {:.3} rad off upright", constraint.tilt_rad(&door)));
+        }
         let way_in = (door != state(&entry)).then(|| joints(self.robot, &door));
         let length_rad = length(&approach) + way_in.map_or(0.0, |way_in| distance(&way_in, &entry));
         Ok(Candidate { door, way_in, approach, length_rad })
@@ -344,7 +382,9 @@ impl Planning<'_> {
             let radius = WAY_OUT_RAD * attempt as f64 / WAYS_OUT as f64;
             let aside = posture.map(|q| q + radius * self.random.random_range(-1.0..=1.0));
             let door = state(&self.robot.clamp(&aside));
-            let free = self.space.is_free(&door)
+            let keeps = self.constraint.as_ref().is_none_or(|c| c.holds_along(&here, &door));
+            let free = keeps
+                && self.space.is_free(&door)
                 && self.checker.edge_is_free(posture, &joints(self.robot, &door), Contact::None);
             free.then_some(door)
         })
@@ -361,7 +401,11 @@ impl Planning<'_> {
         let doors: Vec<State> = self.candidates.iter().map(|c| c.door).collect();
         let budget = Budget { iterations: MAX_SEARCH_ITERATIONS, seed };
         pace.iteration()?;
-        let route = connect(&mut self.space, door, &doors, budget, &mut |_| pace.answer());
+        let mut control = |_: usize| pace.answer();
+        let route = match &self.constraint {
+            None => connect(&mut self.space, door, &doors, budget, &mut control),
+            Some(constraint) => constrained::connect(&mut self.space, constraint, door, &doors, budget, &mut control),
+        };
         match route {
             Ok(route) => {
                 pace.iterations += route.iterations;
@@ -380,44 +424,42 @@ impl Planning<'_> {
         }
     }
 
-    /// A shorter path and the candidate it leads to; `before` is the length of what lies before it.
-    fn improve(
-        &mut self,
-        path: Vec<State>,
-        candidate: usize,
-        before: f64,
-        request: &Request,
-        pace: &mut Pace<'_>,
-    ) -> Result<(Vec<State>, usize), PlanError> {
-        let short = match shortened(&mut self.space, &path, &mut |_| pace.answer()) {
-            Ok(short) => short,
-            Err(ConnectError::Cancelled) => return Err(PlanError::Cancelled),
-            Err(_) => path,
-        };
+    /// Makes the way shorter; `before` is the length of what lies before it.
+    fn improve(&mut self, way: &mut Way, before: f64, request: &Request, pace: &mut Pace<'_>) -> Result<(), Stop> {
+        if let Some(constraint) = &self.constraint {
+            let attempts = request.improvement_iterations.max(constrained::SHORTCUTS);
+            let control = &mut |_: usize| pace.answer();
+            let stopped =
+                constrained::shorten(&mut self.space, constraint, &mut way.path, attempts, request.seed, control);
+            return stopped.map_err(Stop::from);
+        }
+        match shortened(&mut self.space, &way.path, &mut |_| pace.answer()) {
+            Ok(short) => way.path = short,
+            Err(ConnectError::Cancelled) => return Err(Stop::Cancelled),
+            Err(_) => {}
+        }
         let ends = self.candidates.iter().map(Candidate::end).collect();
-        let mut refinement = Refinement::new(short, candidate, ends, request.seed);
+        let mut refinement = Refinement::new(way.path.clone(), way.candidate, ends, request.seed);
         let mut reported = refinement.length();
-        for _ in 0..request.improvement_iterations {
-            let stopped = pace.iteration().and_then(|()| {
+        let mut improve = || {
+            for _ in 0..request.improvement_iterations {
+                pace.iteration()?;
                 if self.random.random_range(0..100) < NEW_CANDIDATES {
                     self.find_another(&mut refinement);
                 } else {
-                    refinement.step(&mut self.space, &mut |_| pace.answer()).map_err(Stop::from)?;
+                    refinement.step(&mut self.space, &mut |_| pace.answer())?;
                 }
                 let length = refinement.length();
                 if length < reported - LEAST_REPORT_RAD {
                     reported = length;
                     pace.report(Progress::Shorter { length_rad: before + f64::from(length) })?;
                 }
-                Ok(())
-            });
-            match stopped {
-                Ok(()) => {}
-                Err(Stop::TimeUp) => break,
-                Err(Stop::Cancelled) => return Err(PlanError::Cancelled),
             }
-        }
-        Ok((refinement.path().to_vec(), refinement.end()))
+            Ok(())
+        };
+        let stopped = improve();
+        *way = Way { path: refinement.path().to_vec(), candidate: refinement.end() };
+        stopped
     }
 
     /// Looks for a posture at the goal that a shorter path could lead to.
@@ -464,6 +506,12 @@ impl Planning<'_> {
         let reason = collision.map_or_else(|| "there is too little room to move".to_owned(), |c| c.to_string());
         PlanError::NoRoom { reason }
     }
+}
+
+fn positions(arm: &Joints) -> Positions {
+    let mut positions = Positions::default();
+    positions[..arm.len()].copy_from_slice(arm);
+    positions
 }
 
 /// How many different reasons an error names.

@@ -1,8 +1,10 @@
 //! What the planner is asked for.
 
+use crate::constrained::LEAST_TOLERANCE;
 use crate::plan::PlanError;
 use crate::robot::{Joints, Robot};
 use ratn_model::pose::Pose;
+use std::f64::consts::FRAC_PI_2;
 
 /// The most alternatives of one goal.
 pub const MAX_GOALS: usize = 64;
@@ -24,6 +26,8 @@ pub struct Request {
     pub depart_m: f64,
     /// Arrive straight down (world -z) this far, in metres.
     pub approach_m: f64,
+    /// What points up in the tool at the end of the departure points up all along the free path, at most this far off, in radians.
+    pub upright_rad: Option<f64>,
     /// Fraction of the joints' velocity and acceleration limits.
     pub speed: f64,
     /// The same seed, scene and iterations give the same plan.
@@ -54,6 +58,12 @@ impl Request {
             if !(0.0..=MAX_STRAIGHT_M).contains(&value) {
                 return malformed(what, value.to_string(), &format!("0 to {MAX_STRAIGHT_M} m"));
             }
+        }
+        if let Some(tolerance) = self.upright_rad
+            && !(LEAST_TOLERANCE..=FRAC_PI_2).contains(&tolerance)
+        {
+            let range = format!("{LEAST_TOLERANCE} to {FRAC_PI_2:.3} rad");
+            return malformed("upright_rad", tolerance.to_string(), &range);
         }
         if self.goals.is_empty() || self.goals.len() > MAX_GOALS {
             return malformed("the number of goals", self.goals.len().to_string(), &format!("1 to {MAX_GOALS}"));

@@ -73,6 +73,16 @@ pub struct Joint {
     pub velocity: f64,
     /// Greatest acceleration, per second squared.
     pub acceleration: f64,
+    /// Greatest jerk, per second cubed.
+    pub jerk: f64,
+}
+
+/// Where a URDF names no jerk, the full acceleration is reached in this time, in seconds.
+const TIME_TO_ACCELERATION_S: f64 = 0.1;
+
+/// The jerk of a URDF, or what its acceleration makes likely.
+pub(crate) fn jerk(given: f64, acceleration: f64) -> f64 {
+    if given > 0.0 && given.is_finite() { given } else { acceleration / TIME_TO_ACCELERATION_S }
 }
 
 /// A rigid link.

@@ -371,7 +371,7 @@ fn norm(sphere: &[f32; 4]) -> f32 {
 }
 
 /// A rotation that takes z to the axis.
-fn align(axis: [f64; 3]) -> Pose {
+pub(crate) fn align(axis: [f64; 3]) -> Pose {
     let [x, y, z] = axis;
     if z < -1.0 + 1e-12 {
         return Pose { position: [0.0; 3], quaternion_xyzw: [1.0, 0.0, 0.0, 0.0] };

@@ -1,20 +1,35 @@
-//! When the arm is where: a path becomes a trajectory within the joints' velocity and acceleration limits.
+//! When the arm is where: a path becomes a trajectory within the joints' velocity, acceleration and jerk limits.
 //!
-//! Every part starts and ends at rest. The corners of the free part are rounded (a quadratic Bézier curve per corner, as wide
-//! as the neighbours and the obstacles leave room for; without room the arm stops there). Each piece is then cut into equal
-//! steps of path length s, and the fastest ds/dt that breaks no limit is found by one sweep forwards and one backwards over
-//! the phase plane, as in time-optimal path parameterisation (Bobrow, 1985; Kunz and Stilman, 2012).
+//! Every part starts and ends at rest. The corners of the free part are rounded (a quintic Bézier curve per corner, straight at
+//! both ends, as wide as the neighbours and the obstacles leave room for; without room the arm stops there). How fast each piece
+//! is followed is for a [`Timing`] to say; ours is [`PhasePlane`].
 
 use crate::collision::{between, distance, length};
 use crate::robot::{Joint, Joints, Robot};
 use crate::trajectory::{ArmTrajectory, Knot};
 use ratn_model::value::Trajectory;
 
+/// Says when a piece of a path, followed exactly from rest to rest, is where.
+pub trait Timing {
+    /// Points in time, the first at 0, along postures close to each other; `speed` is a fraction of the velocity and
+    /// acceleration limits, the limits of jerk hold as they are.
+    fn time(&self, piece: &[Joints], limits: &[Joint], speed: f64) -> Vec<Knot>;
+}
+
+/// The fastest ds/dt along equal steps of path length s that breaks no limit of velocity and acceleration, by one sweep forwards
+/// and one backwards over the phase plane (Bobrow, 1985; Kunz and Stilman, 2012), then averaged over a time so long that jerk
+/// keeps within its limit (the integral of a box is a ramp), then slowed down by what sampling and bends leave over the limits.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct PhasePlane;
+
 /// The widest that a corner is cut on each side, in radians.
 const BLEND_RAD: f64 = 0.5;
 
 /// How often a blend that touches something is halved before the arm stops at the corner instead.
 const BLEND_HALVINGS: usize = 4;
+
+/// Where its control points are on each side, from its end to the corner.
+const CONTROLS: [f64; 3] = [0.0, 0.4, 0.8];
 
 /// Points of a Bézier curve.
 const BLEND_POINTS: usize = 96;
@@ -23,7 +38,7 @@ const BLEND_POINTS: usize = 96;
 const STEP_RAD: f64 = 0.01;
 
 /// Time between two points of the trajectory, in seconds.
-const KNOT_S: f64 = 0.04;
+const KNOT_S: f64 = 0.02;
 
 /// The share of the limits that the sweeps use; the rest is for what sampling rounds off.
 const RESERVE: f64 = 0.97;
@@ -43,6 +58,7 @@ pub fn parameterise(
     robot: &Robot,
     parts: &[Part],
     speed: f64,
+    timing: &dyn Timing,
     is_free: &mut dyn FnMut(&Joints, &Joints) -> bool,
 ) -> Trajectory {
     let mut pieces = Vec::new();
@@ -56,7 +72,7 @@ pub fn parameterise(
     let mut knots = vec![Knot { time_s: 0.0, positions: start, velocities: [0.0; 7] }];
     for piece in pieces {
         let offset = knots[knots.len() - 1].time_s;
-        let timed = time(robot, &piece, speed);
+        let timed = timing.time(&piece, robot.arm_joints(), speed);
         knots.extend(timed.into_iter().skip(1).map(|knot| Knot { time_s: knot.time_s + offset, ..knot }));
     }
     ArmTrajectory::new(knots).to_model(robot)
@@ -97,10 +113,20 @@ fn rounded(path: &[Joints], is_free: &mut dyn FnMut(&Joints, &Joints) -> bool) -
     pieces
 }
 
+/// The curve whose control points are on the two sides: without bend where it begins and ends.
 fn bezier(from: &Joints, corner: &Joints, to: &Joints) -> Vec<Joints> {
+    let before = CONTROLS.map(|share| between(from, corner, share));
+    let after = CONTROLS.map(|share| between(to, corner, share));
+    let controls = [before[0], before[1], before[2], after[2], after[1], after[0]];
     let point = |i: usize| {
         let t = i as f64 / BLEND_POINTS as f64;
-        between(&between(from, corner, t), &between(corner, to, t), t)
+        let mut level = controls;
+        for count in (1..controls.len()).rev() {
+            for k in 0..count {
+                level[k] = between(&level[k], &level[k + 1], t);
+            }
+        }
+        level[0]
     };
     (0..=BLEND_POINTS).map(point).collect()
 }
@@ -111,19 +137,21 @@ fn is_free_along(curve: &[Joints], is_free: &mut dyn FnMut(&Joints, &Joints) -> 
     points.windows(2).all(|pair| is_free(pair[0], pair[1]))
 }
 
-/// A smooth piece from rest to rest; the first knot is at time 0.
-fn time(robot: &Robot, piece: &[Joints], speed: f64) -> Vec<Knot> {
-    let whole = length(piece);
-    let rest = |positions: &Joints, time_s: f64| Knot { time_s, positions: *positions, velocities: [0.0; 7] };
-    if whole < 1e-6 {
-        return vec![rest(&piece[0], 0.0)];
+impl Timing for PhasePlane {
+    fn time(&self, piece: &[Joints], limits: &[Joint], speed: f64) -> Vec<Knot> {
+        let whole = length(piece);
+        if whole < 1e-6 {
+            return vec![Knot { time_s: 0.0, positions: piece[0], velocities: [0.0; 7] }];
+        }
+        let count = ((whole / STEP_RAD).ceil() as usize).max(8);
+        let step = whole / count as f64;
+        let points = resampled(piece, count, step);
+        let phase = Phase::of(&points, step, limits, speed * RESERVE);
+        // From full acceleration to full deceleration within the limit of jerk.
+        let windows = limits.iter().map(|joint| 2.0 * speed * joint.acceleration / joint.jerk);
+        let knots = phase.knots(&points, step, windows.fold(KNOT_S, f64::max));
+        stretched(knots, limits, speed)
     }
-    let count = ((whole / STEP_RAD).ceil() as usize).max(8);
-    let step = whole / count as f64;
-    let points = resampled(piece, count, step);
-    let phase = Phase::of(&points, step, robot.arm_joints(), speed * RESERVE);
-    let knots = phase.knots(&points, step);
-    stretched(knots, robot.arm_joints(), speed)
 }
 
 /// `count + 1` points at equal path lengths.
@@ -193,45 +221,108 @@ impl Phase {
         Phase { directions, squares }
     }
 
-    /// Points at equal times.
-    fn knots(&self, points: &[Joints], step: f64) -> Vec<Knot> {
-        let mut times = vec![0.0];
-        for pair in self.squares.windows(2) {
-            let dt = 2.0 * step / (pair[0].sqrt() + pair[1].sqrt()).max(1e-6);
-            times.push(times[times.len() - 1] + dt);
-        }
-        let duration = times[times.len() - 1];
+    /// Points at equal times of the path length averaged over a window of time.
+    fn knots(&self, points: &[Joints], step: f64, window_s: f64) -> Vec<Knot> {
+        let course = Course::of(&self.squares, step);
+        let duration = course.end_s() + window_s;
         let count = ((duration / KNOT_S).ceil() as usize).max(2);
-        let mut knots = Vec::with_capacity(count + 1);
-        let mut i = 0;
-        for k in 0..=count {
+        let last = points.len() - 1;
+        let knot = |k: usize| {
             let time_s = duration * k as f64 / count as f64;
-            while i + 2 < times.len() && times[i + 1] < time_s {
-                i += 1;
-            }
-            // Within a step the path acceleration is constant.
-            let (v0, v1) = (self.squares[i].sqrt(), self.squares[i + 1].sqrt());
-            let (elapsed, whole) = (time_s - times[i], times[i + 1] - times[i]);
-            let velocity = v0 + (v1 - v0) * elapsed / whole;
-            let fraction = ((v0 + velocity) / 2.0 * elapsed / step).clamp(0.0, 1.0);
+            let (now, then) = (course.at(time_s), course.at(time_s - window_s));
+            let along = ((now.sum - then.sum) / window_s / step).clamp(0.0, last as f64);
+            let velocity = (now.along - then.along) / window_s;
+            let i = (along as usize).min(last - 1);
+            let fraction = along - i as f64;
             let direction = between(&self.directions[i], &self.directions[i + 1], fraction);
-            knots.push(Knot {
+            Knot {
                 time_s,
                 positions: between(&points[i], &points[i + 1], fraction),
                 velocities: direction.map(|d| d * velocity),
-            });
+            }
+        };
+        let mut knots: Vec<Knot> = (0..=count).map(knot).collect();
+        for (end, point) in [(0, 0), (count, last)] {
+            knots[end].positions = points[point];
+            knots[end].velocities = [0.0; 7];
         }
-        let last = knots.len() - 1;
-        knots[0].velocities = [0.0; 7];
-        knots[last].velocities = [0.0; 7];
-        knots[last].positions = points[points.len() - 1];
         knots
     }
+}
+
+/// Path length over time, and its integral.
+struct Course {
+    /// Per point of the phase plane.
+    instants: Vec<Instant>,
+}
+
+#[derive(Clone, Copy)]
+struct Instant {
+    time_s: f64,
+    velocity: f64,
+    along: f64,
+    /// Of the path length over time.
+    sum: f64,
+}
+
+impl Course {
+    fn of(squares: &[f64], step: f64) -> Course {
+        let mut instants = vec![Instant { time_s: 0.0, velocity: 0.0, along: 0.0, sum: 0.0 }];
+        for (i, pair) in squares.windows(2).enumerate() {
+            let (v0, v1) = (pair[0].sqrt(), pair[1].sqrt());
+            let dt = 2.0 * step / (v0 + v1).max(1e-6);
+            let before = instants[i];
+            // Within a step the path acceleration is constant.
+            let sum = before.sum + dt * (before.along + dt * (v0 / 2.0 + (v1 - v0) / 6.0));
+            let along = step * (i + 1) as f64;
+            instants.push(Instant { time_s: before.time_s + dt, velocity: v1, along, sum });
+        }
+        Course { instants }
+    }
+
+    fn end_s(&self) -> f64 {
+        self.instants[self.instants.len() - 1].time_s
+    }
+
+    /// Before the start and after the end it stands.
+    fn at(&self, time_s: f64) -> Instant {
+        let last = self.instants[self.instants.len() - 1];
+        if time_s <= 0.0 {
+            return Instant { time_s, ..self.instants[0] };
+        }
+        if time_s >= last.time_s {
+            return Instant { time_s, velocity: 0.0, sum: last.sum + last.along * (time_s - last.time_s), ..last };
+        }
+        let next = self.instants.partition_point(|i| i.time_s <= time_s);
+        let (a, b) = (self.instants[next - 1], self.instants[next]);
+        let (t, acceleration) = (time_s - a.time_s, (b.velocity - a.velocity) / (b.time_s - a.time_s));
+        Instant {
+            time_s,
+            velocity: a.velocity + acceleration * t,
+            along: a.along + t * (a.velocity + acceleration * t / 2.0),
+            sum: a.sum + t * (a.along + t * (a.velocity / 2.0 + acceleration * t / 6.0)),
+        }
+    }
+}
+
+/// The greatest absolute change of the mean acceleration from one step of time to the next, per joint and second.
+fn jerks(knots: &[Knot]) -> Joints {
+    let mut jerks = [0.0_f64; 7];
+    let step = |i: usize| knots[i + 1].time_s - knots[i].time_s;
+    let mean = |i: usize, j: usize| (knots[i + 1].velocities[j] - knots[i].velocities[j]) / step(i);
+    for i in 1..knots.len() - 1 {
+        for (j, jerk) in jerks.iter_mut().enumerate() {
+            *jerk = jerk.max((mean(i, j) - mean(i - 1, j)).abs() / step(i));
+        }
+    }
+    jerks
 }
 
 /// Slows the whole piece down by what its interpolation breaks the limits by, if it does.
 fn stretched(knots: Vec<Knot>, joints: &[Joint], speed: f64) -> Vec<Knot> {
     let (mut by_velocity, mut by_acceleration) = (0.0_f64, 0.0_f64);
+    let jerks = jerks(&knots);
+    let by_jerk = (0..7).map(|j| jerks[j] / joints[j].jerk).fold(0.0, f64::max);
     let trajectory = ArmTrajectory::new(knots);
     for (velocities, accelerations) in trajectory.extremes() {
         for j in 0..7 {
@@ -239,7 +330,7 @@ fn stretched(knots: Vec<Knot>, joints: &[Joint], speed: f64) -> Vec<Knot> {
             by_acceleration = by_acceleration.max(accelerations[j] / (joints[j].acceleration * speed));
         }
     }
-    let factor = by_velocity.max(by_acceleration.sqrt()).max(1.0);
+    let factor = by_velocity.max(by_acceleration.sqrt()).max(by_jerk.cbrt()).max(1.0);
     let slow = |knot: &Knot| Knot {
         time_s: knot.time_s * factor,
         positions: knot.positions,

@@ -1,7 +1,7 @@
 //! Reading the robot's description: its links, parents first, and the limits of its degrees of freedom.
 
 use crate::geometry::{Body, Geometry};
-use crate::robot::{JOINT_NAMES, Joint, Link, Motion};
+use crate::robot::{JOINT_NAMES, Joint, Link, Motion, jerk};
 use ratn_model::pose::Pose;
 use std::collections::BTreeMap;
 
@@ -47,6 +47,7 @@ pub(crate) fn read(text: &str) -> Result<(Vec<Joint>, Vec<Link>), RobotError> {
             upper: joint.limit.upper,
             velocity: joint.limit.velocity,
             acceleration: joint.limit.acceleration,
+            jerk: jerk(joint.limit.jerk, joint.limit.acceleration),
         });
     }
     Ok((joints, sorted_links(&urdf)?))

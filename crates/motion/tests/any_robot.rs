@@ -1,6 +1,11 @@
 //! Any robot from its URDF: the vector checks beside parry's exact shapes, and paths that both find free.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::disallowed_methods,
+    reason = "a test may panic, and one measures time"
+)]
 
 use parry3d::math::Vector;
 use rand::{Rng, RngExt, SeedableRng};
@@ -16,6 +21,7 @@ use ratn_motion::simplify::{path_length, simplify};
 use ratn_motion::space::{Isa, Obstacle, Space, State, between};
 use ratn_motion::spheres::cover;
 use ratn_motion::trial::{self, Settings};
+use std::time::{Duration, Instant};
 
 const AIMM: &str = include_str!("../robots/aimm.urdf");
 
@@ -294,6 +300,52 @@ fn a_search_that_is_cancelled_or_out_of_iterations_ends_and_says_so() {
     let mut at_once = |_: usize| Control::TimeUp;
     let outcome = connect(&mut space, &state(-0.95), &[state(1.2)], few, &mut at_once);
     assert!(matches!(outcome, Err(ConnectError::TimeUp { .. })), "{outcome:?}");
+}
+
+#[test]
+fn a_cancel_is_noticed_within_five_milliseconds_during_search_and_simplification() {
+    let (urdf, names) = chain(6);
+    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let mut random = ChaCha8Rng::seed_from_u64(8);
+    let (mut longest, mut problems) = (Duration::ZERO, 0);
+    while problems < 6 {
+        let obstacles = clutter(&mut random, 30, 1.2);
+        let mut space = Space::new(&mechanism, &obstacles);
+        let (start, goal) = (posture(&mut random, &mechanism), posture(&mut random, &mechanism));
+        let Ok(route) = connect(&mut space, &start, &[goal], BUDGET, &mut go_on) else { continue };
+        if route.iterations < 100 {
+            continue;
+        }
+        problems += 1;
+        let mut run = || {
+            let (mut gaps, mut last) = (Vec::new(), Instant::now());
+            let mut note = |_: usize| {
+                gaps.push(last.elapsed());
+                last = Instant::now();
+                Control::Continue
+            };
+            let route = connect(&mut space, &start, &[goal], BUDGET, &mut note).unwrap();
+            simplify(&mut space, &route.path, BUDGET, &mut note).unwrap();
+            gaps.push(last.elapsed());
+            gaps
+        };
+        // The same work every time: the least of several runs is without what else the machine did.
+        let runs: Vec<Vec<Duration>> = (0..5).map(|_| run()).collect();
+        assert!(runs.iter().all(|gaps| gaps.len() == runs[0].len()));
+        let least = |i: usize| runs.iter().map(|gaps| gaps[i]).min().unwrap();
+        longest = (0..runs[0].len()).map(least).fold(longest, Duration::max);
+        for answer in 1..runs[0].len() {
+            let mut asked = 0;
+            let mut stop = |_: usize| {
+                asked += 1;
+                if asked == answer { Control::Cancelled } else { Control::Continue }
+            };
+            let outcome = connect(&mut space, &start, &[goal], BUDGET, &mut stop)
+                .and_then(|route| simplify(&mut space, &route.path, BUDGET, &mut stop));
+            assert_eq!((outcome, asked), (Err(ConnectError::Cancelled), answer));
+        }
+    }
+    assert!(longest < Duration::from_millis(5), "{longest:?}");
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Whole motions in the cell: approach, transfer with the box, retract.
 
-#![allow(clippy::unwrap_used, reason = "a test may panic")]
+#![allow(clippy::unwrap_used, clippy::disallowed_methods, reason = "a test may panic, and one measures time")]
 
 mod common;
 
@@ -15,6 +15,7 @@ use ratn_motion::robot::Robot;
 use ratn_motion::trajectory::ArmTrajectory;
 use ratn_motion::validate::{Violation, validate_trajectory};
 use ratn_world::scene::{Placement, SceneObject, Shape};
+use std::time::{Duration, Instant};
 
 /// The whole trajectory touches nothing but with the gripper, checked exactly and four times as densely as it was planned.
 fn assert_valid(cell: &Cell, plan: &Plan, speed: f64) {
@@ -129,6 +130,71 @@ fn a_cancelled_planning_ends_at_once() {
 }
 
 #[test]
+fn whether_time_was_up_is_said() {
+    let cell = Cell::with_boxes(3, 3);
+    let mut request = cell.approach("box_1");
+    request.improvement_iterations = 50;
+    assert!(!cell.plan(&request).unwrap().time_up);
+    let mut asked = 0;
+    let hasty = plan(&cell.robot, &cell.scene, &request, &mut |progress| {
+        asked += usize::from(asked > 0 || matches!(progress, Progress::FirstPath { .. }));
+        if asked > 20 { Control::TimeUp } else { Control::Continue }
+    });
+    assert!(hasty.unwrap().time_up);
+}
+
+#[test]
+fn a_cancel_is_noticed_within_five_milliseconds_wherever_the_planner_is() {
+    let mut cell = Cell::with_boxes(9, 5);
+    cell.improvement_iterations = 150;
+    let request = cell.approach("box_4");
+    let run = || {
+        let (mut gaps, mut last) = (Vec::new(), Instant::now());
+        let outcome = plan(&cell.robot, &cell.scene, &request, &mut |_| {
+            gaps.push(last.elapsed());
+            last = Instant::now();
+            Control::Continue
+        });
+        assert!(outcome.is_ok());
+        gaps.push(last.elapsed());
+        gaps
+    };
+    // The same work every time: the least of several runs is the planner's own, without what else the machine did.
+    let runs: Vec<Vec<Duration>> = (0..5).map(|_| run()).collect();
+    assert!(runs[0].len() > 100 && runs.iter().all(|gaps| gaps.len() == runs[0].len()));
+    let least = |i: usize| runs.iter().map(|gaps| gaps[i]).min().unwrap();
+    let longest = (0..runs[0].len()).map(least).max().unwrap();
+    assert!(longest < Duration::from_millis(5), "{longest:?}");
+}
+
+#[test]
+fn a_box_is_carried_upright_where_the_way_leads_round_something() {
+    let tolerance = 0.15;
+    let mut carried = 0;
+    for seed in 0..4 {
+        let mut cell = Cell::with_boxes(3, 30 + seed);
+        let plan = cell.plan(&cell.approach("box_1")).unwrap();
+        cell.follow(&plan);
+        cell.grasp("box_1");
+        let request = Request { upright_rad: Some(tolerance), ..cell.transfer("box_1", 4) };
+        let plan = cell.plan(&request).unwrap_or_else(|e| panic!("{seed}: {e}"));
+        assert_valid(&cell, &plan, 0.3);
+        let trajectory = ArmTrajectory::read(&cell.robot, &plan.trajectory).unwrap();
+        let mut solver = ratn_motion::inverse::Solver::new(&cell.robot, &Pose::IDENTITY);
+        let steps = (trajectory.duration_s() * 100.0) as usize;
+        for i in 0..=steps {
+            let tool = solver.tool(&trajectory.sample(f64::from(i as u32) / 100.0).positions);
+            let tilt = (-tool.rotate([0.0, 0.0, 1.0])[2]).clamp(-1.0, 1.0).acos();
+            assert!(tilt <= tolerance + 5e-3, "{tilt:.3} rad off upright");
+        }
+        carried += 1;
+        let wild = Request { upright_rad: Some(0.001), ..request };
+        assert!(matches!(cell.plan(&wild), Err(PlanError::Malformed { .. })));
+    }
+    assert_eq!(carried, 4);
+}
+
+#[test]
 fn what_stands_in_the_straight_way_is_gone_round() {
     let mut cell = Cell::with_boxes(3, 8);
     cell.improvement_iterations = 300;
@@ -228,6 +294,26 @@ proptest! {
                     let acceleration = (b[j] - a[j]).abs() / h;
                     prop_assert!(acceleration <= joint.acceleration * speed * 1.01, "{} {acceleration}", joint.name);
                 }
+            }
+        }
+    }
+
+    #[test]
+    fn jerks_keep_within_their_limits(seed in 0_u64..10_000, speed in 0.1..1.0) {
+        let cell = Cell::with_boxes(3, seed);
+        let mut request = cell.approach("box_2");
+        request.speed = speed;
+        let plan = cell.plan(&request).unwrap();
+        let trajectory = ArmTrajectory::read(&Robot::aimm(), &plan.trajectory).unwrap();
+        let knots = trajectory.knots();
+        let mean = |i: usize, j: usize| {
+            (knots[i + 1].velocities[j] - knots[i].velocities[j]) / (knots[i + 1].time_s - knots[i].time_s)
+        };
+        for i in 1..knots.len() - 1 {
+            let step = (knots[i + 1].time_s - knots[i - 1].time_s) / 2.0;
+            for (j, joint) in cell.robot.arm_joints().iter().enumerate() {
+                let jerk = (mean(i, j) - mean(i - 1, j)).abs() / step;
+                prop_assert!(jerk <= joint.jerk * 1.01, "{} {jerk} of {}", joint.name, joint.jerk);
             }
         }
     }

@@ -72,6 +72,7 @@ impl Bench {
             goals,
             depart_m,
             approach_m,
+            upright_rad: None,
             speed: 0.5,
             seed: 3,
             improvement_iterations: 50,

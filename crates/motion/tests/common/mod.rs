@@ -21,7 +21,16 @@ pub struct Cell {
 
 /// A request without straight parts.
 pub fn request(start: Joints, goals: Vec<Goal>) -> Request {
-    Request { start, goals, depart_m: 0.0, approach_m: 0.0, speed: 0.3, seed: 7, improvement_iterations: 0 }
+    Request {
+        start,
+        goals,
+        depart_m: 0.0,
+        approach_m: 0.0,
+        upright_rad: None,
+        speed: 0.3,
+        seed: 7,
+        improvement_iterations: 0,
+    }
 }
 
 impl Cell {

@@ -1,4 +1,5 @@
-//! A goal of the path planner, read from its input ports.
+//! A goal of the path planner, read from its input ports: `start`, `goal` (joints, a pose, or a list of these); optional `depart_m`,
+//! `approach_m` (straight parts), `upright_rad` (what points up in the tool stays so, at most this far off), `speed`, `budget_s`.
 
 use ratn_model::value::Value;
 use ratn_motion::plan::{Goal, Request};
@@ -21,6 +22,7 @@ pub(super) fn request(goal: &GoalContext) -> Result<(Request, Option<f64>), Acti
         goals: goals(goal.port("goal").any()?)?,
         depart_m: goal.optional_float("depart_m")?.unwrap_or(0.0),
         approach_m: goal.optional_float("approach_m")?.unwrap_or(0.0),
+        upright_rad: goal.optional_float("upright_rad")?,
         speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
         seed: goal.seed,
         // Improvement goes on until the budget ends.

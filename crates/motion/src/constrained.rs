@@ -1,0 +1,240 @@
+//! Paths all of whose postures keep a frame where it may be, such as a bowl upright: two trees as in `connect`, grown by small
+//! steps, each projected onto the constraint (Berenson, Srinivasa, Ferguson, Kuffner: *Manipulation Planning on Constraint
+//! Manifolds*, ICRA 2009).
+//!
+//! A step is taken only if it is free and if the constraint holds at the postures between its ends as well, [`Space::RESOLUTION`]
+//! per radian; so the path that comes out is a dense list of postures to be followed as they are. Steps are projected to half of
+//! the tolerance, which leaves the other half for what is between them: tolerances below [`LEAST_TOLERANCE`] ask for too much.
+
+use crate::connect::{Budget, ConnectError, Route};
+use crate::halton::Halton;
+use crate::pace::Control;
+use crate::reach::{Positions, Reach, Target};
+use crate::simplify::path_length;
+use crate::space::{Space, State, between, distance};
+use crate::tree::Tree;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// The least tolerance that makes sense, in radians or metres.
+pub const LEAST_TOLERANCE: f64 = 0.005;
+
+/// How far a step goes, in radians.
+const STEP: f32 = 0.0625;
+
+/// A step must come nearer by at least this share of itself, and its projection may lead at most so many steps away.
+const LEAST_PROGRESS: f32 = 0.1;
+const MOST_ASTRAY: f32 = 2.0;
+
+/// Attempts at shortcuts that make most paths short.
+pub const SHORTCUTS: usize = 60;
+
+/// What all postures of a path keep.
+#[derive(Debug, Clone)]
+pub struct Constraint {
+    reach: Reach,
+    target: Target,
+    inner: Target,
+}
+
+impl Constraint {
+    /// The frame of `reach` stays within the tolerances of `target`.
+    pub fn new(reach: Reach, target: Target) -> Constraint {
+        let half = |tolerance: [f64; 3]| tolerance.map(|t| if t < std::f64::consts::PI { t / 2.0 } else { t });
+        let inner =
+            Target { tolerance_m: half(target.tolerance_m), tolerance_rad: half(target.tolerance_rad), ..target };
+        Constraint { reach, target, inner }
+    }
+
+    /// Whether a posture keeps it.
+    pub fn holds(&self, state: &State) -> bool {
+        self.target.is_met_by(&self.reach.pose(&positions(state)))
+    }
+
+    /// How far the frame's z axis is off that of the target, in radians.
+    pub fn tilt_rad(&self, state: &State) -> f64 {
+        let up = [0.0, 0.0, 1.0];
+        let (have, want) = (self.reach.pose(&positions(state)).rotate(up), self.target.pose.rotate(up));
+        (0..3).map(|i| have[i] * want[i]).sum::<f64>().clamp(-1.0, 1.0).acos()
+    }
+
+    /// Whether all postures of a straight motion keep it, as far as one looks.
+    pub fn holds_along(&self, from: &State, to: &State) -> bool {
+        let steps = (distance(from, to) * Space::RESOLUTION).ceil().max(1.0) as usize;
+        (1..=steps).all(|i| self.holds(&between(from, to, i as f32 / steps as f32)))
+    }
+
+    fn project(&self, state: &State) -> Option<State> {
+        let positions = positions(state);
+        if self.inner.is_met_by(&self.reach.pose(&positions)) {
+            return Some(*state);
+        }
+        self.reach.descend(&self.inner, &positions).map(|p| p.map(|q| q as f32))
+    }
+}
+
+fn positions(state: &State) -> Positions {
+    state.map(f64::from)
+}
+
+/// Searches a path from `start` to one of `goals` that keeps the constraint. `control` gets the iterations so far.
+///
+/// # Errors
+/// [`ConnectError`] says why there is none.
+pub fn connect(
+    space: &mut Space,
+    constraint: &Constraint,
+    start: &State,
+    goals: &[State],
+    budget: Budget,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<Route, ConnectError> {
+    if !space.is_within(start) || !space.is_free(start) {
+        return Err(ConnectError::Start);
+    }
+    if !constraint.holds(start) {
+        return Err(ConnectError::Constraint { which: "start" });
+    }
+    let mut usable: Vec<usize> = (0..goals.len()).filter(|g| space.is_within(&goals[*g])).collect();
+    usable.retain(|g| space.is_free(&goals[*g]));
+    if usable.is_empty() {
+        return Err(ConnectError::Goal { goals: goals.len() });
+    }
+    usable.retain(|g| constraint.holds(&goals[*g]));
+    if usable.is_empty() {
+        return Err(ConnectError::Constraint { which: "goal" });
+    }
+    usable.sort_by(|a, b| distance(start, &goals[*a]).total_cmp(&distance(start, &goals[*b])));
+    let ends: Vec<State> = usable.iter().map(|g| goals[*g]).collect();
+    let (path, iterations) = grow(space, constraint, start, &ends, budget, control)?;
+    let last = path[path.len() - 1];
+    let goal = usable.iter().copied().find(|g| goals[*g] == last).unwrap_or(usable[0]);
+    Ok(Route { path, goal, iterations })
+}
+
+fn grow(
+    space: &mut Space,
+    constraint: &Constraint,
+    start: &State,
+    ends: &[State],
+    budget: Budget,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<(Vec<State>, usize), ConnectError> {
+    let joints = space.joints();
+    let (lower, upper) = (*space.limits().0, *space.limits().1);
+    let mut samples = Halton::new(joints, budget.seed);
+    let mut trees = [Tree::new(space.isa(), joints), Tree::new(space.isa(), joints)];
+    trees[0].push(*start, 0);
+    for (i, end) in ends.iter().enumerate() {
+        trees[1].push(*end, i);
+    }
+    let mut growing = 0;
+    for iteration in 0..budget.iterations {
+        // The first sample is the other tree, which is the straight way.
+        let sample = if iteration == 0 { ends[0] } else { samples.next(&lower, &upper) };
+        let (near, _) = trees[growing].nearest(&sample);
+        let node = extend(space, constraint, &mut trees[growing], near, &sample, control)
+            .map_err(|answer| stopped(answer, iteration))?;
+        let reached = trees[growing].states[node];
+        let (near, _) = trees[1 - growing].nearest(&reached);
+        let meeting = extend(space, constraint, &mut trees[1 - growing], near, &reached, control)
+            .map_err(|answer| stopped(answer, iteration))?;
+        if trees[1 - growing].states[meeting] == reached {
+            let (mut path, rest) = (trees[growing].branch(node), trees[1 - growing].branch(meeting));
+            path.reverse();
+            path.extend(&rest[1..]);
+            if growing == 1 {
+                path.reverse();
+            }
+            return Ok((path, iteration));
+        }
+        growing = 1 - growing;
+    }
+    Err(ConnectError::Exhausted { iterations: budget.iterations })
+}
+
+fn stopped(answer: Control, iterations: usize) -> ConnectError {
+    if answer == Control::Cancelled { ConnectError::Cancelled } else { ConnectError::TimeUp { iterations } }
+}
+
+/// Adds the steps of a walk to a tree; the last node, which is `near` where there is none.
+fn extend(
+    space: &mut Space,
+    constraint: &Constraint,
+    tree: &mut Tree,
+    near: usize,
+    to: &State,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<usize, Control> {
+    let mut node = near;
+    for state in walk(space, constraint, &tree.states[near].clone(), to, control)? {
+        node = tree.push(state, node);
+    }
+    Ok(node)
+}
+
+/// Postures on the constraint from one, which is left out, towards another, as far as they get.
+fn walk(
+    space: &mut Space,
+    constraint: &Constraint,
+    from: &State,
+    to: &State,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<Vec<State>, Control> {
+    let (mut here, mut steps) = (*from, Vec::new());
+    loop {
+        let answer = control(steps.len());
+        if answer != Control::Continue {
+            return Err(answer);
+        }
+        let far = distance(&here, to);
+        if far == 0.0 {
+            return Ok(steps);
+        }
+        let ahead = if far <= STEP { *to } else { between(&here, to, STEP / far) };
+        let Some(next) = constraint.project(&ahead) else { return Ok(steps) };
+        let (way, left) = (distance(&here, &next), distance(&next, to));
+        let progress = far - left >= LEAST_PROGRESS * STEP.min(far) && way <= MOST_ASTRAY * STEP;
+        if !progress || !constraint.holds_along(&here, &next) || !space.is_free_motion(&here, &next) {
+            return Ok(steps);
+        }
+        steps.push(next);
+        here = next;
+    }
+}
+
+/// Makes a path shorter that keeps the constraint, and goes on keeping it, by so many attempts at shortcuts.
+///
+/// # Errors
+/// What `control` said, when that was not to go on; the path is whole all the same.
+pub fn shorten(
+    space: &mut Space,
+    constraint: &Constraint,
+    path: &mut Vec<State>,
+    attempts: usize,
+    seed: u64,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<(), Control> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    for attempt in 0..attempts {
+        let answer = control(attempt);
+        if answer != Control::Continue {
+            return Err(answer);
+        }
+        if path.len() < 3 {
+            break;
+        }
+        let (a, b) = (random.random_range(0..path.len()), random.random_range(0..path.len()));
+        let (low, high) = (a.min(b), a.max(b));
+        if high < low + 2 {
+            continue;
+        }
+        let (from, to) = (path[low], path[high]);
+        let steps = walk(space, constraint, &from, &to, control)?;
+        let whole: Vec<State> = std::iter::once(from).chain(steps).collect();
+        if whole.last() == Some(&to) && path_length(&whole) < path_length(&path[low..=high]) {
+            path.splice(low..=high, whole);
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,141 @@
+//! Driving: paths of the base on the floor, in x, y and heading, among what stands there.
+//!
+//! The base with all that rides on it, in the posture that it is in, is one body moved by two sliding joints and a turning one;
+//! the search is that of the arm. A heading is the same after a whole turn, so every goal is offered with its turns, and the
+//! nearest is taken. Lengths count metres and radians alike.
+
+use crate::connect::{Budget, ConnectError, connect};
+use crate::geometry::Body;
+use crate::mechanism::{Drive, MAX_JOINTS, Mechanism, Part};
+use crate::pace::Control;
+use crate::robot::{Configuration, Geometry, Joint, Robot};
+use crate::simplify::simplify;
+use crate::space::{Obstacle, Space, State};
+use crate::spheres::cover_within;
+use ratn_model::pose::Pose;
+use ratn_world::scene::{Placement, Scene};
+use std::collections::BTreeSet;
+use std::f64::consts::TAU;
+
+/// How far the spheres may stand out of what drives, in metres.
+const OVERHANG_M: f64 = 0.03;
+
+/// Where something may drive and what it is.
+#[derive(Debug, Clone)]
+pub struct Vehicle {
+    /// Everything that moves along, in the frame of the base.
+    pub bodies: Vec<Body>,
+    /// Least and greatest x, least and greatest y, in metres.
+    pub area: [[f64; 2]; 2],
+    /// Room that it keeps, in metres.
+    pub padding_m: f64,
+}
+
+impl Vehicle {
+    /// A disc of a radius and a height, standing on the floor, in metres.
+    pub fn round(radius: f64, height: f64, area: [[f64; 2]; 2], padding_m: f64) -> Vehicle {
+        let geometry = Geometry::Cylinder { radius, half_length: height / 2.0 };
+        Vehicle { bodies: vec![geometry.at(Pose::at(0.0, 0.0, height / 2.0))], area, padding_m }
+    }
+
+    /// Our robot as it stands, with what it holds and the objects of the scene that ride on it; and what it may not touch.
+    pub fn of(
+        robot: &Robot,
+        scene: &Scene,
+        configuration: &Configuration,
+        riding: &[String],
+        area: [[f64; 2]; 2],
+        padding_m: f64,
+    ) -> (Vehicle, Vec<Obstacle>) {
+        let [x, y, yaw] = configuration.base;
+        let base = Pose::from_rpy([x, y, 0.0], 0.0, 0.0, yaw).inverse();
+        let poses = robot.poses(configuration);
+        let links = robot.links.iter().zip(&poses);
+        let placed = |pose: &Pose, body: &Body| Body { pose: base.compose(pose).compose(&body.pose), ..*body };
+        let mut bodies: Vec<Body> =
+            links.flat_map(|(link, pose)| link.bodies.iter().map(|body| placed(pose, body))).collect();
+        let mut obstacles = Vec::new();
+        for object in &scene.objects {
+            let geometry = Geometry::from(&object.shape);
+            match object.placement {
+                Placement::Gripper(pose) => bodies.push(placed(&poses[robot.tool], &geometry.at(pose))),
+                Placement::World(pose) if riding.contains(&object.name) => {
+                    bodies.push(geometry.at(base.compose(&pose)));
+                }
+                Placement::World(pose) => obstacles.push(Obstacle { name: object.name.clone(), pose, geometry }),
+            }
+        }
+        (Vehicle { bodies, area, padding_m }, obstacles)
+    }
+
+    fn mechanism(&self) -> Mechanism {
+        let [[x_low, x_high], [y_low, y_high]] = self.area;
+        let joint = |name: &str, lower, upper| Joint {
+            name: name.to_owned(),
+            lower,
+            upper,
+            velocity: 1.0,
+            acceleration: 1.0,
+            jerk: 10.0,
+        };
+        let joints = vec![joint("x", x_low, x_high), joint("y", y_low, y_high), joint("heading", -TAU, TAU)];
+        let link = |parent, drive| Part {
+            name: "base".to_owned(),
+            parent,
+            origin: Pose::IDENTITY,
+            drive,
+            bodies: Vec::new(),
+            padding_m: 0.0,
+            spheres: Vec::new(),
+        };
+        let slide = |joint, axis| Some(Drive { joint, axis, slides: true });
+        let turn = Some(Drive { joint: 2, axis: [0.0, 0.0, 1.0], slides: false });
+        let mut links = vec![link(None, slide(0, [1.0, 0.0, 0.0])), link(Some(0), slide(1, [0.0, 1.0, 0.0]))];
+        let mut base = link(Some(1), turn);
+        base.padding_m = self.padding_m;
+        base.bodies.clone_from(&self.bodies);
+        let grown = |body: &Body| Body { geometry: body.geometry.grown(self.padding_m), ..*body };
+        base.spheres = self.bodies.iter().flat_map(|body| cover_within(&grown(body), OVERHANG_M)).collect();
+        links.push(base);
+        Mechanism { name: "vehicle".to_owned(), joints, links, disabled: BTreeSet::new(), allowed: BTreeSet::new() }
+    }
+}
+
+/// A short path on the floor from `start` to one of `goals`, each x and y in metres and heading in radians; straight motions
+/// between its places, free all along. The heading at its end is a goal's up to whole turns. Gives the goal's index too.
+///
+/// # Errors
+/// [`ConnectError`] says why there is none.
+pub fn drive(
+    vehicle: &Vehicle,
+    obstacles: &[Obstacle],
+    start: [f64; 3],
+    goals: &[[f64; 3]],
+    budget: Budget,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<(Vec<[f64; 3]>, usize), ConnectError> {
+    let mut space = Space::new(&vehicle.mechanism(), obstacles);
+    let offer = |goal: &[f64; 3]| [-TAU, 0.0, TAU].map(|turn| state([goal[0], goal[1], wrapped(goal[2]) + turn]));
+    let ends: Vec<State> = goals.iter().flat_map(offer).collect();
+    let from = state([start[0], start[1], wrapped(start[2])]);
+    let route = match connect(&mut space, &from, &ends, budget, control) {
+        Err(ConnectError::Goal { .. }) => return Err(ConnectError::Goal { goals: goals.len() }),
+        other => other?,
+    };
+    let path = simplify(&mut space, &route.path, budget, control)?;
+    let places = path.iter().map(|s| [f64::from(s[0]), f64::from(s[1]), f64::from(s[2])]).collect();
+    Ok((places, route.goal / 3))
+}
+
+fn state(place: [f64; 3]) -> State {
+    let mut state = [0.0; MAX_JOINTS];
+    for (to, from) in state.iter_mut().zip(place) {
+        *to = from as f32;
+    }
+    state
+}
+
+/// A heading within half a turn of zero.
+fn wrapped(heading: f64) -> f64 {
+    heading - TAU * (heading / TAU).round()
+}

@@ -1,0 +1,341 @@
+//! Postures that bring a link of any robot to where it is wanted, within tolerances.
+//!
+//! Numeric: damped least squares on the geometric Jacobian, from a given posture or from random ones. What is within its
+//! tolerance counts as no error, so the same descent serves poses to be reached ([`Target::at`]), poses about an axis, and
+//! constraints that a whole path keeps, such as "upright" ([`Target::upright`]). Arms with a spherical shoulder and wrist are
+//! solved in closed form first (`spherical`). Deterministic: the randomness comes from the caller.
+
+use crate::frame::{compose, cross, difference, norm, rotate};
+use crate::mechanism::{Drive, MAX_JOINTS, Mechanism};
+use crate::robot::Joint;
+use crate::spherical::Spherical;
+use rand::{Rng, RngExt};
+use ratn_model::pose::Pose;
+use std::f64::consts::PI;
+
+/// Positions in the order of the joints; unused ones are zero.
+pub type Positions = [f64; MAX_JOINTS];
+
+/// Iterations of one descent.
+const MAX_ITERATIONS: usize = 80;
+
+/// The greatest change of a joint in one iteration, in radians.
+const MAX_STEP: f64 = 0.4;
+
+/// A descent aims at this share of the tolerances, so that it does not creep along their edge.
+const INNER: f64 = 0.9;
+
+/// Tolerances below this leave nothing open, in metres or radians.
+const EXACT: f64 = 1e-4;
+
+/// Two postures closer than this are the same one, in radians.
+const SAME: f64 = 0.05;
+
+/// Where a link is wanted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Target {
+    /// In the frame of the robot's root.
+    pub pose: Pose,
+    /// How far the link may be off along the axes of that pose, in metres.
+    pub tolerance_m: [f64; 3],
+    /// How far it may be turned about them, in radians. A half turn about z or more means: any turn about z, and x and y count
+    /// for the direction of the z axis together.
+    pub tolerance_rad: [f64; 3],
+}
+
+impl Target {
+    /// The pose itself, to within a micrometre and a microradian.
+    pub fn at(pose: Pose) -> Target {
+        Target { pose, tolerance_m: [1e-6; 3], tolerance_rad: [1e-6; 3] }
+    }
+
+    /// Anywhere, with the z axis of a frame whose rotation is that of `pose` at most `tolerance_rad` off its direction.
+    pub fn upright(pose: Pose, tolerance_rad: f64) -> Target {
+        Target { pose, tolerance_m: [f64::INFINITY; 3], tolerance_rad: [tolerance_rad, tolerance_rad, PI] }
+    }
+
+    /// What is missing from a pose to this beyond the tolerances, position and rotation vector in the target's frame; zero where
+    /// it is reached.
+    fn error(&self, have: &Pose, share: f64) -> [f64; 6] {
+        let inverse = self.pose.inverse();
+        let off = rotate(&inverse, difference(self.pose.position, have.position));
+        let about_z = self.tolerance_rad[2] >= PI;
+        let turn = if about_z {
+            let axis = rotate(have, [0.0, 0.0, 1.0]);
+            rotate(&inverse, between_directions(axis, rotate(&self.pose, [0.0, 0.0, 1.0])))
+        } else {
+            rotate(&inverse, rotation_vector(&compose(&self.pose, &have.inverse())))
+        };
+        let beyond = |value: f64, tolerance: f64| {
+            let tolerance = tolerance * share;
+            if value.abs() <= tolerance { 0.0 } else { value - value.signum() * tolerance }
+        };
+        let off: [f64; 3] = std::array::from_fn(|i| beyond(off[i], self.tolerance_m[i]));
+        let turn: [f64; 3] = if about_z {
+            let turn = [turn[0], turn[1], 0.0];
+            let (angle, tolerance) = (norm(turn), self.tolerance_rad[0].min(self.tolerance_rad[1]) * share);
+            turn.map(|t| if angle <= tolerance { 0.0 } else { t * (angle - tolerance) / angle })
+        } else {
+            std::array::from_fn(|i| beyond(turn[i], self.tolerance_rad[i]))
+        };
+        let ([x, y, z], [i, j, k]) = (off, turn);
+        [x, y, z, i, j, k]
+    }
+
+    /// Which parts of an error a step has to mind: those that are free to change are left out.
+    fn minds(&self, error: &[f64; 6]) -> [bool; 6] {
+        let tolerance = |i: usize| if i < 3 { self.tolerance_m[i] } else { self.tolerance_rad[i - 3] };
+        std::array::from_fn(|i| error[i] != 0.0 || tolerance(i) < EXACT)
+    }
+
+    /// Whether a pose is within the tolerances.
+    pub fn is_met_by(&self, pose: &Pose) -> bool {
+        self.error(pose, 1.0) == [0.0; 6]
+    }
+
+    /// Whether the tolerances leave nothing open, to speak of.
+    fn is_exact(&self) -> bool {
+        self.tolerance_m.iter().chain(&self.tolerance_rad).all(|t| *t < EXACT)
+    }
+}
+
+/// The chain of joints from a robot's root to one of its links.
+#[derive(Debug, Clone)]
+pub struct Reach {
+    /// From the root: where each moving link's joint sits in the frame before it.
+    chain: Vec<(Pose, Drive)>,
+    /// The link in the frame of the last joint.
+    tip: Pose,
+    joints: Vec<Joint>,
+    spherical: Option<Spherical>,
+}
+
+/// A joint's axis in the root's frame.
+struct Axis {
+    direction: [f64; 3],
+    point: [f64; 3],
+    drive: Drive,
+}
+
+impl Reach {
+    /// The chain to the link with this index, and from there to a frame fixed to it.
+    pub fn new(mechanism: &Mechanism, link: usize, frame: Pose) -> Reach {
+        let mut links = vec![link];
+        while let Some(parent) = mechanism.links[links[links.len() - 1]].parent {
+            links.push(parent);
+        }
+        let (mut chain, mut fixed) = (Vec::new(), Pose::IDENTITY);
+        for index in links.into_iter().rev() {
+            let link = &mechanism.links[index];
+            fixed = fixed.compose(&link.origin);
+            if let Some(drive) = link.drive {
+                chain.push((fixed, drive));
+                fixed = Pose::IDENTITY;
+            }
+        }
+        let tip = fixed.compose(&frame);
+        let spherical = Spherical::of(&chain, &tip);
+        Reach { chain, tip, joints: mechanism.joints.clone(), spherical }
+    }
+
+    /// How many joints the robot has.
+    pub fn joints(&self) -> usize {
+        self.joints.len()
+    }
+
+    /// The frame in the frame of the root.
+    pub fn pose(&self, positions: &Positions) -> Pose {
+        let place =
+            |pose: &Pose, (origin, drive): &(Pose, Drive)| compose(&compose(pose, origin), &moved(drive, positions));
+        compose(&self.chain.iter().fold(Pose::IDENTITY, |pose, link| place(&pose, link)), &self.tip)
+    }
+
+    /// Positions held within the limits.
+    pub fn clamp(&self, positions: &Positions) -> Positions {
+        let mut clamped = *positions;
+        for (q, joint) in clamped.iter_mut().zip(&self.joints) {
+            *q = q.clamp(joint.lower, joint.upper);
+        }
+        clamped
+    }
+
+    /// Random positions within the limits.
+    pub fn random(&self, random: &mut impl Rng) -> Positions {
+        let mut positions = [0.0; MAX_JOINTS];
+        for (q, joint) in positions.iter_mut().zip(&self.joints) {
+            *q = random.random_range(joint.lower..joint.upper);
+        }
+        positions
+    }
+
+    /// Descends from `seed` to positions within the limits that meet the target.
+    pub fn descend(&self, target: &Target, seed: &Positions) -> Option<Positions> {
+        let mut positions = self.clamp(seed);
+        for _ in 0..MAX_ITERATIONS {
+            let (axes, tip) = self.axes(&positions);
+            if target.is_met_by(&tip) {
+                return Some(positions);
+            }
+            let error = target.error(&tip, INNER);
+            let rows = jacobian(&axes, &tip, &target.pose.inverse(), target.minds(&error));
+            let (off, turned) = (norm([error[0], error[1], error[2]]), norm([error[3], error[4], error[5]]));
+            // Far away a heavily damped step keeps the descent steady; close by it is nearly Newton's.
+            let damping = f64::clamp(1e-3 * (off + turned), 1e-9, 1e-3);
+            let step = damped_step(&rows, &error, damping, self.joints.len())?;
+            let largest = step.iter().fold(0.0_f64, |m, s| m.max(s.abs()));
+            let scale = if largest > MAX_STEP { MAX_STEP / largest } else { 1.0 };
+            for (q, step) in positions.iter_mut().zip(step) {
+                *q += scale * step;
+            }
+            positions = self.clamp(&positions);
+        }
+        None
+    }
+
+    /// Up to `wanted` different postures from at most `attempts`, nearest to `near` first.
+    pub fn solutions(
+        &self,
+        target: &Target,
+        near: &Positions,
+        wanted: usize,
+        attempts: usize,
+        random: &mut impl Rng,
+    ) -> Vec<Positions> {
+        let mut found: Vec<Positions> = Vec::new();
+        for attempt in 0..attempts {
+            for posture in self.attempt(target, near, attempt, random) {
+                if found.len() < wanted && found.iter().all(|other| distance(other, &posture) > SAME) {
+                    found.push(posture);
+                }
+            }
+            if found.len() == wanted {
+                break;
+            }
+        }
+        found.sort_by(|a, b| distance(a, near).total_cmp(&distance(b, near)));
+        found
+    }
+
+    /// The postures of one attempt: the first near `near`, further ones anywhere; in closed form where the arm allows it.
+    pub fn attempt(&self, target: &Target, near: &Positions, attempt: usize, random: &mut impl Rng) -> Vec<Positions> {
+        if let Some(spherical) = self.spherical.as_ref().filter(|_| target.is_exact()) {
+            let turn = if attempt == 0 { spherical.turn(near) } else { random.random_range(-PI..PI) };
+            let within = |p: &Positions| self.clamp(p) == *p && target.is_met_by(&self.pose(p));
+            let mut solutions: Vec<Positions> =
+                spherical.solve(&target.pose, turn).into_iter().filter(within).collect();
+            solutions.sort_by(|a, b| distance(a, near).total_cmp(&distance(b, near)));
+            return solutions;
+        }
+        let seed = if attempt == 0 { *near } else { self.random(random) };
+        self.descend(target, &seed).into_iter().collect()
+    }
+
+    /// Each joint's axis and a point on it, in the root's frame; and the frame.
+    fn axes(&self, positions: &Positions) -> (Vec<Axis>, Pose) {
+        let mut axes = Vec::with_capacity(self.chain.len());
+        let mut pose = Pose::IDENTITY;
+        for (origin, drive) in &self.chain {
+            pose = compose(&pose, origin);
+            axes.push(Axis { direction: rotate(&pose, drive.axis), point: pose.position, drive: *drive });
+            pose = compose(&pose, &moved(drive, positions));
+        }
+        (axes, compose(&pose, &self.tip))
+    }
+}
+
+/// Rows: the velocity of the tip and its angular velocity per joint, as seen from a frame turned by `view`; those that are not
+/// minded are zero.
+fn jacobian(axes: &[Axis], tip: &Pose, view: &Pose, minded: [bool; 6]) -> [Positions; 6] {
+    let mut rows = [[0.0; MAX_JOINTS]; 6];
+    for Axis { direction, point, drive } in axes {
+        let (linear, angular) = match drive.slides {
+            true => (*direction, [0.0; 3]),
+            false => (cross(*direction, difference(tip.position, *point)), *direction),
+        };
+        let values = rotate(view, linear).into_iter().chain(rotate(view, angular));
+        for ((row, value), _) in rows.iter_mut().zip(values).zip(minded).filter(|(_, minded)| *minded) {
+            // A joint may move several links of a chain.
+            row[drive.joint] += value;
+        }
+    }
+    rows
+}
+
+/// The Euclidean distance.
+pub fn distance(a: &Positions, b: &Positions) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+}
+
+fn moved(drive: &Drive, positions: &Positions) -> Pose {
+    let position = positions[drive.joint];
+    if drive.slides {
+        let [x, y, z] = drive.axis.map(|c| c * position);
+        return Pose::at(x, y, z);
+    }
+    let (sin, cos) = (position / 2.0).sin_cos();
+    let [x, y, z] = drive.axis;
+    Pose { position: [0.0; 3], quaternion_xyzw: [x * sin, y * sin, z * sin, cos] }
+}
+
+/// The axis of a rotation times its angle, at most half a turn.
+pub(crate) fn rotation_vector(rotation: &Pose) -> [f64; 3] {
+    let turn = rotation.quaternion_xyzw;
+    let [i, j, k, w] = if turn[3] < 0.0 { turn.map(|c| -c) } else { turn };
+    let sine = norm([i, j, k]);
+    // Near zero the angle is twice the sine of its half.
+    let scale = if sine > 1e-9 { 2.0 * sine.atan2(w) / sine } else { 2.0 };
+    [i * scale, j * scale, k * scale]
+}
+
+/// The shortest rotation from one direction to another, as a rotation vector; about any axis for opposite ones.
+fn between_directions(from: [f64; 3], to: [f64; 3]) -> [f64; 3] {
+    let axis = cross(from, to);
+    let (sine, cosine) = (norm(axis), (0..3).map(|i| from[i] * to[i]).sum::<f64>());
+    if sine > 1e-12 {
+        return axis.map(|c| c * sine.atan2(cosine) / sine);
+    }
+    if cosine > 0.0 {
+        return [0.0; 3];
+    }
+    let aside = if from[0].abs() < 0.9 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] };
+    let axis = cross(from, aside);
+    axis.map(|c| c * PI / norm(axis))
+}
+
+/// Jᵀ (J Jᵀ + λ I)⁻¹ e; `None` where the system is singular.
+fn damped_step(jacobian: &[Positions; 6], error: &[f64; 6], damping: f64, joints: usize) -> Option<Positions> {
+    let mut system = [[0.0; 7]; 6];
+    for row in 0..6 {
+        for column in 0..6 {
+            system[row][column] = (0..joints).map(|j| jacobian[row][j] * jacobian[column][j]).sum();
+        }
+        system[row][row] += damping;
+        system[row][6] = error[row];
+    }
+    let solved = solve(&mut system)?;
+    Some(std::array::from_fn(|j| (0..6).map(|row| jacobian[row][j] * solved[row]).sum()))
+}
+
+/// Gauss elimination with partial pivoting; the right side is the last column.
+pub(crate) fn solve(system: &mut [[f64; 7]; 6]) -> Option<[f64; 6]> {
+    for column in 0..6 {
+        let pivot = (column..6).max_by(|a, b| system[*a][column].abs().total_cmp(&system[*b][column].abs()))?;
+        system.swap(column, pivot);
+        if system[column][column].abs() < 1e-15 {
+            return None;
+        }
+        for row in column + 1..6 {
+            let factor = system[row][column] / system[column][column];
+            let above = system[column];
+            for (value, other) in system[row].iter_mut().zip(above).skip(column) {
+                *value -= factor * other;
+            }
+        }
+    }
+    let mut solution = [0.0; 6];
+    for row in (0..6).rev() {
+        let known: f64 = (row + 1..6).map(|k| system[row][k] * solution[k]).sum();
+        solution[row] = (system[row][6] - known) / system[row][row];
+    }
+    Some(solution)
+}

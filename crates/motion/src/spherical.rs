@@ -1,0 +1,190 @@
+//! Arms of seven turning joints with a spherical shoulder and a spherical wrist, solved in closed form: the elbow from the
+//! distance of the wrist, the shoulder and the wrist as three turns each, and the one free motion that a pose leaves, the turn
+//! of the elbow about the line from shoulder to wrist, chosen by the caller. All axes as they are at zero positions, products
+//! of exponentials from there (Paden and Kahan's subproblems; Murray, Li, Sastry: *A Mathematical Introduction to Robotic
+//! Manipulation*, 3.3).
+
+use crate::frame::{compose, cross, difference, norm, rotate};
+use crate::mechanism::Drive;
+use crate::reach::Positions;
+use ratn_model::pose::Pose;
+use std::f64::consts::{PI, TAU};
+
+/// Axes that pass each other by less than this meet, in metres; directions with a smaller product are perpendicular.
+const MEETING: f64 = 1e-9;
+
+type Vector = [f64; 3];
+
+/// The geometry of such an arm at zero positions.
+#[derive(Debug, Clone)]
+pub(crate) struct Spherical {
+    axes: [Vector; 7],
+    /// Which position turns each axis.
+    joints: [usize; 7],
+    shoulder: Vector,
+    /// A point on the elbow's axis.
+    elbow: Vector,
+    wrist: Vector,
+    tip: Pose,
+}
+
+impl Spherical {
+    /// Where a chain is such an arm and nothing else.
+    pub(crate) fn of(chain: &[(Pose, Drive)], tip: &Pose) -> Option<Spherical> {
+        let chain: &[(Pose, Drive); 7] = chain.try_into().ok()?;
+        let mut pose = Pose::IDENTITY;
+        let (mut axes, mut points, mut joints) = ([[0.0; 3]; 7], [[0.0; 3]; 7], [0; 7]);
+        for (i, (origin, drive)) in chain.iter().enumerate() {
+            pose = compose(&pose, origin);
+            (axes[i], points[i], joints[i]) = (rotate(&pose, drive.axis), pose.position, drive.joint);
+        }
+        let turns = chain.iter().all(|(_, drive)| !drive.slides);
+        let distinct = (0..7).all(|i| !joints[..i].contains(&joints[i]));
+        let square = [(0, 1), (1, 2), (4, 5), (5, 6)].iter().all(|(a, b)| dot(axes[*a], axes[*b]).abs() < MEETING);
+        let meeting = |first: usize| {
+            let point = meeting(points[first], axes[first], points[first + 1], axes[first + 1])?;
+            let beside = difference(point, points[first + 2]);
+            (norm(cross(beside, axes[first + 2])) < MEETING).then_some(point)
+        };
+        if !turns || !distinct || !square {
+            return None;
+        }
+        let (shoulder, wrist) = (meeting(0)?, meeting(4)?);
+        Some(Spherical { axes, joints, shoulder, elbow: points[3], wrist, tip: compose(&pose, tip) })
+    }
+
+    /// How far the elbow of a posture is turned about the line from shoulder to wrist, as [`Spherical::solve`] counts it.
+    pub(crate) fn turn(&self, positions: &Positions) -> f64 {
+        let q: [f64; 7] = std::array::from_fn(|i| positions[self.joints[i]]);
+        let shoulder = self.three(0, [q[0], q[1], q[2]]);
+        let reach = difference(self.bent(q[3]), self.shoulder);
+        let line = rotate(&shoulder, reach);
+        let zero = from_to(reach, line);
+        let rest = compose(&shoulder, &zero.inverse()).quaternion_xyzw;
+        let along = (0..3).map(|i| rest[i] * line[i]).sum::<f64>() / norm(line).max(f64::MIN_POSITIVE);
+        wrapped(2.0 * along.atan2(rest[3]))
+    }
+
+    /// All postures, limits aside, that bring the frame to a pose with the elbow at this turn.
+    pub(crate) fn solve(&self, target: &Pose, turn: f64) -> Vec<Positions> {
+        // What moves the frame from its place at zero to the target.
+        let motion = compose(target, &self.tip.inverse());
+        let line = difference(motion.transform(self.wrist), self.shoulder);
+        let mut solutions = Vec::new();
+        for bend in self.bends(norm(line)) {
+            let reach = difference(self.bent(bend), self.shoulder);
+            let shoulder = compose(&about(unit(line), turn), &from_to(reach, line));
+            for first in self.turns(0, &shoulder) {
+                // The turns themselves, not what they should be, so that errors do not add up.
+                let elbow = compose(&self.three(0, first), &about(self.axes[3], bend));
+                let wrist = compose(&elbow.inverse(), &motion);
+                for last in self.turns(4, &wrist) {
+                    let mut positions = [0.0; crate::mechanism::MAX_JOINTS];
+                    let all = first.into_iter().chain([bend]).chain(last);
+                    for (joint, value) in self.joints.iter().zip(all) {
+                        positions[*joint] = wrapped(value);
+                    }
+                    solutions.push(positions);
+                }
+            }
+        }
+        solutions
+    }
+
+    /// The wrist with the elbow bent.
+    fn bent(&self, bend: f64) -> Vector {
+        let [x, y, z] = rotate(&about(self.axes[3], bend), difference(self.wrist, self.elbow));
+        [x + self.elbow[0], y + self.elbow[1], z + self.elbow[2]]
+    }
+
+    /// Bends of the elbow that bring the wrist this far from the shoulder.
+    fn bends(&self, distance: f64) -> Vec<f64> {
+        let axis = self.axes[3];
+        let (p, q) = (difference(self.wrist, self.elbow), difference(self.shoulder, self.elbow));
+        let (along_p, along_q) = (dot(axis, p), dot(axis, q));
+        let across = |v: Vector, along: f64| -> Vector { std::array::from_fn(|i| v[i] - along * axis[i]) };
+        let (p, q) = (across(p, along_p), across(q, along_q));
+        let square = distance * distance - (along_p - along_q).powi(2);
+        let cosine = (dot(p, p) + dot(q, q) - square) / (2.0 * norm(p) * norm(q));
+        if cosine.is_nan() || cosine.abs() > 1.0 + 1e-12 {
+            return Vec::new();
+        }
+        let straight = dot(axis, cross(p, q)).atan2(dot(p, q));
+        let half = cosine.clamp(-1.0, 1.0).acos();
+        if half < 1e-9 { vec![straight] } else { vec![straight + half, straight - half] }
+    }
+
+    /// The rotation of three joints from `first` on.
+    fn three(&self, first: usize, angles: [f64; 3]) -> Pose {
+        let turn = |i: usize| about(self.axes[first + i], angles[i]);
+        compose(&compose(&turn(0), &turn(1)), &turn(2))
+    }
+
+    /// The two ways to make a rotation of three joints from `first` on, each perpendicular to the next.
+    fn turns(&self, first: usize, rotation: &Pose) -> [[f64; 3]; 2] {
+        let [a, b, c] = [self.axes[first], self.axes[first + 1], self.axes[first + 2]];
+        // Turning c about b keeps its part along b; only the middle turn changes its part along a.
+        let seen = rotate(rotation, c);
+        let (cosine, sine) = (dot(a, c), dot(a, cross(b, c)));
+        let (size, zero) = (cosine.hypot(sine), sine.atan2(cosine));
+        let half = (dot(a, seen) / size).clamp(-1.0, 1.0).acos();
+        [half, -half].map(|half| {
+            let middle = zero + half;
+            let third = rotate(&about(b, middle), c);
+            let outer = angle_about(a, third, seen);
+            let done = compose(&about(a, outer), &about(b, middle));
+            let left = compose(&done.inverse(), rotation);
+            [outer, middle, angle_about(c, b, rotate(&left, b))]
+        })
+    }
+}
+
+/// Where two lines meet, if they do.
+fn meeting(p: Vector, a: Vector, q: Vector, b: Vector) -> Option<Vector> {
+    let normal = cross(a, b);
+    let way = difference(q, p);
+    let square = dot(normal, normal);
+    if square < MEETING || dot(way, normal).abs() > MEETING {
+        return None;
+    }
+    let along = dot(cross(way, b), normal) / square;
+    Some(std::array::from_fn(|i| p[i] + along * a[i]))
+}
+
+fn dot(a: Vector, b: Vector) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+fn unit(v: Vector) -> Vector {
+    let length = norm(v).max(f64::MIN_POSITIVE);
+    v.map(|c| c / length)
+}
+
+/// A turn about a unit vector.
+fn about([x, y, z]: Vector, angle: f64) -> Pose {
+    let (sin, cos) = (angle / 2.0).sin_cos();
+    Pose { position: [0.0; 3], quaternion_xyzw: [x * sin, y * sin, z * sin, cos] }
+}
+
+/// The angle about an axis from one vector to another.
+fn angle_about(axis: Vector, from: Vector, to: Vector) -> f64 {
+    let across = |v: Vector| -> Vector { std::array::from_fn(|i| v[i] - dot(axis, v) * axis[i]) };
+    let (from, to) = (across(from), across(to));
+    dot(axis, cross(from, to)).atan2(dot(from, to))
+}
+
+/// The shortest rotation from one direction to another.
+fn from_to(from: Vector, to: Vector) -> Pose {
+    let (from, to) = (unit(from), unit(to));
+    let axis = cross(from, to);
+    if norm(axis) < 1e-12 {
+        let aside = if from[0].abs() < 0.9 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] };
+        return about(unit(cross(from, aside)), if dot(from, to) > 0.0 { 0.0 } else { PI });
+    }
+    about(unit(axis), norm(axis).atan2(dot(from, to)))
+}
+
+/// The angle within half a turn of zero.
+fn wrapped(angle: f64) -> f64 {
+    angle - TAU * (angle / TAU).round()
+}
