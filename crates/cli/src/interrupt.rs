@@ -2,6 +2,8 @@
 //!
 //! The first asks to end in order, the second to end at once, the third ends the process.
 
+use crate::aside::Aside;
+use std::sync::Arc;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
 
@@ -12,26 +14,30 @@ const PATIENCE: u32 = 3;
 #[derive(Debug, Clone)]
 pub(crate) struct Interrupt {
     count: watch::Receiver<u32>,
+    _aside: Arc<Aside>,
 }
 
 impl Interrupt {
-    /// Begins to listen. Needs a tokio runtime.
+    /// Begins to listen, in a thread of its own: a command that hangs is ended, too.
     ///
     /// # Errors
     /// Where the signals cannot be caught.
     pub(crate) fn listen() -> std::io::Result<Interrupt> {
-        let (mut interrupt, mut terminate, mut hangup) =
-            (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?, signal(SignalKind::hangup())?);
+        let aside = Aside::start("signals")?;
+        let signals = [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()];
+        let [interrupt, terminate, hangup] = aside.within(|| signals.map(signal));
+        let (mut interrupt, mut terminate, mut hangup) = (interrupt?, terminate?, hangup?);
         let (counter, count) = watch::channel(0);
-        tokio::spawn(async move {
+        let listening = async move {
             for n in 1..PATIENCE {
                 tokio::select! { _ = interrupt.recv() => {}, _ = terminate.recv() => {}, _ = hangup.recv() => {} }
                 counter.send_replace(n);
             }
             tokio::select! { _ = interrupt.recv() => {}, _ = terminate.recv() => {}, _ = hangup.recv() => {} }
             std::process::exit(EXIT_CODE_INTERRUPTED);
-        });
-        Ok(Interrupt { count })
+        };
+        aside.within(|| tokio::spawn(listening));
+        Ok(Interrupt { count, _aside: Arc::new(aside) })
     }
 
     /// Whether the user asked this process to end.

@@ -6,6 +6,7 @@
 //! was started: a task file, a config or a command line.
 
 mod arguments;
+mod aside;
 mod columns;
 mod command;
 mod failure;

@@ -23,7 +23,11 @@ use tonic::transport::Channel;
 use tonic::{Code, Request, Status};
 
 /// Texts that say what they like: data of a task, and what the standard wants ignored when it is bad.
-const FREE: [(&str, &str); 2] = [("text", ".ratn.v1.Value"), ("traceparent", ".ratn.v1.SessionRequest")];
+const FREE: [(&str, &str); 3] = [
+    ("text", ".ratn.v1.Value"),
+    ("traceparent", ".ratn.v1.SessionRequest"),
+    ("traceparent", ".ratn.v1.PerformRequest"),
+];
 
 /// A refusal waits for nothing.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -77,15 +81,21 @@ async fn call(channel: &Channel, path: &str, message: Vec<u8>) -> Result<Vec<u8>
     answers.message().await?.ok_or_else(|| Status::ok("no answer"))
 }
 
-/// What a session's stream says of a call it carries.
-fn failure(answer: &[u8]) -> Option<Status> {
-    let answer: ratn_proto::v1::SessionResponse = prost::Message::decode(answer).ok()?;
-    match answer.kind? {
-        ratn_proto::v1::session_response::Kind::Failure(failure) => {
-            Some(Status::new(Code::from(failure.code), failure.message))
-        }
-        _ => None,
-    }
+/// What a session's stream says of a call it carries, and a stream of goals of an execute.
+fn failure(path: &str, answer: &[u8]) -> Option<Status> {
+    use ratn_proto::v1::{PerformResponse, SessionResponse, perform_response, session_response};
+    let failure = if path.ends_with("/Perform") {
+        let answer: PerformResponse = prost::Message::decode(answer).ok()?;
+        answer
+            .kind
+            .and_then(|kind| if let perform_response::Kind::Failure(failure) = kind { Some(failure) } else { None })
+    } else {
+        let answer: SessionResponse = prost::Message::decode(answer).ok()?;
+        answer
+            .kind
+            .and_then(|kind| if let session_response::Kind::Failure(failure) = kind { Some(failure) } else { None })
+    };
+    failure.map(|failure| Status::new(Code::from(failure.code), failure.message))
 }
 
 /// A daemon of each kind but the cell, whose requests hold numbers only.
@@ -137,7 +147,7 @@ async fn control_characters_and_texts_without_end_are_refused_in_every_field_of_
             for bad in ["a\u{1b}[31m", &"a".repeat(2_000)] {
                 let message = schema.with_text(request, &place, bad);
                 let said = match tokio::time::timeout(PATIENCE, call(channel, path, message)).await {
-                    Ok(Ok(answer)) => failure(&answer).ok_or_else(|| format!("{} bytes of answer", answer.len())),
+                    Ok(Ok(answer)) => failure(path, &answer).ok_or_else(|| format!("{} bytes of answer", answer.len())),
                     Ok(Err(status)) => Ok(status),
                     Err(_) => Err("taken, and nothing said".to_owned()),
                 };

@@ -162,18 +162,29 @@ pub async fn connect(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
     connected.map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
 }
 
+/// As [`connect`], without pings while nothing is asked: for questions that are asked again and again, each with a deadline.
+///
+/// # Errors
+/// As [`connect`].
+pub(crate) async fn connect_to_ask(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
+    let connected = unwatched(endpoint)?.connect().await;
+    connected.map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
+}
+
 fn configured(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, ConnectError> {
+    Ok(unwatched(endpoint)?
+        .http2_keep_alive_interval(KEEPALIVE_INTERVAL)
+        .keep_alive_timeout(KEEPALIVE_TIMEOUT)
+        .keep_alive_while_idle(true))
+}
+
+fn unwatched(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, ConnectError> {
     let failed = |source| ConnectError { endpoint: endpoint.clone(), source };
     let mut configured = tonic::transport::Endpoint::from_shared(endpoint.to_string()).map_err(failed)?;
     if let Endpoint::Tls { host, .. } = endpoint {
         configured = configured.tls_config(crate::tls::of_client(host)).map_err(failed)?;
     }
-    Ok(configured
-        .connect_timeout(CONNECT_TIMEOUT)
-        .tcp_nodelay(true)
-        .http2_keep_alive_interval(KEEPALIVE_INTERVAL)
-        .keep_alive_timeout(KEEPALIVE_TIMEOUT)
-        .keep_alive_while_idle(true))
+    Ok(configured.connect_timeout(CONNECT_TIMEOUT).tcp_nodelay(true))
 }
 
 #[cfg(test)]

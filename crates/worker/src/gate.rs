@@ -96,6 +96,10 @@ pub fn ending() -> Status {
     Status::with_error_details(Code::Unavailable, "the process is ending: ask its successor", details)
 }
 
+/// Fires when the server of a request drains; among the request's extensions.
+#[derive(Debug, Clone)]
+pub(crate) struct Draining(pub(crate) CancellationToken);
+
 /// The calls of a server.
 #[derive(Debug, Clone)]
 pub(crate) struct Calls {
@@ -207,6 +211,7 @@ where
             }
         };
         let context = TraceContext::from_headers(request.headers());
+        request.extensions_mut().insert(Draining(calls.draining));
         let answer = self.inner.call(request);
         let answered = async move {
             let answer = answer.await;

@@ -17,11 +17,15 @@
 
 mod echo;
 mod etcd;
+mod hop;
 mod line;
 mod load;
 mod process;
 mod redis;
+mod restart;
+mod rivals;
 mod times;
+mod tiny;
 mod world;
 
 use etcd::Etcd;
@@ -50,12 +54,26 @@ const AHEAD: usize = 16;
 const ETCD_PAIRS: usize = 50;
 
 fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
+        ["--worker", id, directory, endpoint_file] => return hop::work(id, directory, endpoint_file),
+        ["--tiny", mib] => return tiny::work(mib, false),
+        ["--tiny", mib, "staying"] => return tiny::work(mib, true),
+        ["--systemd"] => return rivals::systemd(),
+        _ => {}
+    }
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
     if std::env::args().any(|argument| argument == "--echo") {
         return runtime.block_on(echo::serve());
     }
     if std::env::args().any(|argument| argument == "--world") {
         return runtime.block_on(world::measure());
+    }
+    if std::env::args().any(|argument| argument == "--hop") {
+        return runtime.block_on(hop::measure());
+    }
+    if std::env::args().any(|argument| argument == "--restart") {
+        return runtime.block_on(restart::measure());
     }
     runtime.block_on(measure());
 }

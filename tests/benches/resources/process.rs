@@ -1,9 +1,11 @@
 //! The processes that are measured. Each ends with its value.
 
+use nix::sys::resource::{UsageWho, getrusage};
+use nix::sys::time::{TimeVal, TimeValLike};
 use std::io::{BufRead, BufReader};
 use std::net::TcpListener;
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 use tonic::transport::{Channel, Endpoint};
 
@@ -20,6 +22,23 @@ impl Drop for Process {
 }
 
 impl Process {
+    pub(crate) fn of(child: Child) -> Process {
+        Process(child)
+    }
+
+    pub(crate) fn id(&self) -> u32 {
+        self.0.id()
+    }
+
+    /// The processes that it has started.
+    pub(crate) fn children(&self) -> Vec<u32> {
+        let of_thread = |thread: u32| {
+            let children = std::fs::read_to_string(format!("/proc/{}/task/{thread}/children", self.id()));
+            children.unwrap_or_default().split_whitespace().map(|pid| pid.parse().unwrap()).collect::<Vec<u32>>()
+        };
+        threads(self.id()).into_iter().flat_map(of_thread).collect()
+    }
+
     /// What it has in memory.
     pub(crate) fn resident_bytes(&self) -> f64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.0.id())).unwrap();
@@ -43,25 +62,81 @@ pub(crate) async fn manager(directory: &Path, durability: &str) -> (Process, Str
 }
 
 /// A daemon that keeps a state, with a directory of its own.
-pub(crate) async fn daemon(role: &str, directory: &Path, durability: &str) -> (Process, String) {
-    let child = Command::new(env!("CARGO_BIN_EXE_ratn-under-test"))
-        .args([role, "--listen", "127.0.0.1:0", "--durability", durability, "--runtime-dir"])
+pub(crate) async fn daemon(name: &str, directory: &Path, durability: &str) -> (Process, String) {
+    role(name, directory, &["--listen", "127.0.0.1:0", "--durability", durability]).await
+}
+
+/// The `ratn` that is measured: another build where `RATN_UNDER_TEST` names it.
+pub(crate) fn ratn() -> PathBuf {
+    std::env::var_os("RATN_UNDER_TEST").map_or_else(|| env!("CARGO_BIN_EXE_ratn-under-test").into(), PathBuf::from)
+}
+
+/// A role of a system, and where it is.
+pub(crate) async fn role(name: &str, directory: &Path, arguments: &[&str]) -> (Process, String) {
+    let child = Command::new(ratn())
+        .arg(name)
+        .args(arguments)
+        .arg("--runtime-dir")
         .arg(directory)
         .env("RATN_LOG", "warn")
         .spawn()
         .unwrap();
     let process = Process(child);
-    let file = directory.join(format!("{role}.endpoint"));
+    let file = directory.join(format!("{name}.endpoint"));
+    let said = || {
+        let endpoint = std::fs::read_to_string(&file).ok()?.trim().to_owned();
+        (!endpoint.is_empty()).then_some(endpoint)
+    };
+    (process, until(name, said).await)
+}
+
+/// Asks until there is an answer.
+pub(crate) async fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     let began = Instant::now();
-    while began.elapsed() < PATIENCE {
-        if let Ok(endpoint) = std::fs::read_to_string(&file)
-            && !endpoint.trim().is_empty()
-        {
-            return (process, endpoint.trim().to_owned());
+    loop {
+        if let Some(answer) = ask() {
+            return answer;
         }
-        tokio::time::sleep(Duration::from_millis(5)).await;
+        assert!(began.elapsed() < PATIENCE, "waited in vain for {what}");
+        tokio::time::sleep(Duration::from_millis(2)).await;
     }
-    panic!("the {role} did not come up");
+}
+
+fn threads(pid: u32) -> Vec<u32> {
+    let entries = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
+    entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok()).collect()
+}
+
+/// User and system microseconds of a process so far.
+pub(crate) fn cpu_us(pid: u32) -> f64 {
+    let of_thread = |thread: u32| {
+        let stat = std::fs::read_to_string(format!("/proc/{pid}/task/{thread}/schedstat")).unwrap_or_default();
+        stat.split_whitespace().next().map_or(0.0, |ns| ns.parse::<f64>().unwrap() / 1e3)
+    };
+    threads(pid).into_iter().map(of_thread).sum()
+}
+
+/// How often the threads of a process have waited for something.
+pub(crate) fn switches(pid: u32) -> f64 {
+    let of_thread = |thread: u32| {
+        let status = std::fs::read_to_string(format!("/proc/{pid}/task/{thread}/status")).unwrap_or_default();
+        let line = status.lines().find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"));
+        line.map_or(0.0, |count| count.trim().parse().unwrap())
+    };
+    threads(pid).into_iter().map(of_thread).sum()
+}
+
+/// Waits for a process: how it ended, its user and system microseconds, and how often it waited.
+pub(crate) fn waited_for(mut child: Child) -> (ExitStatus, (f64, f64)) {
+    let used = || {
+        let usage = getrusage(UsageWho::RUSAGE_CHILDREN).unwrap();
+        let us = |time: TimeVal| time.num_microseconds() as f64;
+        (us(usage.user_time()) + us(usage.system_time()), usage.voluntary_context_switches() as f64)
+    };
+    let before = used();
+    let status = child.wait().unwrap();
+    let after = used();
+    (status, (after.0 - before.0, after.1 - before.1))
 }
 
 /// Something installed that listens on a port of the loopback; nothing where it is not installed.

@@ -11,7 +11,15 @@ pub(crate) struct Times(Vec<f64>);
 
 impl Times {
     pub(crate) fn add(&mut self, began: Instant) {
-        self.0.push(began.elapsed().as_secs_f64() * 1e6);
+        self.add_us(began.elapsed().as_secs_f64() * 1e6);
+    }
+
+    pub(crate) fn add_us(&mut self, us: f64) {
+        self.0.push(us);
+    }
+
+    pub(crate) fn count(&self) -> usize {
+        self.0.len()
     }
 
     /// The time that this part of the calls is not above, in tenths of a microsecond.

@@ -5,7 +5,7 @@
 mod result;
 
 use super::run::{on_system, starting};
-use super::{blocking, check};
+use super::{blocking_here, check};
 use crate::arguments::{Budget, DemoArguments, SystemArguments};
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
@@ -33,7 +33,7 @@ pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     let program = Arc::new(check::load_text(TASK, TASK_FILE, &config.catalogue)?);
     let directory = out_directory(arguments)?;
     let mut demonstration = Demonstration::new(arguments);
-    let outcome: Result<(), Failure> = blocking(async {
+    let outcome: Result<(), Failure> = blocking_here(async {
         let interrupt = Interrupt::listen()?;
         for plan in plans(arguments) {
             output::progress(format_args!("\n{}", plan.announcement(arguments)));

@@ -76,6 +76,11 @@ fn unanswered(failure: Failure) -> Failure {
     Failure::Failed(error)
 }
 
+/// Runs a future on this thread: what an event leads to needs no other to be woken.
+fn blocking_here(future: impl Future<Output = Result<(), Failure>>) -> Result<(), Failure> {
+    blocking_on(tokio::runtime::Builder::new_current_thread(), future)
+}
+
 /// Runs a future on a runtime of its own.
 fn blocking(future: impl Future<Output = Result<(), Failure>>) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_multi_thread(), future)

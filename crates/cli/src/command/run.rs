@@ -2,7 +2,7 @@
 
 mod resume;
 
-use super::{blocking, check};
+use super::{blocking_here, check};
 use crate::arguments::{ModeArgument, RunArguments, SystemArguments};
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
@@ -32,7 +32,7 @@ impl From<ModeArgument> for Mode {
 
 /// Runs a task once, or goes on with a run.
 pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
-    blocking(async {
+    blocking_here(async {
         let interrupt = Interrupt::listen()?;
         let directory = public_directory(arguments.runtime_dir.as_deref());
         match (&arguments.resume, &arguments.task) {

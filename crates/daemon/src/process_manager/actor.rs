@@ -25,6 +25,8 @@ use tonic::Status;
 
 /// Messages that wait for the actor; more make their senders wait.
 const INBOX: usize = 256;
+/// Answers that are taken in before anything else gets its turn.
+const AT_ONCE: usize = 256;
 /// Changes that wait for a watcher; one that has more to catch up with is cut off.
 const WATCH_BUFFER: usize = 4_096;
 /// Clients that watch at the same time.
@@ -153,10 +155,16 @@ impl Actor {
                     self.processes.serves(&id, &endpoint);
                     self.handle(Event::Serving { id, endpoint });
                 }
-                Some(health) = inputs.told.health.recv() => self.handle(match health {
-                    (id, Ok(())) => Event::Answered { id },
-                    (id, Err(why)) => Event::Unanswered { id, why },
-                }),
+                Some(health) = inputs.told.health.recv() => {
+                    // They are asked together, so they answer together.
+                    let more = std::iter::from_fn(|| inputs.told.health.try_recv().ok()).take(AT_ONCE);
+                    for (id, answer) in std::iter::once(health).chain(more) {
+                        self.handle(match answer {
+                            Ok(()) => Event::Answered { id },
+                            Err(why) => Event::Unanswered { id, why },
+                        });
+                    }
+                }
                 Some(offering) = inputs.there.recv() => self.handle(match offering {
                     Offering::There(id) => Event::Offered { id },
                     Offering::Gone(id) => Event::Withdrawn { id },

@@ -19,7 +19,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
 
 /// What became of processes that waits for the actor.
@@ -82,6 +82,8 @@ struct Process {
     pid: u32,
     /// As it was started from, until that is in the roster.
     template: Option<Template>,
+    /// Who waits until it is known.
+    known: Option<oneshot::Sender<()>>,
     attended: Option<(AbortHandle, mpsc::Sender<Duration>)>,
 }
 
@@ -171,9 +173,11 @@ impl Processes {
         self.jobs.try_send(job).map_err(|_| BeginError::Busy)?;
         let (ask, questions) = mpsc::channel(1);
         let within = template.start_timeout();
-        let attended = attend(directory.clone(), id.to_owned(), (signs, within), questions, self.tell.clone());
-        let attended = tokio::spawn(attended).abort_handle();
-        let process = Process { directory, pid: 0, template: Some(template.clone()), attended: Some((attended, ask)) };
+        let (known, is_known) = oneshot::channel();
+        let attended =
+            attend(directory.clone(), id.to_owned(), (signs, within), is_known, questions, self.tell.clone());
+        let attended = Some((tokio::spawn(attended).abort_handle(), ask));
+        let process = Process { directory, pid: 0, template: Some(template.clone()), known: Some(known), attended };
         self.by_id.insert(id.to_owned(), process);
         Ok(())
     }
@@ -182,6 +186,7 @@ impl Processes {
     pub(super) fn spawned(&mut self, id: &str, pid: u32, limits: &str, groups: Vec<PathBuf>) {
         let Some(process) = self.by_id.get_mut(id) else { return };
         process.pid = pid;
+        drop(process.known.take());
         if let (Some(template), Some(began)) = (process.template.take(), predecessor::began(pid)) {
             let limits = limits.to_owned();
             self.roster.began(Entry { id: id.to_owned(), pid, began, endpoint: None, limits, groups, template });
@@ -211,7 +216,7 @@ impl Processes {
             let answered = answer(pulse, id.clone(), questions, self.tell.health.clone());
             (tokio::spawn(answered).abort_handle(), ask)
         });
-        let process = Process { directory, pid: entry.pid, template: None, attended };
+        let process = Process { directory, pid: entry.pid, template: None, known: None, attended };
         self.by_id.insert(id.clone(), process);
         self.roster.began(entry);
         spawner::watch_adopted(adopted, &self.log_file(&id), self.max_log_bytes, self.outcomes.clone());
@@ -263,16 +268,20 @@ fn notify_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
 }
 
 /// Tells once a worker is ready, and whether it still is whenever that is asked. One that never is is the pools' business: they
-/// know when it is too late.
+/// know when it is too late. A small one can be ready before its process is known: then that is waited for, or its resource would name
+/// none.
 async fn attend(
     directory: RuntimeDirectory,
     id: String,
     (signs, within): (Signs, Duration),
+    known: oneshot::Receiver<()>,
     questions: mpsc::Receiver<Duration>,
     tell: Tell,
 ) {
     let pulse = match signs.ready(&directory, &id, within).await {
         Ok((endpoint, pulse)) => {
+            // Its sender goes when it is known.
+            let _ = known.await;
             drop(tell.serving.send((id.clone(), endpoint)).await);
             pulse
         }
@@ -293,5 +302,34 @@ async fn answer(
         if health.send((id.clone(), answer)).await.is_err() {
             return;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use std::sync::Arc;
+    use tokio::sync::Notify;
+
+    #[tokio::test]
+    async fn a_worker_that_is_ready_before_its_process_is_known_is_told_of_afterwards() {
+        let place = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(place.path()).unwrap();
+        let (serving, mut served) = mpsc::channel(1);
+        let (known, is_known) = oneshot::channel();
+        let seen = Arc::new(Notify::new());
+        seen.notify_one();
+        let signs = (Signs::Line(seen), Duration::from_secs(10));
+        let tell = Tell { serving, health: mpsc::channel(1).0 };
+        let attended = attend(directory, "w-1@here".to_owned(), signs, is_known, mpsc::channel(1).1, tell);
+        let attended = tokio::spawn(attended);
+        for _ in 0..100 {
+            tokio::task::yield_now().await;
+        }
+        assert!(served.try_recv().is_err());
+        drop(known);
+        assert_eq!(served.recv().await.unwrap().0, "w-1@here");
+        attended.await.unwrap();
     }
 }

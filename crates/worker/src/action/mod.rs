@@ -16,6 +16,7 @@ mod port;
 mod scene;
 mod server;
 mod service;
+mod stream;
 
 pub use context::{CallFailure, GoalContext, WorldFailure};
 pub use port::{InputError, Port};

@@ -2,6 +2,8 @@
 
 use super::ActionServer;
 use super::goal::{Ending, GoalEntry, Listener};
+use super::stream::PerformStream;
+use crate::gate::Draining;
 use futures::stream::{BoxStream, StreamExt, unfold};
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::{name, required};
@@ -12,7 +14,7 @@ use ratn_proto::v1::execute_response::Kind;
 use std::sync::Arc;
 use tokio::sync::broadcast::error::RecvError;
 use tokio::sync::{broadcast, watch};
-use tonic::{Request, Response, Status};
+use tonic::{Request, Response, Status, Streaming};
 
 impl ActionServer {
     /// For [`crate::server::Services::with`].
@@ -34,6 +36,16 @@ impl ActionService for ActionServer {
             return Ok(Response::new(self.join(&goal.id)?.into_stream()));
         }
         Ok(Response::new(self.admit(goal).await?.into_stream()))
+    }
+
+    type PerformStream = PerformStream;
+
+    async fn perform(
+        &self,
+        request: Request<Streaming<v1::PerformRequest>>,
+    ) -> Result<Response<PerformStream>, Status> {
+        let draining = request.extensions().get::<Draining>().cloned();
+        Ok(Response::new(PerformStream::new(self.clone(), request.into_inner(), draining)))
     }
 
     async fn cancel(&self, request: Request<v1::CancelRequest>) -> Result<Response<v1::CancelResponse>, Status> {
@@ -84,7 +96,7 @@ impl Messages {
         unfold(self, step).boxed()
     }
 
-    async fn next(&mut self) -> Option<Result<Kind, Status>> {
+    pub(super) async fn next(&mut self) -> Option<Result<Kind, Status>> {
         if let Some(joined) = self.accepted.take() {
             return Some(Ok(Kind::Accepted(v1::GoalAccepted { joined })));
         }

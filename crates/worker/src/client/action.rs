@@ -9,7 +9,6 @@ use ratn_proto::convert::{Malformed, ports};
 use ratn_proto::types::{Goal, GoalOutcome};
 use ratn_proto::v1;
 use ratn_proto::v1::action_service_client::ActionServiceClient;
-use ratn_proto::v1::execute_response::Kind;
 use std::collections::BTreeMap;
 
 /// Gives goals to providers.
@@ -58,7 +57,7 @@ impl ActionClient {
         &self.channels
     }
 
-    /// Has a goal performed. Dropping the future drops the stream: what that means to the goal is the action's to say.
+    /// Has a goal performed. Dropping the future stops listening: what that means to the goal is the action's to say.
     ///
     /// # Errors
     /// [`CallError::Refused`] when the provider did not take the goal; otherwise what became of the goal is not known.
@@ -92,25 +91,18 @@ impl ActionClient {
         question: v1::ExecuteRequest,
         mut on_progress: impl FnMut(String, BTreeMap<String, Value>),
     ) -> Result<Fate, CallError> {
-        let failed = |status: tonic::Status| CallError::from_status(endpoint, &status);
         let malformed = |m: Malformed| CallError::malformed(endpoint, m);
-        let mut client = self.client(endpoint)?;
-        let mut stream = client.execute(question).await.map_err(failed)?.into_inner();
-        while let Some(message) = stream.message().await.map_err(failed)? {
-            match message.kind {
-                Some(Kind::Accepted(_)) => {}
-                Some(Kind::Progress(progress)) => {
-                    on_progress(progress.message, ports(progress.values, "progress.values").map_err(malformed)?);
-                }
-                Some(Kind::Result(result)) => {
-                    let orphaned = result.orphaned;
-                    return Ok(Fate { outcome: result.try_into().map_err(malformed)?, orphaned });
-                }
-                None => return Err(malformed(Malformed::new("kind", "is not set"))),
-            }
+        let mut nonsense = None;
+        let heard = |progress: v1::GoalProgress| match ports(progress.values, "progress.values") {
+            Ok(values) => on_progress(progress.message, values),
+            Err(error) => nonsense = Some(error),
+        };
+        let result = self.channels.goals.execute(&self.channels, endpoint, question, heard).await?;
+        if let Some(nonsense) = nonsense {
+            return Err(malformed(nonsense));
         }
-        let reason = "the stream of the goal ended without a result".to_owned();
-        Err(CallError::Broken { endpoint: endpoint.clone(), reason })
+        let orphaned = result.orphaned;
+        Ok(Fate { outcome: result.try_into().map_err(malformed)?, orphaned })
     }
 
     /// Tells a goal to stop; whether it was under way. Its outcome comes over its execute.

@@ -1,7 +1,7 @@
 //! Asking gRPC health.
 
 use super::CallError;
-use crate::endpoint::{Endpoint, connect};
+use crate::endpoint::{Endpoint, connect_to_ask};
 use std::time::Duration;
 use tonic::transport::Channel;
 use tonic_health::pb::HealthCheckRequest;
@@ -56,7 +56,7 @@ impl Health {
         let client = match &mut self.client {
             Some(client) => client,
             client => {
-                let channel = connect(&self.endpoint).await.map_err(|error| super::chain(&error))?;
+                let channel = connect_to_ask(&self.endpoint).await.map_err(|error| super::chain(&error))?;
                 client.insert(HealthClient::new(channel))
             }
         };

@@ -2,6 +2,7 @@
 
 mod action;
 mod error;
+mod goals;
 mod health;
 mod line;
 mod process;
@@ -26,10 +27,12 @@ use tonic::transport::Channel;
 /// So many channels are kept; beyond it all are forgotten and made anew as they are needed.
 const MAX_CHANNELS: usize = 256;
 
-/// One channel per endpoint, shared by all clients of a process. A channel connects by itself, again if it broke.
+/// One channel per endpoint, and one stream of goals, shared by all clients of a process. A channel connects by itself, again if it
+/// broke.
 #[derive(Debug, Clone, Default)]
 pub struct Channels {
     kept: Arc<Mutex<BTreeMap<Endpoint, Channel>>>,
+    goals: goals::Goals,
 }
 
 impl Channels {

@@ -14,9 +14,10 @@ use super::outside::Outside;
 use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorder, said};
 use super::retry::{Attempts, patiently};
 use super::shell::Place;
+use crate::aside::Aside;
 use crate::failure::Unbegun;
 use crate::output;
-use anyhow::bail;
+use anyhow::{Context, bail};
 use futures::FutureExt;
 use goal::{Given, Performing};
 use ratn_executive::protocol::{Command, Event, Goal};
@@ -82,6 +83,8 @@ pub(super) struct Performer {
     actions: ActionClient,
     world: WorldClient,
     session: Session,
+    /// Where the session is kept alive, whatever this thread does.
+    _aside: Aside,
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
     outside: Outside,
@@ -126,7 +129,10 @@ impl Performer {
         let channels = Channels::new();
         let run = run.to_owned();
         let manager = &place.endpoints.resource_manager;
-        let session = Session::open_as(&channels, manager, run.clone(), "task-control", DEFAULT_TTL);
+        let aside = Aside::start("session").context("cannot keep a session alive")?;
+        // Over a connection of its own.
+        let open = || Session::open_as(&Channels::new(), manager, run.clone(), "task-control", DEFAULT_TTL);
+        let session = aside.within(open);
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, manager, session.id())?;
         only_run(&resources, task).await?;
@@ -153,6 +159,7 @@ impl Performer {
             actions: ActionClient::new(channels),
             world,
             session,
+            _aside: aside,
             events,
             records,
             outside: Outside::default(),

@@ -103,6 +103,9 @@ pub(super) fn retiring(
     patience: Duration,
     now: Timestamp,
 ) -> (Vec<u64>, Option<Timestamp>) {
+    if surplus == 0 {
+        return (Vec::new(), None);
+    }
     let mut idle: Vec<(Timestamp, u64)> = idle.collect();
     idle.sort_unstable();
     idle.truncate(surplus as usize);
