@@ -72,6 +72,6 @@ fn metrics_are_not_shown_to_other_machines_unless_it_is_said() -> anyhow::Result
     let place = Place::new()?;
     let mut manager = place.start_as("manager", &["resource-manager", "--metrics", "0.0.0.0:0"])?;
     let (code, _, said) = manager.finish()?;
-    ensure!(code == Some(1) && said.contains("--insecure"), "{code:?} {said}");
+    ensure!(code == Some(2) && said.contains("--insecure"), "{code:?} {said}");
     Ok(())
 }

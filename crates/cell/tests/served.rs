@@ -240,6 +240,23 @@ async fn a_reset_lays_the_same_table_again() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_fault_that_is_none_is_refused_and_says_what_one_looks_like() {
+    let system = system(1.0, 1).await;
+    let mut client = CellServiceClient::new(system.channels.get(&system.cell).unwrap());
+    for (text, said) in [
+        ("grasp_slips:1\u{1b}[31m", "fault: holds control characters"),
+        (&*"a".repeat(2_000), "fault: has 2000 bytes"),
+        ("", "fault: is empty"),
+        ("grasp_slips:0", "grasp_slips"),
+    ] {
+        let refused = client.inject_fault(v1::InjectFaultRequest { fault: text.to_owned() }).await.unwrap_err();
+        assert!(refused.code() == tonic::Code::InvalidArgument && refused.message().contains(said), "{refused:?}");
+    }
+    client.inject_fault(v1::InjectFaultRequest { fault: "grasp_slips:1".to_owned() }).await.unwrap();
+    system.end.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn the_modules_vanish_when_the_cell_ends() {
     let system = system(1.0, 1).await;
     system.acquire(&["Arm"]).await;

@@ -4,6 +4,7 @@ use super::keeper::{Keeper, KeeperError, State};
 use crate::config::MAX_BOXES;
 use crate::core::boxes::TrueBox;
 use crate::core::faults::{Fault, FaultError, MAX_FAULTS};
+use ratn_proto::convert::name;
 use ratn_proto::v1;
 use ratn_proto::v1::cell_service_server::CellService;
 use tonic::{Request, Response, Status};
@@ -52,11 +53,9 @@ impl CellService for Service {
         &self,
         request: Request<v1::InjectFaultRequest>,
     ) -> Result<Response<v1::InjectFaultResponse>, Status> {
-        let fault: Fault = request
-            .into_inner()
-            .fault
-            .parse()
-            .map_err(|error: FaultError| Status::invalid_argument(error.to_string()))?;
+        let text = request.into_inner().fault;
+        name(&text, "fault")?;
+        let fault: Fault = text.parse().map_err(|error: FaultError| Status::invalid_argument(error.to_string()))?;
         if self.keeper.inject(fault).await.map_err(status)? {
             Ok(Response::new(v1::InjectFaultResponse {}))
         } else {

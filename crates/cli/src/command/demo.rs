@@ -81,6 +81,8 @@ fn plans(arguments: &DemoArguments) -> Vec<Plan> {
         }
         plans.push(plan(Mode::Cdtn, arguments.planners, false));
     }
+    // With one planner two columns are the same.
+    plans.dedup_by_key(|plan| plan.file_stem());
     plans
 }
 

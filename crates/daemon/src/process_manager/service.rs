@@ -72,8 +72,14 @@ impl v1::process_service_server::ProcessService for Service {
     async fn restart(&self, request: Request<v1::RestartRequest>) -> Result<Response<v1::RestartResponse>, Status> {
         use v1::restart_request::Target;
         let which = match request.into_inner().target {
-            Some(Target::Template(template)) => Restart::Template(template),
-            Some(Target::WorkerId(id)) => Restart::Worker(id),
+            Some(Target::Template(template)) => {
+                name(&template, "template")?;
+                Restart::Template(template)
+            }
+            Some(Target::WorkerId(id)) => {
+                name(&id, "worker_id")?;
+                Restart::Worker(id)
+            }
             None => {
                 let message = "target: is not set: a template or a worker";
                 return Err(crate::details::status(Code::InvalidArgument, "MALFORMED", message));
