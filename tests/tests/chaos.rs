@@ -22,6 +22,8 @@ const KILLS_A_TASK: u64 = 6;
 /// Between two kills.
 const PAUSE_MS: (u64, u64) = (50, 1_200);
 const MAX_RESUMPTIONS: usize = 8;
+/// Of the log of a run that did not end as it should.
+const LAST_LINES: usize = 40;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Victim {
@@ -90,7 +92,11 @@ impl<'a> Task<'a> {
             self.resume()?;
             (code, out, err) = self.run.finish()?;
         }
-        let said = format!("{code:?}\n{out}{err}");
+        let log = std::fs::read_to_string(&self.log)?;
+        // What the run came to before it was resumed for the last time is in its log only.
+        let last: Vec<&str> = log.lines().rev().take(LAST_LINES).collect();
+        let last: Vec<&str> = last.into_iter().rev().collect();
+        let said = format!("{code:?}\n{out}{err}\nthe end of its log:\n{}", last.join("\n"));
         // The last kill may have come when there was nothing left to do.
         let over = err.contains("has ended with success");
         ensure!(over || (code == Some(0) && out.contains("delivered = 1")), "{said}");
