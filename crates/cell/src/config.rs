@@ -5,6 +5,7 @@ use ratn_perception::camera::Intrinsics;
 use ratn_perception::noise::Noise;
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
 
 /// The most boxes that a cell can have: as many as there are places on the base.
 pub const MAX_BOXES: usize = 9;
@@ -27,6 +28,8 @@ pub struct CellConfig {
     pub speed: f64,
     /// How long the session with the resource manager outlives the last keep-alive, in milliseconds.
     pub session_ttl_ms: u64,
+    /// A new file to write down in what happens, so that `ratn cell --replay` goes through it again.
+    pub record: Option<PathBuf>,
     /// What goes wrong: `grasp_slips:2` at the second grasp, `object_moved@12.5` at a time, `sensor_dropout~0.05` by chance.
     pub faults: Vec<Fault>,
     /// The gripper.
@@ -178,6 +181,7 @@ impl Default for CellConfig {
             seed: 1,
             speed: 1.0,
             session_ttl_ms: 3000,
+            record: None,
             faults: Vec::new(),
             gripper: GripperConfig::default(),
             pan_tilt: PanTiltConfig::default(),

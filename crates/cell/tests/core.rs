@@ -340,7 +340,12 @@ fn a_held_motion_stands_still_and_then_takes_the_rest_of_its_time() {
 
     assert!(safety(&mut bench, SafetyState::Ready).is_empty());
     assert_eq!(bench.arm(), here);
-    assert!(!bench.pass(whole_s / 2.0 - 0.001).iter().any(|Command::Ended { ticket: ended, .. }| *ended == ticket));
+    assert!(
+        !bench
+            .pass(whole_s / 2.0 - 0.001)
+            .iter()
+            .any(|command| matches!(command, Command::Ended { ticket: ended, .. } if *ended == ticket))
+    );
     let mut ended = Vec::new();
     while let Some(wake) = bench.cell.next_wake() {
         bench.now = wake;

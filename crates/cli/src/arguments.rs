@@ -128,6 +128,12 @@ pub(crate) struct CellArguments {
     pub(crate) role: RoleArguments,
     #[command(flatten)]
     pub(crate) faults: FaultArguments,
+    /// Write down in a new file what happens, line by line
+    #[arg(long, value_name = "FILE")]
+    pub(crate) record: Option<PathBuf>,
+    /// Go through a recording again, say whether the same comes of it, and end
+    #[arg(long, value_name = "FILE", conflicts_with = "record")]
+    pub(crate) replay: Option<PathBuf>,
 }
 
 /// What shall go wrong.

@@ -110,7 +110,7 @@ const METHODS: [(&str, &[Row]); 6] = [
         &[(Look, &["ListPools", "ReadLog", "Watch"]), (Administer, &["Drain", "Restart", "Scale", "Spawn", "Stop"])],
     ),
     ("ratn.v1.ActionService", &[(Look, &["Describe"]), (Perform, &["Execute", "Perform", "Cancel"])]),
-    ("ratn.v1.CellService", &[(Look, &["GetGroundTruth"]), (Administer, &["InjectFault", "Reset"])]),
+    ("ratn.v1.CellService", &[(Look, &["GetGroundTruth"]), (Administer, &["InjectFault", "PutBack", "Reset", "Save"])]),
     (
         "ratn.v1.SafetyService",
         &[

@@ -13,6 +13,7 @@ use ratn_proto::convert::label;
 use ratn_proto::v1;
 use ratn_proto::v1::safety_service_client::SafetyServiceClient;
 use ratn_proto::v1::safety_service_server::{SafetyService, SafetyServiceServer};
+use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::fs;
 use std::io;
@@ -25,7 +26,8 @@ use crate::client::{CallError, Channels};
 use crate::endpoint::Endpoint;
 
 /// What is in force at a driver.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum SafetyState {
     /// Goals are performed.
     #[default]

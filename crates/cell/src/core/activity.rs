@@ -7,10 +7,12 @@ use ratn_model::time::Timestamp;
 use ratn_motion::robot::Joints;
 use ratn_motion::trajectory::ArmTrajectory;
 use ratn_perception::camera::Camera;
+use serde::{Deserialize, Serialize};
 use std::time::Duration;
 
 /// A goal under way, as its giver named it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
 pub struct Ticket(pub u64);
 
 /// A module of the robot. Each does one thing at a time.
@@ -41,6 +43,8 @@ pub(crate) enum Kind {
     Close { from: f64, object: String, expected: Option<Pose> },
     Open { from: f64, to: f64 },
     Look { from: [f64; 2], to: [f64; 2] },
+    SenseArm,
+    SenseGripper,
     Capture { camera: Camera, frames: u32, taken: u32, next: Timestamp, exposures: Vec<Exposure> },
 }
 

@@ -14,6 +14,11 @@ impl Battery {
         Battery { config, level: config.level }
     }
 
+    /// One that is as full as that.
+    pub(crate) fn at(config: BatteryConfig, level: f64) -> Battery {
+        Battery { config, level }
+    }
+
     /// How full it is, 0 to 1.
     pub(crate) fn level(&self) -> f64 {
         self.level

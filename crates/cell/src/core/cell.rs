@@ -136,6 +136,8 @@ impl Cell {
             }
             Event::Reset { seed, boxes } => self.reset(seed, boxes, &mut out),
             Event::Fault { fault } => self.faults.add(fault),
+            Event::Save => out.push(Command::Saved { snapshot: Box::new(self.save()) }),
+            Event::PutBack { snapshot } => self.put_back(&snapshot, &mut out),
             Event::Tick => {}
         }
         out
@@ -272,6 +274,11 @@ impl Cell {
             Kind::Open { to, .. } => {
                 self.resting.finger = to;
                 Ending::Done(Product::Released)
+            }
+            Kind::SenseArm => Ending::Done(Product::ArmSensed { joints: self.resting.arm }),
+            Kind::SenseGripper => {
+                let (width, holding) = (2.0 * self.resting.finger, self.held.is_some());
+                Ending::Done(Product::GripperSensed { width, holding })
             }
             Kind::Look { to: [pan, tilt], .. } => {
                 (self.resting.pan, self.resting.tilt) = (pan, tilt);

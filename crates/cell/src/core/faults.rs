@@ -94,6 +94,18 @@ impl Faults {
         Faults { coming: coming.to_vec(), random }
     }
 
+    /// What it can be made of again: what is to come, and how many words were drawn.
+    pub(super) fn save(&self) -> (Vec<Fault>, u64) {
+        (self.coming.clone(), u64::try_from(self.random.get_word_pos()).unwrap_or(u64::MAX))
+    }
+
+    /// As it was saved.
+    pub(super) fn restore(coming: &[Fault], seed: u64, drawn: u64) -> Faults {
+        let mut faults = Faults::new(coming, seed);
+        faults.random.set_word_pos(drawn.into());
+        faults
+    }
+
     /// One more; none beyond [`MAX_FAULTS`].
     pub(super) fn add(&mut self, fault: Fault) {
         if self.coming.len() < MAX_FAULTS {

@@ -25,6 +25,16 @@ pub(super) struct Held {
 const MAX_LEAN_RAD: f64 = 0.2;
 
 impl Held {
+    /// Around an object that does not slip.
+    pub(super) fn new(object: usize, in_tool: Pose, friction: f64) -> Held {
+        Held { object, in_tool, slip: Slip::default(), friction, trail: [None; 2], steady: false }
+    }
+
+    /// What it can be made of again.
+    pub(super) fn save(&self) -> (usize, Pose, f64) {
+        (self.object, self.in_tool, self.friction)
+    }
+
     /// Whether it stays where it is as long as the tool does.
     pub(super) fn is_steady(&self) -> bool {
         self.steady
@@ -57,8 +67,8 @@ impl Cell {
         }
         self.resting.finger = grip.width / 2.0;
         let friction = self.environment.model(grip.index).kind.friction();
-        let (in_tool, slip) = (grip.in_tool, Slip::default());
-        self.held = Some(Held { object: grip.index, in_tool, slip, friction, trail: [None; 2], steady: false });
+        let in_tool = grip.in_tool;
+        self.held = Some(Held::new(grip.index, in_tool, friction));
         self.environment.carry(grip.index, &tool.compose(&in_tool));
         let size = self.size_of(grip.index);
         let in_gripper = expected.map(|e| turned_like(&in_tool, &size, e));

@@ -8,6 +8,8 @@ pub mod grasping;
 pub mod picture;
 pub mod placement;
 pub mod protocol;
+pub mod recording;
+pub mod snapshot;
 
 mod activity;
 mod battery;

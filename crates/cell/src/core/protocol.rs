@@ -3,16 +3,19 @@
 pub use super::activity::{Module, Ticket};
 use super::faults::Fault;
 use super::picture::Exposure;
+use super::snapshot::Snapshot;
 use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
 use ratn_motion::robot::Joints;
 use ratn_perception::camera::Camera;
 use ratn_worker::safety::SafetyState;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
 /// What happens to the cell.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Event {
     /// A goal for a module.
     Start {
@@ -71,12 +74,20 @@ pub enum Event {
         /// What and when.
         fault: Fault,
     },
+    /// The state is wanted.
+    Save,
+    /// Back to a state; goals under way end aborted.
+    PutBack {
+        /// Which.
+        snapshot: Box<Snapshot>,
+    },
     /// Only time has passed.
     Tick,
 }
 
 /// What a module can do.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Request {
     /// The arm along a trajectory.
     Follow {
@@ -104,6 +115,10 @@ pub enum Request {
         /// Towards this point of the world.
         target: [f64; 3],
     },
+    /// Says where the arm's joints are.
+    SenseArm,
+    /// Says how far the fingers are open, and whether they hold something.
+    SenseGripper,
     /// Takes a picture.
     Capture {
         /// The average of so many frames.
@@ -120,6 +135,11 @@ pub enum Command {
         ticket: Ticket,
         /// How.
         ending: Ending,
+    },
+    /// The state, as wanted.
+    Saved {
+        /// All of it.
+        snapshot: Box<Snapshot>,
     },
 }
 
@@ -156,6 +176,18 @@ pub enum Product {
     },
     /// The fingers are open.
     Released,
+    /// Where the arm is.
+    ArmSensed {
+        /// Its posture.
+        joints: Joints,
+    },
+    /// How the fingers are.
+    GripperSensed {
+        /// Their opening, in metres.
+        width: f64,
+        /// They are closed around something.
+        holding: bool,
+    },
     /// The camera looks there.
     Looking {
         /// Radians.
@@ -176,8 +208,8 @@ impl Request {
     /// The module that does it.
     pub fn module(&self) -> Module {
         match self {
-            Request::Follow { .. } | Request::MoveTo { .. } => Module::Arm,
-            Request::Grasp { .. } | Request::Release => Module::Gripper,
+            Request::Follow { .. } | Request::MoveTo { .. } | Request::SenseArm => Module::Arm,
+            Request::Grasp { .. } | Request::Release | Request::SenseGripper => Module::Gripper,
             Request::LookAt { .. } => Module::PanTilt,
             Request::Capture { .. } => Module::Camera,
         }

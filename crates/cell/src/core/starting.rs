@@ -51,6 +51,8 @@ impl Cell {
                 let to = self.config.gripper.opening_m / 2.0;
                 (Kind::Open { from: here.finger, to }, self.config.gripper.open_s)
             }
+            Request::SenseArm => (Kind::SenseArm, 0.0),
+            Request::SenseGripper => (Kind::SenseGripper, 0.0),
             Request::LookAt { target } => {
                 self.no_motion_of(Module::Camera)?;
                 let to = self.aim(target)?;

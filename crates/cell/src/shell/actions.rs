@@ -42,7 +42,7 @@ pub(crate) fn server(keeper: &Keeper, config: &CellConfig, channels: Channels, s
 
 type Read = fn(&GoalContext) -> Result<Request, ActionFailure>;
 
-const ACTIONS: [(Module, &str, &str, Read); 6] = [
+const ACTIONS: [(Module, &str, &str, Read); 8] = [
     (Module::Arm, "follow", "moves the arm along a trajectory", |goal| {
         Ok(Request::Follow { trajectory: goal.input_trajectory("trajectory")?.clone() })
     }),
@@ -57,6 +57,8 @@ const ACTIONS: [(Module, &str, &str, Read); 6] = [
         Ok(Request::Grasp { object: goal.input_string("object")?.to_owned(), expected })
     }),
     (Module::Gripper, "release", "opens the fingers", |_| Ok(Request::Release)),
+    (Module::Arm, "state", "says where the arm's joints are", |_| Ok(Request::SenseArm)),
+    (Module::Gripper, "state", "says whether the fingers hold something", |_| Ok(Request::SenseGripper)),
     (Module::PanTilt, "look_at", "turns the camera to a point of the world", |goal| {
         Ok(Request::LookAt { target: goal.input_pose("target")?.position })
     }),
@@ -126,6 +128,10 @@ impl ModuleAction {
                 }
             }
             Product::Released => success,
+            Product::ArmSensed { joints } => success.with_output("joints", Value::Joints(joints.to_vec())),
+            Product::GripperSensed { width, holding } => {
+                success.with_output("width_m", Value::Float(width)).with_output("holding", Value::Bool(holding))
+            }
             Product::Looking { pan, tilt } => {
                 success.with_output("pan", Value::Float(pan)).with_output("tilt", Value::Float(tilt))
             }

@@ -2,10 +2,13 @@
 //!
 //! A thread, not a task: checking a trajectory takes milliseconds, and a motion has to stop on time whatever the runtime does.
 
+use super::recorder::Recorder;
 use crate::core::cell::Cell;
 use crate::core::faults::{Fault, MAX_FAULTS};
 use crate::core::picture::{Exposure, develop};
 use crate::core::protocol::{Command, Ending, Event, Request, Ticket};
+use crate::core::recording::Line;
+use crate::core::snapshot::Snapshot;
 use ratn_model::id::LeaseId;
 use ratn_model::time::Timestamp;
 use ratn_motion::robot::{Joints, Robot};
@@ -84,12 +87,13 @@ enum Message {
     Reset { seed: u64, boxes: usize, state: oneshot::Sender<State> },
     State(oneshot::Sender<State>),
     Fault { fault: Fault, taken: oneshot::Sender<bool> },
+    Save(oneshot::Sender<Box<Snapshot>>),
 }
 
 /// Starts the thread.
-pub(crate) fn start(cell: Cell, clock: RobotClock) -> io::Result<Keeper> {
+pub(crate) fn start(cell: Cell, recorder: Recorder, clock: RobotClock) -> io::Result<Keeper> {
     let (keeper, inbox) = keeper_of(&cell);
-    let keep = move || keep(cell, clock, &inbox);
+    let keep = move || keep(cell, recorder, clock, &inbox);
     std::thread::Builder::new().name("cell".to_owned()).spawn(keep)?;
     Ok(keeper)
 }
@@ -120,6 +124,13 @@ impl Keeper {
     pub(crate) async fn reset(&self, seed: u64, boxes: usize) -> Result<State, KeeperError> {
         let (state, answer) = oneshot::channel();
         self.ask(Message::Reset { seed, boxes, state })?;
+        answer.await.map_err(|_| KeeperError::Ended)
+    }
+
+    /// The state now.
+    pub(crate) async fn save(&self) -> Result<Box<Snapshot>, KeeperError> {
+        let (snapshot, answer) = oneshot::channel();
+        self.ask(Message::Save(snapshot))?;
         answer.await.map_err(|_| KeeperError::Ended)
     }
 
@@ -194,7 +205,7 @@ impl Drop for Motion {
     }
 }
 
-fn keep(mut cell: Cell, clock: RobotClock, inbox: &Receiver<Letter>) {
+fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Receiver<Letter>) {
     let mut waiting: BTreeMap<Ticket, oneshot::Sender<Ending>> = BTreeMap::new();
     loop {
         let sleep = cell.next_wake().map_or(MAX_SLEEP, |moment| clock.until(moment).min(MAX_SLEEP));
@@ -204,7 +215,7 @@ fn keep(mut cell: Cell, clock: RobotClock, inbox: &Receiver<Letter>) {
             Err(RecvTimeoutError::Disconnected) => return,
         };
         let now = clock.now();
-        let mut safety = None;
+        let (mut safety, mut saving) = (None, None);
         let (event, asked) = match message {
             None => (Event::Tick, None),
             Some(Message::Safety { state, applied }) => {
@@ -218,15 +229,33 @@ fn keep(mut cell: Cell, clock: RobotClock, inbox: &Receiver<Letter>) {
             Some(Message::Happened(event)) => (event, None),
             Some(Message::Reset { seed, boxes, state }) => (Event::Reset { seed, boxes }, Some(state)),
             Some(Message::State(state)) => (Event::Tick, Some(state)),
+            Some(Message::Save(snapshot)) => {
+                saving = Some(snapshot);
+                (Event::Save, None)
+            }
             Some(Message::Fault { fault, taken }) => {
                 let _ = taken.send(cell.faults_to_come() < MAX_FAULTS);
                 (Event::Fault { fault }, None)
             }
         };
-        for Command::Ended { ticket, ending } in cell.handle(now, event) {
-            if let Some(ended) = waiting.remove(&ticket) {
-                // Whoever asked may be gone.
-                let _ = ended.send(ending);
+        let recorded = recorder.is_on().then(|| event.clone());
+        let commands = cell.handle(now, event);
+        if let Some(event) = recorded {
+            recorder.write(&Line::of_step(now, event, &commands, &cell));
+        }
+        for command in commands {
+            // Whoever asked may be gone.
+            match command {
+                Command::Ended { ticket, ending } => {
+                    if let Some(ended) = waiting.remove(&ticket) {
+                        let _ = ended.send(ending);
+                    }
+                }
+                Command::Saved { snapshot } => {
+                    if let Some(saving) = saving.take() {
+                        let _ = saving.send(snapshot);
+                    }
+                }
             }
         }
         if let Some(applied) = safety {

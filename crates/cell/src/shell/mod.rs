@@ -11,6 +11,7 @@ mod actions;
 mod keeper;
 mod leases;
 mod link;
+mod recorder;
 mod service;
 
 use crate::config::CellConfig;
@@ -22,6 +23,7 @@ use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::Safety;
 use ratn_worker::server::{Services, Serving, bind_as};
+use recorder::Recorder;
 use tokio_util::sync::CancellationToken;
 
 /// The role's name: of its endpoint file, its command and its section of a config.
@@ -51,7 +53,11 @@ pub async fn run_as(
     config.check()?;
     let laid = config.clone();
     let cell = tokio::task::spawn_blocking(move || Cell::new(laid)).await.context("cannot lay the table")??;
-    let keeper = keeper::start(cell, RobotClock::start(config.speed)).context("cannot start the cell")?;
+    let recorder = match &config.record {
+        Some(file) => Recorder::begin(file, &config)?,
+        None => Recorder::none(),
+    };
+    let keeper = keeper::start(cell, recorder, RobotClock::start(config.speed)).context("cannot start the cell")?;
 
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();

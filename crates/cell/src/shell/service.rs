@@ -4,6 +4,8 @@ use super::keeper::{Keeper, KeeperError, State};
 use crate::config::MAX_BOXES;
 use crate::core::boxes::TrueBox;
 use crate::core::faults::{Fault, FaultError, MAX_FAULTS};
+use crate::core::protocol::Event;
+use crate::core::snapshot::Snapshot;
 use ratn_proto::convert::name;
 use ratn_proto::v1;
 use ratn_proto::v1::cell_service_server::CellService;
@@ -47,6 +49,19 @@ impl CellService for Service {
             return Err(Status::failed_precondition(message));
         }
         Ok(Response::new(v1::ResetResponse { boxes: boxes(state) }))
+    }
+
+    async fn save(&self, _: Request<v1::SaveRequest>) -> Result<Response<v1::SaveResponse>, Status> {
+        let snapshot = self.keeper.save().await.map_err(status)?;
+        Ok(Response::new(v1::SaveResponse { snapshot: snapshot.to_json() }))
+    }
+
+    async fn put_back(&self, request: Request<v1::PutBackRequest>) -> Result<Response<v1::PutBackResponse>, Status> {
+        let snapshot = Snapshot::from_json(&request.into_inner().snapshot)
+            .map_err(|error| Status::invalid_argument(error.to_string()))?;
+        self.keeper.tell(Event::PutBack { snapshot: Box::new(snapshot) }).await.map_err(status)?;
+        let state = self.keeper.state().await.map_err(status)?;
+        Ok(Response::new(v1::PutBackResponse { boxes: boxes(state) }))
     }
 
     async fn inject_fault(

@@ -5,6 +5,7 @@
 use ratn_cell::config::CellConfig;
 use ratn_cell::core::cell::Cell;
 use ratn_cell::core::protocol::{Command, Ending, Event, Product, Request, Ticket};
+use ratn_cell::core::recording::Line;
 use ratn_model::id::LeaseId;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Trajectory;
@@ -20,6 +21,8 @@ pub(crate) struct Bench {
     pub(crate) cell: Cell,
     pub(crate) now: Timestamp,
     tickets: u64,
+    /// What happened.
+    pub(crate) lines: Vec<Line>,
 }
 
 impl Bench {
@@ -29,18 +32,24 @@ impl Bench {
 
     pub(crate) fn of(config: CellConfig) -> Bench {
         let cell = Cell::new(config).unwrap();
-        Bench { cell, now: Timestamp::default(), tickets: 0 }
+        Bench { cell, now: Timestamp::default(), tickets: 0, lines: Vec::new() }
     }
 
     pub(crate) fn start(&mut self, lease: Option<LeaseId>, request: Request) -> (Ticket, Vec<Command>) {
         self.tickets += 1;
         let ticket = Ticket(self.tickets);
-        (ticket, self.cell.handle(self.now, Event::Start { ticket, lease, request }))
+        (ticket, self.handle(Event::Start { ticket, lease, request }))
     }
 
     pub(crate) fn pass(&mut self, seconds: f64) -> Vec<Command> {
         self.now = self.now + Duration::from_secs_f64(seconds);
-        self.cell.handle(self.now, Event::Tick)
+        self.handle(Event::Tick)
+    }
+
+    fn handle(&mut self, event: Event) -> Vec<Command> {
+        let commands = self.cell.handle(self.now, event.clone());
+        self.lines.extend(Line::of_step(self.now, event, &commands, &self.cell));
+        commands
     }
 
     /// Performs a request to its end.
@@ -48,7 +57,7 @@ impl Bench {
         let (ticket, mut commands) = self.start(None, request);
         while commands.is_empty() {
             self.now = self.cell.next_wake().expect("the goal is under way");
-            commands = self.cell.handle(self.now, Event::Tick);
+            commands = self.handle(Event::Tick);
         }
         let [Command::Ended { ticket: ended, ending }] = &commands[..] else { panic!("{commands:?}") };
         assert_eq!(*ended, ticket);

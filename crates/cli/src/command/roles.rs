@@ -8,6 +8,7 @@ use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::{public_directory, variable};
 use anyhow::Context;
+use ratn_cell::core::recording::{self, Replayed};
 use ratn_daemon::config::StorageConfig;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::service::LiveAccess;
@@ -19,7 +20,9 @@ use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{BindError, Exposure, Serving};
 use ratn_worker::worker::WorkerOptions;
 use ratn_worker::{shutdown, tls};
-use std::path::PathBuf;
+use std::fs::File;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -87,12 +90,27 @@ pub(super) fn startable(config: &SystemConfig) -> Result<(), Failure> {
 
 /// `ratn cell`
 pub(super) fn cell(arguments: &CellArguments) -> Result<(), Failure> {
+    if let Some(file) = &arguments.replay {
+        return replay(file);
+    }
     daemon(&arguments.role, ratn_cell::ROLE, async |system, host| {
         let mut config = system.cell;
         config.faults.extend(&arguments.faults.fault);
+        config.record = arguments.record.clone().or(config.record);
         config.listen = host.listen.unwrap_or(config.listen);
         ratn_cell::run_as(config, host.directory, host.serving, host.shutdown).await
     })
+}
+
+/// `ratn cell --replay FILE`
+fn replay(file: &Path) -> Result<(), Failure> {
+    let opened = File::open(file).with_context(|| format!("cannot read {}", file.display()))?;
+    let replayed = recording::replay(BufReader::new(opened).lines());
+    let Replayed { events, goals, end_s } = replayed.with_context(|| file.display().to_string())?;
+    output::result(format_args!(
+        "the same came of {events} events in {end_s:.1} s of the robot: {goals} goals ended as they had"
+    ))?;
+    Ok(())
 }
 
 /// `ratn worker …`

@@ -206,6 +206,12 @@ impl Environment {
         self.steps = self.steps.max(u64::try_from(steps).unwrap_or(u64::MAX));
     }
 
+    /// It is this late, whatever it was before.
+    pub fn set_time(&mut self, now: Timestamp) {
+        self.steps = 0;
+        self.skip_until(now);
+    }
+
     /// One step, in which the robot's joints come to `configuration`.
     pub fn step(&mut self, robot: &Robot, configuration: &Configuration) {
         for (link, (_, pose, _)) in self.links.iter_mut().zip(robot.shapes(configuration)) {

@@ -1,0 +1,195 @@
+//! What happened to a cell, line by line, and the same cell made to go through it again.
+//!
+//! ```text
+//! {"form":1,"config":{…}}                                  first: how the cell was made
+//! {"at":…,"event":{…}}                                     what came in, in the robot's nanoseconds
+//! {"at":…,"ended":…,"how":"done"}                          what a goal came to
+//! {"at":…,"world":"…"}                                     after each event: the digest of the environment
+//! ```
+//! The core is a function of its events, so a recording is replayed by giving them again; the endings and the digests say whether the
+//! same came of it. Ticks are left out: nothing depends on when the core is asked.
+
+use super::cell::Cell;
+use super::placement::PlacementError;
+use super::protocol::{Command, Ending, Event, Ticket};
+use crate::config::CellConfig;
+use ratn_model::time::Timestamp;
+use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
+use std::io;
+
+/// The form of what is written.
+const FORM: u32 = 1;
+
+/// One line.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Line {
+    /// The first.
+    Header {
+        /// Of the lines.
+        form: u32,
+        /// How the cell was made.
+        config: Box<CellConfig>,
+    },
+    /// Something came in.
+    Event {
+        /// When.
+        at: Timestamp,
+        /// What.
+        event: Event,
+    },
+    /// A goal ended.
+    Ended {
+        /// When.
+        at: Timestamp,
+        /// Which.
+        ended: Ticket,
+        /// `done`, `aborted`, `preempted` or `stopped`.
+        how: String,
+        /// Why, where it was not done.
+        #[serde(default, skip_serializing_if = "String::is_empty")]
+        reason: String,
+    },
+    /// The environment after an event.
+    World {
+        /// When.
+        at: Timestamp,
+        /// Its digest.
+        world: String,
+    },
+}
+
+/// What came of a replay.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Replayed {
+    /// Events that came in.
+    pub events: usize,
+    /// Goals that ended as they had.
+    pub goals: usize,
+    /// When the last event was, in the robot's seconds.
+    pub end_s: f64,
+}
+
+/// Why a recording is not replayed, or how it went otherwise.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// It cannot be read.
+    #[error("line {line} cannot be read")]
+    Unreadable {
+        /// Which, from 1.
+        line: usize,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+    /// It is none.
+    #[error("line {line} is none of a recording: {reason}")]
+    NoRecording {
+        /// Which, from 1.
+        line: usize,
+        /// Why.
+        reason: String,
+    },
+    /// The cell cannot be made.
+    #[error(transparent)]
+    Table(#[from] PlacementError),
+    /// Something else came of it.
+    #[error("line {line}: recorded was {recorded}, and now it is {replayed}")]
+    Differs {
+        /// Which, from 1.
+        line: usize,
+        /// What was.
+        recorded: String,
+        /// What is.
+        replayed: String,
+    },
+}
+
+impl Line {
+    /// The first line of a recording.
+    pub fn header(config: &CellConfig) -> Line {
+        Line::Header { form: FORM, config: Box::new(config.clone()) }
+    }
+
+    /// What is recorded of a step of the cell: its event, what ended, and the world after it.
+    pub fn of_step(at: Timestamp, event: Event, commands: &[Command], cell: &Cell) -> Vec<Line> {
+        let is_tick = event == Event::Tick;
+        let begin = (!is_tick).then_some(Line::Event { at, event });
+        let ended = commands.iter().filter_map(|command| {
+            ended(command).map(|(ended, how, reason)| Line::Ended {
+                at,
+                ended,
+                how: how.to_owned(),
+                reason: reason.to_owned(),
+            })
+        });
+        let world = (!is_tick).then(|| Line::World { at, world: cell.environment.digest().to_string() });
+        begin.into_iter().chain(ended).chain(world).collect()
+    }
+}
+
+/// Goes through a recording again.
+///
+/// # Errors
+/// [`ReplayError`] where it is none, and at the first line that something else comes of.
+pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replayed, ReplayError> {
+    let mut cell: Option<Cell> = None;
+    let mut endings: VecDeque<(Ticket, String)> = VecDeque::new();
+    let mut replayed = Replayed { events: 0, goals: 0, end_s: 0.0 };
+    for (index, text) in lines.enumerate() {
+        let line = index + 1;
+        let text = text.map_err(|source| ReplayError::Unreadable { line, source })?;
+        let none = |reason: String| ReplayError::NoRecording { line, reason };
+        let read = serde_json::from_str(&text).map_err(|error| none(error.to_string()))?;
+        let Some(cell) = &mut cell else {
+            match read {
+                Line::Header { form: FORM, config } => {
+                    config.check().map_err(|error| none(error.to_string()))?;
+                    cell = Some(Cell::new(*config)?);
+                }
+                _ => return Err(none(format!("a recording begins with form {FORM} and a config"))),
+            }
+            continue;
+        };
+        let mut pass = |cell: &mut Cell, at: Timestamp, event: Event| {
+            let commands = cell.handle(at, event);
+            endings.extend(commands.iter().filter_map(ended).map(|(ticket, how, _)| (ticket, how.to_owned())));
+            replayed.end_s = at.seconds();
+        };
+        match read {
+            Line::Header { .. } => return Err(none("it has a second beginning".to_owned())),
+            Line::Event { at, event } => {
+                pass(cell, at, event);
+                replayed.events += 1;
+            }
+            Line::Ended { at, ended, how, .. } => {
+                pass(cell, at, Event::Tick);
+                let found = endings.pop_front();
+                if found != Some((ended, how.clone())) {
+                    let say = |ticket: Ticket, how: &str| format!("goal {} {how}", ticket.0);
+                    let now = found.map_or("none ended".to_owned(), |(ticket, how)| say(ticket, &how));
+                    return Err(ReplayError::Differs { line, recorded: say(ended, &how), replayed: now });
+                }
+                replayed.goals += 1;
+            }
+            Line::World { world, .. } => {
+                let now = cell.environment.digest().to_string();
+                if now != world {
+                    return Err(ReplayError::Differs { line, recorded: world, replayed: now });
+                }
+            }
+        }
+    }
+    Ok(replayed)
+}
+
+fn ended(command: &Command) -> Option<(Ticket, &'static str, &str)> {
+    let Command::Ended { ticket, ending } = command else { return None };
+    Some(match ending {
+        Ending::Done(_) => (*ticket, "done", ""),
+        Ending::Aborted(reason) => (*ticket, "aborted", reason),
+        Ending::Preempted(reason) => (*ticket, "preempted", reason),
+        Ending::Stopped(reason) => (*ticket, "stopped", reason),
+    })
+}
