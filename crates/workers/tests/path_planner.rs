@@ -4,7 +4,7 @@
 
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_model::fact::{Change, FactKey, Term};
-use ratn_model::id::{FencingToken, LeaseId};
+use ratn_model::id::{FencingToken, LeaseId, ProjectionId};
 use ratn_model::pose::Pose;
 use ratn_model::resource::{Lease, LeasedResource};
 use ratn_model::value::Value;
@@ -181,4 +181,29 @@ async fn a_plan_for_a_crawling_arm_is_refused_and_not_written_out_for_hours_of_m
     let outcome = system.client.execute(&system.planner, goal, |_, _| {}).await.unwrap();
     assert_eq!(outcome.outcome, "aborted");
     assert!(outcome.reason.contains("speed"), "{}", outcome.reason);
+}
+
+#[tokio::test]
+async fn a_world_pool_that_comes_back_is_waited_for_and_a_world_that_ended_with_it_loses_the_attempt() {
+    let system = system().await;
+    let place = tempfile::tempdir().unwrap();
+    let listen = Endpoint::Unix(place.path().join("late.sock"));
+    let there = Value::Joints(aimm::STOWED.to_vec());
+    let goal = Goal { world_pool: listen.to_string(), ..system.goal("a", &[("goal", there.clone())]) };
+    let planned = system.client.execute(&system.planner, goal, |_, _| {});
+    let starts = async {
+        tokio::time::sleep(Duration::from_millis(400)).await;
+        let config = WorldPoolConfig { listen, ..WorldPoolConfig::default() };
+        let directory = RuntimeDirectory::create(place.path()).unwrap();
+        tokio::spawn(world_pool::run(config, directory, CancellationToken::new()));
+    };
+    let (outcome, ()) = tokio::join!(planned, starts);
+    let outcome = outcome.unwrap();
+    assert!(outcome.is_success(), "{}", outcome.reason);
+
+    // Its projections are not there when it is back: the goal comes to no outcome, and whoever gave it gives it again.
+    let goal = Goal { projection: Some(ProjectionId(77)), ..system.goal("b", &[("goal", there)]) };
+    let lost = system.client.execute(&system.planner, goal, |_, _| {}).await.unwrap_err();
+    assert_eq!(lost.code(), Some(tonic::Code::Aborted));
+    assert!(lost.to_string().contains("is unknown or has ended"), "{lost}");
 }

@@ -10,7 +10,6 @@ mod performer;
 mod progress;
 mod record;
 mod replay;
-mod retry;
 pub(crate) mod shell;
 
 pub(crate) use performer::only_run as claim;

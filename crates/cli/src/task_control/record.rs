@@ -3,13 +3,13 @@
 
 use super::ledger::operation_request;
 use super::performer::Answer;
-use super::retry::{Attempts, patiently};
 use ratn_executive::protocol::Event;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
 use ratn_model::measurement::Evidence;
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_proto::types::Resource;
+use ratn_worker::client::patiently;
 use ratn_worker::client::{CallError, Commit, Projection, ResourceClient, WorldClient};
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -127,7 +127,7 @@ impl Recorder {
         if cancelled() {
             return None;
         }
-        let made = patiently(Attempts::IDEMPOTENT, || self.world.project(wanted.clone())).await;
+        let made = patiently(|| self.world.project(wanted.clone())).await;
         match made {
             Ok(projection) if cancelled() => {
                 let _ = self.world.release(projection).await;
@@ -175,11 +175,11 @@ pub(super) async fn commit_next(
     let mut attempts = MAX_OVERTAKEN;
     loop {
         commit.revision = Some(Revision(known.0 + 1));
-        match patiently(Attempts::IDEMPOTENT, || world.commit_as(commit.clone())).await {
+        match patiently(|| world.commit_as(commit.clone())).await {
             Ok((revision, _)) => return Ok(revision),
             Err(error) if error.code() == Some(tonic::Code::FailedPrecondition) && attempts > 0 => {
                 attempts -= 1;
-                let (_, root) = patiently(Attempts::IDEMPOTENT, || world.diff(known, None, &[])).await?;
+                let (_, root) = patiently(|| world.diff(known, None, &[])).await?;
                 if root == known {
                     return Err(error);
                 }
@@ -209,7 +209,7 @@ pub(super) async fn operate_once(
         // The executive gives these to an acquire.
         ResourceOperation::Block | ResourceOperation::Exists => Ok(()),
     };
-    patiently(Attempts::IDEMPOTENT, ask).await
+    patiently(ask).await
 }
 
 /// An error with its sources in one line.

@@ -1,8 +1,8 @@
 //! What an action gets: its goal, and what it may do with it.
 
-use super::goal::GoalEntry;
+use super::goal::{GoalEntry, StopCause};
 use super::{ActionFailure, InputError, Port};
-use crate::client::{ActionClient, CallError, Channels, WorldClient};
+use crate::client::{ActionClient, CallError, Channels, WorldClient, chain, patiently};
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::safety::{Safety, SafetyState};
 use ratn_model::fact::{Change, FactPattern};
@@ -19,6 +19,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use tokio_util::sync::CancellationToken;
+use tonic::Code;
 
 /// A goal under way.
 #[derive(Debug)]
@@ -243,7 +244,24 @@ impl GoalContext {
     /// # Errors
     /// [`WorldFailure`].
     pub async fn facts(&self, patterns: &[FactPattern]) -> Result<Vec<FactRecord>, WorldFailure> {
-        Ok(self.world_client()?.query(self.projection, patterns).await?)
+        let client = self.world_client()?;
+        self.read_world(|| client.query(self.projection, patterns)).await
+    }
+
+    /// What a world pool says that may be started again meanwhile. Its projections end with it: a goal whose world is gone has lost
+    /// this attempt, whatever its action makes of it.
+    pub(super) async fn read_world<T, F>(&self, ask: impl FnMut() -> F) -> Result<T, WorldFailure>
+    where
+        F: Future<Output = Result<T, CallError>>,
+    {
+        let answer = patiently(ask).await;
+        let lost = answer.as_ref().is_err_and(|error| error.is_crash() || error.code() == Some(Code::NotFound));
+        let answer = answer.map_err(WorldFailure::from);
+        answer.inspect_err(|failure| {
+            if lost {
+                self.entry.blame(StopCause::WorldLost(chain(failure)));
+            }
+        })
     }
 
     pub(super) fn world_client(&self) -> Result<WorldClient, WorldFailure> {

@@ -33,6 +33,8 @@ pub(crate) enum StopCause {
     ShuttingDown,
     /// An emergency stop, and why.
     EmergencyStop(String),
+    /// The world that it works on cannot be read any more, and why.
+    WorldLost(String),
 }
 
 /// How a goal ended.
@@ -42,6 +44,8 @@ pub(crate) enum Ending {
     Outcome(GoalOutcome, bool),
     /// Without one, as if the process had been killed: the provider ends, which is not the goal's doing.
     Gone,
+    /// Without one: what it worked on is gone, and why. Another attempt may have more luck.
+    Lost(String),
 }
 
 impl StopCause {
@@ -62,6 +66,7 @@ impl StopCause {
             StopCause::LeaseEnded(reason) => ActionFailure::Aborted(format!("the lease ended: {reason}")),
             StopCause::ShuttingDown => ActionFailure::Aborted("the provider shuts down".to_owned()),
             StopCause::EmergencyStop(reason) => ActionFailure::emergency_stop(reason),
+            StopCause::WorldLost(reason) => ActionFailure::Aborted(reason.clone()),
         }
     }
 }

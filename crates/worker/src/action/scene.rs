@@ -34,12 +34,12 @@ impl GoalContext {
     pub async fn scene(&self, cache: &SceneCache) -> Result<Arc<Scene>, WorldFailure> {
         let client = self.world_client()?;
         let bases: Vec<Digest> = cache.kept().digests().collect();
-        let delta = client.scene(self.projection, &bases).await?;
+        let delta = self.read_world(|| client.scene(self.projection, &bases)).await?;
         if let Ok(scene) = cache.kept().apply(&delta) {
             return Ok(scene);
         }
         // Other goals have used others meanwhile.
-        let whole = client.scene(self.projection, &[]).await?;
+        let whole = self.read_world(|| client.scene(self.projection, &[])).await?;
         Ok(cache.kept().apply(&whole)?)
     }
 }

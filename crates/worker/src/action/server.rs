@@ -327,6 +327,7 @@ async fn run(
     server.state().end(&entry, server.results_kept);
     let ending = match entry.cause() {
         Some(StopCause::ShuttingDown) if !outcome.is_success() => Ending::Gone,
+        Some(StopCause::WorldLost(reason)) if !outcome.is_success() => Ending::Lost(reason),
         cause => {
             let orphaned = !outcome.is_success() && cause.is_some_and(|cause| cause.is_orphaning());
             Ending::Outcome(outcome, orphaned)

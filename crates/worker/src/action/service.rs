@@ -124,6 +124,7 @@ impl Messages {
             return Some(match ending {
                 Ending::Outcome(outcome, orphaned) => Ok(Kind::Result(v1::GoalResult { orphaned, ..outcome.into() })),
                 Ending::Gone => Err(Status::unavailable("the provider shuts down")),
+                Ending::Lost(reason) => Err(Status::aborted(reason)),
             });
         }
     }

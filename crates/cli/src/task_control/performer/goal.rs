@@ -9,6 +9,7 @@ use ratn_model::measurement::Measurement;
 use ratn_model::program::{ABORTED, PREEMPTED};
 use ratn_model::value::Value;
 use ratn_proto::types::{Goal, GoalOutcome};
+use ratn_worker::client::patiently;
 use ratn_worker::client::{ActionClient, CallError, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::DEFAULT_TTL;
@@ -109,9 +110,10 @@ impl Performing {
             Err(error) if error.code() == Some(tonic::Code::NotFound) && self.would_be_known(endpoint).await => {
                 self.given(endpoint).await
             }
-            Err(error) => {
+            Err(error) if error.code() == Some(tonic::Code::NotFound) => {
                 self.crashed(format!("nobody knows what became of it while task control was gone: {}", said(&error)))
             }
+            Err(error) => self.lost(endpoint, &error).await,
         }
     }
 
@@ -122,7 +124,7 @@ impl Performing {
             Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => self.aborted(said(&error)),
             // Only the connection may have broken; the goal is still there then.
             Err(error @ CallError::Broken { .. }) => self.attached(endpoint, &error).await,
-            Err(error) => self.gone(endpoint, &error).await,
+            Err(error) => self.lost(endpoint, &error).await,
         }
     }
 
@@ -131,13 +133,13 @@ impl Performing {
     async fn would_be_known(&self, endpoint: &Endpoint) -> bool {
         let Some((lease, provider)) = self.provider(endpoint) else { return false };
         let owner = async || {
-            let resource = self.resources.get(&provider).await.ok()?;
+            let resource = patiently(|| self.resources.get(&provider)).await.ok()?;
             let held = resource.holdings.iter().any(|holding| holding.lease == lease);
             held.then_some(resource.session)
         };
         let lives = async {
             let owned_by = owner().await?;
-            let sessions = self.resources.sessions().await.ok()?;
+            let sessions = patiently(|| self.resources.sessions()).await.ok()?;
             let ttl_ms = sessions.iter().find(|session| session.id == owned_by)?.ttl_ms;
             tokio::time::sleep(Duration::from_millis(ttl_ms) + SESSION_SLACK).await;
             Some(owner().await? == owned_by)
@@ -158,19 +160,28 @@ impl Performing {
     async fn attached(&self, endpoint: &Endpoint, broken: &CallError) -> Event {
         match self.actions.attach(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
             Ok(fate) if !fate.orphaned => self.finished(fate.outcome),
-            _ => self.gone(endpoint, broken).await,
+            _ => self.lost(endpoint, broken).await,
         }
+    }
+
+    async fn lost(&self, endpoint: &Endpoint, error: &CallError) -> Event {
+        self.withdrawn(endpoint, error).await;
+        self.crashed(said(error))
     }
 
     /// Who tries again at once would be given the same provider again, and nothing would come of any of its attempts: it is over when
     /// nobody can be given that one any more. Its lease is not given back before.
-    async fn gone(&self, endpoint: &Endpoint, error: &CallError) -> Event {
+    async fn withdrawn(&self, endpoint: &Endpoint, error: &CallError) {
         if let Some((_, provider)) = self.provider(endpoint)
             && error.is_crash()
         {
             let there = endpoint.to_string();
             let withdrawn = async {
-                while self.resources.get(&provider).await.is_ok_and(|resource| resource.endpoint() == there) {
+                // A manager that does not answer may still have it when it is back.
+                while match self.resources.get(&provider).await {
+                    Ok(resource) => resource.endpoint() == there,
+                    Err(error) => error.is_crash(),
+                } {
                     tokio::time::sleep(WITHDRAWAL_POLL).await;
                 }
             };
@@ -179,7 +190,6 @@ impl Performing {
                 () = self.stop.cancelled() => {}
             }
         }
-        self.crashed(said(error))
     }
 
     /// What the provider ended at its deadline has failed, whatever the provider calls that.

@@ -12,7 +12,6 @@ pub(super) use resume::check_world;
 use super::ledger::acquire_request;
 use super::outside::Outside;
 use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorder, said};
-use super::retry::{Attempts, patiently};
 use super::shell::Place;
 use crate::aside::Aside;
 use crate::failure::Unbegun;
@@ -28,6 +27,7 @@ use ratn_model::resource::{LeasedResource, Requirement, ResourceClass};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{self, Resource, WorldChange};
+use ratn_worker::client::patiently;
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
 use ratn_worker::session::{DEFAULT_TTL, Session};
 use ratn_worker::trace::{self, TraceContext};
@@ -177,7 +177,7 @@ impl Performer {
 
     /// The root world as it is now; of every revision after it [`Performer::accept`] will hear.
     pub(super) async fn root(&mut self) -> anyhow::Result<(Revision, Vec<(FactKey, Value)>)> {
-        let (revision, facts) = patiently(Attempts::IDEMPOTENT, || self.world.root()).await?;
+        let (revision, facts) = patiently(|| self.world.root()).await?;
         self.follow(revision)?;
         Ok((revision, facts.into_iter().map(|fact| (fact.key, fact.value)).collect()))
     }
@@ -279,10 +279,10 @@ impl Performer {
         let mut asking = Box::pin(trace::within(self.trace.child(), async move {
             let ask = || resources.acquire(requirements.clone(), options.clone());
             let answer = tokio::select! {
-                answer = patiently(Attempts::IDEMPOTENT, ask) => answer,
+                answer = patiently(ask) => answer,
                 () = withdrawn.cancelled() => {
                     // The call is dropped; what was granted meanwhile goes back.
-                    let _ = patiently(Attempts::IDEMPOTENT, || resources.withdraw(&options.request)).await;
+                    let _ = patiently(|| resources.withdraw(&options.request)).await;
                     return;
                 }
             };
@@ -430,12 +430,12 @@ impl Performer {
                 let _ = job.ended.await;
             }
             if let Some(projection) = projection
-                && let Err(error) = patiently(Attempts::IDEMPOTENT, || world.release(projection)).await
+                && let Err(error) = patiently(|| world.release(projection)).await
             {
                 tracing::warn!(%instance, "a projection was not given back: {}", said(&error));
             }
             if let Some(lease) = lease
-                && let Err(error) = patiently(Attempts::IDEMPOTENT, || resources.release(lease)).await
+                && let Err(error) = patiently(|| resources.release(lease)).await
             {
                 tracing::warn!(%instance, "a lease was not given back: {}", said(&error));
             }
@@ -447,7 +447,7 @@ impl Performer {
 /// goes with the run's session.
 pub(crate) async fn only_run(resources: &ResourceClient, task: &str) -> anyhow::Result<()> {
     let claim = Resource::new(RUN, ResourceClass::Task, "Run").with_attribute("task", Value::String(task.to_owned()));
-    match patiently(Attempts::IDEMPOTENT, || resources.create(claim.clone())).await {
+    match patiently(|| resources.create(claim.clone())).await {
         Ok(_) => Ok(()),
         Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
             let message = "another run is under way on this system: wait for its end, or use a system of your own";

@@ -10,12 +10,12 @@ use crate::task_control::Endpoints;
 use crate::task_control::ledger::Ledger;
 use crate::task_control::outside;
 use crate::task_control::record::{Record, commit_next, operate_once, said};
-use crate::task_control::retry::{Attempts, patiently};
 use anyhow::bail;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, Revision};
 use ratn_proto::types::{Resource, WorldUpdate};
+use ratn_worker::client::patiently;
 use ratn_worker::client::{Channels, WorldClient};
 use ratn_world::world::World;
 use std::cmp::Reverse;
@@ -24,7 +24,7 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Refuses a world that is not the run's. Changes nothing.
 pub(in crate::task_control) async fn check_world(endpoints: &Endpoints, ledger: &Ledger) -> anyhow::Result<()> {
     let world = WorldClient::new(&Channels::new(), &endpoints.world_pool)?;
-    let (root, _) = patiently(Attempts::IDEMPOTENT, || world.root()).await?;
+    let (root, _) = patiently(|| world.root()).await?;
     if root < ledger.first_revision {
         bail!(
             "the world pool's root is at {root}, and the run began at {}: the world pool has lost its \
@@ -58,7 +58,7 @@ impl Performer {
         }
         // What crossed with the end of task control goes back; a waiting one has left the queue with its connection.
         for request in &ledger.withdrawn {
-            let _ = patiently(Attempts::IDEMPOTENT, || self.resources.withdraw(request)).await;
+            let _ = patiently(|| self.resources.withdraw(request)).await;
         }
         for (instance, asked) in ledger.projecting {
             let attempt = asked.attempt;
@@ -80,7 +80,7 @@ impl Performer {
     /// Makes every commit that the world pool does not have, and compares the two worlds: what is otherwise in the pool was changed
     /// from outside.
     async fn commit_again(&mut self, ledger: &Ledger, mirror: &World) -> anyhow::Result<Option<Event>> {
-        let (mut root, _) = patiently(Attempts::IDEMPOTENT, || self.world.root()).await?;
+        let (mut root, _) = patiently(|| self.world.root()).await?;
         let there = self.commits_there(ledger, root).await?;
         for decided in &ledger.commits[there..] {
             let commit = decided.clone().commit(&self.run);
@@ -99,11 +99,11 @@ impl Performer {
     async fn commits_there(&self, ledger: &Ledger, root: Revision) -> anyhow::Result<usize> {
         // Any fact says how far back the pool can tell.
         let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
-        let (_, oldest) = patiently(Attempts::IDEMPOTENT, || self.world.history(any.clone())).await?;
+        let (_, oldest) = patiently(|| self.world.history(any.clone())).await?;
         let after = oldest.max(ledger.first_revision);
         let ids: BTreeMap<String, usize> =
             ledger.commits.iter().enumerate().map(|(place, decided)| (decided.id(&self.run), place + 1)).collect();
-        let mut watch = patiently(Attempts::IDEMPOTENT, || self.world.watch(Some(after), &[])).await?;
+        let mut watch = patiently(|| self.world.watch(Some(after), &[])).await?;
         let (mut told, mut there) = (after, None);
         while told < root {
             let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
@@ -130,7 +130,7 @@ impl Performer {
     }
 
     async fn living_leases(&self) -> anyhow::Result<BTreeSet<LeaseId>> {
-        let resources = patiently(Attempts::IDEMPOTENT, || self.resources.list(&[])).await?;
+        let resources = patiently(|| self.resources.list(&[])).await?;
         let own = |resource: Resource| {
             let holdings = resource.holdings.into_iter().filter(|holding| holding.session == self.run);
             holdings.map(|holding| holding.lease).collect::<Vec<_>>()

@@ -2,11 +2,11 @@
 
 use super::Answer;
 use crate::task_control::record::said;
-use crate::task_control::retry::{Attempts, patiently};
 use ratn_executive::protocol::Event;
 use ratn_model::id::{InstanceId, Revision};
 use ratn_proto::types::WorldUpdate;
 use ratn_worker::client::{CallError, WorldClient};
+use ratn_worker::client::{PAUSE, patiently};
 use tokio::sync::mpsc;
 
 /// Tells of every revision after one, in order and without a gap, as long as somebody listens. A pool that comes back with its
@@ -28,12 +28,12 @@ pub(super) async fn follow(world: WorldClient, mut after: Revision, events: mpsc
                 return;
             }
         }
-        tokio::time::sleep(Attempts::IDEMPOTENT.pause()).await;
+        tokio::time::sleep(PAUSE).await;
     }
 }
 
 async fn tell(world: &WorldClient, after: &mut Revision, events: &mpsc::Sender<Answer>) -> Result<(), CallError> {
-    let mut watch = patiently(Attempts::IDEMPOTENT, || world.watch(Some(*after), &[])).await?;
+    let mut watch = patiently(|| world.watch(Some(*after), &[])).await?;
     while let Some(update) = watch.next().await? {
         if let WorldUpdate::Changed(change) = update {
             *after = change.revision;
