@@ -160,6 +160,12 @@ impl CellConfig {
                 (0.0..0.1).contains(&self.camera.noise.sigma_at_1m),
                 "0 to 0.1",
             ),
+            (
+                "camera.noise.projector_m",
+                self.camera.noise.projector_m,
+                (0.0..1.0).contains(&self.camera.noise.projector_m),
+                "0 to 1",
+            ),
             ("battery.level", self.battery.level, (0.0..=1.0).contains(&self.battery.level), "0 to 1"),
             ("battery.idle_per_hour", self.battery.idle_per_hour, self.battery.idle_per_hour >= 0.0, "0 or more"),
             ("battery.motion_per_hour", self.battery.motion_per_hour, self.battery.motion_per_hour >= 0.0, "0 or more"),

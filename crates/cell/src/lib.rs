@@ -7,6 +7,8 @@
 
 pub mod config;
 pub mod core;
+mod photo;
 mod shell;
 
+pub use photo::photo;
 pub use shell::{ROLE, run, run_as};

@@ -11,7 +11,7 @@ use ratn_motion::aimm;
 use ratn_motion::collision::{PADDING_M, distance};
 use ratn_motion::plan::Goal;
 use ratn_perception::camera::Camera;
-use ratn_perception::detection::{BoxEstimate, Region, locate, segment};
+use ratn_perception::detection::{ObjectClass, Prior, Region, locate, segment};
 use ratn_worker::safety::SafetyState;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::PI;
@@ -215,7 +215,8 @@ fn believing_only_what_the_camera_sees_the_robot_delivers_every_box() {
         bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
         bench.done(Request::LookAt { target: [0.80, 0.0, 0.70] });
         let table = Region { pose: Pose::at(0.80, 0.0, 0.70), size: [0.60, 1.20] };
-        let found = look(&mut bench, 60, |image, camera| segment(image, camera, &table)).unwrap();
+        let found =
+            look(&mut bench, 60, |image, camera| segment(image, camera, &table, &[ObjectClass::Box], &[])).unwrap();
         assert_eq!(found.len(), boxes, "seed {seed}");
         let [x, y, z] = aimm::TABLE_CENTRE;
         let object = |name: String, size, pose| SceneObject {
@@ -226,14 +227,16 @@ fn believing_only_what_the_camera_sees_the_robot_delivers_every_box() {
         let mut believed =
             Scene { base: Pose::IDENTITY, objects: vec![object("table".into(), aimm::TABLE_SIZE, Pose::at(x, y, z))] };
         for (i, b) in found.iter().enumerate() {
-            believed.objects.push(object(format!("box_{}", i + 1), b.size, b.pose));
+            believed.objects.push(object(format!("box_{}", i + 1), b.model.size(), b.pose));
         }
         for (i, seen) in found.iter().enumerate() {
-            let b: BoxEstimate = look(&mut bench, 8, |image, camera| locate(image, camera, seen)).unwrap().unwrap();
+            let prior = Prior { pose: seen.pose, size: seen.model.size() };
+            let located = look(&mut bench, 8, |image, camera| locate(image, camera, &prior, &[ObjectClass::Box], &[]));
+            let (b, size) = located.unwrap().map(|b| (b, b.model.size())).unwrap();
             let truths = bench.cell.ground_truth();
             let error = truths.iter().map(|t| t.pose.distance(&b.pose)).fold(f64::INFINITY, f64::min);
             worst = worst.max(error);
-            let goals = aimm::grasp_poses(&b.pose, b.size).map(Goal::Pose).to_vec();
+            let goals = aimm::grasp_poses(&b.pose, size).map(Goal::Pose).to_vec();
             let approach = bench.plan(&believed, goals, 0.0, 0.10);
             bench.done(Request::Follow { trajectory: approach });
             let tool = bench.cell.robot().tool_pose(&bench.cell.configuration());
@@ -245,7 +248,7 @@ fn believing_only_what_the_camera_sees_the_robot_delivers_every_box() {
             };
             assert!(measured.distance(&in_tool) < 0.015 && measured.angle(&in_tool) < 0.09, "seed {seed} box {i}");
             believed.objects[i + 1].placement = Placement::Gripper(in_tool);
-            let slot = aimm::slots()[i].compose(&Pose::at(0.0, 0.0, b.size[2] / 2.0 + 0.003));
+            let slot = aimm::slots()[i].compose(&Pose::at(0.0, 0.0, size[2] / 2.0 + 0.003));
             let half_turn = slot.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, PI));
             let goals = [slot, half_turn].map(|s| Goal::Pose(s.compose(&in_tool.inverse()))).to_vec();
             let transfer = bench.plan(&believed, goals, 0.10, 0.10);
@@ -261,7 +264,8 @@ fn believing_only_what_the_camera_sees_the_robot_delivers_every_box() {
         bench.done(Request::Follow { trajectory: stow });
         bench.done(Request::LookAt { target: [-0.37, 0.0, 0.60] });
         let deck = Region { pose: Pose::at(-0.37, 0.0, 0.60), size: [0.44, 0.58] };
-        let on_deck = look(&mut bench, 60, |image, camera| segment(image, camera, &deck)).unwrap();
+        let on_deck =
+            look(&mut bench, 60, |image, camera| segment(image, camera, &deck, &[ObjectClass::Box], &[])).unwrap();
         println!("{boxes} boxes, seed {seed}: {:.0} s, {} seen on the deck", bench.now.seconds(), on_deck.len());
         assert_eq!(on_deck.len(), boxes, "seed {seed}: {on_deck:#?}");
     }

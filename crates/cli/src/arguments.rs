@@ -106,21 +106,6 @@ pub(crate) struct RoleArguments {
     pub(crate) exit_with_parent: bool,
 }
 
-/// What a daemon that keeps a state takes beside that.
-#[derive(Debug, Clone, Args)]
-pub(crate) struct KeptRoleArguments {
-    #[command(flatten)]
-    pub(crate) role: RoleArguments,
-    /// When an answer may leave: `none` at once, `group` when it is on the disk, `each` likewise with a sync for every change; the
-    /// config's unless given
-    #[arg(long, value_name = "WHEN")]
-    pub(crate) durability: Option<Durability>,
-    /// Where its state is kept, in a folder of its name; the config's, $RATN_STATE_DIR, $STATE_DIRECTORY or `state` in the runtime
-    /// directory unless given
-    #[arg(long, value_name = "DIR")]
-    pub(crate) state_dir: Option<PathBuf>,
-}
-
 /// What the cell takes beside what every daemon takes.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct CellArguments {
@@ -134,6 +119,30 @@ pub(crate) struct CellArguments {
     /// Go through a recording again, say whether the same comes of it, and end
     #[arg(long, value_name = "FILE", conflicts_with = "record")]
     pub(crate) replay: Option<PathBuf>,
+    /// Write a picture of the configured cell as it begins to this file, PNG, and end
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["record", "replay"])]
+    pub(crate) picture: Option<PathBuf>,
+    /// From where the picture is taken: X,Y,Z in metres; by the robot's own camera unless given
+    #[arg(long, value_name = "PLACE", requires = "picture", allow_hyphen_values = true, value_parser = place)]
+    pub(crate) from: Option<[f64; 3]>,
+    /// Towards where: X,Y,Z in metres
+    #[arg(long, value_name = "PLACE", default_value = "0.8,0,0.7", allow_hyphen_values = true, value_parser = place)]
+    pub(crate) towards: [f64; 3],
+}
+
+/// What a daemon that keeps a state takes beside that.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct KeptRoleArguments {
+    #[command(flatten)]
+    pub(crate) role: RoleArguments,
+    /// When an answer may leave: `none` at once, `group` when it is on the disk, `each` likewise with a sync for every change; the
+    /// config's unless given
+    #[arg(long, value_name = "WHEN")]
+    pub(crate) durability: Option<Durability>,
+    /// Where its state is kept, in a folder of its name; the config's, $RATN_STATE_DIR, $STATE_DIRECTORY or `state` in the runtime
+    /// directory unless given
+    #[arg(long, value_name = "DIR")]
+    pub(crate) state_dir: Option<PathBuf>,
 }
 
 /// What shall go wrong.
@@ -236,6 +245,9 @@ pub(crate) struct WorkerArguments {
     /// Robot's seconds per second
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
     pub(crate) speed: f64,
+    /// Of a detector: keep what it sees and finds as PNG files in this folder
+    #[arg(long, value_name = "DIR")]
+    pub(crate) pictures: Option<PathBuf>,
 }
 
 /// The bundled workers.
@@ -523,6 +535,13 @@ pub(crate) struct DemoArguments {
 
 const SLOWEST: f64 = 0.01;
 const FASTEST: f64 = 1000.0;
+
+/// X,Y,Z in metres.
+fn place(text: &str) -> Result<[f64; 3], String> {
+    let number = |part: &str| part.trim().parse().ok().filter(|x: &f64| x.is_finite());
+    let numbers: Option<Vec<f64>> = text.split(',').map(number).collect();
+    numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| "expected X,Y,Z in metres".to_owned())
+}
 
 fn speed(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {

@@ -87,6 +87,18 @@ impl Intrinsics {
     }
 }
 
+impl Camera {
+    /// A camera without roll at one point that looks at another; both in the world, z up.
+    pub fn looking(eye: [f64; 3], target: [f64; 3], intrinsics: Intrinsics) -> Camera {
+        let way = [0, 1, 2].map(|i| target[i] - eye[i]);
+        let (yaw, pitch) = (way[1].atan2(way[0]), (-way[2]).atan2(way[0].hypot(way[1])));
+        let head = Pose::from_rpy(eye, 0.0, pitch, yaw);
+        // The optical axis is the head's x, right is its -y.
+        let optical = Pose { position: [0.0; 3], quaternion_xyzw: [-0.5, 0.5, -0.5, 0.5] };
+        Camera { intrinsics, pose: head.compose(&optical) }
+    }
+}
+
 impl DepthImage {
     /// The image as little-endian f32.
     pub fn to_bytes(&self) -> Vec<u8> {
@@ -127,6 +139,16 @@ mod tests {
         assert_eq!(DepthImage::from_bytes(2, 2, &image.to_bytes()).unwrap(), image);
         assert!(DepthImage::from_bytes(2, 3, &image.to_bytes()).is_err());
         assert!(DepthImage::from_bytes(1 << 40, 1 << 40, &[]).is_err());
+    }
+
+    #[test]
+    fn a_camera_sees_what_it_looks_at_in_its_middle_and_what_is_above_it_higher() {
+        let camera = Camera::looking([1.0, -2.0, 1.5], [0.0, 0.3, 0.7], Intrinsics::DEFAULT);
+        let seen = |point| camera.intrinsics.project(camera.pose.inverse().transform(point)).unwrap();
+        let [column, row] = seen([0.0, 0.3, 0.7]);
+        assert!((column - camera.intrinsics.cx).abs() < 1e-6 && (row - camera.intrinsics.cy).abs() < 1e-6);
+        let [above, higher] = seen([0.0, 0.3, 0.9]);
+        assert!((above - column).abs() < 1e-6 && higher < row);
     }
 
     #[test]

@@ -1,88 +1,105 @@
-//! Euclidean clusters: points belong together when a chain of close points joins them.
+//! Euclidean clusters (Rusu 2009, section 6.2): points belong together when a chain of close points joins them.
 //!
-//! The points come from an image, so the neighbours of a point are looked for among the pixels around it, not in a tree:
-//! close points of one surface are close in the image.
+//! Points are first gathered in cells, so that what is near the camera does not cost more than what is far; the cells' middles
+//! go into a k-d tree, and clusters grow along its answers.
 
-use crate::vector::{Vector, length, sub};
-use std::collections::VecDeque;
+use crate::vector::Vector;
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
-/// The label of a pixel that is in no cluster.
-pub(crate) const NONE: u32 = u32::MAX;
-
-/// How far apart two points of a chain may be, in metres.
-const LINK: f64 = 0.025;
-/// How far apart they may be in the image, in pixels: bridges pixels that did not return.
-const REACH: usize = 2;
+/// The edge of a cell, in metres.
+const CELL: f64 = 0.007;
+/// How far apart the cells of a chain may be, in metres.
+const LINK: f64 = 0.016;
+/// A cell with fewer neighbours than this is a stray point.
+const MIN_NEIGHBOURS: usize = 3;
 /// More clusters than this are not looked at.
 const MAX_CLUSTERS: usize = 256;
+/// More points than this are not gathered: an image full of clutter.
+const MAX_POINTS: usize = 1 << 20;
 
-/// The clusters of at least `min_size` points, each a list of pixels, and every pixel's label.
-pub(crate) fn clusters(
-    width: usize,
-    height: usize,
-    points: &[Option<Vector>],
-    min_size: usize,
-) -> (Vec<Vec<usize>>, Vec<u32>) {
-    let mut labels = vec![NONE; points.len()];
-    let mut found: Vec<Vec<usize>> = Vec::new();
-    let mut visited = vec![false; points.len()];
-    let mut queue = VecDeque::new();
-    for start in 0..points.len() {
-        if visited[start] || points[start].is_none() {
+/// Clusters of at least `min_size` points, each a list of indices of `points`, the largest first.
+pub(crate) fn clusters(points: &[Vector], min_size: usize) -> Vec<Vec<u32>> {
+    let mut keyed: Vec<(u64, u32)> =
+        points.iter().take(MAX_POINTS).enumerate().map(|(i, p)| (key(p), i as u32)).collect();
+    keyed.sort_unstable();
+    let cells: Vec<&[(u64, u32)]> = keyed.chunk_by(|a, b| a.0 == b.0).collect();
+    let middles: Vec<Vector> = cells.iter().map(|cell| middle(cell.iter().map(|(_, i)| points[*i as usize]))).collect();
+    let Ok(tree) = ImmutableKdTree::<f64, 3>::new_from_slice(&middles) else { return Vec::new() };
+    let near =
+        |cell: usize| tree.query(&middles[cell]).within::<SquaredEuclidean<f64>>(LINK * LINK).unsorted().execute();
+    let mut visited = vec![false; cells.len()];
+    let mut found: Vec<Vec<u32>> = Vec::new();
+    for start in 0..cells.len() {
+        if visited[start] || found.len() == MAX_CLUSTERS {
             continue;
         }
-        if found.len() == MAX_CLUSTERS {
-            break;
-        }
-        let mut members = Vec::new();
         visited[start] = true;
-        queue.push_back(start);
-        while let Some(pixel) = queue.pop_front() {
-            members.push(pixel);
-            let Some(here) = points[pixel] else { continue };
-            let (column, row) = (pixel % width, pixel / width);
-            for near_row in row.saturating_sub(REACH)..(row + REACH + 1).min(height) {
-                for near_column in column.saturating_sub(REACH)..(column + REACH + 1).min(width) {
-                    let near = near_row * width + near_column;
-                    if !visited[near]
-                        && let Some(point) = points[near]
-                        && length(sub(point, here)) < LINK
-                    {
-                        visited[near] = true;
-                        queue.push_back(near);
-                    }
+        let (mut members, mut open) = (Vec::new(), vec![start]);
+        while let Some(cell) = open.pop() {
+            let neighbours = near(cell);
+            // The cell itself is among them. A stray joins nothing.
+            if neighbours.len() <= MIN_NEIGHBOURS {
+                continue;
+            }
+            members.extend(cells[cell].iter().map(|(_, i)| *i));
+            for neighbour in neighbours {
+                let next = neighbour.item as usize;
+                if !visited[next] {
+                    visited[next] = true;
+                    open.push(next);
                 }
             }
         }
         if members.len() >= min_size {
-            for pixel in &members {
-                labels[*pixel] = found.len() as u32;
-            }
+            members.sort_unstable();
             found.push(members);
         }
     }
-    (found, labels)
+    found.sort_by_key(|members| (std::cmp::Reverse(members.len()), members[0]));
+    found
+}
+
+/// The cell of a point, 21 bits an axis.
+fn key(point: &Vector) -> u64 {
+    point.iter().fold(0, |key, c| (key << 21) | (((c / CELL).floor() as i64 + (1 << 20)) as u64 & 0x1F_FFFF))
+}
+
+fn middle(points: impl Iterator<Item = Vector>) -> Vector {
+    let (mut sum, mut count) = ([0.0; 3], 0.0);
+    for p in points {
+        count += 1.0;
+        for axis in 0..3 {
+            sum[axis] += p[axis];
+        }
+    }
+    sum.map(|s| s / count)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_gap_in_space_parts_what_is_adjacent_in_the_image() {
-        // One row: four points, a step of 10 cm in depth, a missing pixel, three points.
-        let points: Vec<Option<Vector>> = [1.0, 1.0, 1.0, 1.0, 1.1, 0.0, 1.1, 1.1]
-            .iter()
-            .enumerate()
-            .map(|(i, z)| (*z > 0.0).then_some([i as f64 * 0.005, 0.0, *z]))
-            .collect();
-        let (found, labels) = clusters(8, 1, &points, 2);
-        assert_eq!(found, vec![vec![0, 1, 2, 3], vec![4, 6, 7]]);
-        assert_eq!(labels, vec![0, 0, 0, 0, 1, NONE, 1, 1]);
+    /// A patch of 20 × 20 points, 2 mm apart.
+    fn patch(x: f64) -> Vec<Vector> {
+        (0..400).map(|i| [x + f64::from(i % 20) * 0.002, f64::from(i / 20) * 0.002, 0.1]).collect()
     }
 
     #[test]
-    fn small_clusters_are_dropped() {
-        assert!(clusters(1, 1, &[Some([0.0; 3])], 2).0.is_empty());
+    fn a_gap_parts_clusters_and_a_narrow_one_does_not() {
+        let apart: Vec<Vector> = patch(0.0).into_iter().chain(patch(0.070)).collect();
+        let found = clusters(&apart, 100);
+        assert_eq!(found.iter().map(Vec::len).collect::<Vec<_>>(), vec![400, 400]);
+        assert_eq!(found[0], (0..400).collect::<Vec<u32>>());
+        let joined: Vec<Vector> = patch(0.0).into_iter().chain(patch(0.046)).collect();
+        assert_eq!(clusters(&joined, 100).len(), 1);
+    }
+
+    #[test]
+    fn strays_and_small_clusters_are_dropped() {
+        let mut points = patch(0.0);
+        points.push([0.3, 0.3, 0.3]);
+        assert_eq!(clusters(&points, 1).iter().map(Vec::len).collect::<Vec<_>>(), vec![400]);
+        assert!(clusters(&points, 401).is_empty());
+        assert!(clusters(&[], 1).is_empty());
     }
 }

@@ -1,17 +1,19 @@
-//! Depth image → boxes on a supporting plane.
+//! Depth image → objects on a supporting surface.
 //!
-//! Points of the region → the plane by RANSAC → points above it → Euclidean clusters → one upright box per cluster. What is
-//! no box (the arm in the image, a cluster that no box explains) is left out.
+//! Points of the region → the plane by RANSAC → points above it, the robot's own body left out → clusters on a k-d tree → to
+//! each cluster every model that it could be, from its principal axes → the one that explains it best, refined. What no
+//! model explains (a part of an arm, a thing of no known class) is left out.
 
 use crate::camera::{Camera, DepthImage};
-use crate::cluster;
-use crate::fit::{Fit, Sight};
-use crate::plane::Plane;
-use crate::vector::Vector;
+use crate::fit::start::Outline;
+use crate::fit::{Evidence, Fit};
+use crate::mask::Ball;
+pub use crate::model::{Model, ObjectClass, Symmetry};
+use crate::view::View;
 use ratn_model::pose::Pose;
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// Where to look: a flat surface on which boxes stand.
+/// Where to look: a flat surface on which things stand.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Region {
     /// The middle of the surface, its z axis up.
@@ -20,14 +22,29 @@ pub struct Region {
     pub size: [f64; 2],
 }
 
-/// A box as seen.
+/// What was seen before.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct BoxEstimate {
-    /// Its centre, upright on the surface; x along its longer horizontal side. Turned by less than a quarter turn either way
-    /// from the region's x axis: half a turn more would look the same.
+pub struct Prior {
+    /// Its centre.
     pub pose: Pose,
-    /// Edge lengths in metres; the first is not shorter than the second, the third is the height.
+    /// The edges of its bounding box, in metres.
     pub size: [f64; 3],
+}
+
+/// An object as seen.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Detection {
+    /// Its shape, in metres. A box's first edge is not shorter than its second.
+    pub model: Model,
+    /// The middle of its bounding box, upright on the surface. A box's yaw is within a quarter turn of the region's x axis
+    /// (half a turn more looks the same), a fork's x axis points to the tips, what is round has the region's yaw.
+    pub pose: Pose,
+    /// Of the position in metres² and of a small turn in radians², both along the world's axes: rows and columns x, y, z, and
+    /// turns about x, y, z. Of what any turn leaves the same, the yaw's variance is that of an unknown angle.
+    pub covariance: [[f64; 6]; 6],
+    /// How sure it is that this is an object of this class, 0 to 1: how much of what was measured the model explains, times
+    /// how much better it does than the other classes.
+    pub confidence: f64,
 }
 
 /// Why nothing can be said.
@@ -51,145 +68,166 @@ pub enum DetectionError {
     },
 }
 
-/// How far above or below its given pose the surface may be, in metres.
-const PLANE_SLACK: f64 = 0.06;
-/// Points up to here belong to the plane, in metres above it.
-const CLEAR_OF_PLANE: f64 = 0.014;
-/// Nothing taller stands on the surface, in metres.
-const TALLEST: f64 = 0.25;
-/// A box is seen by at least so many pixels.
-const MIN_PIXELS: usize = 30;
-/// Pixels around a cluster that take part in the fit.
-const WINDOW_MARGIN: usize = 6;
-/// How much of its cluster a box must explain.
+/// How much of its cluster a model must explain.
 const MIN_EXPLAINED: f64 = 0.7;
-/// How far around a known box is looked for it, in metres.
+/// How badly it may explain what was measured, see `Fit::score`.
+const MAX_SCORE: f64 = 0.6;
+/// How far around a known object is looked for it, in metres.
 const SEARCH_MARGIN: f64 = 0.15;
-/// How far a known box may have moved, in metres.
+/// How far a known object may have moved, in metres.
 const MAX_DISPLACEMENT: f64 = 0.08;
-/// RANSAC's choices: any number does; the same image gives the same boxes.
-const SEED: u64 = 0x5EED;
+/// How much the sizes of a known object may differ from what is seen, in metres, and how much of them.
+const SIZE_SLACK: (f64, f64) = (0.025, 0.25);
+/// A difference of scores by which one class is e times as likely as another.
+const SCORE_SCALE: f64 = 0.06;
+/// Points, rays beside them, and iterations, to tell what something could be and to say where it is.
+const COARSE: (usize, usize, usize) = (140, 100, 9);
+const FINE: (usize, usize, usize) = (500, 360, 9);
+/// Where and how the camera is, is not known better than this, in metres and radians.
+const CALIBRATION: (f64, f64) = (0.0005, 0.002);
 
-/// Every box on the surface, those nearest to the camera first.
+/// Every object of these classes on the surface, those nearest to the camera first. `body` is where the robot is itself.
 ///
 /// # Errors
 /// [`DetectionError`] when the surface is not in the image.
-pub fn segment(image: &DepthImage, camera: &Camera, region: &Region) -> Result<Vec<BoxEstimate>, DetectionError> {
-    let mut boxes = boxes_on(image, camera, region)?;
+pub fn segment(
+    image: &DepthImage,
+    camera: &Camera,
+    region: &Region,
+    classes: &[ObjectClass],
+    body: &[Ball],
+) -> Result<Vec<Detection>, DetectionError> {
+    let mut found = objects_on(image, camera, region, classes, body)?;
     let eye = camera.pose.position;
     // To the centimetre, then by y: what noise tells apart is not told apart.
-    let key = |b: &BoxEstimate| {
-        let [x, y, _] = b.pose.position;
+    let key = |object: &Detection| {
+        let [x, y, _] = object.pose.position;
         (((x - eye[0]).hypot(y - eye[1]) * 100.0).round() as i64, (y * 1000.0).round() as i64)
     };
-    boxes.sort_by_key(key);
-    Ok(boxes)
+    found.sort_by_key(key);
+    Ok(found)
 }
 
-/// The box that was last seen as `prior`: looks around there for the one nearest to it.
+/// What was last seen as `prior`: looks around there for the object of these classes and about that size nearest to it.
 ///
 /// # Errors
 /// [`DetectionError`] when the surface below it is not in the image.
-pub fn locate(image: &DepthImage, camera: &Camera, prior: &BoxEstimate) -> Result<Option<BoxEstimate>, DetectionError> {
-    let reach = prior.size[0].max(prior.size[1]) + 2.0 * SEARCH_MARGIN;
+pub fn locate(
+    image: &DepthImage,
+    camera: &Camera,
+    prior: &Prior,
+    classes: &[ObjectClass],
+    body: &[Ball],
+) -> Result<Option<Detection>, DetectionError> {
+    let reach = prior.size[0].hypot(prior.size[1]) + 2.0 * SEARCH_MARGIN;
     let below = Pose::at(0.0, 0.0, -prior.size[2] / 2.0);
     let region = Region { pose: prior.pose.compose(&below), size: [reach, reach] };
-    let mut boxes = boxes_on(image, camera, &region)?;
-    boxes.retain(|b| b.pose.distance(&prior.pose) <= MAX_DISPLACEMENT);
-    Ok(boxes.into_iter().min_by(|a, b| a.pose.distance(&prior.pose).total_cmp(&b.pose.distance(&prior.pose))))
+    let mut found = objects_on(image, camera, &region, classes, body)?;
+    found.retain(|object| object.pose.distance(&prior.pose) <= MAX_DISPLACEMENT && alike(prior, object));
+    Ok(found.into_iter().min_by(|a, b| a.pose.distance(&prior.pose).total_cmp(&b.pose.distance(&prior.pose))))
 }
 
-fn boxes_on(image: &DepthImage, camera: &Camera, region: &Region) -> Result<Vec<BoxEstimate>, DetectionError> {
-    let (width, height) = (image.width, image.height);
-    if (width, height) != (camera.intrinsics.width, camera.intrinsics.height) || image.depth.len() != width * height {
-        return Err(DetectionError::WrongCamera { width, height });
-    }
-    let view = View::new(image, camera, region);
-    let inside =
-        |p: &Vector| p[0].abs() <= region.size[0] / 2.0 && p[1].abs() <= region.size[1] / 2.0 && p[2] < TALLEST;
-    let points: Vec<Option<Vector>> = (0..width * height).map(|i| view.point(i).filter(inside)).collect();
-    let near: Vec<Vector> = points.iter().flatten().filter(|p| p[2].abs() < PLANE_SLACK).copied().collect();
-    let plane = Plane::find(&near, SEED).ok_or(DetectionError::NoPlane { points: near.len() })?;
-    let above: Vec<Option<Vector>> =
-        points.iter().map(|p| p.filter(|p| (CLEAR_OF_PLANE..TALLEST).contains(&plane.above(*p)))).collect();
-    let (clusters, labels) = cluster::clusters(width, height, &above, MIN_PIXELS);
-    // Large clusters first: a steep side face can come apart from its top, and must not make a second box in the same place.
-    let mut largest_first: Vec<(usize, &Vec<usize>)> = clusters.iter().enumerate().collect();
-    largest_first.sort_by_key(|(label, pixels)| (std::cmp::Reverse(pixels.len()), *label));
+/// Whether an object could be the one seen before, by its size.
+fn alike(prior: &Prior, object: &Detection) -> bool {
+    let sorted = |[x, y, z]: [f64; 3]| [x.max(y), x.min(y), z];
+    let (before, now) = (sorted(prior.size), sorted(object.model.size()));
+    (0..3).all(|i| (before[i] - now[i]).abs() <= SIZE_SLACK.0.max(SIZE_SLACK.1 * before[i]))
+}
+
+fn objects_on(
+    image: &DepthImage,
+    camera: &Camera,
+    region: &Region,
+    classes: &[ObjectClass],
+    body: &[Ball],
+) -> Result<Vec<Detection>, DetectionError> {
+    let view = View::new(image, camera, region, body)?;
     let mut fits: Vec<Fit> = Vec::new();
-    for (label, pixels) in largest_first {
-        let cloud: Vec<Vector> = pixels.iter().filter_map(|i| above[*i]).collect();
-        let Some(start) = Fit::of_top_face(&cloud, &plane) else { continue };
-        let fit = start.refined(view.eye, &plane, &view.window(pixels, label as u32, &labels));
-        let own: Vec<Sight> = pixels.iter().filter_map(|i| view.sight(*i)).collect();
-        if fit.explains(view.eye, &own) >= MIN_EXPLAINED && !fits.iter().any(|other| other.covers(fit.centre)) {
-            fits.push(fit);
+    let mut found = Vec::new();
+    // Large clusters first: a steep side can come apart from its top, and must not make a second object in the same place.
+    for cluster in 0..view.clusters.len() {
+        let Some((fit, share)) = classify(&view, cluster, classes) else { continue };
+        let evidence = view.evidence(cluster, FINE.0, FINE.1);
+        let fit = fit.refined(&evidence, FINE.2);
+        let explained = fit.explains(&evidence);
+        if explained < MIN_EXPLAINED
+            || fit.score(&evidence) > MAX_SCORE
+            || fits.iter().any(|other| other.covers(fit.at()) || fit.covers(other.at()))
+        {
+            continue;
         }
+        found.push(detection(&view, &fit, &evidence, explained * share));
+        fits.push(fit);
     }
-    Ok(fits.iter().map(|fit| estimate(fit, region)).collect())
+    Ok(found)
 }
 
-/// The image as seen from the region's frame.
-struct View<'a> {
-    image: &'a DepthImage,
-    camera: &'a Camera,
-    /// The camera's optical frame in the region's.
-    pose: Pose,
-    eye: Vector,
+/// The model that explains a cluster best, and how likely its class is among those tried.
+fn classify(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Option<(Fit, f64)> {
+    let evidence = view.evidence(cluster, COARSE.0, COARSE.1);
+    let starts = Outline::of(&evidence.points)?.starts(&evidence.points, classes);
+    let tried: Vec<(Fit, f64)> = starts
+        .into_iter()
+        .map(|start| {
+            let fit = start.refined(&evidence, COARSE.2);
+            let score = fit.score(&evidence);
+            (fit, score)
+        })
+        .collect();
+    let (best, score) = tried.iter().min_by(|a, b| a.1.total_cmp(&b.1))?.clone();
+    // Of each other class its best fit.
+    let rivals: f64 = ObjectClass::ALL
+        .into_iter()
+        .filter(|class| *class != best.class)
+        .filter_map(|class| tried.iter().filter(|(fit, _)| fit.class == class).map(|(_, s)| *s).min_by(f64::total_cmp))
+        .map(|rival| ((score - rival) / SCORE_SCALE).exp())
+        .sum();
+    Some((best, 1.0 / (1.0 + rivals)))
 }
 
-impl<'a> View<'a> {
-    fn new(image: &'a DepthImage, camera: &'a Camera, region: &Region) -> View<'a> {
-        let pose = region.pose.inverse().compose(&camera.pose);
-        View { image, camera, eye: pose.position, pose }
-    }
-
-    fn direction(&self, pixel: usize) -> Vector {
-        self.pose.rotate(self.camera.intrinsics.ray(pixel % self.image.width, pixel / self.image.width))
-    }
-
-    fn sight(&self, pixel: usize) -> Option<Sight> {
-        let depth = self.image.at(pixel % self.image.width, pixel / self.image.width)?;
-        Some(Sight { direction: self.direction(pixel), depth })
-    }
-
-    fn point(&self, pixel: usize) -> Option<Vector> {
-        let Sight { direction, depth } = self.sight(pixel)?;
-        Some([0, 1, 2].map(|axis| self.eye[axis] + direction[axis] * depth))
-    }
-
-    /// What is measured around a cluster, without what belongs to another one.
-    fn window(&self, pixels: &[usize], label: u32, labels: &[u32]) -> Vec<Sight> {
-        let (width, height) = (self.image.width, self.image.height);
-        let (mut columns, mut rows) = ((usize::MAX, 0), (usize::MAX, 0));
-        for pixel in pixels {
-            let (column, row) = (pixel % width, pixel / width);
-            columns = (columns.0.min(column), columns.1.max(column));
-            rows = (rows.0.min(row), rows.1.max(row));
-        }
-        let mut window = Vec::new();
-        for row in rows.0.saturating_sub(WINDOW_MARGIN)..(rows.1 + WINDOW_MARGIN + 1).min(height) {
-            for column in columns.0.saturating_sub(WINDOW_MARGIN)..(columns.1 + WINDOW_MARGIN + 1).min(width) {
-                let pixel = row * width + column;
-                if labels[pixel] == label || labels[pixel] == cluster::NONE {
-                    window.extend(self.sight(pixel));
-                }
-            }
-        }
-        window
-    }
-}
-
-fn estimate(fit: &Fit, region: &Region) -> BoxEstimate {
-    let (mut yaw, mut size) = (fit.yaw, fit.size);
-    if size[0] < size[1] {
+fn detection(view: &View<'_>, fit: &Fit, evidence: &Evidence, confidence: f64) -> Detection {
+    let (mut model, mut yaw) = (fit.model(), fit.yaw());
+    if let Model::Box { size } = &mut model
+        && size[0] < size[1]
+    {
         size.swap(0, 1);
         yaw += FRAC_PI_2;
     }
-    yaw = (yaw + FRAC_PI_2).rem_euclid(PI) - FRAC_PI_2;
-    let centre = [fit.centre[0], fit.centre[1], fit.base + fit.height / 2.0];
-    BoxEstimate {
-        pose: region.pose.compose(&Pose::from_rpy(centre, 0.0, 0.0, yaw)),
-        size: [size[0], size[1], fit.height],
+    match model.class().symmetry() {
+        Symmetry::HalfTurn => yaw = (yaw + FRAC_PI_2).rem_euclid(PI) - FRAC_PI_2,
+        Symmetry::None => yaw = (yaw + PI).rem_euclid(2.0 * PI) - PI,
+        Symmetry::Round => yaw = 0.0,
     }
+    let [x, y] = fit.at();
+    let standing = Pose::from_rpy([x, y, model.size()[2] / 2.0], 0.0, 0.0, yaw);
+    Detection { model, pose: view.frame.compose(&standing), covariance: covariance(view, fit, evidence), confidence }
+}
+
+/// The fit's covariance, the plane's and the camera's together, turned into the world.
+fn covariance(view: &View<'_>, fit: &Fit, evidence: &Evidence) -> [[f64; 6]; 6] {
+    let planar = fit.covariance(evidence);
+    let mut local = [[0.0; 6]; 6];
+    // x, y and yaw are the fit's, height and slopes the plane's; half of the height's error is the centre's.
+    for (i, row) in [0, 1, 5].into_iter().enumerate() {
+        for (j, column) in [0, 1, 5].into_iter().enumerate() {
+            local[row][column] = planar.pose[i][j];
+        }
+    }
+    local[2][2] = view.plane_variance[0] + planar.height / 4.0;
+    local[3][3] = view.plane_variance[1];
+    local[4][4] = view.plane_variance[1];
+    for (i, row) in local.iter_mut().enumerate() {
+        row[i] += if i < 3 { CALIBRATION.0 } else { CALIBRATION.1 }.powi(2);
+    }
+    if fit.class.symmetry() == Symmetry::Round {
+        // Of an angle of which nothing is known.
+        local[5][5] = PI * PI / 3.0;
+    }
+    let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| view.frame.rotate(axis));
+    let turn = |row: usize, column: usize| if row / 3 == column / 3 { axes[column % 3][row % 3] } else { 0.0 };
+    let product = |a: &dyn Fn(usize, usize) -> f64, b: &dyn Fn(usize, usize) -> f64| -> [[f64; 6]; 6] {
+        std::array::from_fn(|i| std::array::from_fn(|j| (0..6).map(|k| a(i, k) * b(k, j)).sum()))
+    };
+    let half = product(&turn, &|i, j| local[i][j]);
+    product(&|i, j| half[i][j], &|i, j| turn(j, i))
 }

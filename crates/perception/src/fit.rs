@@ -1,180 +1,342 @@
-//! An upright box fitted to one cluster.
+//! A model fitted to what was measured of one cluster: iterated closest points on the model's surface, with free space.
 //!
-//! The least-area rectangle of the visible top face starts it. Then the box is moved, turned and resized until the depths
-//! that it would show agree best with those measured in the whole window around it: pixels that should see the plane
-//! count as much as those that should see the box, so edges are found to a fraction of a pixel. A coordinate search with
-//! halving steps; the error per pixel is bounded, so that what hides the box does not pull at it.
+//! Every measured point pulls the model's surface towards itself (point to surface; Chen and Medioni 1992, with the closest
+//! point given by the signed distance instead of a search). Points alone would let a model grow behind its visible faces, so
+//! every ray that reached the table beside the cluster pushes out what it would have to pass through. Both are least squares
+//! over place, yaw and the model's own dimensions, by Levenberg and Marquardt, with weights that fade beyond a cut-off which
+//! shrinks as the fit settles. Objects stand upright: the frame's z = 0 is the surface.
 
-use crate::plane::Plane;
-use crate::rectangle;
-use crate::vector::{Vector, median, quantile};
+pub(crate) mod start;
 
-/// An upright box on the plane, in the region's frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
+use crate::model::{Model, ObjectClass, Symmetry};
+use crate::normal::Normal;
+use crate::vector::{Vector, length as length_of, sub};
+
+/// What was measured of a cluster and around it, in the frame of the supporting surface.
+#[derive(Debug, Clone)]
+pub(crate) struct Evidence {
+    /// Where the camera is.
+    pub(crate) eye: Vector,
+    /// Points of the cluster.
+    pub(crate) points: Vec<Vector>,
+    /// Where rays beside the cluster ended, at or below the surface.
+    pub(crate) free: Vec<Vector>,
+    /// Below this height points are not counted on: only those that noise has lifted were told from the surface.
+    pub(crate) floor: f64,
+    /// Standard deviation of a point, in metres.
+    pub(crate) sigma: f64,
+    /// The distance between neighbouring pixels at the cluster, in metres.
+    pub(crate) pitch: f64,
+}
+
+/// A model in its place: z = 0 is below it.
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Fit {
-    pub(crate) centre: [f64; 2],
-    pub(crate) yaw: f64,
-    pub(crate) size: [f64; 2],
-    /// The height of the plane below it.
-    pub(crate) base: f64,
-    /// How high it is.
+    pub(crate) class: ObjectClass,
+    /// x, y, yaw, and then the model's dimensions.
+    parameters: Parameters,
+}
+
+/// How uncertain a fit is: variances and covariances of x, y, yaw; the variance of its height.
+pub(crate) struct Covariance {
+    pub(crate) pose: [[f64; 3]; 3],
     pub(crate) height: f64,
 }
 
-/// A pixel of the window: its ray (the point at depth 1, from the eye) and what it measured.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Sight {
-    pub(crate) direction: Vector,
-    pub(crate) depth: f64,
-}
+/// x, y, yaw and at most three dimensions.
+type Parameters = [f64; MAX_PARAMETERS];
+const MAX_PARAMETERS: usize = 6;
+const YAW: usize = 2;
+const FIRST_DIMENSION: usize = 3;
 
-/// No pixel is more wrong than this, in metres.
-const ERROR_BOUND: f64 = 0.02;
-/// A pixel that agrees to this is explained, in metres.
-const EXPLAINED: f64 = 0.012;
-/// First and last step of the search, in metres; the angle's step is this over a lever of 8 cm.
-const FIRST_STEP: f64 = 0.008;
-const LAST_STEP: f64 = 0.0004;
-const LEVER: f64 = 0.08;
-/// Rounds at one step length.
-const MAX_ROUNDS: usize = 12;
-/// Edges of a box, in metres.
-const EDGES: std::ops::Range<f64> = 0.02..0.35;
+/// The step of numeric derivatives, in metres and radians.
+const DIFFERENCE: f64 = 1e-4;
+/// The cut-off of the first iteration, in metres.
+const FIRST_CUT_OFF: f64 = 0.015;
+/// How much of it the next has.
+const CUT_OFF_FADE: f64 = 0.7;
+/// How exactly the deepest place of a ray is found, in metres.
+const RESOLUTION: f64 = 0.002;
+/// A point this near, or within three deviations, is explained, in metres.
+const EXPLAINED: f64 = 0.004;
+/// A step below which a fit has settled, in metres and radians.
+const SETTLED: f64 = 1e-4;
+/// The longest step of one iteration, in metres; of yaw in radians, ten times as much.
+const LONGEST_STEP: f64 = 0.02;
 
 impl Fit {
-    /// The start: the least-area rectangle of the top face.
-    pub(crate) fn of_top_face(points: &[Vector], plane: &Plane) -> Option<Fit> {
-        let mut heights: Vec<f64> = points.iter().map(|p| plane.above(*p)).collect();
-        let highest = quantile(&mut heights, 0.95)?;
-        let mut upper: Vec<f64> = heights.into_iter().filter(|h| *h > highest - 0.012).collect();
-        let height = median(&mut upper)?;
-        let top: Vec<[f64; 2]> =
-            points.iter().filter(|p| (plane.above(**p) - height).abs() < 0.01).map(|p| [p[0], p[1]]).collect();
-        let rectangle = rectangle::least_area(&top)?;
-        Some(Fit {
-            centre: rectangle.centre,
-            yaw: rectangle.yaw,
-            size: rectangle.size,
-            base: plane.at(rectangle.centre[0], rectangle.centre[1]),
-            height,
+    pub(crate) fn new(class: ObjectClass, at: [f64; 2], yaw: f64, dimensions: &[f64]) -> Fit {
+        let mut parameters = [at[0], at[1], yaw, 0.0, 0.0, 0.0];
+        parameters[FIRST_DIMENSION..FIRST_DIMENSION + dimensions.len()].copy_from_slice(dimensions);
+        Fit { class, parameters }.bounded()
+    }
+
+    pub(crate) fn at(&self) -> [f64; 2] {
+        [self.parameters[0], self.parameters[1]]
+    }
+
+    pub(crate) fn yaw(&self) -> f64 {
+        self.parameters[YAW]
+    }
+
+    pub(crate) fn model(&self) -> Model {
+        self.class.model(&self.parameters[FIRST_DIMENSION..FIRST_DIMENSION + self.class.ranges().len()])
+    }
+
+    /// The fit near this one that agrees best with the evidence.
+    pub(crate) fn refined(self, evidence: &Evidence, iterations: usize) -> Fit {
+        let last_cut_off = (3.0 * evidence.sigma).max(EXPLAINED);
+        let mut cut_off = FIRST_CUT_OFF.max(last_cut_off);
+        let (mut here, mut damping) = (self, 1e-3);
+        for _ in 0..iterations {
+            let used = here.used(evidence);
+            let (normal, cost) = here.linearised(evidence, &used, cut_off);
+            let Some(next) = here.stepped(&normal, damping) else { break };
+            if next.cost(evidence, &used, cut_off) <= cost {
+                let moved = here.parameters.iter().zip(next.parameters).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                here = next;
+                damping = (damping * 0.3).max(1e-6);
+                if moved < SETTLED && cut_off <= last_cut_off {
+                    break;
+                }
+            } else {
+                damping *= 10.0;
+            }
+            cut_off = (cut_off * CUT_OFF_FADE).max(last_cut_off);
+        }
+        here
+    }
+
+    /// How badly it explains the evidence, per point: 0 is perfect, 1 not at all.
+    pub(crate) fn score(&self, evidence: &Evidence) -> f64 {
+        let cut_off = (3.0 * evidence.sigma).max(EXPLAINED);
+        self.cost(evidence, &evidence.points, cut_off) * 2.0 / cut_off.powi(2) / evidence.points.len().max(1) as f64
+    }
+
+    /// How many of the points lie on its surface, 0 to 1.
+    pub(crate) fn explains(&self, evidence: &Evidence) -> f64 {
+        let placed = Placed::of(self);
+        let near = (3.0 * evidence.sigma).max(EXPLAINED);
+        let explained =
+            evidence.points.iter().filter(|p| placed.model.distance(placed.local(**p)).abs() < near).count();
+        explained as f64 / evidence.points.len().max(1) as f64
+    }
+
+    /// Whether a place on the surface is below it.
+    pub(crate) fn covers(&self, place: [f64; 2]) -> bool {
+        let placed = Placed::of(self);
+        let [x, y, _] = placed.local([place[0], place[1], 0.0]);
+        let [length, width, _] = placed.model.size();
+        x.abs() < length / 2.0 && y.abs() < width / 2.0
+    }
+
+    /// How well the evidence determines it, by its noise and the size of pixels.
+    pub(crate) fn covariance(&self, evidence: &Evidence) -> Covariance {
+        let cut_off = (3.0 * evidence.sigma).max(EXPLAINED);
+        let mut normal = Normal::default();
+        let placed = Placed::of(self);
+        let moved = self.neighbours();
+        let (mut squares, mut count) = (0.0, 0.0);
+        for point in &evidence.points {
+            let residual = placed.model.distance(placed.local(*point));
+            if residual.abs() < cut_off {
+                squares += residual * residual;
+                count += 1.0;
+                normal.add(
+                    &self.slope(&moved, residual, |p| p.model.distance(p.local(*point))),
+                    residual,
+                    evidence.sigma.powi(-2),
+                );
+            }
+        }
+        // A ray that passes within a pixel says where the edge is, to about a pixel.
+        for ray in evidence.free.iter().filter_map(|end| placed.deepest(evidence, *end)) {
+            if ray.depth.abs() < evidence.pitch / 2.0 {
+                let slope = self.slope(&moved, ray.depth, |p| p.model.fill_distance(p.local(ray.place)));
+                normal.add(&slope, ray.depth, evidence.pitch.powi(-2));
+            }
+        }
+        // More scattered than the noise says: the model is not quite the thing.
+        let inflation = (squares / f64::max(count, 1.0) / evidence.sigma.powi(2)).max(1.0);
+        let inverse = normal.inverse(&self.fixed()).unwrap_or([[0.0; MAX_PARAMETERS]; MAX_PARAMETERS]);
+        let pose = std::array::from_fn(|row| std::array::from_fn(|column| inverse[row][column] * inflation));
+        // A fork's height follows its length.
+        let last = FIRST_DIMENSION + self.class.ranges().len() - 1;
+        let height = if self.class == ObjectClass::Fork { 0.0 } else { inverse[last][last] * inflation };
+        Covariance { pose, height }
+    }
+
+    /// The parameters that do not exist or change nothing.
+    fn fixed(&self) -> [bool; MAX_PARAMETERS] {
+        let dimensions = self.class.ranges().len();
+        std::array::from_fn(|i| {
+            (i == YAW && self.class.symmetry() == Symmetry::Round) || i >= FIRST_DIMENSION + dimensions
         })
     }
 
-    /// The box near this one that agrees best with what was measured.
-    pub(crate) fn refined(self, eye: Vector, plane: &Plane, window: &[Sight]) -> Fit {
-        let seen: Vec<(Sight, f64)> = window.iter().map(|s| (*s, depth_of_plane(eye, s.direction, plane))).collect();
-        let mut best = self.bounded();
-        let mut error = best.error(eye, &seen);
-        let mut step = FIRST_STEP;
-        while step > LAST_STEP {
-            for _ in 0..MAX_ROUNDS {
-                let before = error;
-                for direction in 0..Move::ALL.len() * 2 {
-                    let signed = if direction % 2 == 0 { step } else { -step };
-                    let candidate = best.moved(Move::ALL[direction / 2], signed);
-                    let candidate_error = candidate.error(eye, &seen);
-                    if candidate_error < error {
-                        (best, error) = (candidate, candidate_error);
-                    }
-                }
-                if error >= before {
-                    break;
-                }
-            }
-            step /= 2.0;
-        }
-        best
-    }
-
-    /// Whether a place is below the box.
-    pub(crate) fn covers(&self, place: [f64; 2]) -> bool {
-        let (sin, cos) = self.yaw.sin_cos();
-        let [dx, dy] = [place[0] - self.centre[0], place[1] - self.centre[1]];
-        (cos * dx + sin * dy).abs() < self.size[0] / 2.0 && (cos * dy - sin * dx).abs() < self.size[1] / 2.0
-    }
-
-    /// How much of what was measured the box explains: the fraction of these pixels whose depth it shows.
-    pub(crate) fn explains(&self, eye: Vector, pixels: &[Sight]) -> f64 {
-        let (sin, cos) = self.yaw.sin_cos();
-        let explained = pixels
-            .iter()
-            .filter(|s| self.depth(eye, s.direction, sin, cos).is_some_and(|d| (d - s.depth).abs() < EXPLAINED))
-            .count();
-        explained as f64 / pixels.len().max(1) as f64
-    }
-
-    fn error(&self, eye: Vector, seen: &[(Sight, f64)]) -> f64 {
-        let (sin, cos) = self.yaw.sin_cos();
-        seen.iter()
-            .map(|(sight, plane)| {
-                let expected = self.depth(eye, sight.direction, sin, cos).unwrap_or(*plane);
-                (expected - sight.depth).abs().min(ERROR_BOUND)
+    /// This fit with each parameter a little greater.
+    fn neighbours(&self) -> [Option<Placed>; MAX_PARAMETERS] {
+        let fixed = self.fixed();
+        std::array::from_fn(|i| {
+            (!fixed[i]).then(|| {
+                let mut next = self.clone();
+                next.parameters[i] += DIFFERENCE;
+                Placed::of(&next)
             })
-            .sum()
+        })
     }
 
-    /// Where a ray meets the box (slabs).
-    fn depth(&self, eye: Vector, direction: Vector, sin: f64, cos: f64) -> Option<f64> {
-        let (dx, dy) = (eye[0] - self.centre[0], eye[1] - self.centre[1]);
-        let from = [cos * dx + sin * dy, cos * dy - sin * dx, eye[2] - self.base - self.height / 2.0];
-        let along = [cos * direction[0] + sin * direction[1], cos * direction[1] - sin * direction[0], direction[2]];
-        let half = [self.size[0] / 2.0, self.size[1] / 2.0, self.height / 2.0];
-        let (mut near, mut far) = (0.0_f64, f64::INFINITY);
-        for axis in 0..3 {
-            let inverse = 1.0 / along[axis];
-            let (a, b) = ((-half[axis] - from[axis]) * inverse, (half[axis] - from[axis]) * inverse);
-            near = near.max(a.min(b));
-            far = far.min(a.max(b));
-        }
-        (near <= far).then_some(near)
+    fn slope(
+        &self,
+        moved: &[Option<Placed>; MAX_PARAMETERS],
+        here: f64,
+        distance: impl Fn(&Placed) -> f64,
+    ) -> Parameters {
+        std::array::from_fn(|i| moved[i].as_ref().map_or(0.0, |p| (distance(p) - here) / DIFFERENCE))
     }
 
-    fn moved(mut self, step: Move, by: f64) -> Fit {
-        let (sin, cos) = self.yaw.sin_cos();
-        match step {
-            Move::Along => self.centre = [self.centre[0] + cos * by, self.centre[1] + sin * by],
-            Move::Across => self.centre = [self.centre[0] - sin * by, self.centre[1] + cos * by],
-            Move::Turn => self.yaw += by / LEVER,
-            Move::Height => self.height += by,
-            Move::Face { axis, side } => {
-                self.size[axis] += by;
-                let shift = if axis == 0 { Move::Along } else { Move::Across };
-                self = self.moved(shift, side * by / 2.0);
+    /// The points that the model has above the floor: chosen by where the model is, not by where noise has put them.
+    fn used(&self, evidence: &Evidence) -> Vec<Vector> {
+        let placed = Placed::of(self);
+        let above = |p: &&Vector| p[2] - placed.model.distance(placed.local(**p)) > evidence.floor;
+        evidence.points.iter().filter(above).copied().collect()
+    }
+
+    fn linearised(&self, evidence: &Evidence, used: &[Vector], cut_off: f64) -> (Normal, f64) {
+        let (placed, moved) = (Placed::of(self), self.neighbours());
+        let (mut normal, mut cost) = (Normal::default(), 0.0);
+        for point in used {
+            let residual = placed.model.distance(placed.local(*point));
+            cost += robust(residual, cut_off);
+            let weight = weight(residual, cut_off);
+            if weight > 0.0 {
+                normal.add(&self.slope(&moved, residual, |p| p.model.distance(p.local(*point))), residual, weight);
             }
         }
-        self.bounded()
+        for end in &evidence.free {
+            let Some(ray) = placed.deepest(evidence, *end) else { continue };
+            if ray.depth < 0.0 {
+                cost += robust(ray.depth, cut_off);
+                let slope = self.slope(&moved, ray.depth, |p| p.model.fill_distance(p.local(ray.place)));
+                normal.add(&slope, ray.depth, weight(ray.depth, cut_off).max(RAY_WEIGHT));
+            }
+        }
+        (normal, cost)
+    }
+
+    fn cost(&self, evidence: &Evidence, points: &[Vector], cut_off: f64) -> f64 {
+        let placed = Placed::of(self);
+        let on_surface = points.iter().map(|p| robust(placed.model.distance(placed.local(*p)), cut_off));
+        let free = evidence.free.iter().filter_map(|end| placed.deepest(evidence, *end));
+        on_surface.sum::<f64>() + free.map(|ray| robust(ray.depth.min(0.0), cut_off)).sum::<f64>()
+    }
+
+    fn stepped(&self, normal: &Normal, damping: f64) -> Option<Fit> {
+        let step = normal.step(&self.fixed(), damping)?;
+        let mut next = self.clone();
+        for (i, (parameter, step)) in next.parameters.iter_mut().zip(step).enumerate() {
+            let longest = if i == YAW { 10.0 * LONGEST_STEP } else { LONGEST_STEP };
+            *parameter -= step.clamp(-longest, longest);
+        }
+        Some(next.bounded())
     }
 
     fn bounded(mut self) -> Fit {
-        self.size = self.size.map(|edge| edge.clamp(EDGES.start, EDGES.end));
-        self.height = self.height.clamp(EDGES.start, EDGES.end);
+        for (parameter, range) in self.parameters[FIRST_DIMENSION..].iter_mut().zip(self.class.ranges()) {
+            *parameter = parameter.clamp(*range.start(), *range.end());
+        }
         self
     }
 }
 
+/// What a ray through the model keeps at least of its weight, however deep: it is no stray.
+const RAY_WEIGHT: f64 = 0.2;
+
+/// Half the square up to the cut-off, fading to a bound (Tukey's biweight, scaled to half the cut-off's square).
+fn robust(residual: f64, cut_off: f64) -> f64 {
+    let part = (residual / cut_off).powi(2).min(1.0);
+    cut_off * cut_off / 2.0 * (1.0 - (1.0 - part).powi(3))
+}
+
+fn weight(residual: f64, cut_off: f64) -> f64 {
+    let part = (residual / cut_off).powi(2).min(1.0);
+    3.0 * (1.0 - part).powi(2)
+}
+
+/// A fit ready for many questions.
 #[derive(Debug, Clone, Copy)]
-enum Move {
-    Along,
-    Across,
-    Turn,
-    Height,
-    Face { axis: usize, side: f64 },
+struct Placed {
+    model: Model,
+    at: Vector,
+    sin: f64,
+    cos: f64,
 }
 
-impl Move {
-    const ALL: [Move; 8] = [
-        Move::Along,
-        Move::Across,
-        Move::Turn,
-        Move::Height,
-        Move::Face { axis: 0, side: 1.0 },
-        Move::Face { axis: 0, side: -1.0 },
-        Move::Face { axis: 1, side: 1.0 },
-        Move::Face { axis: 1, side: -1.0 },
-    ];
+/// The place of a ray that is deepest within the model, or nearest to it.
+struct Deepest {
+    place: Vector,
+    /// Signed distance there.
+    depth: f64,
 }
 
-fn depth_of_plane(eye: Vector, direction: Vector, plane: &Plane) -> f64 {
-    let slope = direction[2] - plane.slope_x * direction[0] - plane.slope_y * direction[1];
-    if slope.abs() < 1e-9 { f64::INFINITY } else { -plane.above(eye) / slope }
+impl Placed {
+    fn of(fit: &Fit) -> Placed {
+        let model = fit.model();
+        let (sin, cos) = fit.yaw().sin_cos();
+        Placed { model, at: [fit.parameters[0], fit.parameters[1], model.size()[2] / 2.0], sin, cos }
+    }
+
+    /// A point in the model's frame.
+    fn local(&self, p: Vector) -> Vector {
+        let (x, y) = (p[0] - self.at[0], p[1] - self.at[1]);
+        [self.cos * x + self.sin * y, self.cos * y - self.sin * x, p[2] - self.at[2]]
+    }
+
+    /// Where the ray from the eye to `end` is deepest, above the floor; `None` where it passes well clear. Golden section: along
+    /// a line the distance to a convex body has one minimum.
+    fn deepest(&self, evidence: &Evidence, end: Vector) -> Option<Deepest> {
+        let eye = evidence.eye;
+        let fall = eye[2] - end[2];
+        let [length, width, height] = self.model.size();
+        if fall < 1e-3 || eye[2] <= height || height <= evidence.floor {
+            return None;
+        }
+        let at = |z: f64| -> Vector {
+            let t = (eye[2] - z) / fall;
+            std::array::from_fn(|i| eye[i] + t * (end[i] - eye[i]))
+        };
+        let (top, bottom) = (at(height), at(evidence.floor));
+        if self.passes_clear(top, bottom, length.hypot(width) / 2.0) {
+            return None;
+        }
+        let point = |s: f64| -> Vector { std::array::from_fn(|i| top[i] + s * (bottom[i] - top[i])) };
+        let depth = |s: f64| self.model.fill_distance(self.local(point(s)));
+        const GOLDEN: f64 = 0.618_033_988_749_895;
+        let (mut low, mut high) = (0.0, 1.0);
+        let (mut a, mut b) = (high - GOLDEN * (high - low), low + GOLDEN * (high - low));
+        let (mut depth_a, mut depth_b) = (depth(a), depth(b));
+        let mut left = length_of(sub(bottom, top));
+        while left > RESOLUTION {
+            left *= GOLDEN;
+            if depth_a < depth_b {
+                (high, b, depth_b) = (b, a, depth_a);
+                a = high - GOLDEN * (high - low);
+                depth_a = depth(a);
+            } else {
+                (low, a, depth_a) = (a, b, depth_b);
+                b = low + GOLDEN * (high - low);
+                depth_b = depth(b);
+            }
+        }
+        let (s, depth) = if depth_a < depth_b { (a, depth_a) } else { (b, depth_b) };
+        Some(Deepest { place: point(s), depth })
+    }
+
+    /// Whether a segment seen from above stays outside a circle around the model.
+    fn passes_clear(&self, top: Vector, bottom: Vector, radius: f64) -> bool {
+        let (dx, dy) = (bottom[0] - top[0], bottom[1] - top[1]);
+        let (px, py) = (self.at[0] - top[0], self.at[1] - top[1]);
+        let t = ((px * dx + py * dy) / (dx * dx + dy * dy).max(1e-12)).clamp(0.0, 1.0);
+        (px - t * dx).powi(2) + (py - t * dy).powi(2) > (radius + 0.004).powi(2)
+    }
 }

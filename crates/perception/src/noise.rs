@@ -1,14 +1,15 @@
-//! What a depth sensor does to the truth: noise that grows with the square of the distance, as of every sensor that
-//! triangulates, and pixels that do not return, more of them at edges.
+//! What a structured-light camera does to the truth: noise that grows with the square of the distance, as of every sensor
+//! that triangulates (Khoshelham and Oude Elberink 2012, equation 10), pixels that do not return, more of them at edges, and the
+//! shadows beside what is near, where the projector's light does not reach.
 //!
 //! Every sample is a hash of (seed, frame, pixel), so an image does not depend on the order in which it is made.
 
-use crate::camera::DepthImage;
+use crate::camera::{DepthImage, Intrinsics};
 use serde::{Deserialize, Serialize};
 
 /// How noisy a camera is.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 pub struct Noise {
     /// Standard deviation of a depth at one metre, in metres; grows with the square of the distance.
     pub sigma_at_1m: f64,
@@ -16,46 +17,56 @@ pub struct Noise {
     pub missing: f64,
     /// How many of the pixels at an edge return nothing, 0 to 1.
     pub missing_at_edges: f64,
+    /// How far the projector is to the right of the camera, in metres: what it does not light returns nothing. 0 for none.
+    pub projector_m: f64,
 }
 
-/// A step of the depth between neighbours that makes an edge, in metres.
-const EDGE: f32 = 0.05;
+/// A step of the depth between neighbours that makes an edge, or casts a shadow, in metres.
+const EDGE: f32 = 0.02;
 /// No image is averaged over more frames.
 pub const MAX_FRAMES: u32 = 1000;
 
 impl Noise {
     /// A structured-light camera of the usual kind.
-    pub const DEFAULT: Noise = Noise { sigma_at_1m: 0.0015, missing: 0.002, missing_at_edges: 0.1 };
+    pub const DEFAULT: Noise = Noise { sigma_at_1m: 0.0015, missing: 0.002, missing_at_edges: 0.1, projector_m: 0.075 };
     /// None at all.
-    pub const NONE: Noise = Noise { sigma_at_1m: 0.0, missing: 0.0, missing_at_edges: 0.0 };
+    pub const NONE: Noise = Noise { sigma_at_1m: 0.0, missing: 0.0, missing_at_edges: 0.0, projector_m: 0.0 };
+}
+
+impl Default for Noise {
+    fn default() -> Noise {
+        Noise::DEFAULT
+    }
 }
 
 /// The average of frames `first_frame ..` of a scene that stands still; a pixel counts in the frames that returned it.
-pub fn observe(clean: &DepthImage, noise: &Noise, seed: u64, first_frame: u64, frames: u32) -> DepthImage {
-    let edges = edges(clean);
-    let frames = frames.clamp(1, MAX_FRAMES);
+pub fn observe(
+    clean: &DepthImage,
+    optics: &Intrinsics,
+    noise: &Noise,
+    seed: u64,
+    first_frame: u64,
+    frames: u32,
+) -> DepthImage {
+    let (edges, shadows) = (edges(clean), shadows(clean, optics, noise.projector_m));
+    let frames = f64::from(frames.clamp(1, MAX_FRAMES));
     let mut depth = vec![0.0; clean.depth.len()];
     for (pixel, (out, truth)) in depth.iter_mut().zip(&clean.depth).enumerate() {
-        if *truth <= 0.0 {
+        if *truth <= 0.0 || shadows[pixel] {
             continue;
         }
         let truth = f64::from(*truth);
         let missing = if edges[pixel] { noise.missing_at_edges } else { noise.missing };
-        let sigma = noise.sigma_at_1m * truth * truth;
-        let (mut sum, mut returned) = (0.0, 0_u32);
-        for frame in 0..u64::from(frames) {
-            let bits = hash(seed ^ hash(first_frame + frame) ^ (pixel as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
-            let [a, b, c] = [bits, bits >> 21, bits >> 42].map(|b| (b & 0x1F_FFFF) as f64 / f64::from(0x20_0000));
-            let d = uniform(hash(bits ^ 1));
-            if d < missing {
-                continue;
-            }
-            // Three uniforms have variance 1/4: twice their centred sum is close to a standard normal.
-            sum += sigma * 2.0 * (a + b + c - 1.5);
-            returned += 1;
-        }
-        if returned > 0 {
-            *out = (truth + sum / f64::from(returned)) as f32;
+        let bits = hash(seed ^ hash(first_frame) ^ (pixel as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        // How many frames returned it: for many of them about normal, with the binomial's mean and variance.
+        let returned = if frames == 1.0 {
+            f64::from(u8::from(uniform(hash(bits ^ 1)) >= missing))
+        } else {
+            let spread = (frames * missing * (1.0 - missing)).sqrt();
+            (frames * (1.0 - missing) + spread * normal(hash(bits ^ 1))).round().clamp(0.0, frames)
+        };
+        if returned > 0.0 {
+            *out = (truth + noise.sigma_at_1m * truth * truth * normal(bits) / returned.sqrt()) as f32;
         }
     }
     DepthImage { width: clean.width, height: clean.height, depth }
@@ -96,6 +107,36 @@ fn edges(image: &DepthImage) -> Vec<bool> {
     edges
 }
 
+/// The pixels that the projector does not light: along a row of it, which is a row of the image, something nearer is in the way.
+fn shadows(image: &DepthImage, optics: &Intrinsics, projector_m: f64) -> Vec<bool> {
+    let mut shadows = vec![false; image.depth.len()];
+    if projector_m <= 0.0 {
+        return shadows;
+    }
+    // The projector's column of a pixel is to the left of the camera's by the disparity.
+    let column = |here: usize, depth: f32| here as f64 - optics.fx * projector_m / f64::from(depth);
+    let bins = 2 * image.width;
+    let bin = |column: f64| (column + image.width as f64).round().clamp(0.0, bins as f64 - 1.0) as usize;
+    let mut nearest = vec![f32::INFINITY; bins];
+    for (row, shadowed) in image.depth.chunks(image.width).zip(shadows.chunks_mut(image.width)) {
+        nearest.fill(f32::INFINITY);
+        for (here, depth) in row.iter().enumerate().filter(|(_, depth)| **depth > 0.0) {
+            let slot = &mut nearest[bin(column(here, *depth))];
+            *slot = slot.min(*depth);
+        }
+        for (here, depth) in row.iter().enumerate().filter(|(_, depth)| **depth > 0.0) {
+            shadowed[here] = nearest[bin(column(here, *depth))] < depth - EDGE;
+        }
+    }
+    shadows
+}
+
+/// Close to a standard normal: three uniforms have variance 1/4, so twice their centred sum has 1.
+fn normal(bits: u64) -> f64 {
+    let [a, b, c] = [bits, bits >> 21, bits >> 42].map(|b| (b & 0x1F_FFFF) as f64 / f64::from(0x20_0000));
+    2.0 * (a + b + c - 1.5)
+}
+
 fn uniform(bits: u64) -> f64 {
     (bits >> 11) as f64 / (1_u64 << 53) as f64
 }
@@ -116,6 +157,10 @@ mod tests {
         DepthImage { width: 100, height: 100, depth: vec![distance; 10_000] }
     }
 
+    fn look(distance: f32, noise: &Noise, seed: u64, first_frame: u64, frames: u32) -> DepthImage {
+        observe(&wall(distance), &Intrinsics::DEFAULT, noise, seed, first_frame, frames)
+    }
+
     fn deviation(image: &DepthImage, truth: f64) -> f64 {
         let seen: Vec<f64> = image.depth.iter().filter(|d| **d > 0.0).map(|d| f64::from(*d) - truth).collect();
         (seen.iter().map(|e| e * e).sum::<f64>() / seen.len() as f64).sqrt()
@@ -123,9 +168,9 @@ mod tests {
 
     #[test]
     fn noise_grows_with_the_square_of_the_distance_and_falls_with_frames() {
-        let near = deviation(&observe(&wall(1.0), &Noise::DEFAULT, 1, 0, 1), 1.0);
-        let far = deviation(&observe(&wall(2.0), &Noise::DEFAULT, 1, 0, 1), 2.0);
-        let averaged = deviation(&observe(&wall(2.0), &Noise::DEFAULT, 1, 0, 16), 2.0);
+        let near = deviation(&look(1.0, &Noise::DEFAULT, 1, 0, 1), 1.0);
+        let far = deviation(&look(2.0, &Noise::DEFAULT, 1, 0, 1), 2.0);
+        let averaged = deviation(&look(2.0, &Noise::DEFAULT, 1, 0, 16), 2.0);
         assert!((near / 0.0015 - 1.0).abs() < 0.05, "{near}");
         assert!((far / near - 4.0).abs() < 0.3, "{far}");
         assert!((far / averaged - 4.0).abs() < 0.3, "{averaged}");
@@ -133,10 +178,10 @@ mod tests {
 
     #[test]
     fn the_same_seed_sees_the_same_and_another_does_not() {
-        let one = observe(&wall(1.0), &Noise::DEFAULT, 7, 3, 2);
-        assert_eq!(one, observe(&wall(1.0), &Noise::DEFAULT, 7, 3, 2));
-        assert_ne!(one, observe(&wall(1.0), &Noise::DEFAULT, 8, 3, 2));
-        assert_ne!(one, observe(&wall(1.0), &Noise::DEFAULT, 7, 4, 2));
+        let one = look(1.0, &Noise::DEFAULT, 7, 3, 2);
+        assert_eq!(one, look(1.0, &Noise::DEFAULT, 7, 3, 2));
+        assert_ne!(one, look(1.0, &Noise::DEFAULT, 8, 3, 2));
+        assert_ne!(one, look(1.0, &Noise::DEFAULT, 7, 4, 2));
     }
 
     #[test]
@@ -147,8 +192,23 @@ mod tests {
     }
 
     #[test]
+    fn beside_what_is_near_the_projector_lights_nothing() {
+        let mut step = wall(2.0);
+        for row in step.depth.chunks_mut(100) {
+            row[50..].fill(1.0);
+        }
+        let optics = Intrinsics { fx: 400.0, ..Intrinsics::DEFAULT };
+        let noise = Noise { projector_m: 0.05, ..Noise::NONE };
+        let seen = observe(&step, &optics, &noise, 1, 0, 1);
+        // The near half is 20 columns off for the projector, the far half 10: the last ten columns of it are in the shadow.
+        let dark: Vec<usize> = (0..100).filter(|column| seen.depth[*column] == 0.0).collect();
+        assert_eq!(dark, (40..50).collect::<Vec<_>>());
+        assert!(observe(&step, &optics, &Noise::NONE, 1, 0, 1).depth.iter().all(|d| *d > 0.0));
+    }
+
+    #[test]
     fn a_few_pixels_are_missing() {
-        let image = observe(&wall(1.0), &Noise { missing: 0.1, ..Noise::DEFAULT }, 7, 0, 1);
+        let image = look(1.0, &Noise { missing: 0.1, ..Noise::DEFAULT }, 7, 0, 1);
         let missing = image.depth.iter().filter(|d| **d == 0.0).count();
         assert!((800..1200).contains(&missing), "{missing}");
     }

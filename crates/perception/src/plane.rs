@@ -5,6 +5,7 @@
 use crate::vector::{Vector, cross, length, scale, sub};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
 
 /// `z = slope_x · x + slope_y · y + height`
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,6 +35,15 @@ impl Plane {
     /// The plane's height at a place.
     pub(crate) fn at(&self, x: f64, y: f64) -> f64 {
         self.slope_x * x + self.slope_y * y + self.height
+    }
+
+    /// Its frame: above the origin, z along the normal.
+    pub(crate) fn frame(&self) -> Pose {
+        let n = scale([-self.slope_x, -self.slope_y, 1.0], 1.0 / self.slope_x.hypot(self.slope_y).hypot(1.0));
+        // Half-way between z and the normal, doubled.
+        let quaternion = [-n[1], n[0], 0.0, 1.0 + n[2]];
+        let norm = quaternion.iter().map(|q| q * q).sum::<f64>().sqrt();
+        Pose { position: [0.0, 0.0, self.height], quaternion_xyzw: quaternion.map(|q| q / norm) }
     }
 
     /// The plane that most points lie on.
@@ -123,6 +133,15 @@ mod tests {
         let found = Plane::find(&points, 5).unwrap();
         assert!((found.at(0.5, 0.5) - truth.at(0.5, 0.5)).abs() < 1e-6);
         assert!((found.slope_x - truth.slope_x).abs() < 1e-6);
+    }
+
+    #[test]
+    fn its_frame_lies_on_it() {
+        let plane = Plane { slope_x: 0.03, slope_y: -0.05, height: 0.2 };
+        let frame = plane.frame();
+        for place in [[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]] {
+            assert!(plane.above(frame.transform([place[0], place[1], 0.0])).abs() < 1e-12);
+        }
     }
 
     #[test]

@@ -75,13 +75,13 @@ pub fn render(camera: &Camera, bodies: &[Body]) -> DepthImage {
     DepthImage { width, height, depth }
 }
 
-struct Window {
-    columns: std::ops::Range<usize>,
-    rows: std::ops::Range<usize>,
+pub(crate) struct Window {
+    pub(crate) columns: std::ops::Range<usize>,
+    pub(crate) rows: std::ops::Range<usize>,
 }
 
 /// The pixels that a body can cover: all of them when it reaches behind the camera.
-fn window(camera: &Intrinsics, body: &Body, seen: &Pose) -> Option<Window> {
+pub(crate) fn window(camera: &Intrinsics, body: &Body, seen: &Pose) -> Option<Window> {
     let bounds = body.shape.compute_local_aabb();
     let corners = (0..8).map(|corner: u32| {
         let pick = |bit: u32, low: f32, high: f32| if corner & bit == 0 { low } else { high };

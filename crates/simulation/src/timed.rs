@@ -39,6 +39,9 @@ impl TimedProviders {
                 vec![
                     ("pose", field("pose").unwrap_or(Value::Pose(Pose::IDENTITY))),
                     ("size", field("size").unwrap_or_else(|| Value::List(vec![Value::Float(0.08); 3]))),
+                    ("class", Value::String("Box".to_owned())),
+                    ("confidence", Value::Float(1.0)),
+                    ("covariance", Value::List(vec![Value::Float(0.0); 36])),
                 ]
             }
             ("path_planner", "plan") => plan(goal),
@@ -59,6 +62,9 @@ fn box_on_table(index: usize) -> Value {
         ("id", Value::String(format!("box_{}", index + 1))),
         ("pose", Value::Pose(Pose::at(0.75, -0.4 + 0.1 * index as f64, 0.75))),
         ("size", Value::List(vec![Value::Float(0.08), Value::Float(0.12), Value::Float(0.1)])),
+        ("class", Value::String("Box".to_owned())),
+        ("confidence", Value::Float(1.0)),
+        ("covariance", Value::List(vec![Value::Float(0.0); 36])),
     ])
 }
 

@@ -1,40 +1,66 @@
-//! The detector worker: finds boxes on a surface in depth images.
+//! The detector worker: finds objects on a surface in depth images.
 //!
-//! It asks the camera of its goal's own lease for a picture and works on nothing else: the picture, the camera's pose in it,
-//! and the region or the box that the goal names. What it finds is named `box_1`, `box_2`, …, the nearest first.
+//! It asks the camera of its goal's own lease for a picture and works on nothing else: the picture, the poses of camera and
+//! robot in it, and the region or the object that the goal names. What it finds is named `box_1`, `fork_1`, `box_2`, …, the
+//! nearest first, and comes with its class, how sure that is, and the covariance of its pose.
 
+mod body;
+mod pictures;
+
+use pictures::Pictures;
 use ratn_model::value::Value;
+use ratn_motion::robot::{Configuration, Robot};
 use ratn_perception::camera::{Camera, DepthImage, Intrinsics};
-use ratn_perception::detection::{BoxEstimate, Region, locate, segment};
+use ratn_perception::detection::{Detection, ObjectClass, Prior, Region, locate, segment};
+use ratn_perception::mask::Ball;
 use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, InputError, Port};
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
 
 /// Frames of a picture in which a whole surface is searched, unless the goal says otherwise: noise falls with their root.
 const SEGMENT_FRAMES: i64 = 60;
-/// Frames of a picture in which one known box is looked for.
+/// Frames of a picture in which one known object is looked for.
 const LOCATE_FRAMES: i64 = 8;
+/// Postures of the robot in one picture at the most.
+const MAX_POSTURES: usize = 64;
 
-/// Serves until told to stop. The robot's time (`speed`) passes in the camera; the detector is as fast as it is.
+/// Serves until told to stop. With `pictures`, what it sees and finds is kept there as PNG files.
 ///
 /// # Errors
 /// Where it cannot serve.
-pub async fn run(options: WorkerOptions, _speed: f64) -> anyhow::Result<()> {
-    Ok(worker(options).run().await?)
+pub async fn run(options: WorkerOptions, pictures: Option<PathBuf>) -> anyhow::Result<()> {
+    Ok(worker(options, pictures).run().await?)
 }
 
 /// The worker, not running yet.
-pub fn worker(options: WorkerOptions) -> Worker {
-    Worker::new(options).action(Segment).action(Locate)
+pub fn worker(options: WorkerOptions, pictures: Option<PathBuf>) -> Worker {
+    let eyes = Eyes { robot: Arc::new(Robot::aimm()), pictures: Pictures::into(pictures) };
+    Worker::new(options).action(Segment(eyes.clone())).action(Locate(eyes))
 }
 
 /// `detector/segment`
 #[derive(Debug)]
-pub struct Segment;
+pub struct Segment(Eyes);
 
 /// `detector/locate`
 #[derive(Debug)]
-pub struct Locate;
+pub struct Locate(Eyes);
+
+/// What both actions look with.
+#[derive(Debug, Clone)]
+struct Eyes {
+    robot: Arc<Robot>,
+    pictures: Pictures,
+}
+
+/// A picture, and where the robot is in it.
+struct Seen {
+    image: DepthImage,
+    camera: Camera,
+    body: Vec<Ball>,
+}
 
 #[tonic::async_trait]
 impl Action for Segment {
@@ -43,7 +69,7 @@ impl Action for Segment {
     }
 
     fn description(&self) -> &str {
-        "Every box that stands on a surface, the nearest to the camera first."
+        "Every object that stands on a surface, the nearest to the camera first."
     }
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
@@ -53,15 +79,22 @@ impl Action for Segment {
             return Err(ActionFailure::aborted(reason));
         };
         let region = Region { pose, size: [x.float()?, y.float()?] };
-        let (image, camera) = picture(&goal, SEGMENT_FRAMES).await?;
-        let found = working(&goal, move || segment(&image, &camera, &region)).await??;
-        goal.progress(format!("{} boxes", found.len()));
-        let named = found.iter().enumerate().map(|(i, estimate)| {
-            Value::map([
-                ("id", Value::String(format!("box_{}", i + 1))),
-                ("pose", Value::Pose(estimate.pose)),
-                ("size", size_value(estimate)),
-            ])
+        let classes = classes(&goal)?;
+        let seen = self.0.look(&goal, SEGMENT_FRAMES).await?;
+        let pictures = self.0.pictures.clone();
+        let found = working(&goal, move || {
+            let found = segment(&seen.image, &seen.camera, &region, &classes, &seen.body)?;
+            pictures.keep(&seen.image, &seen.camera, &found);
+            Ok::<_, ratn_perception::detection::DetectionError>(found)
+        });
+        let found = found.await??;
+        goal.progress(format!("{} objects", found.len()));
+        let mut counts: BTreeMap<ObjectClass, usize> = BTreeMap::new();
+        let named = found.iter().map(|object| {
+            let count = counts.entry(object.model.class()).or_default();
+            *count += 1;
+            let id = format!("{}{count}", object.model.class().prefix());
+            Value::Map(fields([("id", Value::String(id))].into_iter().chain(described(object))))
         });
         Ok(GoalOutcome::success().with_output("boxes", Value::List(named.collect())))
     }
@@ -74,41 +107,72 @@ impl Action for Locate {
     }
 
     fn description(&self) -> &str {
-        "Where a box that was seen before stands now."
+        "Where an object that was seen before stands now."
     }
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let object = goal.port("object");
-        let prior = BoxEstimate { pose: object.field("pose").pose()?, size: object.field("size").vector3()? };
+        let prior = Prior { pose: object.field("pose").pose()?, size: object.field("size").vector3()? };
         let id = object.field("id").string()?.to_owned();
-        let (image, camera) = picture(&goal, LOCATE_FRAMES).await?;
-        let found = working(&goal, move || locate(&image, &camera, &prior)).await??;
-        let found = found.ok_or_else(|| {
+        let classes = classes(&goal)?;
+        let seen = self.0.look(&goal, LOCATE_FRAMES).await?;
+        let pictures = self.0.pictures.clone();
+        let found = working(&goal, move || {
+            let found = locate(&seen.image, &seen.camera, &prior, &classes, &seen.body)?;
+            pictures.keep(&seen.image, &seen.camera, found.as_slice());
+            Ok::<_, ratn_perception::detection::DetectionError>(found)
+        });
+        let found = found.await??.ok_or_else(|| {
             let [x, y, z] = prior.pose.position;
             ActionFailure::aborted(format!("{id} is not near ({x:.2}, {y:.2}, {z:.2}), where it was seen before"))
         })?;
-        let outcome = GoalOutcome::success().with_output("pose", Value::Pose(found.pose));
-        Ok(outcome.with_output("size", size_value(&found)))
+        Ok(described(&found)
+            .into_iter()
+            .fold(GoalOutcome::success(), |out, (name, value)| out.with_output(name, value)))
     }
 }
 
-/// A picture of the leased camera.
-async fn picture(goal: &GoalContext, default_frames: i64) -> Result<(DepthImage, Camera), ActionFailure> {
-    let frames = goal.optional_int("frames")?.unwrap_or(default_frames);
-    let inputs = BTreeMap::from([("frames".to_owned(), Value::Int(frames))]);
-    let outputs = goal.unless_cancelled(goal.call("Camera", "capture", inputs)).await??;
-    let output = |name: &str| Port::new(name, outputs.get(name));
-    let pixels = |name: &str| -> Result<usize, InputError> { Ok(usize::try_from(output(name).int()?).unwrap_or(0)) };
-    let intrinsics = Intrinsics {
-        width: pixels("width")?,
-        height: pixels("height")?,
-        fx: output("fx").float()?,
-        fy: output("fy").float()?,
-        cx: output("cx").float()?,
-        cy: output("cy").float()?,
+impl Eyes {
+    /// A picture of the leased camera.
+    async fn look(&self, goal: &GoalContext, default_frames: i64) -> Result<Seen, ActionFailure> {
+        let frames = goal.optional_int("frames")?.unwrap_or(default_frames);
+        let inputs = BTreeMap::from([("frames".to_owned(), Value::Int(frames))]);
+        let outputs = goal.unless_cancelled(goal.call("Camera", "capture", inputs)).await??;
+        let output = |name: &str| Port::new(name, outputs.get(name));
+        let pixels =
+            |name: &str| -> Result<usize, InputError> { Ok(usize::try_from(output(name).int()?).unwrap_or(0)) };
+        let intrinsics = Intrinsics {
+            width: pixels("width")?,
+            height: pixels("height")?,
+            fx: output("fx").float()?,
+            fy: output("fy").float()?,
+            cx: output("cx").float()?,
+            cy: output("cy").float()?,
+        };
+        let image = DepthImage::from_bytes(intrinsics.width, intrinsics.height, output("image").bytes()?)?;
+        let postures = output("robot").list()?.iter().take(MAX_POSTURES).map(posture).collect::<Result<Vec<_>, _>>()?;
+        let body = body::balls(&self.robot, &postures);
+        Ok(Seen { image, camera: Camera { intrinsics, pose: output("camera").pose()? }, body })
+    }
+}
+
+fn posture(port: &Port) -> Result<Configuration, ActionFailure> {
+    let degrees = port.list()?.iter().map(|degree| degree.float()).collect::<Result<Vec<_>, _>>()?;
+    body::configuration(&degrees)
+        .ok_or_else(|| ActionFailure::aborted(format!("the camera says {} joints of a robot of 13", degrees.len())))
+}
+
+/// What the goal looks for: all that there is, unless it says so.
+fn classes(goal: &GoalContext) -> Result<Vec<ObjectClass>, ActionFailure> {
+    let Some(port) = goal.port("classes").optional() else { return Ok(ObjectClass::ALL.to_vec()) };
+    let named = |port: &Port| {
+        let name = port.string()?;
+        ObjectClass::named(name).ok_or_else(|| {
+            let known = ObjectClass::ALL.map(ObjectClass::name).join(", ");
+            ActionFailure::aborted(format!("input `classes` has `{name}`: known are {known}"))
+        })
     };
-    let image = DepthImage::from_bytes(intrinsics.width, intrinsics.height, output("image").bytes()?)?;
-    Ok((image, Camera { intrinsics, pose: output("camera").pose()? }))
+    port.list()?.iter().map(named).collect()
 }
 
 /// Works on a thread of its own; milliseconds, so a goal that shall stop only leaves the answer behind.
@@ -119,6 +183,18 @@ async fn working<T: Send + 'static>(
     Ok(goal.unless_cancelled(tokio::task::spawn_blocking(work)).await??)
 }
 
-fn size_value(estimate: &BoxEstimate) -> Value {
-    Value::List(estimate.size.map(Value::Float).to_vec())
+/// What is said of an object beside its name.
+fn described(object: &Detection) -> [(&'static str, Value); 5] {
+    let floats = |values: &mut dyn Iterator<Item = f64>| Value::List(values.map(Value::Float).collect());
+    [
+        ("class", Value::String(object.model.class().name().to_owned())),
+        ("pose", Value::Pose(object.pose)),
+        ("size", floats(&mut object.model.size().into_iter())),
+        ("confidence", Value::Float(object.confidence)),
+        ("covariance", floats(&mut object.covariance.into_iter().flatten())),
+    ]
+}
+
+fn fields(named: impl Iterator<Item = (&'static str, Value)>) -> BTreeMap<String, Value> {
+    named.map(|(name, value)| (name.to_owned(), value)).collect()
 }

@@ -220,6 +220,14 @@ impl Cell {
         Scene { base: Pose::IDENTITY, objects: objects.chain([placement::table()]).collect() }
     }
 
+    /// What there is to be seen.
+    pub fn scenery(&self) -> Scenery {
+        let configuration = self.configuration();
+        let tool = self.robot.tool_pose(&configuration);
+        let boxes = (0..self.ids.len()).map(|i| (self.size_of(i), self.pose_of(i, &tool))).collect();
+        Scenery { configuration, boxes }
+    }
+
     pub(super) fn is_held(&self) -> bool {
         matches!(self.safety, SafetyState::Held { .. })
     }
@@ -321,10 +329,7 @@ impl Cell {
 
     /// One frame of the picture under way.
     fn expose(&mut self) {
-        let configuration = self.configuration();
-        let tool = self.robot.tool_pose(&configuration);
-        let boxes = (0..self.ids.len()).map(|i| (self.size_of(i), self.pose_of(i, &tool))).collect();
-        let scenery = Scenery { configuration, boxes };
+        let scenery = self.scenery();
         let period = seconds(1.0 / self.config.camera.frames_per_s);
         let first_frame = self.frames_taken;
         self.frames_taken += 1;

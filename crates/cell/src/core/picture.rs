@@ -5,6 +5,8 @@ use ratn_motion::aimm;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_perception::camera::{Camera, DepthImage};
 use ratn_perception::noise::{Noise, average, observe};
+use ratn_perception::photograph::photograph;
+use ratn_perception::picture::Picture;
 use ratn_perception::render::{Body, render};
 use ratn_world::scene::Shape;
 
@@ -28,18 +30,34 @@ pub struct Exposure {
     pub frames: u32,
 }
 
+/// Red, green and blue of things in a photograph.
+const ROBOT_COLOUR: [u8; 3] = [235, 140, 40];
+const TABLE_COLOUR: [u8; 3] = [170, 125, 85];
+const FLOOR_COLOUR: [u8; 3] = [140, 140, 145];
+const BOX_COLOUR: [u8; 3] = [60, 120, 200];
+
 /// The floor around the robot, in metres; its top is at z = 0.
 const FLOOR_SIZE: [f64; 3] = [12.0, 12.0, 0.1];
 
 impl Scenery {
     /// Every body that the camera could see.
     pub fn bodies(&self, robot: &Robot) -> Vec<Body> {
-        let links = robot.shapes(&self.configuration).into_iter().map(|(_, pose, shape)| Body { shape, pose });
+        self.in_colours(robot).into_iter().map(|(body, _)| body).collect()
+    }
+
+    /// What it looks like to people, from anywhere.
+    pub fn photograph(&self, robot: &Robot, camera: &Camera) -> Picture {
+        photograph(camera, &self.in_colours(robot))
+    }
+
+    fn in_colours(&self, robot: &Robot) -> Vec<(Body, [u8; 3])> {
+        let links = robot.shapes(&self.configuration).into_iter();
+        let links = links.map(|(_, pose, shape)| (Body { shape, pose }, ROBOT_COLOUR));
         let [x, y, z] = aimm::TABLE_CENTRE;
         let table = Body::new(&Shape::Box { size: aimm::TABLE_SIZE }, &Pose::at(x, y, z));
         let floor = Body::new(&Shape::Box { size: FLOOR_SIZE }, &Pose::at(0.0, 0.0, -FLOOR_SIZE[2] / 2.0));
-        let boxes = self.boxes.iter().map(|(size, pose)| Body::new(&Shape::Box { size: *size }, pose));
-        links.chain([table, floor]).chain(boxes).collect()
+        let boxes = self.boxes.iter().map(|(size, pose)| (Body::new(&Shape::Box { size: *size }, pose), BOX_COLOUR));
+        links.chain([(table, TABLE_COLOUR), (floor, FLOOR_COLOUR)]).chain(boxes).collect()
     }
 }
 
@@ -47,7 +65,7 @@ impl Scenery {
 pub fn develop(robot: &Robot, camera: &Camera, noise: &Noise, seed: u64, exposures: &[Exposure]) -> DepthImage {
     let pictures = exposures.iter().map(|exposure| {
         let clean = render(camera, &exposure.scenery.bodies(robot));
-        (observe(&clean, noise, seed, exposure.first_frame, exposure.frames), exposure.frames)
+        (observe(&clean, &camera.intrinsics, noise, seed, exposure.first_frame, exposure.frames), exposure.frames)
     });
     average(camera.intrinsics.width, camera.intrinsics.height, pictures)
 }

@@ -5,6 +5,7 @@ use crate::config::CellConfig;
 use crate::core::protocol::{Ending, Module, Product, Request};
 use ratn_model::fact::{FactKey, Term};
 use ratn_model::value::Value;
+use ratn_motion::robot::Configuration;
 use ratn_perception::noise::MAX_FRAMES;
 use ratn_worker::action::{Action, ActionFailure, ActionResult, ActionServer, GoalContext, GoalOutcome};
 use ratn_worker::client::Channels;
@@ -68,6 +69,12 @@ const ACTIONS: [(Module, &str, &str, Read); 8] = [
         Ok(Request::Capture { frames: u32::try_from(frames).map_err(wrong)? })
     }),
 ];
+
+/// All degrees of freedom in their order: base x, y, yaw, the arm, pan, tilt, finger.
+fn configuration_value(at: &Configuration) -> Value {
+    let degrees = at.base.into_iter().chain(at.arm).chain([at.pan, at.tilt, at.finger]);
+    Value::List(degrees.map(Value::Float).collect())
+}
 
 struct ModuleAction {
     name: &'static str,
@@ -137,6 +144,7 @@ impl ModuleAction {
             }
             Product::Captured { camera, exposures } => {
                 let (keeper, seed) = (self.keeper.clone(), self.seed);
+                let robot = exposures.iter().map(|e| configuration_value(&e.scenery.configuration)).collect();
                 let developing = tokio::task::spawn_blocking(move || keeper.develop(&camera, seed, &exposures));
                 let image = developing.await?;
                 let optics = camera.intrinsics;
@@ -145,6 +153,7 @@ impl ModuleAction {
                     .with_output("width", Value::Int(image.width as i64))
                     .with_output("height", Value::Int(image.height as i64))
                     .with_output("camera", Value::Pose(camera.pose))
+                    .with_output("robot", Value::List(robot))
                     .with_output("fx", Value::Float(optics.fx))
                     .with_output("fy", Value::Float(optics.fy))
                     .with_output("cx", Value::Float(optics.cx))

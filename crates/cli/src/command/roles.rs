@@ -93,6 +93,13 @@ pub(super) fn cell(arguments: &CellArguments) -> Result<(), Failure> {
     if let Some(file) = &arguments.replay {
         return replay(file);
     }
+    if let Some(file) = &arguments.picture {
+        let config = SystemConfig::load(arguments.role.config.as_deref())?.cell;
+        let png = ratn_cell::photo(config, arguments.from, arguments.towards)?;
+        std::fs::write(file, png).with_context(|| format!("cannot write {}", file.display()))?;
+        output::progress(format!("{} shows the cell", file.display()));
+        return Ok(());
+    }
     daemon(&arguments.role, ratn_cell::ROLE, async |system, host| {
         let mut config = system.cell;
         config.faults.extend(&arguments.faults.fault);
@@ -130,7 +137,7 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
     blocking(async {
         match arguments.worker {
             WorkerKind::PathPlanner => ratn_workers::path_planner::run(options, speed).await,
-            WorkerKind::Detector => ratn_workers::detector::run(options, speed).await,
+            WorkerKind::Detector => ratn_workers::detector::run(options, arguments.pictures.clone()).await,
         }
         .map_err(unbegun)
     })

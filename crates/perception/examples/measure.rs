@@ -1,0 +1,147 @@
+//! How well and how fast random tables are detected: one JSON document on standard output. Run it by `scripts/bench-perception`.
+//!
+//! `measure [--tables N] [--first SEED] [--pictures DIR]`; with `--pictures` the image of every table on which something went
+//! wrong is kept, with what was found drawn into it.
+
+#![allow(clippy::print_stdout, clippy::disallowed_methods, reason = "an example prints")]
+
+use ratn_perception::camera::Camera;
+use ratn_perception::detection::{ObjectClass, segment};
+use ratn_perception::noise::Noise;
+use ratn_perception::picture::Picture;
+use ratn_perception::trial::{self, Match, Placed};
+use std::path::PathBuf;
+
+struct Setting {
+    name: &'static str,
+    eye: [f64; 3],
+    frames: u32,
+}
+
+/// From the mast, over a second's frames and a single one; and from as near as an arm holds a camera.
+const SETTINGS: [Setting; 3] = [
+    Setting { name: "mast, 10 frames", eye: [-0.62, 0.0, 1.88], frames: 10 },
+    Setting { name: "mast, 1 frame", eye: [-0.62, 0.0, 1.88], frames: 1 },
+    Setting { name: "near, 1 frame", eye: [-0.05, 0.0, 1.60], frames: 1 },
+];
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let (mut tables, mut first, mut pictures) = (200_u64, 0_u64, None::<PathBuf>);
+    let mut arguments = std::env::args().skip(1);
+    while let Some(name) = arguments.next() {
+        let value = arguments.next().ok_or(format!("{name} needs a value"))?;
+        match name.as_str() {
+            "--tables" => tables = value.parse()?,
+            "--first" => first = value.parse()?,
+            "--pictures" => pictures = Some(value.into()),
+            _ => return Err(format!("unknown argument {name}").into()),
+        }
+    }
+    let measured: Result<Vec<String>, _> =
+        SETTINGS.iter().map(|setting| measure(setting, first..first + tables, pictures.as_deref())).collect();
+    println!("{{\"tables\": {tables}, \"first_seed\": {first}, \"settings\": [{}]}}", measured?.join(",\n"));
+    Ok(())
+}
+
+fn measure(
+    setting: &Setting,
+    seeds: std::ops::Range<u64>,
+    pictures: Option<&std::path::Path>,
+) -> Result<String, Box<dyn std::error::Error>> {
+    let camera = Camera::looking(setting.eye, trial::TABLE, trial::OPTICS);
+    let (mut matches, mut phantoms, mut times): (Vec<Match>, usize, Vec<f64>) = Default::default();
+    for seed in seeds {
+        let table: Vec<Placed> = trial::random_table(seed, 1 + (seed % 8) as usize, &camera);
+        let image = trial::table_image(&table, &camera, &Noise::DEFAULT, seed, setting.frames);
+        let start = processor_s()?;
+        let found = segment(&image, &camera, &trial::region(), &ObjectClass::ALL, &[])?;
+        times.push((processor_s()? - start) * 1e3);
+        let (of_table, phantom) = trial::compare(&table, &found);
+        if let Some(directory) = pictures
+            && (!phantom.is_empty() || of_table.iter().any(|m| !m.is_good()))
+        {
+            let mut picture = Picture::of_depth(&image);
+            found.iter().for_each(|f| picture.draw(&camera, f));
+            let name = format!("{}-{seed}.png", setting.name.replace([' ', ','], "_"));
+            std::fs::write(directory.join(name), picture.to_png()?)?;
+            for m in of_table.iter().filter(|m| !m.is_good()) {
+                let found = m.found.map(|f| (f.model, f.confidence));
+                eprintln!(
+                    "{} {seed}: {:?} at {:?} as {found:?} {:.1} mm {:.1}°",
+                    setting.name,
+                    m.truth.model,
+                    m.truth.pose.position,
+                    m.position * 1e3,
+                    m.angle.to_degrees()
+                );
+            }
+            phantom.iter().for_each(|p| eprintln!("{} {seed}: nothing as {p:?}", setting.name));
+        }
+        phantoms += phantom.len();
+        matches.extend(of_table);
+    }
+    let wrong = matches.iter().filter(|m| m.found.is_some() && !m.is_good()).count();
+    let good = matches.iter().filter(|m| m.is_good()).count();
+    let classes: Vec<String> = ObjectClass::ALL.iter().map(|class| of_class(*class, &matches)).collect();
+    let distance = {
+        let way: f64 = (0..3).map(|i| (setting.eye[i] - trial::TABLE[i]).powi(2)).sum();
+        way.sqrt()
+    };
+    let reported = good + wrong + phantoms;
+    Ok(format!(
+        "{{\"setting\": \"{}\", \"camera_to_table_m\": {distance:.2}, \"frames\": {}, \"objects\": {}, \"found_within_5_mm_and_3_deg\": {:.4}, \
+         \"wrong_class_or_place\": {wrong}, \"false\": {phantoms}, \"false_of_reported\": {:.4}, \"processor_ms_median\": {:.1}, \"processor_ms_p95\": {:.1}, \"processor_ms_max\": {:.1}, \
+         \"squared_error_over_variance\": {}, \"classes\": [{}]}}",
+        setting.name,
+        setting.frames,
+        matches.len(),
+        good as f64 / matches.len() as f64,
+        phantoms as f64 / reported.max(1) as f64,
+        quantile(&mut times, 0.5),
+        quantile(&mut times, 0.95),
+        quantile(&mut times, 1.0),
+        consistency(&matches),
+        classes.join(", ")
+    ))
+}
+
+/// How long this thread has been on a processor, in seconds: what else the machine does is not counted. Linux says so.
+fn processor_s() -> Result<f64, Box<dyn std::error::Error>> {
+    let said = std::fs::read_to_string("/proc/thread-self/schedstat")?;
+    Ok(said.split_whitespace().next().ok_or("an empty schedstat")?.parse::<f64>()? * 1e-9)
+}
+
+/// Mean of squared errors over variances, of x and y: 1 where covariances are true.
+fn consistency(matches: &[Match]) -> String {
+    let squares: Vec<f64> = matches
+        .iter()
+        .filter(|m| m.is_good())
+        .filter_map(|m| m.found.map(|f| (m.truth, f)))
+        .flat_map(|(truth, found)| {
+            [0, 1].map(|i| (truth.pose.position[i] - found.pose.position[i]).powi(2) / found.covariance[i][i])
+        })
+        .collect();
+    format!("{:.2}", squares.iter().sum::<f64>() / squares.len().max(1) as f64)
+}
+
+fn of_class(class: ObjectClass, matches: &[Match]) -> String {
+    let own: Vec<&Match> = matches.iter().filter(|m| m.truth.model.class() == class).collect();
+    let good = own.iter().filter(|m| m.is_good()).count();
+    let mut position: Vec<f64> = own.iter().filter(|m| m.found.is_some()).map(|m| m.position * 1e3).collect();
+    let mut angle: Vec<f64> = own.iter().filter(|m| m.found.is_some()).map(|m| m.angle.to_degrees()).collect();
+    format!(
+        "{{\"class\": \"{}\", \"objects\": {}, \"found\": {:.4}, \"mm_median\": {:.2}, \"mm_p99\": {:.2}, \"deg_median\": {:.2}, \"deg_p99\": {:.2}}}",
+        class.name(),
+        own.len(),
+        good as f64 / own.len().max(1) as f64,
+        quantile(&mut position, 0.5),
+        quantile(&mut position, 0.99),
+        quantile(&mut angle, 0.5),
+        quantile(&mut angle, 0.99)
+    )
+}
+
+fn quantile(values: &mut [f64], part: f64) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(((values.len().max(1) - 1) as f64 * part).round() as usize).copied().unwrap_or(f64::NAN)
+}

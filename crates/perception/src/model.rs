@@ -1,0 +1,272 @@
+//! What stands on tables, as geometry: the classes of objects that detection knows, each a shape with a few free dimensions.
+//!
+//! A model's frame is in the middle of its bounding box, z up as it stands. Two signed distances describe it to the fit: to
+//! its surface (`distance`: a measured point should be at 0), and to what light cannot cross from outside (`fill_distance`: a
+//! hollow thing filled up to its rim). `solid` is the same thing for the ray caster, so that what is rendered and what is fitted
+//! come from one description.
+
+mod fork;
+mod revolved;
+mod solid;
+
+use crate::vector::Vector;
+use serde::{Deserialize, Serialize};
+use std::ops::RangeInclusive;
+
+/// A class of objects, named as in the ontology.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub enum ObjectClass {
+    /// A cuboid of any edges.
+    Box,
+    /// An upright cylinder, closed.
+    Can,
+    /// A tumbler: open, slightly conical, without a handle.
+    Cup,
+    /// Open and round, wider than high.
+    Bowl,
+    /// Flat, with a raised rim.
+    Plate,
+    /// Lies on its back: the tips point up, the neck is its highest part.
+    Fork,
+}
+
+/// An object's shape, in metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Model {
+    /// Edges along x, y, z.
+    Box {
+        /// Edge lengths.
+        size: [f64; 3],
+    },
+    /// Round about z.
+    Round {
+        /// Can, cup, bowl or plate.
+        kind: Round,
+        /// The greatest radius.
+        radius: f64,
+        /// From the table to the rim.
+        height: f64,
+    },
+    /// Along x, tines ahead.
+    Fork {
+        /// From the end of the handle to the tips.
+        length: f64,
+    },
+}
+
+/// What is round about its upright axis.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Round {
+    /// See [`ObjectClass::Can`].
+    Can,
+    /// See [`ObjectClass::Cup`].
+    Cup,
+    /// See [`ObjectClass::Bowl`].
+    Bowl,
+    /// See [`ObjectClass::Plate`].
+    Plate,
+}
+
+/// What a half or quarter turn about z leaves the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Symmetry {
+    /// Nothing: every yaw differs.
+    None,
+    /// Half a turn.
+    HalfTurn,
+    /// Any turn.
+    Round,
+}
+
+impl ObjectClass {
+    /// Every class.
+    pub const ALL: [ObjectClass; 6] = [
+        ObjectClass::Box,
+        ObjectClass::Can,
+        ObjectClass::Cup,
+        ObjectClass::Bowl,
+        ObjectClass::Plate,
+        ObjectClass::Fork,
+    ];
+
+    /// Its name in the ontology.
+    pub fn name(self) -> &'static str {
+        match self {
+            ObjectClass::Box => "Box",
+            ObjectClass::Can => "Can",
+            ObjectClass::Cup => "Cup",
+            ObjectClass::Bowl => "Bowl",
+            ObjectClass::Plate => "Plate",
+            ObjectClass::Fork => "Fork",
+        }
+    }
+
+    /// The class of that name.
+    pub fn named(name: &str) -> Option<ObjectClass> {
+        ObjectClass::ALL.into_iter().find(|class| class.name() == name)
+    }
+
+    /// What its individuals are named with: `box_`, `fork_`.
+    pub fn prefix(self) -> &'static str {
+        match self {
+            ObjectClass::Box => "box_",
+            ObjectClass::Can => "can_",
+            ObjectClass::Cup => "cup_",
+            ObjectClass::Bowl => "bowl_",
+            ObjectClass::Plate => "plate_",
+            ObjectClass::Fork => "fork_",
+        }
+    }
+
+    /// What turns leave it the same.
+    pub fn symmetry(self) -> Symmetry {
+        match self {
+            ObjectClass::Box => Symmetry::HalfTurn,
+            ObjectClass::Fork => Symmetry::None,
+            _ => Symmetry::Round,
+        }
+    }
+
+    /// Within what its dimensions are, in the order of [`Model::dimensions`], in metres.
+    pub fn ranges(self) -> &'static [RangeInclusive<f64>] {
+        match self {
+            ObjectClass::Box => &[0.02..=0.35, 0.02..=0.35, 0.03..=0.25],
+            ObjectClass::Can => &[0.022..=0.06, 0.05..=0.20],
+            ObjectClass::Cup => &[0.030..=0.05, 0.06..=0.13],
+            ObjectClass::Bowl => &[0.055..=0.10, 0.035..=0.08],
+            ObjectClass::Plate => &[0.085..=0.15, 0.014..=0.032],
+            ObjectClass::Fork => &[0.15..=0.23],
+        }
+    }
+
+    /// The model of this class with these dimensions, held within its ranges.
+    pub fn model(self, dimensions: &[f64]) -> Model {
+        let within = |i: usize| {
+            let range = &self.ranges()[i];
+            dimensions.get(i).copied().unwrap_or(*range.start()).clamp(*range.start(), *range.end())
+        };
+        let round = |kind| Model::Round { kind, radius: within(0), height: within(1) };
+        match self {
+            ObjectClass::Box => Model::Box { size: [within(0), within(1), within(2)] },
+            ObjectClass::Can => round(Round::Can),
+            ObjectClass::Cup => round(Round::Cup),
+            ObjectClass::Bowl => round(Round::Bowl),
+            ObjectClass::Plate => round(Round::Plate),
+            ObjectClass::Fork => Model::Fork { length: within(0) },
+        }
+    }
+}
+
+impl Model {
+    /// Its class.
+    pub fn class(&self) -> ObjectClass {
+        match self {
+            Model::Box { .. } => ObjectClass::Box,
+            Model::Round { kind: Round::Can, .. } => ObjectClass::Can,
+            Model::Round { kind: Round::Cup, .. } => ObjectClass::Cup,
+            Model::Round { kind: Round::Bowl, .. } => ObjectClass::Bowl,
+            Model::Round { kind: Round::Plate, .. } => ObjectClass::Plate,
+            Model::Fork { .. } => ObjectClass::Fork,
+        }
+    }
+
+    /// What may be chosen of it: edges, radius and height, or length, in metres.
+    pub fn dimensions(&self) -> Vec<f64> {
+        match *self {
+            Model::Box { size } => size.to_vec(),
+            Model::Round { radius, height, .. } => vec![radius, height],
+            Model::Fork { length } => vec![length],
+        }
+    }
+
+    /// The edges of its bounding box along x, y, z, in metres.
+    pub fn size(&self) -> [f64; 3] {
+        match *self {
+            Model::Box { size } => size,
+            Model::Round { radius, height, .. } => [2.0 * radius, 2.0 * radius, height],
+            Model::Fork { length } => fork::size(length),
+        }
+    }
+
+    /// How far a point of its frame is from its surface, in metres; negative within its material.
+    pub(crate) fn distance(&self, point: Vector) -> f64 {
+        match *self {
+            Model::Box { size } => box_distance(point, size),
+            Model::Round { kind, radius, height } => {
+                let [x, y, z] = point;
+                revolved::distance(kind, radius, height, [(x * x + y * y).sqrt(), z + height / 2.0])
+            }
+            Model::Fork { length } => fork::distance(length, point),
+        }
+    }
+
+    /// How far a point of its frame is from what no ray from outside passes: itself, hollows filled.
+    pub(crate) fn fill_distance(&self, point: Vector) -> f64 {
+        match *self {
+            Model::Round { kind, radius, height } => {
+                let [x, y, z] = point;
+                revolved::fill_distance(kind, radius, height, [(x * x + y * y).sqrt(), z + height / 2.0])
+            }
+            Model::Fork { length } => fork::fill_distance(length, point),
+            _ => self.distance(point),
+        }
+    }
+}
+
+fn box_distance(point: Vector, size: [f64; 3]) -> f64 {
+    let beyond: Vector = std::array::from_fn(|i| point[i].abs() - size[i] / 2.0);
+    let outside: f64 = beyond.iter().map(|b| b.max(0.0).powi(2)).sum::<f64>().sqrt();
+    outside + beyond[0].max(beyond[1]).max(beyond[2]).min(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::render::Body;
+    use parry3d::math::{Pose, Vector as Vector32};
+    use parry3d::query::Ray;
+
+    fn middle(class: ObjectClass) -> Model {
+        let dimensions: Vec<f64> = class.ranges().iter().map(|r| (r.start() + r.end()) / 2.0).collect();
+        class.model(&dimensions)
+    }
+
+    #[test]
+    fn what_is_rendered_lies_on_the_surface_that_is_fitted() {
+        for class in ObjectClass::ALL {
+            let model = middle(class);
+            let body = Body { shape: model.solid(), pose: Pose::IDENTITY };
+            let mut hits = 0;
+            for i in 0..2000_u32 {
+                // From all around above, towards places near the middle.
+                let (turn, rise) = (f64::from(i) * 2.4, 0.35 + 0.9 * f64::from(i % 37) / 37.0);
+                let from = [turn.cos() * rise.cos(), turn.sin() * rise.cos(), rise.sin()];
+                let [x, y, _] = model.size();
+                let to = [x * (f64::from(i % 23) / 23.0 - 0.5), y * (f64::from(i % 17) / 17.0 - 0.5), 0.0];
+                let (origin, way) = ([0, 1, 2].map(|k| from[k] as f32), [0, 1, 2].map(|k| (to[k] - from[k]) as f32));
+                let ray = Ray::new(Vector32::from_array(origin), Vector32::from_array(way));
+                let Some(time) = body.shape.cast_ray(&body.pose, &ray, 2.0, true) else { continue };
+                let hit = [0, 1, 2].map(|k| f64::from(origin[k] + way[k] * time));
+                hits += 1;
+                // Between the tines, light reaches their sides; the fit takes the head as closed.
+                let among_tines = class == ObjectClass::Fork && hit[0] > 0.35 * x;
+                let least = if among_tines { -fork::THICKNESS * x } else { 0.0 };
+                let distance = model.distance(hit);
+                assert!((least - 8e-4..8e-4).contains(&distance), "{class:?} {hit:?}: {distance}");
+                assert!(model.fill_distance(hit) < 8e-4, "{class:?} {hit:?}: {}", model.fill_distance(hit));
+            }
+            assert!(hits > 500, "{class:?}: {hits}");
+        }
+    }
+
+    #[test]
+    fn a_class_is_found_by_its_name_and_its_dimensions_are_held_within_its_ranges() {
+        for class in ObjectClass::ALL {
+            assert_eq!(ObjectClass::named(class.name()), Some(class));
+            assert_eq!(class.model(&[9.0; 3]).class(), class);
+            let (largest, ranges) = (class.model(&[9.0; 3]).dimensions(), class.ranges());
+            assert!(largest.iter().zip(ranges).all(|(d, range)| d == range.end()));
+        }
+    }
+}

@@ -1,0 +1,114 @@
+//! Walls of even thickness, turned about an axis: a polyline of (radius, height) is the middle of the wall.
+
+use super::Round;
+
+/// A point of the half plane: distance from the axis and height above the table, in metres.
+pub(super) type Point = [f64; 2];
+
+/// How thick the walls are, in metres.
+const WALL: f64 = 0.004;
+
+/// The middle of the wall from the axis to the rim, as parts of what is left of radius and height beside the wall itself.
+fn shape(kind: Round) -> &'static [Point] {
+    match kind {
+        Round::Can => &[],
+        Round::Cup => &[[0.0, 0.0], [0.78, 0.0], [1.0, 1.0]],
+        Round::Bowl => &[[0.0, 0.0], [0.45, 0.0], [0.74, 0.22], [0.91, 0.56], [1.0, 1.0]],
+        Round::Plate => &[[0.0, 0.0], [0.60, 0.0], [0.72, 0.42], [1.0, 1.0]],
+    }
+}
+
+/// The middle of the wall, in metres.
+fn wall(kind: Round, radius: f64, height: f64) -> impl Iterator<Item = Point> + Clone {
+    let half = WALL / 2.0;
+    shape(kind).iter().map(move |[r, z]| [r * (radius - half), half + z * (height - WALL)])
+}
+
+/// Signed distance from the surface. What is under a plate counts as its inside: it is seen from above, and a point that noise
+/// has put under its wall still pulls it down.
+pub(super) fn distance(kind: Round, radius: f64, height: f64, point: Point) -> f64 {
+    if kind == Round::Can {
+        return cylinder_distance(radius, height, point);
+    }
+    let to_wall = from_wall(kind, radius, height, point);
+    if kind == Round::Plate && is_under(kind, radius, height, point) { -to_wall - WALL } else { to_wall }
+}
+
+/// Signed distance from the wall itself.
+fn from_wall(kind: Round, radius: f64, height: f64, point: Point) -> f64 {
+    let squares = pairs(wall(kind, radius, height)).map(|(a, b)| square_from_segment(point, a, b));
+    squares.fold(f64::INFINITY, f64::min).sqrt() - WALL / 2.0
+}
+
+/// Signed distance from the thing filled to its rim.
+pub(super) fn fill_distance(kind: Round, radius: f64, height: f64, point: Point) -> f64 {
+    if kind == Round::Can {
+        return cylinder_distance(radius, height, point);
+    }
+    let to_wall = from_wall(kind, radius, height, point);
+    let [r, z] = point;
+    if z < 0.0 || z > height {
+        return to_wall.min(if z > height && r < radius { z - height } else { f64::INFINITY });
+    }
+    // Within the hollow the wall is crossed outwards: negative is how deep below rim and outer side.
+    let inside = pairs(wall(kind, radius, height))
+        .find(|(a, b)| b[1] > a[1] && (a[1]..=b[1]).contains(&z))
+        .is_some_and(|(a, b)| r < a[0] + (b[0] - a[0]) * (z - a[1]) / (b[1] - a[1]));
+    if inside { -(to_wall.max(0.0) + WALL).min(height - z) } else { to_wall }
+}
+
+/// Whether a point is below the middle of the wall, within the rim.
+fn is_under(kind: Round, radius: f64, height: f64, [r, z]: Point) -> bool {
+    pairs(wall(kind, radius, height))
+        .find(|(a, b)| (a[0]..=b[0]).contains(&r))
+        .is_some_and(|(a, b)| z < a[1] + (b[1] - a[1]) * (r - a[0]) / (b[0] - a[0]))
+}
+
+/// The outline of the material: from the axis below, around the rim, back to the axis above. Corners are mitred.
+pub(super) fn outline(kind: Round, radius: f64, height: f64) -> Vec<Point> {
+    if kind == Round::Can {
+        return vec![[0.0, 0.0], [radius, 0.0], [radius, height], [0.0, height]];
+    }
+    let middle: Vec<Point> = wall(kind, radius, height).collect();
+    let side = |sign: f64| -> Vec<Point> {
+        (0..middle.len())
+            .map(|i| {
+                let before = (i > 0).then(|| normal(middle[i - 1], middle[i]));
+                let after = (i + 1 < middle.len()).then(|| normal(middle[i], middle[i + 1]));
+                let (a, b) = (before.or(after).unwrap_or([0.0; 2]), after.or(before).unwrap_or([0.0; 2]));
+                let along = 1.0 + a[0] * b[0] + a[1] * b[1];
+                let offset = [0, 1].map(|k| sign * WALL / 2.0 * (a[k] + b[k]) / along);
+                [middle[i][0] + offset[0], middle[i][1] + offset[1]]
+            })
+            .collect()
+    };
+    let mut outline = side(1.0);
+    // The rim ends half a wall beyond the wall's middle.
+    if let [.., before, last] = middle[..] {
+        let beyond = normal(before, last);
+        outline.push([last[0] - beyond[1] * WALL / 2.0, last[1] + beyond[0] * WALL / 2.0]);
+    }
+    outline.extend(side(-1.0).into_iter().rev());
+    outline
+}
+
+/// The unit normal to the right of the way from `a` to `b`: outwards.
+fn normal(a: Point, b: Point) -> Point {
+    let length = (b[0] - a[0]).hypot(b[1] - a[1]);
+    [(b[1] - a[1]) / length, (a[0] - b[0]) / length]
+}
+
+fn cylinder_distance(radius: f64, height: f64, [r, z]: Point) -> f64 {
+    let (across, along) = (r - radius, (z - height / 2.0).abs() - height / 2.0);
+    (across.max(0.0).powi(2) + along.max(0.0).powi(2)).sqrt() + across.max(along).min(0.0)
+}
+
+fn pairs(points: impl Iterator<Item = Point> + Clone) -> impl Iterator<Item = (Point, Point)> {
+    points.clone().zip(points.skip(1))
+}
+
+fn square_from_segment(p: Point, a: Point, b: Point) -> f64 {
+    let (along, to) = ([b[0] - a[0], b[1] - a[1]], [p[0] - a[0], p[1] - a[1]]);
+    let t = ((to[0] * along[0] + to[1] * along[1]) / (along[0] * along[0] + along[1] * along[1])).clamp(0.0, 1.0);
+    (to[0] - t * along[0]).powi(2) + (to[1] - t * along[1]).powi(2)
+}

@@ -1,0 +1,107 @@
+//! Normal equations of small least-squares problems, solved by Cholesky's decomposition.
+
+/// How many unknowns there are at the most.
+const N: usize = 6;
+
+/// `Jᵀ W J` and `Jᵀ W r`.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Normal {
+    matrix: [[f64; N]; N],
+    right: [f64; N],
+}
+
+impl Normal {
+    /// One more residual with its derivatives.
+    pub(crate) fn add(&mut self, slope: &[f64; N], residual: f64, weight: f64) {
+        for (row, entries) in self.matrix.iter_mut().enumerate() {
+            let weighted = weight * slope[row];
+            for (entry, other) in entries.iter_mut().zip(slope).take(row + 1) {
+                *entry += weighted * other;
+            }
+            self.right[row] += weighted * residual;
+        }
+    }
+
+    /// The step to subtract, with the diagonal increased by a part of itself (Marquardt 1963). `None` where nothing is
+    /// determined.
+    pub(crate) fn step(&self, fixed: &[bool; N], damping: f64) -> Option<[f64; N]> {
+        let factor = self.factor(fixed, damping)?;
+        let mut right = self.right;
+        for (value, fixed) in right.iter_mut().zip(fixed) {
+            if *fixed {
+                *value = 0.0;
+            }
+        }
+        Some(solve(&factor, right))
+    }
+
+    /// The inverse of the matrix; rows and columns of fixed unknowns are those of 1.
+    pub(crate) fn inverse(&self, fixed: &[bool; N]) -> Option<[[f64; N]; N]> {
+        let factor = self.factor(fixed, 1e-9)?;
+        Some(std::array::from_fn(|i| solve(&factor, std::array::from_fn(|j| f64::from(u8::from(i == j))))))
+    }
+
+    fn factor(&self, fixed: &[bool; N], damping: f64) -> Option<[[f64; N]; N]> {
+        let mut factor = [[0.0; N]; N];
+        for row in 0..N {
+            for column in 0..=row {
+                let entry = if fixed[row] || fixed[column] {
+                    f64::from(u8::from(row == column))
+                } else if row == column {
+                    self.matrix[row][row] * (1.0 + damping) + f64::MIN_POSITIVE
+                } else {
+                    self.matrix[row][column]
+                };
+                let sum = entry - (0..column).map(|k| factor[row][k] * factor[column][k]).sum::<f64>();
+                if row == column {
+                    if sum.is_nan() || sum <= 0.0 {
+                        return None;
+                    }
+                    factor[row][row] = sum.sqrt();
+                } else {
+                    factor[row][column] = sum / factor[column][column];
+                }
+            }
+        }
+        Some(factor)
+    }
+}
+
+fn solve(factor: &[[f64; N]; N], mut x: [f64; N]) -> [f64; N] {
+    for row in 0..N {
+        for k in 0..row {
+            x[row] -= factor[row][k] * x[k];
+        }
+        x[row] /= factor[row][row];
+    }
+    for row in (0..N).rev() {
+        for k in row + 1..N {
+            x[row] -= factor[k][row] * x[k];
+        }
+        x[row] /= factor[row][row];
+    }
+    x
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn a_linear_problem_is_solved_in_one_step_and_fixed_unknowns_stay() {
+        let truth = [1.0, -2.0, 0.0, 0.5, 3.0, 0.0];
+        let fixed = [false, false, true, false, false, true];
+        let mut normal = Normal::default();
+        for i in 0..40 {
+            let slope: [f64; N] = std::array::from_fn(|k| ((i * (k + 2)) as f64 * 0.37).sin());
+            let residual: f64 = slope.iter().zip(truth).map(|(s, t)| s * t).sum();
+            normal.add(&slope, residual, 2.0);
+        }
+        let step = normal.step(&fixed, 0.0).unwrap();
+        assert!(step.iter().zip(truth).all(|(s, t)| (s - t).abs() < 1e-9), "{step:?}");
+        let inverse = normal.inverse(&fixed).unwrap();
+        assert!((inverse[2][2] - 1.0).abs() < 1e-9 && inverse[0][2].abs() < 1e-12);
+        assert!(Normal::default().step(&fixed, 1e-3).is_none() || Normal::default().right == [0.0; N]);
+    }
+}

@@ -1,0 +1,225 @@
+//! Random tables, and how well detection does on them: what tests and measurements share.
+//!
+//! One to eight objects of all classes and of random dimensions stand on a table as the robot's mast sees it, at least
+//! [`GAP_M`] apart, and so that each shows most of what it would show alone: what stands behind something else is found when the
+//! robot looks from elsewhere, and is no matter of estimation.
+
+use crate::camera::{Camera, DepthImage, Intrinsics};
+use crate::detection::{Detection, Model, ObjectClass, Region, Symmetry};
+use crate::noise::{Noise, observe};
+use crate::render::{Body, render};
+use rand::{Rng, RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_world::scene::Shape;
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// A structured-light camera of 640 × 480 pixels, 52° × 40°.
+pub const OPTICS: Intrinsics = Intrinsics { width: 640, height: 480, fx: 660.0, fy: 660.0, cx: 319.5, cy: 239.5 };
+/// The middle of the table's top, in metres.
+pub const TABLE: [f64; 3] = [0.80, 0.0, 0.70];
+/// The table's top, in metres.
+pub const TABLE_SIZE: [f64; 2] = [0.6, 1.2];
+/// Between the circles around two objects, or what of them a fork is, in metres.
+pub const GAP_M: f64 = 0.03;
+/// How much of what an object would show alone it shows on its table.
+pub const LEAST_VISIBLE: f64 = 0.75;
+/// What is found is within this of the truth: metres and radians.
+pub const TOLERANCE: (f64, f64) = (0.005, 3.0 * PI / 180.0);
+/// Something found farther than this from everything is false, in metres.
+const ASSIGNED: f64 = 0.05;
+/// Boxes whose edges differ by less than this look the same after a quarter turn, in metres.
+const SQUARE: f64 = 0.01;
+
+/// An object in its place.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Placed {
+    /// What it is.
+    pub model: Model,
+    /// The middle of its bounding box, in the world.
+    pub pose: Pose,
+}
+
+/// How one object was found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Match {
+    /// What it is.
+    pub truth: Placed,
+    /// As what it was found, if at all.
+    pub found: Option<Detection>,
+    /// Between the centres, in metres.
+    pub position: f64,
+    /// Between the axes, modulo the symmetry, in radians.
+    pub angle: f64,
+}
+
+impl Match {
+    /// Of the right class, within the tolerance.
+    pub fn is_good(&self) -> bool {
+        let right = self.found.is_some_and(|f| f.model.class() == self.truth.model.class());
+        right && self.position <= TOLERANCE.0 && self.angle <= TOLERANCE.1
+    }
+}
+
+/// A camera where the robot's mast holds it, that looks at the table's middle from 1.85 m.
+pub fn mast_camera(intrinsics: Intrinsics) -> Camera {
+    Camera::looking([-0.62, 0.0, 1.88], TABLE, intrinsics)
+}
+
+/// The table as a region.
+pub fn region() -> Region {
+    Region { pose: Pose::at(TABLE[0], TABLE[1], TABLE[2]), size: TABLE_SIZE }
+}
+
+/// A random object of a class: any yaw, dimensions in the middle of the class's ranges.
+pub fn random_model(class: ObjectClass, random: &mut impl Rng) -> Model {
+    let dimensions: Vec<f64> = match class {
+        ObjectClass::Box => {
+            let width = random.random_range(0.05..0.10);
+            vec![random.random_range(width..0.18), width, random.random_range(0.04..0.14)]
+        }
+        ObjectClass::Can => vec![random.random_range(0.028..0.045), random.random_range(0.07..0.14)],
+        ObjectClass::Cup => vec![random.random_range(0.035..0.045), random.random_range(0.07..0.11)],
+        ObjectClass::Bowl => vec![random.random_range(0.06..0.09), random.random_range(0.045..0.07)],
+        ObjectClass::Plate => vec![random.random_range(0.09..0.13), random.random_range(0.018..0.028)],
+        ObjectClass::Fork => vec![random.random_range(0.17..0.21)],
+    };
+    class.model(&dimensions)
+}
+
+/// A table with so many objects, as the camera will see each of them. The same seed gives the same table.
+pub fn random_table(seed: u64, count: usize, camera: &Camera) -> Vec<Placed> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut table: Vec<Placed> = Vec::new();
+    // A table so full that nothing fits is laid anew.
+    let mut failures = 0;
+    while table.len() < count {
+        let class = ObjectClass::ALL[random.random_range(0..ObjectClass::ALL.len())];
+        let model = random_model(class, &mut random);
+        let [length, width, height] = model.size();
+        let margin = length.hypot(width) / 2.0 + 0.01;
+        let mut along = |axis: usize| {
+            let half = TABLE_SIZE[axis] / 2.0 - margin;
+            TABLE[axis] + random.random_range(-half..half)
+        };
+        let at = [along(0), along(1), TABLE[2] + height / 2.0];
+        let pose = Pose::from_rpy(at, 0.0, 0.0, random.random_range(-PI..PI));
+        table.push(Placed { model, pose });
+        if !is_clear(&table) || !all_visible(&table, camera) {
+            table.pop();
+            failures += 1;
+            if failures % 400 == 0 {
+                table.clear();
+            }
+        }
+    }
+    table
+}
+
+/// What the camera shows of a table, averaged over frames, with the table, the floor and the robot's base.
+pub fn table_image(table: &[Placed], camera: &Camera, noise: &Noise, seed: u64, frames: u32) -> DepthImage {
+    let mut bodies: Vec<Body> = table.iter().map(Placed::body).collect();
+    let [x, y, z] = TABLE;
+    bodies.push(Body::new(&Shape::Box { size: [TABLE_SIZE[0], TABLE_SIZE[1], 0.05] }, &Pose::at(x, y, z - 0.025)));
+    bodies.push(Body::new(&Shape::Box { size: [10.0, 10.0, 0.1] }, &Pose::at(0.0, 0.0, -0.05)));
+    bodies.push(Body::new(&Shape::Box { size: [0.9, 0.6, 0.6] }, &Pose::at(-0.1, 0.0, 0.3)));
+    observe(&render(camera, &bodies), &camera.intrinsics, noise, seed, 0, frames)
+}
+
+/// Which objects were found, how well, and what was found that is not there. Nearest pairs first.
+pub fn compare(table: &[Placed], found: &[Detection]) -> (Vec<Match>, Vec<Detection>) {
+    let mut pairs: Vec<(usize, usize, f64)> = (0..table.len())
+        .flat_map(|t| (0..found.len()).map(move |f| (t, f, table[t].pose.distance(&found[f].pose))))
+        .filter(|(_, _, distance)| *distance < ASSIGNED)
+        .collect();
+    pairs.sort_by(|a, b| a.2.total_cmp(&b.2));
+    let (mut of_truth, mut taken) = (vec![None; table.len()], vec![false; found.len()]);
+    for (t, f, _) in pairs {
+        if of_truth[t].is_none() && !taken[f] {
+            of_truth[t] = Some(f);
+            taken[f] = true;
+        }
+    }
+    let matches = table.iter().zip(of_truth).map(|(truth, f)| match f.map(|f| found[f]) {
+        Some(found) => {
+            let (position, angle) = (truth.pose.distance(&found.pose), angle(truth, &found.pose));
+            Match { truth: *truth, found: Some(found), position, angle }
+        }
+        None => Match { truth: *truth, found: None, position: f64::INFINITY, angle: f64::INFINITY },
+    });
+    let matches = matches.collect();
+    (matches, found.iter().zip(taken).filter(|(_, taken)| !taken).map(|(f, _)| *f).collect())
+}
+
+/// The least turn from the found pose to one that looks like the truth.
+fn angle(truth: &Placed, found: &Pose) -> f64 {
+    let turned = |yaw: f64| truth.pose.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, yaw)).angle(found);
+    let least = |turns: &[f64]| turns.iter().map(|yaw| turned(*yaw)).fold(f64::INFINITY, f64::min);
+    match (truth.model.class().symmetry(), truth.model) {
+        (Symmetry::None, _) => turned(0.0),
+        (Symmetry::HalfTurn, Model::Box { size }) if (size[0] - size[1]).abs() < SQUARE => {
+            least(&[0.0, FRAC_PI_2, PI, -FRAC_PI_2])
+        }
+        (Symmetry::HalfTurn, _) => least(&[0.0, PI]),
+        (Symmetry::Round, _) => {
+            let up = |pose: &Pose| pose.rotate([0.0, 0.0, 1.0]);
+            let (a, b) = (up(&truth.pose), up(found));
+            (0..3).map(|i| a[i] * b[i]).sum::<f64>().clamp(-1.0, 1.0).acos()
+        }
+    }
+}
+
+impl Placed {
+    /// What the camera sees of it.
+    pub fn body(&self) -> Body {
+        Body { shape: self.model.solid(), pose: crate::render::parry_pose(&self.pose) }
+    }
+
+    /// Circles that hold it, seen from above: one, or four along something slender.
+    fn circles(&self) -> Vec<([f64; 2], f64)> {
+        let [length, width, _] = self.model.size();
+        let pieces = if length > 3.0 * width { 4 } else { 1 };
+        let part = length / f64::from(pieces);
+        let circle = |i: i32| {
+            let centre = self.pose.transform([part * (f64::from(i) + 0.5) - length / 2.0, 0.0, 0.0]);
+            let round = self.model.class().symmetry() == Symmetry::Round;
+            ([centre[0], centre[1]], if round { width / 2.0 } else { part.hypot(width) / 2.0 })
+        };
+        (0..pieces).map(circle).collect()
+    }
+}
+
+/// Whether the last object has room beside the others.
+fn is_clear(table: &[Placed]) -> bool {
+    let Some((last, others)) = table.split_last() else { return true };
+    let apart = |a: &([f64; 2], f64), b: &([f64; 2], f64)| (a.0[0] - b.0[0]).hypot(a.0[1] - b.0[1]) > a.1 + b.1 + GAP_M;
+    let own = last.circles();
+    others.iter().flat_map(Placed::circles).all(|other| own.iter().all(|circle| apart(circle, &other)))
+}
+
+/// Whether every object shows enough of itself. A coarse image does.
+fn all_visible(table: &[Placed], camera: &Camera) -> bool {
+    let optics = camera.intrinsics;
+    let scale = 4.0;
+    let coarse = Intrinsics {
+        width: optics.width / 4,
+        height: optics.height / 4,
+        fx: optics.fx / scale,
+        fy: optics.fy / scale,
+        cx: (optics.cx - 1.5) / scale,
+        cy: (optics.cy - 1.5) / scale,
+    };
+    let camera = Camera { intrinsics: coarse, pose: camera.pose };
+    let alone: Vec<DepthImage> = table.iter().map(|object| render(&camera, &[object.body()])).collect();
+    let nearest =
+        |pixel: usize| alone.iter().map(|image| image.depth[pixel]).filter(|d| *d > 0.0).fold(f32::MAX, f32::min);
+    alone.iter().all(|image| {
+        let own: Vec<usize> = (0..image.depth.len()).filter(|pixel| image.depth[*pixel] > 0.0).collect();
+        let seen = own.iter().filter(|pixel| image.depth[**pixel] <= nearest(**pixel)).count();
+        let cut_off = own.iter().any(|pixel| {
+            let (column, row) = (pixel % coarse.width, pixel / coarse.width);
+            column == 0 || row == 0 || column + 1 == coarse.width || row + 1 == coarse.height
+        });
+        !own.is_empty() && !cut_off && seen as f64 >= LEAST_VISIBLE * own.len() as f64
+    })
+}

@@ -1,0 +1,231 @@
+//! The image sorted by what each pixel says of a surface: it sees something that stands on it, or the surface is free there,
+//! or nobody knows.
+
+use crate::camera::{Camera, DepthImage};
+use crate::cluster;
+use crate::detection::{DetectionError, Region};
+use crate::fit::Evidence;
+use crate::mask::{Ball, Mask};
+use crate::plane::Plane;
+use crate::vector::{Vector, length, median, sub};
+use ratn_model::pose::Pose;
+
+/// How far above or below its given pose the surface may be, in metres.
+const PLANE_SLACK: f64 = 0.06;
+/// Nothing taller stands on the surface, in metres.
+const TALLEST: f64 = 0.25;
+/// Something is seen by at least so many pixels.
+const MIN_PIXELS: usize = 40;
+/// So many deviations above the plane nothing belongs to it any more, and not less or more than these, in metres.
+const CLEAR_OF_PLANE: f64 = 3.5;
+const CLEARANCE: std::ops::RangeInclusive<f64> = 0.0035..=0.014;
+/// What is this many deviations higher is hardly ever taken for the plane.
+const UNBIASED: f64 = 1.5;
+/// Points that the plane is estimated from, about; the rest are left out evenly.
+const PLANE_POINTS: usize = 12_000;
+/// The least part of a depth's deviation that counts as height above the plane: a camera that looks along it says nothing else.
+const LEAST_FALL: f64 = 0.2;
+/// A depth is not more certain than this, in metres.
+const LEAST_SIGMA: f64 = 0.0004;
+/// Which pixels around a cluster's are asked whether they see past it, in steps along rows and columns.
+const BESIDE: [isize; 4] = [1, 2, 3, 5];
+/// RANSAC's choices: any number does; the same image gives the same objects.
+const SEED: u64 = 0x5EED;
+
+/// What is seen on a surface.
+pub(crate) struct View<'a> {
+    image: &'a DepthImage,
+    rays: Rays,
+    /// Pixels that see the surface, or what is behind and below it: nothing stands in their way.
+    free: Vec<bool>,
+    /// The surface's frame in the world: on the plane as seen, its z axis the plane's normal.
+    pub(crate) frame: Pose,
+    /// What stands on it: pixels, the largest cluster first.
+    pub(crate) clusters: Vec<Vec<Seen>>,
+    /// Standard deviation of a depth, in metres.
+    sigma: f64,
+    /// See [`Evidence`].
+    floor: f64,
+    /// How well the plane is known: the variance of its height, in metres², and of its slope.
+    pub(crate) plane_variance: [f64; 2],
+}
+
+/// A pixel of a cluster and the point it sees, in the surface's frame.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Seen {
+    pixel: u32,
+    pub(crate) point: Vector,
+}
+
+/// Every pixel's ray in a frame: its direction is linear in column and row.
+struct Rays {
+    eye: Vector,
+    origin: Vector,
+    per_column: Vector,
+    per_row: Vector,
+    width: usize,
+}
+
+impl Rays {
+    fn new(camera: &Camera, frame: &Pose) -> Rays {
+        let pose = frame.inverse().compose(&camera.pose);
+        let optics = &camera.intrinsics;
+        Rays {
+            eye: pose.position,
+            origin: pose.rotate(optics.ray(0, 0)),
+            per_column: pose.rotate([1.0 / optics.fx, 0.0, 0.0]),
+            per_row: pose.rotate([0.0, 1.0 / optics.fy, 0.0]),
+            width: optics.width,
+        }
+    }
+
+    fn point(&self, pixel: usize, depth: f64) -> Vector {
+        let (column, row) = ((pixel % self.width) as f64, (pixel / self.width) as f64);
+        std::array::from_fn(|i| {
+            self.eye[i] + depth * (self.origin[i] + column * self.per_column[i] + row * self.per_row[i])
+        })
+    }
+}
+
+impl<'a> View<'a> {
+    /// # Errors
+    /// [`DetectionError`] when the surface is not in the image.
+    pub(crate) fn new(
+        image: &'a DepthImage,
+        camera: &Camera,
+        region: &Region,
+        body: &[Ball],
+    ) -> Result<View<'a>, DetectionError> {
+        let (width, height) = (image.width, image.height);
+        if (width, height) != (camera.intrinsics.width, camera.intrinsics.height) || image.depth.len() != width * height
+        {
+            return Err(DetectionError::WrongCamera { width, height });
+        }
+        let (near, stride) = near_surface(image, camera, region);
+        let plane = Plane::find(&near, SEED).ok_or(DetectionError::NoPlane { points: near.len() })?;
+        let (sigma_above, on_plane) = scatter(&near, &plane);
+        let frame = region.pose.compose(&plane.frame());
+        let half = region.size.map(|edge| edge / 2.0);
+        let (looking, up) = (camera.pose.rotate([0.0, 0.0, 1.0]), frame.rotate([0.0, 0.0, 1.0]));
+        let fall = (0..3).map(|i| looking[i] * up[i]).sum::<f64>().abs().max(LEAST_FALL);
+        let clear = (CLEAR_OF_PLANE * sigma_above).clamp(*CLEARANCE.start(), *CLEARANCE.end());
+        let variance = sigma_above.powi(2) / (on_plane.max(1.0) * (stride * stride) as f64);
+        let mut view = View {
+            image,
+            rays: Rays::new(camera, &frame),
+            free: vec![false; image.depth.len()],
+            frame,
+            clusters: Vec::new(),
+            sigma: (sigma_above / fall).max(LEAST_SIGMA),
+            floor: clear + UNBIASED * sigma_above,
+            // The variance of places spread evenly over the region's shorter edge is a third of its half, squared.
+            plane_variance: [variance, variance * 3.0 / half[0].min(half[1]).powi(2)],
+        };
+        let mask = Mask::new(body, &frame, [half[0], half[1], TALLEST]);
+        let above = view.sort(clear, |p| p[0].abs() <= half[0] && p[1].abs() <= half[1] && !mask.hides(*p));
+        view.gather(&above);
+        Ok(view)
+    }
+
+    /// Marks what is free, and says what stands within the region.
+    fn sort(&mut self, clear: f64, within: impl Fn(&Vector) -> bool) -> Vec<Seen> {
+        let mut above = Vec::new();
+        let rays = &self.rays;
+        for (row, depths) in self.image.depth.chunks(self.image.width).enumerate() {
+            let start = rays.origin[2] + row as f64 * rays.per_row[2];
+            for (column, depth) in depths.iter().enumerate() {
+                let Some(depth) = valid(*depth) else { continue };
+                let pixel = row * self.image.width + column;
+                let z = rays.eye[2] + depth * (start + column as f64 * rays.per_column[2]);
+                if z < clear {
+                    self.free[pixel] = true;
+                } else if z < TALLEST {
+                    let point = rays.point(pixel, depth);
+                    if within(&point) {
+                        above.push(Seen { pixel: pixel as u32, point });
+                    }
+                }
+            }
+        }
+        above
+    }
+
+    fn gather(&mut self, above: &[Seen]) {
+        let (width, height) = (self.image.width, self.image.height);
+        let at_border = |seen: &Seen| {
+            let (column, row) = (seen.pixel as usize % width, seen.pixel as usize / width);
+            column == 0 || row == 0 || column + 1 == width || row + 1 == height
+        };
+        let points: Vec<Vector> = above.iter().map(|seen| seen.point).collect();
+        let clusters = cluster::clusters(&points, MIN_PIXELS).into_iter();
+        let seen = clusters.map(|members| members.into_iter().map(|i| above[i as usize]).collect::<Vec<Seen>>());
+        // What the image cuts off is not known to its end.
+        self.clusters = seen.filter(|cluster| !cluster.iter().any(at_border)).collect();
+    }
+
+    /// At most `points` of a cluster's points, evenly, and at most `free` of the rays beside it.
+    pub(crate) fn evidence(&self, cluster: usize, points: usize, free: usize) -> Evidence {
+        let members = &self.clusters[cluster];
+        let beside = self.beside(cluster);
+        let thinned = |count: usize, most: usize| (0..count).step_by(count.div_ceil(most).max(1));
+        let first = members.first().map_or(self.rays.eye, |seen| seen.point);
+        Evidence {
+            eye: self.rays.eye,
+            points: thinned(members.len(), points).map(|i| members[i].point).collect(),
+            free: thinned(beside.len(), free)
+                .map(|i| self.rays.point(beside[i], f64::from(self.image.depth[beside[i]])))
+                .collect(),
+            floor: self.floor,
+            sigma: self.sigma,
+            pitch: length(sub(first, self.rays.eye)) * length(self.rays.per_column),
+        }
+    }
+
+    /// Pixels beside a cluster that see past it, each once.
+    fn beside(&self, cluster: usize) -> Vec<usize> {
+        let (width, rows) = (self.image.width as isize, self.image.height as isize);
+        let mut found = Vec::new();
+        for seen in &self.clusters[cluster] {
+            let (column, row) = (seen.pixel as isize % width, seen.pixel as isize / width);
+            for step in BESIDE {
+                for (column, row) in
+                    [(column - step, row), (column + step, row), (column, row - step), (column, row + step)]
+                {
+                    if (0..width).contains(&column) && (0..rows).contains(&row) {
+                        let pixel = (row * width + column) as usize;
+                        if self.free[pixel] {
+                            found.push(pixel);
+                        }
+                    }
+                }
+            }
+        }
+        found.sort_unstable();
+        found.dedup();
+        found
+    }
+}
+
+/// Points about where the surface should be, of every so many columns and rows.
+fn near_surface(image: &DepthImage, camera: &Camera, region: &Region) -> (Vec<Vector>, usize) {
+    let half = region.size.map(|edge| edge / 2.0);
+    let rough = Rays::new(camera, &region.pose);
+    let stride = (image.depth.len() as f64 / PLANE_POINTS as f64).sqrt().ceil().max(1.0) as usize;
+    let near = (0..image.height)
+        .step_by(stride)
+        .flat_map(|row| (0..image.width).step_by(stride).map(move |column| row * image.width + column))
+        .filter_map(|pixel| valid(image.depth[pixel]).map(|depth| rough.point(pixel, depth)))
+        .filter(|p| p[0].abs() <= half[0] && p[1].abs() <= half[1] && p[2].abs() < PLANE_SLACK);
+    (near.collect(), stride)
+}
+
+/// How much the points of a plane scatter about it, and how many there are: 1.4826 times the median distance is a normal
+/// distribution's deviation, whatever stands on the plane.
+fn scatter(points: &[Vector], plane: &Plane) -> (f64, f64) {
+    let mut off: Vec<f64> = points.iter().map(|p| plane.above(*p).abs()).filter(|off| *off < 0.02).collect();
+    (1.4826 * median(&mut off).unwrap_or(0.0), off.len() as f64)
+}
+
+fn valid(depth: f32) -> Option<f64> {
+    (depth.is_finite() && depth > 0.0).then_some(f64::from(depth))
+}
