@@ -179,7 +179,7 @@ async fn an_unknown_action_is_refused_with_those_that_there_are() {
     let error = run(&provider, goal("a", "fly", 1)).await.unwrap_err();
     assert_eq!(error.code(), Some(Code::InvalidArgument));
     assert!(
-        error.to_string().contains("no action `fly`: there are double, panic, relay, stay, trace, wait"),
+        error.to_string().contains("no action `fly`: there are ask, double, end, panic, relay, stay, trace, wait"),
         "{error}"
     );
     assert!(!error.is_crash());
@@ -205,6 +205,23 @@ async fn an_action_has_another_provider_of_its_lease_help() {
     assert_eq!(outcome.outputs["y"], Value::Float(42.0));
     let outcome = run(&provider, goal("b", "relay", 1)).await.unwrap();
     assert!(outcome.reason.contains("holds no Doubler"), "{}", outcome.reason);
+}
+
+#[tokio::test]
+async fn an_action_whose_helper_is_stopped_or_preempted_ends_as_that_and_else_aborted() {
+    let (helper, provider) = (provider(None).await, provider(None).await);
+    let at = helper.endpoint.to_string();
+    for (outcome, own) in
+        [("stopped", "stopped"), ("preempted", "preempted"), ("aborted", "aborted"), ("lost", "aborted")]
+    {
+        let lease = Some(lease(1, &[(RESOURCE, "Ender", &at)]));
+        let inputs = [("outcome".to_owned(), Value::String(outcome.to_owned()))].into();
+        let ended = run(&provider, Goal { lease, inputs, ..goal(outcome, "ask", 1) }).await.unwrap();
+        assert_eq!(
+            (ended.outcome.as_str(), ended.reason),
+            (own, format!("asked in vain: Ender/end was {outcome}: so"))
+        );
+    }
 }
 
 #[tokio::test]

@@ -110,6 +110,16 @@ pub enum CallFailure {
     },
 }
 
+impl CallFailure {
+    /// The outcome that the called action came to.
+    pub(super) fn ended_as(&self) -> Option<&str> {
+        match self {
+            CallFailure::Outcome { outcome, .. } => Some(outcome),
+            _ => None,
+        }
+    }
+}
+
 impl GoalContext {
     pub(crate) fn new(goal: Goal, entry: Arc<GoalEntry>, channels: Channels, safety: Safety) -> GoalContext {
         GoalContext {

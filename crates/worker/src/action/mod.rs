@@ -25,6 +25,9 @@ pub use scene::SceneCache;
 pub use server::{ActionServer, ActionServerBuilder};
 
 use crate::client::chain;
+use ratn_model::program::{PREEMPTED, STOPPED};
+use std::error::Error;
+use std::iter;
 
 /// Something that can be done.
 #[tonic::async_trait]
@@ -55,7 +58,8 @@ pub trait Action: Send + Sync + 'static {
 /// How a goal ends.
 pub type ActionResult = Result<GoalOutcome, ActionFailure>;
 
-/// A goal that did not come to an outcome of its own. Made from any error by `?`.
+/// A goal that did not come to an outcome of its own. Made from any error by `?`: what another provider that was called
+/// ([`GoalContext::call`]) ended as, where that is `preempted` or `stopped`, else `aborted`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ActionFailure {
     /// It failed: the outcome is `aborted`.
@@ -78,9 +82,15 @@ impl ActionFailure {
     }
 }
 
-impl<E: std::error::Error> From<E> for ActionFailure {
+impl<E: std::error::Error + 'static> From<E> for ActionFailure {
     fn from(error: E) -> ActionFailure {
-        ActionFailure::Aborted(chain(&error))
+        let reason = chain(&error);
+        let causes = iter::successors(Some(&error as &(dyn Error + 'static)), |&error| error.source());
+        match causes.filter_map(|cause| cause.downcast_ref()).find_map(CallFailure::ended_as) {
+            Some(STOPPED) => ActionFailure::Stopped(reason),
+            Some(PREEMPTED) => ActionFailure::Preempted(reason),
+            _ => ActionFailure::Aborted(reason),
+        }
     }
 }
 

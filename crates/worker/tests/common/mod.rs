@@ -5,7 +5,7 @@ use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::{Lease, LeasedResource};
 use ratn_model::value::Value;
 use ratn_proto::types::Goal;
-use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext, GoalOutcome};
+use ratn_worker::action::{Action, ActionResult, ActionServer, CallFailure, GoalContext, GoalOutcome};
 use ratn_worker::client::{ActionClient, Channels};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::server::{DRAIN_DEADLINE, Services, Serving, bind};
@@ -39,6 +39,17 @@ pub struct Trace;
 
 /// `relay`: has the lease's Doubler double x.
 pub struct Relay;
+
+/// `end`: comes to the outcome that it is told.
+pub struct End;
+
+/// `ask`: has the lease's Ender `end`, and wraps what comes of it.
+pub struct Ask;
+
+/// What `ask` makes of an end without success.
+#[derive(Debug, thiserror::Error)]
+#[error("asked in vain")]
+pub struct InVain(#[from] CallFailure);
 
 #[tonic::async_trait]
 impl Action for Double {
@@ -111,6 +122,29 @@ impl Action for Relay {
     }
 }
 
+#[tonic::async_trait]
+impl Action for End {
+    fn name(&self) -> &str {
+        "end"
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        Ok(GoalOutcome { reason: "so".to_owned(), ..GoalOutcome::named(goal.input_string("outcome")?) })
+    }
+}
+
+#[tonic::async_trait]
+impl Action for Ask {
+    fn name(&self) -> &str {
+        "ask"
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        let outputs = goal.call("Ender", "end", goal.inputs.clone()).await.map_err(InVain)?;
+        Ok(GoalOutcome { outputs, ..GoalOutcome::success() })
+    }
+}
+
 /// A served provider.
 pub struct Provider {
     pub endpoint: Endpoint,
@@ -142,6 +176,8 @@ pub async fn provider_with(listen: Option<Endpoint>, drain: Duration) -> Provide
         .action(Panic)
         .action(Trace)
         .action(Relay)
+        .action(End)
+        .action(Ask)
         .build();
     let bound = bind(&listen).await.unwrap();
     let endpoint = bound.endpoint().clone();
