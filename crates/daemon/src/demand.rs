@@ -1,5 +1,6 @@
 //! The part of a provider's link that hears what is missing and what is held, and says why there is no more of it.
 
+use ratn_model::value::Value;
 use ratn_proto::types::{Demand, ResourceEventKind, ResourceUpdate};
 use ratn_worker::client::{CallError, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
@@ -14,8 +15,17 @@ const AGAIN_AFTER: Duration = Duration::from_millis(250);
 /// Characters of a reason that are said; what they are is in the provider's log.
 const REASON_LENGTH: usize = 250;
 
-/// Why there is no more of a kind, by kind.
-pub(crate) type Shortages = BTreeMap<String, String>;
+/// Of which kinds there can be no more for now.
+pub(crate) type Shortages = BTreeMap<String, Shortage>;
+
+/// Of a kind there can be no more than so many for now, and why.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Shortage {
+    /// Those there are count.
+    pub most: u32,
+    /// For people.
+    pub reason: String,
+}
 
 /// Somebody holds a resource now, or nobody any more.
 #[derive(Debug, PartialEq, Eq)]
@@ -28,6 +38,8 @@ pub(crate) struct Use {
 pub(crate) struct DemandLink {
     /// What it can provide: kinds, and how many of each at the most.
     pub(crate) kinds: BTreeMap<String, u32>,
+    /// What all of it has in common.
+    pub(crate) attributes: BTreeMap<String, Value>,
     /// Hears what is missing.
     pub(crate) heard: mpsc::Sender<Vec<Demand>>,
     pub(crate) shortages: watch::Receiver<Shortages>,
@@ -68,15 +80,15 @@ impl DemandLink {
         session: &Session,
     ) -> Result<(), CallError> {
         let manager = ResourceClient::new(channels, endpoint, session.id())?;
-        let mut demand = manager.watch_demand(&self.kinds).await?;
+        let mut demand = manager.watch_demand(&self.kinds, &self.attributes).await?;
         let mut said = Shortages::new();
         loop {
             let shortages = self.shortages.borrow_and_update().clone();
             for kind in said.keys().filter(|kind| !shortages.contains_key(*kind)) {
-                manager.report_shortage(kind, "").await?;
+                manager.report_shortage(kind, 0, "").await?;
             }
-            for (kind, reason) in shortages.iter().filter(|(kind, reason)| said.get(*kind) != Some(*reason)) {
-                manager.report_shortage(kind, &in_one_line(reason)).await?;
+            for (kind, shortage) in shortages.iter().filter(|(kind, shortage)| said.get(*kind) != Some(*shortage)) {
+                manager.report_shortage(kind, shortage.most, &in_one_line(&shortage.reason)).await?;
             }
             said = shortages;
             tokio::select! {

@@ -5,13 +5,14 @@ mod support;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use ratn_daemon::process_manager::{Liveness, Template};
+use ratn_daemon::process_manager::{Label, Liveness, Needs, ProcessManagerConfig, Template};
+use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_model::resource::Requirement;
 use ratn_model::value::Value;
 use ratn_proto::types::{HostPools, Resource, ResourceEvent, ResourceEventKind, WorkerState};
 use ratn_worker::client::AcquireOptions;
 use std::time::Duration;
-use support::{DEADLINE, TestSystem, block, in_time};
+use support::{Client, DEADLINE, TestSystem, block, in_time};
 use tonic::Code;
 
 fn template() -> Template {
@@ -300,4 +301,67 @@ async fn a_demand_goes_on_to_the_next_host_when_the_first_one_cannot_meet_it() {
     assert_eq!(lease.resources[0].id, "planner-1@control");
     first.end().await;
     second.end().await;
+}
+
+/// What a wait for one planner comes to on a system of one host that can start none.
+async fn refused(client: &Client, wanted: &Requirement, why: &str) {
+    let soon = AcquireOptions { deadline: Duration::from_millis(200), ..AcquireOptions::default() };
+    in_time(async {
+        // Until the host has said why.
+        loop {
+            let error = client.resources.acquire(vec![wanted.clone()], soon.clone()).await.unwrap_err();
+            if error.to_string().contains(why) {
+                return;
+            }
+        }
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_host_without_room_is_not_asked_for_what_another_host_can_start() {
+    let system = TestSystem::new();
+    let patient = ResourceManagerConfig { provider_patience_ms: 3_600_000, ..Default::default() };
+    let manager = system.resource_manager_with(patient).await;
+    let client = system.client(&manager, "task").await;
+    let needs = Needs { free_memory_mib: Some(1 << 40), idle_cores: None };
+    let large = vec![Template { min: 0, needs, ..template() }];
+    let full = system.process_manager_of(&manager, "full", large).await;
+    refused(&client, &block("PathPlanner"), "MiB of free memory for one more worker").await;
+    let other = system.process_manager_of(&manager, "other", vec![Template { min: 0, ..template() }]).await;
+    let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+    let lease = in_time(client.resources.acquire(vec![block("PathPlanner")], options)).await.unwrap();
+    assert_eq!(lease.resources[0].id, "planner-1@other");
+    full.end().await;
+    other.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_host_whose_labels_do_not_fit_is_not_asked_for_what_another_host_can_start() {
+    let system = TestSystem::new();
+    let patient = ResourceManagerConfig { provider_patience_ms: 3_600_000, ..Default::default() };
+    let manager = system.resource_manager_with(patient).await;
+    let client = system.client(&manager, "task").await;
+    let with_gpu = |gpu: bool| ProcessManagerConfig {
+        labels: [("gpu".to_owned(), Label::Bool(gpu))].into(),
+        templates: vec![Template { min: 0, ..template() }],
+        ..Default::default()
+    };
+    let wanted =
+        |gpu: bool| Requirement { attributes: [("gpu".to_owned(), Value::Bool(gpu))].into(), ..block("PathPlanner") };
+    let plain = system.process_manager_as(&manager, "plain", with_gpu(false)).await;
+    let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+    // So that it is the first that is asked.
+    let lease = in_time(client.resources.acquire(vec![wanted(false)], options.clone())).await.unwrap();
+    assert_eq!(lease.resources[0].id, "planner-1@plain");
+    let fast = system.process_manager_as(&manager, "fast", with_gpu(true)).await;
+    let lease = in_time(client.resources.acquire(vec![wanted(true)], options)).await.unwrap();
+    assert_eq!(lease.resources[0].id, "planner-1@fast");
+    assert_eq!(
+        system.processes(&plain).pools().await.unwrap().pools[0].workers.len(),
+        1,
+        "none for the other's labels"
+    );
+    plain.end().await;
+    fast.end().await;
 }

@@ -57,11 +57,6 @@ impl Pool {
         fitting.filter(|resource| resource.owner.as_ref() == Some(session)).map(|r| r.quantity()).sum()
     }
 
-    /// Whether a session has said that it cannot provide more of one of these kinds.
-    pub fn is_short(&self, session: &SessionId, kinds: &[String]) -> bool {
-        self.shortages.get(session).is_some_and(|short| kinds.iter().any(|kind| short.contains_key(kind)))
-    }
-
     /// A provider says why there are no more of a kind, to those who wait for it; an empty reason takes that back. It goes with the
     /// session.
     ///

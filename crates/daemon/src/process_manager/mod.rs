@@ -116,7 +116,13 @@ pub async fn run_as(
         ttl: Duration::from_millis(config.session_ttl_ms),
         wanted: to_offer,
         there: Some(Turnover { told, leaving }),
-        demand: Some(DemandLink { kinds: config.kinds(), heard, shortages, used }),
+        demand: Some(DemandLink {
+            kinds: config.kinds(),
+            attributes: offered::attributes(&config.host, &config.labels),
+            heard,
+            shortages,
+            used,
+        }),
     };
     let linked = tokio::spawn(link.keep(shutdown.clone()));
     let machine = Machine { config: config.machine.clone(), labels: config.labels.clone(), host };

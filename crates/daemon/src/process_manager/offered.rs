@@ -7,6 +7,7 @@ use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
 use ratn_proto::types::{Resource, WorkerStatus};
 use ratn_worker::endpoint::Endpoint;
+use std::collections::BTreeMap;
 
 const MIB: u64 = 1 << 20;
 
@@ -46,9 +47,14 @@ pub(super) fn worker(host: &str, labels: &Labels, worker: &WorkerStatus, kind: &
     resource.with_attribute("pid", Value::Int(i64::from(worker.pid)))
 }
 
+/// What everything of a host has in common, with every worker of it that there may ever be.
+pub(super) fn attributes(host: &str, labels: &Labels) -> BTreeMap<String, Value> {
+    let labels = labels.iter().map(|(name, label)| (name.clone(), label.into()));
+    labels.chain([("host".to_owned(), Value::String(host.to_owned()))]).collect()
+}
+
 fn of_host(id: String, class: ResourceClass, kind: &str, host: &str, labels: &Labels) -> Resource {
-    let resource = Resource::new(id, class, kind).with_attribute("host", Value::String(host.to_owned())).on_host(host);
-    labels.iter().fold(resource, |resource, (name, label)| resource.with_attribute(name, label.into()))
+    Resource { attributes: attributes(host, labels), ..Resource::new(id, class, kind).on_host(host) }
 }
 
 fn rounded(number: f64) -> Value {

@@ -140,6 +140,10 @@ impl Needs {
         memory.into_iter().chain(cores).min()
     }
 
+    pub(crate) fn is_something(&self) -> bool {
+        *self != Needs::default()
+    }
+
     pub(crate) fn words(&self) -> String {
         let memory = self.free_memory_mib.map(|mib| format!("{mib} MiB of free memory"));
         let cores = self.idle_cores.map(|cores| format!("{cores} idle cores"));

@@ -1,19 +1,52 @@
 //! The providers that listen: each is told what is asked of it.
 
-use super::handout::{HandOut, Missing, Provider};
-use ratn_model::resource::Quantity;
+use super::handout::{HandOut, Missing, Part};
+use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
 use ratn_proto::types::Demand;
 use ratn_resources::{Pool, SessionId};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::time::Duration;
 use tokio::sync::watch;
+
+/// What somebody can provide.
+#[derive(Debug, Default)]
+pub(super) struct Provisions {
+    /// Kinds, and how many of each at the most.
+    pub(super) kinds: BTreeMap<String, u32>,
+    /// What all of it has in common.
+    pub(super) attributes: BTreeMap<String, Value>,
+}
+
+/// Who can provide.
+#[derive(Debug)]
+struct Provider {
+    session: SessionId,
+    provisions: Provisions,
+    /// Kinds of which there can only be so many for now.
+    bounds: BTreeMap<String, u32>,
+    listener: watch::Sender<Vec<Demand>>,
+}
+
+impl Provider {
+    /// Of how many more it can be asked; nothing where none that it has would do.
+    fn room(&self, demand: &ratn_resources::Demand, provided: u32) -> Option<u32> {
+        if !demand.requirement.accepts(|name| self.provisions.attributes.get(name).map(Cow::Borrowed)) {
+            return None;
+        }
+        let kinds = demand.kinds.iter().filter_map(|kind| Some((kind, *self.provisions.kinds.get(kind)?)));
+        let most = |(kind, most): (&String, u32)| self.bounds.get(kind).map_or(most, |bound| most.min(*bound));
+        kinds.map(most).reduce(u32::saturating_add).map(|most| most.saturating_sub(provided))
+    }
+}
 
 /// See the module.
 #[derive(Debug)]
 pub(super) struct Providers {
     /// The first to come is asked first.
-    all: Vec<(Provider, watch::Sender<Vec<Demand>>)>,
+    all: Vec<Provider>,
     hand_out: HandOut,
     /// Something is to be told that nobody was told yet.
     news: bool,
@@ -29,21 +62,27 @@ impl Providers {
     pub(super) fn join(
         &mut self,
         session: SessionId,
-        kinds: BTreeMap<String, u32>,
+        provisions: Provisions,
         most: usize,
     ) -> Result<watch::Receiver<Vec<Demand>>, usize> {
-        self.all.retain(|(_, listener)| !listener.is_closed());
+        self.all.retain(|provider| !provider.listener.is_closed());
         if self.all.len() >= most {
             return Err(self.all.len());
         }
-        let (tell, told) = watch::channel(Vec::new());
-        self.all.push((Provider { session, kinds }, tell));
+        let (listener, told) = watch::channel(Vec::new());
+        self.all.push(Provider { session, provisions, bounds: BTreeMap::new(), listener });
         self.news = true;
         Ok(told)
     }
 
-    /// What providers say has changed.
-    pub(super) fn changed(&mut self) {
+    /// Of this kind there can only be so many of a provider for now, or as many as it said at first.
+    pub(super) fn bound(&mut self, session: &SessionId, kind: &str, most: Option<u32>) {
+        for provider in self.all.iter_mut().filter(|provider| provider.session == *session) {
+            match most {
+                Some(most) => provider.bounds.insert(kind.to_owned(), most),
+                None => provider.bounds.remove(kind),
+            };
+        }
         self.news = true;
     }
 
@@ -57,41 +96,35 @@ impl Providers {
         let somebody_is_asked = || self.deadline().is_some();
         self.news
             || self.deadline().is_some_and(|at| at <= now)
-            || (somebody_is_asked() && self.all.iter().any(|(_, listener)| listener.is_closed()))
+            || (somebody_is_asked() && self.all.iter().any(|provider| provider.listener.is_closed()))
     }
 
     /// Tells each what of this is asked of it.
     pub(super) fn tell(&mut self, now: Timestamp, pool: &Pool, demands: &[ratn_resources::Demand]) {
         self.news = false;
-        self.all.retain(|(provider, listener)| !listener.is_closed() && pool.has_session(&provider.session));
-        let providers: Vec<Provider> = self.all.iter().map(|(provider, _)| provider.clone()).collect();
+        self.all.retain(|provider| !provider.listener.is_closed() && pool.has_session(&provider.session));
+        let part = |provider: &Provider, demand: &ratn_resources::Demand| {
+            let provided = pool.provided(&provider.session, demand).units();
+            Part { provided, room: provider.room(demand, provided) }
+        };
         let missing = |demand: &ratn_resources::Demand| Missing {
-            selector: format!(
-                "{:?}",
-                ratn_model::resource::Requirement { count: Quantity::ONE, ..demand.requirement.clone() }
-            ),
-            kinds: demand.kinds.clone(),
+            selector: format!("{:?}", Requirement { count: Quantity::ONE, ..demand.requirement.clone() }),
             // Whole resources are provided, also for parts of them.
             count: demand.requirement.count.units_up(),
-            of: providers
-                .iter()
-                .map(|p| (pool.provided(&p.session, demand).units(), pool.is_short(&p.session, &demand.kinds)))
-                .collect(),
+            of: self.all.iter().map(|provider| part(provider, demand)).collect(),
         };
         let missing: Vec<Missing> = demands.iter().map(missing).collect();
-        let asked = self.hand_out.hand_out(now, &providers, &missing);
-        for (index, (_, listener)) in self.all.iter().enumerate() {
+        let sessions: Vec<SessionId> = self.all.iter().map(|provider| provider.session.clone()).collect();
+        let asked = self.hand_out.hand_out(now, &sessions, &missing);
+        for (index, provider) in self.all.iter().enumerate() {
             let of_it = demands.iter().enumerate().filter(|(at, _)| asked[index][*at] > 0);
             let demand = |(at, demand): (usize, &ratn_resources::Demand)| Demand {
-                requirement: ratn_model::resource::Requirement {
-                    count: asked[index][at].into(),
-                    ..demand.requirement.clone()
-                },
+                requirement: Requirement { count: asked[index][at].into(), ..demand.requirement.clone() },
                 kinds: demand.kinds.clone(),
-                provided: missing[at].of[index].0.into(),
+                provided: missing[at].of[index].provided.into(),
             };
             let told: Vec<Demand> = of_it.map(demand).collect();
-            listener.send_if_modified(|before| {
+            provider.listener.send_if_modified(|before| {
                 let changed = *before != told;
                 *before = told;
                 changed

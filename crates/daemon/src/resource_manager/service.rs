@@ -1,6 +1,7 @@
 //! gRPC in front of the actor: checks what the schema cannot say, and undoes what a dropped call was about to get.
 
 use super::actor::{Handle, Message};
+use super::providers::Provisions;
 use super::{Granted, wire};
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
@@ -10,7 +11,7 @@ use crate::owners::Owners;
 use futures::{Stream, StreamExt};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Lease, Requirement, ResourceOperation};
-use ratn_proto::convert::{all, each, label, name, names, required};
+use ratn_proto::convert::{all, each, label, name, names, ports, required};
 use ratn_proto::types::{Resource, ResourceFilter, ResourceUpdate, WatchPosition};
 use ratn_proto::v1;
 use ratn_resources::{AcquireRequest, Reply, Request as PoolRequest, ResourceSpec, SessionId};
@@ -320,8 +321,11 @@ impl v1::resource_service_server::ResourceService for Service {
         for (index, provision) in request.provisions.iter().enumerate() {
             name(&provision.kind, &format!("provisions[{index}].kind"))?;
         }
-        let kinds = request.provisions.into_iter().map(|provision| (provision.kind, provision.most)).collect();
-        let mut demand = self.actor.ask(|answer| Message::WatchDemand { session, kinds, answer }).await??;
+        let provisions = Provisions {
+            kinds: request.provisions.into_iter().map(|provision| (provision.kind, provision.most)).collect(),
+            attributes: ports(request.attributes, "attributes")?,
+        };
+        let mut demand = self.actor.ask(|answer| Message::WatchDemand { session, provisions, answer }).await??;
         demand.mark_changed();
         let stream = futures::stream::unfold(demand, async |mut demand| {
             demand.changed().await.ok()?;
@@ -336,11 +340,11 @@ impl v1::resource_service_server::ResourceService for Service {
         request: Request<v1::ReportShortageRequest>,
     ) -> Result<Response<v1::ReportShortageResponse>, Status> {
         let caller = Caller::of(&request);
-        let v1::ReportShortageRequest { session_id, kind, reason } = request.into_inner();
+        let v1::ReportShortageRequest { session_id, kind, reason, most } = request.into_inner();
         name(&kind, "kind")?;
         label(&reason, "reason")?;
         let session = self.session(&caller, &session_id)?;
-        self.actor.ask(|answer| Message::ReportShortage { session, kind, reason, answer }).await??;
+        self.actor.ask(|answer| Message::ReportShortage { session, kind, most, reason, answer }).await??;
         Ok(Response::new(v1::ReportShortageResponse {}))
     }
 

@@ -97,13 +97,23 @@ impl TestSystem {
         host: &str,
         templates: Vec<process_manager::Template>,
     ) -> Daemon {
+        let config = process_manager::ProcessManagerConfig { templates, ..Default::default() };
+        self.process_manager_as(manager, host, config).await
+    }
+
+    /// The same with a config, of which the host is said besides.
+    pub(crate) async fn process_manager_as(
+        &self,
+        manager: &Daemon,
+        host: &str,
+        config: process_manager::ProcessManagerConfig,
+    ) -> Daemon {
         let directory = RuntimeDirectory::create(self.parent.path().join(host)).unwrap();
         let config = process_manager::ProcessManagerConfig {
             listen: directory.socket("pm"),
             host: host.to_owned(),
             resource_manager: Some(manager.endpoint.clone()),
-            templates,
-            ..Default::default()
+            ..config
         };
         let shutdown = CancellationToken::new();
         let running = tokio::spawn(process_manager::run(config, directory.clone(), shutdown.clone()));

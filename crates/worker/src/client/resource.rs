@@ -6,8 +6,9 @@ use crate::endpoint::Endpoint;
 use crate::trace::Traced;
 use ratn_model::id::LeaseId;
 use ratn_model::resource::{Lease, Requirement};
+use ratn_model::value::Value;
 use ratn_proto::MAX_MESSAGE_BYTES;
-use ratn_proto::convert::{Malformed, all, each, required};
+use ratn_proto::convert::{Malformed, all, each, required, wire_ports};
 use ratn_proto::types::{
     Demand, Resource, ResourceFilter, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition,
 };
@@ -313,26 +314,35 @@ impl ResourceClient {
         Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
-    /// Tells a provider of so many of these kinds at the most what is asked of it: what is missing at first, and then whenever that
-    /// changes.
+    /// Tells a provider of so many of these kinds at the most, all with these attributes, what is asked of it: what is missing at
+    /// first, and then whenever that changes.
     ///
     /// # Errors
     /// [`CallError`].
-    pub async fn watch_demand(&self, kinds: &BTreeMap<String, u32>) -> Result<DemandWatch, CallError> {
+    pub async fn watch_demand(
+        &self,
+        kinds: &BTreeMap<String, u32>,
+        attributes: &BTreeMap<String, Value>,
+    ) -> Result<DemandWatch, CallError> {
         let provision = |(kind, most): (&String, &u32)| v1::Provision { kind: kind.clone(), most: *most };
         let provisions = kinds.iter().map(provision).collect();
-        let question = v1::WatchDemandRequest { session_id: self.session.clone(), provisions };
+        let question = v1::WatchDemandRequest {
+            session_id: self.session.clone(),
+            provisions,
+            attributes: wire_ports(attributes.clone()),
+        };
         let answer = self.client.clone().watch_demand(question).await.map_err(|status| self.failed(&status))?;
         Ok(DemandWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
-    /// Says to those who wait for a kind why there are no more of it; an empty reason takes that back.
+    /// Says to those who wait for a kind why there are at most so many of it for now; an empty reason takes that back. More than that is
+    /// not asked of this provider.
     ///
     /// # Errors
     /// [`CallError`].
-    pub async fn report_shortage(&self, kind: &str, reason: &str) -> Result<(), CallError> {
+    pub async fn report_shortage(&self, kind: &str, most: u32, reason: &str) -> Result<(), CallError> {
         let (session_id, kind, reason) = (self.session.clone(), kind.to_owned(), reason.to_owned());
-        let question = v1::ReportShortageRequest { session_id, kind, reason };
+        let question = v1::ReportShortageRequest { session_id, kind, reason, most };
         self.client.clone().report_shortage(question).await.map(drop).map_err(|status| self.failed(&status))
     }
 

@@ -16,6 +16,7 @@ mod restart;
 mod size;
 mod worker;
 
+pub use crate::demand::Shortage;
 pub use command::{Command, Event, PoolError};
 
 use super::config::Labels;
@@ -234,11 +235,15 @@ impl Pools {
         commands
     }
 
-    /// Why there are no more workers of a kind, by kind.
-    pub fn shortages(&self) -> BTreeMap<String, String> {
-        let drained = self.draining.then(|| format!("the host `{}` is drained", self.host));
-        let shortage = |pool: &Pool| drained.clone().or_else(|| pool.shortage());
-        self.pools.values().filter_map(|pool| Some((pool.template().kind.clone(), shortage(pool)?))).collect()
+    /// Of which kinds there can be no more workers for now, and why. Of several templates of a kind the first counts, as for demand.
+    pub fn shortages(&self) -> BTreeMap<String, Shortage> {
+        let drained = || Shortage { most: 0, reason: format!("the host `{}` is drained", self.host) };
+        let shortage = |pool: &Pool| if self.draining { Some(drained()) } else { pool.shortage() };
+        let mut first = BTreeMap::new();
+        for pool in self.pools.values() {
+            first.entry(&pool.template().kind).or_insert_with(|| shortage(pool));
+        }
+        first.into_iter().filter_map(|(kind, shortage)| Some((kind.clone(), shortage?))).collect()
     }
 
     /// Whether no worker is left.

@@ -4,6 +4,7 @@ use super::command::{Command, PoolError};
 use super::restart::Restarts;
 use super::size::{Size, retiring};
 use super::worker::Worker;
+use crate::demand::Shortage;
 use crate::process_manager::machine::Sample;
 use crate::process_manager::readiness::Readiness;
 use crate::process_manager::template::Template;
@@ -38,7 +39,8 @@ impl Pool {
             waits_for: template.after.clone(),
             workers: BTreeMap::new(),
             last_number: 0,
-            room: None,
+            // Until the machine has been looked at.
+            room: template.needs.is_something().then_some(0),
             crashes: 0,
             last_exit: String::new(),
             host: host.to_owned(),
@@ -73,20 +75,22 @@ impl Pool {
         }
     }
 
-    /// Why there are no more workers.
-    pub(super) fn shortage(&self) -> Option<String> {
-        let name = &self.template.name;
-        match self.restarts.failure() {
-            "" if self.room == Some(0) && self.wanted() > self.there() => {
-                Some(format!("`{name}` needs {} for one more worker", self.template.needs.words()))
-            }
-            "" if self.waits() && self.wanted() > 0 => {
-                Some(format!("`{name}` waits until there is a worker of {}", self.waits_for.join(", ")))
-            }
-            "" if self.size.is_short() => Some(format!("`{name}` has {} workers at the most", self.size.bounds().1)),
-            "" => None,
-            failure => Some(format!("`{name}` crash-loops: {failure}")),
-        }
+    /// There can be no more workers than so many for now, and why.
+    pub(super) fn shortage(&self) -> Option<Shortage> {
+        let (name, there, (min, max, _)) = (&self.template.name, self.there(), self.size.bounds());
+        let room = self.room.map(|room| there.saturating_add(room).max(min)).filter(|most| *most < max);
+        let (most, reason) = if self.restarts.has_failed() {
+            (there, format!("`{name}` crash-loops: {}", self.restarts.failure()))
+        } else if self.waits() {
+            (there, format!("`{name}` waits until there is a worker of {}", self.waits_for.join(", ")))
+        } else if let Some(most) = room {
+            (most, format!("`{name}` needs {} for one more worker", self.template.needs.words()))
+        } else if self.size.is_short() || max < self.template.max_workers() {
+            (max, format!("`{name}` has {max} workers at the most"))
+        } else {
+            return None;
+        };
+        Some(Shortage { most, reason })
     }
 
     /// When time alone changes something.

@@ -24,6 +24,10 @@ impl Deref for Rig {
     }
 }
 
+fn shortage(most: u32, reason: &str) -> Shortage {
+    Shortage { most, reason: reason.to_owned() }
+}
+
 impl Rig {
     fn take_commands(&mut self) -> Vec<Command> {
         std::mem::take(&mut self.commands)
@@ -301,7 +305,7 @@ fn for_those_who_wait_workers_are_started_once_and_up_to_the_maximum() {
     assert_eq!((started(&mut pools).len(), pools.shortages().len()), (0, 0));
     pools.demanded(now, &demand(1, 9));
     assert_eq!(started(&mut pools).len(), 1);
-    assert_eq!(pools.shortages()["PathPlanner"], "`planner` has 3 workers at the most");
+    assert_eq!(pools.shortages()["PathPlanner"], shortage(3, "`planner` has 3 workers at the most"));
     // Nobody waits any more: what does not serve yet is ended, the other one stays.
     pools.demanded(now, &[]);
     let ended: Vec<Command> = pools.take_commands();
@@ -416,7 +420,7 @@ fn a_template_starts_after_those_it_waits_for() {
     let mut pools = Rig { pools, commands: Vec::new() };
     pools.advance(at(0.0));
     assert_eq!(started(&mut pools), ["c-1@compute"]);
-    assert_eq!(pools.shortages()["Any"], "`b` waits until there is a worker of c");
+    assert_eq!(pools.shortages()["Any"], shortage(0, "`a` waits until there is a worker of b, c"));
     pools.bring_up(at(1.0), "c-1@compute");
     assert_eq!(started(&mut pools), ["b-1@compute"]);
     // What has ended since was there.
@@ -496,7 +500,7 @@ fn a_drained_host_starts_nothing_whoever_asks_and_all_of_it_again_when_that_is_o
     let commands = pools.pools.drain(at(1.0), true);
     assert_eq!(commands, [Command::Retire { id: "planner-1@compute".into() }]);
     assert_eq!(pools.pools.spawn(at(1.0), "planner", 1), Err(PoolError::Drained { host: "compute".into() }));
-    assert_eq!(pools.shortages()["PathPlanner"], "the host `compute` is drained");
+    assert_eq!(pools.shortages()["PathPlanner"], shortage(0, "the host `compute` is drained"));
     pools.demanded(at(2.0), &demand(0, 2));
     pools.used(at(3.0), "planner-1@compute", false);
     pools.handle(at(3.0), Event::Withdrawn { id: "planner-1@compute".into() });
@@ -531,9 +535,11 @@ fn more_than_the_minimum_are_started_only_where_the_machine_has_room() {
     pools.handle(at(1.0), free(1_000));
     pools.demanded(at(1.0), &demand(1, 3));
     assert_eq!(started(&mut pools), [] as [&str; 0]);
-    assert_eq!(pools.shortages()["PathPlanner"], "`planner` needs 2048 MiB of free memory for one more worker");
+    let at_most = |most| shortage(most, "`planner` needs 2048 MiB of free memory for one more worker");
+    assert_eq!(pools.shortages()["PathPlanner"], at_most(1));
     pools.handle(at(2.0), free(5_000));
     assert_eq!(started(&mut pools), ["planner-2@compute", "planner-3@compute"]);
+    assert_eq!(pools.shortages()["PathPlanner"], at_most(3), "those that are starting count");
     pools.handle(at(3.0), free(5_000));
     assert_eq!(started(&mut pools), [] as [&str; 0], "those have not taken theirs yet");
     for id in ["planner-2@compute", "planner-3@compute"] {
@@ -541,5 +547,17 @@ fn more_than_the_minimum_are_started_only_where_the_machine_has_room() {
     }
     pools.handle(at(5.0), free(3_000));
     assert_eq!(started(&mut pools), ["planner-4@compute"]);
-    assert!(pools.shortages().is_empty());
+    assert_eq!(pools.shortages()["PathPlanner"], at_most(4));
+    pools.handle(at(6.0), free(5_000));
+    assert!(pools.shortages().is_empty(), "for the fifth there is room");
+}
+
+#[test]
+fn a_machine_that_was_not_looked_at_has_room_for_the_minimum_only() {
+    let mut pools = pools(|template| {
+        template.max = Some(5);
+        template.needs = Needs { free_memory_mib: Some(1), idle_cores: None };
+    });
+    pools.demanded(at(0.0), &demand(0, 3));
+    assert_eq!(started(&mut pools), ["planner-1@compute"]);
 }

@@ -1,10 +1,10 @@
 //! What is missing, for those who can provide it.
 
+use super::super::providers::Provisions;
 use super::Actor;
 use crate::details::retry_later;
 use ratn_proto::types::Demand;
 use ratn_resources::SessionId;
-use std::collections::BTreeMap;
 use std::time::Duration;
 use tokio::sync::watch;
 use tonic::{Code, Status};
@@ -13,9 +13,9 @@ impl Actor {
     pub(super) fn watch_demand(
         &mut self,
         session: SessionId,
-        kinds: BTreeMap<String, u32>,
+        provisions: Provisions,
     ) -> Result<watch::Receiver<Vec<Demand>>, Status> {
-        self.providers.join(session, kinds, self.config.max_watchers).map_err(|there| {
+        self.providers.join(session, provisions, self.config.max_watchers).map_err(|there| {
             let message = format!("{there} providers watch already");
             retry_later(Code::ResourceExhausted, "TOO_MANY", message, Duration::from_secs(1))
         })

@@ -1,5 +1,6 @@
 //! What the service asks of the actor, and how it gets there.
 
+use super::super::providers::Provisions;
 use crate::details::ending;
 use crate::resource_manager::Granted;
 use ratn_model::id::{LeaseId, Revision};
@@ -7,7 +8,6 @@ use ratn_model::resource::Requirement;
 use ratn_proto::types::{Demand, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition};
 use ratn_resources::{AcquireRequest, Quantity, Reply, Request, ResourceView, SessionId};
 use std::cmp::Reverse;
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
@@ -82,13 +82,13 @@ pub(in super::super) enum Message {
     },
     WatchDemand {
         session: SessionId,
-        /// What it can provide: kinds, and how many of each at the most.
-        kinds: BTreeMap<String, u32>,
+        provisions: Provisions,
         answer: Answer<watch::Receiver<Vec<Demand>>>,
     },
     ReportShortage {
         session: SessionId,
         kind: String,
+        most: u32,
         reason: String,
         answer: Answer<()>,
     },

@@ -246,13 +246,15 @@ impl Actor {
             Message::List { answer } => self.tell(answer, (self.pool.list(), self.pool.revision())),
             Message::Revision { answer } => self.tell(answer, self.pool.revision()),
             Message::Sessions { answer } => self.tell(answer, self.sessions()),
-            Message::WatchDemand { session, kinds, answer } => {
-                let watch = self.watch_demand(session, kinds);
+            Message::WatchDemand { session, provisions, answer } => {
+                let watch = self.watch_demand(session, provisions);
                 self.reply(answer, watch);
             }
-            Message::ReportShortage { session, kind, reason, answer } => {
+            Message::ReportShortage { session, kind, most, reason, answer } => {
                 let reported = self.pool.report_shortage(now, &session, &kind, &reason);
-                self.providers.changed();
+                if reported.is_ok() {
+                    self.providers.bound(&session, &kind, (!reason.is_empty()).then_some(most));
+                }
                 self.reply(answer, reported.map_err(|error| status::of_error(&error)));
             }
             Message::Explain { request_id, answer } => {
