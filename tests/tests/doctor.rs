@@ -28,12 +28,16 @@ fn write(place: &Place, name: &str, text: &str) -> anyhow::Result<String> {
 fn examined(place: &Place, config: &str) -> anyhow::Result<(Option<i32>, Vec<String>)> {
     let output = place.ratn(&["doctor", "--quiet", "--json", "--config", config]).output()?;
     let (out, err) = texts(&output);
-    let document: Value = serde_json::from_str(&out).with_context(|| format!("{out} {err}"))?;
+    Ok((output.status.code(), findings(&out).with_context(|| err)?))
+}
+
+fn findings(out: &str) -> anyhow::Result<Vec<String>> {
+    let document: Value = serde_json::from_str(out).with_context(|| out.to_owned())?;
     let findings = document["findings"].as_array().context("findings")?;
     let text = |finding: &Value, key: &str| finding[key].as_str().unwrap_or_default().to_owned();
     let line = |f: &Value| format!("{} {}: {}", text(f, "level"), text(f, "about"), text(f, "found"));
     ensure!(findings.iter().all(|finding| !text(finding, "help").is_empty()), "what to do is not said: {out}");
-    Ok((output.status.code(), findings.iter().map(line).collect()))
+    Ok(findings.iter().map(line).collect())
 }
 
 fn says(findings: &[String], what: &str) -> anyhow::Result<()> {
@@ -112,6 +116,25 @@ fn what_is_wrong_with_a_config_on_this_machine_is_said() -> anyhow::Result<()> {
     says(&examined(&place, &exposed)?.1, "problem [cell] listen: http://0.0.0.0:0 can be reached")?;
     let bad = write(&place, "bad.toml", "sped = 1\n")?;
     says(&examined(&place, &bad)?.1, "unknown field `sped`")
+}
+
+#[test]
+fn too_few_open_files_for_the_pools_are_a_problem_only_where_the_hard_limit_has_fewer() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let config = write(&place, "ratn.toml", &format!("{GOOD}max = 50\n"))?;
+    let found = |limits: &str| -> anyhow::Result<Vec<String>> {
+        let ratn = place.ratn(&["doctor", "--quiet", "--json", "--config", &config]);
+        let mut limited = place.within("/bin/sh", &["-c", &format!("{limits} && exec \"$0\" \"$@\"")]);
+        let output = limited.arg(ratn.get_program()).args(ratn.get_args()).output()?;
+        findings(&texts(&output).0)
+    };
+    says(
+        &found("ulimit -Sn 500 && ulimit -Hn 500")?,
+        "problem open files: 500 may be open at once; a process manager of 50",
+    )?;
+    let raised = found("ulimit -Sn 500 && ulimit -Hn 1000")?;
+    ensure!(!raised.iter().any(|finding| finding.contains("open files")), "it raises its limit itself: {raised:#?}");
+    Ok(())
 }
 
 #[test]

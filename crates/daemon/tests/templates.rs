@@ -3,10 +3,11 @@
 
 mod support;
 
-use ratn_daemon::process_manager::{Limits, Liveness, Parameter, Readiness, Template};
+use ratn_daemon::process_manager::{Limits, Liveness, Parameter, ROLE, Readiness, Template};
 use ratn_proto::types::ResourceEventKind;
+use ratn_worker::client::ProcessClient;
 use std::time::Duration;
-use support::{Daemon, TestSystem, in_time};
+use support::{DEADLINE, Daemon, TestSystem, in_time};
 
 /// A shell that runs `script`.
 fn shell(script: &str, readiness: Readiness) -> Template {
@@ -76,10 +77,41 @@ async fn a_worker_gets_its_parameters_a_clean_environment_its_directory_and_its_
     assert!(log.starts_with("mode=fast manifest=none package=ratn-daemon level=7\nin=/usr\n"), "{log}");
     let status = system.processes(&processes).pools().await.unwrap().pools[0].workers[0].clone();
     assert_eq!(status.limits, "cpus not limited: no cgroup, 77 open files (rlimit)");
-    let limits = std::fs::read_to_string(format!("/proc/{}/limits", status.pid)).unwrap();
-    let files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();
-    assert_eq!(files.split_whitespace().nth(3), Some("77"));
+    assert_eq!(open_files(status.pid), ["77", "77"]);
     processes.end().await;
+}
+
+/// The soft and the hard limit of a process.
+fn open_files(pid: u32) -> [String; 2] {
+    let limits = std::fs::read_to_string(format!("/proc/{pid}/limits")).unwrap();
+    let files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();
+    let mut words = files.split_whitespace().skip(3).map(str::to_owned);
+    [words.next().unwrap(), words.next().unwrap()]
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_process_manager_may_open_all_files_that_it_can_and_its_worker_as_many_as_it_was_started_with() {
+    let system = TestSystem::new();
+    let (program, directory) = (env!("CARGO_BIN_EXE_ratn-test-worker"), system.directory.path());
+    let script = r#"ulimit -Sn 300 && ulimit -Hn 900 && exec "$0" manage "$1""#;
+    let mut command = tokio::process::Command::new("/bin/sh");
+    let mut manager = command.args(["-c", script, program]).arg(directory).kill_on_drop(true).spawn().unwrap();
+    let endpoint = system.directory.wait_for(ROLE, DEADLINE).await.unwrap();
+    let client = ProcessClient::new(&system.channels, &endpoint).unwrap();
+    let worker = in_time(async {
+        loop {
+            let worker = client.pools().await.unwrap().pools.remove(0).workers.pop();
+            // It is ready after its limits were set.
+            if let Some(worker) = worker.filter(|worker| !worker.endpoint.is_empty()) {
+                break worker.pid;
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    })
+    .await;
+    assert_eq!(open_files(worker), ["300", "900"]);
+    assert_eq!(open_files(manager.id().unwrap()), ["900", "900"]);
+    manager.kill().await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -32,7 +32,12 @@ impl Place {
 
     /// `ratn …`, with its temporary files here, and away from any system that the user runs.
     pub(crate) fn ratn(&self, arguments: &[&str]) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_ratn-under-test"));
+        self.within(env!("CARGO_BIN_EXE_ratn-under-test"), arguments)
+    }
+
+    /// Another program in the same surroundings.
+    pub(crate) fn within(&self, program: &str, arguments: &[&str]) -> Command {
+        let mut command = Command::new(program);
         command.args(arguments).env("TMPDIR", self.path()).env("RATN_RUNTIME_DIR", self.path().join("run"));
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         command

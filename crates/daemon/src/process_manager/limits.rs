@@ -3,6 +3,7 @@
 //!
 //! They are set right after the process is started: nothing may run in the child before its program does.
 
+use super::open_files;
 use crate::config::{ConfigError, rule};
 use rustix::process::{Pid, Resource, Rlimit, prlimit};
 use serde::{Deserialize, Serialize};
@@ -98,6 +99,11 @@ impl Limits {
         force.words.extend(missing.cpus.map(|_| "cpus not limited: no cgroup".to_owned()));
         force.words.extend(missing.processes.map(|_| "processes not limited: no cgroup".to_owned()));
         force.limit(pid, Resource::Nofile, self.open_files, |count| format!("{count} open files (rlimit)"));
+        if self.open_files.is_none()
+            && let Err(error) = open_files::give_back(pid)
+        {
+            tracing::warn!(id, %error, "a worker keeps the process manager's limit of open files");
+        }
         force
     }
 

@@ -19,6 +19,7 @@ pub mod log_file;
 mod log_stream;
 mod machine;
 mod offered;
+mod open_files;
 mod order;
 mod parameter;
 pub mod pools;
@@ -87,6 +88,9 @@ pub async fn run_as(
     serving: Serving,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
+    if let Err(error) = open_files::raise() {
+        tracing::warn!(%error, "the limit of open files stays as it is");
+    }
     for obstacle in config.obstacles() {
         tracing::warn!("{obstacle}: its workers cannot be started");
     }

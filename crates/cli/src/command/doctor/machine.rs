@@ -109,10 +109,11 @@ fn room(findings: &mut Findings, what: &str, directory: &Path) {
 
 fn files(findings: &mut Findings, workers: u64) {
     let needed = OWN_FILES + FILES_PER_WORKER * workers;
-    let Ok((soft, _)) = getrlimit(Resource::RLIMIT_NOFILE) else { return };
-    let found = format!("{soft} may be open at once; a process manager of {workers} workers needs some {needed}");
-    if soft < needed {
-        findings.problem("open files", found, format!("ulimit -n {needed}, or LimitNOFILE={needed} in its unit"));
+    // A process manager takes all that it may have.
+    let Ok((_, hard)) = getrlimit(Resource::RLIMIT_NOFILE) else { return };
+    let found = format!("{hard} may be open at once; a process manager of {workers} workers needs some {needed}");
+    if hard < needed {
+        findings.problem("open files", found, format!("ulimit -Hn {needed}, or LimitNOFILE={needed} in its unit"));
     } else {
         findings.ok("open files", found);
     }
