@@ -191,6 +191,7 @@ impl Shell {
     /// Hands an event to the executive, and what it commands to whoever does it.
     fn step(&mut self, event: Event) -> anyhow::Result<Option<Ended>> {
         let (now, commands) = self.decide(&event)?;
+        self.performer.prepare(&event, &commands);
         self.perform(now, commands)
     }
 

@@ -2,6 +2,7 @@
 //! [`super::record`]. Never waits: every answer comes back as an event.
 
 mod goal;
+mod handover;
 mod resume;
 #[cfg(test)]
 mod tests;
@@ -19,6 +20,7 @@ use crate::output;
 use anyhow::{Context, bail};
 use futures::FutureExt;
 use goal::{Given, Performing};
+use handover::{Handover, Leases};
 use ratn_executive::protocol::{Command, Event, Goal};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::FactKey;
@@ -92,6 +94,9 @@ pub(super) struct Performer {
     following: Option<AbortOnDropHandle<()>>,
     cancelled: Cancelled,
     asking: BTreeMap<InstanceId, Asking>,
+    leases: Leases,
+    /// Of the commands that are performed now.
+    handover: Option<Handover>,
     jobs: BTreeMap<InstanceId, Job>,
     giving_back: JoinSet<()>,
     acquires: u64,
@@ -105,6 +110,7 @@ pub(super) struct Performer {
 /// An acquire under way.
 struct Asking {
     request: String,
+    requirements: Vec<Requirement>,
     since: Instant,
     withdrawn: CancellationToken,
 }
@@ -166,6 +172,8 @@ impl Performer {
             following: None,
             cancelled,
             asking: BTreeMap::new(),
+            leases: Leases::default(),
+            handover: None,
             jobs: BTreeMap::new(),
             giving_back: JoinSet::new(),
             acquires: 0,
@@ -195,6 +203,12 @@ impl Performer {
         self.session.lost().await;
     }
 
+    /// What the executive made of an event is performed next, all of it.
+    pub(super) fn prepare(&mut self, event: &Event, commands: &[Command]) {
+        let waiting = self.asking.values().map(|asking| asking.requirements.as_slice());
+        self.handover = self.leases.handover(event, commands, waiting, Instant::now());
+    }
+
     /// Begins to perform a command.
     pub(super) fn perform(&mut self, command: Command) -> anyhow::Result<()> {
         while self.giving_back.try_join_next().is_some() {}
@@ -220,7 +234,11 @@ impl Performer {
                     self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).insert((instance, attempt));
                 }
             },
-            Command::Release { instance, lease, projection } => self.release(instance, lease, projection),
+            Command::Release { instance, lease, projection } => {
+                let goes_back = |id: &LeaseId| self.handover.as_ref().is_none_or(|handover| handover.lease.id != *id);
+                let lease = lease.filter(goes_back);
+                self.release(instance, lease, projection);
+            }
             Command::Commit { instance, writer, changes, evidence, revision } => {
                 let decided = Decided { instance, writer, changes, evidence, revision };
                 self.outside.decided(&self.run, &decided);
@@ -267,8 +285,14 @@ impl Performer {
     fn acquire(&mut self, instance: InstanceId, number: u64, requirements: Vec<Requirement>, priority: i64) {
         let withdrawn = CancellationToken::new();
         let request = acquire_request(&self.run, instance, number, self.resumptions);
-        let asked = Asking { request: request.clone(), since: Instant::now(), withdrawn: withdrawn.clone() };
+        let asked = Asking {
+            request: request.clone(),
+            requirements: requirements.clone(),
+            since: Instant::now(),
+            withdrawn: withdrawn.clone(),
+        };
         self.asking.insert(instance, asked);
+        let handed = self.handover.as_ref().filter(|handover| handover.to == instance).map(|one| one.lease.clone());
         let options = AcquireOptions {
             request,
             priority,
@@ -278,13 +302,16 @@ impl Performer {
         let (resources, events) = (self.resources.clone(), self.events.clone());
         let mut asking = Box::pin(trace::within(self.trace.child(), async move {
             let ask = || resources.acquire(requirements.clone(), options.clone());
-            let answer = tokio::select! {
-                answer = patiently(ask) => answer,
-                () = withdrawn.cancelled() => {
-                    // The call is dropped; what was granted meanwhile goes back.
-                    let _ = patiently(|| resources.withdraw(&options.request)).await;
-                    return;
-                }
+            let answer = match handed {
+                Some(lease) => Ok(lease),
+                None => tokio::select! {
+                    answer = patiently(ask) => answer,
+                    () = withdrawn.cancelled() => {
+                        // The call is dropped; what was granted meanwhile goes back.
+                        let _ = patiently(|| resources.withdraw(&options.request)).await;
+                        return;
+                    }
+                },
             };
             let event = match answer {
                 Ok(lease) => Event::Granted { instance, lease },
@@ -345,7 +372,10 @@ impl Performer {
             Event::Crashed { instance, attempt, .. } if self.was_cancelled(instance, attempt) => None,
             event => {
                 if let Event::Granted { instance, .. } | Event::Refused { instance, .. } = &event {
-                    self.asking.remove(instance);
+                    let asked = self.asking.remove(instance);
+                    if let (Event::Granted { lease, .. }, Some(asked)) = (&event, asked) {
+                        self.leases.granted(lease, asked.requirements, Instant::now());
+                    }
                 }
                 Some(event)
             }
@@ -423,6 +453,9 @@ impl Performer {
         lease: Option<LeaseId>,
         projection: Option<ProjectionId>,
     ) {
+        if let Some(lease) = lease {
+            self.leases.given_back(lease);
+        }
         let (resources, world) = (self.resources.clone(), self.world.clone());
         self.giving_back.spawn(async move {
             // Whoever gets the resources next finds them idle.

@@ -8,6 +8,7 @@ use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_executive::protocol::Origin;
 use ratn_model::fact::{Change, Footprint};
+use ratn_model::program::SUCCESS;
 use ratn_model::resource::ResourceOperation;
 use ratn_model::time::Timestamp;
 use ratn_worker::client::fresh_id;
@@ -74,6 +75,25 @@ impl Bench {
         self.performer.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })
     }
 
+    /// What the executive makes of the end of `ended`: `next` wants what that had.
+    fn goes_on(&mut self, ended: InstanceId, lease: LeaseId, next: InstanceId) -> anyhow::Result<()> {
+        let event = Event::Finished {
+            instance: ended,
+            attempt: 1,
+            outcome: SUCCESS.to_owned(),
+            outputs: BTreeMap::new(),
+            measured: Vec::new(),
+            evidence: Vec::new(),
+            reason: String::new(),
+        };
+        let commands = [
+            Command::Acquire { instance: next, requirements: arm(), priority: 0 },
+            Command::Release { instance: ended, lease: Some(lease), projection: None },
+        ];
+        self.performer.prepare(&event, &commands);
+        commands.into_iter().try_for_each(|command| self.performer.perform(command))
+    }
+
     /// The next event that the executive is given.
     async fn event(&mut self) -> Option<Event> {
         loop {
@@ -126,6 +146,30 @@ async fn an_acquire_of_the_event_that_gave_a_lease_back_can_be_withdrawn() -> an
     bench.performer.perform(Command::Withdraw { instance })?;
     bench.ask(other)?;
     bench.granted(other).await?;
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn the_next_node_takes_a_lease_over_until_others_get_their_turn() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second, third, fourth] = [1, 2, 3, 4].map(InstanceId);
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    bench.goes_on(first, lease, second)?;
+    assert_eq!(bench.granted(second).await?, lease);
+    // Longer than a turn.
+    tokio::time::sleep(Duration::from_millis(150)).await;
+    bench.goes_on(second, lease, third)?;
+    let other = bench.granted(third).await?;
+    assert_ne!(other, lease);
+
+    // One that is not wanted any more when it is taken over goes back.
+    bench.goes_on(third, other, fourth)?;
+    bench.performer.perform(Command::Withdraw { instance: fourth })?;
+    let handed = bench.answers.recv().await;
+    assert_eq!(bench.performer.accept(handed.context("no answer")?, &World::default())?, None);
+    bench.ask(first)?;
+    bench.granted(first).await?;
     bench.performer.close().await
 }
 

@@ -1,0 +1,178 @@
+//! Leases that go from one node to the next without the resource manager: where a goal ends well and the next node wants exactly what
+//! it had, giving it back and asking for it again would cost two calls and come to the same.
+//!
+//! The resource manager sees one lease that lives longer, so others get their turn: nobody of this run may wait for any of it, nothing of
+//! higher priority may want it, and after [`TURN`] it goes back all the same. What depends on the state of a resource (attributes,
+//! conditions, what is there or is used up) is asked anew every time.
+
+use ratn_executive::protocol::{Command, Event};
+use ratn_model::id::{InstanceId, LeaseId};
+use ratn_model::program::SUCCESS;
+use ratn_model::resource::{Lease, Requirement, ResourceOperation};
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+/// How long after its grant a lease may be handed over: so much longer somebody outside this run may wait.
+const TURN: Duration = Duration::from_millis(100);
+
+/// The leases of a run, with what was asked for.
+#[derive(Debug, Default)]
+pub(super) struct Leases(BTreeMap<LeaseId, Held>);
+
+#[derive(Debug)]
+struct Held {
+    lease: Lease,
+    requirements: Vec<Requirement>,
+    granted: Instant,
+}
+
+/// A lease that is handed over.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Handover {
+    pub(super) to: InstanceId,
+    pub(super) lease: Lease,
+}
+
+impl Leases {
+    /// A lease is there; one that was handed over counts from its grant.
+    pub(super) fn granted(&mut self, lease: &Lease, requirements: Vec<Requirement>, now: Instant) {
+        self.0.entry(lease.id).or_insert_with(|| Held { lease: lease.clone(), requirements, granted: now });
+    }
+
+    /// A lease goes back.
+    pub(super) fn given_back(&mut self, lease: LeaseId) {
+        self.0.remove(&lease);
+    }
+
+    /// Who takes over the lease that is given back for this event, if anybody does. `waiting` is what the run has asked for before.
+    pub(super) fn handover<'a>(
+        &self,
+        event: &Event,
+        commands: &[Command],
+        mut waiting: impl Iterator<Item = &'a [Requirement]>,
+        now: Instant,
+    ) -> Option<Handover> {
+        let Event::Finished { instance: ended, outcome, .. } = event else { return None };
+        let given_back = commands.iter().find_map(|command| match command {
+            Command::Release { instance, lease, .. } if instance == ended => *lease,
+            _ => None,
+        });
+        let held = self.0.get(&given_back?)?;
+        if outcome != SUCCESS || now.duration_since(held.granted) >= TURN || waiting.any(|asked| held.is_wanted(asked))
+        {
+            return None;
+        }
+        let asks = commands.iter().rev().filter_map(|command| match command {
+            Command::Acquire { instance, requirements, priority } => Some((*instance, requirements, *priority)),
+            _ => None,
+        });
+        // Of equals the first.
+        let next =
+            asks.filter(|(_, requirements, _)| held.is_wanted(requirements)).max_by_key(|(_, _, priority)| *priority);
+        let (to, requirements, _) = next?;
+        held.serves(requirements).then(|| Handover { to, lease: held.lease.clone() })
+    }
+}
+
+impl Held {
+    /// Whether any of its resources is what is asked for.
+    fn is_wanted(&self, requirements: &[Requirement]) -> bool {
+        requirements.iter().any(|wanted| self.lease.resources.iter().any(|resource| resource.is_a(&wanted.kind)))
+    }
+
+    fn serves(&self, requirements: &[Requirement]) -> bool {
+        let plain = |wanted: &Requirement| {
+            wanted.operation == ResourceOperation::Block && wanted.attributes.is_empty() && wanted.conditions.is_empty()
+        };
+        requirements == self.requirements && requirements.iter().all(plain)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_model::id::FencingToken;
+    use ratn_model::resource::LeasedResource;
+    use ratn_model::value::Value;
+    use std::slice::from_ref;
+
+    const FIRST: InstanceId = InstanceId(1);
+
+    fn planner() -> Vec<Requirement> {
+        vec![Requirement::new(ResourceOperation::Block, "PathPlanner")]
+    }
+
+    fn ended(outcome: &str) -> Event {
+        Event::Finished {
+            instance: FIRST,
+            attempt: 1,
+            outcome: outcome.to_owned(),
+            outputs: BTreeMap::new(),
+            measured: Vec::new(),
+            evidence: Vec::new(),
+            reason: String::new(),
+        }
+    }
+
+    fn asks(instance: u64, requirements: Vec<Requirement>, priority: i64) -> Command {
+        Command::Acquire { instance: InstanceId(instance), requirements, priority }
+    }
+
+    /// Of a planner's lease that is given back after so many milliseconds, in a step with these acquires.
+    fn handover(event: &Event, asks: &[Command], waiting: &[Vec<Requirement>], after_ms: u64) -> Option<InstanceId> {
+        let resource = LeasedResource {
+            id: "path-planner-1".to_owned(),
+            kind: "PathPlanner".to_owned(),
+            endpoint: String::new(),
+            superclasses: vec!["Planner".to_owned()],
+        };
+        let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: vec![resource] };
+        let (mut leases, now) = (Leases::default(), Instant::now());
+        leases.granted(&lease, planner(), now);
+        let mut commands = asks.to_vec();
+        commands.push(Command::Release { instance: FIRST, lease: Some(lease.id), projection: None });
+        let waiting = waiting.iter().map(Vec::as_slice);
+        let handover = leases.handover(event, &commands, waiting, now + Duration::from_millis(after_ms))?;
+        assert_eq!(handover.lease, lease);
+        Some(handover.to)
+    }
+
+    #[test]
+    fn the_next_that_wants_exactly_the_same_takes_the_lease_over_for_a_while() {
+        let next = [asks(2, planner(), 5)];
+        assert_eq!(handover(&ended(SUCCESS), &next, &[], 1), Some(InstanceId(2)));
+        assert_eq!(handover(&ended(SUCCESS), &next, &[], 100), None, "its turn is over");
+        assert_eq!(handover(&ended("aborted"), &next, &[], 1), None, "nobody knows how its provider is");
+        assert_eq!(handover(&Event::Woken, &next, &[], 1), None);
+        assert_eq!(handover(&ended(SUCCESS), &[], &[], 1), None);
+    }
+
+    #[test]
+    fn who_waits_already_or_has_a_higher_priority_comes_first() {
+        let arm = vec![Requirement::new(ResourceOperation::Block, "Arm")];
+        let any_planner = vec![Requirement::new(ResourceOperation::Block, "Planner")];
+        let next = asks(2, planner(), 5);
+        let one = [next.clone()];
+        assert_eq!(handover(&ended(SUCCESS), &one, from_ref(&arm), 1), Some(InstanceId(2)));
+        assert_eq!(handover(&ended(SUCCESS), &one, from_ref(&any_planner), 1), None);
+        let others = [asks(3, arm, 9), next.clone(), asks(4, any_planner.clone(), 5)];
+        assert_eq!(handover(&ended(SUCCESS), &others, &[], 1), Some(InstanceId(2)), "of equals the first");
+        assert_eq!(handover(&ended(SUCCESS), &[next, asks(4, any_planner, 6)], &[], 1), None);
+    }
+
+    #[test]
+    fn what_depends_on_how_a_resource_is_now_is_asked_anew() {
+        let mut two = planner();
+        two[0].count = 2.into();
+        assert_eq!(handover(&ended(SUCCESS), &[asks(2, two, 5)], &[], 1), None);
+        let held = |change: &dyn Fn(&mut Requirement)| {
+            let mut requirements = planner();
+            requirements.iter_mut().for_each(change);
+            let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: Vec::new() };
+            Held { lease, requirements: requirements.clone(), granted: Instant::now() }.serves(&requirements)
+        };
+        assert!(held(&|_| {}));
+        assert!(!held(&|one| drop(one.attributes.insert("gpu".to_owned(), Value::Bool(true)))));
+        assert!(!held(&|one| one.operation = ResourceOperation::Exists));
+    }
+}
