@@ -2,6 +2,7 @@
 //!
 //! Workers are killed with SIGKILL, one at a time, each when its pool is whole again. Ready is when the resource manager has the
 //! successor's resource, as a watcher of the process manager hears it. Starts of the same program without anybody between take turns.
+//! All is measured, or the parts that are named: `plain`, `sdk`, `spare`, `crowd`, `sdk_crowd`, `rivals`.
 //!
 //! | key | what |
 //! |---|---|
@@ -44,16 +45,25 @@ pub(crate) async fn measure() {
     let directory = tempfile::tempdir().unwrap();
     let mut report = serde_json::Map::new();
     let mut note = |key: String, value: f64| drop(report.insert(key, json!((value * 1e3).round() / 1e3)));
-    for (mib, kills) in SIZES {
+    let parts: Vec<String> = std::env::args().skip_while(|argument| argument != "--restart").skip(1).collect();
+    let named: Vec<&String> = parts.iter().filter(|part| !part.starts_with('-')).collect();
+    let wanted = |part: &str| named.is_empty() || named.iter().any(|name| *name == part);
+    for (mib, kills) in SIZES.into_iter().filter(|_| wanted("plain")) {
         plain(&directory.path().join(format!("plain-{mib}")), mib, kills, &mut note).await;
     }
-    sdk(&directory.path().join("sdk"), &mut note).await;
-    spare(&directory.path().join("spare"), &mut note).await;
+    if wanted("sdk") {
+        sdk(&directory.path().join("sdk"), &mut note).await;
+    }
+    if wanted("spare") {
+        spare(&directory.path().join("spare"), &mut note).await;
+    }
     let tiny = "args = [\"--tiny\", \"0\"]\nreadiness = { kind = \"notify\" }\n";
-    for (key, worker) in [("crowd", tiny), ("sdk_crowd", SDK)] {
+    for (key, worker) in [("crowd", tiny), ("sdk_crowd", SDK)].into_iter().filter(|(key, _)| wanted(key)) {
         crowd(&directory.path().join(key), key, worker, &mut note).await;
     }
-    rivals::measure(directory.path(), &mut note);
+    if wanted("rivals") {
+        rivals::measure(directory.path(), &mut note);
+    }
     println!("{}", serde_json::to_string_pretty(&report).unwrap());
 }
 

@@ -46,6 +46,8 @@ fn supervisord(directory: &Path) -> Option<f64> {
     );
     std::fs::write(&config, text).unwrap();
     let started = Command::new("supervisord").arg("-c").arg(config).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    let started =
+        started.inspect_err(|error| eprintln!("supervisord cannot be started here ({error}): it is left out"));
     let _process = Process::of(started.ok()?);
     // A second for each.
     Some(killed(&socket, KILLS / 6))
