@@ -132,6 +132,17 @@ async fn the_cell_offers_its_modules_and_its_battery() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn the_arm_says_where_it_is_and_the_gripper_what_it_feels() {
+    let system = system(20.0, 1).await;
+    let lease = system.acquire(&["Arm", "Gripper"]).await;
+    let here = system.execute(&lease, "Arm", "where", []).await.unwrap();
+    assert_eq!(here.outputs["joints"], Value::Joints(aimm::HOME.to_vec()));
+    let felt = system.execute(&lease, "Gripper", "feel", []).await.unwrap();
+    assert_eq!(felt.outputs["holding"], Value::Bool(false));
+    system.end.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn the_detector_finds_the_boxes_through_the_leased_camera() {
     let system = system(20.0, 3).await;
     let lease = system.acquire(&["Arm", "PanTilt", "Camera", "Detector"]).await;

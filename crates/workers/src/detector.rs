@@ -2,7 +2,8 @@
 //!
 //! It asks the camera of its goal's own lease for a picture and works on nothing else: the picture, the poses of camera and
 //! robot in it, and the region or the object that the goal names. What it finds is named `box_1`, `fork_1`, `box_2`, …, the
-//! nearest first, and comes with its class, how sure that is, and the covariance of its pose.
+//! nearest first, or from another number on where the goal says so, and comes with its class, how sure that is, and the covariance of
+//! its pose.
 
 mod body;
 mod pictures;
@@ -88,12 +89,13 @@ impl Action for Segment {
             Ok::<_, ratn_perception::detection::DetectionError>(found)
         });
         let found = found.await??;
+        let first = goal.optional_int("first")?.unwrap_or(1);
         goal.progress(format!("{} objects", found.len()));
-        let mut counts: BTreeMap<ObjectClass, usize> = BTreeMap::new();
+        let mut numbers: BTreeMap<ObjectClass, i64> = BTreeMap::new();
         let named = found.iter().map(|object| {
-            let count = counts.entry(object.model.class()).or_default();
-            *count += 1;
-            let id = format!("{}{count}", object.model.class().prefix());
+            let number = numbers.entry(object.model.class()).or_insert(first);
+            let id = format!("{}{number}", object.model.class().prefix());
+            *number += 1;
             Value::Map(fields([("id", Value::String(id))].into_iter().chain(described(object))))
         });
         Ok(GoalOutcome::success().with_output("boxes", Value::List(named.collect())))

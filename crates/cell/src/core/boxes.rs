@@ -23,7 +23,7 @@ pub struct TrueBox {
     pub size: [f64; 3],
     /// Its centre, in the world frame.
     pub pose: Pose,
-    /// It stands on the load deck: delivered.
+    /// It stands at a place of the load deck: delivered.
     pub on_base: bool,
     /// The gripper holds it.
     pub held: bool,

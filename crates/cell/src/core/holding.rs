@@ -6,7 +6,8 @@ use super::environment::{GRAVITY, Grip, Hold, Load, STEP, Slip, Support};
 use super::faults::Kind as Fault;
 use super::protocol::{Ending, Product};
 use ratn_model::pose::Pose;
-use std::f64::consts::PI;
+use ratn_motion::aimm;
+use std::f64::consts::{FRAC_PI_2, PI};
 
 /// What the fingers are closed around.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -23,6 +24,8 @@ pub(super) struct Held {
 
 /// How far something may lean and still stand as it was made to.
 const MAX_LEAN_RAD: f64 = 0.2;
+/// How far from the middle of its place a delivered object may stand, in metres.
+const MAX_OFF_PLACE_M: f64 = 0.03;
 
 impl Held {
     /// Around an object that does not slip.
@@ -141,15 +144,21 @@ impl Cell {
         }
     }
 
-    /// Whether an object stands on the load deck. A box has no top.
+    /// Whether an object stands at one of the places of the load deck, on whichever of its faces: a box has no top.
     pub(super) fn is_delivered(&self, pose: &Pose, on: &str) -> bool {
-        on == ON_BASE && pose.rotate([0.0, 0.0, 1.0])[2].abs() >= MAX_LEAN_RAD.cos()
+        let upright = |axis: usize| pose.rotate(unit(axis))[2].abs() >= MAX_LEAN_RAD.cos();
+        let off = |slot: &Pose| (slot.position[0] - pose.position[0]).hypot(slot.position[1] - pose.position[1]);
+        on == ON_BASE && (0..3).any(upright) && aimm::slots().iter().any(|slot| off(slot) <= MAX_OFF_PLACE_M)
     }
+}
+
+fn unit(axis: usize) -> [f64; 3] {
+    std::array::from_fn(|i| f64::from(u8::from(i == axis)))
 }
 
 /// The two edges that lie across the closing direction.
 fn across(in_tool: &Pose, size: &[f64; 3]) -> [f64; 2] {
-    let along = |k: usize| in_tool.rotate(std::array::from_fn(|i| f64::from(u8::from(i == k))))[1].abs();
+    let along = |k: usize| in_tool.rotate(unit(k))[1].abs();
     match (0..3).max_by(|a, b| along(*a).total_cmp(&along(*b))) {
         Some(0) => [size[1], size[2]],
         Some(2) => [size[0], size[1]],
@@ -157,18 +166,42 @@ fn across(in_tool: &Pose, size: &[f64; 3]) -> [f64; 2] {
     }
 }
 
-/// The same box turned into whichever of its symmetries is closest to `expected`: nobody can tell them apart. Quarter turns
-/// count only where the sides that change places are about equal.
+/// The same box in whichever of its own frames is closest to `expected`: nobody can tell them apart. Which axis is its height was not
+/// seen when it fell over since, so any may be; of the two others the first is the longer one, unless they are about equal.
 fn turned_like(pose: &Pose, size: &[f64; 3], expected: &Pose) -> Pose {
     const SQUARE_M: f64 = 0.01;
-    let quarters = if (size[0] - size[1]).abs() < SQUARE_M { 1 } else { 2 };
-    let turned = |flip: f64, quarter: usize| {
-        let turn = Pose::from_rpy([0.0; 3], flip, 0.0, quarter as f64 * PI / 2.0);
-        pose.compose(&turn)
+    // Each axis upwards and downwards.
+    let upright = [[0.0, 0.0], [PI, 0.0], [FRAC_PI_2, 0.0], [-FRAC_PI_2, 0.0], [0.0, FRAC_PI_2], [0.0, -FRAC_PI_2]];
+    let frames = upright.into_iter().flat_map(|[roll, pitch]| {
+        (0..4).map(move |quarter| {
+            let quarter = Pose::from_rpy([0.0; 3], 0.0, 0.0, f64::from(quarter) * FRAC_PI_2);
+            Pose::from_rpy([0.0; 3], roll, pitch, 0.0).compose(&quarter)
+        })
+    });
+    let extent = |turn: &Pose, axis: usize| {
+        let along = turn.rotate(unit(axis));
+        (0..3).map(|i| along[i].abs() * size[i]).sum::<f64>()
     };
-    let symmetries = [0.0, PI].into_iter().flat_map(|flip| (0..4).step_by(quarters).map(move |q| (flip, q)));
-    symmetries
-        .map(|(flip, quarter)| turned(flip, quarter))
+    frames
+        .filter(|turn| extent(turn, 0) > extent(turn, 1) - SQUARE_M)
+        .map(|turn| pose.compose(&turn))
         .min_by(|a, b| a.angle(expected).total_cmp(&b.angle(expected)))
         .unwrap_or(*pose)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_box_that_fell_over_is_held_as_it_was_seen_lying() {
+        // It lies on its side: its height along the tool's x axis.
+        let (size, lying) = ([0.08, 0.06, 0.12], Pose::from_rpy([0.0, 0.0, 0.01], 0.0, FRAC_PI_2, 0.0));
+        // What was seen is 0.12 long, 0.06 wide and 0.08 high.
+        let seen = Pose::from_rpy([0.0, 0.0, 0.012], PI, 0.0, 0.05);
+        assert!(turned_like(&lying, &size, &seen).angle(&seen) < 0.06);
+        // A quarter turn away it would be 0.06 long: that it was seen so badly is not hidden.
+        let across = Pose::from_rpy([0.0, 0.0, 0.012], PI, 0.0, FRAC_PI_2);
+        assert!((turned_like(&lying, &size, &across).angle(&across) - FRAC_PI_2).abs() < 0.01);
+    }
 }

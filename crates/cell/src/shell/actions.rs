@@ -43,6 +43,7 @@ pub(crate) fn server(keeper: &Keeper, config: &CellConfig, channels: Channels, s
 
 type Read = fn(&GoalContext) -> Result<Request, ActionFailure>;
 
+/// All modules are behind one server: no two actions have the same name.
 const ACTIONS: [(Module, &str, &str, Read); 8] = [
     (Module::Arm, "follow", "moves the arm along a trajectory", |goal| {
         Ok(Request::Follow { trajectory: goal.input_trajectory("trajectory")?.clone() })
@@ -58,8 +59,8 @@ const ACTIONS: [(Module, &str, &str, Read); 8] = [
         Ok(Request::Grasp { object: goal.input_string("object")?.to_owned(), expected })
     }),
     (Module::Gripper, "release", "opens the fingers", |_| Ok(Request::Release)),
-    (Module::Arm, "state", "says where the arm's joints are", |_| Ok(Request::SenseArm)),
-    (Module::Gripper, "state", "says whether the fingers hold something", |_| Ok(Request::SenseGripper)),
+    (Module::Arm, "where", "says where the arm's joints are", |_| Ok(Request::SenseArm)),
+    (Module::Gripper, "feel", "says whether the fingers hold something", |_| Ok(Request::SenseGripper)),
     (Module::PanTilt, "look_at", "turns the camera to a point of the world", |goal| {
         Ok(Request::LookAt { target: goal.input_pose("target")?.position })
     }),

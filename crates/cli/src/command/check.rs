@@ -8,6 +8,7 @@ use crate::task_control::learn;
 use crate::{input, output};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
+use ratn_model::load::Files;
 use ratn_model::parameters::ParameterError;
 use ratn_model::program::Program;
 use ratn_model::resource::Quantity;
@@ -148,7 +149,17 @@ pub(crate) fn load(path: &Path, catalogue: &Catalogue) -> Result<Program, Failur
 
 /// Loads a task file's text; `file` is its name in messages.
 pub(crate) fn load_text(text: &str, file: &str, catalogue: &Catalogue) -> Result<Program, Failure> {
-    match ratn_model::load::load_with(text, file, catalogue, &input::Libraries) {
+    load_from(&input::Libraries, text, file, catalogue)
+}
+
+/// As [`load_text`], with libraries from elsewhere.
+pub(super) fn load_from(
+    libraries: &impl Files,
+    text: &str,
+    file: &str,
+    catalogue: &Catalogue,
+) -> Result<Program, Failure> {
+    match ratn_model::load::load_with(text, file, catalogue, libraries) {
         Ok(loaded) => {
             loaded.warnings.iter().for_each(output::progress);
             Ok(loaded.program)

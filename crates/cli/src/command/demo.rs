@@ -18,19 +18,32 @@ use crate::task_control::log;
 use crate::task_control::shell::Run;
 use anyhow::{Context, anyhow, bail};
 use ratn_executive::protocol::Mode;
+use ratn_model::load::Files;
 use ratn_model::program::{Program, SUCCESS};
 use result::{Demonstration, Outcome, Plan};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The task, so that the demo works from anywhere.
-const TASK: &str = include_str!("../../../../examples/fetch_boxes.yaml");
-const TASK_FILE: &str = "examples/fetch_boxes.yaml";
+/// The tasks are built in, so that the demo works from anywhere: their files' names and texts.
+const FETCH: (&str, &str) = ("fetch_boxes.yaml", include_str!("../../../../examples/fetch_boxes.yaml"));
+/// The one for a cell in which something goes wrong, which uses the other.
+const RECOVERING: (&str, &str) =
+    ("fetch_boxes_recovering.yaml", include_str!("../../../../examples/fetch_boxes_recovering.yaml"));
+
+struct BuiltIn;
+
+impl Files for BuiltIn {
+    fn read(&self, _using: &str, path: &str) -> Result<(String, String), String> {
+        let (name, text) = FETCH;
+        if path == name { Ok((name.to_owned(), text.to_owned())) } else { Err("it is not built in".to_owned()) }
+    }
+}
 
 /// Runs the task in every way and compares.
 pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     let config = SystemConfig::load(arguments.config.as_deref())?;
-    let program = Arc::new(check::load_text(TASK, TASK_FILE, &config.catalogue)?);
+    let (file, text) = if arguments.faults.fault.is_empty() { FETCH } else { RECOVERING };
+    let program = Arc::new(check::load_from(&BuiltIn, text, file, &config.catalogue)?);
     let directory = out_directory(arguments)?;
     let mut demonstration = Demonstration::new(arguments);
     let outcome: Result<(), Failure> = blocking_here(async {
