@@ -91,7 +91,7 @@ fn measure(
     Ok(format!(
         "{{\"setting\": \"{}\", \"camera_to_table_m\": {distance:.2}, \"frames\": {}, \"objects\": {}, \"found_within_5_mm_and_3_deg\": {:.4}, \
          \"wrong_class_or_place\": {wrong}, \"false\": {phantoms}, \"false_of_reported\": {:.4}, \"processor_ms_median\": {:.1}, \"processor_ms_p95\": {:.1}, \"processor_ms_max\": {:.1}, \
-         \"squared_error_over_variance\": {}, \"classes\": [{}]}}",
+         \"normalised_square\": {:.2}, \"classes\": [{}]}}",
         setting.name,
         setting.frames,
         matches.len(),
@@ -100,7 +100,7 @@ fn measure(
         quantile(&mut times, 0.5),
         quantile(&mut times, 0.95),
         quantile(&mut times, 1.0),
-        consistency(&matches),
+        consistency(matches.iter()),
         classes.join(", ")
     ))
 }
@@ -111,17 +111,10 @@ fn processor_s() -> Result<f64, Box<dyn std::error::Error>> {
     Ok(said.split_whitespace().next().ok_or("an empty schedstat")?.parse::<f64>()? * 1e-9)
 }
 
-/// Mean of squared errors over variances, of x and y: 1 where covariances are true.
-fn consistency(matches: &[Match]) -> String {
-    let squares: Vec<f64> = matches
-        .iter()
-        .filter(|m| m.is_good())
-        .filter_map(|m| m.found.map(|f| (m.truth, f)))
-        .flat_map(|(truth, found)| {
-            [0, 1].map(|i| (truth.pose.position[i] - found.pose.position[i]).powi(2) / found.covariance[i][i])
-        })
-        .collect();
-    format!("{:.2}", squares.iter().sum::<f64>() / squares.len().max(1) as f64)
+/// The mean of the position's normalised squared errors: 1 where covariances are true.
+fn consistency<'a>(matches: impl Iterator<Item = &'a Match>) -> f64 {
+    let squares: Vec<f64> = matches.filter(|m| m.is_good()).filter_map(Match::normalised_square).collect();
+    squares.iter().sum::<f64>() / squares.len().max(1) as f64
 }
 
 fn of_class(class: ObjectClass, matches: &[Match]) -> String {
@@ -130,14 +123,15 @@ fn of_class(class: ObjectClass, matches: &[Match]) -> String {
     let mut position: Vec<f64> = own.iter().filter(|m| m.found.is_some()).map(|m| m.position * 1e3).collect();
     let mut angle: Vec<f64> = own.iter().filter(|m| m.found.is_some()).map(|m| m.angle.to_degrees()).collect();
     format!(
-        "{{\"class\": \"{}\", \"objects\": {}, \"found\": {:.4}, \"mm_median\": {:.2}, \"mm_p99\": {:.2}, \"deg_median\": {:.2}, \"deg_p99\": {:.2}}}",
+        "{{\"class\": \"{}\", \"objects\": {}, \"found\": {:.4}, \"mm_median\": {:.2}, \"mm_p99\": {:.2}, \"deg_median\": {:.2}, \"deg_p99\": {:.2}, \"normalised_square\": {:.2}}}",
         class.name(),
         own.len(),
         good as f64 / own.len().max(1) as f64,
         quantile(&mut position, 0.5),
         quantile(&mut position, 0.99),
         quantile(&mut angle, 0.5),
-        quantile(&mut angle, 0.99)
+        quantile(&mut angle, 0.99),
+        consistency(own.iter().copied())
     )
 }
 

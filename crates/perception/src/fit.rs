@@ -59,6 +59,8 @@ const CUT_OFF_FADE: f64 = 0.7;
 const RESOLUTION: f64 = 0.002;
 /// A point this near, or within three deviations, is explained, in metres.
 const EXPLAINED: f64 = 0.004;
+/// The variance of what the evidence does not determine, in metres² and radians².
+const UNKNOWN: f64 = 0.01;
 /// A step below which a fit has settled, in metres and radians.
 const SETTLED: f64 = 1e-4;
 /// The longest step of one iteration, in metres; of yaw in radians, ten times as much.
@@ -115,38 +117,33 @@ impl Fit {
 
     /// How many of the points lie on its surface, 0 to 1.
     pub(crate) fn explains(&self, evidence: &Evidence) -> f64 {
-        let placed = Placed::of(self);
+        let placed = Placed::of(self, evidence.eye);
         let near = (3.0 * evidence.sigma).max(EXPLAINED);
-        let explained =
-            evidence.points.iter().filter(|p| placed.model.distance(placed.local(**p)).abs() < near).count();
+        let explained = evidence.points.iter().filter(|p| placed.distance(**p).abs() < near).count();
         explained as f64 / evidence.points.len().max(1) as f64
     }
 
     /// Whether a place on the surface is below it.
     pub(crate) fn covers(&self, place: [f64; 2]) -> bool {
-        let placed = Placed::of(self);
-        let [x, y, _] = placed.local([place[0], place[1], 0.0]);
-        let [length, width, _] = placed.model.size();
-        x.abs() < length / 2.0 && y.abs() < width / 2.0
+        let (sin, cos) = self.yaw().sin_cos();
+        let (x, y) = (place[0] - self.parameters[0], place[1] - self.parameters[1]);
+        let [length, width, _] = self.model().size();
+        (cos * x + sin * y).abs() < length / 2.0 && (cos * y - sin * x).abs() < width / 2.0
     }
 
     /// How well the evidence determines it, by its noise and the size of pixels.
     pub(crate) fn covariance(&self, evidence: &Evidence) -> Covariance {
         let cut_off = (3.0 * evidence.sigma).max(EXPLAINED);
         let mut normal = Normal::default();
-        let placed = Placed::of(self);
-        let moved = self.neighbours();
+        let placed = Placed::of(self, evidence.eye);
+        let moved = self.neighbours(evidence.eye);
         let (mut squares, mut count) = (0.0, 0.0);
         for point in &evidence.points {
-            let residual = placed.model.distance(placed.local(*point));
+            let residual = placed.distance(*point);
             if residual.abs() < cut_off {
                 squares += residual * residual;
                 count += 1.0;
-                normal.add(
-                    &self.slope(&moved, residual, |p| p.model.distance(p.local(*point))),
-                    residual,
-                    evidence.sigma.powi(-2),
-                );
+                normal.add(&self.slope(&moved, residual, |p| p.distance(*point)), residual, evidence.sigma.powi(-2));
             }
         }
         // A ray that passes within a pixel says where the edge is, to about a pixel.
@@ -158,7 +155,8 @@ impl Fit {
         }
         // More scattered than the noise says: the model is not quite the thing.
         let inflation = (squares / f64::max(count, 1.0) / evidence.sigma.powi(2)).max(1.0);
-        let inverse = normal.inverse(&self.fixed()).unwrap_or([[0.0; MAX_PARAMETERS]; MAX_PARAMETERS]);
+        let unknown = std::array::from_fn(|i| std::array::from_fn(|j| if i == j { UNKNOWN } else { 0.0 }));
+        let inverse = normal.inverse(&self.fixed()).unwrap_or(unknown);
         let pose = std::array::from_fn(|row| std::array::from_fn(|column| inverse[row][column] * inflation));
         // A fork's height follows its length.
         let last = FIRST_DIMENSION + self.class.ranges().len() - 1;
@@ -175,13 +173,13 @@ impl Fit {
     }
 
     /// This fit with each parameter a little greater.
-    fn neighbours(&self) -> [Option<Placed>; MAX_PARAMETERS] {
+    fn neighbours(&self, eye: Vector) -> [Option<Placed>; MAX_PARAMETERS] {
         let fixed = self.fixed();
         std::array::from_fn(|i| {
             (!fixed[i]).then(|| {
                 let mut next = self.clone();
                 next.parameters[i] += DIFFERENCE;
-                Placed::of(&next)
+                Placed::of(&next, eye)
             })
         })
     }
@@ -197,20 +195,20 @@ impl Fit {
 
     /// The points that the model has above the floor: chosen by where the model is, not by where noise has put them.
     fn used(&self, evidence: &Evidence) -> Vec<Vector> {
-        let placed = Placed::of(self);
-        let above = |p: &&Vector| p[2] - placed.model.distance(placed.local(**p)) > evidence.floor;
+        let placed = Placed::of(self, evidence.eye);
+        let above = |p: &&Vector| p[2] - placed.distance(**p) > evidence.floor;
         evidence.points.iter().filter(above).copied().collect()
     }
 
     fn linearised(&self, evidence: &Evidence, used: &[Vector], cut_off: f64) -> (Normal, f64) {
-        let (placed, moved) = (Placed::of(self), self.neighbours());
+        let (placed, moved) = (Placed::of(self, evidence.eye), self.neighbours(evidence.eye));
         let (mut normal, mut cost) = (Normal::default(), 0.0);
         for point in used {
-            let residual = placed.model.distance(placed.local(*point));
+            let residual = placed.distance(*point);
             cost += robust(residual, cut_off);
             let weight = weight(residual, cut_off);
             if weight > 0.0 {
-                normal.add(&self.slope(&moved, residual, |p| p.model.distance(p.local(*point))), residual, weight);
+                normal.add(&self.slope(&moved, residual, |p| p.distance(*point)), residual, weight);
             }
         }
         for end in &evidence.free {
@@ -225,8 +223,8 @@ impl Fit {
     }
 
     fn cost(&self, evidence: &Evidence, points: &[Vector], cut_off: f64) -> f64 {
-        let placed = Placed::of(self);
-        let on_surface = points.iter().map(|p| robust(placed.model.distance(placed.local(*p)), cut_off));
+        let placed = Placed::of(self, evidence.eye);
+        let on_surface = points.iter().map(|p| robust(placed.distance(*p), cut_off));
         let free = evidence.free.iter().filter_map(|end| placed.deepest(evidence, *end));
         on_surface.sum::<f64>() + free.map(|ray| robust(ray.depth.min(0.0), cut_off)).sum::<f64>()
     }
@@ -270,6 +268,8 @@ struct Placed {
     at: Vector,
     sin: f64,
     cos: f64,
+    /// The camera in its frame.
+    eye: Vector,
 }
 
 /// The place of a ray that is deepest within the model, or nearest to it.
@@ -280,10 +280,18 @@ struct Deepest {
 }
 
 impl Placed {
-    fn of(fit: &Fit) -> Placed {
+    fn of(fit: &Fit, eye: Vector) -> Placed {
         let model = fit.model();
         let (sin, cos) = fit.yaw().sin_cos();
-        Placed { model, at: [fit.parameters[0], fit.parameters[1], model.size()[2] / 2.0], sin, cos }
+        let at = [fit.parameters[0], fit.parameters[1], model.size()[2] / 2.0];
+        let mut placed = Placed { model, at, sin, cos, eye };
+        placed.eye = placed.local(eye);
+        placed
+    }
+
+    /// How far a point is from the surface that the camera sees.
+    fn distance(&self, point: Vector) -> f64 {
+        self.model.distance(self.local(point), self.eye)
     }
 
     /// A point in the model's frame.

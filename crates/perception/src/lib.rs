@@ -18,6 +18,7 @@ pub mod trial;
 
 mod cluster;
 mod fit;
+mod level;
 mod normal;
 mod plane;
 mod rectangle;

@@ -188,13 +188,15 @@ impl Model {
         }
     }
 
-    /// How far a point of its frame is from its surface, in metres; negative within its material.
-    pub(crate) fn distance(&self, point: Vector) -> f64 {
+    /// How far a point of its frame is from its surface as seen from `eye`, in metres; negative behind it.
+    pub(crate) fn distance(&self, point: Vector, eye: Vector) -> f64 {
         match *self {
             Model::Box { size } => box_distance(point, size),
             Model::Round { kind, radius, height } => {
                 let [x, y, z] = point;
-                revolved::distance(kind, radius, height, [(x * x + y * y).sqrt(), z + height / 2.0])
+                let from_axis = (x * x + y * y).sqrt();
+                let outwards = (x * (eye[0] - x) + y * (eye[1] - y)) / from_axis.max(1e-9);
+                revolved::distance(kind, radius, height, [from_axis, z + height / 2.0], [outwards, eye[2] - z])
             }
             Model::Fork { length } => fork::distance(length, point),
         }
@@ -208,7 +210,7 @@ impl Model {
                 revolved::fill_distance(kind, radius, height, [(x * x + y * y).sqrt(), z + height / 2.0])
             }
             Model::Fork { length } => fork::fill_distance(length, point),
-            _ => self.distance(point),
+            Model::Box { size } => box_distance(point, size),
         }
     }
 }
@@ -252,7 +254,7 @@ mod tests {
                 // Between the tines, light reaches their sides; the fit takes the head as closed.
                 let among_tines = class == ObjectClass::Fork && hit[0] > 0.35 * x;
                 let least = if among_tines { -fork::THICKNESS * x } else { 0.0 };
-                let distance = model.distance(hit);
+                let distance = model.distance(hit, from);
                 assert!((least - 8e-4..8e-4).contains(&distance), "{class:?} {hit:?}: {distance}");
                 assert!(model.fill_distance(hit) < 8e-4, "{class:?} {hit:?}: {}", model.fill_distance(hit));
             }

@@ -8,6 +8,7 @@ use crate::camera::{Camera, DepthImage, Intrinsics};
 use crate::detection::{Detection, Model, ObjectClass, Region, Symmetry};
 use crate::noise::{Noise, observe};
 use crate::render::{Body, render};
+use crate::vector::{cross, dot};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
@@ -58,6 +59,18 @@ impl Match {
     pub fn is_good(&self) -> bool {
         let right = self.found.is_some_and(|f| f.model.class() == self.truth.model.class());
         right && self.position <= TOLERANCE.0 && self.angle <= TOLERANCE.1
+    }
+
+    /// The position's squared error by its covariance, over its three dimensions: 1 in the mean where covariances are true, less
+    /// where they are too large (the normalised estimation error squared; Bar-Shalom, Li and Kirubarajan 2001, section 5.4).
+    pub fn normalised_square(&self) -> Option<f64> {
+        let found = self.found?;
+        let e: [f64; 3] = std::array::from_fn(|i| found.pose.position[i] - self.truth.pose.position[i]);
+        let [a, b, c]: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| found.covariance[i][j]));
+        // By Cramer's rule: symmetric, so rows are columns.
+        let determinant = |a, b, c| dot(a, cross(b, c));
+        let solution = [determinant(e, b, c), determinant(a, e, c), determinant(a, b, e)];
+        Some(dot(solution, e) / determinant(a, b, c) / 3.0)
     }
 }
 

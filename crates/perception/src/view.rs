@@ -5,6 +5,7 @@ use crate::camera::{Camera, DepthImage};
 use crate::cluster;
 use crate::detection::{DetectionError, Region};
 use crate::fit::Evidence;
+use crate::level;
 use crate::mask::{Ball, Mask};
 use crate::plane::Plane;
 use crate::vector::{Vector, length, median, sub};
@@ -29,6 +30,8 @@ const LEAST_FALL: f64 = 0.2;
 const LEAST_SIGMA: f64 = 0.0004;
 /// Which pixels around a cluster's are asked whether they see past it, in steps along rows and columns.
 const BESIDE: [isize; 4] = [1, 2, 3, 5];
+/// What stands on the plane lifts it by about so much of its points' deviation: low parts are taken for it.
+const LIFT: f64 = 0.1;
 /// RANSAC's choices: any number does; the same image gives the same objects.
 const SEED: u64 = 0x5EED;
 
@@ -101,15 +104,17 @@ impl<'a> View<'a> {
         {
             return Err(DetectionError::WrongCamera { width, height });
         }
-        let (near, stride) = near_surface(image, camera, region);
+        let near = near_surface(image, camera, region);
         let plane = Plane::find(&near, SEED).ok_or(DetectionError::NoPlane { points: near.len() })?;
         let (sigma_above, on_plane) = scatter(&near, &plane);
         let frame = region.pose.compose(&plane.frame());
         let half = region.size.map(|edge| edge / 2.0);
         let (looking, up) = (camera.pose.rotate([0.0, 0.0, 1.0]), frame.rotate([0.0, 0.0, 1.0]));
         let fall = (0..3).map(|i| looking[i] * up[i]).sum::<f64>().abs().max(LEAST_FALL);
-        let clear = (CLEAR_OF_PLANE * sigma_above).clamp(*CLEARANCE.start(), *CLEARANCE.end());
-        let variance = sigma_above.powi(2) / (on_plane.max(1.0) * (stride * stride) as f64);
+        let clearance = |sigma: f64| (CLEAR_OF_PLANE * sigma).clamp(*CLEARANCE.start(), *CLEARANCE.end());
+        let sigma_in_mean = sigma_above / level::SIDE as f64;
+        let (clear, clear_in_mean) = (clearance(sigma_above), clearance(sigma_in_mean));
+        let variance = sigma_above.powi(2) / on_plane.max(1.0);
         let mut view = View {
             image,
             rays: Rays::new(camera, &frame),
@@ -117,37 +122,53 @@ impl<'a> View<'a> {
             frame,
             clusters: Vec::new(),
             sigma: (sigma_above / fall).max(LEAST_SIGMA),
-            floor: clear + UNBIASED * sigma_above,
+            floor: clear_in_mean + UNBIASED * sigma_in_mean,
             // The variance of places spread evenly over the region's shorter edge is a third of its half, squared.
-            plane_variance: [variance, variance * 3.0 / half[0].min(half[1]).powi(2)],
+            plane_variance: [variance + (LIFT * sigma_above).powi(2), variance * 3.0 / half[0].min(half[1]).powi(2)],
         };
         let mask = Mask::new(body, &frame, [half[0], half[1], TALLEST]);
-        let above = view.sort(clear, |p| p[0].abs() <= half[0] && p[1].abs() <= half[1] && !mask.hides(*p));
+        let above =
+            view.sort(clear, clear_in_mean, |p| p[0].abs() <= half[0] && p[1].abs() <= half[1] && !mask.hides(*p));
         view.gather(&above);
         Ok(view)
     }
 
-    /// Marks what is free, and says what stands within the region.
-    fn sort(&mut self, clear: f64, within: impl Fn(&Vector) -> bool) -> Vec<Seen> {
+    /// Marks what is free, and says what stands within the region: what is itself clear of the plane, and what is so in the mean
+    /// with the pixels around it.
+    fn sort(&mut self, clear: f64, clear_in_mean: f64, within: impl Fn(&Vector) -> bool) -> Vec<Seen> {
+        let heights = self.heights();
+        let width = self.image.width;
+        let means = level::means(&heights, width, clear as f32);
         let mut above = Vec::new();
-        let rays = &self.rays;
-        for (row, depths) in self.image.depth.chunks(self.image.width).enumerate() {
-            let start = rays.origin[2] + row as f64 * rays.per_row[2];
-            for (column, depth) in depths.iter().enumerate() {
-                let Some(depth) = valid(*depth) else { continue };
-                let pixel = row * self.image.width + column;
-                let z = rays.eye[2] + depth * (start + column as f64 * rays.per_column[2]);
-                if z < clear {
-                    self.free[pixel] = true;
-                } else if z < TALLEST {
-                    let point = rays.point(pixel, depth);
-                    if within(&point) {
-                        above.push(Seen { pixel: pixel as u32, point });
-                    }
-                }
+        for (pixel, (z, mean)) in heights.iter().zip(means).enumerate() {
+            if z.is_nan() || f64::from(*z) >= TALLEST {
+                continue;
+            }
+            let stands = f64::from(*z) >= clear || (f64::from(*z) > -clear && f64::from(mean) >= clear_in_mean);
+            if !stands {
+                self.free[pixel] = true;
+                continue;
+            }
+            let point = self.rays.point(pixel, f64::from(self.image.depth[pixel]));
+            if within(&point) {
+                above.push(Seen { pixel: pixel as u32, point });
             }
         }
         above
+    }
+
+    /// How far each pixel's point is above the surface, in metres; not a number where nothing came back.
+    fn heights(&self) -> Vec<f32> {
+        let rays = &self.rays;
+        let mut heights = Vec::with_capacity(self.image.depth.len());
+        for (row, depths) in self.image.depth.chunks(self.image.width).enumerate() {
+            let start = rays.origin[2] + row as f64 * rays.per_row[2];
+            heights.extend(depths.iter().enumerate().map(|(column, depth)| match valid(*depth) {
+                Some(depth) => (rays.eye[2] + depth * (start + column as f64 * rays.per_column[2])) as f32,
+                None => f32::NAN,
+            }));
+        }
+        heights
     }
 
     fn gather(&mut self, above: &[Seen]) {
@@ -207,7 +228,7 @@ impl<'a> View<'a> {
 }
 
 /// Points about where the surface should be, of every so many columns and rows.
-fn near_surface(image: &DepthImage, camera: &Camera, region: &Region) -> (Vec<Vector>, usize) {
+fn near_surface(image: &DepthImage, camera: &Camera, region: &Region) -> Vec<Vector> {
     let half = region.size.map(|edge| edge / 2.0);
     let rough = Rays::new(camera, &region.pose);
     let stride = (image.depth.len() as f64 / PLANE_POINTS as f64).sqrt().ceil().max(1.0) as usize;
@@ -216,7 +237,7 @@ fn near_surface(image: &DepthImage, camera: &Camera, region: &Region) -> (Vec<Ve
         .flat_map(|row| (0..image.width).step_by(stride).map(move |column| row * image.width + column))
         .filter_map(|pixel| valid(image.depth[pixel]).map(|depth| rough.point(pixel, depth)))
         .filter(|p| p[0].abs() <= half[0] && p[1].abs() <= half[1] && p[2].abs() < PLANE_SLACK);
-    (near.collect(), stride)
+    near.collect()
 }
 
 /// How much the points of a plane scatter about it, and how many there are: 1.4826 times the median distance is a normal

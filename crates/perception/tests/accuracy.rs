@@ -38,16 +38,14 @@ fn objects_of_all_classes_are_found_where_they_stand_and_nothing_else() {
         for m in matches.iter().filter(|m| m.is_good()) {
             let found = m.found.unwrap();
             assert!(found.confidence > 0.5 && found.confidence <= 1.0, "seed {seed}: {m:?}");
-            squares.extend(
-                [0, 1].map(|i| (m.truth.pose.position[i] - found.pose.position[i]).powi(2) / found.covariance[i][i]),
-            );
+            squares.extend(m.normalised_square());
         }
     }
     assert!(good as f64 >= 0.98 * f64::from(objects as u32), "{good} of {objects}");
     assert!(phantoms as f64 <= 0.01 * objects as f64, "{phantoms} of {objects}");
-    // Squared errors over their variances: 1 in the mean where covariances are true.
+    // 1 in the mean where covariances are true.
     let consistency = squares.iter().sum::<f64>() / squares.len() as f64;
-    assert!((0.3..4.0).contains(&consistency), "{consistency}");
+    assert!((0.5..1.5).contains(&consistency), "{consistency}");
 }
 
 #[test]

@@ -27,6 +27,9 @@ pub(super) const NODES: [Node; 6] = [
 /// The strip's thickness.
 pub(super) const THICKNESS: f64 = 0.015;
 
+/// What is nearer than this below the strip counts as closed for rays: hardly any gets there from above, and a strip of 3 mm would
+/// not keep its own ends where the rays beside it say.
+const UNDER: f64 = 0.05;
 /// How much of a tine's pitch is metal; the rest is the gap.
 pub(super) const TINE: f64 = 0.62;
 /// Tines, in the last part of the head.
@@ -45,10 +48,10 @@ pub(super) fn distance(length: f64, point: Vector) -> f64 {
     length * ((across.max(0.0).powi(2) + aside.max(0.0).powi(2)).sqrt() + across.max(aside).min(0.0))
 }
 
-/// Signed distance from the strip itself: rays pass under its neck.
+/// Signed distance from the strip, a little thicker below: rays pass under its neck.
 pub(super) fn fill_distance(length: f64, point: Vector) -> f64 {
     let (above, aside) = offsets(length, point);
-    let across = above.abs() - THICKNESS / 2.0;
+    let across = above.max(-above - UNDER) - THICKNESS / 2.0;
     length * ((across.max(0.0).powi(2) + aside.max(0.0).powi(2)).sqrt() + across.max(aside).min(0.0))
 }
 

@@ -24,14 +24,29 @@ fn wall(kind: Round, radius: f64, height: f64) -> impl Iterator<Item = Point> + 
     shape(kind).iter().map(move |[r, z]| [r * (radius - half), half + z * (height - WALL)])
 }
 
-/// Signed distance from the surface. What is under a plate counts as its inside: it is seen from above, and a point that noise
-/// has put under its wall still pulls it down.
-pub(super) fn distance(kind: Round, radius: f64, height: f64, point: Point) -> f64 {
+/// How edge-on a wall has to be seen for both of its sides to be taken for seen: the cosine between its normal and the ray.
+const EDGE_ON: f64 = 0.15;
+
+/// Signed distance from the side of the wall that looks to the eye: a point that noise has put behind a wall of 4 mm still
+/// belongs to the side that was seen. `to_eye` is the way from the point to the eye, outwards and up.
+pub(super) fn distance(kind: Round, radius: f64, height: f64, point: Point, to_eye: Point) -> f64 {
     if kind == Round::Can {
         return cylinder_distance(radius, height, point);
     }
-    let to_wall = from_wall(kind, radius, height, point);
-    if kind == Round::Plate && is_under(kind, radius, height, point) { -to_wall - WALL } else { to_wall }
+    let half = WALL / 2.0;
+    let nearest = pairs(wall(kind, radius, height))
+        .map(|(a, b)| (square_from_segment(point, a, b), a, b))
+        .min_by(|left, right| left.0.total_cmp(&right.0));
+    let Some((square, a, b)) = nearest else { return f64::INFINITY };
+    let outwards = normal(a, b);
+    let facing = outwards[0] * to_eye[0] + outwards[1] * to_eye[1];
+    let off = outwards[0] * (point[0] - a[0]) + outwards[1] * (point[1] - a[1]);
+    // All around the rim the wall is seen.
+    let along = [b[0] - a[0], b[1] - a[1]];
+    let past = (point[0] - b[0]) * along[0] + (point[1] - b[1]) * along[1];
+    let at_rim = b[1] >= height - WALL && past > -half * along[0].hypot(along[1]);
+    let behind = facing.abs() > EDGE_ON * to_eye[0].hypot(to_eye[1]) && off * facing < 0.0 && !at_rim;
+    if behind { -square.sqrt() - half } else { square.sqrt() - half }
 }
 
 /// Signed distance from the wall itself.
@@ -55,13 +70,6 @@ pub(super) fn fill_distance(kind: Round, radius: f64, height: f64, point: Point)
         .find(|(a, b)| b[1] > a[1] && (a[1]..=b[1]).contains(&z))
         .is_some_and(|(a, b)| r < a[0] + (b[0] - a[0]) * (z - a[1]) / (b[1] - a[1]));
     if inside { -(to_wall.max(0.0) + WALL).min(height - z) } else { to_wall }
-}
-
-/// Whether a point is below the middle of the wall, within the rim.
-fn is_under(kind: Round, radius: f64, height: f64, [r, z]: Point) -> bool {
-    pairs(wall(kind, radius, height))
-        .find(|(a, b)| (a[0]..=b[0]).contains(&r))
-        .is_some_and(|(a, b)| z < a[1] + (b[1] - a[1]) * (r - a[0]) / (b[0] - a[0]))
 }
 
 /// The outline of the material: from the axis below, around the rim, back to the axis above. Corners are mitred.
