@@ -51,6 +51,11 @@ fn a_task_runs_on_the_system_that_is_up_and_leaves_it_running() -> anyhow::Resul
     ensure!(out.contains("delivered = 1"), "{out}");
     ensure!(place.processes().len() == before, "{:?}", place.processes());
 
+    // What the detector measured says how sure it was.
+    let (facts, err) = support::texts(&place.ratn(&["world", "facts", "shape(box_1)"]).output()?);
+    ensure!(facts.contains("(confidence 0.") || facts.contains("(confidence 1)"), "{facts}{err}");
+    ensure!(std::fs::read_to_string(&log)?.contains("\"covariance\""), "no covariance in the log");
+
     // Once more, on a table like the first, of which nothing is known.
     let output = place.ratn(&["reset"]).output()?;
     let (out, err) = support::texts(&output);

@@ -153,11 +153,14 @@ async fn the_detector_finds_the_boxes_through_the_leased_camera() {
     assert!(looked.is_success(), "{looked:?}");
     let size = Value::List(vec![Value::Float(0.6), Value::Float(1.2)]);
     let region = Value::map([("pose", Value::Pose(table)), ("size", size)]);
-    let outcome = system.execute(&lease, "Detector", "segment", [("region", region)]).await.unwrap();
+    let measures = Value::List(["at", "shape"].map(|name| Value::String(name.to_owned())).to_vec());
+    let inputs = [("region", region), ("measures", measures)];
+    let outcome = system.execute(&lease, "Detector", "segment", inputs).await.unwrap();
     assert!(outcome.is_success(), "{outcome:?}");
     let Value::List(boxes) = &outcome.outputs["boxes"] else { panic!() };
     let truth = system.truth().await.boxes;
     assert_eq!(boxes.len(), truth.len());
+    assert_eq!((outcome.measured.len(), outcome.evidence.len()), (2 * boxes.len(), 2 * boxes.len()));
     for found in boxes {
         let Some(Value::Pose(pose)) = found.field("pose") else { panic!() };
         let off = |t: &v1::TrueBox| {

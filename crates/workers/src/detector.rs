@@ -6,8 +6,10 @@
 //! its pose.
 
 mod body;
+mod facts;
 mod pictures;
 
+use facts::Facts;
 use pictures::Pictures;
 use ratn_model::value::Value;
 use ratn_motion::robot::{Configuration, Robot};
@@ -80,7 +82,7 @@ impl Action for Segment {
             return Err(ActionFailure::aborted(reason));
         };
         let region = Region { pose, size: [x.float()?, y.float()?] };
-        let classes = classes(&goal)?;
+        let (classes, facts) = (classes(&goal)?, Facts::of(&goal)?);
         let seen = self.0.look(&goal, SEGMENT_FRAMES).await?;
         let pictures = self.0.pictures.clone();
         let found = working(&goal, move || {
@@ -92,13 +94,15 @@ impl Action for Segment {
         let first = goal.optional_int("first")?.unwrap_or(1);
         goal.progress(format!("{} objects", found.len()));
         let mut numbers: BTreeMap<ObjectClass, i64> = BTreeMap::new();
-        let named = found.iter().map(|object| {
+        let (mut boxes, mut outcome) = (Vec::new(), GoalOutcome::success());
+        for object in &found {
             let number = numbers.entry(object.model.class()).or_insert(first);
             let id = format!("{}{number}", object.model.class().prefix());
             *number += 1;
-            Value::Map(fields([("id", Value::String(id))].into_iter().chain(described(object))))
-        });
-        Ok(GoalOutcome::success().with_output("boxes", Value::List(named.collect())))
+            outcome = facts.write(outcome, &id, object);
+            boxes.push(Value::Map(fields([("id", Value::String(id))].into_iter().chain(described(object)))));
+        }
+        Ok(outcome.with_output("boxes", Value::List(boxes)))
     }
 }
 
@@ -116,7 +120,7 @@ impl Action for Locate {
         let object = goal.port("object");
         let prior = Prior { pose: object.field("pose").pose()?, size: object.field("size").vector3()? };
         let id = object.field("id").string()?.to_owned();
-        let classes = classes(&goal)?;
+        let (classes, facts) = (classes(&goal)?, Facts::of(&goal)?);
         let seen = self.0.look(&goal, LOCATE_FRAMES).await?;
         let pictures = self.0.pictures.clone();
         let found = working(&goal, move || {
@@ -128,9 +132,8 @@ impl Action for Locate {
             let [x, y, z] = prior.pose.position;
             ActionFailure::aborted(format!("{id} is not near ({x:.2}, {y:.2}, {z:.2}), where it was seen before"))
         })?;
-        Ok(described(&found)
-            .into_iter()
-            .fold(GoalOutcome::success(), |out, (name, value)| out.with_output(name, value)))
+        let outcome = facts.write(GoalOutcome::success(), &id, &found);
+        Ok(described(&found).into_iter().fold(outcome, |out, (name, value)| out.with_output(name, value)))
     }
 }
 

@@ -5,6 +5,7 @@ use crate::columns::columns;
 use ratn_model::fact::FactKey;
 use ratn_model::id::Revision;
 use ratn_model::measurement::{Certainty, Measurement};
+use ratn_model::value::Value;
 use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
 use ratn_world::query::Rows;
 use serde_json::json;
@@ -17,7 +18,7 @@ pub(super) fn facts(facts: &[FactRecord]) -> String {
             fact.value.to_string(),
             fact.revision.0.to_string(),
             fact.writer.as_deref().unwrap_or("-").to_owned(),
-            fact.measured.as_deref().map_or_else(String::new, measured),
+            fact.measured.as_deref().map_or_else(String::new, |by| measured(by, &fact.value)),
         ]
     });
     columns(&["FACT", "VALUE", "REVISION", "WRITER", "MEASURED BY"], rows.collect())
@@ -129,12 +130,29 @@ pub(super) fn rows_json(revision: Revision, rows: &Rows) -> serde_json::Value {
     json!({ "revision": revision.0, "variables": rows.variables, "rows": rows.rows, "more": rows.more })
 }
 
-fn measured(measured: &Measurement) -> String {
+fn measured(measured: &Measurement, value: &Value) -> String {
     match &measured.certainty {
         None => measured.source.clone(),
-        Some(Certainty::Confidence(confidence)) => format!("{} (confidence {confidence})", measured.source),
-        Some(Certainty::Covariance(_)) => format!("{} (with covariance)", measured.source),
+        Some(Certainty::Confidence(confidence)) => format!("{} (confidence {})", measured.source, short(*confidence)),
+        Some(Certainty::Covariance(entries)) => format!("{} ({})", measured.source, deviation(entries, value)),
     }
+}
+
+/// The greatest standard deviation; of a pose that of its place and of its turn.
+fn deviation(entries: &[f64], value: &Value) -> String {
+    let rows = entries.len().isqrt();
+    let greatest = |from: usize, to: usize| {
+        (from..to).filter_map(|i| entries.get(i * (rows + 1))).fold(0.0_f64, |most, v| most.max(*v)).sqrt()
+    };
+    match value {
+        Value::Pose(_) => format!("σ {:.1} mm, {:.1}°", greatest(0, 3) * 1e3, greatest(3, 6).to_degrees()),
+        _ => format!("σ {}", short(greatest(0, rows))),
+    }
+}
+
+/// Four digits at the most.
+fn short(number: f64) -> f64 {
+    (number * 1e4).round() / 1e4
 }
 
 #[cfg(test)]
@@ -142,7 +160,7 @@ mod tests {
     use super::*;
     use insta::assert_snapshot;
     use ratn_model::fact::Term;
-    use ratn_model::value::Value;
+    use ratn_model::pose::Pose;
     use std::sync::Arc;
 
     fn fact(name: &str, value: i64) -> FactRecord {
@@ -164,6 +182,18 @@ mod tests {
         full(box)   12     3         fill[2]  camera (confidence 0.9)
         full(base)  1      3         -
         ");
+    }
+
+    #[test]
+    fn a_pose_says_how_far_off_its_place_and_its_turn_may_be() {
+        let mut entries = vec![0.0; 36];
+        for (i, deviation) in [0.0005, 0.0002, 0.0001, 0.001, 0.001, 0.005].into_iter().enumerate() {
+            entries[7 * i] = deviation * deviation;
+        }
+        let measured = Measurement { source: "camera".to_owned(), certainty: Some(Certainty::Covariance(entries)) };
+        assert_eq!(super::measured(&measured, &Value::Pose(Pose::IDENTITY)), "camera (σ 0.5 mm, 0.3°)");
+        let measured = Measurement { certainty: Some(Certainty::Covariance(vec![0.04])), ..measured };
+        assert_eq!(super::measured(&measured, &Value::Float(2.0)), "camera (σ 0.2)");
     }
 
     #[test]
