@@ -1,13 +1,17 @@
 //! Writes down what happens to the cell, [`Line`] by line.
 //!
-//! A line that cannot be written ends the recording, not the cell.
+//! A line that cannot be written ends the recording, not the cell. A cell that is started again leaves the recordings of before as they
+//! are.
 
 use crate::config::CellConfig;
 use crate::core::recording::Line;
 use anyhow::Context;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+
+/// Recordings of one name.
+const MAX_RECORDINGS: u32 = 1_000;
 
 #[derive(Debug)]
 pub(crate) struct Recorder(Option<BufWriter<File>>);
@@ -18,9 +22,10 @@ impl Recorder {
         Recorder(None)
     }
 
-    /// Begins a recording in a new file.
+    /// Begins a recording in a new file: `file`, or `file.2`, `file.3` and so on after others.
     pub(crate) fn begin(file: &Path, config: &CellConfig) -> anyhow::Result<Recorder> {
-        let made = File::create_new(file).with_context(|| format!("cannot record to {}", file.display()))?;
+        let (made, file) = new_file(file).with_context(|| format!("cannot record to {}", file.display()))?;
+        tracing::info!(file = %file.display(), "what happens is recorded");
         let mut recorder = Recorder(Some(BufWriter::new(made)));
         recorder.write(&[Line::header(config)]);
         Ok(recorder)
@@ -41,10 +46,45 @@ impl Recorder {
     }
 }
 
+fn new_file(wanted: &Path) -> io::Result<(File, PathBuf)> {
+    let later = (2..=MAX_RECORDINGS).map(|number| {
+        let mut name = wanted.as_os_str().to_owned();
+        name.push(format!(".{number}"));
+        PathBuf::from(name)
+    });
+    for file in std::iter::once(wanted.to_owned()).chain(later) {
+        match File::create_new(&file) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+            made => return Ok((made?, file)),
+        }
+    }
+    Err(io::Error::other(format!("{MAX_RECORDINGS} recordings of that name are there: remove some")))
+}
+
 fn write(file: &mut BufWriter<File>, lines: &[Line]) -> io::Result<()> {
     for line in lines {
         serde_json::to_writer(&mut *file, line)?;
         file.write_all(b"\n")?;
     }
     file.flush()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cell_that_is_started_again_leaves_the_recordings_of_before() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        let file = place.path().join("cell.jsonl");
+        for _ in 0..3 {
+            assert!(Recorder::begin(&file, &CellConfig::default())?.is_on());
+        }
+        for name in ["cell.jsonl", "cell.jsonl.2", "cell.jsonl.3"] {
+            assert!(std::fs::read_to_string(place.path().join(name))?.starts_with("{\"form\":1"), "{name}");
+        }
+        let nowhere = Recorder::begin(&place.path().join("no/cell.jsonl"), &CellConfig::default());
+        assert!(nowhere.is_err_and(|error| error.to_string().starts_with("cannot record to")));
+        Ok(())
+    }
 }
