@@ -14,7 +14,7 @@ use pictures::Pictures;
 use ratn_model::value::Value;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_perception::camera::{Camera, DepthImage, Intrinsics};
-use ratn_perception::detection::{Detection, ObjectClass, Prior, Region, locate, segment};
+use ratn_perception::detection::{Detection, DetectionError, ObjectClass, Prior, Region, locate, segment};
 use ratn_perception::mask::Ball;
 use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, InputError, Port};
 use ratn_worker::worker::{Worker, WorkerOptions};
@@ -83,14 +83,8 @@ impl Action for Segment {
         };
         let region = Region { pose, size: [x.float()?, y.float()?] };
         let (classes, facts) = (classes(&goal)?, Facts::of(&goal)?);
-        let seen = self.0.look(&goal, SEGMENT_FRAMES).await?;
-        let pictures = self.0.pictures.clone();
-        let found = working(&goal, move || {
-            let found = segment(&seen.image, &seen.camera, &region, &classes, &seen.body)?;
-            pictures.keep(&seen.image, &seen.camera, &found);
-            Ok::<_, ratn_perception::detection::DetectionError>(found)
-        });
-        let found = found.await??;
+        let all = move |seen: &Seen| segment(&seen.image, &seen.camera, &region, &classes, &seen.body);
+        let found = self.0.find(&goal, SEGMENT_FRAMES, all).await?;
         let first = goal.optional_int("first")?.unwrap_or(1);
         goal.progress(format!("{} objects", found.len()));
         let mut numbers: BTreeMap<ObjectClass, i64> = BTreeMap::new();
@@ -121,14 +115,11 @@ impl Action for Locate {
         let prior = Prior { pose: object.field("pose").pose()?, size: object.field("size").vector3()? };
         let id = object.field("id").string()?.to_owned();
         let (classes, facts) = (classes(&goal)?, Facts::of(&goal)?);
-        let seen = self.0.look(&goal, LOCATE_FRAMES).await?;
-        let pictures = self.0.pictures.clone();
-        let found = working(&goal, move || {
+        let one = move |seen: &Seen| {
             let found = locate(&seen.image, &seen.camera, &prior, &classes, &seen.body)?;
-            pictures.keep(&seen.image, &seen.camera, found.as_slice());
-            Ok::<_, ratn_perception::detection::DetectionError>(found)
-        });
-        let found = found.await??.ok_or_else(|| {
+            Ok(found.into_iter().collect())
+        };
+        let found = self.0.find(&goal, LOCATE_FRAMES, one).await?.pop().ok_or_else(|| {
             let [x, y, z] = prior.pose.position;
             ActionFailure::aborted(format!("{id} is not near ({x:.2}, {y:.2}, {z:.2}), where it was seen before"))
         })?;
@@ -138,6 +129,23 @@ impl Action for Locate {
 }
 
 impl Eyes {
+    /// What is found in a picture of the leased camera, on a thread of its own; milliseconds, so a goal that shall stop only leaves the
+    /// answer behind.
+    async fn find(
+        &self,
+        goal: &GoalContext,
+        default_frames: i64,
+        search: impl FnOnce(&Seen) -> Result<Vec<Detection>, DetectionError> + Send + 'static,
+    ) -> Result<Vec<Detection>, ActionFailure> {
+        let (seen, pictures) = (self.look(goal, default_frames).await?, self.pictures.clone());
+        let searching = tokio::task::spawn_blocking(move || {
+            let found = search(&seen)?;
+            pictures.keep(&seen.image, &seen.camera, &found);
+            Ok::<_, DetectionError>(found)
+        });
+        Ok(goal.unless_cancelled(searching).await???)
+    }
+
     /// A picture of the leased camera.
     async fn look(&self, goal: &GoalContext, default_frames: i64) -> Result<Seen, ActionFailure> {
         let frames = goal.optional_int("frames")?.unwrap_or(default_frames);
@@ -178,14 +186,6 @@ fn classes(goal: &GoalContext) -> Result<Vec<ObjectClass>, ActionFailure> {
         })
     };
     port.list()?.iter().map(named).collect()
-}
-
-/// Works on a thread of its own; milliseconds, so a goal that shall stop only leaves the answer behind.
-async fn working<T: Send + 'static>(
-    goal: &GoalContext,
-    work: impl FnOnce() -> T + Send + 'static,
-) -> Result<T, ActionFailure> {
-    Ok(goal.unless_cancelled(tokio::task::spawn_blocking(work)).await??)
 }
 
 /// What is said of an object beside its name.

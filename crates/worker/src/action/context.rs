@@ -1,13 +1,14 @@
 //! What an action gets: its goal, and what it may do with it.
 
-use super::goal::{GoalEntry, StopCause};
+use super::goal::GoalEntry;
 use super::{ActionFailure, InputError, Port};
-use crate::client::{ActionClient, CallError, Channels, WorldClient, chain, patiently};
+use crate::client::{ActionClient, CallError, Channels, WorldClient, patiently};
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::safety::{Safety, SafetyState};
 use ratn_model::fact::{Change, FactPattern};
 use ratn_model::id::ProjectionId;
 use ratn_model::pose::Pose;
+use ratn_model::program::{PREEMPTED, STOPPED};
 use ratn_model::resource::Lease;
 use ratn_model::value::{Trajectory, Value};
 use ratn_proto::convert::wire_ports;
@@ -111,12 +112,23 @@ pub enum CallFailure {
 }
 
 impl CallFailure {
-    /// The outcome that the called action came to.
-    pub(super) fn ended_as(&self) -> Option<&str> {
-        match self {
-            CallFailure::Outcome { outcome, .. } => Some(outcome),
+    /// What it makes of whoever called, where that is not to be aborted.
+    pub(super) fn failure(&self) -> Option<fn(String) -> ActionFailure> {
+        let CallFailure::Outcome { outcome, .. } = self else { return None };
+        match outcome.as_str() {
+            STOPPED => Some(ActionFailure::Stopped),
+            PREEMPTED => Some(ActionFailure::Preempted),
             _ => None,
         }
+    }
+}
+
+impl WorldFailure {
+    /// What it makes of the goal, where that is not to be aborted: projections end with the world pool.
+    pub(super) fn failure(&self) -> Option<fn(String) -> ActionFailure> {
+        let WorldFailure::Call(error) = self else { return None };
+        let gone = error.is_crash() || error.code() == Some(Code::NotFound);
+        gone.then_some(ActionFailure::Lost)
     }
 }
 
@@ -255,23 +267,8 @@ impl GoalContext {
     /// [`WorldFailure`].
     pub async fn facts(&self, patterns: &[FactPattern]) -> Result<Vec<FactRecord>, WorldFailure> {
         let client = self.world_client()?;
-        self.read_world(|| client.query(self.projection, patterns)).await
-    }
-
-    /// What a world pool says that may be started again meanwhile. Its projections end with it: a goal whose world is gone has lost
-    /// this attempt, whatever its action makes of it.
-    pub(super) async fn read_world<T, F>(&self, ask: impl FnMut() -> F) -> Result<T, WorldFailure>
-    where
-        F: Future<Output = Result<T, CallError>>,
-    {
-        let answer = patiently(ask).await;
-        let lost = answer.as_ref().is_err_and(|error| error.is_crash() || error.code() == Some(Code::NotFound));
-        let answer = answer.map_err(WorldFailure::from);
-        answer.inspect_err(|failure| {
-            if lost {
-                self.entry.blame(StopCause::WorldLost(chain(failure)));
-            }
-        })
+        // It may be started again just now.
+        Ok(patiently(|| client.query(self.projection, patterns)).await?)
     }
 
     pub(super) fn world_client(&self) -> Result<WorldClient, WorldFailure> {

@@ -33,8 +33,6 @@ pub(crate) enum StopCause {
     ShuttingDown,
     /// An emergency stop, and why.
     EmergencyStop(String),
-    /// The world that it works on cannot be read any more, and why.
-    WorldLost(String),
 }
 
 /// How a goal ended.
@@ -66,7 +64,6 @@ impl StopCause {
             StopCause::LeaseEnded(reason) => ActionFailure::Aborted(format!("the lease ended: {reason}")),
             StopCause::ShuttingDown => ActionFailure::Aborted("the provider shuts down".to_owned()),
             StopCause::EmergencyStop(reason) => ActionFailure::emergency_stop(reason),
-            StopCause::WorldLost(reason) => ActionFailure::Aborted(reason.clone()),
         }
     }
 }

@@ -25,7 +25,6 @@ pub use scene::SceneCache;
 pub use server::{ActionServer, ActionServerBuilder};
 
 use crate::client::chain;
-use ratn_model::program::{PREEMPTED, STOPPED};
 use std::error::Error;
 use std::iter;
 
@@ -59,7 +58,8 @@ pub trait Action: Send + Sync + 'static {
 pub type ActionResult = Result<GoalOutcome, ActionFailure>;
 
 /// A goal that did not come to an outcome of its own. Made from any error by `?`: what another provider that was called
-/// ([`GoalContext::call`]) ended as, where that is `preempted` or `stopped`, else `aborted`.
+/// ([`GoalContext::call`]) ended as, where that is `preempted` or `stopped`; lost, where the world pool or the goal's projection is gone
+/// ([`WorldFailure`]); else `aborted`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ActionFailure {
     /// It failed: the outcome is `aborted`.
@@ -68,6 +68,8 @@ pub enum ActionFailure {
     Preempted(String),
     /// An emergency stop is in force: the outcome is `stopped`.
     Stopped(String),
+    /// The world that it works on is gone: it comes to no outcome, as if its process had been killed, and another attempt may.
+    Lost(String),
 }
 
 impl ActionFailure {
@@ -85,19 +87,19 @@ impl ActionFailure {
 impl<E: std::error::Error + 'static> From<E> for ActionFailure {
     fn from(error: E) -> ActionFailure {
         let reason = chain(&error);
-        let causes = iter::successors(Some(&error as &(dyn Error + 'static)), |&error| error.source());
-        match causes.filter_map(|cause| cause.downcast_ref()).find_map(CallFailure::ended_as) {
-            Some(STOPPED) => ActionFailure::Stopped(reason),
-            Some(PREEMPTED) => ActionFailure::Preempted(reason),
-            _ => ActionFailure::Aborted(reason),
-        }
+        let mut causes = iter::successors(Some(&error as &(dyn Error + 'static)), |&error| error.source());
+        let failure = causes.find_map(|cause| {
+            let call = cause.downcast_ref().and_then(CallFailure::failure);
+            call.or_else(|| cause.downcast_ref().and_then(WorldFailure::failure))
+        });
+        failure.unwrap_or(ActionFailure::Aborted)(reason)
     }
 }
 
 impl From<ActionFailure> for GoalOutcome {
     fn from(failure: ActionFailure) -> GoalOutcome {
         match failure {
-            ActionFailure::Aborted(reason) => GoalOutcome::aborted(reason),
+            ActionFailure::Aborted(reason) | ActionFailure::Lost(reason) => GoalOutcome::aborted(reason),
             ActionFailure::Preempted(reason) => GoalOutcome::preempted(reason),
             ActionFailure::Stopped(reason) => GoalOutcome::stopped(reason),
         }

@@ -305,18 +305,19 @@ async fn run(
         entry.cancelled.cancelled().await;
         tokio::time::sleep(STOP_GRACE).await;
     };
-    let outcome = tokio::select! {
+    let result = tokio::select! {
         biased;
-        performed = &mut performing => outcome_of(performed),
+        performed = &mut performing => result_of(performed),
         () = overdue => {
             performing.abort();
-            let (ActionFailure::Aborted(cause) | ActionFailure::Preempted(cause) | ActionFailure::Stopped(cause)) =
-                entry.stopped();
-            GoalOutcome::aborted(format!("{cause}; it did not stop within {} s", STOP_GRACE.as_secs()))
+            let cause = GoalOutcome::from(entry.stopped()).reason;
+            Err(ActionFailure::Aborted(format!("{cause}; it did not stop within {} s", STOP_GRACE.as_secs())))
         }
         never = deadline => match never {},
         never = stopped => match never {},
     };
+    let lost = result.as_ref().is_err_and(|failure| matches!(failure, ActionFailure::Lost(_)));
+    let outcome = result.unwrap_or_else(GoalOutcome::from);
     let outcome = match entry.cause() {
         // Whatever the action makes of being stopped.
         Some(cause @ StopCause::EmergencyStop(_)) if !outcome.is_success() => cause.failure().into(),
@@ -327,7 +328,7 @@ async fn run(
     server.state().end(&entry, server.results_kept);
     let ending = match entry.cause() {
         Some(StopCause::ShuttingDown) if !outcome.is_success() => Ending::Gone,
-        Some(StopCause::WorldLost(reason)) if !outcome.is_success() => Ending::Lost(reason),
+        None if lost => Ending::Lost(outcome.reason),
         cause => {
             let orphaned = !outcome.is_success() && cause.is_some_and(|cause| cause.is_orphaning());
             Ending::Outcome(outcome, orphaned)
@@ -336,15 +337,13 @@ async fn run(
     entry.result.send_replace(Some(ending));
 }
 
-fn outcome_of(performed: Result<ActionResult, JoinError>) -> GoalOutcome {
-    match performed {
-        Ok(Ok(outcome)) => outcome,
-        Ok(Err(failure)) => failure.into(),
-        Err(error) => GoalOutcome::aborted(match error.try_into_panic() {
+fn result_of(performed: Result<ActionResult, JoinError>) -> ActionResult {
+    performed.unwrap_or_else(|error| {
+        Err(ActionFailure::Aborted(match error.try_into_panic() {
             Ok(panic) => format!("the action panicked: {}", panic_message(&*panic)),
             Err(error) => format!("the action was torn down: {error}"),
-        }),
-    }
+        }))
+    })
 }
 
 fn panic_message(panic: &(dyn std::any::Any + Send)) -> &str {
