@@ -74,9 +74,10 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
     use super::*;
+    use crate::arm;
     use crate::collision::{Checker, Contact, PADDING_M};
-    use crate::inverse::Solver;
     use crate::line::line;
+    use crate::reach::Target;
     use crate::robot::{Configuration, Robot};
     use parry3d::math::Vector;
     use parry3d::query::Ray;
@@ -97,13 +98,14 @@ mod tests {
 
     /// Some solution at the grasp from which the straight line up is free.
     fn reachable(robot: &Robot, scene: &Scene, pose: &Pose, size: [f64; 3]) -> Result<(), String> {
-        let mut solver = Solver::new(robot, &scene.base);
+        let reach = arm::reach(robot);
         let mut checker = Checker::new(robot, scene, PADDING_M);
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let mut reasons = Vec::new();
         for grasp in grasp_poses(pose, size) {
-            for solution in solver.solutions(&grasp, &HOME, 12, 40, &mut random) {
-                match line(&mut solver, &solution, [0.0, 0.0, APPROACH_M]) {
+            for posture in reach.solutions(&Target::at(grasp), &arm::positions(&HOME), 12, 40, &mut random) {
+                let solution = std::array::from_fn(|j| posture[j]);
+                match line(&reach, &solution, [0.0, 0.0, APPROACH_M]) {
                     Err(error) => reasons.push(error.to_string()),
                     Ok(postures) => {
                         let contact = Contact::Gripper(crate::collision::CONTACT_TOLERANCE_M);
@@ -165,7 +167,7 @@ mod tests {
         let scene = Scene { base: Pose::IDENTITY, objects: objects.chain([table()]).collect() };
         let mut checker = Checker::new(&robot, &scene, PADDING_M);
         for (name, posture) in [("HOME", HOME), ("OBSERVATION", OBSERVATION), ("STOWED", STOWED)] {
-            let tool = Solver::new(&robot, &Pose::IDENTITY).tool(&posture);
+            let tool = arm::reach(&robot).pose(&arm::positions(&posture));
             assert_eq!(robot.clamp(&posture), posture, "{name} is within limits");
             assert_eq!(checker.collision(&posture, Contact::None), None, "{name}, tool at {:?}", tool.position);
         }

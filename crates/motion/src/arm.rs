@@ -6,7 +6,8 @@
 //! finds clear of obstacles the spheres do too, and what the spheres find free is free by the exact check with `ROOM_M`.
 
 use crate::mechanism::{Drive, MAX_JOINTS, Mechanism, Part};
-use crate::robot::{Body, Configuration, Geometry, Joints, Motion, Robot};
+use crate::reach::{Positions, Reach};
+use crate::robot::{Body, Configuration, Geometry, Joints, Link, Motion, Robot};
 use crate::space::{Obstacle, Space, State};
 use crate::spheres::cover_within;
 use ratn_model::pose::Pose;
@@ -40,17 +41,7 @@ pub fn in_scene(robot: &Robot, scene: &Scene, finger: f64) -> (Mechanism, Vec<Ob
     let mut links = Vec::new();
     let mut allowed = BTreeSet::new();
     for (index, link) in robot.links.iter().enumerate() {
-        let (mut origin, mut drive) = (link.origin, None);
-        match link.motion {
-            Motion::Turn { axis, joint } if (FIRST_ARM_JOINT..FIRST_ARM_JOINT + 7).contains(&joint) => {
-                drive = Some(Drive { joint: joint - FIRST_ARM_JOINT, axis, slides: false });
-            }
-            Motion::Slide { axis, joint: FINGER } => {
-                let [x, y, z] = axis.map(|c| c * finger);
-                origin = origin.compose(&Pose::at(x, y, z));
-            }
-            _ => {}
-        }
+        let (origin, drive) = placed(link, finger);
         let moves = robot.arm_links.contains(&index);
         let bodies = if moves { link.bodies.clone() } else { Vec::new() };
         links.push(part(&link.name, link.parent, origin, drive, bodies));
@@ -87,6 +78,32 @@ pub fn in_scene(robot: &Robot, scene: &Scene, finger: f64) -> (Mechanism, Vec<Ob
     };
     let disabled = pairs.filter(touching).collect();
     (Mechanism { name: "arm".to_owned(), joints, links, disabled, allowed }, obstacles)
+}
+
+/// The tool of the arm in the frame of the base.
+pub fn reach(robot: &Robot) -> Reach {
+    let bare = |link: &Link| {
+        let (origin, drive) = placed(link, 0.0);
+        part(&link.name, link.parent, origin, drive, Vec::new())
+    };
+    let links = robot.links.iter().map(bare).collect();
+    let (joints, disabled, allowed) = (robot.arm_joints().to_vec(), BTreeSet::new(), BTreeSet::new());
+    let mechanism = Mechanism { name: "arm".to_owned(), joints, links, disabled, allowed };
+    Reach::new(&mechanism, robot.tool, Pose::IDENTITY)
+}
+
+/// Where a link sits in its parent's frame, each finger `finger` metres from the middle, and which joint of the arm moves it.
+fn placed(link: &Link, finger: f64) -> (Pose, Option<Drive>) {
+    match link.motion {
+        Motion::Turn { axis, joint } if (FIRST_ARM_JOINT..FIRST_ARM_JOINT + 7).contains(&joint) => {
+            (link.origin, Some(Drive { joint: joint - FIRST_ARM_JOINT, axis, slides: false }))
+        }
+        Motion::Slide { axis, joint: FINGER } => {
+            let [x, y, z] = axis.map(|c| c * finger);
+            (link.origin.compose(&Pose::at(x, y, z)), None)
+        }
+        _ => (link.origin, None),
+    }
 }
 
 /// The base's place and heading on the floor.
@@ -150,6 +167,13 @@ pub fn state(arm: &Joints) -> State {
         *to = *from as f32;
     }
     state
+}
+
+/// A posture as [`Reach`] wants it.
+pub fn positions(arm: &Joints) -> Positions {
+    let mut positions = [0.0; MAX_JOINTS];
+    positions[..7].copy_from_slice(arm);
+    positions
 }
 
 /// A posture of the vector checks, within the arm's limits.

@@ -1,6 +1,7 @@
 //! Straight motions of the tool: depart straight up, approach straight down.
 
-use crate::inverse::Solver;
+use crate::arm::positions;
+use crate::reach::{Reach, Target};
 use crate::robot::Joints;
 
 /// The tool's way between two solved postures, in metres.
@@ -19,14 +20,14 @@ pub struct LineError {
     pub wanted_m: f64,
 }
 
-/// Postures along the straight line of the tool from `start` by `offset` (world frame, metres), its rotation kept; the first
-/// is `start`.
+/// Postures along the straight line of the arm's tool from `start` by `offset` (in the frame of the base, metres), its rotation
+/// kept; the first is `start`.
 ///
 /// # Errors
 /// [`LineError`] where limits or a singularity end the line early.
-pub fn line(solver: &mut Solver<'_>, start: &Joints, offset: [f64; 3]) -> Result<Vec<Joints>, LineError> {
+pub fn line(reach: &Reach, start: &Joints, offset: [f64; 3]) -> Result<Vec<Joints>, LineError> {
     let length = offset.iter().map(|c| c * c).sum::<f64>().sqrt();
-    let from = solver.tool(start);
+    let from = reach.pose(&positions(start));
     let steps = ((length / STEP_M).ceil() as usize).max(1);
     let mut postures = vec![*start];
     let mut here = *start;
@@ -35,9 +36,11 @@ pub fn line(solver: &mut Solver<'_>, start: &Joints, offset: [f64; 3]) -> Result
         for (coordinate, way) in target.position.iter_mut().zip(offset) {
             *coordinate += way * i as f64 / steps as f64;
         }
-        let next = solver.descend(&target, &here, None);
+        let next = reach.descend(&Target::at(target), &positions(&here));
         match next {
-            Some(next) if (0..7).all(|j| (next[j] - here[j]).abs() < MAX_JUMP_RAD) => here = next,
+            Some(next) if (0..7).all(|j| (next[j] - here[j]).abs() < MAX_JUMP_RAD) => {
+                here = std::array::from_fn(|j| next[j]);
+            }
             _ => return Err(LineError { reached_m: length * (i - 1) as f64 / steps as f64, wanted_m: length }),
         }
         postures.push(here);

@@ -10,14 +10,13 @@
 //! postures that have room for them; where the start or a candidate has less, a short way out of there comes first. Where the
 //! tool is to stay upright, the free path keeps it so (`constrained`), and the straight parts do anyway.
 
-use crate::arm::{self, finger_around_held, joints, state};
+use crate::arm::{self, finger_around_held, joints, positions, state};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M, distance, length};
 use crate::connect::{Budget, ConnectError, connect};
 use crate::constrained::{self, Constraint};
-use crate::inverse::{Solver, is_same};
 use crate::line::{LineError, line};
 use crate::pace::{Control, Pace, Progress, Stop};
-use crate::reach::{Positions, Reach, Target};
+use crate::reach::{Positions, Postures, Reach, Target, is_new};
 use crate::refine::{End, Refinement};
 pub use crate::request::{Goal, MAX_GOALS, MAX_STRAIGHT_M, MIN_SPEED, Request};
 use crate::robot::{Configuration, Joints, Robot};
@@ -169,7 +168,6 @@ struct Planning<'a> {
     base: Pose,
     /// What the free path keeps.
     constraint: Option<Constraint>,
-    solver: Solver<'a>,
     random: ChaCha8Rng,
     goals: Vec<Goal>,
     approach_m: f64,
@@ -196,7 +194,6 @@ pub fn plan(
         reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
         base: arm::on_floor(&scene.base),
         constraint: None,
-        solver: Solver::new(robot, &scene.base),
         random: ChaCha8Rng::seed_from_u64(request.seed),
         goals: request.goals.clone(),
         approach_m: request.approach_m,
@@ -267,8 +264,7 @@ impl Planning<'_> {
             };
         }
         let failed = |reason: String| PlanError::Depart { depart_m: request.depart_m, reason };
-        let postures =
-            line(&mut self.solver, &start, [0.0, 0.0, request.depart_m]).map_err(|e| failed(e.to_string()))?;
+        let postures = line(&self.reach, &start, [0.0, 0.0, request.depart_m]).map_err(|e| failed(e.to_string()))?;
         match self.straight_collision(&postures) {
             Some(collision) => Err(failed(collision.to_string())),
             None => match self.checker.collision(&postures[postures.len() - 1], Contact::None) {
@@ -328,19 +324,26 @@ impl Planning<'_> {
         attempts: usize,
         pace: &mut Pace<'_>,
     ) -> Result<Vec<Joints>, Stop> {
-        let target = Target::at(self.base.inverse().compose(pose));
-        let mut found: Vec<Joints> = Vec::new();
+        let (postures, near) = (self.goal(pose), positions(near));
+        let mut found = Vec::new();
         for attempt in 0..attempts {
             pace.poll()?;
-            let postures = self.reach.attempt(&target, &positions(near), attempt, &mut self.random);
-            for posture in postures.into_iter().take(SOLUTIONS_PER_ATTEMPT) {
-                let posture: Joints = std::array::from_fn(|j| posture[j]);
-                if found.len() < wanted && found.iter().all(|other| !is_same(other, &posture)) {
+            let some = self.reach.attempt(&postures, &near, attempt, &mut self.random);
+            for posture in some.into_iter().take(SOLUTIONS_PER_ATTEMPT) {
+                if found.len() < wanted && is_new(&found, &posture) {
                     found.push(posture);
                 }
             }
+            if found.len() == wanted || postures.is_empty() {
+                break;
+            }
         }
-        Ok(found)
+        Ok(found.iter().map(arm_of).collect())
+    }
+
+    /// All postures at a pose in the world frame.
+    fn goal(&self, pose: &Pose) -> Postures {
+        self.reach.postures(&Target::at(self.base.inverse().compose(pose)))
     }
 
     /// The goal posture with its approach, or why it is none.
@@ -348,7 +351,7 @@ impl Planning<'_> {
         let mut approach = vec![*goal];
         if self.approach_m > 0.0 {
             let up = [0.0, 0.0, self.approach_m];
-            approach = line(&mut self.solver, goal, up).map_err(|e: LineError| format!("approaching the goal, {e}"))?;
+            approach = line(&self.reach, goal, up).map_err(|e: LineError| format!("approaching the goal, {e}"))?;
             if let Some(collision) = self.straight_collision(&approach) {
                 return Err(format!("approaching the goal, {collision}"));
             }
@@ -474,7 +477,8 @@ impl Planning<'_> {
         let near = joints(self.robot, &refinement.point(along).0);
         let seed = near.map(|q| q + self.random.random_range(-0.5..0.5));
         let bound = f64::from(refinement.length());
-        let Some(posture) = self.solver.descend(&pose, &seed, Some(&near)) else { return };
+        let postures = self.reach.nearest(&self.goal(&pose), &positions(&seed));
+        let Some(posture) = postures.first().map(arm_of) else { return };
         if distance(&start, &posture) >= bound * 1.1 {
             return;
         }
@@ -508,10 +512,8 @@ impl Planning<'_> {
     }
 }
 
-fn positions(arm: &Joints) -> Positions {
-    let mut positions = Positions::default();
-    positions[..arm.len()].copy_from_slice(arm);
-    positions
+fn arm_of(positions: &Positions) -> Joints {
+    std::array::from_fn(|j| positions[j])
 }
 
 /// How many different reasons an error names.

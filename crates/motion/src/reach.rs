@@ -2,9 +2,11 @@
 //!
 //! Numeric: damped least squares on the geometric Jacobian, from a given posture or from random ones. What is within its
 //! tolerance counts as no error, so the same descent serves poses to be reached ([`Target::at`]), poses about an axis, and
-//! constraints that a whole path keeps, such as "upright" ([`Target::upright`]). Arms with a spherical shoulder and wrist are
-//! solved in closed form first (`spherical`). Deterministic: the randomness comes from the caller.
+//! constraints that a whole path keeps, such as "upright" ([`Target::upright`]). Arms of seven joints with a spherical shoulder
+//! and wrist are solved in closed form (`spherical`, `elbow`): every pose that they reach is found, and it is certain when one
+//! is out of reach. Deterministic: the randomness comes from the caller.
 
+use crate::elbow::{self, Arc};
 use crate::frame::{compose, cross, difference, norm, rotate};
 use crate::mechanism::{Drive, MAX_JOINTS, Mechanism};
 use crate::robot::Joint;
@@ -27,6 +29,9 @@ const INNER: f64 = 0.9;
 
 /// Tolerances below this leave nothing open, in metres or radians.
 const EXACT: f64 = 1e-4;
+
+/// Arcs of the elbow's turns that are looked at for the nearest posture.
+const ARCS_TRIED: usize = 4;
 
 /// Two postures closer than this are the same one, in radians.
 const SAME: f64 = 0.05;
@@ -108,6 +113,21 @@ pub struct Reach {
     tip: Pose,
     joints: Vec<Joint>,
     spherical: Option<Spherical>,
+}
+
+/// All postures that meet a target, in closed form where the arm allows it.
+#[derive(Debug, Clone)]
+pub struct Postures {
+    target: Target,
+    /// The turns of the elbow that keep the limits.
+    arcs: Option<Vec<Arc>>,
+}
+
+impl Postures {
+    /// Whether it is certain that there are none.
+    pub fn is_empty(&self) -> bool {
+        self.arcs.as_ref().is_some_and(Vec::is_empty)
+    }
 }
 
 /// A joint's axis in the root's frame.
@@ -192,6 +212,12 @@ impl Reach {
         None
     }
 
+    /// The postures that meet a target, to be taken from by [`Reach::nearest`] and [`Reach::anywhere`].
+    pub fn postures(&self, target: &Target) -> Postures {
+        let closed = self.spherical.as_ref().filter(|_| target.is_exact());
+        Postures { target: *target, arcs: closed.map(|arm| elbow::arcs(arm, &target.pose, &self.joints)) }
+    }
+
     /// Up to `wanted` different postures from at most `attempts`, nearest to `near` first.
     pub fn solutions(
         &self,
@@ -202,32 +228,71 @@ impl Reach {
         random: &mut impl Rng,
     ) -> Vec<Positions> {
         let mut found: Vec<Positions> = Vec::new();
+        let postures = self.postures(target);
         for attempt in 0..attempts {
-            for posture in self.attempt(target, near, attempt, random) {
-                if found.len() < wanted && found.iter().all(|other| distance(other, &posture) > SAME) {
+            for posture in self.attempt(&postures, near, attempt, random) {
+                if found.len() < wanted && is_new(&found, &posture) {
                     found.push(posture);
                 }
             }
-            if found.len() == wanted {
+            if found.len() == wanted || postures.is_empty() {
                 break;
             }
         }
-        found.sort_by(|a, b| distance(a, near).total_cmp(&distance(b, near)));
-        found
+        sorted(found, near)
     }
 
-    /// The postures of one attempt: the first near `near`, further ones anywhere; in closed form where the arm allows it.
-    pub fn attempt(&self, target: &Target, near: &Positions, attempt: usize, random: &mut impl Rng) -> Vec<Positions> {
-        if let Some(spherical) = self.spherical.as_ref().filter(|_| target.is_exact()) {
-            let turn = if attempt == 0 { spherical.turn(near) } else { random.random_range(-PI..PI) };
-            let within = |p: &Positions| self.clamp(p) == *p && target.is_met_by(&self.pose(p));
-            let mut solutions: Vec<Positions> =
-                spherical.solve(&target.pose, turn).into_iter().filter(within).collect();
-            solutions.sort_by(|a, b| distance(a, near).total_cmp(&distance(b, near)));
-            return solutions;
+    /// The postures of one attempt, nearest to `near` first: the first with those close to it, further ones anywhere.
+    pub fn attempt(
+        &self,
+        postures: &Postures,
+        near: &Positions,
+        attempt: usize,
+        random: &mut impl Rng,
+    ) -> Vec<Positions> {
+        if attempt == 0 { self.nearest(postures, near) } else { self.anywhere(postures, near, random) }
+    }
+
+    /// Postures close to `near`, the nearest first.
+    pub fn nearest(&self, postures: &Postures, near: &Positions) -> Vec<Positions> {
+        let (Some(arm), Some(arcs)) = (&self.spherical, &postures.arcs) else {
+            return self.descend(&postures.target, near).into_iter().collect();
+        };
+        let turn = arm.turn(near);
+        let mut closest: Vec<(f64, f64, f64)> = Vec::new();
+        for arc in arcs {
+            let (turn, away) = arc.nearest(turn);
+            closest.push((away, turn, arc.bend));
         }
-        let seed = if attempt == 0 { *near } else { self.random(random) };
-        self.descend(target, &seed).into_iter().collect()
+        closest.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let found = closest.into_iter().take(ARCS_TRIED).flat_map(|(_, turn, bend)| self.solve(postures, bend, turn));
+        sorted(found.collect(), near)
+    }
+
+    /// Postures anywhere, the nearest to `near` first.
+    pub fn anywhere(&self, postures: &Postures, near: &Positions, random: &mut impl Rng) -> Vec<Positions> {
+        let Some(arcs) = &postures.arcs else {
+            return self.descend(&postures.target, &self.random(random)).into_iter().collect();
+        };
+        let mut along = random.random_range(0.0..1.0) * arcs.iter().map(|arc| arc.width).sum::<f64>();
+        let chosen = arcs.iter().find(|arc| {
+            let here = along < arc.width;
+            if !here {
+                along -= arc.width;
+            }
+            here
+        });
+        let found = chosen.map(|arc| self.solve(postures, arc.bend, arc.from + along));
+        sorted(found.unwrap_or_default(), near)
+    }
+
+    /// The postures within the limits with the elbow at this bend and turn, in closed form.
+    fn solve(&self, postures: &Postures, bend: f64, turn: f64) -> Vec<Positions> {
+        let target = &postures.target;
+        let Some(arm) = &self.spherical else { return Vec::new() };
+        // At the end of an arc a joint is at its limit, but for rounding.
+        let clamped = arm.solve(&target.pose, bend, turn).into_iter().map(|posture| self.clamp(&posture));
+        clamped.filter(|posture| target.is_met_by(&self.pose(posture))).collect()
     }
 
     /// Each joint's axis and a point on it, in the root's frame; and the frame.
@@ -259,6 +324,16 @@ fn jacobian(axes: &[Axis], tip: &Pose, view: &Pose, minded: [bool; 6]) -> [Posit
         }
     }
     rows
+}
+
+/// Whether a posture is none of these.
+pub(crate) fn is_new(found: &[Positions], posture: &Positions) -> bool {
+    found.iter().all(|other| distance(other, posture) > SAME)
+}
+
+fn sorted(mut postures: Vec<Positions>, near: &Positions) -> Vec<Positions> {
+    postures.sort_by(|a, b| distance(a, near).total_cmp(&distance(b, near)));
+    postures
 }
 
 /// The Euclidean distance.

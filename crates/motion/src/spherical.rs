@@ -13,14 +13,17 @@ use std::f64::consts::{PI, TAU};
 /// Axes that pass each other by less than this meet, in metres; directions with a smaller product are perpendicular.
 const MEETING: f64 = 1e-9;
 
+/// Axes this close to one direction turn about the same one, in radians: a tenth of what a pose may be off.
+const IN_LINE: f64 = 1e-7;
+
 type Vector = [f64; 3];
 
 /// The geometry of such an arm at zero positions.
 #[derive(Debug, Clone)]
 pub(crate) struct Spherical {
-    axes: [Vector; 7],
+    pub(crate) axes: [Vector; 7],
     /// Which position turns each axis.
-    joints: [usize; 7],
+    pub(crate) joints: [usize; 7],
     shoulder: Vector,
     /// A point on the elbow's axis.
     elbow: Vector,
@@ -65,30 +68,52 @@ impl Spherical {
         wrapped(2.0 * along.atan2(rest[3]))
     }
 
-    /// All postures, limits aside, that bring the frame to a pose with the elbow at this turn.
-    pub(crate) fn solve(&self, target: &Pose, turn: f64) -> Vec<Positions> {
-        // What moves the frame from its place at zero to the target.
-        let motion = compose(target, &self.tip.inverse());
-        let line = difference(motion.transform(self.wrist), self.shoulder);
+    /// The bends of the elbow with which the wrist is where a pose needs it; none where that is too far away or too close.
+    pub(crate) fn bends_for(&self, target: &Pose) -> Vec<f64> {
+        let motion = self.motion(target);
+        self.bends(norm(difference(motion.transform(self.wrist), self.shoulder)))
+    }
+
+    /// All postures, limits aside, that bring the frame to a pose with the elbow at one of its bends and at this turn.
+    pub(crate) fn solve(&self, target: &Pose, bend: f64, turn: f64) -> Vec<Positions> {
+        let motion = self.motion(target);
         let mut solutions = Vec::new();
-        for bend in self.bends(norm(line)) {
-            let reach = difference(self.bent(bend), self.shoulder);
-            let shoulder = compose(&about(unit(line), turn), &from_to(reach, line));
-            for first in self.turns(0, &shoulder) {
-                // The turns themselves, not what they should be, so that errors do not add up.
-                let elbow = compose(&self.three(0, first), &about(self.axes[3], bend));
-                let wrist = compose(&elbow.inverse(), &motion);
-                for last in self.turns(4, &wrist) {
-                    let mut positions = [0.0; crate::mechanism::MAX_JOINTS];
-                    let all = first.into_iter().chain([bend]).chain(last);
-                    for (joint, value) in self.joints.iter().zip(all) {
-                        positions[*joint] = wrapped(value);
-                    }
-                    solutions.push(positions);
+        for first in self.turns(0, &self.turned_shoulder(&motion, bend, turn)) {
+            // The turns themselves, not what they should be, so that errors do not add up.
+            let wrist = self.turned_wrist(&motion, bend, &self.three(0, first));
+            for last in self.turns(4, &wrist) {
+                let mut positions = [0.0; crate::mechanism::MAX_JOINTS];
+                let all = first.into_iter().chain([bend]).chain(last);
+                for (joint, value) in self.joints.iter().zip(all) {
+                    positions[*joint] = wrapped(value);
                 }
+                solutions.push(positions);
             }
         }
         solutions
+    }
+
+    /// The rotations of the shoulder and of the wrist then.
+    pub(crate) fn rotations(&self, target: &Pose, bend: f64, turn: f64) -> [Pose; 2] {
+        let motion = self.motion(target);
+        let shoulder = self.turned_shoulder(&motion, bend, turn);
+        [shoulder, self.turned_wrist(&motion, bend, &shoulder)]
+    }
+
+    /// What moves the frame from its place at zero to the target.
+    fn motion(&self, target: &Pose) -> Pose {
+        compose(target, &self.tip.inverse())
+    }
+
+    fn turned_shoulder(&self, motion: &Pose, bend: f64, turn: f64) -> Pose {
+        let line = difference(motion.transform(self.wrist), self.shoulder);
+        let reach = difference(self.bent(bend), self.shoulder);
+        compose(&about(unit(line), turn), &from_to(reach, line))
+    }
+
+    fn turned_wrist(&self, motion: &Pose, bend: f64, shoulder: &Pose) -> Pose {
+        let elbow = compose(shoulder, &about(self.axes[3], bend));
+        compose(&elbow.inverse(), motion)
     }
 
     /// The wrist with the elbow bent.
@@ -131,10 +156,17 @@ impl Spherical {
         [half, -half].map(|half| {
             let middle = zero + half;
             let third = rotate(&about(b, middle), c);
+            let last = |outer: f64| {
+                let done = compose(&about(a, outer), &about(b, middle));
+                angle_about(c, b, rotate(&compose(&done.inverse(), rotation), b))
+            };
+            if norm(cross(a, third)) < IN_LINE {
+                // Only the two outer turns together count: half of it for each is within the most limits.
+                let outer = last(0.0) / 2.0 * dot(a, third).signum();
+                return [outer, middle, last(outer)];
+            }
             let outer = angle_about(a, third, seen);
-            let done = compose(&about(a, outer), &about(b, middle));
-            let left = compose(&done.inverse(), rotation);
-            [outer, middle, angle_about(c, b, rotate(&left, b))]
+            [outer, middle, last(outer)]
         })
     }
 }
@@ -151,7 +183,7 @@ fn meeting(p: Vector, a: Vector, q: Vector, b: Vector) -> Option<Vector> {
     Some(std::array::from_fn(|i| p[i] + along * a[i]))
 }
 
-fn dot(a: Vector, b: Vector) -> f64 {
+pub(crate) fn dot(a: Vector, b: Vector) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
@@ -161,7 +193,7 @@ fn unit(v: Vector) -> Vector {
 }
 
 /// A turn about a unit vector.
-fn about([x, y, z]: Vector, angle: f64) -> Pose {
+pub(crate) fn about([x, y, z]: Vector, angle: f64) -> Pose {
     let (sin, cos) = (angle / 2.0).sin_cos();
     Pose { position: [0.0; 3], quaternion_xyzw: [x * sin, y * sin, z * sin, cos] }
 }

@@ -3,11 +3,9 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use proptest::prelude::*;
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
-use ratn_motion::inverse::Solver;
+use ratn_motion::arm;
 use ratn_motion::line::line;
 use ratn_motion::robot::{Configuration, DEGREES_OF_FREEDOM, Joints, Robot};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -43,29 +41,14 @@ proptest! {
     }
 
     #[test]
-    fn solutions_reach_the_pose_within_limits(arm in postures(), seed in 0_u64..1000) {
-        let robot = Robot::aimm();
-        let mut solver = Solver::new(&robot, &Pose::at(0.3, -0.2, 0.0));
-        let target = solver.tool(&arm);
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        let solutions = solver.solutions(&target, &aimm::HOME, 4, 60, &mut random);
-        prop_assert!(!solutions.is_empty(), "a pose taken from a posture can be reached");
-        for solution in solutions {
-            let tool = solver.tool(&solution);
-            prop_assert!(tool.distance(&target) < 1e-5 && tool.angle(&target) < 1e-5);
-            prop_assert_eq!(robot.clamp(&solution), solution);
-        }
-    }
-
-    #[test]
     fn a_straight_line_is_straight(dx in -0.05..0.05, dz in 0.0..0.1) {
         let robot = Robot::aimm();
-        let mut solver = Solver::new(&robot, &Pose::IDENTITY);
-        let start = solver.tool(&aimm::HOME);
-        let postures = line(&mut solver, &aimm::HOME, [dx, 0.0, dz]).unwrap();
+        let reach = arm::reach(&robot);
+        let start = reach.pose(&arm::positions(&aimm::HOME));
+        let postures = line(&reach, &aimm::HOME, [dx, 0.0, dz]).unwrap();
         for pair in postures.windows(2) {
             let middle = ratn_motion::collision::between(&pair[0], &pair[1], 0.5);
-            let tool = solver.tool(&middle);
+            let tool = reach.pose(&arm::positions(&middle));
             let [x, y, z] = [0, 1, 2].map(|i| tool.position[i] - start.position[i]);
             prop_assert!(y.abs() < 1e-4 && (x * dz - z * dx).abs() < 1e-4 && tool.angle(&start) < 1e-3);
         }

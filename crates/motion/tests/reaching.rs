@@ -52,20 +52,41 @@ proptest! {
     }
 
     #[test]
-    fn in_closed_form_every_elbow_turn_has_postures_and_its_own_posture_is_among_them(seed in 0_u64..10_000) {
+    fn in_closed_form_every_attempt_gives_postures_and_the_nearest_to_one_is_itself(seed in 0_u64..10_000) {
         let reach = tool(&arm(1..=7));
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let posture = reach.random(&mut random);
         let target = Target::at(reach.pose(&posture));
-        let solutions = reach.attempt(&target, &posture, 0, &mut random);
-        prop_assert!(distance(&solutions[0], &posture) < 1e-5, "{:?}", solutions.first());
-        for attempt in 1..20 {
-            for solution in reach.attempt(&target, &posture, attempt, &mut random) {
+        let postures = reach.postures(&target);
+        prop_assert!(distance(&reach.nearest(&postures, &posture)[0], &posture) < 1e-5);
+        for _ in 1..20 {
+            let solutions = reach.anywhere(&postures, &posture, &mut random);
+            prop_assert!(!solutions.is_empty());
+            for solution in solutions {
                 let pose = reach.pose(&solution);
                 prop_assert!(pose.distance(&target.pose) < 1e-6 && pose.angle(&target.pose) < 1e-6);
                 prop_assert_eq!(reach.clamp(&solution), solution);
             }
         }
+    }
+
+    #[test]
+    fn what_an_arm_of_seven_joints_can_reach_it_does(choices in prop::array::uniform7(0_u8..6), seed in 0_u64..10_000) {
+        let mechanism = arm(1..=7);
+        let reach = tool(&mechanism);
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let mut posture = reach.random(&mut random);
+        for ((q, joint), choice) in posture.iter_mut().zip(&mechanism.joints).zip(choices) {
+            *q = match choice {
+                0 => 0.0,
+                1 => joint.lower + 1e-5,
+                2 => joint.upper - 1e-5,
+                _ => *q,
+            };
+        }
+        let target = Target::at(reach.pose(&posture));
+        let solutions = reach.solutions(&target, &[0.0; MAX_JOINTS], 1, 20, &mut random);
+        prop_assert!(!solutions.is_empty(), "{posture:?}: {:?}", reach.postures(&target));
     }
 
     #[test]

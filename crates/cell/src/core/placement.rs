@@ -7,9 +7,10 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
+use ratn_motion::arm;
 use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
-use ratn_motion::inverse::Solver;
 use ratn_motion::line::line;
+use ratn_motion::reach::Target;
 use ratn_motion::robot::Robot;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::FRAC_PI_2;
@@ -157,12 +158,13 @@ fn all_graspable(robot: &Robot, footprints: &[Footprint]) -> bool {
     });
     let scene = Scene { base: Pose::IDENTITY, objects: objects.chain([table()]).collect() };
     let mut checker = Checker::new(robot, &scene, PADDING_M);
-    let mut solver = Solver::new(robot, &scene.base);
+    let (reach, home) = (arm::reach(robot), arm::positions(&aimm::HOME));
     let mut random = ChaCha8Rng::seed_from_u64(0);
     footprints.iter().all(|f| {
         aimm::grasp_poses(&f.pose(), f.size).iter().any(|grasp| {
-            solver.solutions(grasp, &aimm::HOME, 6, 20, &mut random).iter().any(|posture| {
-                line(&mut solver, posture, [0.0, 0.0, aimm::APPROACH_M]).is_ok_and(|postures| {
+            reach.solutions(&Target::at(*grasp), &home, 6, 20, &mut random).iter().any(|posture| {
+                let posture = std::array::from_fn(|j| posture[j]);
+                line(&reach, &posture, [0.0, 0.0, aimm::APPROACH_M]).is_ok_and(|postures| {
                     postures.iter().all(|p| checker.is_free(p, Contact::Gripper(CONTACT_TOLERANCE_M)))
                 })
             })

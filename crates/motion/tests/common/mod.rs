@@ -8,7 +8,7 @@ use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::pace::{Control, Progress};
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
-use ratn_motion::robot::{Joints, Robot};
+use ratn_motion::robot::{Configuration, Joints, Robot};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::TAU;
 
@@ -100,7 +100,8 @@ impl Cell {
     }
 
     fn tool(&self) -> Pose {
-        ratn_motion::inverse::Solver::new(&self.robot, &self.scene.base).tool(&self.arm)
+        let configuration = Configuration { arm: self.arm, ..Configuration::ZERO.with_base(&self.scene.base) };
+        self.robot.tool_pose(&configuration)
     }
 
     pub fn grasp(&mut self, name: &str) {
