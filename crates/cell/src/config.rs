@@ -88,6 +88,8 @@ pub struct BatteryConfig {
     pub idle_per_hour: f64,
     /// How much more an hour of moving the arm uses up.
     pub motion_per_hour: f64,
+    /// How much more an hour of driving uses up.
+    pub driving_per_hour: f64,
 }
 
 /// A value that no cell can have.
@@ -169,6 +171,12 @@ impl CellConfig {
             ("battery.level", self.battery.level, (0.0..=1.0).contains(&self.battery.level), "0 to 1"),
             ("battery.idle_per_hour", self.battery.idle_per_hour, self.battery.idle_per_hour >= 0.0, "0 or more"),
             ("battery.motion_per_hour", self.battery.motion_per_hour, self.battery.motion_per_hour >= 0.0, "0 or more"),
+            (
+                "battery.driving_per_hour",
+                self.battery.driving_per_hour,
+                self.battery.driving_per_hour >= 0.0,
+                "0 or more",
+            ),
         ];
         match rules.into_iter().find(|(_, _, holds, _)| !holds) {
             Some((key, value, _, rule)) => Err(ConfigError { key, value: value.to_string(), rule }),
@@ -217,7 +225,7 @@ impl Default for CameraConfig {
 
 impl Default for BatteryConfig {
     fn default() -> BatteryConfig {
-        BatteryConfig { level: 1.0, idle_per_hour: 0.1, motion_per_hour: 0.4 }
+        BatteryConfig { level: 1.0, idle_per_hour: 0.1, motion_per_hour: 0.4, driving_per_hour: 0.8 }
     }
 }
 

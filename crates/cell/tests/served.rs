@@ -119,7 +119,7 @@ fn to_observation() -> [(&'static str, Value); 2] {
 #[tokio::test(flavor = "multi_thread")]
 async fn the_cell_offers_its_modules_and_its_battery() {
     let system = system(1.0, 1).await;
-    for kind in ["Arm", "Gripper", "PanTilt", "Camera"] {
+    for kind in ["Base", "Arm", "Gripper", "PanTilt", "Camera"] {
         let lease = system.acquire(&[kind]).await;
         assert_eq!(lease.resource(kind).unwrap().endpoint, system.cell.to_string());
     }
@@ -132,9 +132,11 @@ async fn the_cell_offers_its_modules_and_its_battery() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_arm_says_where_it_is_and_the_gripper_what_it_feels() {
+async fn arm_and_base_say_where_they_are_and_the_gripper_what_it_feels() {
     let system = system(20.0, 1).await;
-    let lease = system.acquire(&["Arm", "Gripper"]).await;
+    let lease = system.acquire(&["Base", "Arm", "Gripper"]).await;
+    let stands = system.execute(&lease, "Base", "localise", []).await.unwrap();
+    assert_eq!(stands.outputs["pose"], Value::Pose(Pose::IDENTITY));
     let here = system.execute(&lease, "Arm", "where", []).await.unwrap();
     assert_eq!(here.outputs["joints"], Value::Joints(aimm::HOME.to_vec()));
     let felt = system.execute(&lease, "Gripper", "feel", []).await.unwrap();

@@ -21,6 +21,9 @@ pub const TABLE_CENTRE: [f64; 3] = [0.80, 0.0, 0.675];
 /// The table's top slab: its edges.
 pub const TABLE_SIZE: [f64; 3] = [0.60, 1.20, 0.05];
 
+/// Where the base may drive: least and greatest x, least and greatest y.
+pub const DRIVE_AREA: [[f64; 2]; 2] = [[-4.5, 4.5], [-4.5, 4.5]];
+
 /// Where the centres of boxes may stand on the table: least and greatest x, least and greatest y. Any yaw.
 pub const BOX_REGION: [[f64; 2]; 2] = [[0.62, 0.84], [-0.38, 0.38]];
 

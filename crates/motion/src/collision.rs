@@ -356,17 +356,17 @@ enum Other {
 }
 
 /// The posture a fraction of the way from one to another.
-pub fn between(from: &Joints, to: &Joints, fraction: f64) -> Joints {
+pub fn between<const N: usize>(from: &[f64; N], to: &[f64; N], fraction: f64) -> [f64; N] {
     std::array::from_fn(|j| from[j] + (to[j] - from[j]) * fraction)
 }
 
 /// The Euclidean distance of two postures, in radians.
-pub fn distance(a: &Joints, b: &Joints) -> f64 {
-    (0..7).map(|j| (a[j] - b[j]).powi(2)).sum::<f64>().sqrt()
+pub fn distance<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
+    (0..N).map(|j| (a[j] - b[j]).powi(2)).sum::<f64>().sqrt()
 }
 
 /// The length of a path, in radians.
-pub fn length(path: &[Joints]) -> f64 {
+pub fn length<const N: usize>(path: &[[f64; N]]) -> f64 {
     path.windows(2).map(|pair| distance(&pair[0], &pair[1])).sum()
 }
 

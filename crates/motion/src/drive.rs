@@ -68,7 +68,7 @@ impl Vehicle {
         (Vehicle { bodies, area, padding_m }, obstacles)
     }
 
-    fn mechanism(&self) -> Mechanism {
+    pub(crate) fn mechanism(&self) -> Mechanism {
         let [[x_low, x_high], [y_low, y_high]] = self.area;
         let joint = |name: &str, lower, upper| Joint {
             name: name.to_owned(),
@@ -114,20 +114,31 @@ pub fn drive(
     budget: Budget,
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<(Vec<[f64; 3]>, usize), ConnectError> {
-    let mut space = Space::new(&vehicle.mechanism(), obstacles);
+    drive_in(&mut Space::new(&vehicle.mechanism(), obstacles), start, goals, budget, control)
+}
+
+/// As [`drive`], in the vehicle's space.
+pub(crate) fn drive_in(
+    space: &mut Space,
+    start: [f64; 3],
+    goals: &[[f64; 3]],
+    budget: Budget,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<(Vec<[f64; 3]>, usize), ConnectError> {
     let offer = |goal: &[f64; 3]| [-TAU, 0.0, TAU].map(|turn| state([goal[0], goal[1], wrapped(goal[2]) + turn]));
     let ends: Vec<State> = goals.iter().flat_map(offer).collect();
     let from = state([start[0], start[1], wrapped(start[2])]);
-    let route = match connect(&mut space, &from, &ends, budget, control) {
+    let route = match connect(space, &from, &ends, budget, control) {
         Err(ConnectError::Goal { .. }) => return Err(ConnectError::Goal { goals: goals.len() }),
         other => other?,
     };
-    let path = simplify(&mut space, &route.path, budget, control)?;
+    let path = simplify(space, &route.path, budget, control)?;
     let places = path.iter().map(|s| [f64::from(s[0]), f64::from(s[1]), f64::from(s[2])]).collect();
     Ok((places, route.goal / 3))
 }
 
-fn state(place: [f64; 3]) -> State {
+/// A place for the vector checks.
+pub(crate) fn state(place: [f64; 3]) -> State {
     let mut state = [0.0; MAX_JOINTS];
     for (to, from) in state.iter_mut().zip(place) {
         *to = from as f32;
@@ -136,6 +147,6 @@ fn state(place: [f64; 3]) -> State {
 }
 
 /// A heading within half a turn of zero.
-fn wrapped(heading: f64) -> f64 {
+pub fn wrapped(heading: f64) -> f64 {
     heading - TAU * (heading / TAU).round()
 }

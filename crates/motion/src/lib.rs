@@ -5,6 +5,7 @@
 
 pub mod aimm;
 pub mod arm;
+pub mod base;
 pub mod collision;
 pub mod connect;
 pub mod constrained;

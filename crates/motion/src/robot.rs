@@ -197,6 +197,11 @@ impl Robot {
         &self.joints[FIRST_ARM_JOINT..FIRST_ARM_JOINT + 7]
     }
 
+    /// The limits of the base's x, y and heading.
+    pub fn base_joints(&self) -> &[Joint] {
+        &self.joints[..FIRST_ARM_JOINT]
+    }
+
     /// The finger joint: its upper limit is half of the greatest opening.
     pub fn finger(&self) -> &Joint {
         &self.joints[12]

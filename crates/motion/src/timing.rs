@@ -6,14 +6,14 @@
 
 use crate::collision::{between, distance, length};
 use crate::robot::{Joint, Joints, Robot};
-use crate::trajectory::{ArmTrajectory, Knot};
+use crate::trajectory::{Curve, Knot};
 use ratn_model::value::Trajectory;
 
 /// Says when a piece of a path, followed exactly from rest to rest, is where.
-pub trait Timing {
+pub trait Timing<const N: usize = 7> {
     /// Points in time, the first at 0, along postures close to each other; `speed` is a fraction of the velocity and
     /// acceleration limits, the limits of jerk hold as they are.
-    fn time(&self, piece: &[Joints], limits: &[Joint], speed: f64) -> Vec<Knot>;
+    fn time(&self, piece: &[[f64; N]], limits: &[Joint], speed: f64) -> Vec<Knot<N>>;
 }
 
 /// The fastest ds/dt along equal steps of path length s that breaks no limit of velocity and acceleration, by one sweep forwards
@@ -45,11 +45,11 @@ const RESERVE: f64 = 0.97;
 
 /// A part of a path, from rest to rest.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Part {
+pub enum Part<const N: usize = 7> {
     /// Corners may be rounded where nothing is touched.
-    Free(Vec<Joints>),
+    Free(Vec<[f64; N]>),
     /// Postures close to each other along a straight line of the tool, to be followed as they are.
-    Straight(Vec<Joints>),
+    Straight(Vec<[f64; N]>),
 }
 
 /// The trajectory along the parts at a fraction `speed` of the limits; velocities and accelerations keep within it. Corners are
@@ -61,6 +61,17 @@ pub fn parameterise(
     timing: &dyn Timing,
     is_free: &mut dyn FnMut(&Joints, &Joints) -> bool,
 ) -> Trajectory {
+    timed(robot.arm_joints(), parts, speed, timing, is_free).to_model(robot)
+}
+
+/// As [`parameterise`], for any joints.
+pub fn timed<const N: usize>(
+    joints: &[Joint],
+    parts: &[Part<N>],
+    speed: f64,
+    timing: &dyn Timing<N>,
+    is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
+) -> Curve<N> {
     let mut pieces = Vec::new();
     for part in parts {
         match part {
@@ -68,18 +79,21 @@ pub fn parameterise(
             Part::Straight(path) => pieces.push(path.clone()),
         }
     }
-    let start = pieces.first().and_then(|piece| piece.first()).copied().unwrap_or_default();
-    let mut knots = vec![Knot { time_s: 0.0, positions: start, velocities: [0.0; 7] }];
+    let start = pieces.first().and_then(|piece| piece.first()).copied().unwrap_or([0.0; N]);
+    let mut knots = vec![Knot { time_s: 0.0, positions: start, velocities: [0.0; N] }];
     for piece in pieces {
         let offset = knots[knots.len() - 1].time_s;
-        let timed = timing.time(&piece, robot.arm_joints(), speed);
+        let timed = timing.time(&piece, joints, speed);
         knots.extend(timed.into_iter().skip(1).map(|knot| Knot { time_s: knot.time_s + offset, ..knot }));
     }
-    ArmTrajectory::new(knots).to_model(robot)
+    Curve::new(knots)
 }
 
 /// The path with rounded corners, cut where the arm has to stop.
-fn rounded(path: &[Joints], is_free: &mut dyn FnMut(&Joints, &Joints) -> bool) -> Vec<Vec<Joints>> {
+fn rounded<const N: usize>(
+    path: &[[f64; N]],
+    is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
+) -> Vec<Vec<[f64; N]>> {
     let mut pieces = Vec::new();
     let mut piece = vec![path[0]];
     for window in path.windows(3) {
@@ -114,7 +128,7 @@ fn rounded(path: &[Joints], is_free: &mut dyn FnMut(&Joints, &Joints) -> bool) -
 }
 
 /// The curve whose control points are on the two sides: without bend where it begins and ends.
-fn bezier(from: &Joints, corner: &Joints, to: &Joints) -> Vec<Joints> {
+fn bezier<const N: usize>(from: &[f64; N], corner: &[f64; N], to: &[f64; N]) -> Vec<[f64; N]> {
     let before = CONTROLS.map(|share| between(from, corner, share));
     let after = CONTROLS.map(|share| between(to, corner, share));
     let controls = [before[0], before[1], before[2], after[2], after[1], after[0]];
@@ -131,17 +145,17 @@ fn bezier(from: &Joints, corner: &Joints, to: &Joints) -> Vec<Joints> {
     (0..=BLEND_POINTS).map(point).collect()
 }
 
-fn is_free_along(curve: &[Joints], is_free: &mut dyn FnMut(&Joints, &Joints) -> bool) -> bool {
+fn is_free_along<const N: usize>(curve: &[[f64; N]], is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool) -> bool {
     // Every eighth point: the chords between them stay within a fraction of a milliradian of the curve.
-    let points: Vec<&Joints> = curve.iter().step_by(8).collect();
+    let points: Vec<&[f64; N]> = curve.iter().step_by(8).collect();
     points.windows(2).all(|pair| is_free(pair[0], pair[1]))
 }
 
-impl Timing for PhasePlane {
-    fn time(&self, piece: &[Joints], limits: &[Joint], speed: f64) -> Vec<Knot> {
+impl<const N: usize> Timing<N> for PhasePlane {
+    fn time(&self, piece: &[[f64; N]], limits: &[Joint], speed: f64) -> Vec<Knot<N>> {
         let whole = length(piece);
         if whole < 1e-6 {
-            return vec![Knot { time_s: 0.0, positions: piece[0], velocities: [0.0; 7] }];
+            return vec![Knot { time_s: 0.0, positions: piece[0], velocities: [0.0; N] }];
         }
         let count = ((whole / STEP_RAD).ceil() as usize).max(8);
         let step = whole / count as f64;
@@ -155,7 +169,7 @@ impl Timing for PhasePlane {
 }
 
 /// `count + 1` points at equal path lengths.
-fn resampled(piece: &[Joints], count: usize, step: f64) -> Vec<Joints> {
+fn resampled<const N: usize>(piece: &[[f64; N]], count: usize, step: f64) -> Vec<[f64; N]> {
     let mut points = vec![piece[0]];
     let (mut i, mut passed) = (0, 0.0);
     for k in 1..count {
@@ -172,21 +186,21 @@ fn resampled(piece: &[Joints], count: usize, step: f64) -> Vec<Joints> {
 }
 
 /// The phase plane over path length: direction and squared path velocity at every point.
-struct Phase {
-    directions: Vec<Joints>,
+struct Phase<const N: usize> {
+    directions: Vec<[f64; N]>,
     squares: Vec<f64>,
 }
 
-impl Phase {
-    fn of(points: &[Joints], step: f64, joints: &[Joint], scale: f64) -> Phase {
+impl<const N: usize> Phase<N> {
+    fn of(points: &[[f64; N]], step: f64, joints: &[Joint], scale: f64) -> Phase<N> {
         let last = points.len() - 1;
-        let directions: Vec<Joints> = (0..=last)
+        let directions: Vec<[f64; N]> = (0..=last)
             .map(|i| {
                 let (a, b) = (i.saturating_sub(1), (i + 1).min(last));
                 std::array::from_fn(|j| (points[b][j] - points[a][j]) / ((b - a) as f64 * step))
             })
             .collect();
-        let bends: Vec<Joints> = (0..=last)
+        let bends: Vec<[f64; N]> = (0..=last)
             .map(|i| {
                 let i = i.clamp(1, last - 1);
                 std::array::from_fn(|j| (points[i - 1][j] - 2.0 * points[i][j] + points[i + 1][j]) / (step * step))
@@ -199,7 +213,7 @@ impl Phase {
                     let by_bend = joints[j].acceleration * scale / bends[i][j].abs().max(1e-9);
                     by_velocity.min(by_bend)
                 };
-                (0..7).map(limit).fold(f64::INFINITY, f64::min)
+                (0..N).map(limit).fold(f64::INFINITY, f64::min)
             })
             .collect();
         // How much the square may grow in one step from point i when it is `square` there.
@@ -208,7 +222,7 @@ impl Phase {
                 let left = joints[j].acceleration * scale - bends[i][j].abs() * square;
                 left.max(0.0) / directions[i][j].abs().max(1e-9)
             };
-            2.0 * step * (0..7).map(room).fold(f64::INFINITY, f64::min)
+            2.0 * step * (0..N).map(room).fold(f64::INFINITY, f64::min)
         };
         squares[0] = 0.0;
         squares[last] = 0.0;
@@ -222,7 +236,7 @@ impl Phase {
     }
 
     /// Points at equal times of the path length averaged over a window of time.
-    fn knots(&self, points: &[Joints], step: f64, window_s: f64) -> Vec<Knot> {
+    fn knots(&self, points: &[[f64; N]], step: f64, window_s: f64) -> Vec<Knot<N>> {
         let course = Course::of(&self.squares, step);
         let duration = course.end_s() + window_s;
         let count = ((duration / KNOT_S).ceil() as usize).max(2);
@@ -241,10 +255,10 @@ impl Phase {
                 velocities: direction.map(|d| d * velocity),
             }
         };
-        let mut knots: Vec<Knot> = (0..=count).map(knot).collect();
+        let mut knots: Vec<Knot<N>> = (0..=count).map(knot).collect();
         for (end, point) in [(0, 0), (count, last)] {
             knots[end].positions = points[point];
-            knots[end].velocities = [0.0; 7];
+            knots[end].velocities = [0.0; N];
         }
         knots
     }
@@ -306,8 +320,8 @@ impl Course {
 }
 
 /// The greatest absolute change of the mean acceleration from one step of time to the next, per joint and second.
-fn jerks(knots: &[Knot]) -> Joints {
-    let mut jerks = [0.0_f64; 7];
+fn jerks<const N: usize>(knots: &[Knot<N>]) -> [f64; N] {
+    let mut jerks = [0.0_f64; N];
     let step = |i: usize| knots[i + 1].time_s - knots[i].time_s;
     let mean = |i: usize, j: usize| (knots[i + 1].velocities[j] - knots[i].velocities[j]) / step(i);
     for i in 1..knots.len() - 1 {
@@ -319,19 +333,19 @@ fn jerks(knots: &[Knot]) -> Joints {
 }
 
 /// Slows the whole piece down by what its interpolation breaks the limits by, if it does.
-fn stretched(knots: Vec<Knot>, joints: &[Joint], speed: f64) -> Vec<Knot> {
+fn stretched<const N: usize>(knots: Vec<Knot<N>>, joints: &[Joint], speed: f64) -> Vec<Knot<N>> {
     let (mut by_velocity, mut by_acceleration) = (0.0_f64, 0.0_f64);
     let jerks = jerks(&knots);
-    let by_jerk = (0..7).map(|j| jerks[j] / joints[j].jerk).fold(0.0, f64::max);
-    let trajectory = ArmTrajectory::new(knots);
+    let by_jerk = (0..N).map(|j| jerks[j] / joints[j].jerk).fold(0.0, f64::max);
+    let trajectory = Curve::new(knots);
     for (velocities, accelerations) in trajectory.extremes() {
-        for j in 0..7 {
+        for j in 0..N {
             by_velocity = by_velocity.max(velocities[j] / (joints[j].velocity * speed));
             by_acceleration = by_acceleration.max(accelerations[j] / (joints[j].acceleration * speed));
         }
     }
     let factor = by_velocity.max(by_acceleration.sqrt()).max(by_jerk.cbrt()).max(1.0);
-    let slow = |knot: &Knot| Knot {
+    let slow = |knot: &Knot<N>| Knot {
         time_s: knot.time_s * factor,
         positions: knot.positions,
         velocities: knot.velocities.map(|v| v / factor),

@@ -1,33 +1,39 @@
-//! A trajectory of the arm as a curve: cubic Hermite interpolation between its points.
+//! A trajectory of the arm, or of the base, as a curve: cubic Hermite interpolation between its points.
 
-use crate::robot::{Joints, Robot};
+use crate::robot::{Joint, Robot};
 use ratn_model::value::{Trajectory, TrajectoryPoint};
 
 /// The most points that a trajectory may have.
 pub const MAX_POINTS: usize = 100_000;
 
-/// A well-formed trajectory of the seven arm joints.
+/// A well-formed trajectory of `N` joints.
 #[derive(Debug, Clone, PartialEq)]
-pub struct ArmTrajectory {
-    knots: Vec<Knot>,
+pub struct Curve<const N: usize> {
+    knots: Vec<Knot<N>>,
 }
 
-/// Where the arm is, and how fast, at one moment.
+/// Of the seven arm joints.
+pub type ArmTrajectory = Curve<7>;
+
+/// Of the base: x, y and heading.
+pub type BaseTrajectory = Curve<3>;
+
+/// Where the joints are, and how fast, at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Knot {
+pub struct Knot<const N: usize = 7> {
     /// Seconds since the start.
     pub time_s: f64,
-    /// Radians.
-    pub positions: Joints,
-    /// Radians per second.
-    pub velocities: Joints,
+    /// Radians, or metres where a joint slides.
+    pub positions: [f64; N],
+    /// The same per second.
+    pub velocities: [f64; N],
 }
 
-/// A trajectory that is not one of this arm.
+/// A trajectory that is not one of these joints.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum TrajectoryError {
     /// Other joints.
-    #[error("the trajectory moves [{joints}], the arm's joints are [{expected}]")]
+    #[error("the trajectory moves [{joints}], it should move [{expected}]")]
     OtherJoints {
         /// What it moves.
         joints: String,
@@ -51,17 +57,32 @@ pub enum TrajectoryError {
 }
 
 impl ArmTrajectory {
-    /// From knots whose times grow from 0.
-    pub(crate) fn new(knots: Vec<Knot>) -> ArmTrajectory {
-        ArmTrajectory { knots }
-    }
-
     /// Reads a trajectory of the task model.
     ///
     /// # Errors
     /// [`TrajectoryError`] where it is not one of this arm, or its times do not grow strictly from 0.
     pub fn read(robot: &Robot, trajectory: &Trajectory) -> Result<ArmTrajectory, TrajectoryError> {
-        let names: Vec<&str> = robot.arm_joints().iter().map(|j| j.name.as_str()).collect();
+        Curve::of(robot.arm_joints(), trajectory)
+    }
+
+    /// As a trajectory of the task model.
+    pub fn to_model(&self, robot: &Robot) -> Trajectory {
+        self.named(robot.arm_joints())
+    }
+}
+
+impl<const N: usize> Curve<N> {
+    /// From knots whose times grow from 0.
+    pub(crate) fn new(knots: Vec<Knot<N>>) -> Curve<N> {
+        Curve { knots }
+    }
+
+    /// Reads a trajectory of these joints.
+    ///
+    /// # Errors
+    /// [`TrajectoryError`] where it is one of others, or its times do not grow strictly from 0.
+    pub fn of(joints: &[Joint], trajectory: &Trajectory) -> Result<Curve<N>, TrajectoryError> {
+        let names: Vec<&str> = joints.iter().map(|j| j.name.as_str()).collect();
         if trajectory.joints != names {
             let joints = trajectory.joints.join(", ");
             return Err(TrajectoryError::OtherJoints { joints, expected: names.join(", ") });
@@ -69,12 +90,12 @@ impl ArmTrajectory {
         if trajectory.points.is_empty() || trajectory.points.len() > MAX_POINTS {
             return Err(TrajectoryError::Points { points: trajectory.points.len() });
         }
-        let mut knots: Vec<Knot> = Vec::with_capacity(trajectory.points.len());
+        let mut knots: Vec<Knot<N>> = Vec::with_capacity(trajectory.points.len());
         for (index, point) in trajectory.points.iter().enumerate() {
             let wrong = |reason: String| TrajectoryError::Point { index, reason };
-            let seven = |values: &[f64], what: &str| -> Result<Joints, TrajectoryError> {
-                let joints: Joints =
-                    values.try_into().map_err(|_| wrong(format!("{} {what}, expected 7", values.len())))?;
+            let numbers = |values: &[f64], what: &str| -> Result<[f64; N], TrajectoryError> {
+                let joints: [f64; N] =
+                    values.try_into().map_err(|_| wrong(format!("{} {what}, expected {N}", values.len())))?;
                 if joints.iter().all(|v| v.is_finite()) { Ok(joints) } else { Err(wrong(format!("{what} not finite"))) }
             };
             let after = knots.last().map_or(0.0, |k| k.time_s);
@@ -82,27 +103,27 @@ impl ArmTrajectory {
             if !grows {
                 return Err(wrong(format!("time {} s does not grow strictly from 0", point.time_s)));
             }
-            let velocities = seven(&point.velocities, "velocities")?;
-            knots.push(Knot { time_s: point.time_s, positions: seven(&point.positions, "positions")?, velocities });
+            let velocities = numbers(&point.velocities, "velocities")?;
+            knots.push(Knot { time_s: point.time_s, positions: numbers(&point.positions, "positions")?, velocities });
         }
-        Ok(ArmTrajectory { knots })
+        Ok(Curve { knots })
     }
 
-    /// As a trajectory of the task model.
-    pub fn to_model(&self, robot: &Robot) -> Trajectory {
-        let point = |knot: &Knot| TrajectoryPoint {
+    /// As a trajectory of the task model, with the joints' names.
+    pub fn named(&self, joints: &[Joint]) -> Trajectory {
+        let point = |knot: &Knot<N>| TrajectoryPoint {
             time_s: knot.time_s,
             positions: knot.positions.to_vec(),
             velocities: knot.velocities.to_vec(),
         };
         Trajectory {
-            joints: robot.arm_joints().iter().map(|j| j.name.clone()).collect(),
+            joints: joints.iter().map(|j| j.name.clone()).collect(),
             points: self.knots.iter().map(point).collect(),
         }
     }
 
     /// The points.
-    pub fn knots(&self) -> &[Knot] {
+    pub fn knots(&self) -> &[Knot<N>] {
         &self.knots
     }
 
@@ -112,27 +133,27 @@ impl ArmTrajectory {
     }
 
     /// Where the trajectory ends.
-    pub fn end(&self) -> Joints {
-        self.knots.last().map_or([0.0; 7], |k| k.positions)
+    pub fn end(&self) -> [f64; N] {
+        self.knots.last().map_or([0.0; N], |k| k.positions)
     }
 
-    /// Where the arm is at a moment; before the start and after the end it stands.
-    pub fn sample(&self, time_s: f64) -> Knot {
+    /// Where the joints are at a moment; before the start and after the end it stands.
+    pub fn sample(&self, time_s: f64) -> Knot<N> {
         let next = self.knots.partition_point(|k| k.time_s <= time_s);
         if next == 0 || next == self.knots.len() {
             let knot = if next == 0 { &self.knots[0] } else { &self.knots[next - 1] };
-            return Knot { time_s, positions: knot.positions, velocities: [0.0; 7] };
+            return Knot { time_s, positions: knot.positions, velocities: [0.0; N] };
         }
         hermite(&self.knots[next - 1], &self.knots[next], time_s)
     }
 
     /// Per segment the greatest absolute velocities and accelerations of each joint.
-    pub(crate) fn extremes(&self) -> impl Iterator<Item = (Joints, Joints)> {
+    pub(crate) fn extremes(&self) -> impl Iterator<Item = ([f64; N], [f64; N])> {
         self.knots.windows(2).map(|pair| {
             let (a, b) = (&pair[0], &pair[1]);
             let h = b.time_s - a.time_s;
-            let (mut velocities, mut accelerations) = ([0.0; 7], [0.0; 7]);
-            for j in 0..7 {
+            let (mut velocities, mut accelerations) = ([0.0; N], [0.0; N]);
+            for j in 0..N {
                 let mean = (b.positions[j] - a.positions[j]) / h;
                 let (v0, v1) = (a.velocities[j], b.velocities[j]);
                 let (a0, a1) = ((6.0 * mean - 4.0 * v0 - 2.0 * v1) / h, (2.0 * v0 + 4.0 * v1 - 6.0 * mean) / h);
@@ -150,7 +171,7 @@ impl ArmTrajectory {
     }
 }
 
-fn hermite(a: &Knot, b: &Knot, time_s: f64) -> Knot {
+fn hermite<const N: usize>(a: &Knot<N>, b: &Knot<N>, time_s: f64) -> Knot<N> {
     let h = b.time_s - a.time_s;
     let t = (time_s - a.time_s) / h;
     let (t2, t3) = (t * t, t * t * t);

@@ -1,8 +1,8 @@
 //! Whether the arm may follow a trajectory: what a controller checks before it moves, against what it knows itself.
 
 use crate::collision::{Checker, Collision, Contact};
-use crate::robot::{Joints, Robot};
-use crate::trajectory::{ArmTrajectory, TrajectoryError};
+use crate::robot::{Joint, Joints, Robot};
+use crate::trajectory::{ArmTrajectory, Curve, Knot, TrajectoryError};
 use ratn_model::value::Trajectory;
 use ratn_world::scene::Scene;
 
@@ -32,7 +32,7 @@ pub enum Violation {
         start_rad: f64,
     },
     /// It does not start or end at rest.
-    #[error("{joint} moves at {velocity:.4} rad/s at {time_s:.3} s, where the trajectory must be at rest")]
+    #[error("{joint} moves at {velocity:.4} per second at {time_s:.3} s, where the trajectory must be at rest")]
     NotAtRest {
         /// Which joint.
         joint: String,
@@ -80,7 +80,8 @@ pub fn validate_trajectory(
 ) -> Result<ArmTrajectory, Violation> {
     let trajectory = ArmTrajectory::read(robot, trajectory)?;
     check_start(robot, start, &trajectory)?;
-    check_limits(robot, &trajectory)?;
+    check_rest(robot.arm_joints(), &trajectory)?;
+    check_limits(robot.arm_joints(), &trajectory)?;
     let mut checker = match finger {
         Some(finger) => Checker::with_finger(robot, scene, 0.0, finger),
         None => Checker::new(robot, scene, 0.0),
@@ -97,23 +98,31 @@ fn check_start(robot: &Robot, start: &Joints, trajectory: &ArmTrajectory) -> Res
             let (joint, actual_rad) = (joint.name.clone(), start[j]);
             return Err(Violation::Start { joint, actual_rad, start_rad: planned });
         }
-        for knot in [&knots[0], &knots[knots.len() - 1]] {
-            if knot.velocities[j].abs() > 1e-3 {
-                let (joint, velocity) = (joint.name.clone(), knot.velocities[j]);
-                return Err(Violation::NotAtRest { joint, velocity, time_s: knot.time_s });
-            }
-        }
     }
     Ok(())
 }
 
-fn check_limits(robot: &Robot, trajectory: &ArmTrajectory) -> Result<(), Violation> {
+/// It starts and ends at rest.
+pub(crate) fn check_rest<const N: usize>(joints: &[Joint], trajectory: &Curve<N>) -> Result<(), Violation> {
+    let knots = trajectory.knots();
+    let moves = |knot: &Knot<N>| (0..N).find(|j| knot.velocities[*j].abs() > 1e-3);
+    match [&knots[0], &knots[knots.len() - 1]].into_iter().find_map(|knot| moves(knot).map(|j| (knot, j))) {
+        None => Ok(()),
+        Some((knot, j)) => {
+            let (joint, velocity) = (joints[j].name.clone(), knot.velocities[j]);
+            Err(Violation::NotAtRest { joint, velocity, time_s: knot.time_s })
+        }
+    }
+}
+
+/// Positions, velocities and accelerations are within the limits.
+pub(crate) fn check_limits<const N: usize>(joints: &[Joint], trajectory: &Curve<N>) -> Result<(), Violation> {
     let exceeded = |j: usize, what, value: f64, limit: f64, time_s| {
-        let joint = robot.arm_joints()[j].name.clone();
+        let joint = joints[j].name.clone();
         Err(Violation::Limit { joint, what, value, limit, time_s })
     };
     for knot in trajectory.knots() {
-        for (j, joint) in robot.arm_joints().iter().enumerate() {
+        for (j, joint) in joints.iter().enumerate() {
             let position = knot.positions[j];
             if position < joint.lower - 1e-3 {
                 return exceeded(j, "position", position, joint.lower, knot.time_s);
@@ -125,7 +134,7 @@ fn check_limits(robot: &Robot, trajectory: &ArmTrajectory) -> Result<(), Violati
     }
     for (i, (velocities, accelerations)) in trajectory.extremes().enumerate() {
         let time_s = trajectory.knots()[i].time_s;
-        for (j, joint) in robot.arm_joints().iter().enumerate() {
+        for (j, joint) in joints.iter().enumerate() {
             if velocities[j] > joint.velocity * (1.0 + LIMIT_TOLERANCE) {
                 return exceeded(j, "velocity", velocities[j], joint.velocity, time_s);
             }

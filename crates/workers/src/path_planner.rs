@@ -1,13 +1,15 @@
-//! The path planner worker: one action, `plan`.
+//! The path planner worker: `plan` for the arm, and `drive` for the base.
 //!
 //! It has the scene of the goal's projection sent, as what it differs by from one that it knows, plans on a thread of its own and answers with a timed
 //! trajectory. All durations in its goals and answers are in the robot's seconds; `clock` knows how many of them pass in
 //! one of ours. Where `budget_s` is given, planning takes exactly that long and gets a shorter path for it.
 
 mod clock;
+mod drive;
 mod goal;
 
 use clock::{Clock, Figures};
+pub use drive::DriveAction;
 use ratn_model::value::Value;
 use ratn_motion::plan::{Plan, PlanError, plan};
 use ratn_motion::robot::Robot;
@@ -22,7 +24,7 @@ use std::time::Instant;
 pub struct PlanAction {
     robot: Arc<Robot>,
     speed: f64,
-    scenes: SceneCache,
+    scenes: Arc<SceneCache>,
 }
 
 /// Runs the worker until it is told to stop; `speed` is how many of the robot's seconds pass in one of ours.
@@ -30,13 +32,15 @@ pub struct PlanAction {
 /// # Errors
 /// Where it cannot serve.
 pub async fn run(options: WorkerOptions, speed: f64) -> anyhow::Result<()> {
-    Ok(Worker::new(options).action(PlanAction::new(speed)).run().await?)
+    let plan = PlanAction::new(speed);
+    let drive = DriveAction::new(&plan.robot, speed, &plan.scenes);
+    Ok(Worker::new(options).action(plan).action(drive).run().await?)
 }
 
 impl PlanAction {
     /// For our robot.
     pub fn new(speed: f64) -> PlanAction {
-        PlanAction { robot: Arc::new(Robot::aimm()), speed, scenes: SceneCache::default() }
+        PlanAction { robot: Arc::new(Robot::aimm()), speed, scenes: Arc::default() }
     }
 }
 

@@ -81,6 +81,7 @@ impl Host {
     pub(crate) fn is_whole(&self) -> anyhow::Result<()> {
         let promised = BTreeMap::from([
             ("Arm", 1),
+            ("Base", 1),
             ("Camera", 1),
             ("Detector", 1),
             ("Gripper", 1),

@@ -1,11 +1,11 @@
 //! What a module is doing, and where that has brought it at a moment.
 
+use super::motion::Motion;
 use super::picture::Exposure;
 use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::robot::Joints;
-use ratn_motion::trajectory::ArmTrajectory;
 use ratn_perception::camera::Camera;
 use serde::{Deserialize, Serialize};
 use std::time::Duration;
@@ -18,6 +18,8 @@ pub struct Ticket(pub u64);
 /// A module of the robot. Each does one thing at a time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Module {
+    /// What everything else stands on.
+    Base,
     /// The seven joints.
     Arm,
     /// The two fingers.
@@ -39,10 +41,12 @@ pub(crate) struct Activity {
 
 #[derive(Debug, Clone)]
 pub(crate) enum Kind {
-    Follow { trajectory: ArmTrajectory, gives_up_s: Option<f64> },
+    Drive(Motion<3>),
+    Follow(Motion<7>),
     Close { from: f64, object: String, expected: Option<Pose> },
     Open { from: f64, to: f64 },
     Look { from: [f64; 2], to: [f64; 2] },
+    SenseBase,
     SenseArm,
     SenseGripper,
     Capture { camera: Camera, frames: u32, taken: u32, next: Timestamp, exposures: Vec<Exposure> },
@@ -50,11 +54,12 @@ pub(crate) enum Kind {
 
 impl Module {
     /// All of them.
-    pub const ALL: [Module; 4] = [Module::Arm, Module::Gripper, Module::PanTilt, Module::Camera];
+    pub const ALL: [Module; 5] = [Module::Base, Module::Arm, Module::Gripper, Module::PanTilt, Module::Camera];
 
     /// The kind of the resource that it is.
     pub fn kind(self) -> &'static str {
         match self {
+            Module::Base => "Base",
             Module::Arm => "Arm",
             Module::Gripper => "Gripper",
             Module::PanTilt => "PanTilt",
@@ -75,10 +80,18 @@ impl Activity {
         if whole > 0.0 { (self.elapsed_s(now) / whole).clamp(0.0, 1.0) } else { 1.0 }
     }
 
+    /// Where the base is, if it moves the base: x, y and heading.
+    pub(crate) fn base(&self, now: Timestamp) -> Option<[f64; 3]> {
+        match &self.kind {
+            Kind::Drive(motion) => Some(motion.at(self.elapsed_s(now))),
+            _ => None,
+        }
+    }
+
     /// Where the arm is, if it moves the arm.
     pub(crate) fn arm(&self, now: Timestamp) -> Option<Joints> {
         match &self.kind {
-            Kind::Follow { trajectory, .. } => Some(trajectory.sample(self.elapsed_s(now)).positions),
+            Kind::Follow(motion) => Some(motion.at(self.elapsed_s(now))),
             _ => None,
         }
     }

@@ -12,7 +12,7 @@
 use super::activity::{Activity, Kind, seconds};
 use super::battery::Battery;
 use super::boxes::{Placed, TrueBox};
-use super::deviations::GAVE_UP;
+use super::deviations::LOST;
 use super::environment::{Environment, Kind as ObjectKind};
 use super::faults::Faults;
 use super::grasping::Pads;
@@ -25,6 +25,7 @@ use crate::config::{CellConfig, MAX_BOXES};
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::aimm;
+use ratn_motion::drive::wrapped;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_worker::safety::SafetyState;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
@@ -153,12 +154,19 @@ impl Cell {
     pub fn configuration(&self) -> Configuration {
         let mut configuration = self.resting;
         for activity in self.activities.values() {
+            configuration.base = activity.base(self.motion_time).unwrap_or(configuration.base);
             configuration.arm = activity.arm(self.motion_time).unwrap_or(configuration.arm);
             configuration.finger = activity.finger(self.motion_time).unwrap_or(configuration.finger);
             [configuration.pan, configuration.tilt] =
                 activity.head(self.motion_time).unwrap_or([configuration.pan, configuration.tilt]);
         }
         configuration
+    }
+
+    /// Where the base stands, in the world frame.
+    pub fn base_pose(&self) -> Pose {
+        let [x, y, heading] = self.configuration().base;
+        Pose::from_rpy([x, y, 0.0], 0.0, 0.0, heading)
     }
 
     /// What is true of every box.
@@ -217,7 +225,7 @@ impl Cell {
                 _ => Placement::World(self.environment.state(i).pose),
             },
         });
-        Scene { base: Pose::IDENTITY, objects: objects.chain([placement::table()]).collect() }
+        Scene { base: self.base_pose(), objects: objects.chain([placement::table()]).collect() }
     }
 
     /// What there is to be seen.
@@ -269,20 +277,29 @@ impl Cell {
     fn finish(&mut self, module: Module, out: &mut Vec<Command>) {
         let Some(activity) = self.activities.remove(&module) else { return };
         let ending = match activity.kind {
-            Kind::Follow { ref trajectory, gives_up_s: Some(gives_up_s) } => {
-                self.resting.arm = trajectory.sample(gives_up_s).positions;
-                Ending::Aborted(GAVE_UP.to_owned())
+            Kind::Drive(motion) => {
+                let ([x, y, heading], broken) = motion.end();
+                self.resting.base = [x, y, wrapped(heading)];
+                match broken {
+                    Some(reason) => Ending::Aborted(reason.to_owned()),
+                    None => Ending::Done(Product::Driven { end: self.base_pose() }),
+                }
             }
-            Kind::Follow { ref trajectory, gives_up_s: None } => {
-                let end = trajectory.end();
+            Kind::Follow(motion) => {
+                let (end, broken) = motion.end();
                 self.resting.arm = end;
-                Ending::Done(Product::Moved { end })
+                match broken {
+                    Some(reason) => Ending::Aborted(reason.to_owned()),
+                    None => Ending::Done(Product::Moved { end }),
+                }
             }
             Kind::Close { from, object, expected } => self.close(from, object, expected.as_ref()),
             Kind::Open { to, .. } => {
                 self.resting.finger = to;
                 Ending::Done(Product::Released)
             }
+            Kind::SenseBase if self.is_lost() => Ending::Aborted(LOST.to_owned()),
+            Kind::SenseBase => Ending::Done(Product::BaseSensed { pose: self.base_pose() }),
             Kind::SenseArm => Ending::Done(Product::ArmSensed { joints: self.resting.arm }),
             Kind::SenseGripper => {
                 let (width, holding) = (2.0 * self.resting.finger, self.held.is_some());

@@ -4,7 +4,7 @@ use super::activity::{Activity, Kind as Doing, seconds};
 use super::cell::Cell;
 use super::faults::{Fault, Kind, When};
 use super::placement::TABLE;
-use super::protocol::{Command, Ending, Module};
+use super::protocol::{Command, Ending};
 use rand::RngExt;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
@@ -32,7 +32,10 @@ impl Cell {
                 }
                 Kind::ObjectMoved => self.move_something(),
                 Kind::SensorDropout => self.blind_until = self.now + seconds(OUTAGE_S),
-                Kind::LocalisationLost => self.lost_until = self.now + seconds(OUTAGE_S),
+                Kind::LocalisationLost => {
+                    self.lost_until = self.now + seconds(OUTAGE_S);
+                    self.hold(moves_the_base, |_| Ending::Aborted(LOST.to_owned()), out);
+                }
                 Kind::ControllerAbort => self.give_up(out),
             }
         }
@@ -60,16 +63,29 @@ impl Cell {
         spoilt
     }
 
-    /// How long a motion of `lasts_s` goes on before its controller gives up, where it does.
-    pub(super) fn giving_up_after(&mut self, lasts_s: f64) -> Option<f64> {
-        self.faults.occurs(Kind::ControllerAbort).map(|_| lasts_s / 2.0)
+    /// After how long a motion of the arm, of `lasts_s`, breaks off, and why, where it does.
+    pub(super) fn arm_breaks_off(&mut self, lasts_s: f64) -> Option<(f64, String)> {
+        self.faults.occurs(Kind::ControllerAbort).map(|_| (lasts_s / 2.0, GAVE_UP.to_owned()))
     }
 
-    /// The arm's controller gives up now, or in the next motion.
+    /// The same of a drive.
+    pub(super) fn drive_breaks_off(&mut self, lasts_s: f64) -> Option<(f64, String)> {
+        let (gave_up, lost) = (self.faults.occurs(Kind::ControllerAbort), self.faults.occurs(Kind::LocalisationLost));
+        let reason = if gave_up.is_some() { BASE_GAVE_UP } else { LOST };
+        gave_up.or(lost).map(|_| (lasts_s / 2.0, reason.to_owned()))
+    }
+
+    /// Whether the robot does not know where it stands.
+    pub(super) fn is_lost(&self) -> bool {
+        self.lost_until > self.now
+    }
+
+    /// The controller of what moves gives up now, or in the next motion.
     fn give_up(&mut self, out: &mut Vec<Command>) {
-        if self.is_active(Module::Arm) {
-            let moves_the_arm = |a: &Activity| matches!(a.kind, Doing::Follow { .. });
-            self.hold(moves_the_arm, |_| Ending::Aborted(GAVE_UP.to_owned()), out);
+        let moves_the_arm = |a: &Activity| matches!(a.kind, Doing::Follow(_));
+        if self.activities.values().any(|a| moves_the_arm(a) || moves_the_base(a)) {
+            let why = |a: &Activity| if moves_the_base(a) { BASE_GAVE_UP } else { GAVE_UP };
+            self.hold(|a| moves_the_arm(a) || moves_the_base(a), |a| Ending::Aborted(why(a).to_owned()), out);
         } else {
             // There is room: one was just taken out.
             self.faults.add(Fault { kind: Kind::ControllerAbort, when: When::Nth(1) });
@@ -107,5 +123,12 @@ impl Cell {
     }
 }
 
+fn moves_the_base(activity: &Activity) -> bool {
+    matches!(activity.kind, Doing::Drive(_))
+}
+
 /// Why a motion ended.
-pub(super) const GAVE_UP: &str = "the arm's controller gave up: its tracking error was too great; it holds";
+const GAVE_UP: &str = "the arm's controller gave up: its tracking error was too great; it holds";
+const BASE_GAVE_UP: &str = "the base's controller gave up: its tracking error was too great; it holds";
+/// Why nothing drives.
+pub(super) const LOST: &str = "the robot does not know where it stands; it holds; localise it before it drives on";

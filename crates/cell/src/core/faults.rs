@@ -25,9 +25,10 @@ pub enum Kind {
     ObjectMoved,
     /// The camera gives no image; at a time: for a while. Occasion: a picture.
     SensorDropout,
-    /// The arm's controller gives up half-way. Occasion: a motion of the arm.
+    /// A controller gives up half-way. Occasion: a motion of the arm or of the base.
     ControllerAbort,
-    /// The robot does not know where it stands, for a while: no picture can be placed in the world. Occasion: a picture.
+    /// The robot does not know where it stands, for a while: no picture can be placed in the world, and it does not drive.
+    /// Occasion: a picture, or a drive.
     LocalisationLost,
 }
 

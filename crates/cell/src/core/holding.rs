@@ -144,10 +144,27 @@ impl Cell {
         }
     }
 
+    /// What goes where the base goes: what stands on it, or on something that does.
+    pub(super) fn riding(&self) -> Vec<String> {
+        let mut rides: Vec<bool> = vec![false; self.ids.len()];
+        // As many rounds as things can stand on each other.
+        for _ in 0..self.ids.len() {
+            for object in 0..self.ids.len() {
+                rides[object] |= match self.environment.rests_on(object) {
+                    Some(Support::Named(name)) => self.robot.link(name).is_some(),
+                    Some(Support::Object(below)) => rides[below],
+                    None => false,
+                };
+            }
+        }
+        self.ids.iter().zip(rides).filter(|(_, rides)| *rides).map(|(id, _)| id.clone()).collect()
+    }
+
     /// Whether an object stands at one of the places of the load deck, on whichever of its faces: a box has no top.
     pub(super) fn is_delivered(&self, pose: &Pose, on: &str) -> bool {
         let upright = |axis: usize| pose.rotate(unit(axis))[2].abs() >= MAX_LEAN_RAD.cos();
-        let off = |slot: &Pose| (slot.position[0] - pose.position[0]).hypot(slot.position[1] - pose.position[1]);
+        let seen = self.base_pose().inverse().compose(pose).position;
+        let off = |slot: &Pose| (slot.position[0] - seen[0]).hypot(slot.position[1] - seen[1]);
         on == ON_BASE && (0..3).any(upright) && aimm::slots().iter().any(|slot| off(slot) <= MAX_OFF_PLACE_M)
     }
 }

@@ -16,6 +16,7 @@ mod battery;
 mod deviations;
 mod holding;
 mod leases;
+mod motion;
 mod passing;
 mod starting;
 mod trajectory;

@@ -26,9 +26,10 @@ impl Cell {
         let configuration = self.configuration();
         let tool = self.robot.tool_pose(&configuration);
         if let Some(lost) = self.keep_hold(&tool) {
-            let reason = format!("{} slipped out of the fingers; the arm holds", self.ids[lost]);
-            let moves_the_arm = |a: &Activity| matches!(a.kind, Kind::Follow { .. });
-            self.hold(moves_the_arm, |_| Ending::Aborted(reason.clone()), out);
+            let holds = if self.is_active(Module::Base) { "base" } else { "arm" };
+            let reason = format!("{} slipped out of the fingers; the {holds} holds", self.ids[lost]);
+            let moves = |a: &Activity| matches!(a.kind, Kind::Follow(_) | Kind::Drive(_));
+            self.hold(moves, |_| Ending::Aborted(reason.clone()), out);
         }
         let open = self.config.gripper.opening_m / 2.0 - configuration.finger < OPEN_M;
         self.environment.set_fingers_solid(open);
@@ -37,13 +38,16 @@ impl Cell {
 
     /// Whether something may move that the environment does not know of: the robot, or what it holds.
     fn may_move(&self) -> bool {
-        let moves = [Module::Arm, Module::Gripper, Module::PanTilt].into_iter().any(|module| self.is_active(module));
+        let modules = [Module::Base, Module::Arm, Module::Gripper, Module::PanTilt];
+        let moves = modules.into_iter().any(|module| self.is_active(module));
         (moves && !self.is_held()) || self.held.is_some_and(|held| !held.is_steady())
     }
 
     fn drain_until(&mut self, time: Timestamp) {
         let passed = time.since(self.now);
-        self.battery.drain(passed, self.is_active(Module::Arm) && !self.is_held());
+        let moves = |module| self.is_active(module) && !self.is_held();
+        let (moving, driving) = (moves(Module::Arm), moves(Module::Base));
+        self.battery.drain(passed, moving, driving);
         self.now = self.now.max(time);
         if !self.is_held() {
             self.motion_time = self.motion_time + passed;

@@ -89,6 +89,11 @@ pub enum Event {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Request {
+    /// The base along a trajectory.
+    Drive {
+        /// In x, y and heading, from where the base is.
+        trajectory: Trajectory,
+    },
     /// The arm along a trajectory.
     Follow {
         /// From where the arm is.
@@ -115,6 +120,8 @@ pub enum Request {
         /// Towards this point of the world.
         target: [f64; 3],
     },
+    /// Says where the base stands.
+    SenseBase,
     /// Says where the arm's joints are.
     SenseArm,
     /// Says how far the fingers are open, and whether they hold something.
@@ -159,6 +166,11 @@ pub enum Ending {
 /// What comes of a goal.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Product {
+    /// The base is there.
+    Driven {
+        /// Its frame, in the world frame.
+        end: Pose,
+    },
     /// The arm is there.
     Moved {
         /// Its posture.
@@ -176,6 +188,11 @@ pub enum Product {
     },
     /// The fingers are open.
     Released,
+    /// Where the base is.
+    BaseSensed {
+        /// Its frame, in the world frame.
+        pose: Pose,
+    },
     /// Where the arm is.
     ArmSensed {
         /// Its posture.
@@ -208,6 +225,7 @@ impl Request {
     /// The module that does it.
     pub fn module(&self) -> Module {
         match self {
+            Request::Drive { .. } | Request::SenseBase => Module::Base,
             Request::Follow { .. } | Request::MoveTo { .. } | Request::SenseArm => Module::Arm,
             Request::Grasp { .. } | Request::Release | Request::SenseGripper => Module::Gripper,
             Request::LookAt { .. } => Module::PanTilt,

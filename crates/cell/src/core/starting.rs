@@ -2,12 +2,13 @@
 
 use super::activity::{Activity, Kind, Module, Ticket, seconds};
 use super::cell::Cell;
+use super::deviations::LOST;
+use super::motion::Motion;
 use super::protocol::Request;
 use super::trajectory;
 use ratn_model::id::LeaseId;
-use ratn_model::pose::Pose;
 use ratn_motion::robot::Configuration;
-use ratn_motion::trajectory::ArmTrajectory;
+use ratn_motion::trajectory::{ArmTrajectory, BaseTrajectory};
 use ratn_perception::camera::Camera;
 use ratn_perception::noise::MAX_FRAMES;
 
@@ -26,12 +27,25 @@ impl Cell {
         }
         let here = self.configuration();
         let (kind, lasts_s) = match request {
+            Request::Drive { trajectory } => {
+                for other in [Module::Arm, Module::Gripper, Module::PanTilt, Module::Camera] {
+                    self.no_motion_of(other)?;
+                }
+                if self.is_lost() {
+                    return Err(LOST.to_owned());
+                }
+                let trajectory =
+                    trajectory::check_base(&self.robot, &self.scene(), &here, &self.riding(), &trajectory)?;
+                self.driving(trajectory)
+            }
             Request::Follow { trajectory } => {
+                self.no_motion_of(Module::Base)?;
                 self.no_motion_of(Module::Gripper)?;
                 let trajectory = trajectory::check(&self.robot, &self.scene(), &here, &trajectory)?;
                 self.following(trajectory)
             }
             Request::MoveTo { joints, speed } => {
+                self.no_motion_of(Module::Base)?;
                 self.no_motion_of(Module::Gripper)?;
                 let scene = self.scene();
                 let line = trajectory::straight(&self.robot, &here.arm, &joints, speed)?;
@@ -39,6 +53,7 @@ impl Cell {
                 self.following(trajectory)
             }
             Request::Grasp { object, expected } => {
+                self.no_motion_of(Module::Base)?;
                 self.no_motion_of(Module::Arm)?;
                 if let Some(held) = self.held {
                     return Err(format!("the gripper holds {} already", self.ids[held.object]));
@@ -46,14 +61,17 @@ impl Cell {
                 (Kind::Close { from: here.finger, object, expected }, self.config.gripper.close_s)
             }
             Request::Release => {
+                self.no_motion_of(Module::Base)?;
                 self.no_motion_of(Module::Arm)?;
                 self.let_go();
                 let to = self.config.gripper.opening_m / 2.0;
                 (Kind::Open { from: here.finger, to }, self.config.gripper.open_s)
             }
+            Request::SenseBase => (Kind::SenseBase, 0.0),
             Request::SenseArm => (Kind::SenseArm, 0.0),
             Request::SenseGripper => (Kind::SenseGripper, 0.0),
             Request::LookAt { target } => {
+                self.no_motion_of(Module::Base)?;
                 self.no_motion_of(Module::Camera)?;
                 let to = self.aim(target)?;
                 let from = [here.pan, here.tilt];
@@ -61,6 +79,7 @@ impl Cell {
                 (Kind::Look { from, to }, lasts_s)
             }
             Request::Capture { frames } => {
+                self.no_motion_of(Module::Base)?;
                 self.no_motion_of(Module::PanTilt)?;
                 if !(1..=MAX_FRAMES).contains(&frames) {
                     return Err(format!("a picture has 1 to {MAX_FRAMES} frames, not {frames}"));
@@ -80,8 +99,17 @@ impl Cell {
     /// What the arm does, and for how long.
     fn following(&mut self, trajectory: ArmTrajectory) -> (Kind, f64) {
         let lasts_s = trajectory.duration_s();
-        let gives_up_s = self.giving_up_after(lasts_s);
-        (Kind::Follow { trajectory, gives_up_s }, gives_up_s.unwrap_or(lasts_s))
+        let motion = Motion::new(trajectory, self.arm_breaks_off(lasts_s));
+        let lasts_s = motion.lasts_s();
+        (Kind::Follow(motion), lasts_s)
+    }
+
+    /// What the base does, and for how long.
+    fn driving(&mut self, trajectory: BaseTrajectory) -> (Kind, f64) {
+        let lasts_s = trajectory.duration_s();
+        let motion = Motion::new(trajectory, self.drive_breaks_off(lasts_s));
+        let lasts_s = motion.lasts_s();
+        (Kind::Drive(motion), lasts_s)
     }
 
     fn no_motion_of(&self, module: Module) -> Result<(), String> {
@@ -92,6 +120,7 @@ impl Cell {
                 module.kind(),
                 other.ticket.0,
                 match module {
+                    Module::Base => "nothing else happens while the base drives, so let both states block `Base`",
                     Module::Arm | Module::Gripper =>
                         "arm and gripper do not move at once, so let one of both states block `Arm` and `Gripper`",
                     Module::PanTilt | Module::Camera =>
@@ -102,7 +131,7 @@ impl Cell {
     }
 
     fn aim(&self, target: [f64; 3]) -> Result<[f64; 2], String> {
-        let (pan, tilt) = self.robot.look_at(&Pose::IDENTITY, target);
+        let (pan, tilt) = self.robot.look_at(&self.base_pose(), target);
         let camera = self.robot.camera_pose(&Configuration { pan, tilt, ..self.configuration() });
         let seen = camera.inverse().transform(target);
         let off = seen[0].hypot(seen[1]).atan2(seen[2]);

@@ -1,11 +1,12 @@
-//! Which motions the arm follows: those that ratn-motion finds nothing wrong with in the *true* scene.
+//! Which motions arm and base follow: those that ratn-motion finds nothing wrong with in the *true* scene.
 
 use ratn_model::value::Trajectory;
+use ratn_motion::base::check_drive;
 use ratn_motion::collision::Contact;
 use ratn_motion::plan::MIN_SPEED;
 use ratn_motion::robot::{Configuration, Joints, Robot};
 use ratn_motion::timing::{Part, PhasePlane, parameterise};
-use ratn_motion::trajectory::ArmTrajectory;
+use ratn_motion::trajectory::{ArmTrajectory, BaseTrajectory};
 use ratn_motion::validate::validate_trajectory;
 use ratn_world::scene::Scene;
 
@@ -26,15 +27,34 @@ pub(crate) fn check(
     here: &Configuration,
     trajectory: &Trajectory,
 ) -> Result<ArmTrajectory, String> {
-    let lasts_s = trajectory.duration_s();
-    if lasts_s > MAX_MOTION_S {
-        return Err(format!(
-            "the trajectory is refused: it lasts {lasts_s:.0} s, a motion lasts at most {MAX_MOTION_S} s"
-        ));
-    }
+    is_short(trajectory)?;
     let contact = Contact::Gripper(COMPLIANCE_M);
     validate_trajectory(robot, scene, &here.arm, Some(here.finger), trajectory, contact)
         .map_err(|violation| format!("the trajectory is refused: {violation}"))
+}
+
+/// The same for the base, with what rides on it.
+///
+/// # Errors
+/// Why it may not be followed.
+pub(crate) fn check_base(
+    robot: &Robot,
+    scene: &Scene,
+    here: &Configuration,
+    riding: &[String],
+    trajectory: &Trajectory,
+) -> Result<BaseTrajectory, String> {
+    is_short(trajectory)?;
+    check_drive(robot, scene, here, riding, trajectory)
+        .map_err(|violation| format!("the trajectory is refused: {violation}"))
+}
+
+fn is_short(trajectory: &Trajectory) -> Result<(), String> {
+    let lasts_s = trajectory.duration_s();
+    if lasts_s <= MAX_MOTION_S {
+        return Ok(());
+    }
+    Err(format!("the trajectory is refused: it lasts {lasts_s:.0} s, a motion lasts at most {MAX_MOTION_S} s"))
 }
 
 /// The straight line of joint space to a posture.

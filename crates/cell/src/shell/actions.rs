@@ -1,4 +1,4 @@
-//! The actions of the four modules: reads a goal's inputs, has the core do it, writes its outputs.
+//! The actions of the five modules: reads a goal's inputs, has the core do it, writes its outputs.
 
 use super::keeper::Keeper;
 use crate::config::CellConfig;
@@ -17,6 +17,7 @@ const MOVE_TO_SPEED: f64 = 0.2;
 /// The id of a module's resource on a host, `pan-tilt@sim`.
 pub(crate) fn resource_id(module: Module, host: &str) -> String {
     let name = match module {
+        Module::Base => "base",
         Module::Arm => "arm",
         Module::Gripper => "gripper",
         Module::PanTilt => "pan-tilt",
@@ -44,7 +45,11 @@ pub(crate) fn server(keeper: &Keeper, config: &CellConfig, channels: Channels, s
 type Read = fn(&GoalContext) -> Result<Request, ActionFailure>;
 
 /// All modules are behind one server: no two actions have the same name.
-const ACTIONS: [(Module, &str, &str, Read); 8] = [
+const ACTIONS: [(Module, &str, &str, Read); 10] = [
+    (Module::Base, "drive", "moves the base along a trajectory", |goal| {
+        Ok(Request::Drive { trajectory: goal.input_trajectory("trajectory")?.clone() })
+    }),
+    (Module::Base, "localise", "says where the base stands", |_| Ok(Request::SenseBase)),
     (Module::Arm, "follow", "moves the arm along a trajectory", |goal| {
         Ok(Request::Follow { trajectory: goal.input_trajectory("trajectory")?.clone() })
     }),
@@ -126,6 +131,8 @@ impl ModuleAction {
     async fn outcome(&self, product: Product) -> ActionResult {
         let success = GoalOutcome::success();
         Ok(match product {
+            Product::Driven { end } => success.with_output("end", Value::Pose(end)),
+            Product::BaseSensed { pose } => success.with_output("pose", Value::Pose(pose)),
             Product::Moved { end } => success.with_output("end", Value::Joints(end.to_vec())),
             Product::Grasped { object, width, in_gripper } => {
                 let outcome = success.with_output("width_m", Value::Float(width));

@@ -10,6 +10,7 @@ use crate::core::protocol::{Command, Ending, Event, Request, Ticket};
 use crate::core::recording::Line;
 use crate::core::snapshot::Snapshot;
 use ratn_model::id::LeaseId;
+use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::robot::{Joints, Robot};
 use ratn_perception::camera::{Camera, DepthImage};
@@ -37,6 +38,7 @@ pub(crate) struct State {
     pub(crate) boxes: Vec<TrueBox>,
     pub(crate) battery: f64,
     pub(crate) arm: Joints,
+    pub(crate) base: Pose,
     pub(crate) now: Timestamp,
     pub(crate) seed: u64,
 }
@@ -268,7 +270,14 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
 }
 
 fn state_of(cell: &Cell, now: Timestamp) -> State {
-    State { boxes: cell.ground_truth(), battery: cell.battery(), arm: cell.configuration().arm, now, seed: cell.seed() }
+    State {
+        boxes: cell.ground_truth(),
+        battery: cell.battery(),
+        arm: cell.configuration().arm,
+        base: cell.base_pose(),
+        now,
+        seed: cell.seed(),
+    }
 }
 
 #[cfg(test)]

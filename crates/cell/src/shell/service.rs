@@ -6,6 +6,7 @@ use crate::core::boxes::TrueBox;
 use crate::core::faults::{Fault, FaultError, MAX_FAULTS};
 use crate::core::protocol::Event;
 use crate::core::snapshot::Snapshot;
+use ratn_model::pose::Pose;
 use ratn_proto::convert::name;
 use ratn_proto::v1;
 use ratn_proto::v1::cell_service_server::CellService;
@@ -30,6 +31,7 @@ impl CellService for Service {
         let state = self.keeper.state().await.map_err(status)?;
         Ok(Response::new(v1::GetGroundTruthResponse {
             battery_level: state.battery,
+            base: Some(pose(&state.base)),
             arm: Some(v1::Joints { positions: state.arm.to_vec() }),
             time_s: state.now.seconds(),
             seed: state.seed,
@@ -82,13 +84,17 @@ impl CellService for Service {
 fn boxes(state: State) -> Vec<v1::TrueBox> {
     let wire = |b: TrueBox| v1::TrueBox {
         id: b.id,
-        pose: Some(v1::Pose { position_m: b.pose.position.to_vec(), quaternion_xyzw: b.pose.quaternion_xyzw.to_vec() }),
+        pose: Some(pose(&b.pose)),
         size_m: b.size.to_vec(),
         on_base: b.on_base,
         held: b.held,
         rests_on: b.on,
     };
     state.boxes.into_iter().map(wire).collect()
+}
+
+fn pose(pose: &Pose) -> v1::Pose {
+    v1::Pose { position_m: pose.position.to_vec(), quaternion_xyzw: pose.quaternion_xyzw.to_vec() }
 }
 
 fn status(error: KeeperError) -> Status {

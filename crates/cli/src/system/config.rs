@@ -24,7 +24,7 @@ const SPEED_PLACEHOLDER: &str = "{speed}";
 /// The kind whose pool `--planners` sizes.
 const PATH_PLANNER: &str = "PathPlanner";
 /// What a cell provides, one of each.
-const CELL_RESOURCES: [&str; 5] = ["Arm", "Gripper", "PanTilt", "Camera", "Battery"];
+const CELL_RESOURCES: [&str; 6] = ["Base", "Arm", "Gripper", "PanTilt", "Camera", "Battery"];
 const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=1000.0;
 
 /// All keys are optional.

@@ -52,7 +52,7 @@ fn not_a_goal(value: &Value) -> ActionFailure {
     ActionFailure::aborted(format!("input `goal` has a {found}: expected joints, a pose, or a list of these"))
 }
 
-fn joints(port: &str, values: &[f64]) -> Result<Joints, ActionFailure> {
+pub(super) fn joints(port: &str, values: &[f64]) -> Result<Joints, ActionFailure> {
     let wrong = |_| ActionFailure::aborted(format!("input `{port}` has {} joints: expected 7", values.len()));
     values.try_into().map_err(wrong)
 }

@@ -93,6 +93,8 @@ pub struct Environment {
     /// What can be stood on: collider and name.
     supports: Vec<(ColliderHandle, String)>,
     links: Vec<RobotBody>,
+    /// Where the robot's base was at the last step.
+    base: [f64; 3],
     fingers_solid: bool,
     objects: Vec<Body>,
 }
@@ -161,6 +163,7 @@ impl Environment {
             furniture: furniture.to_vec(),
             supports: Vec::new(),
             links: Vec::new(),
+            base: configuration.base,
             fingers_solid: true,
             objects: Vec::new(),
         };
@@ -214,6 +217,10 @@ impl Environment {
 
     /// One step, in which the robot's joints come to `configuration`.
     pub fn step(&mut self, robot: &Robot, configuration: &Configuration) {
+        // A contact that is taken over from the step before has its points where the carrier was then: on a deck that turns, things
+        // would creep outwards.
+        self.parameters.contact_recycling = self.base == configuration.base;
+        self.base = configuration.base;
         for (link, (_, pose, _)) in self.links.iter_mut().zip(robot.shapes(configuration)) {
             if link.at != pose {
                 link.at = pose;

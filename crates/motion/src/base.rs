@@ -1,0 +1,310 @@
+//! Motions of the base: planned from where it stands to a place with a tolerance, timed within its limits, and checked before they
+//! are followed.
+//!
+//! The path is that of `drive`, its corners are rounded and it is timed like the arm's (`timing`), in x, y and heading. What
+//! stands on the deck, and what is held, rides along. Headings of a trajectory go on beyond half a turn; those of a place do not.
+
+use crate::aimm;
+use crate::arm::finger_around_held;
+use crate::collision::{distance, length};
+use crate::connect::{Budget, ConnectError};
+use crate::drive::{Vehicle, drive_in, state, wrapped};
+use crate::exact::{Exact, Touch};
+use crate::geometry::Geometry;
+use crate::pace::Control;
+use crate::request::MIN_SPEED;
+use crate::robot::{Configuration, Joint, Joints, Robot, to_f32};
+use crate::space::{Obstacle, Space};
+use crate::timing::{Part, PhasePlane, timed};
+use crate::trajectory::{BaseTrajectory, Curve, TrajectoryError};
+use crate::validate::{Violation, check_limits, check_rest};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_model::value::Trajectory;
+use ratn_world::scene::{Placement, Scene};
+use std::f64::consts::TAU;
+
+/// Room that a planned way keeps, in metres.
+const PADDING_M: f64 = 0.02;
+
+/// How far from the base's place a trajectory may start, in metres and in radians.
+pub const START_TOLERANCE: f64 = 0.02;
+
+/// Something stands on the deck that is at most this much above it, or in it, in metres.
+const STANDS_M: f64 = 0.03;
+
+/// The loosest tolerances, in metres and in radians.
+const MAX_TOLERANCE: f64 = 1.0;
+
+/// Places tried within the tolerance of goals that are not free.
+const PLACES: usize = 64;
+
+/// The most alternatives of one goal.
+const MAX_GOALS: usize = 64;
+
+/// Samples of the search.
+const ITERATIONS: usize = 30_000;
+
+/// How far any point of what drives moves between two checked places, in metres.
+const CHECK_STEP_M: f64 = 0.01;
+
+/// Where to drive.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DriveRequest {
+    /// From there: x, y and heading.
+    pub start: [f64; 3],
+    /// The posture that the arm is in all along.
+    pub arm: Joints,
+    /// Alternatives, any one will do: x, y and heading.
+    pub goals: Vec<[f64; 3]>,
+    /// A goal that is not free may be missed by so much, in metres.
+    pub position_tolerance_m: f64,
+    /// … and by so much, in radians.
+    pub heading_tolerance_rad: f64,
+    /// Fraction of the base's velocity and acceleration limits.
+    pub speed: f64,
+    /// The same request, scene and seed give the same plan.
+    pub seed: u64,
+}
+
+/// A drive.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DrivePlan {
+    /// Timed.
+    pub trajectory: Trajectory,
+    /// Where it ends: x, y and heading within half a turn.
+    pub end: [f64; 3],
+    /// Of the path, in metres and radians alike.
+    pub length: f64,
+}
+
+/// Why there is no way.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum DriveError {
+    /// The request makes no sense.
+    #[error("{what} is {value}: expected {expected}")]
+    Malformed {
+        /// Which part of it.
+        what: &'static str,
+        /// What it is.
+        value: String,
+        /// What it should be.
+        expected: String,
+    },
+    /// It touches something where it stands.
+    #[error("the robot cannot drive off: there is less than {:.0} mm between it and something else{}", PADDING_M * 1e3, touching(.touch.as_ref()))]
+    Start {
+        /// What, where it touches it.
+        touch: Option<Touch>,
+    },
+    /// It would touch something at every goal.
+    #[error(
+        "none of the {goals} goals is free, nor any place tried within {position_m:.2} m and {heading_rad:.2} rad of them"
+    )]
+    Goal {
+        /// How many there are.
+        goals: usize,
+        /// The tolerance, in metres.
+        position_m: f64,
+        /// The tolerance, in radians.
+        heading_rad: f64,
+    },
+    /// Nothing was found.
+    #[error(transparent)]
+    NoPath(ConnectError),
+    /// The caller gave up.
+    #[error("planning was cancelled")]
+    Cancelled,
+}
+
+/// Why the base may not follow a trajectory.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum DriveViolation {
+    /// It is none of the base.
+    #[error(transparent)]
+    Malformed(#[from] TrajectoryError),
+    /// It starts elsewhere.
+    #[error("the base is {metres:.3} m and {radians:.3} rad away from where the trajectory starts")]
+    Start {
+        /// How far.
+        metres: f64,
+        /// How much turned.
+        radians: f64,
+    },
+    /// It breaks a limit, or does not start and end at rest.
+    #[error(transparent)]
+    Limit(#[from] Violation),
+    /// Something is in the way.
+    #[error("at {time_s:.2} s {touch}")]
+    Touch {
+        /// When.
+        time_s: f64,
+        /// What touches what.
+        touch: Touch,
+    },
+}
+
+/// What stands on the robot's deck: objects whose middle is above it and whose lowest point is at its height.
+pub fn riding(robot: &Robot, scene: &Scene) -> Vec<String> {
+    let standing = Configuration::ZERO.with_base(&scene.base);
+    let Some(base) = robot.link("base") else { return Vec::new() };
+    let frame = robot.poses(&standing)[base];
+    let stands = |pose: &Pose, geometry: &Geometry| {
+        robot.links[base].bodies.iter().any(|deck| {
+            let Geometry::Box { half } = deck.geometry else { return false };
+            let seen = frame.compose(&deck.pose).inverse().compose(pose);
+            let low = geometry.shape(0.0).compute_aabb(&to_f32(&geometry.at(seen).pose)).mins.z;
+            (0..2).all(|i| seen.position[i].abs() <= half[i]) && (f64::from(low) - half[2]).abs() <= STANDS_M
+        })
+    };
+    let on_deck = scene.objects.iter().filter(|object| match object.placement {
+        Placement::World(pose) => stands(&pose, &Geometry::from(&object.shape)),
+        Placement::Gripper(_) => false,
+    });
+    on_deck.map(|object| object.name.clone()).collect()
+}
+
+/// A way for the base in a scene, whose base says where what rides along is seen from.
+///
+/// # Errors
+/// [`DriveError`] says why there is none.
+pub fn plan_drive(
+    robot: &Robot,
+    scene: &Scene,
+    request: &DriveRequest,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<DrivePlan, DriveError> {
+    request.check()?;
+    let here = Configuration { arm: request.arm, finger: finger_around_held(robot, scene), ..Configuration::ZERO };
+    let here = here.with_base(&scene.base);
+    let riding = riding(robot, scene);
+    let (vehicle, obstacles) = Vehicle::of(robot, scene, &here, &riding, aimm::DRIVE_AREA, PADDING_M);
+    let mechanism = vehicle.mechanism();
+    let mut space = Space::new(&mechanism, &obstacles);
+    let budget = Budget { iterations: ITERATIONS, seed: request.seed };
+    let found = match drive_in(&mut space, request.start, &request.goals, budget, control) {
+        Err(ConnectError::Goal { .. }) => drive_in(&mut space, request.start, &request.around(), budget, control),
+        other => other,
+    };
+    let (path, _) = found.map_err(|error| match error {
+        ConnectError::Start => DriveError::Start { touch: Exact::new(&mechanism, &obstacles).touch(&request.start) },
+        ConnectError::Goal { .. } => DriveError::Goal {
+            goals: request.goals.len(),
+            position_m: request.position_tolerance_m,
+            heading_rad: request.heading_tolerance_rad,
+        },
+        ConnectError::Cancelled => DriveError::Cancelled,
+        other => DriveError::NoPath(other),
+    })?;
+    let joints = limits(robot);
+    let mut free = |from: &[f64; 3], to: &[f64; 3]| space.is_free_motion(&state(*from), &state(*to));
+    let trajectory = timed(&joints, &[Part::Free(path.clone())], request.speed, &PhasePlane, &mut free);
+    let [x, y, heading] = trajectory.end();
+    Ok(DrivePlan { trajectory: trajectory.named(&joints), end: [x, y, wrapped(heading)], length: length(&path) })
+}
+
+/// Checks a trajectory for a base that stands where the scene says, with the arm as in `configuration` and `riding` on its deck.
+/// Gives it back ready to be sampled.
+///
+/// # Errors
+/// The first [`DriveViolation`].
+pub fn check_drive(
+    robot: &Robot,
+    scene: &Scene,
+    configuration: &Configuration,
+    riding: &[String],
+    trajectory: &Trajectory,
+) -> Result<BaseTrajectory, DriveViolation> {
+    let joints = limits(robot);
+    let trajectory: BaseTrajectory = Curve::of(&joints, trajectory)?;
+    let (here, first) = (configuration.base, trajectory.knots()[0].positions);
+    let metres = (here[0] - first[0]).hypot(here[1] - first[1]);
+    let radians = wrapped(here[2] - first[2]).abs();
+    if metres > START_TOLERANCE || radians > START_TOLERANCE {
+        return Err(DriveViolation::Start { metres, radians });
+    }
+    check_rest(&joints, &trajectory)?;
+    check_limits(&joints, &trajectory)?;
+    let (vehicle, obstacles) = Vehicle::of(robot, scene, configuration, riding, aimm::DRIVE_AREA, 0.0);
+    check_way(&vehicle, &obstacles, &trajectory)?;
+    Ok(trajectory)
+}
+
+/// Looks at every place between which nothing moves farther than a step: roughly first, exactly where that finds something.
+fn check_way(vehicle: &Vehicle, obstacles: &[Obstacle], trajectory: &BaseTrajectory) -> Result<(), DriveViolation> {
+    let mechanism = vehicle.mechanism();
+    let mut space = Space::new(&mechanism, obstacles);
+    let exact = Exact::new(&mechanism, obstacles);
+    let reach = vehicle.bodies.iter().map(|b| b.pose.position[0].hypot(b.pose.position[1]) + b.geometry.radius());
+    let reach = reach.fold(0.0, f64::max);
+    let mut look = |time_s: f64, place: &[f64; 3]| match space.is_free(&state(*place)) {
+        true => Ok(()),
+        false => exact.touch(place).map_or(Ok(()), |touch| Err(DriveViolation::Touch { time_s, touch })),
+    };
+    let knots = trajectory.knots();
+    look(0.0, &knots[0].positions)?;
+    for pair in knots.windows(2) {
+        let [a, b] = [&pair[0].positions, &pair[1].positions];
+        // A cubic between two knots is at most so much longer than its chord.
+        let way = 1.5 * (distance(&[a[0], a[1]], &[b[0], b[1]]) + reach * (b[2] - a[2]).abs());
+        let samples = (way / CHECK_STEP_M).ceil().max(1.0) as usize;
+        let duration = pair[1].time_s - pair[0].time_s;
+        for i in 1..=samples {
+            let time_s = pair[0].time_s + duration * i as f64 / samples as f64;
+            look(time_s, &trajectory.sample(time_s).positions)?;
+        }
+    }
+    Ok(())
+}
+
+/// The base's joints within the driving area; a heading has no limits.
+fn limits(robot: &Robot) -> Vec<Joint> {
+    let [[x_low, x_high], [y_low, y_high]] = aimm::DRIVE_AREA;
+    let within = [[x_low, x_high], [y_low, y_high], [-2.0 * TAU, 2.0 * TAU]];
+    let joints = robot.base_joints().iter().zip(within);
+    joints.map(|(joint, [lower, upper])| Joint { lower, upper, ..joint.clone() }).collect()
+}
+
+impl DriveRequest {
+    fn check(&self) -> Result<(), DriveError> {
+        let malformed = |what, value: String, expected: String| Err(DriveError::Malformed { what, value, expected });
+        if !(MIN_SPEED..=1.0).contains(&self.speed) {
+            return malformed("speed", self.speed.to_string(), format!("a fraction from {MIN_SPEED} to 1"));
+        }
+        let tolerances = [
+            ("position_tolerance_m", self.position_tolerance_m, "m"),
+            ("heading_tolerance_rad", self.heading_tolerance_rad, "rad"),
+        ];
+        for (what, value, unit) in tolerances {
+            if !(0.0..=MAX_TOLERANCE).contains(&value) {
+                return malformed(what, value.to_string(), format!("0 to {MAX_TOLERANCE} {unit}"));
+            }
+        }
+        if !(1..=MAX_GOALS).contains(&self.goals.len()) {
+            return malformed("the number of goals", self.goals.len().to_string(), format!("1 to {MAX_GOALS}"));
+        }
+        let finite = |place: &[f64; 3]| place.iter().all(|c| c.is_finite());
+        match self.goals.iter().chain([&self.start]).find(|place| !finite(place)) {
+            Some(place) => malformed("a place", format!("{place:?}"), "finite numbers".to_owned()),
+            None => Ok(()),
+        }
+    }
+
+    /// Places within the tolerance of the goals.
+    fn around(&self) -> Vec<[f64; 3]> {
+        let mut random = ChaCha8Rng::seed_from_u64(self.seed);
+        let place = |i: usize| {
+            let [x, y, heading] = self.goals[i % self.goals.len()];
+            let (angle, share) = (random.random_range(0.0..TAU), random.random_range(0.0_f64..=1.0).sqrt());
+            let away = self.position_tolerance_m * share;
+            let turn = self.heading_tolerance_rad * random.random_range(-1.0..=1.0);
+            [x + away * angle.cos(), y + away * angle.sin(), heading + turn]
+        };
+        (0..PLACES).map(place).collect()
+    }
+}
+
+fn touching(touch: Option<&Touch>) -> String {
+    touch.map_or(String::new(), |touch| format!("; {touch}"))
+}

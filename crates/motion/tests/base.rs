@@ -1,0 +1,115 @@
+//! Motions of the base: planned, timed, checked.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
+
+use ratn_model::pose::Pose;
+use ratn_motion::aimm;
+use ratn_motion::base::{DriveError, DrivePlan, DriveRequest, DriveViolation, check_drive, plan_drive, riding};
+use ratn_motion::pace::Control;
+use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::trajectory::Curve;
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use std::f64::consts::{FRAC_PI_2, PI};
+
+const STANDING: Configuration = Configuration { arm: aimm::STOWED, finger: 0.055, ..Configuration::ZERO };
+
+fn block(name: &str, pose: Pose, size: [f64; 3]) -> SceneObject {
+    SceneObject { name: name.to_owned(), shape: Shape::Box { size }, placement: Placement::World(pose) }
+}
+
+fn cell(base: Pose, more: &[SceneObject]) -> Scene {
+    let [x, y, z] = aimm::TABLE_CENTRE;
+    let table = block("table", Pose::at(x, y, z), aimm::TABLE_SIZE);
+    Scene { base, objects: [&[table], more].concat() }
+}
+
+fn to(goal: [f64; 3]) -> DriveRequest {
+    DriveRequest {
+        start: [0.0; 3],
+        arm: aimm::STOWED,
+        goals: vec![goal],
+        position_tolerance_m: 0.0,
+        heading_tolerance_rad: 0.0,
+        speed: 0.5,
+        seed: 4,
+    }
+}
+
+fn planned(scene: &Scene, request: &DriveRequest) -> Result<DrivePlan, DriveError> {
+    plan_drive(&Robot::aimm(), scene, request, &mut |_| Control::Continue)
+}
+
+#[test]
+fn the_base_drives_round_the_table_to_its_other_side_within_its_limits() {
+    let robot = Robot::aimm();
+    let scene = cell(Pose::IDENTITY, &[]);
+    let plan = planned(&scene, &to([1.75, 0.0, PI])).unwrap();
+    assert!((plan.end[0] - 1.75).abs() < 1e-5 && plan.end[1].abs() < 1e-5 && (plan.end[2].abs() - PI).abs() < 1e-5);
+    let driven = check_drive(&robot, &scene, &STANDING, &[], &plan.trajectory).unwrap();
+    assert!(driven.duration_s() > plan.length / 0.8 / 0.5, "faster than half of 0.8 m/s");
+    // 2 m of table and base are in between: it cannot go straight.
+    assert!(driven.knots().iter().any(|k| k.positions[1].abs() > 0.8));
+    assert_eq!(planned(&scene, &to([1.75, 0.0, PI])).unwrap(), plan, "the same request gives the same plan");
+}
+
+#[test]
+fn what_is_in_the_way_starts_elsewhere_or_is_too_fast_is_refused_with_the_reason() {
+    let robot = Robot::aimm();
+    let check = |scene: &Scene, at: &Configuration, plan: &DrivePlan| {
+        check_drive(&robot, scene, at, &[], &plan.trajectory).map(drop)
+    };
+    let scene = cell(Pose::IDENTITY, &[]);
+    let back = planned(&scene, &to([-1.5, 0.0, 0.0])).unwrap();
+    check(&scene, &STANDING, &back).unwrap();
+    let there = Configuration { base: [0.1, 0.0, 0.0], ..STANDING };
+    assert!(
+        matches!(check(&scene, &there, &back), Err(DriveViolation::Start { metres, .. }) if (metres - 0.1).abs() < 1e-6)
+    );
+    let turned = Configuration { base: [0.0, 0.0, 2.0 * PI], ..STANDING };
+    check(&scene, &turned, &back).unwrap();
+
+    let crate_there = cell(Pose::IDENTITY, &[block("crate", Pose::at(-1.5, 0.0, 0.2), [0.4; 3])]);
+    let refused = check(&crate_there, &STANDING, &back).unwrap_err();
+    assert!(
+        matches!(&refused, DriveViolation::Touch { touch, time_s } if touch.other == "crate" && *time_s > 0.1),
+        "{refused}"
+    );
+
+    let mut hasty = back.clone();
+    for point in &mut hasty.trajectory.points {
+        point.time_s /= 4.0;
+        point.velocities.iter_mut().for_each(|v| *v *= 4.0);
+    }
+    let refused = check(&scene, &STANDING, &hasty).unwrap_err();
+    assert!(refused.to_string().contains("base_x reaches"), "{refused}");
+    assert!(matches!(planned(&scene, &to([9.0, 0.0, 0.0])), Err(DriveError::Goal { goals: 1, .. })));
+}
+
+#[test]
+fn a_goal_that_is_not_free_is_missed_within_the_tolerance_and_no_further() {
+    // The base reaches 0.35 m ahead of its middle: at 0.2 it would be in the crate.
+    let scene = cell(Pose::at(-1.5, 0.0, 0.0), &[block("crate", Pose::at(0.65, 0.0, 0.2), [0.2, 2.0, 0.4])]);
+    let request = DriveRequest { start: [-1.5, 0.0, 0.0], ..to([0.21, 0.0, 0.0]) };
+    assert!(matches!(planned(&scene, &request), Err(DriveError::Goal { .. })));
+    let loose = DriveRequest { position_tolerance_m: 0.15, heading_tolerance_rad: 0.1, ..request };
+    let end = planned(&scene, &loose).unwrap().end;
+    let missed = (end[0] - 0.21).hypot(end[1]);
+    assert!(missed > 0.0 && missed <= 0.15 + 1e-6 && end[2].abs() <= 0.1 + 1e-6, "{end:?}");
+}
+
+#[test]
+fn what_stands_on_the_deck_rides_along_wherever_the_base_stands() {
+    let robot = Robot::aimm();
+    let base = Pose::from_rpy([1.0, -2.0, 0.0], 0.0, 0.0, FRAC_PI_2);
+    let on_deck = base.compose(&aimm::slots()[4]).compose(&Pose::at(0.0, 0.0, 0.052));
+    let beside = base.compose(&Pose::at(-0.37, 0.5, 0.652));
+    let scene = cell(base, &[block("cargo", on_deck, [0.1; 3]), block("beside", beside, [0.1; 3])]);
+    assert_eq!(riding(&robot, &scene), ["cargo"]);
+}
+
+#[test]
+fn a_trajectory_of_the_arm_is_none_of_the_base() {
+    let plan = planned(&cell(Pose::IDENTITY, &[]), &to([-1.0, 0.5, 0.3])).unwrap();
+    let error = Curve::<7>::of(Robot::aimm().arm_joints(), &plan.trajectory).unwrap_err();
+    assert!(error.to_string().starts_with("the trajectory moves [base_x, base_y, base_yaw]"), "{error}");
+}

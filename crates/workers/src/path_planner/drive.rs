@@ -1,0 +1,85 @@
+//! `path_planner/drive`: a way for the base in the goal's projection. Inputs: `arm` (the posture that the arm is in), `goal` (a pose on
+//! the floor, or a list of such poses); optional `start`, `position_tolerance_m`, `heading_tolerance_rad`, `speed`.
+
+use super::goal::joints;
+use ratn_model::pose::Pose;
+use ratn_model::value::Value;
+use ratn_motion::base::{DriveError, DriveRequest, plan_drive};
+use ratn_motion::pace::Control;
+use ratn_motion::robot::{Configuration, Robot};
+use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, SceneCache};
+use ratn_world::scene::Scene;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// The fraction of the base's limits where the goal says none.
+const DEFAULT_SPEED: f64 = 0.5;
+
+/// `path_planner/drive`.
+#[derive(Debug)]
+pub struct DriveAction {
+    robot: Arc<Robot>,
+    speed: f64,
+    scenes: Arc<SceneCache>,
+}
+
+impl DriveAction {
+    pub(super) fn new(robot: &Arc<Robot>, speed: f64, scenes: &Arc<SceneCache>) -> DriveAction {
+        DriveAction { robot: Arc::clone(robot), speed, scenes: Arc::clone(scenes) }
+    }
+}
+
+#[tonic::async_trait]
+impl Action for DriveAction {
+    fn name(&self) -> &str {
+        "drive"
+    }
+
+    fn description(&self) -> &str {
+        "A collision-free way of the base to a place on the floor, timed."
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        let begin = Instant::now();
+        let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
+        let request = request(&goal, &scene)?;
+        let (robot, goal) = (Arc::clone(&self.robot), Arc::new(goal));
+        let asking = Arc::clone(&goal);
+        let mut control = move |_| if asking.cancelled.is_cancelled() { Control::Cancelled } else { Control::Continue };
+        let planning = tokio::task::spawn_blocking(move || plan_drive(&robot, &scene, &request, &mut control));
+        match planning.await? {
+            Ok(plan) => Ok(GoalOutcome::success()
+                .with_output("trajectory", Value::Trajectory(plan.trajectory))
+                .with_output("end", Value::Pose(on_floor(plan.end)))
+                .with_output("length_m", Value::Float(plan.length))
+                .with_output("planning_s", Value::Float(begin.elapsed().as_secs_f64() * self.speed))),
+            Err(DriveError::Cancelled) => Err(goal.stopped()),
+            Err(error) => Err(error.into()),
+        }
+    }
+}
+
+fn request(goal: &GoalContext, scene: &Scene) -> Result<DriveRequest, ActionFailure> {
+    let goals = match goal.port("goal").any()? {
+        Value::List(_) => goal.port("goal").list()?.iter().map(|port| port.pose()).collect::<Result<Vec<_>, _>>()?,
+        _ => vec![goal.input_pose("goal")?],
+    };
+    let start = goal.port("start").optional().map(|port| port.pose()).transpose()?;
+    Ok(DriveRequest {
+        start: place(&start.unwrap_or(scene.base)),
+        arm: joints("arm", goal.input_joints("arm")?)?,
+        goals: goals.iter().map(place).collect(),
+        position_tolerance_m: goal.optional_float("position_tolerance_m")?.unwrap_or(0.0),
+        heading_tolerance_rad: goal.optional_float("heading_tolerance_rad")?.unwrap_or(0.0),
+        speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
+        seed: goal.seed,
+    })
+}
+
+fn place(pose: &Pose) -> [f64; 3] {
+    Configuration::ZERO.with_base(pose).base
+}
+
+fn on_floor([x, y, heading]: [f64; 3]) -> Pose {
+    Pose::from_rpy([x, y, 0.0], 0.0, 0.0, heading)
+}
