@@ -4,6 +4,7 @@
 //!
 //! The same space, ends, seed and budget give the same path. The caller is asked every `POLL` iterations whether to go on.
 
+use crate::ellipsoid;
 use crate::halton::Halton;
 use crate::pace::Control;
 use crate::reach::{Reach, Target};
@@ -27,8 +28,11 @@ const POLL: usize = 32;
 const POSTURES: usize = 8;
 const ATTEMPTS: usize = 24;
 
-/// Samples drawn at most to mend one motion.
-const MENDING_ITERATIONS: usize = 2_000;
+/// Samples drawn at most to mend one motion, how much longer than it a detour through the first of them may be, in radians, and
+/// after how many that doubles: the last are from everywhere.
+const MENDING_ITERATIONS: usize = 512;
+const FIRST_DETOUR: f32 = 0.1;
+const DETOUR_DOUBLES: usize = 64;
 
 /// How often a path with a gap between its postures is mended before the search gives up.
 const MENDINGS: usize = 16;
@@ -161,10 +165,11 @@ fn go_on(control: &mut dyn FnMut(usize) -> Control, iterations: usize) -> Result
     }
 }
 
-/// Makes sure that a path whose postures are free is free also between them: motions that are not are searched anew, finely.
+/// Makes sure that a path whose postures are free is free also between them: for motions that are not, a detour is
+/// searched, near them first.
 ///
 /// # Errors
-/// As [`connect`], where a motion cannot be mended.
+/// [`ConnectError::Exhausted`] where a motion cannot be mended, [`ConnectError::TimeUp`] and [`ConnectError::Cancelled`].
 pub fn mend(
     space: &mut Space,
     path: &[State],
@@ -183,13 +188,32 @@ pub fn mend(
         if mended > MENDINGS {
             return Err(ConnectError::Exhausted { iterations: budget.iterations });
         }
-        space.set_swept(true);
         let little = Budget { iterations: budget.iterations.min(MENDING_ITERATIONS), ..budget };
-        let detour = connect(space, &pair[0], &pair[1..], little, control);
-        space.set_swept(false);
-        whole.extend_from_slice(&detour?.path[1..]);
+        whole.extend_from_slice(&detour(space, &pair[0], &pair[1], little, control)?[1..]);
     }
     Ok(whole)
+}
+
+/// A way free between its postures that is little longer than the straight motion, where there is one.
+fn detour(
+    space: &mut Space,
+    from: &State,
+    to: &State,
+    budget: Budget,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<Vec<State>, ConnectError> {
+    let (lower, upper, joints) = (*space.limits().0, *space.limits().1, space.joints());
+    let mut random = ChaCha8Rng::seed_from_u64(budget.seed);
+    let (straight, mut drawn) = (distance(from, to), 0);
+    let sample = || {
+        let more = FIRST_DETOUR * 2_f32.powi((drawn / DETOUR_DOUBLES) as i32);
+        drawn += 1;
+        ellipsoid::draw(from, to, straight + more, (&lower, &upper), joints, &mut random)
+    };
+    space.set_swept(true);
+    let found = grow(space, from, std::slice::from_ref(to), budget.iterations, sample, control);
+    space.set_swept(false);
+    found.map(|(path, _)| path)
 }
 
 /// Grows a tree from the start and one from all ends, which are free, until they meet; gives the path and the iterations.

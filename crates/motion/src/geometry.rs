@@ -92,6 +92,21 @@ impl Geometry {
         Body { pose: pose.compose(&self.turn()), geometry: self }
     }
 
+    /// How far the shape reaches from its centre along the axes of the world, where it has this pose, its axis along z.
+    pub(crate) fn extents(&self, pose: &Pose) -> [f64; 3] {
+        let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| pose.rotate(axis));
+        std::array::from_fn(|i| {
+            let [x, y, z] = axes.map(|axis| axis[i].abs());
+            let disc = x.hypot(y);
+            match *self {
+                Geometry::Box { half } => x * half[0] + y * half[1] + z * half[2],
+                Geometry::Cylinder { radius, half_length } => disc * radius + z * half_length,
+                Geometry::Capsule { radius, half_length } => radius + z * half_length,
+                Geometry::Sphere { radius } => radius,
+            }
+        })
+    }
+
     /// The radius of a sphere about the centre that holds the shape.
     pub fn radius(&self) -> f64 {
         match *self {

@@ -37,6 +37,8 @@ pub fn simplify(
     let short = shortened(space, path, control)?;
     match mend(space, &short, budget, control) {
         Err(ConnectError::Exhausted { .. }) => {}
+        // Detours have corners of their own.
+        Ok(mended) if mended.len() > short.len() => return shortened_swept(space, &mended, control),
         other => return other,
     }
     // The short way leads through a gap that is none. The long one may not, and another search looks between postures.
@@ -49,8 +51,16 @@ pub fn simplify(
         }
         other => other?,
     };
+    shortened_swept(space, &long, control)
+}
+
+fn shortened_swept(
+    space: &mut Space,
+    path: &[State],
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<Vec<State>, ConnectError> {
     space.set_swept(true);
-    let short = shortened(space, &long, control);
+    let short = shortened(space, path, control);
     space.set_swept(false);
     short
 }

@@ -3,11 +3,12 @@
 //! Two ways to check a motion. [`Space::is_free_motion`] looks at [`Space::RESOLUTION`] postures per radian, as the search
 //! does. [`Space::is_swept_free`] leaves nothing between the postures: each sphere is grown by how far it can move until the
 //! next one, and the parts where that is too much are cut finer, down to postures so close that what is between is noise.
+//! How far it can move is half of its step to the next posture, and what the curvature of its way allows beside that.
 
 use crate::geometry::Geometry;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 pub use crate::simd::Isa;
-use crate::simd::{self, Compiled, Edge, Frame, Group, Scratch, SelfPair};
+use crate::simd::{self, Block, Compiled, Edge, Frame, Group, Row, Scratch, SelfPair};
 use ratn_model::pose::Pose;
 
 /// Positions in the order of the joints; unused ones are zero.
@@ -40,14 +41,25 @@ pub struct Space {
     compiled: Compiled,
     scratch: Scratch,
     isa: Isa,
-    /// Per group and joint: how far a point of the group moves at most for one radian (or metre) of the joint.
-    lever: Vec<[f32; MAX_JOINTS]>,
+    /// Per group.
+    arms: Vec<Arm>,
     inflate: Vec<f32>,
     lower: State,
     upper: State,
     /// A part that no joint moves stands in an obstacle.
     blocked: bool,
     swept: bool,
+}
+
+/// How a group moves with each joint.
+#[derive(Debug, Clone)]
+struct Arm {
+    /// How far a point of it moves at most for one radian (or metre).
+    levers: State,
+    /// How far it turns for one radian; zero for joints that slide.
+    turns: State,
+    /// How far it slides for one metre; zero for joints that turn.
+    slides: State,
 }
 
 impl Space {
@@ -62,40 +74,39 @@ impl Space {
     /// As [`Space::new`], with instructions that are not the widest.
     pub fn with_isa(mechanism: &Mechanism, obstacles: &[Obstacle], isa: Isa) -> Space {
         let compiled_obstacles: Vec<simd::Obstacle> = obstacles.iter().map(compile_obstacle).collect();
-        let (mut compiled, reaches, links) = compile_robot(mechanism, ROUNDING_M);
-        let count = obstacles.len();
-        compiled.nearest = vec![f32::INFINITY; count * compiled.groups.len()];
+        let (mut compiled, shells, links) = compile_robot(mechanism, ROUNDING_M);
         let mut blocked = false;
         for (index, group) in compiled.groups.iter_mut().enumerate() {
-            let nearest = &mut compiled.nearest[index * count..(index + 1) * count];
+            let mut near: Vec<(f64, usize)> = Vec::new();
             for (o, obstacle) in obstacles.iter().enumerate() {
                 if !mechanism.is_kept_from(links[index], &obstacle.name) {
                     continue;
                 }
-                nearest[o] = (gap(obstacle, group.anchor.map(f64::from)) - 1e-4) as f32;
                 if group.frame == 0 {
                     let touches =
                         |s: &[f32; 4]| gap(obstacle, std::array::from_fn(|i| f64::from(s[i]))) < f64::from(s[3]);
                     blocked |= group.fine.iter().any(touches);
-                } else if nearest[o] <= reaches[index] {
-                    let list = if is_cylinder(obstacle) { &mut group.cylinders } else { &mut group.rounded };
-                    list.push(o as u16);
+                    continue;
+                }
+                let far = gap(obstacle, shells[index].anchor);
+                if far <= shells[index].reach {
+                    near.push((far, o));
                 }
             }
-            for list in [&mut group.rounded, &mut group.cylinders] {
-                list.sort_by(|a, b| nearest[usize::from(*a)].total_cmp(&nearest[usize::from(*b)]));
-            }
+            near.sort_by(|a, b| a.0.total_cmp(&b.0));
+            let order: Vec<usize> = near.into_iter().map(|(_, o)| o).collect();
+            group.near = order.chunks(isa.width()).map(|row| compile_row(row, obstacles)).collect();
         }
         compiled.obstacles = compiled_obstacles;
         compiled.pairs = pairs(mechanism, &compiled.groups, &links);
-        let lever = levers(&compiled);
+        let arms = compiled.groups.iter().map(|group| arm(&compiled, group)).collect();
         let (mut lower, mut upper) = ([0.0; MAX_JOINTS], [0.0; MAX_JOINTS]);
         for (j, joint) in mechanism.joints.iter().enumerate() {
             (lower[j], upper[j]) = (joint.lower as f32, joint.upper as f32);
         }
         let scratch = Scratch::new(&compiled);
         let inflate = vec![0.0; compiled.groups.len()];
-        Space { compiled, scratch, isa, lever, inflate, lower, upper, blocked, swept: false }
+        Space { compiled, scratch, isa, arms, inflate, lower, upper, blocked, swept: false }
     }
 
     /// How many joints there are.
@@ -205,8 +216,14 @@ impl Space {
         // Each posture stands for the step that it is in the middle of: nothing is further than half a step from one.
         let step = 0.5 / self.isa.width() as f32;
         let joints = self.compiled.joints;
-        for (inflate, lever) in self.inflate.iter_mut().zip(&self.lever) {
-            *inflate = step * (0..joints).map(|j| lever[j] * delta[j].abs()).sum::<f32>();
+        for ((inflate, arm), group) in self.inflate.iter_mut().zip(&self.arms).zip(&self.compiled.groups) {
+            let along = |levers: &State| (0..joints).map(|j| levers[j] * delta[j].abs()).sum::<f32>() * step;
+            let (turned, moved, slid) = (along(&arm.turns), along(&arm.levers), along(&arm.slides));
+            // The second derivative by two joints that turn is no longer than the lever of the later one. The mean speed of a
+            // step differs from that anywhere in it and half a step beyond by what it changes in one step at most.
+            let bend = 2.0 * turned * (moved + slid);
+            // Points beside the centre of the bounding sphere turn about it.
+            *inflate = bend + turned * group.coarse[3];
         }
         let start: State = std::array::from_fn(|j| start[j] - delta[j] * step);
         let edge = Edge { compiled: &self.compiled, start: &start, delta, batches: 1, inflate: &self.inflate };
@@ -234,10 +251,6 @@ pub fn between(a: &State, b: &State, fraction: f32) -> State {
     std::array::from_fn(|j| a[j] + (b[j] - a[j]) * fraction)
 }
 
-fn is_cylinder(obstacle: &Obstacle) -> bool {
-    matches!(obstacle.geometry, Geometry::Cylinder { .. })
-}
-
 /// How far a point is from an obstacle, in metres; zero inside.
 fn gap(obstacle: &Obstacle, point: [f64; 3]) -> f64 {
     let [x, y, z] = obstacle.pose.inverse().transform(point);
@@ -263,19 +276,42 @@ fn compile_obstacle(obstacle: &Obstacle) -> simd::Obstacle {
         axes: std::array::from_fn(|i| axes[i / 3][i % 3] as f32),
         half: half.map(|h| h as f32),
         round: round as f32,
+        is_cylinder: matches!(obstacle.geometry, Geometry::Cylinder { .. }),
         upright: axes[2][2] > 1.0 - 1e-12,
     }
 }
 
-/// The robot's frames and groups, how far each group can be from its anchor, and the link of each group.
-fn compile_robot(mechanism: &Mechanism, padding: f64) -> (Compiled, Vec<f32>, Vec<usize>) {
+fn compile_row(order: &[usize], obstacles: &[Obstacle]) -> Row {
+    let unused = [Block([f32::INFINITY; 16]); 3];
+    let indices = order.iter().map(|o| *o as u16).collect();
+    let mut row = Row { obstacles: indices, least: unused, minus_greatest: unused };
+    for (lane, o) in order.iter().enumerate() {
+        let Obstacle { pose, geometry, .. } = &obstacles[*o];
+        let extents = geometry.extents(pose);
+        for (i, (at, extent)) in pose.position.iter().zip(extents).enumerate() {
+            row.least[i].0[lane] = (at - extent - ROUNDING_M) as f32;
+            row.minus_greatest[i].0[lane] = (-at - extent - ROUNDING_M) as f32;
+        }
+    }
+    row
+}
+
+/// Where a group can be: within a sphere about the first joint of its chain.
+#[derive(Debug, Clone, Copy)]
+struct Shell {
+    anchor: [f64; 3],
+    reach: f64,
+}
+
+/// The robot's frames and groups, and of each group where it can be and its link.
+fn compile_robot(mechanism: &Mechanism, padding: f64) -> (Compiled, Vec<Shell>, Vec<usize>) {
     let mut frames: Vec<Frame> = Vec::new();
     // Per frame: how far its origin can be from the first joint of its chain, and that joint's place.
     let mut chains: Vec<(f64, [f64; 3])> = vec![(0.0, [0.0; 3])];
     // Per link: its frame, and where it is there.
     let mut places: Vec<(usize, Pose)> = Vec::new();
     let mut compiled = Compiled { joints: mechanism.joints.len(), ..Compiled::default() };
-    let (mut reaches, mut links) = (Vec::new(), Vec::new());
+    let (mut shells, mut links) = (Vec::new(), Vec::new());
     for (index, link) in mechanism.links.iter().enumerate() {
         let (parent, place) = link.parent.map_or((0, Pose::IDENTITY), |p| places[p]);
         let origin = place.compose(&link.origin);
@@ -308,19 +344,10 @@ fn compile_robot(mechanism: &Mechanism, padding: f64) -> (Compiled, Vec<f32>, Ve
                 })
                 .collect();
             let coarse = enclose(&fine);
-            let anchor = chains[frame].1.map(|c| c as f32);
-            reaches.push(chains[frame].0 as f32 + norm(&coarse) + coarse[3] + 1e-4);
+            let (way, anchor) = chains[frame];
+            shells.push(Shell { anchor, reach: way + f64::from(norm(&coarse) + coarse[3]) + 1e-4 });
             links.push(index);
-            let slot = 0;
-            compiled.groups.push(Group {
-                frame,
-                coarse,
-                fine,
-                slot,
-                rounded: Vec::new(),
-                cylinders: Vec::new(),
-                anchor,
-            });
+            compiled.groups.push(Group { frame, coarse, fine, slot: 0, near: Vec::new() });
         }
     }
     compiled.frames = frames;
@@ -332,9 +359,9 @@ fn compile_robot(mechanism: &Mechanism, padding: f64) -> (Compiled, Vec<f32>, Ve
         group.slot = compiled.slots;
         compiled.slots += group.fine.len();
     }
-    let reaches = order.iter().map(|i| reaches[*i]).collect();
+    let shells = order.iter().map(|i| shells[*i]).collect();
     let links = order.iter().map(|i| links[*i]).collect();
-    (compiled, reaches, links)
+    (compiled, shells, links)
 }
 
 fn pairs(mechanism: &Mechanism, groups: &[Group], links: &[usize]) -> Vec<SelfPair> {
@@ -349,21 +376,24 @@ fn pairs(mechanism: &Mechanism, groups: &[Group], links: &[usize]) -> Vec<SelfPa
     pairs
 }
 
-fn levers(compiled: &Compiled) -> Vec<[f32; MAX_JOINTS]> {
-    let lever = |group: &Group| {
-        let mut levers = [0.0; MAX_JOINTS];
-        let mut arm = norm(&group.coarse) + group.coarse[3];
-        let mut frame = group.frame;
-        while frame != 0 {
-            let here = &compiled.frames[frame - 1];
-            // A joint may move several links of a chain.
-            levers[here.joint] += if here.slides { 1.0 } else { arm };
-            arm += here.origin[9].hypot(here.origin[10]).hypot(here.origin[11]) + here.travel;
-            frame = here.parent;
+fn arm(compiled: &Compiled, group: &Group) -> Arm {
+    let mut arm = Arm { levers: [0.0; MAX_JOINTS], turns: [0.0; MAX_JOINTS], slides: [0.0; MAX_JOINTS] };
+    let mut reach = norm(&group.coarse) + group.coarse[3];
+    let mut frame = group.frame;
+    while frame != 0 {
+        let here = &compiled.frames[frame - 1];
+        // A joint may move several links of a chain.
+        if here.slides {
+            arm.levers[here.joint] += 1.0;
+            arm.slides[here.joint] += 1.0;
+        } else {
+            arm.levers[here.joint] += reach;
+            arm.turns[here.joint] += 1.0;
         }
-        levers
-    };
-    compiled.groups.iter().map(lever).collect()
+        reach += here.origin[9].hypot(here.origin[10]).hypot(here.origin[11]) + here.travel;
+        frame = here.parent;
+    }
+    arm
 }
 
 fn norm(sphere: &[f32; 4]) -> f32 {

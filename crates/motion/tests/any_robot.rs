@@ -200,28 +200,30 @@ fn paths_are_short_repeatable_and_free_by_the_exact_check_at_four_times_the_reso
 
 #[test]
 fn a_motion_free_between_its_postures_is_free_wherever_one_looks() {
-    let (urdf, names) = chain(5);
-    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let (turning, names) = chain(5);
+    let sliding = turning.replacen("revolute", "prismatic", 2);
     let mut random = ChaCha8Rng::seed_from_u64(5);
-    let mut free = 0;
-    for _ in 0..60 {
+    let mut free = [0; 2];
+    for case in 0..90 {
+        let slides = case % 3 == 0;
+        let mechanism = Mechanism::read(if slides { &sliding } else { &turning }, None, &names).unwrap();
         // Thin plates slip between postures that are too far apart.
         let geometry = Geometry::Box { half: [0.2, 0.2, 0.001] };
         let plates: Vec<Obstacle> = (0..4)
             .map(|i| Obstacle { name: format!("plate {i}"), pose: random_pose(&mut random, 0.8), geometry })
             .collect();
-        let mut space = Space::new(&mechanism, &plates);
         let exact = Exact::new(&mechanism, &plates);
         let (from, to) = (posture(&mut random, &mechanism), posture(&mut random, &mechanism));
-        if space.is_free(&from) && space.is_swept_free(&from, &to) {
-            free += 1;
+        let mut spaces = Isa::available().into_iter().map(|isa| Space::with_isa(&mechanism, &plates, isa));
+        if spaces.any(|mut space| space.is_free(&from) && space.is_swept_free(&from, &to)) {
+            free[usize::from(slides)] += 1;
             for i in 0..=2000 {
                 let state = between(&from, &to, i as f32 / 2000.0);
                 assert_eq!(exact.touch(&positions(&mechanism, &state)), None, "at {i} of 2000");
             }
         }
     }
-    assert!(free > 5, "{free}");
+    assert!(free[0] > 5 && free[1] > 5, "{free:?}");
 }
 
 #[test]

@@ -2,8 +2,9 @@
 //!
 //! The postures of one batch are spread over the whole edge, later batches fill the gaps, so that the first batch most likely
 //! finds what is in the way (Thomason, Kingston, Kavraki: *Motions in Microseconds via Vectorized Sampling-Based Planning*, ICRA
-//! 2024). Kinematics first; then group by group, the hand before the shoulder, a bounding sphere against the obstacles that the
-//! group can reach at all, nearest first; its fine spheres only against obstacles that the bounding sphere meets. Then pairs
+//! 2024). Kinematics first; then group by group, the hand before the shoulder, the box that holds its bounding sphere in
+//! all lanes against those of the obstacles that it can reach at all, as many at once as there are lanes; the sphere against what
+//! is in there, nearest to the shoulder first; its fine spheres only against obstacles that the bounding sphere meets. Then pairs
 //! of groups, in the same manner. Any touching lane ends it.
 //!
 //! There are no closures over vectors here: a closure that is not inlined is compiled without the instructions of its caller.
@@ -35,10 +36,19 @@ pub(crate) struct Group {
     pub(crate) fine: Vec<[f32; 4]>,
     /// Where its fine centres are in the scratch blocks.
     pub(crate) slot: usize,
-    /// What it can reach, by shape, nearest to `anchor` first.
-    pub(crate) rounded: Vec<u16>,
-    pub(crate) cylinders: Vec<u16>,
-    pub(crate) anchor: [f32; 3],
+    /// What it can reach, nearest to its anchor first.
+    pub(crate) near: Vec<Row>,
+}
+
+/// As many obstacles as there are lanes, and the boxes along the axes of the world that hold them.
+#[derive(Debug, Clone)]
+pub(crate) struct Row {
+    /// Indices of the obstacles.
+    pub(crate) obstacles: Vec<u16>,
+    /// Least x, y, z; unused lanes hold infinity.
+    pub(crate) least: [Block; 3],
+    /// Greatest x, y, z, with the sign changed.
+    pub(crate) minus_greatest: [Block; 3],
 }
 
 /// Two groups that must not meet.
@@ -58,6 +68,7 @@ pub(crate) struct Obstacle {
     pub(crate) half: [f32; 3],
     /// How far it is rounded outwards.
     pub(crate) round: f32,
+    pub(crate) is_cylinder: bool,
     /// Whether its z axis is the world's.
     pub(crate) upright: bool,
 }
@@ -72,8 +83,6 @@ pub(crate) struct Compiled {
     pub(crate) groups: Vec<Group>,
     pub(crate) pairs: Vec<SelfPair>,
     pub(crate) obstacles: Vec<Obstacle>,
-    /// Per obstacle and group: how near the obstacle comes to the group's anchor.
-    pub(crate) nearest: Vec<f32>,
     pub(crate) slots: usize,
 }
 
@@ -85,6 +94,8 @@ pub(crate) struct Scratch {
     fine: Vec<[Block; 3]>,
     /// Batch in which a group's fine centres were computed last.
     stamps: Vec<u64>,
+    /// How much larger the spheres of each group are in this batch.
+    grown: Vec<f32>,
     batch: u64,
 }
 
@@ -100,6 +111,7 @@ impl Scratch {
             coarse: vec![[zero; 3]; compiled.groups.len()],
             fine: vec![[zero; 3]; compiled.slots],
             stamps: vec![0; compiled.groups.len()],
+            grown: vec![0.0; compiled.groups.len()],
             batch: 0,
         }
     }
@@ -113,7 +125,8 @@ pub(crate) struct Edge<'a> {
     pub(crate) delta: &'a [f32; LENGTH],
     /// How many batches; the end is checked, the start is not.
     pub(crate) batches: usize,
-    /// How much larger the spheres of each group are; empty for not at all.
+    /// For the check that leaves nothing between postures: what the spheres of each group grow by, beside half of the greatest
+    /// step of the group's bounding sphere. Empty for a check of the postures alone.
     pub(crate) inflate: &'a [f32],
 }
 
@@ -255,6 +268,19 @@ fn fetch<V: Lanes>(from: &[Block; 3]) -> [V; 3] {
     [V::load(&from[0]), V::load(&from[1]), V::load(&from[2])]
 }
 
+/// How far a point goes from one lane to the next at most.
+#[inline(always)]
+fn greatest_step(point: &[Block; 3], width: usize) -> f32 {
+    let mut squares = [0.0_f32; 15];
+    for Block(along) in point {
+        for (i, square) in squares.iter_mut().enumerate() {
+            let step = along[i + 1] - along[i];
+            *square += step * step;
+        }
+    }
+    squares[..width - 1].iter().fold(0.0, |most: f32, square| if *square > most { *square } else { most }).sqrt()
+}
+
 /// Fills in the fine centres of a group, once per batch.
 #[inline(always)]
 fn refine<V: Lanes>(group: &Group, index: usize, scratch: &mut Scratch) {
@@ -271,67 +297,77 @@ fn refine<V: Lanes>(group: &Group, index: usize, scratch: &mut Scratch) {
 fn in_obstacles<V: Lanes, const ALL: bool>(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
     let mut found = 0;
     let compiled = edge.compiled;
-    let count = compiled.obstacles.len();
     for (index, group) in compiled.groups.iter().enumerate() {
         let centre = place::<V>(&scratch.frames[group.frame], &group.coarse);
         store(centre, &mut scratch.coarse[index]);
-        if group.rounded.is_empty() && group.cylinders.is_empty() {
+        let grown = match edge.inflate.get(index) {
+            Some(more) => more + 0.5 * greatest_step(&scratch.coarse[index], V::WIDTH),
+            None => 0.0,
+        };
+        scratch.grown[index] = grown;
+        if group.near.is_empty() {
             continue;
         }
-        let grown = if edge.inflate.is_empty() { 0.0 } else { edge.inflate[index] };
         let radius = group.coarse[3] + grown;
-        let reach = squared(minus(centre, splat3::<V>(&group.anchor))).peak().sqrt() + radius;
-        let nearest = &compiled.nearest[index * count..(index + 1) * count];
-        for &o in &group.rounded {
-            if nearest[usize::from(o)] > reach {
-                break;
-            }
-            let obstacle = &compiled.obstacles[usize::from(o)];
-            let near = meets_rounded(centre, radius, obstacle) & !found;
-            if near == 0 {
-                continue;
-            }
-            if group.fine.len() == 1 {
-                found |= near;
-            } else {
+        let bounds = bounds(centre, radius);
+        for row in &group.near {
+            let mut hits = overlaps::<V>(&bounds, row);
+            while hits != 0 {
+                let obstacle = &compiled.obstacles[usize::from(row.obstacles[hits.trailing_zeros() as usize])];
+                hits &= hits - 1;
+                if meets(centre, radius, obstacle) & !found == 0 {
+                    continue;
+                }
                 refine::<V>(group, index, scratch);
                 for (sphere, at) in group.fine.iter().zip(&scratch.fine[group.slot..]) {
-                    found |= meets_rounded::<V>(fetch(at), sphere[3] + grown, obstacle);
+                    found |= meets::<V>(fetch(at), sphere[3] + grown, obstacle);
                     if !ALL && found != 0 {
                         return found;
                     }
                 }
-            }
-            if found != 0 && (!ALL || found == V::ALL) {
-                return found;
-            }
-        }
-        for &o in &group.cylinders {
-            if nearest[usize::from(o)] > reach {
-                break;
-            }
-            let obstacle = &compiled.obstacles[usize::from(o)];
-            let near = meets_cylinder(centre, radius, obstacle) & !found;
-            if near == 0 {
-                continue;
-            }
-            if group.fine.len() == 1 {
-                found |= near;
-            } else {
-                refine::<V>(group, index, scratch);
-                for (sphere, at) in group.fine.iter().zip(&scratch.fine[group.slot..]) {
-                    found |= meets_cylinder::<V>(fetch(at), sphere[3] + grown, obstacle);
-                    if !ALL && found != 0 {
-                        return found;
-                    }
+                if found == V::ALL {
+                    return found;
                 }
-            }
-            if found != 0 && (!ALL || found == V::ALL) {
-                return found;
             }
         }
     }
     found
+}
+
+/// Greatest and least coordinates of spheres in all lanes, the least with the sign changed.
+#[inline(always)]
+fn bounds<V: Lanes>([x, y, z]: [V; 3], radius: f32) -> [f32; 6] {
+    let zero = V::splat(0.0);
+    let greatest = [x.peak(), y.peak(), z.peak()];
+    let least = [zero.sub(x).peak(), zero.sub(y).peak(), zero.sub(z).peak()];
+    [
+        greatest[0] + radius,
+        greatest[1] + radius,
+        greatest[2] + radius,
+        least[0] + radius,
+        least[1] + radius,
+        least[2] + radius,
+    ]
+}
+
+/// Which obstacles of a row are about there, a bit each.
+#[inline(always)]
+fn overlaps<V: Lanes>(bounds: &[f32; 6], row: &Row) -> u32 {
+    let mut hits = V::ALL;
+    for i in 0..3 {
+        hits &= V::load(&row.least[i]).below(V::splat(bounds[i]));
+        hits &= V::load(&row.minus_greatest[i]).below(V::splat(bounds[3 + i]));
+    }
+    hits
+}
+
+#[inline(always)]
+fn meets<V: Lanes>(centre: [V; 3], radius: f32, obstacle: &Obstacle) -> u32 {
+    if obstacle.is_cylinder {
+        meets_cylinder(centre, radius, obstacle)
+    } else {
+        meets_rounded(centre, radius, obstacle)
+    }
 }
 
 /// A point in an obstacle's frame.
@@ -388,7 +424,7 @@ fn in_itself<V: Lanes, const ALL: bool>(edge: &Edge<'_>, mut found: u32, scratch
     for pair in &edge.compiled.pairs {
         let (i, j) = (usize::from(pair.first), usize::from(pair.second));
         let (a, b) = (&edge.compiled.groups[i], &edge.compiled.groups[j]);
-        let more = if edge.inflate.is_empty() { 0.0 } else { edge.inflate[i] + edge.inflate[j] };
+        let more = scratch.grown[i] + scratch.grown[j];
         let (at_a, at_b) = (fetch::<V>(&scratch.coarse[i]), fetch::<V>(&scratch.coarse[j]));
         if meet(at_a, at_b, a.coarse[3] + b.coarse[3] + more) & !found == 0 {
             continue;
