@@ -73,9 +73,7 @@ impl Pools {
                 }
             }
             Event::Serving { id, endpoint } => {
-                if let Some((pool, number)) = self.find(&id) {
-                    pool.serving(now, number, &endpoint, &mut commands);
-                }
+                self.about(now, &id, &mut commands, |pool, number, c| pool.serving(now, number, &endpoint, c));
             }
             Event::Offered { id } => {
                 self.about(now, &id, &mut commands, |pool, number, c| pool.offered(now, number, c));

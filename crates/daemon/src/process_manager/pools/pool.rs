@@ -13,6 +13,9 @@ use ratn_proto::types::{PoolStatus, Scale, WorkerStatus};
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+/// Workers of a pool that are being started at a time: more would only keep each other from being ready in time.
+pub(super) const STARTING_AT_ONCE: u32 = 32;
+
 #[derive(Debug)]
 pub(super) struct Pool {
     template: Template,
@@ -150,12 +153,14 @@ impl Pool {
     fn start(&mut self, now: Timestamp, commands: &mut Vec<Command>) -> String {
         self.last_number += 1;
         self.room = self.room.map(|room| room.saturating_sub(1));
-        let (name, number) = (&self.template.name, self.last_number);
-        let id = format!("{name}-{number}@{}", self.host);
-        let worker = Worker::starting(now, id.clone(), &self.template);
-        self.workers.insert(number, worker);
-        commands.push(Command::Start { id: id.clone(), template: name.clone() });
+        let (id, template) = (self.id(self.last_number), self.template.name.clone());
+        self.workers.insert(self.last_number, Worker::starting(now, id.clone(), &self.template));
+        commands.push(Command::Start { id: id.clone(), template });
         id
+    }
+
+    fn id(&self, number: u64) -> String {
+        format!("{}-{number}@{}", self.template.name, self.host)
     }
 
     /// Later workers have later numbers.
@@ -206,7 +211,7 @@ impl Pool {
         }
     }
 
-    /// A worker's health is SERVING.
+    /// A worker serves: another one may be started now.
     pub(super) fn serving(&mut self, now: Timestamp, number: u64, endpoint: &str, commands: &mut Vec<Command>) {
         if let Some(worker) = self.workers.get_mut(&number) {
             worker.serving(now, endpoint, &self.template.kind, commands);
@@ -235,6 +240,8 @@ impl Pool {
         }
         self.restarts.forgive();
         let mut started = self.fill(now, commands);
+        // The others follow in this order.
+        started.extend((1..=u64::from(self.lacking())).map(|ahead| self.id(self.last_number + ahead)));
         Ok(started.split_off(started.len().saturating_sub(count as usize)))
     }
 
@@ -353,7 +360,13 @@ impl Pool {
         self.size.wanted(self.count(|worker| worker.is_ready() && worker.is_held()))
     }
 
+    /// So many are to be started now.
     fn missing(&self) -> u32 {
+        self.lacking().min(STARTING_AT_ONCE.saturating_sub(self.count(Worker::is_starting)))
+    }
+
+    /// So many are to be started, now or when others have been.
+    fn lacking(&self) -> u32 {
         let there = if self.is_single() { self.count(|_| true) } else { self.there() };
         let wanted = self.wanted() + self.surge();
         let kept = self.size.bounds().0.saturating_sub(there);

@@ -234,6 +234,26 @@ fn a_worker_stopped_before_its_process_was_there_is_terminated_and_if_late_kille
 }
 
 #[test]
+fn of_a_crowd_some_are_started_at_a_time_and_nobody_is_late_because_of_the_others() {
+    let crowd = pool::STARTING_AT_ONCE * 3;
+    let mut pools = pools(|template| (template.min, template.max) = (0, Some(crowd)));
+    let promised = pools.spawn(at(0.0), "planner", crowd).unwrap();
+    assert_eq!(promised.len(), crowd as usize);
+    let mut begun = started(&mut pools);
+    assert_eq!(begun.len(), pool::STARTING_AT_ONCE as usize);
+    for ready in 0..promised.len() {
+        // All of them together take much longer than one may.
+        pools.advance(at(5.0 * ready as f64 / f64::from(pool::STARTING_AT_ONCE)));
+        let id = begun[ready].clone();
+        pools.bring_up(at(5.0 * ready as f64 / f64::from(pool::STARTING_AT_ONCE)), &id);
+        begun.extend(started(&mut pools));
+        assert!(begun.len() - (ready + 1) <= pool::STARTING_AT_ONCE as usize);
+    }
+    assert_eq!(begun, promised);
+    assert!(pools.status()[0].workers.iter().all(|worker| worker.state == WorkerState::Ready));
+}
+
+#[test]
 fn a_failed_pool_at_its_maximum_starts_again_when_somebody_asks() {
     let mut pools = pools(|template| (template.min, template.crash_limit) = (2, 1));
     for id in started(&mut pools) {
