@@ -137,29 +137,46 @@ impl Link {
             }
             refused.retain(|id, resource| wanted.get(id) == Some(resource));
             let leaving = self.let_go(&provider, &mut offered).await;
-            for (id, resource) in wanted {
-                if offered.get(&id) == Some(&resource) || refused.contains_key(&id) || leaving.contains(&id) {
-                    continue;
-                }
-                match provider.offer(resource.clone()).await {
+            let is_new = |(id, resource): &(&String, &Resource)| {
+                offered.get(*id) != Some(*resource) && !refused.contains_key(*id) && !leaving.contains(*id)
+            };
+            let new = wanted.iter().filter(is_new).map(|(_, resource)| resource.clone()).collect();
+            let mut settled = leaving.is_empty();
+            for (id, done) in provider.offer_all(new).await {
+                let resource = wanted.get(&id).cloned().into_iter().map(|resource| (id.clone(), resource));
+                match done {
                     Ok(true) => {
-                        offered.insert(id.clone(), resource);
+                        offered.extend(resource);
                         if let Some(there) = &self.there {
                             let _ = there.told.send(Offering::There(id)).await;
                         }
                     }
                     // The provider offers it by itself as soon as it can; asked again only to learn that it has.
-                    Ok(false) => {}
+                    Ok(false) => settled = false,
                     Err(error) => {
                         tracing::error!(id, %error, "the resource manager does not take the resource");
-                        refused.insert(id, resource);
+                        refused.extend(resource);
                     }
                 }
             }
+            if !self.has_news(endpoint, settled).await {
+                return Ok(());
+            }
+        }
+    }
+
+    /// Waits until other resources are wanted, or until those that are not settled can be looked at again; false where the manager
+    /// has moved, or nothing is wanted ever again.
+    async fn has_news(&mut self, endpoint: &Endpoint, settled: bool) -> bool {
+        loop {
             tokio::select! {
-                changed = self.wanted.changed() => if changed.is_err() { return Ok(()) },
-                () = more_leave(&mut self.there) => {}
-                () = tokio::time::sleep(LOOK_INTERVAL) => if self.manager.has_moved_from(endpoint) { return Ok(()) },
+                changed = self.wanted.changed() => return changed.is_ok(),
+                () = more_leave(&mut self.there) => return true,
+                () = tokio::time::sleep(LOOK_INTERVAL) => match self.manager.has_moved_from(endpoint) {
+                    true => return false,
+                    false if !settled => return true,
+                    false => {}
+                },
             }
         }
     }

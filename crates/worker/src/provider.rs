@@ -4,15 +4,18 @@
 use crate::client::{CallError, Channels, ResourceClient};
 use crate::endpoint::Endpoint;
 use crate::session::{Session, SessionState};
+use futures::{StreamExt, stream};
 use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_proto::types::Resource;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{Mutex, Notify, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::Code;
 
+/// Resources that the manager is asked for at a time.
+const AT_ONCE: usize = 16;
 /// The pause before the manager is asked again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -69,6 +72,17 @@ impl Provider {
         self.wish(resource.id.clone(), Some(resource)).await
     }
 
+    /// As [`Provider::offer`] for each of them, several at a time; what became of each, by id.
+    pub async fn offer_all(&self, resources: Vec<Resource>) -> Vec<(String, Result<bool, CallError>)> {
+        let mut wishes = self.shared.wishes.lock().await;
+        let ids: BTreeSet<String> = resources.iter().map(|resource| resource.id.clone()).collect();
+        for resource in resources {
+            let wish = wishes.entry(resource.id.clone()).or_default();
+            wish.resource = Some(resource);
+        }
+        self.shared.ask(&mut wishes, &ids).await
+    }
+
     /// Withdraws a resource; who holds a lease of it loses it. True once it is gone; false when the manager cannot be asked
     /// now: it will be withdrawn as soon as it can.
     ///
@@ -105,16 +119,9 @@ impl Provider {
 
     async fn wish(&self, id: String, resource: Option<Resource>) -> Result<bool, CallError> {
         let mut wishes = self.shared.wishes.lock().await;
-        let alive = self.shared.state.borrow().alive;
-        let wish = wishes.entry(id.clone()).or_default();
-        wish.resource = resource;
-        let done = if alive { wish.ask(&self.shared.client, &id).await } else { Ok(false) };
-        match done {
-            Ok(true) if wish.resource.is_some() => {}
-            Ok(false) => self.shared.missing.notify_one(),
-            Ok(true) | Err(_) => drop(wishes.remove(&id)),
-        }
-        done
+        wishes.entry(id.clone()).or_default().resource = resource;
+        let asked = self.shared.ask(&mut wishes, &BTreeSet::from([id])).await;
+        asked.into_iter().next().map_or(Ok(true), |(_, done)| done)
     }
 
     /// What is offered, by id.
@@ -123,14 +130,49 @@ impl Provider {
     }
 }
 
+impl Shared {
+    /// Asks for these, several at a time, if the session lives: true for what is so now, false for what will be asked for again. What
+    /// is gone, or refused for good, is no wish any more.
+    async fn ask(
+        &self,
+        wishes: &mut BTreeMap<String, Wish>,
+        ids: &BTreeSet<String>,
+    ) -> Vec<(String, Result<bool, CallError>)> {
+        if !self.state.borrow().alive {
+            self.missing.notify_one();
+            return ids.iter().map(|id| (id.clone(), Ok(false))).collect();
+        }
+        let wished = ids.iter().filter_map(|id| Some((id.clone(), wishes.get(id)?.resource.clone())));
+        let asked: Vec<_> = wished.map(|(id, resource)| ask(self.client.clone(), id, resource)).collect();
+        let answers: Vec<_> = stream::iter(asked).buffer_unordered(AT_ONCE).collect().await;
+        let mut concluded = Vec::with_capacity(answers.len());
+        for (id, answer) in answers {
+            let Some(wish) = wishes.get_mut(&id) else { continue };
+            let done = wish.conclude(&id, answer);
+            match &done {
+                Ok(false) => self.missing.notify_one(),
+                Ok(true) if wish.resource.is_some() => {}
+                Ok(true) | Err(_) => drop(wishes.remove(&id)),
+            }
+            concluded.push((id, done));
+        }
+        concluded
+    }
+}
+
+/// Tells the manager that a resource is there, or gone; its id and the answer.
+async fn ask(client: ResourceClient, id: String, resource: Option<Resource>) -> (String, Result<(), CallError>) {
+    let answer = match resource {
+        Some(resource) => client.create(resource).await.map(drop),
+        None => client.delete(&id).await,
+    };
+    (id, answer)
+}
+
 impl Wish {
     /// Whether it is so now; an error where it never will be.
-    async fn ask(&mut self, client: &ResourceClient, id: &str) -> Result<bool, CallError> {
-        let asked = match &self.resource {
-            Some(resource) => client.create(resource.clone()).await.map(drop),
-            None => client.delete(id).await,
-        };
-        match asked {
+    fn conclude(&mut self, id: &str, answer: Result<(), CallError>) -> Result<bool, CallError> {
+        match answer {
             Err(error) if is_passing(&error) => {
                 let problem = error.to_string();
                 if self.problem != problem {
@@ -182,21 +224,13 @@ async fn restore(shared: Arc<Shared>) {
 /// Asks for everything; whether all is so (or refused for good).
 async fn ask_for_all(shared: &Shared) -> bool {
     let mut wishes = shared.wishes.lock().await;
+    let ids = wishes.keys().cloned().collect();
     let mut all = true;
-    let mut settled = Vec::new();
-    for (id, wish) in wishes.iter_mut() {
-        match wish.ask(&shared.client, id).await {
-            Ok(true) if wish.resource.is_some() => {}
-            Ok(true) => settled.push(id.clone()),
-            Ok(false) => all = false,
-            Err(error) => {
-                tracing::warn!(resource = %id, %error, "the resource manager refuses for good");
-                settled.push(id.clone());
-            }
+    for (id, done) in shared.ask(&mut wishes, &ids).await {
+        match done {
+            Ok(done) => all &= done,
+            Err(error) => tracing::warn!(resource = %id, %error, "the resource manager refuses for good"),
         }
-    }
-    for id in settled {
-        wishes.remove(&id);
     }
     all
 }
