@@ -10,6 +10,31 @@ use std::path::PathBuf;
 /// The most boxes that a cell can have: as many as there are places on the base.
 pub const MAX_BOXES: usize = 9;
 
+/// The most bowls that a cell can have, and the most forks: as many as there are places for each on the table.
+pub const MAX_TABLEWARE: usize = 3;
+
+/// What the cell is furnished for: the paper's two experiments.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Setting {
+    /// Boxes on a table, to be fetched onto the base.
+    #[default]
+    Boxes,
+    /// Bowls and forks on a rack, to be set on the table.
+    Table,
+}
+
+/// What can be moved of a new scene; each setting looks at its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Goods {
+    /// Boxes, 1 to 9.
+    pub boxes: usize,
+    /// Bowls, 0 to 3.
+    pub bowls: usize,
+    /// Forks, 0 to 3; with the bowls at least one.
+    pub forks: usize,
+}
+
 /// A cell's configuration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -20,8 +45,14 @@ pub struct CellConfig {
     pub resource_manager: Option<Endpoint>,
     /// The host that the resources say they are on.
     pub host: String,
+    /// What stands there: `boxes` on the table, or `table`: bowls and forks on a rack.
+    pub scene: Setting,
     /// How many boxes stand on the table, 1 to 9.
     pub boxes: usize,
+    /// How many bowls stand on the rack, 0 to 3.
+    pub bowls: usize,
+    /// How many forks lie on the rack, 0 to 3.
+    pub forks: usize,
     /// What the boxes' sizes and places and the camera's noise are derived from.
     pub seed: u64,
     /// The robot's seconds per second of wall time.
@@ -92,6 +123,43 @@ pub struct BatteryConfig {
     pub driving_per_hour: f64,
 }
 
+impl Setting {
+    /// All of them.
+    pub const ALL: [Setting; 2] = [Setting::Boxes, Setting::Table];
+
+    /// As in a text.
+    pub fn name(self) -> &'static str {
+        match self {
+            Setting::Boxes => "boxes",
+            Setting::Table => "table",
+        }
+    }
+
+    /// The setting of that name.
+    pub fn named(name: &str) -> Option<Setting> {
+        Setting::ALL.into_iter().find(|setting| setting.name() == name)
+    }
+}
+
+impl Goods {
+    /// Whether a cell of this setting can have so many.
+    pub fn fit(&self, setting: Setting) -> bool {
+        let Goods { boxes, bowls, forks } = *self;
+        match setting {
+            Setting::Boxes => (1..=MAX_BOXES).contains(&boxes),
+            Setting::Table => bowls <= MAX_TABLEWARE && forks <= MAX_TABLEWARE && bowls + forks > 0,
+        }
+    }
+
+    /// How many there are in this setting.
+    pub fn count(&self, setting: Setting) -> usize {
+        match setting {
+            Setting::Boxes => self.boxes,
+            Setting::Table => self.bowls + self.forks,
+        }
+    }
+}
+
 /// A value that no cell can have.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("`{key}` of the cell is {value}: it must be {rule}")]
@@ -105,6 +173,11 @@ pub struct ConfigError {
 }
 
 impl CellConfig {
+    /// What can be moved at the beginning.
+    pub fn goods(&self) -> Goods {
+        Goods { boxes: self.boxes, bowls: self.bowls, forks: self.forks }
+    }
+
     /// Checks what the types cannot say.
     ///
     /// # Errors
@@ -112,6 +185,9 @@ impl CellConfig {
     pub fn check(&self) -> Result<(), ConfigError> {
         let rules = [
             ("boxes", self.boxes as f64, (1..=MAX_BOXES).contains(&self.boxes), "1 to 9"),
+            ("bowls", self.bowls as f64, self.bowls <= MAX_TABLEWARE, "0 to 3"),
+            ("forks", self.forks as f64, self.forks <= MAX_TABLEWARE, "0 to 3"),
+            ("forks", self.forks as f64, self.bowls + self.forks > 0, "at least 1 where there are no bowls"),
             ("speed", self.speed, self.speed > 0.0 && self.speed <= 1000.0, "above 0 and at most 1000"),
             (
                 "session_ttl_ms",
@@ -191,7 +267,10 @@ impl Default for CellConfig {
             listen: Endpoint::local(),
             resource_manager: None,
             host: "sim".to_owned(),
+            scene: Setting::Boxes,
             boxes: 3,
+            bowls: 2,
+            forks: 2,
             seed: 1,
             speed: 1.0,
             session_ttl_ms: 3000,

@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic and print")]
 
+use ratn_cell::config::Goods;
 use ratn_cell::core::picture::develop;
 use ratn_cell::core::protocol::{Command, Ending, Event, Module, Product, Request};
 use ratn_model::id::LeaseId;
@@ -152,7 +153,7 @@ fn the_same_seed_makes_the_same_world_and_a_reset_makes_it_again() {
     assert_ne!(one.cell.ground_truth(), other.cell.ground_truth());
     let mut bench = Bench::new(5, 12);
     bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
-    bench.cell.handle(bench.now, Event::Reset { seed: 11, boxes: 5 });
+    bench.cell.handle(bench.now, Event::Reset { seed: 11, goods: Goods { boxes: 5, bowls: 0, forks: 0 } });
     assert_eq!(bench.cell.ground_truth(), one.cell.ground_truth());
     assert_eq!(bench.arm(), aimm::HOME);
 }

@@ -247,11 +247,21 @@ async fn a_reset_lays_the_same_table_again() {
     let system = system(1.0, 4).await;
     let first = system.truth().await.boxes;
     let mut client = CellServiceClient::new(system.channels.get(&system.cell).unwrap());
-    let other = client.reset(v1::ResetRequest { seed: 8, boxes: 2 }).await.unwrap().into_inner().boxes;
+    let other = client
+        .reset(v1::ResetRequest { seed: 8, boxes: 2, ..v1::ResetRequest::default() })
+        .await
+        .unwrap()
+        .into_inner()
+        .boxes;
     assert_eq!(other.len(), 2);
-    let again = client.reset(v1::ResetRequest { seed: 3, boxes: 4 }).await.unwrap().into_inner().boxes;
+    let again = client
+        .reset(v1::ResetRequest { seed: 3, boxes: 4, ..v1::ResetRequest::default() })
+        .await
+        .unwrap()
+        .into_inner()
+        .boxes;
     assert_eq!(first, again);
-    assert!(client.reset(v1::ResetRequest { seed: 3, boxes: 10 }).await.is_err());
+    assert!(client.reset(v1::ResetRequest { seed: 3, boxes: 10, ..v1::ResetRequest::default() }).await.is_err());
     system.end.cancel();
 }
 

@@ -6,6 +6,7 @@ use crate::command::resource::ResourceArguments;
 use crate::command::world::WorldArguments;
 use crate::task_control::control::Word;
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use ratn_cell::config::Setting;
 use ratn_cell::core::faults::Fault;
 use ratn_daemon::config::Durability;
 use ratn_worker::endpoint::Endpoint;
@@ -22,7 +23,8 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Fetch boxes in the simulated cell (HSM, CDTN with one planner, CDTN with several; each with and without a budget) and compare
+    /// Fetch boxes, or set a table, in the simulated cell (HSM, CDTN with one planner, CDTN with several; each with and without a
+    /// budget) and compare
     Demo(DemoArguments),
     /// Start a whole system on this machine and keep it running in the foreground
     Up(UpArguments),
@@ -113,6 +115,9 @@ pub(crate) struct CellArguments {
     pub(crate) role: RoleArguments,
     #[command(flatten)]
     pub(crate) faults: FaultArguments,
+    /// What the cell is furnished for: boxes on a table, or bowls and forks on a rack; as its config says unless given
+    #[arg(long, value_name = "SCENE", value_parser = scene)]
+    pub(crate) scene: Option<Setting>,
     /// Write down in a new file what happens, line by line
     #[arg(long, value_name = "FILE")]
     pub(crate) record: Option<PathBuf>,
@@ -451,9 +456,15 @@ pub(crate) struct GoOnArguments {
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ResetArguments {
     /// Boxes on the new table; as many as on the old one unless given
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=9))]
-    pub(crate) boxes: Option<u8>,
-    /// The same seed makes the same table; that of the old one unless given
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=9))]
+    pub(crate) boxes: Option<u32>,
+    /// Bowls on the new rack; as many as on the old one unless given
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) bowls: Option<u32>,
+    /// Forks on the new rack; as many as on the old one unless given
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) forks: Option<u32>,
+    /// The same seed makes the same scene; that of the old one unless given
     #[arg(long, value_name = "N")]
     pub(crate) seed: Option<u64>,
     /// Where the endpoint files of the system are
@@ -476,9 +487,18 @@ pub(crate) struct UpArguments {
 /// What differs from a system's config.
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct SystemArguments {
+    /// What the cell is furnished for: boxes on a table, or bowls and forks on a rack
+    #[arg(long, value_name = "SCENE", value_parser = scene)]
+    pub(crate) scene: Option<Setting>,
     /// Boxes on the cell's table
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=9))]
     pub(crate) boxes: Option<u32>,
+    /// Bowls on the cell's rack
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) bowls: Option<u32>,
+    /// Forks on the cell's rack
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) forks: Option<u32>,
     /// Path planner processes
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=32))]
     pub(crate) planners: Option<u32>,
@@ -505,9 +525,18 @@ pub(crate) enum Budget {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct DemoArguments {
+    /// Which of the paper's experiments: boxes are fetched onto the base, or a table is set with bowls and forks
+    #[arg(long, value_name = "SCENARIO", default_value = "boxes", value_parser = scene)]
+    pub(crate) scenario: Setting,
     /// Boxes to fetch
     #[arg(long, value_name = "1..9", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=9))]
     pub(crate) boxes: u32,
+    /// Bowls to set
+    #[arg(long, value_name = "0..3", default_value_t = 2, value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) bowls: u32,
+    /// Forks to set
+    #[arg(long, value_name = "0..3", default_value_t = 2, value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) forks: u32,
     /// Path planner processes of the last run
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=32))]
     pub(crate) planners: u32,
@@ -541,6 +570,10 @@ fn place(text: &str) -> Result<[f64; 3], String> {
     let number = |part: &str| part.trim().parse().ok().filter(|x: &f64| x.is_finite());
     let numbers: Option<Vec<f64>> = text.split(',').map(number).collect();
     numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| "expected X,Y,Z in metres".to_owned())
+}
+
+fn scene(text: &str) -> Result<Setting, String> {
+    Setting::named(text).ok_or_else(|| format!("expected {}", Setting::ALL.map(Setting::name).join(" or ")))
 }
 
 fn speed(text: &str) -> Result<f64, String> {

@@ -126,9 +126,11 @@ pub enum Function {
     /// `between(a, b)`: b as seen from a, both in one reference frame
     Between,
     /// `grasp_pose({pose, size})` → list of poses of the gripper's tool frame that take the box from above, fingers
-    /// across its shorter horizontal side: the two that differ by half a turn
+    /// across its shorter horizontal side: the two that differ by half a turn; with `class: Bowl` or `Plate`, those around its
+    /// rim
     GraspPose,
-    /// `place_pose(target, in_gripper)`: the tool pose that brings a held object to the pose `target`
+    /// `place_pose(target, in_gripper, turns)` → list of the tool poses that bring a held object to the pose `target`, which looks
+    /// the same after each of so many equal turns about its z axis; two unless said
     PlacePose,
     /// `concat(a, b, …)` of strings, ints
     Concat,

@@ -10,6 +10,7 @@ pub mod condition;
 pub mod diagnostic;
 pub mod expression;
 pub mod fact;
+pub mod grasp;
 pub mod id;
 pub mod load;
 pub mod measurement;

@@ -66,5 +66,5 @@ fn the_objects_to_set_are_the_bowls_then_the_forks() {
     assert_eq!(collection.evaluate(&scope).unwrap().to_string(), "[bowl, fork, fork]");
     let world = ratn_model::expression::EffectExpr::bind(&program.initial, &scope).unwrap();
     let text: Vec<String> = world.iter().map(|change| change.pattern().to_string()).collect();
-    assert!(text.contains(&"at(bowl_0)".to_owned()) && text.contains(&"at(fork_2)".to_owned()), "{text:?}");
+    assert!(text.contains(&"at(bowl_1)".to_owned()) && text.contains(&"at(fork_2)".to_owned()), "{text:?}");
 }

@@ -51,6 +51,8 @@ struct Obstacle {
     pose: Pose32,
     centre: Vector,
     radius: f32,
+    /// Where contact is allowed the fingers may be in it, however deep.
+    open: bool,
 }
 
 #[derive(Clone)]
@@ -136,6 +138,14 @@ impl<'a> Checker<'a> {
         checker
     }
 
+    /// The same, but where contact is allowed the fingers may be in these objects: hollow ones, whose shapes are filled.
+    pub fn reaching_into(mut self, objects: &[String]) -> Checker<'a> {
+        for obstacle in &mut self.obstacles {
+            obstacle.open = obstacle.link.is_none() && objects.contains(&obstacle.name);
+        }
+        self
+    }
+
     fn add_robot(&mut self) {
         let hand = self.robot.link("hand");
         for (i, link) in self.robot.links.iter().enumerate() {
@@ -196,6 +206,7 @@ impl<'a> Checker<'a> {
             pose,
             centre: pose.translation,
             radius: geometry.radius() as f32,
+            open: false,
         });
     }
 
@@ -333,6 +344,11 @@ impl<'a> Checker<'a> {
 
     fn allowed(&self, i: usize, other: Other, contact: Contact) -> bool {
         let Contact::Gripper(tolerance) = contact else { return false };
+        if let (Part::Finger, Other::Obstacle(o)) = (self.moving[i].part, other)
+            && self.obstacles[o].open
+        {
+            return true;
+        }
         matches!(self.moving[i].part, Part::Finger | Part::Held)
             && self.depth(i, other).is_some_and(|depth| depth <= tolerance)
     }

@@ -189,7 +189,7 @@ pub fn plan(
     let (mechanism, obstacles) = arm::in_scene(robot, scene, finger_around_held(robot, scene));
     let mut planning = Planning {
         robot,
-        checker: Checker::new(robot, scene, PADDING_M),
+        checker: Checker::new(robot, scene, PADDING_M).reaching_into(&request.reaches_into),
         space: arm::space(&mechanism, &obstacles),
         reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
         base: arm::on_floor(&scene.base),
@@ -201,7 +201,7 @@ pub fn plan(
     };
     let depart = match planning.depart(request) {
         Err(_) => {
-            planning.checker = Checker::new(robot, scene, TIGHT_PADDING_M);
+            planning.checker = Checker::new(robot, scene, TIGHT_PADDING_M).reaching_into(&request.reaches_into);
             planning.depart(request)?
         }
         depart => depart?,

@@ -28,6 +28,8 @@ pub struct Request {
     pub approach_m: f64,
     /// What points up in the tool at the end of the departure points up all along the free path, at most this far off, in radians.
     pub upright_rad: Option<f64>,
+    /// Hollow things that the fingers may reach into on the straight parts, by their names in the scene: their shapes there are filled.
+    pub reaches_into: Vec<String>,
     /// Fraction of the joints' velocity and acceleration limits.
     pub speed: f64,
     /// The same seed, scene and iterations give the same plan.

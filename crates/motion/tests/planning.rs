@@ -14,7 +14,7 @@ use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::robot::Robot;
 use ratn_motion::trajectory::ArmTrajectory;
 use ratn_motion::validate::{Violation, validate_trajectory};
-use ratn_world::scene::{Placement, SceneObject, Shape};
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::time::{Duration, Instant};
 
 /// The whole trajectory touches nothing but with the gripper, checked exactly and four times as densely as it was planned.
@@ -318,4 +318,20 @@ proptest! {
             }
         }
     }
+}
+
+#[test]
+fn the_fingers_reach_only_into_what_is_said_to_be_hollow() {
+    let robot = Robot::aimm();
+    let (bowl, table) = (Pose::at(0.75, 0.1, 0.725), Pose::at(0.8, 0.0, 0.675));
+    let object = |name: &str, shape, pose| SceneObject { name: name.into(), shape, placement: Placement::World(pose) };
+    let shape = Shape::Cylinder { radius: 0.065, length: 0.05 };
+    let objects = vec![object("bowl", shape, bowl), object("table", Shape::Box { size: aimm::TABLE_SIZE }, table)];
+    let scene = Scene { base: Pose::IDENTITY, objects };
+    let rim = ratn_model::grasp::at_rim(&bowl, [0.13, 0.13, 0.05]).into_iter().map(Goal::Pose).collect();
+    let request = Request { approach_m: 0.10, ..request(aimm::OBSERVATION, rim) };
+    let refused = plan(&robot, &scene, &request, &mut |_| Control::Continue);
+    assert!(matches!(&refused, Err(PlanError::NoGoal { .. })), "{refused:?}");
+    let request = Request { reaches_into: vec!["bowl".to_owned()], ..request };
+    plan(&robot, &scene, &request, &mut |_| Control::Continue).unwrap();
 }

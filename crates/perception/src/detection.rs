@@ -73,6 +73,8 @@ pub enum DetectionError {
 const MIN_EXPLAINED: f64 = 0.7;
 /// How badly it may explain what was measured, see `Fit::score`.
 const MAX_SCORE: f64 = 0.6;
+/// How far apart the middles of two parts of one thing are at the most, in metres.
+const MAX_APART: f64 = 0.12;
 /// How far around a known object is looked for it, in metres.
 const SEARCH_MARGIN: f64 = 0.15;
 /// How far a known object may have moved, in metres.
@@ -143,25 +145,50 @@ fn objects_on(
     classes: &[ObjectClass],
     body: &[Ball],
 ) -> Result<Vec<Detection>, DetectionError> {
-    let view = View::new(image, camera, region, body)?;
-    let mut fits: Vec<Fit> = Vec::new();
-    let mut found = Vec::new();
+    let mut view = View::new(image, camera, region, body)?;
+    let mut found: Vec<(Fit, Detection)> = Vec::new();
     // Large clusters first: a steep side can come apart from its top, and must not make a second object in the same place.
+    let mut fragments = Vec::new();
     for cluster in 0..view.clusters.len() {
-        let Some((fit, share)) = classify(&view, cluster, classes) else { continue };
-        let evidence = view.evidence(cluster, FINE.0, FINE.1);
-        let fit = fit.refined(&evidence, FINE.2);
-        let explained = fit.explains(&evidence);
-        if explained < MIN_EXPLAINED
-            || fit.score(&evidence) > MAX_SCORE
-            || fits.iter().any(|other| other.covers(fit.at()) || fit.covers(other.at()))
-        {
-            continue;
+        match explanation(&view, cluster, classes) {
+            Some((fit, object)) => {
+                if !is_taken(&found, &fit) {
+                    found.push((fit, object));
+                }
+            }
+            None => fragments.push(cluster),
         }
-        found.push(detection(&view, &fit, &evidence, explained * share));
-        fits.push(fit);
     }
-    Ok(found)
+    // What is hollow comes apart where its far side is seen over its near one.
+    for (i, a) in fragments.iter().enumerate() {
+        for b in &fragments[i + 1..] {
+            let Some(whole) = view.joined(*a, *b, MAX_APART) else { continue };
+            if let Some((fit, object)) = explanation(&view, whole, classes)
+                && !is_taken(&found, &fit)
+            {
+                found.push((fit, object));
+            }
+        }
+    }
+    Ok(found.into_iter().map(|(_, object)| object).collect())
+}
+
+/// Whether something stands there already.
+fn is_taken(found: &[(Fit, Detection)], fit: &Fit) -> bool {
+    found.iter().any(|(other, _)| other.covers(fit.at()) || fit.covers(other.at()))
+}
+
+/// What a cluster is, if a model explains it.
+fn explanation(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Option<(Fit, Detection)> {
+    let (fit, share) = classify(view, cluster, classes)?;
+    let evidence = view.evidence(cluster, FINE.0, FINE.1);
+    let fit = fit.refined(&evidence, FINE.2);
+    let explained = fit.explains(&evidence);
+    if explained < MIN_EXPLAINED || fit.score(&evidence) > MAX_SCORE {
+        return None;
+    }
+    let object = detection(view, &fit, &evidence, explained * share);
+    Some((fit, object))
 }
 
 /// The model that explains a cluster best, and how likely its class is among those tried.

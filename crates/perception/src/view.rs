@@ -184,6 +184,20 @@ impl<'a> View<'a> {
         self.clusters = seen.filter(|cluster| !cluster.iter().any(at_border)).collect();
     }
 
+    /// Two clusters as one more, unless their middles are farther apart than `most`.
+    pub(crate) fn joined(&mut self, a: usize, b: usize, most: f64) -> Option<usize> {
+        let [a, b] = [a, b].map(|cluster| &self.clusters[cluster]);
+        let middle = |cluster: &[Seen]| -> Vector {
+            std::array::from_fn(|i| cluster.iter().map(|seen| seen.point[i]).sum::<f64>() / cluster.len().max(1) as f64)
+        };
+        if length(sub(middle(a), middle(b))) > most {
+            return None;
+        }
+        let both = a.iter().chain(b).copied().collect();
+        self.clusters.push(both);
+        Some(self.clusters.len() - 1)
+    }
+
     /// At most `points` of a cluster's points, evenly, and at most `free` of the rays beside it.
     pub(crate) fn evidence(&self, cluster: usize, points: usize, free: usize) -> Evidence {
         let members = &self.clusters[cluster];

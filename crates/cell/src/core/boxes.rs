@@ -1,6 +1,6 @@
 //! The objects of the cell as its ground truth tells of them, as nobody on the robot knows them.
 
-use super::environment::Model;
+use super::environment::{Kind, Model};
 use ratn_model::pose::Pose;
 
 /// An object of a new table.
@@ -14,17 +14,23 @@ pub struct Placed {
     pub pose: Pose,
 }
 
-/// What the ground truth says of a box.
+/// What the ground truth says of an object.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrueBox {
     /// Its name in the cell.
     pub id: String,
-    /// Edge lengths in metres.
+    /// What it is.
+    pub kind: Kind,
+    /// Edge lengths of its bounding box in metres.
     pub size: [f64; 3],
     /// Its centre, in the world frame.
     pub pose: Pose,
     /// It stands at a place of the load deck: delivered.
     pub on_base: bool,
+    /// It stands where the task of this cell is to bring it: a box on the load deck, tableware at a place for its kind on the table.
+    pub in_place: bool,
+    /// How far it leaned at the most while the gripper held it, in radians.
+    pub greatest_tilt_rad: f64,
     /// The gripper holds it.
     pub held: bool,
     /// On what it rests; empty while held, and in the air.

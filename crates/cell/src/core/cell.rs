@@ -13,22 +13,23 @@ use super::activity::{Activity, Kind, seconds};
 use super::battery::Battery;
 use super::boxes::{Placed, TrueBox};
 use super::deviations::LOST;
-use super::environment::{Environment, Kind as ObjectKind};
+use super::environment::Environment;
 use super::faults::Faults;
 use super::grasping::Pads;
 use super::holding::Held;
 use super::leases::Leases;
 use super::picture::{Exposure, Scenery};
-use super::placement::{self, PlacementError};
+use super::placement::{self, PlacementError, TABLE};
 use super::protocol::{Command, Ending, Event, Module, Product};
-use crate::config::{CellConfig, MAX_BOXES};
+use super::tableware;
+use crate::config::{CellConfig, Goods, Setting};
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::aimm;
 use ratn_motion::drive::wrapped;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_worker::safety::SafetyState;
-use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use ratn_world::scene::{Placement, Scene, SceneObject};
 use std::collections::BTreeMap;
 
 /// The simulated robot and its table.
@@ -46,6 +47,8 @@ pub struct Cell {
     pub(super) environment: Environment,
     /// The objects' names.
     pub(super) ids: Vec<String>,
+    /// How far each object leaned at the most while it was held, in radians.
+    pub(super) tilts: Vec<f64>,
     pub(super) held: Option<Held>,
     pub(super) faults: Faults,
     /// Until when the camera is blind.
@@ -72,9 +75,9 @@ impl Cell {
             reason = "the built-in robot has fingers made of boxes, and every test uses them"
         )]
         let pads = Pads::of(&robot).expect("the gripper of the built-in robot has two fingers");
-        let boxes = placement::boxes(&robot, config.boxes, config.seed)?;
+        let objects = placement::objects(&robot, config.scene, config.goods(), config.seed)?;
         let resting = first_posture(&config);
-        let (environment, ids) = environment(&robot, &resting, &boxes);
+        let (environment, ids) = environment(&robot, &resting, config.scene, &objects);
         let now = Timestamp::default();
         Ok(Cell {
             pads,
@@ -85,6 +88,7 @@ impl Cell {
             activities: BTreeMap::new(),
             leases: Leases::default(),
             environment,
+            tilts: vec![0.0; ids.len()],
             ids,
             held: None,
             faults: Faults::new(&config.faults, config.seed),
@@ -135,7 +139,7 @@ impl Cell {
                 }
                 self.safety = state;
             }
-            Event::Reset { seed, boxes } => self.reset(seed, boxes, &mut out),
+            Event::Reset { seed, goods } => self.reset(seed, goods, &mut out),
             Event::Fault { fault } => self.faults.add(fault),
             Event::Save => out.push(Command::Saved { snapshot: Box::new(self.save()) }),
             Event::PutBack { snapshot } => self.put_back(&snapshot, &mut out),
@@ -169,15 +173,21 @@ impl Cell {
         Pose::from_rpy([x, y, 0.0], 0.0, 0.0, heading)
     }
 
-    /// What is true of every box.
+    /// What is true of every object.
     pub fn ground_truth(&self) -> Vec<TrueBox> {
         let tool = self.robot.tool_pose(&self.configuration());
         let truth = |i: usize| {
             let held = self.held.is_some_and(|held| held.object == i);
             let on = if held { String::new() } else { self.support_of(i) };
             let pose = self.pose_of(i, &tool);
+            let kind = self.environment.model(i).kind;
             let on_base = self.is_delivered(&pose, &on);
-            TrueBox { id: self.ids[i].clone(), size: self.size_of(i), pose, on_base, held, on }
+            let in_place = match self.config.scene {
+                Setting::Boxes => on_base,
+                Setting::Table => on == TABLE && tableware::is_in_place(kind, &pose),
+            };
+            let (id, size, greatest_tilt_rad) = (self.ids[i].clone(), self.size_of(i), self.tilts[i]);
+            TrueBox { id, kind, size, pose, on_base, in_place, greatest_tilt_rad, held, on }
         };
         (0..self.ids.len()).map(truth).collect()
     }
@@ -212,28 +222,32 @@ impl Cell {
         self.seed
     }
 
-    /// What collides: the table and the boxes, held ones in the gripper.
+    /// What collides: the furniture and the parts of all objects, held ones in the gripper.
     pub fn scene(&self) -> Scene {
-        let objects = (0..self.ids.len()).map(|i| SceneObject {
-            name: self.ids[i].clone(),
-            shape: match (self.environment.model(i).kind, self.size_of(i)) {
-                (ObjectKind::Box | ObjectKind::Fork, size) => Shape::Box { size },
-                (_, [width, _, height]) => Shape::Cylinder { radius: width / 2.0, length: height },
-            },
-            placement: match self.held {
-                Some(held) if held.object == i => Placement::Gripper(held.in_tool),
-                _ => Placement::World(self.environment.state(i).pose),
-            },
+        let parts = (0..self.ids.len()).flat_map(|i| {
+            let place = match self.held {
+                Some(held) if held.object == i => None,
+                _ => Some(self.environment.state(i).pose),
+            };
+            let in_tool = self.held.map_or(Pose::IDENTITY, |held| held.in_tool);
+            self.environment.model(i).parts().into_iter().map(move |(part, shape)| SceneObject {
+                name: self.ids[i].clone(),
+                shape,
+                placement: match place {
+                    Some(pose) => Placement::World(pose.compose(&part)),
+                    None => Placement::Gripper(in_tool.compose(&part)),
+                },
+            })
         });
-        Scene { base: self.base_pose(), objects: objects.chain([placement::table()]).collect() }
+        Scene { base: self.base_pose(), objects: parts.chain(placement::fixed(self.config.scene)).collect() }
     }
 
     /// What there is to be seen.
     pub fn scenery(&self) -> Scenery {
         let configuration = self.configuration();
         let tool = self.robot.tool_pose(&configuration);
-        let boxes = (0..self.ids.len()).map(|i| (self.size_of(i), self.pose_of(i, &tool))).collect();
-        Scenery { configuration, boxes }
+        let object = |i| (self.environment.model(i).clone(), self.pose_of(i, &tool));
+        Scenery { configuration, setting: self.config.scene, objects: (0..self.ids.len()).map(object).collect() }
     }
 
     pub(super) fn is_held(&self) -> bool {
@@ -333,14 +347,15 @@ impl Cell {
         }
     }
 
-    fn reset(&mut self, seed: u64, count: usize, out: &mut Vec<Command>) {
+    fn reset(&mut self, seed: u64, goods: Goods, out: &mut Vec<Command>) {
         self.hold(|_| true, |_| Ending::Aborted("the cell was reset".to_owned()), out);
         self.resting = first_posture(&self.config);
         self.seed = seed;
         // The request was checked before it became an event; a table that cannot be laid is an empty one.
-        let boxes = placement::boxes(&self.robot, count.clamp(1, MAX_BOXES), seed).unwrap_or_default();
+        let objects = placement::objects(&self.robot, self.config.scene, goods, seed).unwrap_or_default();
         self.held = None;
-        (self.environment, self.ids) = environment(&self.robot, &self.resting, &boxes);
+        self.tilts = vec![0.0; objects.len()];
+        (self.environment, self.ids) = environment(&self.robot, &self.resting, self.config.scene, &objects);
         self.environment.skip_until(self.now);
     }
 
@@ -373,9 +388,14 @@ fn next_frame(activity: &Activity) -> Option<Timestamp> {
 }
 
 /// Everything that stands there, and the names of what can be moved.
-fn environment(robot: &Robot, configuration: &Configuration, objects: &[Placed]) -> (Environment, Vec<String>) {
+fn environment(
+    robot: &Robot,
+    configuration: &Configuration,
+    setting: Setting,
+    objects: &[Placed],
+) -> (Environment, Vec<String>) {
     let models: Vec<_> = objects.iter().map(|o| (o.model.clone(), o.pose)).collect();
-    let environment = Environment::new(robot, configuration, &placement::furniture(), &models);
+    let environment = Environment::new(robot, configuration, &placement::furniture(setting), &models);
     (environment, objects.iter().map(|o| o.id.clone()).collect())
 }
 

@@ -5,6 +5,8 @@ use super::cell::Cell;
 use super::faults::{Fault, Kind, When};
 use super::placement::TABLE;
 use super::protocol::{Command, Ending};
+use super::tableware;
+use crate::config::Setting;
 use rand::RngExt;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
@@ -92,25 +94,28 @@ impl Cell {
         }
     }
 
-    /// Somebody takes an object from the table and puts it down elsewhere on it, where it stands apart.
+    /// Somebody takes an object that is still to be fetched and puts it down elsewhere on what it stands on, where it stands apart.
     fn move_something(&mut self) {
-        let on_table: Vec<usize> = (0..self.ids.len())
-            .filter(|i| self.held.is_none_or(|held| held.object != *i) && self.support_of(*i) == TABLE)
+        let (support, height, [[x_low, x_high], [y_low, y_high]]) = match self.config.scene {
+            Setting::Boxes => (TABLE, aimm::TABLE_HEIGHT_M, aimm::BOX_REGION),
+            Setting::Table => (tableware::RACK, tableware::RACK_HEIGHT_M, tableware::RACK_REGION),
+        };
+        let movable: Vec<usize> = (0..self.ids.len())
+            .filter(|i| self.held.is_none_or(|held| held.object != *i) && self.support_of(*i) == support)
             .collect();
-        if on_table.is_empty() {
+        if movable.is_empty() {
             return;
         }
-        let object = on_table[self.faults.random().random_range(0..on_table.len())];
+        let object = movable[self.faults.random().random_range(0..movable.len())];
         let radius = |i: usize| self.size_of(i)[0].hypot(self.size_of(i)[1]) / 2.0;
         let others: Vec<([f64; 3], f64)> = (0..self.ids.len())
             .filter(|i| *i != object)
             .map(|i| (self.environment.state(i).pose.position, radius(i)))
             .collect();
-        let (mine, height) = (radius(object), aimm::TABLE_HEIGHT_M + self.size_of(object)[2] / 2.0);
+        let (mine, height) = (radius(object), height + self.size_of(object)[2] / 2.0);
         let tool = self.robot.tool_pose(&self.configuration()).position;
         let random = self.faults.random();
         let place = (0..MAX_PLACES).find_map(|_| {
-            let [[x_low, x_high], [y_low, y_high]] = aimm::BOX_REGION;
             let (x, y) = (random.random_range(x_low..=x_high), random.random_range(y_low..=y_high));
             let yaw = random.random_range(-PI..PI);
             let apart = |at: &[f64; 3], radius: f64| (at[0] - x).hypot(at[1] - y) > mine + radius + APART_M;

@@ -2,7 +2,7 @@
 
 use super::boxes::ON_BASE;
 use super::cell::Cell;
-use super::environment::{GRAVITY, Grip, Hold, Load, STEP, Slip, Support};
+use super::environment::{GRAVITY, Grip, Hold, Kind, Load, Model, STEP, Slip, Support};
 use super::faults::Kind as Fault;
 use super::protocol::{Ending, Product};
 use ratn_model::pose::Pose;
@@ -53,8 +53,11 @@ impl Cell {
     /// The fingers have closed from `from` metres on each side of the middle.
     pub(super) fn close(&mut self, from: f64, object: String, expected: Option<&Pose>) -> Ending {
         let tool = self.robot.tool_pose(&self.configuration());
-        let there: Vec<(String, Pose, [f64; 3])> =
-            (0..self.ids.len()).map(|i| (self.ids[i].clone(), self.pose_of(i, &tool), self.size_of(i))).collect();
+        let parts: Vec<(Pose, [f64; 3])> =
+            (0..self.ids.len()).map(|i| self.grip_part(i, &tool.inverse().compose(&self.pose_of(i, &tool)))).collect();
+        let there: Vec<(String, Pose, [f64; 3])> = (parts.iter().enumerate())
+            .map(|(i, (part, size))| (self.ids[i].clone(), self.pose_of(i, &tool).compose(part), *size))
+            .collect();
         let grip = match self.pads.close(&tool, from, &there) {
             Ok(grip) => grip,
             Err(reason) => {
@@ -70,11 +73,11 @@ impl Cell {
         }
         self.resting.finger = grip.width / 2.0;
         let friction = self.environment.model(grip.index).kind.friction();
-        let in_tool = grip.in_tool;
+        let in_tool = grip.in_tool.compose(&parts[grip.index].0.inverse());
         self.held = Some(Held::new(grip.index, in_tool, friction));
         self.environment.carry(grip.index, &tool.compose(&in_tool));
-        let size = self.size_of(grip.index);
-        let in_gripper = expected.map(|e| turned_like(&in_tool, &size, e));
+        let model = self.environment.model(grip.index);
+        let in_gripper = expected.map(|e| turned_like(&in_tool, model, e));
         Ending::Done(Product::Grasped { object, width: grip.width, in_gripper })
     }
 
@@ -100,7 +103,11 @@ impl Cell {
         let felt = [-acceleration[0], -acceleration[1], -acceleration[2] - GRAVITY];
         let turned = Pose { position: [0.0; 3], ..tool.inverse() };
         let (model, size) = (self.environment.model(held.object), self.size_of(held.object));
-        if let Some(patch) = self.pads.patch(&held.in_tool, &size) {
+        let patch = |in_tool: &Pose| {
+            let (part, size) = self.grip_part(held.object, in_tool);
+            self.pads.patch(&in_tool.compose(&part), &size)
+        };
+        if let Some(patch) = patch(&held.in_tool) {
             let mass_kg = model.mass_kg();
             let [a, b] = across(&held.in_tool, &size);
             let hold = Hold { in_tool: held.in_tool, patch, mass_kg, inertia: mass_kg * (a * a + b * b) / 12.0 };
@@ -109,7 +116,9 @@ impl Cell {
         }
         held.steady = stands && held.slip.is_none();
         let pose = tool.compose(&held.in_tool);
-        if self.pads.patch(&held.in_tool, &size).is_some() {
+        let lean = pose.rotate([0.0, 0.0, 1.0])[2].clamp(-1.0, 1.0).acos();
+        if patch(&held.in_tool).is_some() {
+            self.tilts[held.object] = self.tilts[held.object].max(lean);
             self.environment.carry(held.object, &pose);
             self.held = Some(held);
             return None;
@@ -120,6 +129,11 @@ impl Cell {
         // Nothing is left to stop the fingers.
         self.resting.finger = 0.0;
         Some(held.object)
+    }
+
+    /// What the fingers can close around of an object that is there in the tool frame.
+    fn grip_part(&self, object: usize, in_tool: &Pose) -> (Pose, [f64; 3]) {
+        self.environment.model(object).grip_part(&in_tool.inverse())
     }
 
     /// An object's extents.
@@ -183,9 +197,18 @@ fn across(in_tool: &Pose, size: &[f64; 3]) -> [f64; 2] {
     }
 }
 
+/// The same object in whichever of its own frames is closest to `expected`.
+fn turned_like(pose: &Pose, model: &Model, expected: &Pose) -> Pose {
+    if model.is_round() {
+        let ahead = pose.inverse().compose(expected).rotate([1.0, 0.0, 0.0]);
+        return pose.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, ahead[1].atan2(ahead[0])));
+    }
+    if model.kind == Kind::Box { box_turned_like(pose, &model.size, expected) } else { *pose }
+}
+
 /// The same box in whichever of its own frames is closest to `expected`: nobody can tell them apart. Which axis is its height was not
 /// seen when it fell over since, so any may be; of the two others the first is the longer one, unless they are about equal.
-fn turned_like(pose: &Pose, size: &[f64; 3], expected: &Pose) -> Pose {
+fn box_turned_like(pose: &Pose, size: &[f64; 3], expected: &Pose) -> Pose {
     const SQUARE_M: f64 = 0.01;
     // Each axis upwards and downwards.
     let upright = [[0.0, 0.0], [PI, 0.0], [FRAC_PI_2, 0.0], [-FRAC_PI_2, 0.0], [0.0, FRAC_PI_2], [0.0, -FRAC_PI_2]];
@@ -216,9 +239,9 @@ mod tests {
         let (size, lying) = ([0.08, 0.06, 0.12], Pose::from_rpy([0.0, 0.0, 0.01], 0.0, FRAC_PI_2, 0.0));
         // What was seen is 0.12 long, 0.06 wide and 0.08 high.
         let seen = Pose::from_rpy([0.0, 0.0, 0.012], PI, 0.0, 0.05);
-        assert!(turned_like(&lying, &size, &seen).angle(&seen) < 0.06);
+        assert!(box_turned_like(&lying, &size, &seen).angle(&seen) < 0.06);
         // A quarter turn away it would be 0.06 long: that it was seen so badly is not hidden.
         let across = Pose::from_rpy([0.0, 0.0, 0.012], PI, 0.0, FRAC_PI_2);
-        assert!((turned_like(&lying, &size, &across).angle(&across) - FRAC_PI_2).abs() < 0.01);
+        assert!((box_turned_like(&lying, &size, &across).angle(&across) - FRAC_PI_2).abs() < 0.01);
     }
 }

@@ -10,6 +10,7 @@ pub mod placement;
 pub mod protocol;
 pub mod recording;
 pub mod snapshot;
+pub mod tableware;
 
 mod activity;
 mod battery;

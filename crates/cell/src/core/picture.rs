@@ -1,8 +1,10 @@
 //! What the camera looks at: the true scene at one moment, robot included, and the frames taken of it.
 
+use super::environment::Model;
+use super::placement::furniture;
+use crate::config::Setting;
 use ratn_model::pose::Pose;
-use ratn_motion::aimm;
-use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::robot::{Configuration, Robot, to_f32};
 use ratn_perception::camera::{Camera, DepthImage};
 use ratn_perception::noise::{Noise, average, observe};
 use ratn_perception::photograph::photograph;
@@ -15,8 +17,10 @@ use ratn_world::scene::Shape;
 pub struct Scenery {
     /// Where the robot's joints are.
     pub configuration: Configuration,
-    /// Sizes and poses of the boxes, in the world frame.
-    pub boxes: Vec<([f64; 3], Pose)>,
+    /// What the cell is furnished for.
+    pub setting: Setting,
+    /// Everything that can be moved, and where it is in the world frame.
+    pub objects: Vec<(Model, Pose)>,
 }
 
 /// Frames of a scene that stood still.
@@ -34,7 +38,7 @@ pub struct Exposure {
 const ROBOT_COLOUR: [u8; 3] = [235, 140, 40];
 const TABLE_COLOUR: [u8; 3] = [170, 125, 85];
 const FLOOR_COLOUR: [u8; 3] = [140, 140, 145];
-const BOX_COLOUR: [u8; 3] = [60, 120, 200];
+const OBJECT_COLOUR: [u8; 3] = [60, 120, 200];
 
 /// The floor around the robot, in metres; its top is at z = 0.
 const FLOOR_SIZE: [f64; 3] = [12.0, 12.0, 0.1];
@@ -53,11 +57,14 @@ impl Scenery {
     fn in_colours(&self, robot: &Robot) -> Vec<(Body, [u8; 3])> {
         let links = robot.shapes(&self.configuration).into_iter();
         let links = links.map(|(_, pose, shape)| (Body { shape, pose }, ROBOT_COLOUR));
-        let [x, y, z] = aimm::TABLE_CENTRE;
-        let table = Body::new(&Shape::Box { size: aimm::TABLE_SIZE }, &Pose::at(x, y, z));
+        let pieces = furniture(self.setting).into_iter().flat_map(|piece| piece.parts);
+        let pieces = pieces.map(|(pose, size)| (Body::new(&Shape::Box { size }, &pose), TABLE_COLOUR));
         let floor = Body::new(&Shape::Box { size: FLOOR_SIZE }, &Pose::at(0.0, 0.0, -FLOOR_SIZE[2] / 2.0));
-        let boxes = self.boxes.iter().map(|(size, pose)| (Body::new(&Shape::Box { size: *size }, pose), BOX_COLOUR));
-        links.chain([(table, TABLE_COLOUR), (floor, FLOOR_COLOUR)]).chain(boxes).collect()
+        let objects = self
+            .objects
+            .iter()
+            .map(|(model, pose)| (Body { shape: model.seen().solid(), pose: to_f32(pose) }, OBJECT_COLOUR));
+        links.chain(pieces).chain([(floor, FLOOR_COLOUR)]).chain(objects).collect()
     }
 }
 

@@ -1,10 +1,13 @@
-//! Boxes on the table at random, but so that the task can be done: apart from each other, within reach, and each of them
-//! graspable from above while all others still stand there. The same seed gives the same table.
+//! What stands there is random, but so that the task can be done: apart from each other, within reach, and each object graspable
+//! from above while all others still stand there. The same seed gives the same scene.
 
 use super::boxes::Placed;
 use super::environment::{Furniture, Kind, Model};
+use super::tableware;
+use crate::config::{Goods, Setting};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use ratn_model::grasp;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::arm;
@@ -15,11 +18,11 @@ use ratn_motion::robot::Robot;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::FRAC_PI_2;
 
-/// No table was found on which the task could be done.
+/// No scene was found in which the task could be done.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("no feasible table with {count} boxes was found from seed {seed} in {MAX_TABLES} tries; try another seed")]
+#[error("no feasible scene with {count} objects was found from seed {seed} in {MAX_TABLES} tries; try another seed")]
 pub struct PlacementError {
-    /// How many boxes.
+    /// How many objects.
     pub count: usize,
     /// From which seed.
     pub seed: u64,
@@ -37,39 +40,64 @@ const FINGER_HALF_WIDTH_M: f64 = 0.033;
 /// The table's name.
 pub const TABLE: &str = "table";
 
-/// The boxes of a new table.
+/// What can be moved of a new scene.
 ///
 /// # Errors
 /// [`PlacementError`] when there seems to be no feasible one.
-pub fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<Placed>, PlacementError> {
+pub fn objects(robot: &Robot, setting: Setting, goods: Goods, seed: u64) -> Result<Vec<Placed>, PlacementError> {
+    match setting {
+        Setting::Boxes => boxes(robot, goods.boxes, seed),
+        Setting::Table => dishes(robot, goods, seed),
+    }
+}
+
+/// Tableware on the rack.
+fn dishes(robot: &Robot, goods: Goods, seed: u64) -> Result<Vec<Placed>, PlacementError> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut tables = (0..MAX_TABLES).map(|_| tableware::lay(goods, &mut random));
+    let feasible = tables.find(|placed| all_graspable(robot, Setting::Table, placed));
+    feasible.ok_or(PlacementError { count: goods.bowls + goods.forks, seed })
+}
+
+/// Boxes on the table.
+fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<Placed>, PlacementError> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     for table in 0..MAX_TABLES {
         // Long boxes get rarer as the table gets fuller, and the more tries have failed.
         let crowding = (count as f64 / 9.0).powi(2) * 0.6 + 0.4 * table as f64 / MAX_TABLES as f64;
         let footprints = footprints(&mut random, count, crowding.min(1.0));
-        if let Some(footprints) = footprints
-            && all_graspable(robot, &footprints)
+        let placed: Option<Vec<Placed>> =
+            footprints.map(|footprints| footprints.iter().enumerate().map(|(i, f)| f.as_box(i)).collect());
+        if let Some(placed) = placed
+            && all_graspable(robot, Setting::Boxes, &placed)
         {
-            return Ok(footprints.iter().enumerate().map(|(i, f)| f.as_box(i)).collect());
+            return Ok(placed);
         }
     }
     Err(PlacementError { count, seed })
 }
 
-/// The table as an object of the scene.
-pub fn table() -> SceneObject {
-    let [x, y, z] = aimm::TABLE_CENTRE;
-    SceneObject {
-        name: TABLE.to_owned(),
-        shape: Shape::Box { size: aimm::TABLE_SIZE },
-        placement: Placement::World(Pose::at(x, y, z)),
-    }
+/// What never moves, as objects of the scene.
+pub fn fixed(setting: Setting) -> impl Iterator<Item = SceneObject> {
+    let parts = |piece: Furniture| {
+        let name = piece.name;
+        piece.parts.into_iter().map(move |(pose, size)| SceneObject {
+            name: name.clone(),
+            shape: Shape::Box { size },
+            placement: Placement::World(pose),
+        })
+    };
+    furniture(setting).into_iter().flat_map(parts)
 }
 
-/// The table as something that stands there.
-pub fn furniture() -> Vec<Furniture> {
+/// What never moves.
+pub fn furniture(setting: Setting) -> Vec<Furniture> {
     let [x, y, z] = aimm::TABLE_CENTRE;
-    vec![Furniture { name: TABLE.to_owned(), parts: vec![(Pose::at(x, y, z), aimm::TABLE_SIZE)] }]
+    let table = Furniture { name: TABLE.to_owned(), parts: vec![(Pose::at(x, y, z), aimm::TABLE_SIZE)] };
+    match setting {
+        Setting::Boxes => vec![table],
+        Setting::Table => vec![table, tableware::rack()],
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -149,19 +177,21 @@ impl Rectangle {
     }
 }
 
-/// Whether each box can be taken from above while all of them stand there.
-fn all_graspable(robot: &Robot, footprints: &[Footprint]) -> bool {
-    let objects = footprints.iter().enumerate().map(|(i, f)| SceneObject {
-        name: format!("slc_{}", i + 1),
-        shape: Shape::Box { size: f.size },
-        placement: Placement::World(f.pose()),
+/// Whether each object can be taken from above while all of them stand there.
+fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
+    let parts = placed.iter().flat_map(|object| {
+        object.model.parts().into_iter().map(|(part, shape)| SceneObject {
+            name: object.id.clone(),
+            shape,
+            placement: Placement::World(object.pose.compose(&part)),
+        })
     });
-    let scene = Scene { base: Pose::IDENTITY, objects: objects.chain([table()]).collect() };
+    let scene = Scene { base: Pose::IDENTITY, objects: parts.chain(fixed(setting)).collect() };
     let mut checker = Checker::new(robot, &scene, PADDING_M);
     let (reach, home) = (arm::reach(robot), arm::positions(&aimm::HOME));
     let mut random = ChaCha8Rng::seed_from_u64(0);
-    footprints.iter().all(|f| {
-        aimm::grasp_poses(&f.pose(), f.size).iter().any(|grasp| {
+    placed.iter().all(|object| {
+        grasps(object).iter().any(|grasp| {
             reach.solutions(&Target::at(*grasp), &home, 6, 20, &mut random).iter().any(|posture| {
                 let posture = std::array::from_fn(|j| posture[j]);
                 line(&reach, &posture, [0.0, 0.0, aimm::APPROACH_M]).is_ok_and(|postures| {
@@ -170,6 +200,15 @@ fn all_graspable(robot: &Robot, footprints: &[Footprint]) -> bool {
             })
         })
     })
+}
+
+/// The ways to take an object from above.
+fn grasps(object: &Placed) -> Vec<Pose> {
+    match object.model.kind {
+        Kind::Bowl | Kind::Plate => grasp::at_rim(&object.pose, object.model.size),
+        Kind::Box => aimm::grasp_poses(&object.pose, object.model.size).to_vec(),
+        Kind::Cup | Kind::Fork => grasp::from_above(&object.pose, object.model.size).to_vec(),
+    }
 }
 
 #[cfg(test)]
@@ -188,6 +227,33 @@ mod tests {
             }
             assert_ne!(boxes(&robot, count, 1).unwrap(), boxes(&robot, count, 2).unwrap());
         }
+    }
+
+    #[test]
+    fn every_rack_is_laid_and_the_same_seed_lays_the_same() {
+        let robot = Robot::aimm();
+        for (bowls, forks) in [(0, 1), (1, 0), (2, 2), (3, 3)] {
+            let goods = Goods { boxes: 0, bowls, forks };
+            let rack = |seed| objects(&robot, Setting::Table, goods, seed).unwrap();
+            for seed in 0..20 {
+                assert_eq!(rack(seed).len(), bowls + forks);
+            }
+            assert_eq!(rack(1), rack(1));
+            assert_ne!(rack(1), rack(2));
+        }
+    }
+
+    #[test]
+    fn every_place_on_the_table_can_be_served_from_above_while_all_others_are_full() {
+        let robot = Robot::aimm();
+        let goods = Goods { boxes: 0, bowls: 3, forks: 3 };
+        let mut placed = objects(&robot, Setting::Table, goods, 1).unwrap();
+        for (i, object) in placed.iter_mut().enumerate() {
+            let place = tableware::places(object.model.kind)[i % 3];
+            object.pose = place.compose(&Pose::at(0.0, 0.0, object.model.size[2] / 2.0));
+            assert!(tableware::is_in_place(object.model.kind, &object.pose));
+        }
+        assert!(all_graspable(&robot, Setting::Table, &placed));
     }
 
     #[test]

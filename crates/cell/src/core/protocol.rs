@@ -4,6 +4,7 @@ pub use super::activity::{Module, Ticket};
 use super::faults::Fault;
 use super::picture::Exposure;
 use super::snapshot::Snapshot;
+use crate::config::Goods;
 use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
@@ -66,8 +67,8 @@ pub enum Event {
     Reset {
         /// From which seed.
         seed: u64,
-        /// With how many boxes.
-        boxes: usize,
+        /// With how much on it.
+        goods: Goods,
     },
     /// Something shall go wrong.
     Fault {

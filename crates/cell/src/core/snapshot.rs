@@ -26,6 +26,7 @@ pub struct Snapshot {
     form: u32,
     seed: u64,
     ids: Vec<String>,
+    tilts: Vec<f64>,
     environment: Saved,
     posture: Posture,
     held: Option<SavedHold>,
@@ -86,7 +87,7 @@ impl Snapshot {
             return Err(SnapshotError::OtherForm(snapshot.form));
         }
         let objects = snapshot.environment.objects.len();
-        if snapshot.ids.len() != objects {
+        if snapshot.ids.len() != objects || snapshot.tilts.len() != objects {
             return Err(SnapshotError::Inconsistent("its objects and their names are not as many"));
         }
         if snapshot.held.as_ref().is_some_and(|held| held.object >= objects) {
@@ -108,6 +109,7 @@ impl Cell {
             form: FORM,
             seed: self.seed,
             ids: self.ids.clone(),
+            tilts: self.tilts.clone(),
             environment: self.environment.save(&self.robot, &self.configuration()),
             posture: Posture { base, arm, pan, tilt, finger },
             held: self.held.map(|held| {
@@ -128,10 +130,12 @@ impl Cell {
         self.hold(|_| true, |_| Ending::Aborted("the cell was put back to a snapshot".to_owned()), out);
         let Posture { base, arm, pan, tilt, finger } = snapshot.posture.clone();
         self.resting = Configuration { base, arm, pan, tilt, finger };
-        self.environment = Environment::restore(&self.robot, &self.resting, &furniture(), &snapshot.environment);
+        self.environment =
+            Environment::restore(&self.robot, &self.resting, &furniture(self.config.scene), &snapshot.environment);
         self.environment.set_time(self.now);
         self.held = snapshot.held.as_ref().map(|held| Held::new(held.object, held.in_tool, held.friction));
         self.ids.clone_from(&snapshot.ids);
+        self.tilts.clone_from(&snapshot.tilts);
         self.seed = snapshot.seed;
         self.battery = Battery::at(self.config.battery, snapshot.battery);
         self.frames_taken = snapshot.frames_taken;

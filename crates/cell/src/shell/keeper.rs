@@ -3,6 +3,7 @@
 //! A thread, not a task: checking a trajectory takes milliseconds, and a motion has to stop on time whatever the runtime does.
 
 use super::recorder::Recorder;
+use crate::config::Goods;
 use crate::core::cell::Cell;
 use crate::core::faults::{Fault, MAX_FAULTS};
 use crate::core::picture::{Exposure, develop};
@@ -86,7 +87,7 @@ enum Message {
     Start { ticket: Ticket, lease: Option<LeaseId>, request: Request, ended: oneshot::Sender<Ending> },
     Happened(Event),
     Safety { state: SafetyState, applied: oneshot::Sender<()> },
-    Reset { seed: u64, boxes: usize, state: oneshot::Sender<State> },
+    Reset { seed: u64, goods: Goods, state: oneshot::Sender<State> },
     State(oneshot::Sender<State>),
     Fault { fault: Fault, taken: oneshot::Sender<bool> },
     Save(oneshot::Sender<Box<Snapshot>>),
@@ -123,9 +124,9 @@ impl Keeper {
     }
 
     /// A new table; what is true then.
-    pub(crate) async fn reset(&self, seed: u64, boxes: usize) -> Result<State, KeeperError> {
+    pub(crate) async fn reset(&self, seed: u64, goods: Goods) -> Result<State, KeeperError> {
         let (state, answer) = oneshot::channel();
-        self.ask(Message::Reset { seed, boxes, state })?;
+        self.ask(Message::Reset { seed, goods, state })?;
         answer.await.map_err(|_| KeeperError::Ended)
     }
 
@@ -229,7 +230,7 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
                 (Event::Start { ticket, lease, request }, None)
             }
             Some(Message::Happened(event)) => (event, None),
-            Some(Message::Reset { seed, boxes, state }) => (Event::Reset { seed, boxes }, Some(state)),
+            Some(Message::Reset { seed, goods, state }) => (Event::Reset { seed, goods }, Some(state)),
             Some(Message::State(state)) => (Event::Tick, Some(state)),
             Some(Message::Save(snapshot)) => {
                 saving = Some(snapshot);

@@ -52,7 +52,7 @@ pub async fn run_as(
 ) -> anyhow::Result<()> {
     config.check()?;
     let laid = config.clone();
-    let cell = tokio::task::spawn_blocking(move || Cell::new(laid)).await.context("cannot lay the table")??;
+    let cell = tokio::task::spawn_blocking(move || Cell::new(laid)).await.context("cannot lay the scene")??;
     let recorder = match &config.record {
         Some(file) => Recorder::begin(file, &config)?,
         None => Recorder::none(),
@@ -69,7 +69,7 @@ pub async fn run_as(
     let services = Services::new()
         .with(server.clone().into_service())
         .with(safety.into_service())
-        .with(CellServiceServer::new(service::Service::new(keeper.clone())));
+        .with(CellServiceServer::new(service::Service::new(keeper.clone(), config.scene)));
     let link =
         link::Link { config, directory: directory.clone(), channels, endpoint: endpoint.clone(), keeper, server };
     // Motions under way have their leases until the last has ended.

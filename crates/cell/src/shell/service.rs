@@ -1,7 +1,7 @@
 //! The gRPC adapter of the ground truth.
 
 use super::keeper::{Keeper, KeeperError, State};
-use crate::config::MAX_BOXES;
+use crate::config::{Goods, MAX_BOXES, MAX_TABLEWARE, Setting};
 use crate::core::boxes::TrueBox;
 use crate::core::faults::{Fault, FaultError, MAX_FAULTS};
 use crate::core::protocol::Event;
@@ -14,11 +14,12 @@ use tonic::{Request, Response, Status};
 
 pub(crate) struct Service {
     keeper: Keeper,
+    setting: Setting,
 }
 
 impl Service {
-    pub(crate) fn new(keeper: Keeper) -> Service {
-        Service { keeper }
+    pub(crate) fn new(keeper: Keeper, setting: Setting) -> Service {
+        Service { keeper, setting }
     }
 }
 
@@ -40,14 +41,23 @@ impl CellService for Service {
     }
 
     async fn reset(&self, request: Request<v1::ResetRequest>) -> Result<Response<v1::ResetResponse>, Status> {
-        let v1::ResetRequest { seed, boxes: count } = request.into_inner();
-        let count = usize::try_from(count).unwrap_or(usize::MAX);
-        if !(1..=MAX_BOXES).contains(&count) {
-            return Err(Status::invalid_argument(format!("{count} boxes: a table has 1 to {MAX_BOXES}")));
+        let v1::ResetRequest { seed, boxes: count, bowls, forks } = request.into_inner();
+        let many = |n: u32| usize::try_from(n).unwrap_or(usize::MAX);
+        let goods = Goods { boxes: many(count), bowls: many(bowls), forks: many(forks) };
+        if !goods.fit(self.setting) {
+            return Err(Status::invalid_argument(match self.setting {
+                Setting::Boxes => format!("{count} boxes: a table has 1 to {MAX_BOXES}"),
+                Setting::Table => {
+                    format!(
+                        "{bowls} bowls and {forks} forks: a rack has 0 to {MAX_TABLEWARE} of each, and at least one"
+                    )
+                }
+            }));
         }
-        let state = self.keeper.reset(seed, count).await.map_err(status)?;
+        let (state, count) = (self.keeper.reset(seed, goods).await.map_err(status)?, goods.count(self.setting));
         if state.boxes.len() != count {
-            let message = format!("no feasible table with {count} boxes was found from seed {seed}; try another seed");
+            let message =
+                format!("no feasible scene with {count} objects was found from seed {seed}; try another seed");
             return Err(Status::failed_precondition(message));
         }
         Ok(Response::new(v1::ResetResponse { boxes: boxes(state) }))
@@ -89,6 +99,9 @@ fn boxes(state: State) -> Vec<v1::TrueBox> {
         on_base: b.on_base,
         held: b.held,
         rests_on: b.on,
+        kind: b.kind.name().to_owned(),
+        in_place: b.in_place,
+        greatest_tilt_rad: b.greatest_tilt_rad,
     };
     state.boxes.into_iter().map(wire).collect()
 }

@@ -82,6 +82,7 @@ impl Bench {
             depart_m,
             approach_m,
             upright_rad: None,
+            reaches_into: Vec::new(),
             speed: 0.5,
             seed: 3,
             improvement_iterations: 50,

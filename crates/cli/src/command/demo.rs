@@ -17,6 +17,7 @@ use crate::system::config::SystemConfig;
 use crate::task_control::log;
 use crate::task_control::shell::Run;
 use anyhow::{Context, anyhow, bail};
+use ratn_cell::config::Setting;
 use ratn_executive::protocol::Mode;
 use ratn_model::load::Files;
 use ratn_model::program::{Program, SUCCESS};
@@ -29,39 +30,55 @@ const FETCH: (&str, &str) = ("fetch_boxes.yaml", include_str!("../../../../examp
 /// The one for a cell in which something goes wrong, which uses the other.
 const RECOVERING: (&str, &str) =
     ("fetch_boxes_recovering.yaml", include_str!("../../../../examples/fetch_boxes_recovering.yaml"));
+/// The second experiment: what is used by the task that looks first.
+const SET: (&str, &str) = ("set_table.yaml", include_str!("../../../../examples/set_table.yaml"));
+const LOOK_AND_SET: (&str, &str) =
+    ("set_table_recovering.yaml", include_str!("../../../../examples/set_table_recovering.yaml"));
+
+/// How far a bowl may have leaned on its way, in radians: as far as the task says, and what the grasp adds.
+const MAX_TILT_RAD: f64 = 0.11;
 
 struct BuiltIn;
 
 impl Files for BuiltIn {
     fn read(&self, _using: &str, path: &str) -> Result<(String, String), String> {
-        let (name, text) = FETCH;
-        if path == name { Ok((name.to_owned(), text.to_owned())) } else { Err("it is not built in".to_owned()) }
+        let (name, text) = [FETCH, SET].into_iter().find(|(name, _)| path == *name).ok_or("it is not built in")?;
+        Ok((name.to_owned(), text.to_owned()))
     }
 }
 
 /// Runs the task in every way and compares.
 pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     let config = SystemConfig::load(arguments.config.as_deref())?;
-    let (file, text) = if arguments.faults.fault.is_empty() { FETCH } else { RECOVERING };
+    let (file, text) = match arguments.scenario {
+        Setting::Boxes if arguments.faults.fault.is_empty() => FETCH,
+        Setting::Boxes => RECOVERING,
+        Setting::Table => LOOK_AND_SET,
+    };
+    let goods = result::Goods::of(arguments)?;
     let program = Arc::new(check::load_from(&BuiltIn, text, file, &config.catalogue)?);
     let directory = out_directory(arguments)?;
-    let mut demonstration = Demonstration::new(arguments);
+    let mut demonstration = Demonstration::new(arguments, goods);
     let outcome: Result<(), Failure> = blocking_here(async {
         let interrupt = Interrupt::listen()?;
         for plan in plans(arguments) {
-            output::progress(format_args!("\n{}", plan.announcement(arguments)));
-            let run = one_run(&plan, arguments, &config, &program, &directory, &interrupt);
+            output::progress(format_args!("\n{}", plan.announcement(&goods)));
+            let run = one_run(&plan, &goods, arguments, &config, &program, &directory, &interrupt);
             // A config is large.
             let outcome = Box::pin(run).await;
             let outcome = outcome.with_context(|| plan.name())?;
-            let (end, delivered) = (outcome.end.clone(), outcome.delivered);
+            let (end, delivered, tilt_rad) = (outcome.end.clone(), outcome.delivered, outcome.greatest_tilt_rad);
             demonstration.outcomes.push(outcome);
             if interrupt.asked() {
                 return Err(anyhow!("interrupted").into());
             }
-            if delivered != arguments.boxes as usize {
-                let all = result::boxes(arguments.boxes);
-                return Err(anyhow!("{}: {delivered} of {all} delivered to the base; {end}", plan.name()).into());
+            if delivered != goods.count() {
+                return Err(anyhow!("{}: {delivered} of {goods} {}; {end}", plan.name(), goods.destination()).into());
+            }
+            if tilt_rad > MAX_TILT_RAD {
+                let message =
+                    format!("a bowl leaned by {tilt_rad:.2} rad on its way, at most {MAX_TILT_RAD} are tolerated");
+                return Err(anyhow!("{}: {message}", plan.name()).into());
             }
         }
         Ok(())
@@ -101,6 +118,7 @@ fn plans(arguments: &DemoArguments) -> Vec<Plan> {
 
 async fn one_run(
     plan: &Plan,
+    goods: &result::Goods,
     arguments: &DemoArguments,
     config: &SystemConfig,
     program: &Arc<Program>,
@@ -109,13 +127,17 @@ async fn one_run(
 ) -> anyhow::Result<Outcome> {
     let mut config = config.clone();
     config.apply(&SystemArguments {
+        scene: Some(arguments.scenario),
         boxes: Some(arguments.boxes),
+        bowls: Some(arguments.bowls),
+        forks: Some(arguments.forks),
         planners: Some(plan.planners),
         speed: Some(arguments.speed),
         seed: Some(arguments.seed),
         faults: arguments.faults.clone(),
     });
-    let set = [("boxes".to_owned(), arguments.boxes.to_string()), ("budget".to_owned(), plan.budget.to_string())];
+    let mut set = goods.parameters();
+    set.push(("budget".to_owned(), plan.budget.to_string()));
     let log_file = directory.join(format!("{}.jsonl", plan.file_stem()));
     let run = Run {
         program: program.clone(),
@@ -129,7 +151,8 @@ async fn one_run(
         quiet: false,
     };
     let system = starting(System::start_private(config), interrupt).await?;
-    let (ended, delivered) = on_system(run, system, interrupt, async |system| system.delivered_boxes().await).await?;
+    let (ended, (delivered, greatest_tilt_rad)) =
+        on_system(run, system, interrupt, async |system| system.in_place().await).await?;
     let timeline = Timeline::of(&log::read(&log_file)?.lines);
     if timeline.outcome.as_deref() != Some(ended.outcome.as_str()) {
         bail!("the event log {} does not end as the run did", log_file.display());
@@ -140,7 +163,7 @@ async fn one_run(
         format!("the task ended with {}: {}", ended.outcome, ended.reason)
     };
     let chart = directory.join(format!("{}.html", plan.file_stem()));
-    Ok(Outcome { plan: *plan, timeline, delivered, end, log: log_file, chart })
+    Ok(Outcome { plan: *plan, timeline, delivered, greatest_tilt_rad, end, log: log_file, chart })
 }
 
 fn out_directory(arguments: &DemoArguments) -> anyhow::Result<PathBuf> {

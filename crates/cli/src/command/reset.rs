@@ -23,7 +23,7 @@ use std::time::Duration;
 /// A resource manager that opens no session within this time is not there.
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
 
-/// Lays the table anew and forgets every fact.
+/// Lays the scene anew and forgets every fact.
 pub(crate) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
@@ -53,10 +53,16 @@ async fn reset(
     let before =
         cell.get_ground_truth(GetGroundTruthRequest {}).await.context("the cell does not answer")?.into_inner();
     let seed = arguments.seed.unwrap_or(before.seed);
-    let boxes = arguments.boxes.map_or(before.boxes.len(), usize::from);
-    let table = ResetRequest { seed, boxes: u32::try_from(boxes)? };
-    cell.reset(table).await.context("the table is not laid anew")?;
-    let (_, facts) = world.root().await.context("the table is new, the facts are not forgotten")?;
+    let as_many = |kind: &str| before.boxes.iter().filter(|one| one.kind == kind).count();
+    let many = |given: Option<u32>, kind: &str| given.map_or_else(|| u32::try_from(as_many(kind)), Ok);
+    let request = ResetRequest {
+        seed,
+        boxes: many(arguments.boxes, "box")?,
+        bowls: many(arguments.bowls, "bowl")?,
+        forks: many(arguments.forks, "fork")?,
+    };
+    let objects = cell.reset(request).await.context("the scene is not laid anew")?.into_inner().boxes;
+    let (_, facts) = world.root().await.context("the scene is new, the facts are not forgotten")?;
     let every: BTreeSet<FactPattern> = facts
         .iter()
         .map(|fact| FactPattern {
@@ -69,5 +75,10 @@ async fn reset(
         let commit = Commit { id: fresh_id("reset"), changes, writer: "ratn reset".to_owned(), ..Commit::default() };
         world.commit_as(commit).await.context("the table is new, the facts are not forgotten")?;
     }
-    Ok(format!("a new table with {boxes} boxes, from seed {seed}; {} facts are forgotten", facts.len()))
+    let many = |kind: &str| objects.iter().filter(|one| one.kind == kind).count();
+    let laid = match (many("box"), many("bowl"), many("fork")) {
+        (0, bowls, forks) => format!("a new rack with {bowls} bowls and {forks} forks"),
+        (boxes, ..) => format!("a new table with {boxes} boxes"),
+    };
+    Ok(format!("{laid}, from seed {seed}; {} facts are forgotten", facts.len()))
 }

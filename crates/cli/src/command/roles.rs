@@ -94,7 +94,8 @@ pub(super) fn cell(arguments: &CellArguments) -> Result<(), Failure> {
         return replay(file);
     }
     if let Some(file) = &arguments.picture {
-        let config = SystemConfig::load(arguments.role.config.as_deref())?.cell;
+        let mut config = SystemConfig::load(arguments.role.config.as_deref())?.cell;
+        config.scene = arguments.scene.unwrap_or(config.scene);
         let png = ratn_cell::photo(config, arguments.from, arguments.towards)?;
         std::fs::write(file, png).with_context(|| format!("cannot write {}", file.display()))?;
         output::progress(format!("{} shows the cell", file.display()));
@@ -102,6 +103,7 @@ pub(super) fn cell(arguments: &CellArguments) -> Result<(), Failure> {
     }
     daemon(&arguments.role, ratn_cell::ROLE, async |system, host| {
         let mut config = system.cell;
+        config.scene = arguments.scene.unwrap_or(config.scene);
         config.faults.extend(&arguments.faults.fault);
         config.record = arguments.record.clone().or(config.record);
         config.listen = host.listen.unwrap_or(config.listen);

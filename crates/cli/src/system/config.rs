@@ -116,7 +116,10 @@ impl SystemConfig {
     /// With what the command line says.
     pub(crate) fn apply(&mut self, arguments: &SystemArguments) {
         self.speed = arguments.speed.unwrap_or(self.speed);
+        self.cell.scene = arguments.scene.unwrap_or(self.cell.scene);
         self.cell.boxes = arguments.boxes.map_or(self.cell.boxes, |n| n as usize);
+        self.cell.bowls = arguments.bowls.map_or(self.cell.bowls, |n| n as usize);
+        self.cell.forks = arguments.forks.map_or(self.cell.forks, |n| n as usize);
         self.cell.seed = arguments.seed.unwrap_or(self.cell.seed);
         self.cell.faults.extend(&arguments.faults.fault);
         if let Some(planners) = arguments.planners {

@@ -306,7 +306,11 @@ fn call(function: Function, arguments: &[Expr], types: &[Type]) -> Found {
             Type::List(Box::new(Type::Pose))
         }
         Function::PlacePose => {
-            all(Type::Pose)?;
+            expect(0, Type::Pose)?;
+            expect(1, Type::Pose)?;
+            if types.len() > 2 {
+                expect(2, Type::Int)?;
+            }
             Type::List(Box::new(Type::Pose))
         }
         Function::Concat => {

@@ -1,18 +1,20 @@
 //! The built-in functions, on values.
 //!
-//! The two geometric ones know one thing about a gripper: its tool frame sits between the fingertips, z points out of the
-//! gripper, y is the direction in which the fingers close. Both give two poses that differ by half a turn about the
-//! vertical, because a box looks the same from both.
+//! What the two geometric ones know about a gripper is in [`crate::grasp`]. `place_pose` gives two poses that differ by half a turn
+//! about the vertical, because a box looks the same from both, unless it is told how many turns look the same.
 
 use super::Function;
 use super::evaluate::{MAX_LIST, described, number, order};
+use crate::grasp;
 use crate::pose::Pose;
 use crate::value::Value;
-use std::f64::consts::{FRAC_PI_2, PI};
+use std::f64::consts::TAU;
 
-/// How far below an object's top the tool frame's origin goes in a grasp from above, in metres; half the height of
-/// something lower than twice that.
-pub const GRASP_DEPTH_M: f64 = 0.03;
+/// Classes that are wider than the fingers open, and open at the top.
+const HELD_BY_THE_RIM: [&str; 2] = ["Bowl", "Plate"];
+
+/// As many alternatives as a planner takes.
+const MAX_TURNS: i64 = 64;
 
 impl Function {
     /// Every function.
@@ -76,8 +78,10 @@ impl Function {
             Function::Compose => "compose(pose, pose)",
             Function::Inverse => "inverse(pose)",
             Function::Between => "between(pose, pose)",
-            Function::GraspPose => "grasp_pose(object), an object being {pose, size}",
-            Function::PlacePose => "place_pose(target, in_gripper)",
+            Function::GraspPose => {
+                "grasp_pose(object), an object being {pose, size, class}, the class where it has one"
+            }
+            Function::PlacePose => "place_pose(target, in_gripper) or place_pose(target, in_gripper, turns)",
             Function::Concat => "concat(a, b, …)",
             Function::Repeat => "repeat(value, n)",
             Function::Take => "take(list, n)",
@@ -89,9 +93,8 @@ impl Function {
         match self {
             Function::Len | Function::Abs | Function::Inverse | Function::GraspPose => arguments == 1,
             Function::Range => matches!(arguments, 1 | 2),
-            Function::Compose | Function::Between | Function::PlacePose | Function::Repeat | Function::Take => {
-                arguments == 2
-            }
+            Function::Compose | Function::Between | Function::Repeat | Function::Take => arguments == 2,
+            Function::PlacePose => matches!(arguments, 2 | 3),
             Function::If => arguments == 3,
             Function::Pose => matches!(arguments, 3 | 6),
             Function::Min | Function::Max | Function::Joints | Function::Concat => arguments >= 1,
@@ -126,7 +129,11 @@ pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, Str
         (Function::Between, [a, b]) => Ok(Value::Pose(pose(a)?.inverse().compose(pose(b)?))),
         (Function::Inverse, [a]) => Ok(Value::Pose(pose(a)?.inverse())),
         (Function::GraspPose, [object]) => grasp_poses(object),
-        (Function::PlacePose, [target, in_gripper]) => Ok(place_poses(pose(target)?, pose(in_gripper)?)),
+        (Function::PlacePose, [target, in_gripper]) => Ok(place_poses(pose(target)?, pose(in_gripper)?, 2)),
+        (Function::PlacePose, [target, in_gripper, turns]) => match int(turns)? {
+            turns @ 1..=MAX_TURNS => Ok(place_poses(pose(target)?, pose(in_gripper)?, turns)),
+            other => Err(format!("{other} turns: expected 1 to {MAX_TURNS}")),
+        },
         (Function::Concat, _) => {
             let parts = arguments.iter().map(|part| match part {
                 Value::String(text) => Ok(text.clone()),
@@ -201,20 +208,18 @@ fn grasp_poses(object: &Value) -> Result<Value, String> {
     };
     let edges = size.iter().map(number).collect::<Result<Vec<f64>, _>>()?;
     let [x, y, z] = <[f64; 3]>::try_from(edges).map_err(|_| expected())?;
-    let forward = centre.rotate([1.0, 0.0, 0.0]);
-    let yaw = forward[1].atan2(forward[0]);
-    // Turned upside down (roll π), the tool's y axis points along -y of the object; a quarter turn puts it along x.
-    let across = if x <= y { FRAC_PI_2 } else { 0.0 };
-    let top = centre.position[2] + z / 2.0;
-    let origin = [centre.position[0], centre.position[1], top - GRASP_DEPTH_M.min(z / 2.0)];
-    let turned = |by: f64| Value::Pose(Pose::from_rpy(origin, PI, 0.0, yaw + across + by));
-    Ok(Value::List(vec![turned(0.0), turned(PI)]))
+    let round =
+        matches!(object.field("class"), Some(Value::String(class)) if HELD_BY_THE_RIM.contains(&class.as_str()));
+    let grasps = if round { grasp::at_rim(centre, [x, y, z]) } else { grasp::from_above(centre, [x, y, z]).to_vec() };
+    Ok(Value::List(grasps.into_iter().map(Value::Pose).collect()))
 }
 
-fn place_poses(target: &Pose, in_gripper: &Pose) -> Value {
-    let half_turn = Pose::from_rpy([0.0; 3], 0.0, 0.0, PI);
-    let tool = |target: &Pose| Value::Pose(target.compose(&in_gripper.inverse()));
-    Value::List(vec![tool(target), tool(&target.compose(&half_turn))])
+fn place_poses(target: &Pose, in_gripper: &Pose, turns: i64) -> Value {
+    let tool = |turn: i64| {
+        let turned = Pose::from_rpy([0.0; 3], 0.0, 0.0, TAU * turn as f64 / turns as f64);
+        Value::Pose(target.compose(&turned).compose(&in_gripper.inverse()))
+    };
+    Value::List((0..turns).map(tool).collect())
 }
 
 #[cfg(test)]
@@ -222,6 +227,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
     use super::*;
+    use std::f64::consts::PI;
 
     fn poses(value: &Value) -> Vec<Pose> {
         let Value::List(items) = value else { return Vec::new() };
@@ -259,9 +265,11 @@ mod tests {
     }
 
     #[test]
-    fn a_low_object_is_grasped_at_half_its_height() {
-        let grasps = poses(&call(Function::GraspPose, &[object(0.0, [0.05, 0.2, 0.02])]).unwrap());
-        assert!((grasps[0].position[2] - 0.75).abs() < 1e-12);
+    fn a_bowl_is_grasped_at_its_rim() {
+        let Value::Map(mut bowl) = object(0.0, [0.13, 0.13, 0.05]) else { panic!() };
+        bowl.insert("class".to_owned(), Value::String("Bowl".to_owned()));
+        let grasps = poses(&call(Function::GraspPose, &[Value::Map(bowl)]).unwrap());
+        assert_eq!(grasps, grasp::at_rim(&Pose::from_rpy([0.7, 0.1, 0.75], 0.0, 0.0, 0.0), [0.13, 0.13, 0.05]));
     }
 
     #[test]
@@ -273,6 +281,12 @@ mod tests {
         assert!(first.distance(&target) < 1e-9 && first.angle(&target) < 1e-6);
         let second = tools[1].compose(&in_gripper);
         assert!(second.distance(&target) < 1e-9 && (second.angle(&target) - PI).abs() < 1e-6);
+        let place =
+            |turns| call(Function::PlacePose, &[Value::Pose(target), Value::Pose(in_gripper), Value::Int(turns)]);
+        let eight = poses(&place(8).unwrap());
+        assert_eq!((eight.len(), eight[0]), (8, tools[0]));
+        assert!((eight[1].compose(&in_gripper).angle(&target) - PI / 4.0).abs() < 1e-6);
+        assert!(place(1).is_ok() && place(0).is_err() && place(65).is_err());
     }
 
     #[test]

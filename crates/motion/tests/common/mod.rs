@@ -27,6 +27,7 @@ pub fn request(start: Joints, goals: Vec<Goal>) -> Request {
         depart_m: 0.0,
         approach_m: 0.0,
         upright_rad: None,
+        reaches_into: Vec::new(),
         speed: 0.3,
         seed: 7,
         improvement_iterations: 0,

@@ -1,5 +1,6 @@
 //! A goal of the path planner, read from its input ports: `start`, `goal` (joints, a pose, or a list of these); optional `depart_m`,
-//! `approach_m` (straight parts), `upright_rad` (what points up in the tool stays so, at most this far off), `speed`, `budget_s`.
+//! `approach_m` (straight parts), `upright_rad` (what points up in the tool stays so, at most this far off), `reaches_into` (names of hollow
+//! objects whose insides the fingers may enter on the straight parts), `speed`, `budget_s`.
 
 use ratn_model::value::Value;
 use ratn_motion::plan::{Goal, Request};
@@ -23,12 +24,18 @@ pub(super) fn request(goal: &GoalContext) -> Result<(Request, Option<f64>), Acti
         depart_m: goal.optional_float("depart_m")?.unwrap_or(0.0),
         approach_m: goal.optional_float("approach_m")?.unwrap_or(0.0),
         upright_rad: goal.optional_float("upright_rad")?,
+        reaches_into: names(goal)?,
         speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
         seed: goal.seed,
         // Improvement goes on until the budget ends.
         improvement_iterations: if budget_s.is_some() { usize::MAX } else { 0 },
     };
     Ok((request, budget_s))
+}
+
+fn names(goal: &GoalContext) -> Result<Vec<String>, ActionFailure> {
+    let Some(port) = goal.port("reaches_into").optional() else { return Ok(Vec::new()) };
+    port.list()?.iter().map(|name| Ok(name.string()?.to_owned())).collect()
 }
 
 fn goals(value: &Value) -> Result<Vec<Goal>, ActionFailure> {

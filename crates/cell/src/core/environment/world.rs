@@ -1,6 +1,6 @@
 //! The bodies and their steps.
 
-use super::object::{Kind, Model, Part};
+use super::object::{Kind, Model};
 use rapier3d::math::{Pose as Pose32, Vector};
 use rapier3d::parry::query::contact;
 use rapier3d::prelude::{
@@ -10,7 +10,7 @@ use rapier3d::prelude::{
 };
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
-use ratn_motion::robot::{Configuration, Robot, to_f32};
+use ratn_motion::robot::{Configuration, Geometry, Robot, to_f32};
 use ratn_world::digest::{Digest, Digester};
 use serde::{Deserialize, Serialize};
 use std::time::Duration;
@@ -404,10 +404,11 @@ impl Environment {
             .build();
         body.activation_mut().time_until_sleep = STILL_S;
         let body = self.bodies.insert(body);
-        let parts = model.parts();
+        let parts: Vec<_> = model.parts().iter().map(|(pose, shape)| Geometry::from(shape).at(*pose)).collect();
+        let parts: Vec<_> = parts.iter().map(|part| (to_f32(&part.pose), part.geometry.shape(0.0))).collect();
         let volume: f32 = parts.iter().map(|(_, shape)| shape.mass_properties(1.0).mass()).sum();
         let density = model.mass_kg() as f32 / volume;
-        let parts = parts.into_iter().map(|(pose, shape): Part| {
+        let parts = parts.into_iter().map(|(pose, shape)| {
             let collider = ColliderBuilder::new(shape)
                 .position(pose)
                 .density(density)

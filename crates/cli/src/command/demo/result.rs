@@ -1,17 +1,34 @@
-//! What a demonstration has to show: the paper's Table I with this machine's figures, and where the time went.
+//! What a demonstration has to show: the paper's Table I or II with this machine's figures, and where the time went.
 
 use crate::arguments::DemoArguments;
 use crate::command::tables::improvement;
+use crate::failure::Failure;
 use crate::report::statistics::{self, Statistics, mode_name};
 use crate::report::timeline::Timeline;
+use ratn_cell::config::Setting;
 use ratn_executive::protocol::Mode;
 use ratn_model::program::SUCCESS;
 use serde_json::{Value, json};
 use std::fmt;
 use std::path::PathBuf;
 
-/// Table I of the paper: boxes, HSM, CDTN 1 MP, CDTN 2 MP.
-const PAPER: [(u32, f64, f64, f64); 3] = [(1, 81.3, 73.5, 72.3), (2, 123.7, 107.3, 97.3), (3, 164.2, 141.5, 116.5)];
+/// Tables I and II of the paper: HSM, CDTN 1 MP, CDTN 2 MP.
+const PAPER: [(Goods, f64, Option<f64>, f64); 5] = [
+    (Goods::Boxes(1), 81.3, Some(73.5), 72.3),
+    (Goods::Boxes(2), 123.7, Some(107.3), 97.3),
+    (Goods::Boxes(3), 164.2, Some(141.5), 116.5),
+    (Goods::Dishes { bowls: 2, forks: 2 }, 169.2, None, 122.9),
+    (Goods::Dishes { bowls: 3, forks: 3 }, 255.4, None, 207.2),
+];
+
+/// What a task brings somewhere.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Goods {
+    /// Boxes, onto the base.
+    Boxes(u32),
+    /// Tableware, onto the table.
+    Dishes { bowls: u32, forks: u32 },
+}
 
 /// One run to be made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,8 +44,10 @@ pub(super) struct Plan {
 pub(super) struct Outcome {
     pub(super) plan: Plan,
     pub(super) timeline: Timeline,
-    /// Boxes on the base in the cell's ground truth.
+    /// What stands where it should in the cell's ground truth.
     pub(super) delivered: usize,
+    /// How far a bowl leaned at the most while it was held.
+    pub(super) greatest_tilt_rad: f64,
     /// How the task ended, as a sentence.
     pub(super) end: String,
     pub(super) log: PathBuf,
@@ -38,7 +57,7 @@ pub(super) struct Outcome {
 /// All runs.
 #[derive(Debug)]
 pub(super) struct Demonstration {
-    boxes: u32,
+    goods: Goods,
     planners: u32,
     speed: f64,
     seed: u64,
@@ -65,21 +84,21 @@ impl Plan {
     }
 
     /// Before it begins.
-    pub(super) fn announcement(&self, arguments: &DemoArguments) -> String {
+    pub(super) fn announcement(&self, goods: &Goods) -> String {
         let how = match self.mode {
             Mode::Hsm => "as its state machine is written".to_owned(),
             Mode::Cdtn if self.planners == 1 => "as a dataflow network, one motion planner".to_owned(),
             Mode::Cdtn => format!("as a dataflow network, {} motion planners", self.planners),
         };
         let budget = if self.budget { "" } else { "; planning takes what it takes" };
-        format!("== {}: {} {how}{budget} ==", self.name(), boxes(arguments.boxes))
+        format!("== {}: {} {how}{budget} ==", self.name(), goods)
     }
 }
 
 impl Demonstration {
-    pub(super) fn new(arguments: &DemoArguments) -> Demonstration {
-        let DemoArguments { boxes, planners, speed, seed, .. } = *arguments;
-        Demonstration { boxes, planners, speed, seed, outcomes: Vec::new() }
+    pub(super) fn new(arguments: &DemoArguments, goods: Goods) -> Demonstration {
+        let DemoArguments { planners, speed, seed, .. } = *arguments;
+        Demonstration { goods, planners, speed, seed, outcomes: Vec::new() }
     }
 
     /// Of a run that ended with success; how long another lasted says nothing.
@@ -107,7 +126,6 @@ impl Demonstration {
     pub(super) fn to_json(&self) -> Value {
         let main = self.main_budget();
         let mut document = json!({
-            "boxes": self.boxes,
             "planners": self.planners,
             "speed": self.speed,
             "seed": self.seed,
@@ -117,11 +135,13 @@ impl Demonstration {
                 "planners": o.plan.planners,
                 "budget": budget_name(o.plan.budget),
                 "delivered": o.delivered,
+                "greatest_tilt_rad": (o.greatest_tilt_rad * 1000.0).round() / 1000.0,
                 "log": o.log,
                 "chart": o.chart,
                 "statistics": Statistics::of(&o.timeline),
             })).collect::<Vec<_>>(),
         });
+        merge(&mut document, self.goods.to_json());
         merge(&mut document, self.row_json(main));
         if main && self.outcomes.iter().any(|o| !o.plan.budget) {
             document["budget_none"] = self.row_json(false);
@@ -148,9 +168,73 @@ impl Demonstration {
     }
 }
 
-/// For people.
-pub(super) fn boxes(number: u32) -> String {
-    if number == 1 { "1 box".to_owned() } else { format!("{number} boxes") }
+impl Goods {
+    /// What the command line asks for.
+    pub(super) fn of(arguments: &DemoArguments) -> Result<Goods, Failure> {
+        match *arguments {
+            DemoArguments { scenario: Setting::Boxes, boxes, .. } => Ok(Goods::Boxes(boxes)),
+            DemoArguments { bowls: 0, forks: 0, .. } => {
+                Err(Failure::Refused("ratn: no bowls and no forks: there is nothing to set".to_owned()))
+            }
+            DemoArguments { bowls, forks, .. } => Ok(Goods::Dishes { bowls, forks }),
+        }
+    }
+
+    /// How many.
+    pub(super) fn count(&self) -> usize {
+        match *self {
+            Goods::Boxes(boxes) => boxes as usize,
+            Goods::Dishes { bowls, forks } => (bowls + forks) as usize,
+        }
+    }
+
+    /// As parameters of the task.
+    pub(super) fn parameters(&self) -> Vec<(String, String)> {
+        let set = |name: &str, value: u32| (name.to_owned(), value.to_string());
+        match *self {
+            Goods::Boxes(boxes) => vec![set("boxes", boxes)],
+            Goods::Dishes { bowls, forks } => vec![set("bowls", bowls), set("forks", forks)],
+        }
+    }
+
+    /// What was to be done with them.
+    pub(super) fn destination(&self) -> &'static str {
+        match self {
+            Goods::Boxes(_) => "delivered to the base",
+            Goods::Dishes { .. } => "at their places on the table",
+        }
+    }
+
+    fn doing(&self) -> &'static str {
+        match self {
+            Goods::Boxes(_) => "Fetching",
+            Goods::Dishes { .. } => "Setting",
+        }
+    }
+
+    fn to_json(self) -> Value {
+        match self {
+            Goods::Boxes(boxes) => json!({ "scenario": "boxes", "boxes": boxes }),
+            Goods::Dishes { bowls, forks } => json!({ "scenario": "table", "bowls": bowls, "forks": forks }),
+        }
+    }
+}
+
+impl fmt::Display for Goods {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let many = |number: u32, one: &str, more: &str| match number {
+            1 => format!("1 {one}"),
+            _ => format!("{number} {more}"),
+        };
+        match *self {
+            Goods::Boxes(boxes) => f.write_str(&many(boxes, "box", "boxes")),
+            Goods::Dishes { bowls, forks: 0 } => f.write_str(&many(bowls, "bowl", "bowls")),
+            Goods::Dishes { bowls: 0, forks } => f.write_str(&many(forks, "fork", "forks")),
+            Goods::Dishes { bowls, forks } => {
+                write!(f, "{} and {}", many(bowls, "bowl", "bowls"), many(forks, "fork", "forks"))
+            }
+        }
+    }
 }
 
 fn budget_name(budget: bool) -> &'static str {
@@ -163,7 +247,7 @@ fn merge(into: &mut Value, from: Value) {
     }
 }
 
-/// A row of Table I.
+/// A row of the table.
 #[derive(Debug, Clone, Copy)]
 struct Row {
     hsm_s: Option<f64>,
@@ -194,8 +278,9 @@ impl fmt::Display for Demonstration {
         let planners = self.planners;
         writeln!(
             f,
-            "Fetching {}: seconds of the robot's time (wall time × {}); MP: motion planner processes\n",
-            boxes(self.boxes),
+            "{} {}: seconds of the robot's time (wall time × {}); MP: motion planner processes\n",
+            self.goods.doing(),
+            self.goods,
             self.speed
         )?;
         let columns = (format!("CDTN {planners} MP"), format!("{planners} MP over HSM"));
@@ -206,8 +291,8 @@ impl fmt::Display for Demonstration {
         if self.outcomes.iter().any(|o| !o.plan.budget) {
             self.row(false).write(f, "planning without a budget")?;
         }
-        if let Some((_, hsm, one, two)) = PAPER.into_iter().find(|row| row.0 == self.boxes) {
-            let paper = Row { hsm_s: Some(hsm), cdtn_1mp_s: Some(one), cdtn_nmp_s: (planners == 2).then_some(two) };
+        if let Some((_, hsm, one, two)) = PAPER.into_iter().find(|row| row.0 == self.goods) {
+            let paper = Row { hsm_s: Some(hsm), cdtn_1mp_s: one, cdtn_nmp_s: (planners == 2).then_some(two) };
             paper.write(f, "the paper")?;
         }
         self.write_where_the_time_went(f)?;
@@ -239,7 +324,7 @@ impl Demonstration {
                 s.time.planning_waited_for_s,
                 s.time.idle_s,
                 s.overlap_s,
-                format!("{} of {}", outcome.delivered, self.boxes)
+                format!("{} of {}", outcome.delivered, self.goods.count())
             )?;
         }
         writeln!(f, "  (planning: while nothing moved and nothing was looked at)")
@@ -277,12 +362,20 @@ mod tests {
         let mut timeline = Timeline::of(&[]);
         (timeline.outcome, timeline.end_s) = (end.map(str::to_owned), 50.0);
         let plan = Plan { mode, planners: 2, budget: true };
-        Outcome { plan, timeline, delivered: 1, end: String::new(), log: PathBuf::new(), chart: PathBuf::new() }
+        Outcome {
+            plan,
+            timeline,
+            delivered: 1,
+            greatest_tilt_rad: 0.0,
+            end: String::new(),
+            log: PathBuf::new(),
+            chart: PathBuf::new(),
+        }
     }
 
     #[test]
     fn a_run_that_did_not_succeed_has_no_figure() {
-        let mut shown = Demonstration { boxes: 3, planners: 2, speed: 1.0, seed: 1, outcomes: vec![] };
+        let mut shown = Demonstration { goods: Goods::Boxes(3), planners: 2, speed: 1.0, seed: 1, outcomes: vec![] };
         shown.outcomes = vec![outcome(Mode::Hsm, Some(SUCCESS)), outcome(Mode::Cdtn, Some("preempted"))];
         let json = shown.to_json();
         assert_eq!((&json["hsm_s"], &json["cdtn_2mp_s"]), (&json!(50.0), &Value::Null));
