@@ -317,6 +317,9 @@ pub(crate) struct PlanArguments {
     /// The robot, with collision shapes or spheres
     #[arg(long, value_name = "URDF")]
     pub(crate) robot: PathBuf,
+    /// Where the packages are that the robot's meshes are named by (`package://NAME/...`)
+    #[arg(long, value_name = "DIR")]
+    pub(crate) packages: Vec<PathBuf>,
     /// Which links may touch; without it neighbours, and links that touch in the middle of all limits
     #[arg(long, value_name = "FILE")]
     pub(crate) srdf: Option<PathBuf>,

@@ -157,7 +157,7 @@ pub(crate) fn is_neighbour(robot: &Robot, a: usize, b: usize) -> bool {
 fn part(name: &str, parent: Option<usize>, origin: Pose, drive: Option<Drive>, bodies: Vec<Body>) -> Part {
     let grown = |body: &Body| Body { geometry: body.geometry.grown(ROOM_M), ..*body };
     let spheres = bodies.iter().flat_map(|body| cover_within(&grown(body), REACH_M - ROOM_M)).collect();
-    Part { name: name.to_owned(), parent, origin, drive, bodies, padding_m: ROOM_M, spheres }
+    Part { name: name.to_owned(), parent, origin, drive, bodies, meshes: Vec::new(), padding_m: ROOM_M, spheres }
 }
 
 /// A posture for the vector checks.

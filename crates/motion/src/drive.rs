@@ -85,6 +85,7 @@ impl Vehicle {
             origin: Pose::IDENTITY,
             drive,
             bodies: Vec::new(),
+            meshes: Vec::new(),
             padding_m: 0.0,
             spheres: Vec::new(),
         };

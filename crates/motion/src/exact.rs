@@ -35,7 +35,22 @@ pub struct Exact<'a> {
     mechanism: &'a Mechanism,
     obstacles: Vec<Solid<'a>>,
     /// Per link.
-    bodies: Vec<Vec<(Pose, SharedShape)>>,
+    bodies: Vec<Vec<Shape>>,
+}
+
+/// What a link has: its pose there, its shape, and how near to it is as good as touching, in metres.
+#[derive(Debug)]
+struct Shape {
+    at: Pose,
+    shape: SharedShape,
+    skin: f32,
+}
+
+/// A shape in its place.
+struct Placed<'s> {
+    pose: Pose32,
+    shape: &'s SharedShape,
+    skin: f32,
 }
 
 #[derive(Debug)]
@@ -53,7 +68,9 @@ impl<'a> Exact<'a> {
             Solid { name: &obstacle.name, pose: to_f32(&body.pose), shape: body.geometry.shape(0.0) }
         };
         let bodies = |link: &crate::mechanism::Part| {
-            link.bodies.iter().map(|b| (b.pose, b.geometry.shape(link.padding_m))).collect()
+            let primitives = link.bodies.iter().map(|b| (b.pose, b.geometry.shape(link.padding_m), 0.0));
+            let meshes = link.meshes.iter().map(|m| (m.pose, m.mesh.shape(), link.padding_m as f32));
+            primitives.chain(meshes).map(|(at, shape, skin)| Shape { at, shape, skin }).collect()
         };
         Exact {
             mechanism,
@@ -92,17 +109,17 @@ impl<'a> Exact<'a> {
     /// Shows touches until it hears that no more are wanted.
     fn visit(&self, positions: &[f64], wants_more: &mut dyn FnMut(Touch) -> bool) {
         let poses = self.mechanism.poses(positions);
-        let placed: Vec<Vec<(Pose32, &SharedShape)>> = self
-            .bodies
-            .iter()
-            .zip(&poses)
-            .map(|(bodies, pose)| bodies.iter().map(|(at, shape)| (to_f32(&compose(pose, at)), shape)).collect())
-            .collect();
+        let mut placed: Vec<Vec<Placed<'_>>> = Vec::with_capacity(self.bodies.len());
+        for (shapes, link) in self.bodies.iter().zip(&poses) {
+            let place = |s: &'_ Shape| to_f32(&compose(link, &s.at));
+            placed.push(shapes.iter().map(|s| Placed { pose: place(s), shape: &s.shape, skin: s.skin }).collect());
+        }
         let name = |link: usize| self.mechanism.links[link].name.clone();
         for (link, bodies) in placed.iter().enumerate() {
-            for (pose, shape) in bodies {
+            for body in bodies {
                 for solid in self.obstacles.iter().filter(|o| self.mechanism.is_kept_from(link, o.name)) {
-                    if let Some(depth_m) = depth(pose, shape, &solid.pose, &solid.shape)
+                    let other = Placed { pose: solid.pose, shape: &solid.shape, skin: 0.0 };
+                    if let Some(depth_m) = depth(body, &other)
                         && !wants_more(Touch { link: name(link), other: solid.name.to_owned(), depth_m })
                     {
                         return;
@@ -112,8 +129,8 @@ impl<'a> Exact<'a> {
                     if !self.mechanism.is_checked(link, second) {
                         continue;
                     }
-                    for (at, other) in others {
-                        if let Some(depth_m) = depth(pose, shape, at, other)
+                    for other in others {
+                        if let Some(depth_m) = depth(body, other)
                             && !wants_more(Touch { link: name(link), other: name(second), depth_m })
                         {
                             return;
@@ -142,11 +159,18 @@ impl<'a> Exact<'a> {
 }
 
 /// How deep two shapes are in each other, if they touch; a pair that parry cannot decide counts as touching.
-fn depth(a: &Pose32, first: &SharedShape, b: &Pose32, second: &SharedShape) -> Option<f64> {
-    match query::intersection_test(a, &**first, b, &**second) {
+fn depth(a: &Placed<'_>, b: &Placed<'_>) -> Option<f64> {
+    let skin = a.skin + b.skin;
+    if skin > 0.0 {
+        return match query::contact(&a.pose, &**a.shape, &b.pose, &**b.shape, skin) {
+            Ok(contact) => contact.map(|c| f64::from(skin - c.dist)),
+            Err(_) => Some(0.0),
+        };
+    }
+    match query::intersection_test(&a.pose, &**a.shape, &b.pose, &**b.shape) {
         Ok(found) if !found.intersecting => None,
         Ok(_) => {
-            let contact = query::contact(a, &**first, b, &**second, 0.0).ok().flatten();
+            let contact = query::contact(&a.pose, &**a.shape, &b.pose, &**b.shape, 0.0).ok().flatten();
             Some(contact.map_or(0.0, |c| -f64::from(c.dist)))
         }
         Err(_) => Some(0.0),

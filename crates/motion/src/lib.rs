@@ -18,6 +18,8 @@ pub mod geometry;
 mod halton;
 pub mod line;
 pub mod mechanism;
+pub mod mesh;
+pub mod mesh_files;
 pub mod pace;
 pub mod plan;
 pub mod problems;

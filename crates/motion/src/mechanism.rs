@@ -6,9 +6,10 @@
 
 use crate::frame::compose;
 use crate::geometry::Body;
+use crate::mesh::{MeshError, Meshed};
 use crate::robot::{Joint, jerk};
 use crate::spheres::{self, Sphere};
-use crate::urdf::{self, RobotError};
+use crate::urdf::{self, Loader, RobotError};
 use ratn_model::pose::Pose;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -47,8 +48,10 @@ pub struct Part {
     pub origin: Pose,
     /// The planned joint that moves it.
     pub drive: Option<Drive>,
-    /// What can collide, exactly.
+    /// What can collide, exactly: primitives,
     pub bodies: Vec<Body>,
+    /// and meshes.
+    pub meshes: Vec<Meshed>,
     /// How much larger its bodies are taken, in metres.
     pub padding_m: f64,
     /// Spheres that hold all of it, padding included.
@@ -84,11 +87,26 @@ pub enum MechanismError {
 }
 
 impl Mechanism {
-    /// Reads a robot; `joints` are planned for, without any all that move and follow no other.
+    /// Reads a robot without meshes; `joints` are planned for, without any all that move and follow no other.
     ///
     /// # Errors
     /// [`MechanismError`] names the joint or link that is missing or not supported.
     pub fn read(urdf: &str, srdf: Option<&str>, joints: &[String]) -> Result<Mechanism, MechanismError> {
+        let nowhere = |_: &str| Err(MeshError::Read { reason: "no folder to look in was named".to_owned() });
+        Mechanism::read_with_meshes(urdf, srdf, joints, &mut { nowhere })
+    }
+
+    /// As [`Mechanism::read`]; `load` gives what is in the mesh file that the URDF names so
+    /// ([`MeshFiles::read`](crate::mesh_files::MeshFiles::read)).
+    ///
+    /// # Errors
+    /// [`MechanismError`]; for meshes [`RobotError::Mesh`] names the link and the file.
+    pub fn read_with_meshes(
+        urdf: &str,
+        srdf: Option<&str>,
+        joints: &[String],
+        load: &mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>,
+    ) -> Result<Mechanism, MechanismError> {
         let description = urdf_rs::read_from_string(urdf).map_err(RobotError::Urdf)?;
         let moves = |j: &&urdf_rs::Joint| j.joint_type != urdf_rs::JointType::Fixed && j.mimic.is_none();
         let names: Vec<String> = if joints.is_empty() {
@@ -100,7 +118,7 @@ impl Mechanism {
             return Err(MechanismError::TooMany { count: names.len() });
         }
         let joints = names.iter().map(|name| limits(&description, name)).collect::<Result<Vec<_>, _>>()?;
-        let links = links(&description, &names)?;
+        let links = links(&description, &names, load)?;
         let mut mechanism = Mechanism {
             name: description.name.clone(),
             joints,
@@ -143,6 +161,7 @@ impl Mechanism {
         part.padding_m = padding_m;
         let grown = |body: &Body| Body { geometry: body.geometry.grown(padding_m), ..*body };
         part.spheres = part.bodies.iter().flat_map(|body| spheres::cover(&grown(body))).collect();
+        part.spheres.extend(part.meshes.iter().flat_map(|meshed| meshed.cover(padding_m)));
     }
 
     /// As [`Mechanism::pad`], for all links.
@@ -163,6 +182,7 @@ impl Mechanism {
             origin: Pose::IDENTITY,
             drive: None,
             bodies,
+            meshes: Vec::new(),
             padding_m: 0.0,
             spheres,
         });
@@ -231,7 +251,7 @@ impl Mechanism {
     /// The next link towards the root that has a shape.
     fn solid_parent(&self, link: usize) -> Option<usize> {
         let mut next = self.links[link].parent;
-        while let Some(parent) = next.filter(|p| self.links[*p].bodies.is_empty()) {
+        while let Some(parent) = next.filter(|p| self.links[*p].spheres.is_empty()) {
             next = self.links[parent].parent;
         }
         next
@@ -268,11 +288,11 @@ fn limits(urdf: &urdf_rs::Robot, name: &str) -> Result<Joint, RobotError> {
     Err(RobotError::Unsupported { what: "joint", name: name.to_owned(), reason })
 }
 
-fn links(urdf: &urdf_rs::Robot, names: &[String]) -> Result<Vec<Part>, RobotError> {
+fn links(urdf: &urdf_rs::Robot, names: &[String], load: &mut Loader<'_>) -> Result<Vec<Part>, RobotError> {
     let children: BTreeSet<&str> = urdf.joints.iter().map(|j| j.child.link.as_str()).collect();
     let root = urdf.links.iter().find(|l| !children.contains(l.name.as_str()));
     let root = root.ok_or_else(|| RobotError::Missing { what: "link", name: "without a parent".to_owned() })?;
-    let mut links = vec![part(root, None, Pose::IDENTITY, None)?];
+    let mut links = vec![part(root, None, Pose::IDENTITY, None, load)?];
     let mut next = 0;
     while next < links.len() {
         let parent = links[next].name.clone();
@@ -285,17 +305,23 @@ fn links(urdf: &urdf_rs::Robot, names: &[String]) -> Result<Vec<Part>, RobotErro
                 return Err(RobotError::Unsupported { what: "link", name: name.clone(), reason });
             }
             let (origin, drive) = drive(urdf, joint, names)?;
-            links.push(part(child, Some(next), origin, drive)?);
+            links.push(part(child, Some(next), origin, drive, load)?);
         }
         next += 1;
     }
     Ok(links)
 }
 
-fn part(link: &urdf_rs::Link, parent: Option<usize>, origin: Pose, drive: Option<Drive>) -> Result<Part, RobotError> {
-    let bodies = urdf::bodies(link)?;
-    let spheres = bodies.iter().flat_map(spheres::cover).collect();
-    Ok(Part { name: link.name.clone(), parent, origin, drive, bodies, padding_m: 0.0, spheres })
+fn part(
+    link: &urdf_rs::Link,
+    parent: Option<usize>,
+    origin: Pose,
+    drive: Option<Drive>,
+    load: &mut Loader<'_>,
+) -> Result<Part, RobotError> {
+    let (bodies, meshes) = urdf::shapes(link, load)?;
+    let spheres = bodies.iter().flat_map(spheres::cover).chain(meshes.iter().flat_map(|m| m.cover(0.0))).collect();
+    Ok(Part { name: link.name.clone(), parent, origin, drive, bodies, meshes, padding_m: 0.0, spheres })
 }
 
 /// Where a joint is, and what moves it.

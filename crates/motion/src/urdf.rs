@@ -1,9 +1,11 @@
 //! Reading the robot's description: its links, parents first, and the limits of its degrees of freedom.
 
 use crate::geometry::{Body, Geometry};
+use crate::mesh::{Mesh, MeshError, Meshed};
 use crate::robot::{JOINT_NAMES, Joint, Link, Motion, jerk};
 use ratn_model::pose::Pose;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// A URDF that does not describe this kind of robot.
 #[derive(Debug, thiserror::Error)]
@@ -18,6 +20,17 @@ pub enum RobotError {
         what: &'static str,
         /// Its name.
         name: String,
+    },
+    /// A mesh that cannot be used.
+    #[error("the mesh `{file}` of link `{link}`: {source}")]
+    Mesh {
+        /// The link.
+        link: String,
+        /// As the description names it.
+        file: String,
+        /// What is wrong.
+        #[source]
+        source: MeshError,
     },
     /// Something this model does not support.
     #[error("{what} `{name}` of the robot description is not supported: {reason}")]
@@ -109,25 +122,51 @@ fn motion(joint: &urdf_rs::Joint) -> Result<Motion, RobotError> {
     }
 }
 
-pub(crate) fn bodies(link: &urdf_rs::Link) -> Result<Vec<Body>, RobotError> {
+/// The primitives of a link, of which all its shapes must be.
+fn bodies(link: &urdf_rs::Link) -> Result<Vec<Body>, RobotError> {
     let body = |collision: &urdf_rs::Collision| {
-        let geometry = match &collision.geometry {
-            urdf_rs::Geometry::Box { size } => Geometry::Box { half: size.0.map(|s| s / 2.0) },
-            urdf_rs::Geometry::Cylinder { radius, length } => {
-                Geometry::Cylinder { radius: *radius, half_length: length / 2.0 }
-            }
-            urdf_rs::Geometry::Capsule { radius, length } => {
-                Geometry::Capsule { radius: *radius, half_length: length / 2.0 }
-            }
-            urdf_rs::Geometry::Sphere { radius } => Geometry::Sphere { radius: *radius },
-            urdf_rs::Geometry::Mesh { .. } => {
-                let reason = "collision shapes are primitives, not meshes";
-                return Err(RobotError::Unsupported { what: "link", name: link.name.clone(), reason });
-            }
-        };
-        Ok(geometry.at(origin(&collision.origin)))
+        let reason = "collision shapes are primitives, not meshes";
+        let unsupported = || RobotError::Unsupported { what: "link", name: link.name.clone(), reason };
+        primitive(&collision.geometry).map(|geometry| geometry.at(origin(&collision.origin))).ok_or_else(unsupported)
     };
     link.collision.iter().map(body).collect()
+}
+
+/// The primitives and the meshes of a link; `load` gives what is in the file of a name.
+pub(crate) fn shapes(link: &urdf_rs::Link, load: &mut Loader<'_>) -> Result<(Vec<Body>, Vec<Meshed>), RobotError> {
+    let (mut bodies, mut meshes) = (Vec::new(), Vec::new());
+    for collision in &link.collision {
+        let pose = origin(&collision.origin);
+        if let Some(geometry) = primitive(&collision.geometry) {
+            bodies.push(geometry.at(pose));
+        } else if let urdf_rs::Geometry::Mesh { filename, scale } = &collision.geometry {
+            let failed = |source| RobotError::Mesh { link: link.name.clone(), file: filename.clone(), source };
+            if !filename.to_ascii_lowercase().ends_with(".stl") {
+                return Err(failed(MeshError::NotStl));
+            }
+            let scale = scale.map_or([1.0; 3], |scale| scale.0);
+            let mesh = load(filename).and_then(|bytes| Mesh::stl(&bytes, scale)).map_err(failed)?;
+            meshes.push(Meshed { pose, mesh: Arc::new(mesh) });
+        }
+    }
+    Ok((bodies, meshes))
+}
+
+/// What is in a mesh file.
+pub(crate) type Loader<'l> = dyn FnMut(&str) -> Result<Vec<u8>, MeshError> + 'l;
+
+fn primitive(geometry: &urdf_rs::Geometry) -> Option<Geometry> {
+    Some(match geometry {
+        urdf_rs::Geometry::Box { size } => Geometry::Box { half: size.0.map(|s| s / 2.0) },
+        urdf_rs::Geometry::Cylinder { radius, length } => {
+            Geometry::Cylinder { radius: *radius, half_length: length / 2.0 }
+        }
+        urdf_rs::Geometry::Capsule { radius, length } => {
+            Geometry::Capsule { radius: *radius, half_length: length / 2.0 }
+        }
+        urdf_rs::Geometry::Sphere { radius } => Geometry::Sphere { radius: *radius },
+        urdf_rs::Geometry::Mesh { .. } => return None,
+    })
 }
 
 pub(crate) fn origin(pose: &urdf_rs::Pose) -> Pose {

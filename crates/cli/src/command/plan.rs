@@ -5,6 +5,7 @@ use crate::failure::Failure;
 use crate::{input, output};
 use ratn_motion::connect::{Budget, ConnectError};
 use ratn_motion::mechanism::Mechanism;
+use ratn_motion::mesh_files::MeshFiles;
 use ratn_motion::problems::Problems;
 use ratn_motion::trial::{self, Settings, Trial};
 use serde::Serialize;
@@ -58,8 +59,11 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     let srdf = arguments.srdf.as_deref().map(read).transpose()?;
     let problems =
         Problems::parse(&read(&arguments.problems)?).map_err(|error| refused(&arguments.problems, &error))?;
-    let mut mechanism =
-        Mechanism::read(&urdf, srdf.as_deref(), &problems.joints).map_err(|error| refused(&arguments.robot, &error))?;
+    let beside = arguments.robot.parent().unwrap_or(Path::new("")).to_owned();
+    let meshes = MeshFiles { beside, packages: arguments.packages.clone() };
+    let mut load = |name: &str| meshes.read(name);
+    let mut mechanism = Mechanism::read_with_meshes(&urdf, srdf.as_deref(), &problems.joints, &mut load)
+        .map_err(|error| refused(&arguments.robot, &error))?;
     mechanism.pad_all(arguments.padding_mm * 1e-3);
     let settings = Settings {
         budget: Budget { iterations: arguments.iterations, seed: arguments.seed },

@@ -49,6 +49,8 @@ enum Kind {
     Avx512,
     #[cfg(target_arch = "x86_64")]
     Avx2,
+    #[cfg(target_arch = "aarch64")]
+    Neon,
     Plain,
 }
 
@@ -70,6 +72,10 @@ impl Isa {
                 all.push(Isa(Kind::Avx2));
             }
         }
+        #[cfg(target_arch = "aarch64")]
+        if std::arch::is_aarch64_feature_detected!("neon") {
+            all.push(Isa(Kind::Neon));
+        }
         all.push(Isa(Kind::Plain));
         all
     }
@@ -81,6 +87,8 @@ impl Isa {
             Kind::Avx512 => 16,
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => 8,
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => 8,
             Kind::Plain => 8,
         }
     }
@@ -95,6 +103,9 @@ impl Isa {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { is_free_avx2(edge, scratch) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => unsafe { is_free_neon(edge, scratch) },
             Kind::Plain => kernel::is_free::<[f32; 8]>(edge, scratch),
         }
     }
@@ -109,6 +120,9 @@ impl Isa {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { touching_avx2(edge, scratch) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => unsafe { touching_neon(edge, scratch) },
             Kind::Plain => kernel::touching::<[f32; 8], true>(edge, 0, scratch),
         }
     }
@@ -153,6 +167,18 @@ fn touching_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
 #[target_feature(enable = "avx512f,avx2")]
 fn nearest_avx512(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> (usize, f32) {
     nearest::nearest(blocks, dimensions, count, to)
+}
+
+#[cfg(target_arch = "aarch64")]
+#[target_feature(enable = "neon")]
+fn is_free_neon(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
+    kernel::is_free::<arm::Pair>(edge, scratch)
+}
+
+#[cfg(target_arch = "aarch64")]
+#[target_feature(enable = "neon")]
+fn touching_neon(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
+    kernel::touching::<arm::Pair, true>(edge, 0, scratch)
 }
 
 impl Lanes for [f32; 8] {
@@ -321,6 +347,78 @@ mod x86 {
         #[inline(always)]
         fn abs(self) -> Self {
             Wide8(unsafe { _mm256_andnot_ps(_mm256_set1_ps(-0.0), self.0) })
+        }
+    }
+}
+
+#[cfg(target_arch = "aarch64")]
+mod arm {
+    //! SAFETY of every block here: as for the other processors, see above; the second four numbers of a block follow the first.
+
+    use super::{Block, Lanes};
+    use core::arch::aarch64::*;
+
+    /// Eight numbers in two registers.
+    #[derive(Clone, Copy)]
+    pub(super) struct Pair(float32x4_t, float32x4_t);
+
+    impl Lanes for Pair {
+        const WIDTH: usize = 8;
+        #[inline(always)]
+        fn splat(value: f32) -> Self {
+            let four = unsafe { vdupq_n_f32(value) };
+            Pair(four, four)
+        }
+        #[inline(always)]
+        fn load(block: &Block) -> Self {
+            let first = block.0.as_ptr();
+            Pair(unsafe { vld1q_f32(first) }, unsafe { vld1q_f32(first.add(4)) })
+        }
+        #[inline(always)]
+        fn store(self, block: &mut Block) {
+            let first = block.0.as_mut_ptr();
+            unsafe { vst1q_f32(first, self.0) };
+            unsafe { vst1q_f32(first.add(4), self.1) };
+        }
+        #[inline(always)]
+        fn add(self, other: Self) -> Self {
+            Pair(unsafe { vaddq_f32(self.0, other.0) }, unsafe { vaddq_f32(self.1, other.1) })
+        }
+        #[inline(always)]
+        fn sub(self, other: Self) -> Self {
+            Pair(unsafe { vsubq_f32(self.0, other.0) }, unsafe { vsubq_f32(self.1, other.1) })
+        }
+        #[inline(always)]
+        fn mul(self, other: Self) -> Self {
+            Pair(unsafe { vmulq_f32(self.0, other.0) }, unsafe { vmulq_f32(self.1, other.1) })
+        }
+        #[inline(always)]
+        fn mul_add(self, factor: Self, term: Self) -> Self {
+            let low = unsafe { vfmaq_f32(term.0, self.0, factor.0) };
+            Pair(low, unsafe { vfmaq_f32(term.1, self.1, factor.1) })
+        }
+        #[inline(always)]
+        fn max(self, other: Self) -> Self {
+            Pair(unsafe { vmaxq_f32(self.0, other.0) }, unsafe { vmaxq_f32(self.1, other.1) })
+        }
+        #[inline(always)]
+        fn sqrt(self) -> Self {
+            Pair(unsafe { vsqrtq_f32(self.0) }, unsafe { vsqrtq_f32(self.1) })
+        }
+        #[inline(always)]
+        fn below(self, other: Self) -> u32 {
+            let worth: [u32; 8] = [1, 2, 4, 8, 16, 32, 64, 128];
+            let low = unsafe { vandq_u32(vcltq_f32(self.0, other.0), vld1q_u32(worth.as_ptr())) };
+            let high = unsafe { vandq_u32(vcltq_f32(self.1, other.1), vld1q_u32(worth.as_ptr().add(4))) };
+            unsafe { vaddvq_u32(vorrq_u32(low, high)) }
+        }
+        #[inline(always)]
+        fn peak(self) -> f32 {
+            unsafe { vmaxvq_f32(vmaxq_f32(self.0, self.1)) }
+        }
+        #[inline(always)]
+        fn abs(self) -> Self {
+            Pair(unsafe { vabsq_f32(self.0) }, unsafe { vabsq_f32(self.1) })
         }
     }
 }

@@ -1,0 +1,287 @@
+//! Triangle meshes as collision shapes: read from STL, binary or text, and held by spheres.
+//!
+//! For the cover the mesh is put into a grid; the cells that the surface passes through and those that it closes in get a sphere
+//! around each. So everything of the mesh is in a sphere by construction, its inside too where it is closed. Files are found and
+//! read by `mesh_files` or by whoever uses the crate.
+
+use crate::spheres::Sphere;
+use parry3d::math::Vector;
+use parry3d::shape::SharedShape;
+use ratn_model::pose::Pose;
+use std::sync::Arc;
+
+/// Triangles of a mesh at the most.
+pub const MAX_TRIANGLES: usize = 1_000_000;
+
+/// Spheres that hold one mesh at the most, and cells along its longest edge in the first, finest grid.
+const MAX_SPHERES: usize = 96;
+const FINEST: usize = 24;
+
+/// Bytes before the triangles of a binary STL, and of each of them.
+const HEADER: usize = 84;
+const RECORD: usize = 50;
+
+/// Surfaces that lie between two cells belong to both, in cells.
+const SKIN: f64 = 1e-6;
+
+/// Why there is no mesh.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum MeshError {
+    /// Of another kind.
+    #[error("only STL meshes are supported; convert it")]
+    NotStl,
+    /// It ends too early, or has no triangles, or too many.
+    #[error("{triangles} triangles announced, {bytes} bytes there: expected 1 to {MAX_TRIANGLES} whole triangles")]
+    Triangles {
+        /// As the file says.
+        triangles: usize,
+        /// How long the file is.
+        bytes: usize,
+    },
+    /// A text that is no STL.
+    #[error("line {line} is no vertex of three numbers, or comes too early or too late for a triangle")]
+    Line {
+        /// Counted from 1.
+        line: usize,
+    },
+    /// Not finite.
+    #[error("a corner of triangle {triangle} is not finite, or it is beyond a kilometre")]
+    NotFinite {
+        /// Counted from 0.
+        triangle: usize,
+    },
+    /// It cannot be read.
+    #[error("cannot be read: {reason}")]
+    Read {
+        /// Why not.
+        reason: String,
+    },
+}
+
+/// Triangles, in metres.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mesh {
+    triangles: Vec<[[f64; 3]; 3]>,
+}
+
+/// A mesh fixed to a link.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Meshed {
+    /// In the link's frame.
+    pub pose: Pose,
+    /// What it is.
+    pub mesh: Arc<Mesh>,
+}
+
+impl Mesh {
+    /// Reads an STL; its numbers are multiplied by `scale` along x, y, z to be metres.
+    ///
+    /// # Errors
+    /// [`MeshError`] says what is wrong with it.
+    pub fn stl(bytes: &[u8], scale: [f64; 3]) -> Result<Mesh, MeshError> {
+        let announced = bytes.get(HEADER - 4..HEADER).and_then(|b| b.try_into().ok()).map(u32::from_le_bytes);
+        let count = announced.map_or(0, |count| count as usize);
+        // A binary header may begin with `solid`, the length decides.
+        let is_binary = announced.is_some() && bytes.len() == HEADER.saturating_add(count.saturating_mul(RECORD));
+        let mut triangles = match std::str::from_utf8(bytes) {
+            _ if is_binary => bytes[HEADER..].chunks_exact(RECORD).map(record).collect(),
+            Ok(text) if text.trim_start().starts_with("solid") => lines(text)?,
+            _ => return Err(MeshError::Triangles { triangles: count, bytes: bytes.len() }),
+        };
+        if triangles.is_empty() || triangles.len() > MAX_TRIANGLES {
+            return Err(MeshError::Triangles { triangles: triangles.len(), bytes: bytes.len() });
+        }
+        for (index, triangle) in triangles.iter_mut().enumerate() {
+            for corner in triangle {
+                *corner = std::array::from_fn(|i| corner[i] * scale[i]);
+                if corner.iter().any(|c| c.is_nan() || c.abs() > 1e3) {
+                    return Err(MeshError::NotFinite { triangle: index });
+                }
+            }
+        }
+        Ok(Mesh { triangles })
+    }
+
+    /// Corners of the triangles.
+    pub fn triangles(&self) -> &[[[f64; 3]; 3]] {
+        &self.triangles
+    }
+
+    /// The shape for parry3d: the surface.
+    pub(crate) fn shape(&self) -> SharedShape {
+        let corners = self.triangles.iter().flatten().map(|[x, y, z]| Vector::new(*x as f32, *y as f32, *z as f32));
+        let indices = (0..self.triangles.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
+        let ball = || SharedShape::ball(0.0);
+        // It refuses meshes without triangles only, and there are none.
+        SharedShape::trimesh(corners.collect(), indices).unwrap_or_else(|_| ball())
+    }
+
+    /// Spheres that hold it, `padding` metres larger.
+    pub fn cover(&self, padding: f64) -> Vec<Sphere> {
+        let mut cells = FINEST;
+        loop {
+            let grid = Grid::new(self, cells);
+            let spheres = grid.spheres(padding);
+            if spheres.len() <= MAX_SPHERES || cells == 1 {
+                return spheres;
+            }
+            cells = cells * 4 / 5;
+        }
+    }
+}
+
+impl Meshed {
+    /// Spheres, in the link's frame, that hold it and `padding` metres around.
+    pub fn cover(&self, padding: f64) -> Vec<Sphere> {
+        let spheres = self.mesh.cover(padding).into_iter();
+        spheres.map(|s| Sphere { centre: self.pose.transform(s.centre), ..s }).collect()
+    }
+}
+
+fn record(bytes: &[u8]) -> [[f64; 3]; 3] {
+    // After the normal.
+    let number = |i: usize| -> f64 {
+        let at = 12 + 4 * i;
+        f64::from(f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]))
+    };
+    std::array::from_fn(|corner| std::array::from_fn(|i| number(3 * corner + i)))
+}
+
+fn lines(text: &str) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
+    let (mut triangles, mut corners) = (Vec::new(), Vec::new());
+    for (index, line) in text.lines().enumerate() {
+        let wrong = MeshError::Line { line: index + 1 };
+        let mut words = line.split_whitespace();
+        match words.next() {
+            Some("vertex") => {
+                let numbers: Vec<f64> = words.map_while(|word| word.parse().ok()).collect();
+                corners.push(<[f64; 3]>::try_from(numbers).map_err(|_| wrong)?);
+            }
+            Some("endfacet") => {
+                let triangle = <[[f64; 3]; 3]>::try_from(std::mem::take(&mut corners)).map_err(|_| wrong)?;
+                triangles.push(triangle);
+            }
+            _ => {}
+        }
+    }
+    Ok(triangles)
+}
+
+/// Cells over the box that holds a mesh.
+struct Grid {
+    least: [f64; 3],
+    cell: [f64; 3],
+    counts: [usize; 3],
+    taken: Vec<bool>,
+}
+
+impl Grid {
+    /// With so many cells along the longest edge.
+    fn new(mesh: &Mesh, longest: usize) -> Grid {
+        let corners = || mesh.triangles.iter().flatten();
+        let least: [f64; 3] = std::array::from_fn(|i| corners().map(|c| c[i]).fold(f64::INFINITY, f64::min));
+        let greatest: [f64; 3] = std::array::from_fn(|i| corners().map(|c| c[i]).fold(f64::NEG_INFINITY, f64::max));
+        let extents: [f64; 3] = std::array::from_fn(|i| greatest[i] - least[i]);
+        let wanted = extents.into_iter().fold(1e-9, f64::max) / longest as f64;
+        let counts = extents.map(|extent| ((extent / wanted).ceil() as usize).clamp(1, longest));
+        let cell = std::array::from_fn(|i| (extents[i] / counts[i] as f64).max(1e-9));
+        let mut grid = Grid { least, cell, counts, taken: vec![false; counts.iter().product()] };
+        for triangle in &mesh.triangles {
+            let polygon = triangle.iter().map(|c| std::array::from_fn(|i| (c[i] - least[i]) / cell[i])).collect();
+            grid.take(polygon, 0, [0; 3]);
+        }
+        grid.fill();
+        grid
+    }
+
+    fn index(&self, [x, y, z]: [usize; 3]) -> usize {
+        (x * self.counts[1] + y) * self.counts[2] + z
+    }
+
+    /// Marks the cells of a polygon, in cells, slab by slab along one axis after the other.
+    fn take(&mut self, polygon: Vec<[f64; 3]>, axis: usize, at: [usize; 3]) {
+        if polygon.is_empty() {
+            return;
+        }
+        if axis == 3 {
+            let index = self.index(at);
+            self.taken[index] = true;
+            return;
+        }
+        let least = polygon.iter().map(|c| c[axis]).fold(f64::INFINITY, f64::min);
+        let greatest = polygon.iter().map(|c| c[axis]).fold(f64::NEG_INFINITY, f64::max);
+        let last = self.counts[axis] - 1;
+        let first = ((least - SKIN).floor().max(0.0) as usize).min(last);
+        for slab in first..=((greatest + SKIN).floor().max(0.0) as usize).min(last) {
+            let mut at = at;
+            at[axis] = slab;
+            let (low, high) = (slab as f64 - SKIN, (slab + 1) as f64 + SKIN);
+            self.take(cut(&cut(&polygon, axis, low, 1.0), axis, high, -1.0), axis + 1, at);
+        }
+    }
+
+    /// Marks what the surface closes in: all that cannot be reached from outside.
+    fn fill(&mut self) {
+        let mut outside = vec![false; self.taken.len()];
+        let mut open = Vec::new();
+        for index in 0..self.taken.len() {
+            let at = self.place(index);
+            if (0..3).any(|i| at[i] == 0 || at[i] + 1 == self.counts[i]) {
+                open.push(at);
+            }
+        }
+        while let Some(at) = open.pop() {
+            let index = self.index(at);
+            if self.taken[index] || outside[index] {
+                continue;
+            }
+            outside[index] = true;
+            for axis in 0..3 {
+                let mut beside = at;
+                if at[axis] > 0 {
+                    beside[axis] = at[axis] - 1;
+                    open.push(beside);
+                }
+                if at[axis] + 1 < self.counts[axis] {
+                    beside[axis] = at[axis] + 1;
+                    open.push(beside);
+                }
+            }
+        }
+        self.taken = outside.into_iter().map(|outside| !outside).collect();
+    }
+
+    fn place(&self, index: usize) -> [usize; 3] {
+        let [_, y, z] = self.counts;
+        [index / (y * z), index / z % y, index % z]
+    }
+
+    fn spheres(&self, padding: f64) -> Vec<Sphere> {
+        // A little for the surfaces that lie between two cells.
+        let radius = self.cell.iter().map(|c| (c * (0.5 + SKIN)).powi(2)).sum::<f64>().sqrt() + padding.max(0.0);
+        let sphere = |index| {
+            let at = self.place(index);
+            let centre = std::array::from_fn(|i| self.least[i] + (at[i] as f64 + 0.5) * self.cell[i]);
+            Sphere { centre, radius }
+        };
+        (0..self.taken.len()).filter(|index| self.taken[*index]).map(sphere).collect()
+    }
+}
+
+/// The part of a polygon on one side of a plane (Sutherland and Hodgman, CACM 1974).
+fn cut(polygon: &[[f64; 3]], axis: usize, at: f64, side: f64) -> Vec<[f64; 3]> {
+    let beyond = |corner: &[f64; 3]| (corner[axis] - at) * side;
+    let mut kept = Vec::with_capacity(polygon.len() + 1);
+    for (i, corner) in polygon.iter().enumerate() {
+        let next = &polygon[(i + 1) % polygon.len()];
+        let (here, there) = (beyond(corner), beyond(next));
+        if here >= 0.0 {
+            kept.push(*corner);
+        }
+        if (here > 0.0 && there < 0.0) || (here < 0.0 && there > 0.0) {
+            let share = here / (here - there);
+            kept.push(std::array::from_fn(|j| corner[j] + (next[j] - corner[j]) * share));
+        }
+    }
+    kept
+}

@@ -1,0 +1,69 @@
+//! Where the mesh files are that a URDF names: `package://NAME/rest` below a root of packages, `file:///path`, and paths from the
+//! folder of the URDF.
+
+use crate::mesh::MeshError;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// Longest file of a mesh, in bytes.
+const MAX_FILE: u64 = 64 << 20;
+
+/// Folders to look in.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct MeshFiles {
+    /// The folder of the URDF.
+    pub beside: PathBuf,
+    /// Folders that hold packages, or are one.
+    pub packages: Vec<PathBuf>,
+}
+
+impl MeshFiles {
+    /// The file that a URDF names so.
+    ///
+    /// # Errors
+    /// [`MeshError::Read`] says where it was looked for.
+    pub fn path(&self, name: &str) -> Result<PathBuf, MeshError> {
+        let places: Vec<PathBuf> = if let Some(rest) = name.strip_prefix("package://") {
+            let (package, inside) = rest.split_once('/').unwrap_or((rest, ""));
+            let place = |root: &PathBuf| {
+                let is_package = root.file_name().is_some_and(|folder| folder == package);
+                if is_package { root.join(inside) } else { root.join(package).join(inside) }
+            };
+            self.packages.iter().map(place).collect()
+        } else if let Some(path) = name.strip_prefix("file://") {
+            vec![PathBuf::from(path)]
+        } else if let Some((kind, _)) = name.split_once("://") {
+            return Err(MeshError::Read { reason: format!("`{kind}:` is neither `package:` nor `file:`") });
+        } else {
+            vec![self.beside.join(name)]
+        };
+        places.iter().find(|place| place.is_file()).cloned().ok_or_else(|| {
+            let all: Vec<String> = places.iter().map(|place| place.display().to_string()).collect();
+            let reason = match all.is_empty() {
+                true => "no folder with packages was named".to_owned(),
+                false => format!("no file at {}", all.join(" or ")),
+            };
+            MeshError::Read { reason }
+        })
+    }
+
+    /// What is in the file that a URDF names so.
+    ///
+    /// # Errors
+    /// [`MeshError::Read`] says what is in the way.
+    pub fn read(&self, name: &str) -> Result<Vec<u8>, MeshError> {
+        let path = self.path(name)?;
+        let failed = |reason: String| MeshError::Read { reason: format!("{}: {reason}", path.display()) };
+        read_up_to(&path).map_err(|error| failed(error.to_string())).and_then(|bytes| {
+            let fits = bytes.len() as u64 <= MAX_FILE;
+            if fits { Ok(bytes) } else { Err(failed(format!("longer than {MAX_FILE} bytes"))) }
+        })
+    }
+}
+
+fn read_up_to(path: &Path) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    File::open(path)?.take(MAX_FILE + 1).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
