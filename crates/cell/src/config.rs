@@ -63,6 +63,8 @@ pub struct CellConfig {
     pub record: Option<PathBuf>,
     /// What goes wrong: `grasp_slips:2` at the second grasp, `object_moved@12.5` at a time, `sensor_dropout~0.05` by chance.
     pub faults: Vec<Fault>,
+    /// What drives arm and base along their trajectories.
+    pub controllers: ControllersConfig,
     /// The gripper.
     pub gripper: GripperConfig,
     /// The pan-tilt unit.
@@ -71,6 +73,20 @@ pub struct CellConfig {
     pub camera: CameraConfig,
     /// The battery.
     pub battery: BatteryConfig,
+}
+
+/// What drives arm and base along their trajectories. The stiffer, the less they lag.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ControllersConfig {
+    /// Of the arm's joints, in radians per second.
+    pub arm_stiffness: f64,
+    /// How far one of them may be from its trajectory, in radians: then the motion is aborted.
+    pub arm_most_off_rad: f64,
+    /// Of the base, in radians per second.
+    pub base_stiffness: f64,
+    /// How far it may be from its trajectory, in metres and in radians.
+    pub base_most_off: f64,
 }
 
 /// The gripper.
@@ -196,6 +212,30 @@ impl CellConfig {
                 "500 to 600000",
             ),
             (
+                "controllers.arm_stiffness",
+                self.controllers.arm_stiffness,
+                (2.0..=100.0).contains(&self.controllers.arm_stiffness),
+                "2 to 100",
+            ),
+            (
+                "controllers.base_stiffness",
+                self.controllers.base_stiffness,
+                (2.0..=100.0).contains(&self.controllers.base_stiffness),
+                "2 to 100",
+            ),
+            (
+                "controllers.arm_most_off_rad",
+                self.controllers.arm_most_off_rad,
+                (0.02..=1.0).contains(&self.controllers.arm_most_off_rad),
+                "0.02 to 1",
+            ),
+            (
+                "controllers.base_most_off",
+                self.controllers.base_most_off,
+                (0.03..=1.0).contains(&self.controllers.base_most_off),
+                "0.03 to 1",
+            ),
+            (
                 "gripper.opening_m",
                 self.gripper.opening_m,
                 (0.02..=0.11).contains(&self.gripper.opening_m),
@@ -276,11 +316,18 @@ impl Default for CellConfig {
             session_ttl_ms: 3000,
             record: None,
             faults: Vec::new(),
+            controllers: ControllersConfig::default(),
             gripper: GripperConfig::default(),
             pan_tilt: PanTiltConfig::default(),
             camera: CameraConfig::default(),
             battery: BatteryConfig::default(),
         }
+    }
+}
+
+impl Default for ControllersConfig {
+    fn default() -> ControllersConfig {
+        ControllersConfig { arm_stiffness: 60.0, arm_most_off_rad: 0.05, base_stiffness: 15.0, base_most_off: 0.05 }
     }
 }
 

@@ -69,7 +69,10 @@ fn a_box_on_the_deck_rides_round_the_table_and_is_still_delivered() {
     let before = load(&mut bench);
     let (battery, start) = (bench.cell.battery(), bench.now);
     let request = drive(&bench, BEHIND);
-    let Product::Driven { end } = bench.done(request) else { panic!() };
+    let Product::Driven { end, tracking } = bench.done(request) else { panic!() };
+    println!("{tracking:?}");
+    assert!(tracking.most_m > 1e-4 && tracking.most_m < 0.01 && tracking.most_rad > 1e-5 && tracking.most_rad < 0.01);
+    assert!(tracking.rms_m < tracking.most_m && tracking.rms_rad < tracking.most_rad);
     assert!(off(&bench, BEHIND) < 1e-3 && end == bench.cell.base_pose());
     assert_eq!(bench.done(Request::SenseBase), Product::BaseSensed { pose: end });
     let drained = (battery - bench.cell.battery()) * 3600.0 / bench.now.since(start).as_secs_f64();
@@ -158,7 +161,7 @@ fn a_base_whose_lease_ends_holds_where_it_is_as_at_an_emergency_stop() {
             false => matches!(ending, Ending::Stopped(r) if r == "a person"),
         };
         assert!(
-            matches!(&commands[..], [Command::Ended { ticket: t, ending }] if *t == ticket && ended(ending)),
+            matches!(&commands[..], [Command::Ended { ticket: t, ending, .. }] if *t == ticket && ended(ending)),
             "{commands:?}"
         );
         let held = bench.cell.base_pose();

@@ -2,9 +2,10 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic and print")]
 
-use ratn_cell::config::Goods;
+use ratn_cell::config::{CellConfig, ControllersConfig, Goods};
 use ratn_cell::core::picture::develop;
-use ratn_cell::core::protocol::{Command, Ending, Event, Module, Product, Request};
+use ratn_cell::core::protocol::{Command, Ending, Event, Module, Product, Request, Ticket};
+use ratn_cell::core::recording::Line;
 use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::value::{Trajectory, TrajectoryPoint};
@@ -121,7 +122,7 @@ fn an_arm_whose_lease_ends_in_mid_motion_is_held_where_it_was() {
     let ended = Event::LeaseEnded { lease: LeaseId(5), reason: "session expired".to_owned() };
     let commands = bench.cell.handle(bench.now, ended);
     assert!(
-        matches!(&commands[..], [Command::Ended { ticket: t, ending: Ending::Aborted(reason) }]
+        matches!(&commands[..], [Command::Ended { ticket: t, ending: Ending::Aborted(reason), .. }]
             if *t == ticket && reason.contains("session expired")),
         "{commands:?}"
     );
@@ -139,11 +140,14 @@ fn a_stopped_motion_is_preempted_and_a_second_goal_for_a_busy_module_refused() {
     let (ticket, _) = bench.start(None, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
     bench.pass(1.0);
     let (second, refused) = bench.start(None, Request::MoveTo { joints: aimm::HOME, speed: 0.3 });
-    assert!(matches!(&refused[..], [Command::Ended { ticket, ending: Ending::Aborted(_) }] if *ticket == second));
+    assert!(matches!(&refused[..], [Command::Ended { ticket, ending: Ending::Aborted(_), .. }] if *ticket == second));
     let (_, refused) = bench.start(None, grasp());
     assert!(matches!(&refused[..], [Command::Ended { ending: Ending::Aborted(r), .. }] if r.contains("Arm")));
     let stopped = bench.cell.handle(bench.now, Event::Stop { ticket, reason: "cancelled".to_owned() });
-    assert_eq!(stopped, vec![Command::Ended { ticket, ending: Ending::Preempted("cancelled".to_owned()) }]);
+    let [Command::Ended { ticket: ended, ending: Ending::Preempted(reason), tracking: Some(_) }] = &stopped[..] else {
+        panic!("{stopped:?}")
+    };
+    assert_eq!((*ended, reason.as_str()), (ticket, "cancelled"));
 }
 
 #[test]
@@ -357,7 +361,7 @@ fn a_held_motion_stands_still_and_then_takes_the_rest_of_its_time() {
         ended.extend(bench.cell.handle(wake, Event::Tick));
     }
     let done = |ticket| {
-        let is = |command: &&Command| matches!(command, Command::Ended { ticket: of, ending: Ending::Done(_) } if *of == ticket);
+        let is = |command: &&Command| matches!(command, Command::Ended { ticket: of, ending: Ending::Done(_), .. } if *of == ticket);
         ended.iter().filter(is).count() == 1
     };
     assert!(done(ticket) && bench.arm() == aimm::OBSERVATION, "{ended:?}");
@@ -371,16 +375,53 @@ fn an_emergency_stop_ends_whatever_moves_and_whatever_is_begun_until_it_is_clear
     let (head, _) = bench.start(None, Request::LookAt { target: [0.8, 0.0, 0.7] });
     bench.pass(0.2);
     let stop = SafetyState::Stopped { reason: "a hand".to_owned() };
-    let stopped = |ticket| Command::Ended { ticket, ending: Ending::Stopped("a hand".to_owned()) };
-    assert_eq!(safety(&mut bench, stop.clone()), [stopped(arm), stopped(head)]);
+    let stopped = |commands: &[Command]| -> Vec<Ticket> {
+        let by_hand = |command: &Command| match command {
+            Command::Ended { ticket, ending: Ending::Stopped(reason), .. } if reason == "a hand" => *ticket,
+            other => panic!("{other:?}"),
+        };
+        commands.iter().map(by_hand).collect()
+    };
+    assert_eq!(stopped(&safety(&mut bench, stop.clone())), [arm, head]);
     let here = bench.arm();
     assert!(bench.pass(60.0).is_empty() && bench.arm() == here);
     assert!(safety(&mut bench, stop).is_empty());
     let (late, refused) = bench.start(None, Request::Release);
-    assert_eq!(refused, [stopped(late)]);
+    assert_eq!(stopped(&refused), [late]);
 
     // What was stopped does not go on by itself.
     safety(&mut bench, SafetyState::Ready);
     assert!(bench.pass(60.0).is_empty() && bench.arm() == here);
     bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 });
+}
+
+#[test]
+fn a_motion_lags_a_little_and_settles_and_a_weak_controller_gives_up_with_the_reason() {
+    let mut bench = Bench::new(1, 7);
+    let request = Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 };
+    let Product::Moved { end, tracking } = bench.done(request.clone()) else { panic!() };
+    println!("{tracking:?}");
+    assert_eq!(end, aimm::OBSERVATION, "it stands where it should");
+    assert!(
+        tracking.most_rad > 1e-5 && tracking.most_rad < 0.005 && tracking.rms_rad < tracking.most_rad,
+        "{tracking:?}"
+    );
+    assert_eq!((tracking.most_m, tracking.rms_m), (0.0, 0.0));
+    let ended = bench.lines.iter().find_map(|line| match line {
+        Line::Ended { tracking, .. } => *tracking,
+        _ => None,
+    });
+    assert_eq!(ended, Some(tracking), "and it is in the recording");
+
+    let controllers = ControllersConfig { arm_stiffness: 4.0, ..ControllersConfig::default() };
+    let mut weak = Bench::of(CellConfig { boxes: 1, seed: 7, controllers, ..CellConfig::default() });
+    let (ticket, _) = weak.start(None, request);
+    let commands = weak.pass(60.0);
+    let [Command::Ended { ticket: ended, ending: Ending::Aborted(reason), tracking: Some(tracking) }] = &commands[..]
+    else {
+        panic!("{commands:?}")
+    };
+    assert!(*ended == ticket && reason.contains("rad from its trajectory, 0.05 rad are allowed"), "{reason}");
+    assert!(tracking.most_rad > 0.05 && tracking.most_rad < 0.06, "{tracking:?}");
+    assert!(distance(&weak.arm(), &aimm::HOME) > 0.01 && distance(&weak.arm(), &aimm::OBSERVATION) > 0.1);
 }

@@ -45,10 +45,8 @@ impl TimedProviders {
                 ]
             }
             ("path_planner", "plan") => plan(goal),
-            ("arm", "follow") => vec![("end", Value::Joints(end_of(goal.inputs.get("trajectory"))))],
-            ("arm", "move_to") => {
-                vec![("end", goal.inputs.get("joints").cloned().unwrap_or(Value::Joints(vec![0.0; 7])))]
-            }
+            ("arm", "follow") => followed(Value::Joints(end_of(goal.inputs.get("trajectory")))),
+            ("arm", "move_to") => followed(goal.inputs.get("joints").cloned().unwrap_or(Value::Joints(vec![0.0; 7]))),
             ("pan_tilt", "look_at") => vec![("pan", Value::Float(0.0)), ("tilt", Value::Float(0.5))],
             ("gripper", "grasp") => vec![("width_m", Value::Float(0.08))],
             _ => Vec::new(),
@@ -101,6 +99,11 @@ fn plan(goal: &Goal) -> Vec<(&'static str, Value)> {
         ("planning_s", Value::Float(goal.expected_s.unwrap_or(UNDECLARED_S))),
         ("iterations", Value::Int(1)),
     ]
+}
+
+/// Exactly along the trajectory to its end.
+fn followed(end: Value) -> Vec<(&'static str, Value)> {
+    vec![("end", end), ("tracking_max_rad", Value::Float(0.0)), ("tracking_rms_rad", Value::Float(0.0))]
 }
 
 fn end_of(trajectory: Option<&Value>) -> Vec<f64> {

@@ -1,6 +1,6 @@
 //! What a module is doing, and where that has brought it at a moment.
 
-use super::motion::Motion;
+use super::motion::{Motion, Tracking};
 use super::picture::Exposure;
 use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
@@ -72,6 +72,15 @@ impl Activity {
     /// The time since it started.
     fn elapsed_s(&self, now: Timestamp) -> f64 {
         now.since(self.started).as_secs_f64()
+    }
+
+    /// How well it has followed a trajectory so far, if it follows one.
+    pub(crate) fn tracking(&self, now: Timestamp) -> Option<Tracking> {
+        match &self.kind {
+            Kind::Drive(motion) => Some(motion.tracking(self.elapsed_s(now))),
+            Kind::Follow(motion) => Some(motion.tracking(self.elapsed_s(now))),
+            _ => None,
+        }
     }
 
     /// How much of its time has passed, 0 to 1.

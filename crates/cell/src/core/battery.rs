@@ -1,4 +1,6 @@
 //! A battery that drains with time, faster while the arm moves, and faster still while the base does.
+//!
+//! Times are added up exactly: how full it is does not depend on how often it is looked at.
 
 use crate::config::BatteryConfig;
 use std::time::Duration;
@@ -6,31 +8,37 @@ use std::time::Duration;
 #[derive(Debug, Clone)]
 pub(crate) struct Battery {
     config: BatteryConfig,
+    /// How full it was when it was made.
     level: f64,
+    /// The time since, and how much of it the arm and the base moved.
+    passed: Duration,
+    moving: Duration,
+    driving: Duration,
 }
 
 impl Battery {
     pub(crate) fn new(config: BatteryConfig) -> Battery {
-        Battery { config, level: config.level }
+        Battery::at(config, config.level)
     }
 
     /// One that is as full as that.
     pub(crate) fn at(config: BatteryConfig, level: f64) -> Battery {
-        Battery { config, level }
+        Battery { config, level, passed: Duration::ZERO, moving: Duration::ZERO, driving: Duration::ZERO }
     }
 
     /// How full it is, 0 to 1.
     pub(crate) fn level(&self) -> f64 {
-        self.level
+        let hours = |time: Duration| time.as_secs_f64() / 3600.0;
+        let idle = self.config.idle_per_hour * hours(self.passed);
+        let moving = self.config.motion_per_hour * hours(self.moving);
+        (self.level - idle - moving - self.config.driving_per_hour * hours(self.driving)).max(0.0)
     }
 
     pub(crate) fn drain(&mut self, time: Duration, moving: bool, driving: bool) {
-        let hours = time.as_secs_f64() / 3600.0;
-        let more = |is: bool, rate: f64| if is { rate } else { 0.0 };
-        let rate = self.config.idle_per_hour
-            + more(moving, self.config.motion_per_hour)
-            + more(driving, self.config.driving_per_hour);
-        self.level = (self.level - rate * hours).max(0.0);
+        let part = |is: bool| if is { time } else { Duration::ZERO };
+        self.passed += time;
+        self.moving += part(moving);
+        self.driving += part(driving);
     }
 }
 

@@ -112,7 +112,7 @@ impl Cell {
                     SafetyState::Stopped { reason } => Some(Ending::Stopped(reason.clone())),
                     _ => self.start(ticket, lease, request).err().map(Ending::Aborted),
                 };
-                out.extend(refused.map(|ending| Command::Ended { ticket, ending }));
+                out.extend(refused.map(|ending| Command::Ended { ticket, ending, tracking: None }));
             }
             Event::Stop { ticket, reason } => {
                 self.hold(|a| a.ticket == ticket, |_| Ending::Preempted(reason.clone()), &mut out);
@@ -152,6 +152,11 @@ impl Cell {
     pub fn next_wake(&self) -> Option<Timestamp> {
         let ends = self.activities.values().map(|a| a.ends).min().filter(|_| !self.is_held());
         ends.map(|ends| self.real_time(ends)).into_iter().chain(self.faults.next()).min()
+    }
+
+    /// Whether something moves: then every step costs time, and who waits until the last of them is due is late.
+    pub fn is_restless(&self) -> bool {
+        !self.environment.is_at_rest() || self.may_move()
     }
 
     /// Where the joints are.
@@ -290,13 +295,15 @@ impl Cell {
 
     fn finish(&mut self, module: Module, out: &mut Vec<Command>) {
         let Some(activity) = self.activities.remove(&module) else { return };
+        let tracking = activity.tracking(self.motion_time);
+        let followed = tracking.unwrap_or_default();
         let ending = match activity.kind {
             Kind::Drive(motion) => {
                 let ([x, y, heading], broken) = motion.end();
                 self.resting.base = [x, y, wrapped(heading)];
                 match broken {
                     Some(reason) => Ending::Aborted(reason.to_owned()),
-                    None => Ending::Done(Product::Driven { end: self.base_pose() }),
+                    None => Ending::Done(Product::Driven { end: self.base_pose(), tracking: followed }),
                 }
             }
             Kind::Follow(motion) => {
@@ -304,7 +311,7 @@ impl Cell {
                 self.resting.arm = end;
                 match broken {
                     Some(reason) => Ending::Aborted(reason.to_owned()),
-                    None => Ending::Done(Product::Moved { end }),
+                    None => Ending::Done(Product::Moved { end, tracking: followed }),
                 }
             }
             Kind::Close { from, object, expected } => self.close(from, object, expected.as_ref()),
@@ -328,7 +335,7 @@ impl Cell {
                 None => Ending::Done(Product::Captured { camera, exposures }),
             },
         };
-        out.push(Command::Ended { ticket: activity.ticket, ending });
+        out.push(Command::Ended { ticket: activity.ticket, ending, tracking });
     }
 
     /// Ends activities where they are: every joint stays where it has come to.
@@ -342,7 +349,8 @@ impl Cell {
         let stopped: Vec<Module> = self.activities.iter().filter(|(_, a)| which(a)).map(|(m, _)| *m).collect();
         for module in stopped {
             if let Some(activity) = self.activities.remove(&module) {
-                out.push(Command::Ended { ticket: activity.ticket, ending: ending(&activity) });
+                let tracking = activity.tracking(self.motion_time);
+                out.push(Command::Ended { ticket: activity.ticket, ending: ending(&activity), tracking });
             }
         }
     }

@@ -1,36 +1,233 @@
-//! A trajectory that is being followed.
+//! A trajectory that is being followed, and how well.
+//!
+//! The joints are driven by a controller that sees where they are and where the trajectory has them: each is a critically damped
+//! second-order system with the trajectory's velocity fed forward, a = ω²(x* − x) + 2ω(v* − v). It lags by about x*″ / ω² while the
+//! trajectory accelerates. A motion is over when the joints have settled at the trajectory's end, where the brakes close; it breaks
+//! off where they are too far from it. All of that follows from the trajectory alone, so it is worked out when the motion starts.
 
+use super::environment::STEP;
 use ratn_motion::trajectory::Curve;
+use serde::{Deserialize, Serialize};
 
 /// Joints on their way along a trajectory.
 #[derive(Debug, Clone)]
 pub(crate) struct Motion<const N: usize> {
     trajectory: Curve<N>,
+    /// Where the joints are, every [`STEP`] from the start.
+    course: Vec<[f64; N]>,
+    /// How many of the joints slide; they come first.
+    slides: usize,
     /// When it ends before it is done, and why.
     breaks: Option<(f64, String)>,
 }
 
+/// How a controller drives joints.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Controller {
+    /// Whose it is.
+    pub(crate) of: &'static str,
+    /// ω, in radians per second.
+    pub(crate) stiffness: f64,
+    /// How far the joints may be from their trajectory, in radians and in metres.
+    pub(crate) most_off: f64,
+    /// How many of the joints slide; they come first.
+    pub(crate) slides: usize,
+}
+
+/// How far joints were from a trajectory while they followed it.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Tracking {
+    /// Those that turn, in radians: any of them at the most.
+    pub most_rad: f64,
+    /// The root of the mean square over all of them and all the time.
+    pub rms_rad: f64,
+    /// Those that slide, in metres: their distance at the most.
+    pub most_m: f64,
+    /// The root of its mean square over all the time.
+    pub rms_m: f64,
+}
+
+/// What counts as there, in radians and in metres: what a joint's encoder can tell.
+const SETTLED: f64 = 1e-5;
+/// What counts as standing, per second.
+const STANDING: f64 = 1e-3;
+/// How long joints may take to settle, in seconds.
+const MAX_SETTLING_S: f64 = 5.0;
+
 impl<const N: usize> Motion<N> {
-    /// Along all of it, or until it breaks off: after so many seconds, for that reason.
-    pub(crate) fn new(trajectory: Curve<N>, breaks: Option<(f64, String)>) -> Motion<N> {
-        Motion { trajectory, breaks }
+    /// From where the joints are to the trajectory's end, or until something breaks it off: after so many seconds, for that reason.
+    pub(crate) fn new(
+        trajectory: Curve<N>,
+        start: [f64; N],
+        controller: Controller,
+        breaks: Option<(f64, String)>,
+    ) -> Motion<N> {
+        let dt = STEP.as_secs_f64();
+        let duration_s = trajectory.duration_s();
+        let mut motion = Motion { trajectory, course: vec![start], slides: controller.slides, breaks };
+        let (mut at, mut moving) = (start, [0.0_f64; N]);
+        loop {
+            let time_s = dt * (motion.course.len() - 1) as f64;
+            if motion.breaks.as_ref().is_some_and(|(breaks_s, _)| *breaks_s <= time_s) {
+                return motion;
+            }
+            let wanted = motion.trajectory.sample(time_s);
+            let (radians, metres) = motion.off(&at, &wanted.positions);
+            if radians > controller.most_off || metres > controller.most_off {
+                motion.breaks = Some((time_s, controller.lost(radians, metres)));
+                return motion;
+            }
+            let still = moving.iter().all(|v| v.abs() <= STANDING);
+            if time_s >= duration_s && radians.max(metres) <= SETTLED && still {
+                return motion;
+            }
+            if time_s > duration_s + MAX_SETTLING_S {
+                let reason = format!("the {} did not settle within {MAX_SETTLING_S} s; it holds", controller.of);
+                motion.breaks = Some((time_s, reason));
+                return motion;
+            }
+            let stiffness = controller.stiffness;
+            for j in 0..N {
+                let (off, slow) = (wanted.positions[j] - at[j], wanted.velocities[j] - moving[j]);
+                moving[j] += stiffness * (stiffness * off + 2.0 * slow) * dt;
+                at[j] += moving[j] * dt;
+            }
+            motion.course.push(at);
+        }
     }
 
     /// How long it takes, in seconds.
     pub(crate) fn lasts_s(&self) -> f64 {
-        self.breaks.as_ref().map_or(self.trajectory.duration_s(), |(at_s, _)| *at_s)
+        let settled_s = STEP.as_secs_f64() * (self.course.len() - 1) as f64;
+        self.breaks.as_ref().map_or(settled_s, |(breaks_s, _)| *breaks_s)
     }
 
     /// Where the joints are after so many seconds.
     pub(crate) fn at(&self, time_s: f64) -> [f64; N] {
-        self.trajectory.sample(time_s).positions
+        let steps = (time_s / STEP.as_secs_f64()).max(0.0);
+        let (index, fraction) = (steps as usize, steps.fract());
+        let last = self.course.len() - 1;
+        let (a, b) = (&self.course[index.min(last)], &self.course[(index + 1).min(last)]);
+        std::array::from_fn(|j| a[j] + (b[j] - a[j]) * fraction)
     }
 
     /// Where they end; why they do not get to the trajectory's end, if so.
     pub(crate) fn end(&self) -> ([f64; N], Option<&str>) {
         match &self.breaks {
-            Some((at_s, reason)) => (self.at(*at_s), Some(reason)),
+            Some((breaks_s, reason)) => (self.at(*breaks_s), Some(reason)),
             None => (self.trajectory.end(), None),
         }
+    }
+
+    /// How well it was followed for so many seconds.
+    pub(crate) fn tracking(&self, time_s: f64) -> Tracking {
+        let dt = STEP.as_secs_f64();
+        let (mut tracking, turns) = (Tracking::default(), N - self.slides);
+        let passed = self.course.iter().enumerate().take_while(|(i, _)| *i as f64 * dt <= time_s);
+        let mut count = 0.0;
+        for (i, at) in passed {
+            let wanted = self.trajectory.sample(i as f64 * dt).positions;
+            let (radians, metres) = self.off(at, &wanted);
+            tracking.most_rad = tracking.most_rad.max(radians);
+            tracking.most_m = tracking.most_m.max(metres);
+            tracking.rms_m += metres.powi(2);
+            tracking.rms_rad += (self.slides..N).map(|j| (at[j] - wanted[j]).powi(2)).sum::<f64>() / turns as f64;
+            count += 1.0;
+        }
+        let root = |sum: f64| (sum / f64::max(count, 1.0)).sqrt();
+        Tracking { rms_rad: root(tracking.rms_rad), rms_m: root(tracking.rms_m), ..tracking }
+    }
+
+    /// How far the joints are from where they should be: the one that is turned too far at the most, and those that slide together.
+    fn off(&self, at: &[f64; N], wanted: &[f64; N]) -> (f64, f64) {
+        let off = |j: usize| (at[j] - wanted[j]).abs();
+        let metres = (0..self.slides).map(|j| off(j).powi(2)).sum::<f64>().sqrt();
+        ((self.slides..N).map(off).fold(0.0, f64::max), metres)
+    }
+}
+
+impl Controller {
+    fn lost(&self, radians: f64, metres: f64) -> String {
+        let (off, unit) = if radians > self.most_off { (radians, "rad") } else { (metres, "m") };
+        format!(
+            "the {} is {off:.3} {unit} from its trajectory, {} {unit} are allowed; it holds; move slower, or have its controller \
+             looked at",
+            self.of, self.most_off
+        )
+    }
+}
+
+impl Tracking {
+    /// The worse of both, figure by figure.
+    pub fn or_worse(self, other: Tracking) -> Tracking {
+        Tracking {
+            most_rad: self.most_rad.max(other.most_rad),
+            rms_rad: self.rms_rad.max(other.rms_rad),
+            most_m: self.most_m.max(other.most_m),
+            rms_m: self.rms_m.max(other.rms_m),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_model::value::{Trajectory, TrajectoryPoint};
+    use ratn_motion::robot::Robot;
+
+    const CONTROLLER: Controller = Controller { of: "base", stiffness: 20.0, most_off: 0.05, slides: 2 };
+
+    /// Straight along x with an acceleration of 0.5 m/s² for two seconds, and down again.
+    fn straight(robot: &Robot) -> Curve<3> {
+        let point = |time_s: f64, x: f64, v: f64| TrajectoryPoint {
+            time_s,
+            positions: vec![x, 0.0, 0.0],
+            velocities: vec![v, 0.0, 0.0],
+        };
+        let joints = robot.base_joints();
+        let points = vec![point(0.0, 0.0, 0.0), point(2.0, 1.0, 1.0), point(4.0, 2.0, 0.0)];
+        let trajectory = Trajectory { joints: joints.iter().map(|j| j.name.clone()).collect(), points };
+        #[expect(clippy::expect_used, reason = "a test may panic")]
+        Curve::of(joints, &trajectory).expect("a trajectory of the base")
+    }
+
+    #[test]
+    fn the_lag_is_that_of_the_model_and_a_stiffer_controller_lags_less() {
+        let motion = Motion::new(straight(&Robot::aimm()), [0.0; 3], CONTROLLER, None);
+        // 0.5 / 20² m.
+        let tracking = motion.tracking(f64::INFINITY);
+        assert!((tracking.most_m - 0.00125).abs() < 2e-4, "{tracking:?}");
+        assert!(tracking.rms_m > 0.5 * tracking.most_m && tracking.rms_m < tracking.most_m, "{tracking:?}");
+        assert_eq!((tracking.most_rad, tracking.rms_rad), (0.0, 0.0));
+        let stiffer = Controller { stiffness: 40.0, ..CONTROLLER };
+        let stiffer = Motion::new(straight(&Robot::aimm()), [0.0; 3], stiffer, None).tracking(f64::INFINITY);
+        assert!(stiffer.most_m < 0.3 * tracking.most_m, "{stiffer:?}");
+    }
+
+    #[test]
+    fn it_waits_until_the_joints_have_settled_and_then_stands_where_it_should() {
+        let motion = Motion::new(straight(&Robot::aimm()), [0.0; 3], CONTROLLER, None);
+        let over = motion.lasts_s() - 4.0;
+        assert!(over > 0.1 && over < 1.0, "{over} s");
+        assert!((motion.at(4.0)[0] - 2.0).abs() > SETTLED && (motion.at(motion.lasts_s())[0] - 2.0).abs() <= SETTLED);
+        assert_eq!(motion.end(), ([2.0, 0.0, 0.0], None));
+    }
+
+    #[test]
+    fn what_is_too_far_off_breaks_off_there_and_says_how_far() {
+        let weak = Controller { stiffness: 3.0, ..CONTROLLER };
+        let motion = Motion::new(straight(&Robot::aimm()), [0.0; 3], weak, None);
+        let (end, reason) = motion.end();
+        assert!(motion.lasts_s() < 3.0 && end[0] < 2.0);
+        assert!(reason.is_some_and(|r| r.contains("m from its trajectory, 0.05 m are allowed")), "{reason:?}");
+        assert!((motion.tracking(f64::INFINITY).most_m - 0.05).abs() < 0.002);
+    }
+
+    #[test]
+    fn a_motion_that_starts_beside_its_trajectory_comes_to_it() {
+        let motion = Motion::new(straight(&Robot::aimm()), [0.0, 0.01, 0.01], CONTROLLER, None);
+        let tracking = motion.tracking(f64::INFINITY);
+        assert!((tracking.most_rad - 0.01).abs() < 1e-9 && tracking.rms_rad < 0.002, "{tracking:?}");
+        assert_eq!(motion.end().0, [2.0, 0.0, 0.0]);
     }
 }

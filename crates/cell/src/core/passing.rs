@@ -37,7 +37,7 @@ impl Cell {
     }
 
     /// Whether something may move that the environment does not know of: the robot, or what it holds.
-    fn may_move(&self) -> bool {
+    pub(super) fn may_move(&self) -> bool {
         let modules = [Module::Base, Module::Arm, Module::Gripper, Module::PanTilt];
         let moves = modules.into_iter().any(|module| self.is_active(module));
         (moves && !self.is_held()) || self.held.is_some_and(|held| !held.is_steady())

@@ -2,6 +2,7 @@
 
 pub use super::activity::{Module, Ticket};
 use super::faults::Fault;
+pub use super::motion::Tracking;
 use super::picture::Exposure;
 use super::snapshot::Snapshot;
 use crate::config::Goods;
@@ -143,6 +144,8 @@ pub enum Command {
         ticket: Ticket,
         /// How.
         ending: Ending,
+        /// How well it followed a trajectory, to its end or as far as it came.
+        tracking: Option<Tracking>,
     },
     /// The state, as wanted.
     Saved {
@@ -171,11 +174,15 @@ pub enum Product {
     Driven {
         /// Its frame, in the world frame.
         end: Pose,
+        /// How well it followed.
+        tracking: Tracking,
     },
     /// The arm is there.
     Moved {
         /// Its posture.
         end: Joints,
+        /// How well it followed.
+        tracking: Tracking,
     },
     /// Something is in the gripper.
     Grasped {

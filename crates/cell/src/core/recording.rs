@@ -11,7 +11,7 @@
 
 use super::cell::Cell;
 use super::placement::PlacementError;
-use super::protocol::{Command, Ending, Event, Ticket};
+use super::protocol::{Command, Ending, Event, Ticket, Tracking};
 use crate::config::CellConfig;
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -50,6 +50,9 @@ pub enum Line {
         /// Why, where it was not done.
         #[serde(default, skip_serializing_if = "String::is_empty")]
         reason: String,
+        /// How well it followed its trajectory, where it followed one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        tracking: Option<Tracking>,
     },
     /// The environment after an event.
     World {
@@ -69,6 +72,8 @@ pub struct Replayed {
     pub goals: usize,
     /// When the last event was, in the robot's seconds.
     pub end_s: f64,
+    /// How well trajectories were followed: the worst of all.
+    pub tracking: Tracking,
 }
 
 /// Why a recording is not replayed, or how it went otherwise.
@@ -122,6 +127,7 @@ impl Line {
                 ended,
                 how: how.to_owned(),
                 reason: reason.to_owned(),
+                tracking: tracking(command),
             })
         });
         let world = (!is_tick).then(|| Line::World { at, world: cell.environment.digest().to_string() });
@@ -136,7 +142,7 @@ impl Line {
 pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replayed, ReplayError> {
     let mut cell: Option<Cell> = None;
     let mut endings: VecDeque<(Ticket, String)> = VecDeque::new();
-    let mut replayed = Replayed { events: 0, goals: 0, end_s: 0.0 };
+    let mut replayed = Replayed { events: 0, goals: 0, end_s: 0.0, tracking: Tracking::default() };
     for (index, text) in lines.enumerate() {
         let line = index + 1;
         let text = text.map_err(|source| ReplayError::Unreadable { line, source })?;
@@ -155,6 +161,8 @@ pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replaye
         let mut pass = |cell: &mut Cell, at: Timestamp, event: Event| {
             let commands = cell.handle(at, event);
             endings.extend(commands.iter().filter_map(ended).map(|(ticket, how, _)| (ticket, how.to_owned())));
+            let followed = commands.iter().filter_map(tracking);
+            replayed.tracking = followed.fold(replayed.tracking, Tracking::or_worse);
             replayed.end_s = at.seconds();
         };
         match read {
@@ -185,11 +193,15 @@ pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replaye
 }
 
 fn ended(command: &Command) -> Option<(Ticket, &'static str, &str)> {
-    let Command::Ended { ticket, ending } = command else { return None };
+    let Command::Ended { ticket, ending, .. } = command else { return None };
     Some(match ending {
         Ending::Done(_) => (*ticket, "done", ""),
         Ending::Aborted(reason) => (*ticket, "aborted", reason),
         Ending::Preempted(reason) => (*ticket, "preempted", reason),
         Ending::Stopped(reason) => (*ticket, "stopped", reason),
     })
+}
+
+fn tracking(command: &Command) -> Option<Tracking> {
+    if let Command::Ended { tracking, .. } = command { *tracking } else { None }
 }

@@ -105,6 +105,7 @@ impl Cell {
     pub(super) fn save(&mut self) -> Snapshot {
         let Configuration { base, arm, pan, tilt, finger } = self.configuration();
         let (faults, drawn) = self.faults.save();
+        self.battery = Battery::at(self.config.battery, self.battery.level());
         Snapshot {
             form: FORM,
             seed: self.seed,

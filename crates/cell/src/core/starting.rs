@@ -3,10 +3,11 @@
 use super::activity::{Activity, Kind, Module, Ticket, seconds};
 use super::cell::Cell;
 use super::deviations::LOST;
-use super::motion::Motion;
+use super::motion::{Controller, Motion};
 use super::protocol::Request;
 use super::trajectory;
 use ratn_model::id::LeaseId;
+use ratn_motion::drive::wrapped;
 use ratn_motion::robot::Configuration;
 use ratn_motion::trajectory::{ArmTrajectory, BaseTrajectory};
 use ratn_perception::camera::Camera;
@@ -99,7 +100,11 @@ impl Cell {
     /// What the arm does, and for how long.
     fn following(&mut self, trajectory: ArmTrajectory) -> (Kind, f64) {
         let lasts_s = trajectory.duration_s();
-        let motion = Motion::new(trajectory, self.arm_breaks_off(lasts_s));
+        let config = self.config.controllers;
+        let controller =
+            Controller { of: "arm", stiffness: config.arm_stiffness, most_off: config.arm_most_off_rad, slides: 0 };
+        let breaks = self.arm_breaks_off(lasts_s);
+        let motion = Motion::new(trajectory, self.configuration().arm, controller, breaks);
         let lasts_s = motion.lasts_s();
         (Kind::Follow(motion), lasts_s)
     }
@@ -107,7 +112,14 @@ impl Cell {
     /// What the base does, and for how long.
     fn driving(&mut self, trajectory: BaseTrajectory) -> (Kind, f64) {
         let lasts_s = trajectory.duration_s();
-        let motion = Motion::new(trajectory, self.drive_breaks_off(lasts_s));
+        let config = self.config.controllers;
+        let controller =
+            Controller { of: "base", stiffness: config.base_stiffness, most_off: config.base_most_off, slides: 2 };
+        let breaks = self.drive_breaks_off(lasts_s);
+        // A heading is the same after a whole turn: the one that the trajectory begins at.
+        let ([x, y, heading], first) = (self.configuration().base, trajectory.knots()[0].positions[2]);
+        let start = [x, y, first + wrapped(heading - first)];
+        let motion = Motion::new(trajectory, start, controller, breaks);
         let lasts_s = motion.lasts_s();
         (Kind::Drive(motion), lasts_s)
     }

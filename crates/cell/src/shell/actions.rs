@@ -131,9 +131,17 @@ impl ModuleAction {
     async fn outcome(&self, product: Product) -> ActionResult {
         let success = GoalOutcome::success();
         Ok(match product {
-            Product::Driven { end } => success.with_output("end", Value::Pose(end)),
+            Product::Driven { end, tracking } => success
+                .with_output("end", Value::Pose(end))
+                .with_output("tracking_max_m", Value::Float(tracking.most_m))
+                .with_output("tracking_rms_m", Value::Float(tracking.rms_m))
+                .with_output("tracking_max_rad", Value::Float(tracking.most_rad))
+                .with_output("tracking_rms_rad", Value::Float(tracking.rms_rad)),
             Product::BaseSensed { pose } => success.with_output("pose", Value::Pose(pose)),
-            Product::Moved { end } => success.with_output("end", Value::Joints(end.to_vec())),
+            Product::Moved { end, tracking } => success
+                .with_output("end", Value::Joints(end.to_vec()))
+                .with_output("tracking_max_rad", Value::Float(tracking.most_rad))
+                .with_output("tracking_rms_rad", Value::Float(tracking.rms_rad)),
             Product::Grasped { object, width, in_gripper } => {
                 let outcome = success.with_output("width_m", Value::Float(width));
                 let fact = FactKey { predicate: "in_gripper".to_owned(), arguments: vec![Term::Name(object)] };

@@ -32,6 +32,8 @@ use crate::core::boxes::TrueBox;
 const MAX_MESSAGES: usize = 256;
 /// It looks at the clock at least this often.
 const MAX_SLEEP: Duration = Duration::from_secs(1);
+/// … and so often while something moves: what is not computed meanwhile makes the end of a motion late.
+const RESTLESS_SLEEP: Duration = Duration::from_millis(5);
 
 /// What the cell knows.
 #[derive(Debug, Clone, PartialEq)]
@@ -211,7 +213,8 @@ impl Drop for Motion {
 fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Receiver<Letter>) {
     let mut waiting: BTreeMap<Ticket, oneshot::Sender<Ending>> = BTreeMap::new();
     loop {
-        let sleep = cell.next_wake().map_or(MAX_SLEEP, |moment| clock.until(moment).min(MAX_SLEEP));
+        let most = if cell.is_restless() { RESTLESS_SLEEP } else { MAX_SLEEP };
+        let sleep = cell.next_wake().map_or(most, |moment| clock.until(moment).min(most));
         let message = match inbox.recv_timeout(sleep) {
             Ok(letter) => Some(letter.message),
             Err(RecvTimeoutError::Timeout) => None,
@@ -249,7 +252,7 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
         for command in commands {
             // Whoever asked may be gone.
             match command {
-                Command::Ended { ticket, ending } => {
+                Command::Ended { ticket, ending, .. } => {
                     if let Some(ended) = waiting.remove(&ticket) {
                         let _ = ended.send(ending);
                     }

@@ -11,6 +11,8 @@ mod actions;
 mod keeper;
 mod leases;
 mod link;
+#[cfg(test)]
+mod pace;
 mod recorder;
 mod service;
 

@@ -59,7 +59,7 @@ impl Bench {
             self.now = self.cell.next_wake().expect("the goal is under way");
             commands = self.handle(Event::Tick);
         }
-        let [Command::Ended { ticket: ended, ending }] = &commands[..] else { panic!("{commands:?}") };
+        let [Command::Ended { ticket: ended, ending, .. }] = &commands[..] else { panic!("{commands:?}") };
         assert_eq!(*ended, ticket);
         ending.clone()
     }

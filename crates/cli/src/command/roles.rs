@@ -115,9 +115,12 @@ pub(super) fn cell(arguments: &CellArguments) -> Result<(), Failure> {
 fn replay(file: &Path) -> Result<(), Failure> {
     let opened = File::open(file).with_context(|| format!("cannot read {}", file.display()))?;
     let replayed = recording::replay(BufReader::new(opened).lines());
-    let Replayed { events, goals, end_s } = replayed.with_context(|| file.display().to_string())?;
+    let Replayed { events, goals, end_s, tracking } = replayed.with_context(|| file.display().to_string())?;
     output::result(format_args!(
-        "the same came of {events} events in {end_s:.1} s of the robot: {goals} goals ended as they had"
+        "the same came of {events} events in {end_s:.1} s of the robot: {goals} goals ended as they had; trajectories were \
+         followed within {:.2} mrad and {:.2} mm",
+        tracking.most_rad * 1e3,
+        tracking.most_m * 1e3
     ))?;
     Ok(())
 }
