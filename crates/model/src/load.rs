@@ -68,7 +68,6 @@ const TASK_KEYS: [&str; 14] = [
     "outcomes",
     "states",
 ];
-const LATER_TASK_KEYS: [&str; 1] = ["imports"];
 
 /// A program and what was noticed about it.
 #[derive(Debug, Clone, PartialEq)]
@@ -173,7 +172,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     let (ontology, ontology_text) = described.unzip();
     let task = Task { source, catalogue, outline, ports, parameters, libraries, ontology };
     let mut fields = Fields { task: &task, view: View::default(), path: String::new(), out };
-    fields.keys(&root, &TASK_KEYS, &LATER_TASK_KEYS);
+    fields.keys(&root, &TASK_KEYS);
     let horizon = match root.get("horizon") {
         Some(node) => horizon(&mut fields, node),
         None => DEFAULT_HORIZON,
@@ -296,7 +295,7 @@ fn read_parameters(fields: &mut Fields<'_, '_>, root: &Node) -> Vec<Parameter> {
     for entry in root.get("parameters").map(Node::entries).unwrap_or_default() {
         let long = entry.value.get("type").is_some() || entry.value.get("default").is_some();
         let default = if long {
-            fields.keys(&entry.value, &["type", "default", "description"], &[]);
+            fields.keys(&entry.value, &["type", "default", "description"]);
             entry.value.get("default")
         } else {
             Some(&entry.value)

@@ -87,26 +87,3 @@ fn the_document_lists_every_function_as_it_is_called() {
     let called: BTreeSet<&str> = usages.iter().flat_map(|usage| usage.split(" or ")).collect();
     assert_eq!(documented, called);
 }
-
-#[test]
-fn what_the_document_says_is_not_supported_yet_is_refused_as_that() {
-    let mut seen = 0;
-    for cells in rows("Not supported yet") {
-        for key in quoted(cells[1]) {
-            let task = match cells[0] {
-                "top level" => format!("task: t\n{key}: 1\nstates: []\n"),
-                "forms of states" => format!("task: t\nstates:\n  - a: {{ {key}: 1 }}\n"),
-                "state" => format!("task: t\nstates:\n  - a: {{ states: [], {key}: 1 }}\n"),
-                "resource line" => {
-                    format!("task: t\nstates:\n  - a: {{ states: [], resources: [{{ block: Arm, {key}: 1 }}] }}\n")
-                }
-                other => panic!("no way to try keys of `{other}`"),
-            };
-            let found = findings(&task);
-            let rules: Vec<&str> = found.iter().map(|finding| finding.rule.as_str()).collect();
-            assert_eq!(rules, ["not-supported-yet"], "{key}");
-            seen += 1;
-        }
-    }
-    assert!(seen > 0, "the table is not there");
-}

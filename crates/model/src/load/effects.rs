@@ -44,7 +44,7 @@ fn effect(fields: &mut Fields<'_, '_>, item: &Node) -> Option<EffectExpr> {
         fields.error("invalid-expression", item.at, message, "quote an effect that contains `: ` or a comma");
         return None;
     };
-    fields.keys(item, &["for", "do", "set", "delete", "increase", "decrease"], &[]);
+    fields.keys(item, &["for", "do", "set", "delete", "increase", "decrease"]);
     let path = fields.path.clone();
     let (variable, head) = header(for_each, &path, &mut fields.out.findings)?;
     let collection = fields.parsed(head.node, &head.collection, head.offset, parse_expression)?;

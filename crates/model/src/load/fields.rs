@@ -52,20 +52,15 @@ impl<'t, 'a> Fields<'t, 'a> {
         self.out.findings.error(rule, at, &self.path, message, help);
     }
 
-    /// Complains of keys that are neither known nor planned.
-    pub(crate) fn keys(&mut self, node: &Node, known: &[&str], later: &[&str]) {
+    /// Complains of keys that are not known.
+    pub(crate) fn keys(&mut self, node: &Node, known: &[&str]) {
         for entry in node.entries() {
             let key = entry.key.as_str();
             if known.contains(&key) {
                 continue;
             }
-            if later.contains(&key) {
-                let message = format!("`{key}` is not supported yet");
-                self.error("not-supported-yet", entry.at, message, "leave it out");
-            } else {
-                let help = suggestion(key, known.iter().copied(), "", "leave it out");
-                self.error("unknown-key", entry.at, format!("there is no key `{key}` here"), help);
-            }
+            let help = suggestion(key, known.iter().copied(), "", "leave it out");
+            self.error("unknown-key", entry.at, format!("there is no key `{key}` here"), help);
         }
     }
 

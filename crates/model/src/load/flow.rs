@@ -209,7 +209,7 @@ pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &m
     if let Some(node) = body.get("retry") {
         let count = node.get("count").unwrap_or(node);
         if node.get("count").is_some() {
-            fields.keys(node, &["count", "backoff"], &[]);
+            fields.keys(node, &["count", "backoff"]);
         }
         let backoff_s = node.get("backoff").map_or(Some(0.0), |node| seconds(fields, node, "backoff"));
         if let (Some(count), Some(backoff_s)) = (fields.count(count, "retry", 1), backoff_s) {

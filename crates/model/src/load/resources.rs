@@ -67,7 +67,6 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
             "hold",
             "unordered",
         ],
-        &[],
     );
     if let Some(node) = item.get("divisible").filter(|_| *operation != ResourceOperation::Create) {
         let help = "leave it out: what is there already says so itself";

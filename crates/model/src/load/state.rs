@@ -58,7 +58,7 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
             }
             _ => known.push("outcomes"),
         }
-        fields.keys(step.body, &known, &[]);
+        fields.keys(step.body, &known);
     }
     let kind = kind(&mut fields, step);
     let outcomes = flow::outcomes(&mut fields, id);
@@ -222,7 +222,7 @@ pub(crate) fn task_outputs(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<Task
             _ => None,
         };
         if long {
-            fields.keys(&entry.value, &["type", "value", "default", "description"], &[]);
+            fields.keys(&entry.value, &["type", "value", "default", "description"]);
         }
         let value = if long { entry.value.get("value").unwrap_or(&entry.value) } else { &entry.value };
         if let Some(value) = fields.expression(value) {

@@ -37,7 +37,7 @@ fn deviation(fields: &mut Fields<'_, '_>, node: &Node, of_task: bool) -> Deviati
     match &node.content {
         Content::Map(_) => {
             let known: Vec<&str> = KEYS.into_iter().chain(of_task.then_some("predicates")).collect();
-            fields.keys(node, &known, &[]);
+            fields.keys(node, &known);
             let mut of = |key: &str| node.get(key).and_then(|node| number(fields, node));
             Deviation { number: of("number"), position_m: of("position"), angle_rad: of("angle") }
         }
