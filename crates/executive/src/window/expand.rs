@@ -1,34 +1,20 @@
 //! Growing the window: a cursor walks the program along its transitions and appends instances, until the horizon.
 //!
-//! An instance with several ways on gets an arm for each; each arm has a cursor. What follows the same condition on both arms
-//! is expanded twice: they are two futures.
+//! What is appended: `append`. Loops: `iterate`. Where there are several ways on: `branch`. Regions: `concurrency`.
 
 use super::Window;
-use super::cursor::{Cursor, Todo};
-use super::environment::{Binding, Frame, Iteration, Link, Producer};
-use super::instance::{Arm, Instance, Role, Segment, Status, Wait, gives_outputs};
+use super::cursor::Todo;
+use super::environment::{Binding, Frame, Iteration};
+use super::instance::Role;
 use super::plan::{Outcome, Predicate};
-use super::segment::Branch;
-use crate::analysis::NodeNature;
 use crate::context::{Context, in_circles};
-use crate::protocol::Note;
 use ratn_model::expression::scope::NothingKnown;
-use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{ABORTED, Program, SUCCESS, State, StateKind, Target};
-use ratn_model::time::Timestamp;
-use ratn_model::value::Value;
-use smallvec::{SmallVec, smallvec};
-use std::cell::Cell;
-use std::sync::{Arc, OnceLock};
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, Program, SUCCESS, StateKind, Target};
+use std::sync::Arc;
 
 /// A path that goes on for so many steps without doing anything goes in circles.
 const MAX_IDLE_STEPS: usize = 10_000;
-
-/// Duration assumed of a node that says none, in seconds.
-const DEFAULT_DURATION_S: f32 = 1.0;
-
-/// How likely a connected failure is, unless it was learned.
-const FAILURE: f32 = 0.1;
 
 impl Window {
     /// Grows at every cursor that may; whether anything came of it.
@@ -190,55 +176,6 @@ impl Window {
         }
     }
 
-    /// Both lists of a condition, from where it stands.
-    pub(super) fn branch_on_condition(
-        &mut self,
-        context: &Context<'_>,
-        index: usize,
-        instance: InstanceId,
-        visit: u32,
-    ) {
-        let Some(id) = self.instances.get(instance).map(|instance| instance.state) else { return };
-        let state = context.program.state(id);
-        let StateKind::Condition { then, otherwise, .. } = &state.kind else { return };
-        let environment = &self.cursors[index].environment;
-        let path: Arc<str> = environment.path(&state.name, visit, None).into();
-        let base = environment.variables.len() - state.variables.len();
-        let decisions = [(0, "then"), (1, "else")];
-        for (cursor, taken) in self.branch(context, index, instance, id, &decisions) {
-            let list = if taken == 0 { then } else { otherwise };
-            self.begin_list(cursor, id, visit, path.clone(), base, list);
-        }
-    }
-
-    /// Another iteration of a `while`, and its end, from where its test stands.
-    pub(super) fn branch_on_test(
-        &mut self,
-        context: &Context<'_>,
-        index: usize,
-        test: InstanceId,
-        visit: u32,
-        number: usize,
-    ) {
-        let Some(owner) = self.instances.get(test).map(|test| test.state) else { return };
-        let state = context.program.state(owner);
-        let environment = &self.cursors[index].environment;
-        let path: Arc<str> = environment.path(&state.name, visit, None).into();
-        let path = if owner == Program::ROOT { Arc::from("") } else { path };
-        let base = environment.variables.len();
-        let inside = self.frame(index, owner, visit, path, base, Some(Iteration { index: number, elements: None }));
-        let decisions = [(0, "again"), (1, "done")];
-        for (cursor, taken) in self.branch(context, index, test, owner, &decisions) {
-            if taken == 0 {
-                self.cursors[cursor].environment.frames = Some(inside.clone());
-                self.begin_iteration(cursor, context.program);
-            } else {
-                let ended = &mut self.cursors[cursor];
-                ended.todo = Todo::Exit { state: owner, visit, outcome: 0, variables: base };
-            }
-        }
-    }
-
     fn count_visit(&mut self, index: usize, id: StateId) -> u32 {
         let plan = self.plan.clone();
         let Some(frame) = &self.cursors[index].environment.frames else { return 1 };
@@ -258,11 +195,11 @@ impl Window {
         }
     }
 
-    fn top_frame(&mut self, index: usize) -> Option<&mut Frame> {
+    pub(super) fn top_frame(&mut self, index: usize) -> Option<&mut Frame> {
         self.cursors[index].environment.frames.as_mut().map(Arc::make_mut)
     }
 
-    fn frame(
+    pub(super) fn frame(
         &self,
         index: usize,
         owner: StateId,
@@ -293,59 +230,6 @@ impl Window {
         let cursor = &mut self.cursors[index];
         cursor.environment.frames = Some(frame);
         cursor.todo = Todo::Enter(*first);
-    }
-
-    /// The list of a loop is known: its iterations begin.
-    pub(super) fn unroll(&mut self, context: &Context<'_>, waits_for: InstanceId, elements: Vec<Value>) {
-        let Some(index) = self.cursors.iter().position(|cursor| cursor.todo == Todo::Await(waits_for)) else { return };
-        let Some(instance) = self.instances.get(waits_for) else { return };
-        let (state, visit) = (context.program.state(instance.state), instance.visit);
-        let path: Arc<str> = self.cursors[index].environment.path(&state.name, visit, None).into();
-        let base = self.cursors[index].environment.variables.len();
-        let iteration = Iteration { index: usize::MAX, elements: Some(Arc::new(elements)) };
-        let frame = self.frame(index, state.id, visit, path, base, Some(iteration));
-        let cursor = &mut self.cursors[index];
-        cursor.environment.frames = Some(frame);
-        cursor.todo = Todo::Iterate;
-    }
-
-    /// The innermost loop goes on to its next iteration, or ends.
-    fn iterate(&mut self, context: &mut Context<'_>, index: usize) {
-        let program = context.program;
-        let Some(frame) = self.top_frame(index) else { return };
-        let (owner, visit, base) = (frame.owner, frame.visit, frame.variables);
-        let Some(iteration) = &mut frame.iteration else { return };
-        iteration.index = iteration.index.wrapping_add(1);
-        let (number, elements) = (iteration.index, iteration.elements.clone());
-        frame.visits.clear();
-        match elements {
-            Some(elements) if number < elements.len() => self.begin_iteration(index, program),
-            Some(_) => self.leave_frame(index, 0),
-            None => {
-                let state = program.state(owner);
-                // The test stands where the loop stands, not in its body.
-                let environment = &mut self.cursors[index].environment;
-                environment.variables.truncate(base);
-                let inside = environment.frames.clone();
-                environment.frames = inside.as_ref().and_then(|frame| frame.below.clone());
-                environment.test = Some(Box::new((owner, Iteration { index: number, elements: None })));
-                let test = self.append(context, index, state, Role::Test, visit, Some(number), 0);
-                self.cursors[index].environment.test = None;
-                self.branch_on_test(context, index, test, visit, number);
-            }
-        }
-    }
-
-    /// The first state of the innermost loop's body is next.
-    fn begin_iteration(&mut self, index: usize, program: &Program) {
-        let Some(frame) = &self.cursors[index].environment.frames else { return };
-        let body = match &program.state(frame.owner).kind {
-            StateKind::ForEach { body, .. } | StateKind::While { body, .. } => body.first(),
-            _ => None,
-        };
-        let base = frame.variables;
-        self.cursors[index].environment.variables.truncate(base);
-        self.cursors[index].todo = body.map_or(Todo::Iterate, |first| Todo::Enter(*first));
     }
 
     /// Follows an outcome of a state that has ended.
@@ -379,7 +263,7 @@ impl Window {
     }
 
     /// The innermost list has ended by an outcome of its owner.
-    fn leave_frame(&mut self, index: usize, outcome: Outcome) {
+    pub(super) fn leave_frame(&mut self, index: usize, outcome: Outcome) {
         let cursor = &mut self.cursors[index];
         let Some(frame) = cursor.environment.frames.clone() else { return };
         cursor.environment.frames = frame.below.clone();
@@ -423,241 +307,5 @@ impl Window {
         let outcome = root.outcome(outcome).unwrap_or(root.outcomes.len() - 2);
         self.append(context, index, context.program.state(Program::ROOT), Role::End, 1, None, outcome);
         self.cursors[index].todo = Todo::Done;
-    }
-
-    /// The environment behind an instance that ends by an outcome.
-    pub(super) fn come_after(
-        &mut self,
-        index: usize,
-        instance: InstanceId,
-        id: StateId,
-        outcome: Outcome,
-        vague: bool,
-        writes: &[Predicate],
-    ) {
-        let producer = self.instances.get(instance).and_then(|i| i.producer.clone());
-        for predicate in writes {
-            let link = Link { writer: instance, outcome, vague };
-            self.cursors[index].environment.writers.set(*predicate, Some(link));
-        }
-        self.produce(index, producer, id, outcome);
-    }
-
-    /// Its outputs and what it assigns are seen from here on.
-    pub(super) fn produce(&mut self, index: usize, producer: Option<Arc<Producer>>, id: StateId, outcome: Outcome) {
-        let plan = self.plan.clone();
-        let own = plan.state(id);
-        let environment = &mut self.cursors[index].environment;
-        let good = gives_outputs(&own.outcomes[outcome]);
-        if let Some(producer) = producer {
-            if own.is_read && good {
-                environment.producers.set(id.0 as usize, Some(producer.clone()));
-            }
-            if good || own.is_routine {
-                for name in &own.assigns {
-                    environment.variables.assign(name, Binding::Assigned(producer.clone()));
-                }
-            }
-        }
-    }
-
-    /// The arms of a node: one per target of the outcomes that are computed ahead.
-    fn branch_by_outcome(&mut self, context: &Context<'_>, index: usize, instance: InstanceId, id: StateId) {
-        let plan = self.plan.clone();
-        let own = plan.state(id);
-        let links = own.writes.as_slice();
-        match own.arms.as_slice() {
-            [] => self.cursors[index].todo = Todo::Done,
-            [arm] => {
-                self.single_arm(index, instance);
-                if let Some(instance) = self.instances.get_mut(instance) {
-                    instance.arms[0].outcomes = arm.outcomes;
-                    instance.arms[0].outcome = arm.outcome;
-                }
-                self.come_after(index, instance, id, arm.outcome, !arm.same_effects, links);
-                self.cursors[index].todo = Todo::Leave(id, arm.outcome);
-            }
-            arms => {
-                let decisions: Vec<(Outcome, &str)> =
-                    arms.iter().map(|arm| (arm.outcome, &*own.outcomes[arm.outcome])).collect();
-                for (cursor, outcome) in self.branch(context, index, instance, id, &decisions) {
-                    let Some(arm) = arms.iter().find(|arm| arm.outcome == outcome) else { continue };
-                    if let Some(instance) = self.instances.get_mut(instance)
-                        && let Some(own) = instance.arms.iter_mut().find(|own| own.outcome == outcome)
-                    {
-                        own.outcomes = arm.outcomes;
-                    }
-                    self.come_after(cursor, instance, id, outcome, !arm.same_effects, links);
-                    self.cursors[cursor].todo = Todo::Leave(id, outcome);
-                }
-            }
-        }
-    }
-
-    pub(super) fn single_arm(&mut self, index: usize, instance: InstanceId) {
-        let segment = self.cursors[index].segment;
-        if let Some(instance) = self.instances.get_mut(instance) {
-            instance.arms = smallvec![Arm { outcomes: 1, outcome: 0, next: None, segment }];
-        }
-    }
-
-    /// One cursor per decision, each on a segment of its own, the likeliest first; cursors with what they stand for.
-    fn branch(
-        &mut self,
-        context: &Context<'_>,
-        index: usize,
-        instance: InstanceId,
-        id: StateId,
-        decisions: &[(Outcome, &str)],
-    ) -> Vec<(usize, Outcome)> {
-        let learned = self.learned.outcomes.get(&context.program.state(id).path);
-        let shares: Vec<f32> = decisions
-            .iter()
-            .map(|(_, name)| match learned {
-                Some(shares) => shares.get(*name).map_or(0.01, |share| *share as f32).max(0.01),
-                None if matches!(*name, ABORTED | ratn_model::program::PREEMPTED) => FAILURE,
-                None => 1.0,
-            })
-            .collect();
-        let total: f32 = shares.iter().sum();
-        let mut cursors = Vec::new();
-        let template = self.cursors[index].clone();
-        for (number, ((outcome, _), share)) in decisions.iter().zip(shares).enumerate() {
-            let probability = template.probability * share / total;
-            let segment = self.new_segment(Branch {
-                parent: template.segment,
-                decision: instance,
-                probability,
-                expanded: false,
-                members: Vec::new(),
-            });
-            if let Some(instance) = self.instances.get_mut(instance) {
-                instance.arms.push(Arm { outcomes: 1 << outcome, outcome: *outcome, next: None, segment });
-            }
-            self.next_order += 1;
-            let cursor = Cursor {
-                tail: Some((instance, number)),
-                segment,
-                probability,
-                order: self.next_order,
-                ..template.clone()
-            };
-            if number == 0 {
-                self.cursors[index] = cursor;
-                cursors.push((index, *outcome));
-            } else {
-                self.cursors.push(cursor);
-                cursors.push((self.cursors.len() - 1, *outcome));
-            }
-        }
-        cursors
-    }
-
-    pub(super) fn new_segment(&mut self, branch: Branch) -> Segment {
-        self.next_segment += 1;
-        self.branches.insert(self.next_segment, branch);
-        self.next_segment
-    }
-
-    #[expect(clippy::too_many_arguments, reason = "all of it is one visit")]
-    pub(super) fn append(
-        &mut self,
-        context: &mut Context<'_>,
-        index: usize,
-        state: &State,
-        role: Role,
-        visit: u32,
-        iteration: Option<usize>,
-        leaves_by: Outcome,
-    ) -> InstanceId {
-        let id = context.new_instance();
-        let plan = self.plan.clone();
-        let own = plan.state(state.id);
-        let cursor = &mut self.cursors[index];
-        cursor.idle = 0;
-        let (line, segment, position) = (cursor.line, cursor.segment, cursor.position);
-        cursor.position += 1;
-        let environment = cursor.environment.clone();
-        let tail = cursor.tail.replace((id, 0));
-        let left_because = cursor.because.clone();
-        let writes_outputs = match role {
-            Role::Node | Role::Exit => own.is_read || !own.assigns.is_empty(),
-            Role::Entry | Role::RegionEnd => true,
-            _ => false,
-        };
-        // The first of a line, and what follows one that others were let pass, is nobody's next in line.
-        let mut is_next = false;
-        if let Some((tail, arm)) = tail
-            && let Some(older) = self.instances.get_mut(tail)
-        {
-            is_next = older.role != Role::Fork && !older.detached;
-            if let Some(arm) = older.arms.get_mut(arm) {
-                arm.next = Some(id);
-            }
-        }
-        let nature = match role {
-            Role::Node => context.analysis.state(state.id).nature,
-            _ => NodeNature::Computes,
-        };
-        let duration_s = match role {
-            Role::Node => self.learned.durations_s.get(&state.path).map_or(DEFAULT_DURATION_S, |s| *s as f32),
-            _ => 0.0,
-        };
-        self.instances.push(Instance {
-            id,
-            state: state.id,
-            visit,
-            iteration,
-            role,
-            nature,
-            environment,
-            producer: writes_outputs.then(|| Arc::new(Producer { instance: id, real: OnceLock::new() })),
-            line,
-            segment,
-            position,
-            arms: SmallVec::new(),
-            leaves_by,
-            left_because,
-            is_head: false,
-            detached: false,
-            queued: false,
-            status: Status::Expanded,
-            wait: Wait::Nothing,
-            attempt: 1,
-            tries: 1,
-            has_acted: false,
-            crashes: 0,
-            not_before: Timestamp(0),
-            began: Timestamp(0),
-            lease: None,
-            projection: None,
-            ended: None,
-            settled: Cell::new(false),
-            routine: None,
-            seen: None,
-            waiters: SmallVec::new(),
-            users: SmallVec::new(),
-            duration_s,
-            remaining_s: duration_s,
-            advised: false,
-            asked_with: 0,
-        });
-        if !is_next && role != Role::Join {
-            self.set_head(line, Some(id));
-        }
-        let speculative = match self.branches.get_mut(&segment) {
-            Some(branch) => {
-                branch.members.push(id);
-                true
-            }
-            None => false,
-        };
-        if role == Role::Node {
-            let path = self.path(context.program, id);
-            context.note(Note::Expanded { instance: id, state: state.id, path, speculative });
-        }
-        self.grown_since_estimate += 1;
-        self.enqueue(id);
-        id
     }
 }

@@ -14,7 +14,9 @@
 //! | beginning | [`ready`], [`begin`], [`priority`], [`timers`] |
 //! | ending | [`decide`], [`settle`], [`retire`], [`revalidate`], [`outside`], [`squash`], [`twins`] |
 
+mod append;
 mod begin;
+mod branch;
 mod concurrency;
 mod cursor;
 mod decide;
@@ -22,6 +24,7 @@ mod environment;
 mod expand;
 mod instance;
 mod instances;
+mod iterate;
 mod outside;
 mod plan;
 mod priority;

@@ -1,0 +1,66 @@
+//! Loops: their iterations are appended one behind the other, as far as the list is known or a test is decided or predicted.
+
+use super::Window;
+use super::cursor::Todo;
+use super::environment::Iteration;
+use super::instance::Role;
+use crate::context::Context;
+use ratn_model::id::InstanceId;
+use ratn_model::program::{Program, StateKind};
+use ratn_model::value::Value;
+use std::sync::Arc;
+
+impl Window {
+    /// The list of a loop is known: its iterations begin.
+    pub(super) fn unroll(&mut self, context: &Context<'_>, waits_for: InstanceId, elements: Vec<Value>) {
+        let Some(index) = self.cursors.iter().position(|cursor| cursor.todo == Todo::Await(waits_for)) else { return };
+        let Some(instance) = self.instances.get(waits_for) else { return };
+        let (state, visit) = (context.program.state(instance.state), instance.visit);
+        let path: Arc<str> = self.cursors[index].environment.path(&state.name, visit, None).into();
+        let base = self.cursors[index].environment.variables.len();
+        let iteration = Iteration { index: usize::MAX, elements: Some(Arc::new(elements)) };
+        let frame = self.frame(index, state.id, visit, path, base, Some(iteration));
+        let cursor = &mut self.cursors[index];
+        cursor.environment.frames = Some(frame);
+        cursor.todo = Todo::Iterate;
+    }
+
+    /// The innermost loop goes on to its next iteration, or ends.
+    pub(super) fn iterate(&mut self, context: &mut Context<'_>, index: usize) {
+        let program = context.program;
+        let Some(frame) = self.top_frame(index) else { return };
+        let (owner, visit, base) = (frame.owner, frame.visit, frame.variables);
+        let Some(iteration) = &mut frame.iteration else { return };
+        iteration.index = iteration.index.wrapping_add(1);
+        let (number, elements) = (iteration.index, iteration.elements.clone());
+        frame.visits.clear();
+        match elements {
+            Some(elements) if number < elements.len() => self.begin_iteration(index, program),
+            Some(_) => self.leave_frame(index, 0),
+            None => {
+                let state = program.state(owner);
+                // The test stands where the loop stands, not in its body.
+                let environment = &mut self.cursors[index].environment;
+                environment.variables.truncate(base);
+                let inside = environment.frames.clone();
+                environment.frames = inside.as_ref().and_then(|frame| frame.below.clone());
+                environment.test = Some(Box::new((owner, Iteration { index: number, elements: None })));
+                let test = self.append(context, index, state, Role::Test, visit, Some(number), 0);
+                self.cursors[index].environment.test = None;
+                self.branch_on_test(context, index, test, visit, number);
+            }
+        }
+    }
+
+    /// The first state of the innermost loop's body is next.
+    pub(super) fn begin_iteration(&mut self, index: usize, program: &Program) {
+        let Some(frame) = &self.cursors[index].environment.frames else { return };
+        let body = match &program.state(frame.owner).kind {
+            StateKind::ForEach { body, .. } | StateKind::While { body, .. } => body.first(),
+            _ => None,
+        };
+        let base = frame.variables;
+        self.cursors[index].environment.variables.truncate(base);
+        self.cursors[index].todo = body.map_or(Todo::Iterate, |first| Todo::Enter(*first));
+    }
+}
