@@ -34,7 +34,8 @@ fn every_box_is_delivered_although_everything_goes_wrong_once() -> anyhow::Resul
 }
 
 #[test]
-fn a_table_is_set_with_upright_bowls_although_a_grasp_slips_and_the_arm_gives_up() -> anyhow::Result<()> {
+fn a_table_with_a_plate_is_set_with_upright_bowls_and_cups_although_a_grasp_slips_and_the_arm_gives_up()
+-> anyhow::Result<()> {
     let place = Place::new()?;
     let out = place.path().join("out");
     let out = out.to_str().context("a path")?;
@@ -45,6 +46,10 @@ fn a_table_is_set_with_upright_bowls_although_a_grasp_slips_and_the_arm_gives_up
         "--bowls",
         "1",
         "--forks",
+        "1",
+        "--cups",
+        "1",
+        "--plates",
         "1",
         "--planners",
         "1",
@@ -63,7 +68,7 @@ fn a_table_is_set_with_upright_bowls_although_a_grasp_slips_and_the_arm_gives_up
     let (code, document, said) = place.start(&arguments)?.finish()?;
     ensure!(code == Some(0), "{code:?}\n{said}");
     let document: Value = serde_json::from_str(&document).with_context(|| document.clone())?;
-    ensure!(document["delivered_per_run"] == serde_json::json!([2, 2]), "{document}");
+    ensure!(document["delivered_per_run"] == serde_json::json!([4, 4]), "{document}");
     for (run, name) in document["runs"].as_array().context("no runs")?.iter().zip(["hsm_s", "cdtn_1mp_s"]) {
         ensure!(document[name].as_f64().is_some(), "it did not end with success: {document}\n{said}");
         let tilt = run["greatest_tilt_rad"].as_f64().context("no tilt")?;

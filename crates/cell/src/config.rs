@@ -10,7 +10,7 @@ use std::path::PathBuf;
 /// The most boxes that a cell can have: as many as there are places on the base.
 pub const MAX_BOXES: usize = 9;
 
-/// The most bowls that a cell can have, and the most forks: as many as there are places for each on the table.
+/// The most of each kind of tableware that a cell can have: as many as there are places for it on the table.
 pub const MAX_TABLEWARE: usize = 3;
 
 /// What the cell is furnished for: the paper's two experiments.
@@ -20,19 +20,24 @@ pub enum Setting {
     /// Boxes on a table, to be fetched onto the base.
     #[default]
     Boxes,
-    /// Bowls and forks on a rack, to be set on the table.
+    /// Bowls, forks and cups on a rack, to be set on a table that plates lie on already.
     Table,
 }
 
 /// What can be moved of a new scene; each setting looks at its own.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Goods {
     /// Boxes, 1 to 9.
     pub boxes: usize,
     /// Bowls, 0 to 3.
     pub bowls: usize,
-    /// Forks, 0 to 3; with the bowls at least one.
+    /// Forks, 0 to 3.
     pub forks: usize,
+    /// Cups, 0 to 3; with bowls and forks at least one.
+    pub cups: usize,
+    /// Plates, 0 to 3: they lie on the table and are not moved.
+    pub plates: usize,
 }
 
 /// A cell's configuration.
@@ -45,7 +50,7 @@ pub struct CellConfig {
     pub resource_manager: Option<Endpoint>,
     /// The host that the resources say they are on.
     pub host: String,
-    /// What stands there: `boxes` on the table, or `table`: bowls and forks on a rack.
+    /// What stands there: `boxes` on the table, or `table`: tableware on a rack.
     pub scene: Setting,
     /// How many boxes stand on the table, 1 to 9.
     pub boxes: usize,
@@ -53,6 +58,10 @@ pub struct CellConfig {
     pub bowls: usize,
     /// How many forks lie on the rack, 0 to 3.
     pub forks: usize,
+    /// How many cups stand on the rack, 0 to 3.
+    pub cups: usize,
+    /// How many plates lie on the table, 0 to 3.
+    pub plates: usize,
     /// What the boxes' sizes and places and the camera's noise are derived from.
     pub seed: u64,
     /// The robot's seconds per second of wall time.
@@ -160,10 +169,12 @@ impl Setting {
 impl Goods {
     /// Whether a cell of this setting can have so many.
     pub fn fit(&self, setting: Setting) -> bool {
-        let Goods { boxes, bowls, forks } = *self;
+        let Goods { boxes, bowls, forks, cups, plates } = *self;
         match setting {
             Setting::Boxes => (1..=MAX_BOXES).contains(&boxes),
-            Setting::Table => bowls <= MAX_TABLEWARE && forks <= MAX_TABLEWARE && bowls + forks > 0,
+            Setting::Table => {
+                [bowls, forks, cups, plates].iter().all(|many| *many <= MAX_TABLEWARE) && bowls + forks + cups > 0
+            }
         }
     }
 
@@ -171,7 +182,7 @@ impl Goods {
     pub fn count(&self, setting: Setting) -> usize {
         match setting {
             Setting::Boxes => self.boxes,
-            Setting::Table => self.bowls + self.forks,
+            Setting::Table => self.bowls + self.forks + self.cups + self.plates,
         }
     }
 }
@@ -191,7 +202,8 @@ pub struct ConfigError {
 impl CellConfig {
     /// What can be moved at the beginning.
     pub fn goods(&self) -> Goods {
-        Goods { boxes: self.boxes, bowls: self.bowls, forks: self.forks }
+        let CellConfig { boxes, bowls, forks, cups, plates, .. } = *self;
+        Goods { boxes, bowls, forks, cups, plates }
     }
 
     /// Checks what the types cannot say.
@@ -203,7 +215,14 @@ impl CellConfig {
             ("boxes", self.boxes as f64, (1..=MAX_BOXES).contains(&self.boxes), "1 to 9"),
             ("bowls", self.bowls as f64, self.bowls <= MAX_TABLEWARE, "0 to 3"),
             ("forks", self.forks as f64, self.forks <= MAX_TABLEWARE, "0 to 3"),
-            ("forks", self.forks as f64, self.bowls + self.forks > 0, "at least 1 where there are no bowls"),
+            ("cups", self.cups as f64, self.cups <= MAX_TABLEWARE, "0 to 3"),
+            ("plates", self.plates as f64, self.plates <= MAX_TABLEWARE, "0 to 3"),
+            (
+                "forks",
+                self.forks as f64,
+                self.bowls + self.forks + self.cups > 0,
+                "at least 1 where there are no bowls and no cups",
+            ),
             ("speed", self.speed, self.speed > 0.0 && self.speed <= 1000.0, "above 0 and at most 1000"),
             (
                 "session_ttl_ms",
@@ -311,6 +330,8 @@ impl Default for CellConfig {
             boxes: 3,
             bowls: 2,
             forks: 2,
+            cups: 0,
+            plates: 0,
             seed: 1,
             speed: 1.0,
             session_ttl_ms: 3000,

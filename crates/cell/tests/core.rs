@@ -157,7 +157,7 @@ fn the_same_seed_makes_the_same_world_and_a_reset_makes_it_again() {
     assert_ne!(one.cell.ground_truth(), other.cell.ground_truth());
     let mut bench = Bench::new(5, 12);
     bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
-    bench.cell.handle(bench.now, Event::Reset { seed: 11, goods: Goods { boxes: 5, bowls: 0, forks: 0 } });
+    bench.cell.handle(bench.now, Event::Reset { seed: 11, goods: Goods { boxes: 5, ..Goods::default() } });
     assert_eq!(bench.cell.ground_truth(), one.cell.ground_truth());
     assert_eq!(bench.arm(), aimm::HOME);
 }

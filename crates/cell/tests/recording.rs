@@ -6,7 +6,7 @@ mod bench;
 
 use bench::{Bench, grasp};
 use ratn_cell::config::CellConfig;
-use ratn_cell::core::boxes::TrueBox;
+use ratn_cell::core::objects::TrueObject;
 use ratn_cell::core::protocol::{Command, Ending, Event, Product, Request};
 use ratn_cell::core::recording::{Line, ReplayError, replay};
 use ratn_cell::core::snapshot::{Snapshot, SnapshotError};
@@ -82,7 +82,7 @@ fn deliver(bench: &mut Bench) -> String {
     bench.done(Request::Release);
     bench.pass(3.0);
     // How far it leaned is looked at step by step, and steps may fall elsewhere.
-    let settled = bench.cell.ground_truth().into_iter().map(|o| TrueBox { greatest_tilt_rad: 0.0, ..o });
+    let settled = bench.cell.ground_truth().into_iter().map(|o| TrueObject { greatest_tilt_rad: 0.0, ..o });
     format!("{:?}", settled.collect::<Vec<_>>())
 }
 

@@ -160,12 +160,12 @@ async fn the_detector_finds_the_boxes_through_the_leased_camera() {
     let outcome = system.execute(&lease, "Detector", "segment", inputs).await.unwrap();
     assert!(outcome.is_success(), "{outcome:?}");
     let Value::List(boxes) = &outcome.outputs["boxes"] else { panic!() };
-    let truth = system.truth().await.boxes;
+    let truth = system.truth().await.objects;
     assert_eq!(boxes.len(), truth.len());
     assert_eq!((outcome.measured.len(), outcome.evidence.len()), (2 * boxes.len(), 2 * boxes.len()));
     for found in boxes {
         let Some(Value::Pose(pose)) = found.field("pose") else { panic!() };
-        let off = |t: &v1::TrueBox| {
+        let off = |t: &v1::TrueObject| {
             let p = &t.pose.as_ref().unwrap().position_m;
             pose.distance(&Pose::at(p[0], p[1], p[2]))
         };
@@ -245,21 +245,21 @@ async fn a_goal_with_an_older_lease_or_without_one_is_refused() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_reset_lays_the_same_table_again() {
     let system = system(1.0, 4).await;
-    let first = system.truth().await.boxes;
+    let first = system.truth().await.objects;
     let mut client = CellServiceClient::new(system.channels.get(&system.cell).unwrap());
     let other = client
         .reset(v1::ResetRequest { seed: 8, boxes: 2, ..v1::ResetRequest::default() })
         .await
         .unwrap()
         .into_inner()
-        .boxes;
+        .objects;
     assert_eq!(other.len(), 2);
     let again = client
         .reset(v1::ResetRequest { seed: 3, boxes: 4, ..v1::ResetRequest::default() })
         .await
         .unwrap()
         .into_inner()
-        .boxes;
+        .objects;
     assert_eq!(first, again);
     assert!(client.reset(v1::ResetRequest { seed: 3, boxes: 10, ..v1::ResetRequest::default() }).await.is_err());
     system.end.cancel();

@@ -115,7 +115,7 @@ pub(crate) struct CellArguments {
     pub(crate) role: RoleArguments,
     #[command(flatten)]
     pub(crate) faults: FaultArguments,
-    /// What the cell is furnished for: boxes on a table, or bowls and forks on a rack; as its config says unless given
+    /// What the cell is furnished for: boxes on a table, or tableware on a rack; as its config says unless given
     #[arg(long, value_name = "SCENE", value_parser = scene)]
     pub(crate) scene: Option<Setting>,
     /// Write down in a new file what happens, line by line
@@ -467,6 +467,12 @@ pub(crate) struct ResetArguments {
     /// Forks on the new rack; as many as on the old one unless given
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=3))]
     pub(crate) forks: Option<u32>,
+    /// Cups on the new rack; as many as on the old one unless given
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) cups: Option<u32>,
+    /// Plates on the new table; as many as on the old one unless given
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) plates: Option<u32>,
     /// The same seed makes the same scene; that of the old one unless given
     #[arg(long, value_name = "N")]
     pub(crate) seed: Option<u64>,
@@ -490,7 +496,7 @@ pub(crate) struct UpArguments {
 /// What differs from a system's config.
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct SystemArguments {
-    /// What the cell is furnished for: boxes on a table, or bowls and forks on a rack
+    /// What the cell is furnished for: boxes on a table, or tableware on a rack
     #[arg(long, value_name = "SCENE", value_parser = scene)]
     pub(crate) scene: Option<Setting>,
     /// Boxes on the cell's table
@@ -502,6 +508,12 @@ pub(crate) struct SystemArguments {
     /// Forks on the cell's rack
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=3))]
     pub(crate) forks: Option<u32>,
+    /// Cups on the cell's rack
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) cups: Option<u32>,
+    /// Plates on the cell's table
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) plates: Option<u32>,
     /// Path planner processes
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=32))]
     pub(crate) planners: Option<u32>,
@@ -528,7 +540,7 @@ pub(crate) enum Budget {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct DemoArguments {
-    /// Which of the paper's experiments: boxes are fetched onto the base, or a table is set with bowls and forks
+    /// Which of the paper's experiments: boxes are fetched onto the base, or a table is set with tableware from a rack
     #[arg(long, value_name = "SCENARIO", default_value = "boxes", value_parser = scene)]
     pub(crate) scenario: Setting,
     /// Boxes to fetch
@@ -540,6 +552,12 @@ pub(crate) struct DemoArguments {
     /// Forks to set
     #[arg(long, value_name = "0..3", default_value_t = 2, value_parser = clap::value_parser!(u32).range(0..=3))]
     pub(crate) forks: u32,
+    /// Cups to set
+    #[arg(long, value_name = "0..3", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) cups: u32,
+    /// Plates that lie on the table, between which the rest is set
+    #[arg(long, value_name = "0..3", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=3))]
+    pub(crate) plates: u32,
     /// Path planner processes of the last run
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=32))]
     pub(crate) planners: u32,

@@ -21,6 +21,9 @@ const CLEARANCE_M: f64 = 0.002;
 const RIM_DEPTH_M: f64 = 0.02;
 const RIM_INSET_M: f64 = 0.005;
 
+/// Ways to turn the fingers around something round, in half a turn; after that they are the same fingers.
+const TURNS: u32 = 8;
+
 /// Places around a rim.
 const AROUND: u32 = 16;
 
@@ -35,6 +38,13 @@ pub fn from_above(centre: &Pose, size: [f64; 3]) -> [Pose; 2] {
     let [at_x, at_y, at_z] = centre.position;
     let turned = |by: f64| Pose::from_rpy([at_x, at_y, at_z + height], PI, 0.0, yaw(centre) + across + by);
     [turned(0.0), turned(PI)]
+}
+
+/// The ways to take something round from above that is narrower than the fingers open: they close around it from any side. As
+/// [`from_above`].
+pub fn around(centre: &Pose, size: [f64; 3]) -> Vec<Pose> {
+    let turned = |i: u32| Pose::from_rpy([0.0; 3], 0.0, 0.0, PI * f64::from(i) / f64::from(TURNS));
+    (0..TURNS).flat_map(|i| from_above(&centre.compose(&turned(i)), size)).collect()
 }
 
 /// The ways to take something round and open by its rim, all around it and each with either finger inside. As [`from_above`].
@@ -70,6 +80,17 @@ mod tests {
         for grasp in from_above(&Pose::at(0.7, 0.1, 0.75), [0.05, 0.2, 0.02]) {
             let tip = grasp.transform([0.0, 0.0, FINGERTIP_M]);
             assert!(close(tip, [0.7, 0.1, 0.74 + CLEARANCE_M]), "{tip:?}");
+        }
+    }
+
+    #[test]
+    fn a_cup_is_taken_with_the_fingers_beside_it_from_every_side() {
+        let centre = Pose::from_rpy([0.7, 0.1, 0.75], 0.0, 0.0, 0.3);
+        let grasps = around(&centre, [0.07, 0.07, 0.09]);
+        assert_eq!(grasps.len(), 2 * TURNS as usize);
+        for (i, grasp) in grasps.iter().enumerate() {
+            assert!(close(grasp.position, [0.7, 0.1, 0.765]) && close(grasp.rotate([0.0, 0.0, 1.0]), [0.0, 0.0, -1.0]));
+            assert!(grasps[..i].iter().all(|other| other.angle(grasp) > 0.3));
         }
     }
 

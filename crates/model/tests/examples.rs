@@ -58,13 +58,14 @@ fn setting_the_table_takes_as_long_as_in_the_second_table_when_executed_in_seque
 }
 
 #[test]
-fn the_objects_to_set_are_the_bowls_then_the_forks() {
+fn the_objects_to_set_are_the_bowls_then_the_forks_then_the_cups() {
     let program = example("set_table");
-    let set = [("bowls".to_owned(), "1".to_owned()), ("forks".to_owned(), "2".to_owned())];
+    let set = [("bowls", "1"), ("forks", "2"), ("cups", "1")].map(|(name, n)| (name.to_owned(), n.to_owned()));
     let scope = program.bind_parameters(&set).unwrap();
     let StateKind::ForEach { collection, .. } = &program.states[1].kind else { panic!("a loop") };
-    assert_eq!(collection.evaluate(&scope).unwrap().to_string(), "[bowl, fork, fork]");
+    assert_eq!(collection.evaluate(&scope).unwrap().to_string(), "[bowl, fork, fork, cup]");
     let world = ratn_model::expression::EffectExpr::bind(&program.initial, &scope).unwrap();
     let text: Vec<String> = world.iter().map(|change| change.pattern().to_string()).collect();
     assert!(text.contains(&"at(bowl_1)".to_owned()) && text.contains(&"at(fork_2)".to_owned()), "{text:?}");
+    assert!(text.contains(&"at(cup_1)".to_owned()) && text.contains(&"at(place_cup_3)".to_owned()), "{text:?}");
 }

@@ -11,13 +11,13 @@
 
 use super::activity::{Activity, Kind, seconds};
 use super::battery::Battery;
-use super::boxes::{Placed, TrueBox};
 use super::deviations::LOST;
 use super::environment::Environment;
 use super::faults::Faults;
 use super::grasping::Pads;
 use super::holding::Held;
 use super::leases::Leases;
+use super::objects::{Placed, TrueObject};
 use super::picture::{Exposure, Scenery};
 use super::placement::{self, PlacementError, TABLE};
 use super::protocol::{Command, Ending, Event, Module, Product};
@@ -179,7 +179,7 @@ impl Cell {
     }
 
     /// What is true of every object.
-    pub fn ground_truth(&self) -> Vec<TrueBox> {
+    pub fn ground_truth(&self) -> Vec<TrueObject> {
         let tool = self.robot.tool_pose(&self.configuration());
         let truth = |i: usize| {
             let held = self.held.is_some_and(|held| held.object == i);
@@ -192,7 +192,7 @@ impl Cell {
                 Setting::Table => on == TABLE && tableware::is_in_place(kind, &pose),
             };
             let (id, size, greatest_tilt_rad) = (self.ids[i].clone(), self.size_of(i), self.tilts[i]);
-            TrueBox { id, kind, size, pose, on_base, in_place, greatest_tilt_rad, held, on }
+            TrueObject { id, kind, size, pose, on_base, in_place, greatest_tilt_rad, held, on }
         };
         (0..self.ids.len()).map(truth).collect()
     }

@@ -1,8 +1,9 @@
 //! What is between the fingers, really.
 //!
-//! The pads of the two fingers sweep a cuboid of the tool frame when they close (along y). A box is grasped when two of its
+//! The pads of the two fingers sweep a cuboid of the tool frame when they close (along y). What they can close around of an object is a
+//! cuboid, too (`Model::grip_part`): a box, the wall of a bowl. It is grasped when two of its
 //! opposite faces are roughly across that direction, all of it that the pads would meet is between them, and the pads meet
-//! enough of it. Closing then turns and shifts the box until its faces are flush with the pads: compliant boxes and rigid
+//! enough of it. Closing then turns and shifts it until its faces are flush with the pads: compliant objects and rigid
 //! fingers do that, so a pose that was off by millimetres ends exactly in the middle.
 
 use ratn_model::pose::Pose;
@@ -22,24 +23,24 @@ pub struct Pads {
 /// A grasp.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Grip {
-    /// Which box of those asked about.
+    /// Which of those asked about.
     pub index: usize,
     /// The opening at which the fingers stopped, in metres.
     pub width: f64,
-    /// The box's centre in the tool frame, once the fingers have closed.
+    /// The cuboid's centre in the tool frame, once the fingers have closed.
     pub in_tool: Pose,
 }
 
 /// Why closing the fingers holds nothing.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NotGrasped {
-    /// No box is there.
+    /// No object is there.
     #[error("nothing is between the fingers")]
     Nothing,
     /// It would not lie flush.
     #[error("{id} stands {degrees:.0}° askew between the fingers; at most {MAX_ASKEW_DEGREES}° is taken")]
     Askew {
-        /// Which box.
+        /// Which object.
         id: String,
         /// How much.
         degrees: f64,
@@ -47,7 +48,7 @@ pub enum NotGrasped {
     /// A finger is in it or on the wrong side of it.
     #[error("{id} is not between the fingers: it reaches {beyond_mm:.0} mm beyond one of them")]
     Beyond {
-        /// Which box.
+        /// Which object.
         id: String,
         /// How far.
         beyond_mm: f64,
@@ -55,7 +56,7 @@ pub enum NotGrasped {
     /// Only an edge of it is there.
     #[error("the fingers hold only an edge of {id}: {held_mm:.0} mm of it, at least {:.0} mm are needed", MIN_HOLD_M * 1e3)]
     Edge {
-        /// Which box.
+        /// Which object.
         id: String,
         /// How much.
         held_mm: f64,
@@ -70,9 +71,9 @@ pub enum NotGrasped {
     },
 }
 
-/// How far a box may be turned away from the closing direction.
+/// How far a cuboid may be turned away from the closing direction.
 pub const MAX_ASKEW_DEGREES: f64 = 15.0;
-/// How much of a box the pads must hold, along x and along z.
+/// How much of it the pads must hold, along x and along z.
 pub const MIN_HOLD_M: f64 = 0.008;
 /// What the pads give way, in metres.
 const PAD_GIVE_M: f64 = 0.002;
@@ -92,23 +93,23 @@ impl Pads {
     ///
     /// # Errors
     /// [`NotGrasped`] says why they hold nothing.
-    pub fn close(&self, tool: &Pose, finger: f64, boxes: &[(String, Pose, [f64; 3])]) -> Result<Grip, NotGrasped> {
+    pub fn close(&self, tool: &Pose, finger: f64, cuboids: &[(String, Pose, [f64; 3])]) -> Result<Grip, NotGrasped> {
         let mut grip: Option<Grip> = None;
-        for (index, (id, pose, size)) in boxes.iter().enumerate() {
+        for (index, (id, pose, size)) in cuboids.iter().enumerate() {
             let in_tool = tool.inverse().compose(pose);
             if !self.meets(finger, &in_tool, size) {
                 continue;
             }
             let new = self.grip(index, id, &in_tool, size, finger)?;
             if let Some(other) = grip {
-                return Err(NotGrasped::Several { first: boxes[other.index].0.clone(), second: id.clone() });
+                return Err(NotGrasped::Several { first: cuboids[other.index].0.clone(), second: id.clone() });
             }
             grip = Some(new);
         }
         grip.ok_or(NotGrasped::Nothing)
     }
 
-    /// What of a box lies between the closed pads: least and greatest x and z of the tool frame. `None` where that is too little to
+    /// What of a cuboid lies between the closed pads: least and greatest x and z of the tool frame. `None` where that is too little to
     /// hold it.
     pub fn patch(&self, in_tool: &Pose, size: &[f64; 3]) -> Option<[[f64; 2]; 2]> {
         let axes = axes(in_tool);
@@ -121,7 +122,7 @@ impl Pads {
         enough.then_some([x, z])
     }
 
-    /// Whether a box is in the cuboid that the pads sweep: whether no axis of either separates the two.
+    /// Whether a cuboid is in the one that the pads sweep: whether no axis of either separates the two.
     fn meets(&self, finger: f64, in_tool: &Pose, size: &[f64; 3]) -> bool {
         let half = [self.x, finger, (self.z_to - self.z_from) / 2.0];
         let offset = [in_tool.position[0], in_tool.position[1], in_tool.position[2] - (self.z_to + self.z_from) / 2.0];
@@ -130,12 +131,12 @@ impl Pads {
             let reach: f64 = (0..3).map(|k| axes[k][i].abs() * size[k] / 2.0).sum();
             offset[i].abs() < half[i] + reach
         };
-        let along_box = |k: usize| {
+        let along_it = |k: usize| {
             let reach: f64 = (0..3).map(|i| axes[k][i].abs() * half[i]).sum();
             let distance: f64 = (0..3).map(|i| axes[k][i] * offset[i]).sum();
             distance.abs() < size[k] / 2.0 + reach
         };
-        (0..3).all(along_tool) && (0..3).all(along_box)
+        (0..3).all(along_tool) && (0..3).all(along_it)
     }
 
     fn grip(&self, index: usize, id: &str, in_tool: &Pose, size: &[f64; 3], finger: f64) -> Result<Grip, NotGrasped> {
@@ -163,7 +164,7 @@ impl Pads {
     }
 }
 
-/// The pose after closing: the axis that lay roughly along ±y lies exactly so, and the box is in the middle.
+/// The pose after closing: the axis that lay roughly along ±y lies exactly so, and the cuboid is in the middle.
 fn flush(in_tool: &Pose, axis: [f64; 3]) -> Pose {
     let side = axis[1].signum();
     // The rotation that takes `axis` to ±y: about their cross product, by the angle between them.

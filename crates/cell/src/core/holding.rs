@@ -1,9 +1,9 @@
 //! What happens to objects when the fingers close and open, and while they hold something.
 
-use super::boxes::ON_BASE;
 use super::cell::Cell;
 use super::environment::{GRAVITY, Grip, Hold, Kind, Load, Model, STEP, Slip, Support};
 use super::faults::Kind as Fault;
+use super::objects::ON_BASE;
 use super::protocol::{Ending, Product};
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
@@ -66,6 +66,12 @@ impl Cell {
                 return Ending::Aborted(format!("{object} is not grasped: {reason}"));
             }
         };
+        if let Some(lean) = self.environment.model(grip.index).slips_off() {
+            self.resting.finger = 0.0;
+            let (id, degrees) = (&self.ids[grip.index], lean.to_degrees());
+            let reason = format!("the rim of {id} leans outwards by {degrees:.0}°, the fingers slide off it");
+            return Ending::Aborted(format!("{object} is not grasped: {reason}"));
+        }
         if self.faults.occurs(Fault::GraspSlips).is_some() {
             self.resting.finger = 0.0;
             let id = &self.ids[grip.index];

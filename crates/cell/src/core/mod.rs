@@ -1,10 +1,10 @@
 //! The cell as a pure machine: events in, commands out, time as an argument.
 
-pub mod boxes;
 pub mod cell;
 pub mod environment;
 pub mod faults;
 pub mod grasping;
+pub mod objects;
 pub mod picture;
 pub mod placement;
 pub mod protocol;

@@ -1,8 +1,8 @@
 //! What stands there is random, but so that the task can be done: apart from each other, within reach, and each object graspable
 //! from above while all others still stand there. The same seed gives the same scene.
 
-use super::boxes::Placed;
 use super::environment::{Furniture, Kind, Model};
+use super::objects::Placed;
 use super::tableware;
 use crate::config::{Goods, Setting};
 use rand::{RngExt, SeedableRng};
@@ -55,8 +55,8 @@ pub fn objects(robot: &Robot, setting: Setting, goods: Goods, seed: u64) -> Resu
 fn dishes(robot: &Robot, goods: Goods, seed: u64) -> Result<Vec<Placed>, PlacementError> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut tables = (0..MAX_TABLES).map(|_| tableware::lay(goods, &mut random));
-    let feasible = tables.find(|placed| all_graspable(robot, Setting::Table, placed));
-    feasible.ok_or(PlacementError { count: goods.bowls + goods.forks, seed })
+    let feasible = tables.find(|placed| tableware::are_apart(placed) && all_graspable(robot, Setting::Table, placed));
+    feasible.ok_or(PlacementError { count: goods.count(Setting::Table), seed })
 }
 
 /// Boxes on the table.
@@ -177,7 +177,7 @@ impl Rectangle {
     }
 }
 
-/// Whether each object can be taken from above while all of them stand there.
+/// Whether each object that can be taken from above at all can be so while all of them stand there.
 fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
     let parts = placed.iter().flat_map(|object| {
         object.model.parts().into_iter().map(|(part, shape)| SceneObject {
@@ -190,7 +190,7 @@ fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
     let mut checker = Checker::new(robot, &scene, PADDING_M);
     let (reach, home) = (arm::reach(robot), arm::positions(&aimm::HOME));
     let mut random = ChaCha8Rng::seed_from_u64(0);
-    placed.iter().all(|object| {
+    placed.iter().filter(|object| object.model.slips_off().is_none()).all(|object| {
         grasps(object).iter().any(|grasp| {
             reach.solutions(&Target::at(*grasp), &home, 6, 20, &mut random).iter().any(|posture| {
                 let posture = std::array::from_fn(|j| posture[j]);
@@ -207,7 +207,8 @@ fn grasps(object: &Placed) -> Vec<Pose> {
     match object.model.kind {
         Kind::Bowl | Kind::Plate => grasp::at_rim(&object.pose, object.model.size),
         Kind::Box => aimm::grasp_poses(&object.pose, object.model.size).to_vec(),
-        Kind::Cup | Kind::Fork => grasp::from_above(&object.pose, object.model.size).to_vec(),
+        Kind::Cup => grasp::around(&object.pose, object.model.size),
+        Kind::Fork => grasp::from_above(&object.pose, object.model.size).to_vec(),
     }
 }
 
@@ -232,11 +233,13 @@ mod tests {
     #[test]
     fn every_rack_is_laid_and_the_same_seed_lays_the_same() {
         let robot = Robot::aimm();
-        for (bowls, forks) in [(0, 1), (1, 0), (2, 2), (3, 3)] {
-            let goods = Goods { boxes: 0, bowls, forks };
+        for (bowls, forks, cups, plates) in
+            [(0, 1, 0, 0), (1, 0, 0, 0), (2, 2, 0, 0), (3, 3, 0, 0), (0, 0, 1, 0), (3, 3, 3, 3)]
+        {
+            let goods = Goods { bowls, forks, cups, plates, ..Goods::default() };
             let rack = |seed| objects(&robot, Setting::Table, goods, seed).unwrap();
             for seed in 0..20 {
-                assert_eq!(rack(seed).len(), bowls + forks);
+                assert_eq!(rack(seed).len(), bowls + forks + cups + plates);
             }
             assert_eq!(rack(1), rack(1));
             assert_ne!(rack(1), rack(2));
@@ -246,7 +249,7 @@ mod tests {
     #[test]
     fn every_place_on_the_table_can_be_served_from_above_while_all_others_are_full() {
         let robot = Robot::aimm();
-        let goods = Goods { boxes: 0, bowls: 3, forks: 3 };
+        let goods = Goods { bowls: 3, forks: 3, cups: 3, plates: 3, ..Goods::default() };
         let mut placed = objects(&robot, Setting::Table, goods, 1).unwrap();
         for (i, object) in placed.iter_mut().enumerate() {
             let place = tableware::places(object.model.kind)[i % 3];

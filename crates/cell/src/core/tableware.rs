@@ -1,11 +1,19 @@
-//! The second scene: bowls and forks on a rack, and the places on the table where they shall stand.
+//! The second scene: bowls, forks and cups on a rack, and the places on the table where they shall stand.
 //!
+//! ```text
+//!      left: the table             right: the rack
+//!   plates    O     O     O
+//!   bowls     o     o     o   |  o     o     o
+//!   cups        .     .     . |     .     .     .
+//!   forks     |     |     |   |  |     |     |       (the robot is below)
+//! ```
 //! The rack is a board on the right half of the table. On it, as on the left half, there is a row of bowls and, nearer to the robot, a
-//! row of forks that point away from it. The places are known; where on them things stand is random, and so are their sizes. The same
-//! seed lays the same.
+//! row of forks that point away from it, with cups in between. Plates lie behind the bowls' places from the beginning: their rims
+//! are too flat for fingers that come from above ([`Model::slips_off`]). The places are known; where on them things stand is random, and so
+//! are their sizes. The same seed lays the same.
 
-use super::boxes::Placed;
 use super::environment::{Furniture, Kind, Model};
+use super::objects::Placed;
 use crate::config::{Goods, MAX_TABLEWARE};
 use rand::seq::SliceRandom;
 use rand::{Rng, RngExt};
@@ -18,27 +26,48 @@ pub const RACK: &str = "rack";
 /// The height of its top, in metres.
 pub const RACK_HEIGHT_M: f64 = 0.75;
 /// The rack: a board, its middle and its edges.
-const RACK_CENTRE: [f64; 3] = [0.72, -0.25, 0.725];
-const RACK_SIZE: [f64; 3] = [0.44, 0.54, 0.05];
+const RACK_CENTRE: [f64; 3] = [0.72, -0.29, 0.725];
+const RACK_SIZE: [f64; 3] = [0.44, 0.62, 0.05];
 /// Where somebody puts what is moved on the rack: least and greatest x, least and greatest y.
 pub const RACK_REGION: [[f64; 2]; 2] = [[0.62, 0.84], [-0.40, -0.10]];
 
-/// Where the rows are, along x, on the rack and on the table.
-const BOWLS_X: f64 = 0.83;
-const FORKS_X: f64 = 0.62;
-/// Where a row begins on the rack, from where it goes on to the right, and on the table, to the left: an open finger fits between two
-/// bowls.
-const RACK_FIRST_Y: f64 = -0.06;
-const TABLE_FIRST_Y: f64 = 0.10;
-const BETWEEN_M: f64 = 0.19;
+/// A row of places for things of a kind.
+struct Row {
+    /// Where it is along x, on the rack and on the table.
+    x: f64,
+    /// Where it begins on the rack, from where it goes on to the right.
+    rack_y: f64,
+    /// Where it begins on the table, from where it goes on to the left.
+    table_y: f64,
+    /// From one place to the next.
+    between: f64,
+}
+
+/// An open finger fits between two bowls.
+const BOWLS: Row = Row { x: 0.83, rack_y: -0.06, table_y: 0.10, between: 0.19 };
+const FORKS: Row = Row { x: 0.62, ..BOWLS };
+/// Between bowls and forks, so far from the forks' middles that the hand fits in between.
+const CUPS: Row = Row { x: 0.745, rack_y: -0.155, ..BOWLS };
+/// On the table nearer to their bowls' left sides, which leaves the last one on it.
+const CUPS_ON_TABLE: Row = Row { x: 0.73, table_y: 0.175, ..CUPS };
+/// As far apart as the table is long enough for, so that the camera tells them apart.
+const PLATES: Row = Row { x: 1.0, rack_y: f64::NAN, table_y: 0.115, between: 0.195 };
 
 /// How far from its place on the rack something stands at the most, in metres, and how far a fork is turned, in radians.
 const SPREAD_M: f64 = 0.008;
 const SPREAD_RAD: f64 = 0.25;
-/// Least and greatest radius and height of bowls, and length of forks, in metres.
+/// The same of plates, which the table has hardly room for.
+const PLATE_SPREAD_M: f64 = 0.002;
+/// How far apart what is round stands at the least, in metres.
+const APART_M: f64 = 0.02;
+/// Least and greatest radius and height of bowls, cups and plates, and length of forks, in metres.
 const BOWL_RADIUS: [f64; 2] = [0.058, 0.066];
 const BOWL_HEIGHT: [f64; 2] = [0.046, 0.056];
 const FORK_LENGTH: [f64; 2] = [0.17, 0.19];
+const CUP_RADIUS: [f64; 2] = [0.033, 0.036];
+const CUP_HEIGHT: [f64; 2] = [0.075, 0.09];
+const PLATE_RADIUS: [f64; 2] = [0.085, 0.086];
+const PLATE_HEIGHT: [f64; 2] = [0.022, 0.026];
 
 /// How far from its place something that was set stands at the most, in metres.
 const MAX_OFF_PLACE_M: f64 = 0.02;
@@ -54,7 +83,8 @@ pub fn rack() -> Furniture {
 
 /// The places on the table for things of a kind, on its surface; a fork's x axis points to its tips.
 pub fn places(kind: Kind) -> [Pose; MAX_TABLEWARE] {
-    std::array::from_fn(|i| Pose::at(row(kind), TABLE_FIRST_Y + BETWEEN_M * i as f64, aimm::TABLE_HEIGHT_M))
+    let Row { x, table_y, between, .. } = if kind == Kind::Cup { CUPS_ON_TABLE } else { row(kind) };
+    std::array::from_fn(|i| Pose::at(x, table_y + between * i as f64, aimm::TABLE_HEIGHT_M))
 }
 
 /// Whether something stands, or lies, at a place of its kind on the table.
@@ -65,38 +95,64 @@ pub fn is_in_place(kind: Kind, pose: &Pose) -> bool {
     upright && (ahead || kind != Kind::Fork) && places(kind).iter().any(|place| off(place) <= MAX_OFF_PLACE_M)
 }
 
-/// A random rack.
+/// Whether the camera tells round things from each other.
+pub(super) fn are_apart(placed: &[Placed]) -> bool {
+    let near = |a: &Placed, b: &Placed| {
+        let [x, y] = [0, 1].map(|i| a.pose.position[i] - b.pose.position[i]);
+        x.hypot(y) < (a.model.size[0] + b.model.size[0]) / 2.0 + APART_M
+    };
+    let round: Vec<&Placed> = placed.iter().filter(|object| object.model.is_round()).collect();
+    round.iter().enumerate().all(|(i, a)| round[..i].iter().all(|b| !near(a, b)))
+}
+
+/// A random rack, and plates on the table.
 pub(super) fn lay(goods: Goods, random: &mut impl Rng) -> Vec<Placed> {
     let mut placed = Vec::new();
-    for (kind, count) in [(Kind::Bowl, goods.bowls), (Kind::Fork, goods.forks)] {
-        let mut places: [f64; MAX_TABLEWARE] = std::array::from_fn(|i| RACK_FIRST_Y - BETWEEN_M * i as f64);
+    let kinds =
+        [(Kind::Bowl, goods.bowls), (Kind::Fork, goods.forks), (Kind::Cup, goods.cups), (Kind::Plate, goods.plates)];
+    for (kind, count) in kinds.into_iter().filter(|(_, count)| *count > 0) {
+        let mut places = if kind == Kind::Plate { places(kind) } else { on_rack(kind) };
         places.shuffle(random);
-        for (i, y) in places.into_iter().take(count).enumerate() {
-            let (model, name) = match kind {
-                Kind::Fork => (fork(within(FORK_LENGTH, random)), "fork"),
-                _ => (bowl(within(BOWL_RADIUS, random), within(BOWL_HEIGHT, random)), "bowl"),
-            };
-            let mut off = || random.random_range(-SPREAD_M..=SPREAD_M);
-            let at = [row(kind) + off(), y + off(), RACK_HEIGHT_M + model.size[2] / 2.0];
+        for (i, place) in places.into_iter().take(count).enumerate() {
+            let model = model(kind, random);
+            let spread = if kind == Kind::Plate { PLATE_SPREAD_M } else { SPREAD_M };
+            let [x, y, top] = place.position;
+            let at = [x, y].map(|c| c + random.random_range(-spread..=spread));
             let yaw = random.random_range(-SPREAD_RAD..=SPREAD_RAD);
-            placed.push(Placed { id: format!("{name}_{}", i + 1), model, pose: Pose::from_rpy(at, 0.0, 0.0, yaw) });
+            let pose = Pose::from_rpy([at[0], at[1], top + model.size[2] / 2.0], 0.0, 0.0, yaw);
+            placed.push(Placed { id: format!("{}_{}", kind.name(), i + 1), model, pose });
         }
     }
     placed
 }
 
-fn row(kind: Kind) -> f64 {
-    if kind == Kind::Fork { FORKS_X } else { BOWLS_X }
+/// The places on the rack for things of a kind, on its surface.
+fn on_rack(kind: Kind) -> [Pose; MAX_TABLEWARE] {
+    let Row { x, rack_y, between, .. } = row(kind);
+    std::array::from_fn(|i| Pose::at(x, rack_y - between * i as f64, RACK_HEIGHT_M))
+}
+
+fn row(kind: Kind) -> Row {
+    match kind {
+        Kind::Fork => FORKS,
+        Kind::Cup => CUPS,
+        Kind::Plate => PLATES,
+        Kind::Bowl | Kind::Box => BOWLS,
+    }
+}
+
+/// One of random size.
+fn model(kind: Kind, random: &mut impl Rng) -> Model {
+    let (radius, height) = match kind {
+        Kind::Fork => return Model { kind, size: Seen::Fork { length: within(FORK_LENGTH, random) }.size() },
+        Kind::Cup => (CUP_RADIUS, CUP_HEIGHT),
+        Kind::Plate => (PLATE_RADIUS, PLATE_HEIGHT),
+        Kind::Bowl | Kind::Box => (BOWL_RADIUS, BOWL_HEIGHT),
+    };
+    let width = 2.0 * within(radius, random);
+    Model { kind, size: [width, width, within(height, random)] }
 }
 
 fn within([low, high]: [f64; 2], random: &mut impl Rng) -> f64 {
     random.random_range(low..=high)
-}
-
-fn bowl(radius: f64, height: f64) -> Model {
-    Model { kind: Kind::Bowl, size: [2.0 * radius, 2.0 * radius, height] }
-}
-
-fn fork(length: f64) -> Model {
-    Model { kind: Kind::Fork, size: Seen::Fork { length }.size() }
 }

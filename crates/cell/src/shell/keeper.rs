@@ -26,7 +26,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
-use crate::core::boxes::TrueBox;
+use crate::core::objects::TrueObject;
 
 /// Messages that wait for the keeper at the most, besides one per goal that tells it to stop.
 const MAX_MESSAGES: usize = 256;
@@ -38,7 +38,7 @@ const RESTLESS_SLEEP: Duration = Duration::from_millis(5);
 /// What the cell knows.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct State {
-    pub(crate) boxes: Vec<TrueBox>,
+    pub(crate) objects: Vec<TrueObject>,
     pub(crate) battery: f64,
     pub(crate) arm: Joints,
     pub(crate) base: Pose,
@@ -275,7 +275,7 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
 
 fn state_of(cell: &Cell, now: Timestamp) -> State {
     State {
-        boxes: cell.ground_truth(),
+        objects: cell.ground_truth(),
         battery: cell.battery(),
         arm: cell.configuration().arm,
         base: cell.base_pose(),

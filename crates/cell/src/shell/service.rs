@@ -2,8 +2,8 @@
 
 use super::keeper::{Keeper, KeeperError, State};
 use crate::config::{Goods, MAX_BOXES, MAX_TABLEWARE, Setting};
-use crate::core::boxes::TrueBox;
 use crate::core::faults::{Fault, FaultError, MAX_FAULTS};
+use crate::core::objects::TrueObject;
 use crate::core::protocol::Event;
 use crate::core::snapshot::Snapshot;
 use ratn_model::pose::Pose;
@@ -36,31 +36,38 @@ impl CellService for Service {
             arm: Some(v1::Joints { positions: state.arm.to_vec() }),
             time_s: state.now.seconds(),
             seed: state.seed,
-            boxes: boxes(state),
+            objects: objects(state),
         }))
     }
 
     async fn reset(&self, request: Request<v1::ResetRequest>) -> Result<Response<v1::ResetResponse>, Status> {
-        let v1::ResetRequest { seed, boxes: count, bowls, forks } = request.into_inner();
+        let v1::ResetRequest { seed, boxes: count, bowls, forks, cups, plates } = request.into_inner();
         let many = |n: u32| usize::try_from(n).unwrap_or(usize::MAX);
-        let goods = Goods { boxes: many(count), bowls: many(bowls), forks: many(forks) };
+        let goods = Goods {
+            boxes: many(count),
+            bowls: many(bowls),
+            forks: many(forks),
+            cups: many(cups),
+            plates: many(plates),
+        };
         if !goods.fit(self.setting) {
             return Err(Status::invalid_argument(match self.setting {
                 Setting::Boxes => format!("{count} boxes: a table has 1 to {MAX_BOXES}"),
                 Setting::Table => {
                     format!(
-                        "{bowls} bowls and {forks} forks: a rack has 0 to {MAX_TABLEWARE} of each, and at least one"
+                        "{bowls} bowls, {forks} forks, {cups} cups, {plates} plates: there are 0 to {MAX_TABLEWARE} of each, \
+                         and at least one beside the plates"
                     )
                 }
             }));
         }
         let (state, count) = (self.keeper.reset(seed, goods).await.map_err(status)?, goods.count(self.setting));
-        if state.boxes.len() != count {
+        if state.objects.len() != count {
             let message =
                 format!("no feasible scene with {count} objects was found from seed {seed}; try another seed");
             return Err(Status::failed_precondition(message));
         }
-        Ok(Response::new(v1::ResetResponse { boxes: boxes(state) }))
+        Ok(Response::new(v1::ResetResponse { objects: objects(state) }))
     }
 
     async fn save(&self, _: Request<v1::SaveRequest>) -> Result<Response<v1::SaveResponse>, Status> {
@@ -73,7 +80,7 @@ impl CellService for Service {
             .map_err(|error| Status::invalid_argument(error.to_string()))?;
         self.keeper.tell(Event::PutBack { snapshot: Box::new(snapshot) }).await.map_err(status)?;
         let state = self.keeper.state().await.map_err(status)?;
-        Ok(Response::new(v1::PutBackResponse { boxes: boxes(state) }))
+        Ok(Response::new(v1::PutBackResponse { objects: objects(state) }))
     }
 
     async fn inject_fault(
@@ -91,19 +98,19 @@ impl CellService for Service {
     }
 }
 
-fn boxes(state: State) -> Vec<v1::TrueBox> {
-    let wire = |b: TrueBox| v1::TrueBox {
-        id: b.id,
-        pose: Some(pose(&b.pose)),
-        size_m: b.size.to_vec(),
-        on_base: b.on_base,
-        held: b.held,
-        rests_on: b.on,
-        kind: b.kind.name().to_owned(),
-        in_place: b.in_place,
-        greatest_tilt_rad: b.greatest_tilt_rad,
+fn objects(state: State) -> Vec<v1::TrueObject> {
+    let wire = |object: TrueObject| v1::TrueObject {
+        id: object.id,
+        pose: Some(pose(&object.pose)),
+        size_m: object.size.to_vec(),
+        on_base: object.on_base,
+        held: object.held,
+        rests_on: object.on,
+        kind: object.kind.name().to_owned(),
+        in_place: object.in_place,
+        greatest_tilt_rad: object.greatest_tilt_rad,
     };
-    state.boxes.into_iter().map(wire).collect()
+    state.objects.into_iter().map(wire).collect()
 }
 
 fn pose(pose: &Pose) -> v1::Pose {

@@ -35,7 +35,7 @@ const SET: (&str, &str) = ("set_table.yaml", include_str!("../../../../examples/
 const LOOK_AND_SET: (&str, &str) =
     ("set_table_recovering.yaml", include_str!("../../../../examples/set_table_recovering.yaml"));
 
-/// How far a bowl may have leaned on its way, in radians: as far as the task says, and what the grasp adds.
+/// How far a bowl or a cup may have leaned on its way, in radians: as far as the task says, and what the grasp adds.
 const MAX_TILT_RAD: f64 = 0.11;
 
 struct BuiltIn;
@@ -76,8 +76,9 @@ pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
                 return Err(anyhow!("{}: {delivered} of {goods} {}; {end}", plan.name(), goods.destination()).into());
             }
             if tilt_rad > MAX_TILT_RAD {
-                let message =
-                    format!("a bowl leaned by {tilt_rad:.2} rad on its way, at most {MAX_TILT_RAD} are tolerated");
+                let message = format!(
+                    "a bowl or a cup leaned by {tilt_rad:.2} rad on its way, at most {MAX_TILT_RAD} are tolerated"
+                );
                 return Err(anyhow!("{}: {message}", plan.name()).into());
             }
         }
@@ -131,6 +132,8 @@ async fn one_run(
         boxes: Some(arguments.boxes),
         bowls: Some(arguments.bowls),
         forks: Some(arguments.forks),
+        cups: Some(arguments.cups),
+        plates: Some(arguments.plates),
         planners: Some(plan.planners),
         speed: Some(arguments.speed),
         seed: Some(arguments.seed),

@@ -53,15 +53,17 @@ async fn reset(
     let before =
         cell.get_ground_truth(GetGroundTruthRequest {}).await.context("the cell does not answer")?.into_inner();
     let seed = arguments.seed.unwrap_or(before.seed);
-    let as_many = |kind: &str| before.boxes.iter().filter(|one| one.kind == kind).count();
+    let as_many = |kind: &str| before.objects.iter().filter(|one| one.kind == kind).count();
     let many = |given: Option<u32>, kind: &str| given.map_or_else(|| u32::try_from(as_many(kind)), Ok);
     let request = ResetRequest {
         seed,
         boxes: many(arguments.boxes, "box")?,
         bowls: many(arguments.bowls, "bowl")?,
         forks: many(arguments.forks, "fork")?,
+        cups: many(arguments.cups, "cup")?,
+        plates: many(arguments.plates, "plate")?,
     };
-    let objects = cell.reset(request).await.context("the scene is not laid anew")?.into_inner().boxes;
+    let objects = cell.reset(request).await.context("the scene is not laid anew")?.into_inner().objects;
     let (_, facts) = world.root().await.context("the scene is new, the facts are not forgotten")?;
     let every: BTreeSet<FactPattern> = facts
         .iter()
@@ -76,9 +78,13 @@ async fn reset(
         world.commit_as(commit).await.context("the table is new, the facts are not forgotten")?;
     }
     let many = |kind: &str| objects.iter().filter(|one| one.kind == kind).count();
-    let laid = match (many("box"), many("bowl"), many("fork")) {
-        (0, bowls, forks) => format!("a new rack with {bowls} bowls and {forks} forks"),
-        (boxes, ..) => format!("a new table with {boxes} boxes"),
+    let laid = match many("box") {
+        0 => {
+            let rack =
+                format!("a new rack with {} bowls, {} forks and {} cups", many("bowl"), many("fork"), many("cup"));
+            format!("{rack}, {} plates on the table", many("plate"))
+        }
+        boxes => format!("a new table with {boxes} boxes"),
     };
     Ok(format!("{laid}, from seed {seed}; {} facts are forgotten", facts.len()))
 }

@@ -120,6 +120,8 @@ impl SystemConfig {
         self.cell.boxes = arguments.boxes.map_or(self.cell.boxes, |n| n as usize);
         self.cell.bowls = arguments.bowls.map_or(self.cell.bowls, |n| n as usize);
         self.cell.forks = arguments.forks.map_or(self.cell.forks, |n| n as usize);
+        self.cell.cups = arguments.cups.map_or(self.cell.cups, |n| n as usize);
+        self.cell.plates = arguments.plates.map_or(self.cell.plates, |n| n as usize);
         self.cell.seed = arguments.seed.unwrap_or(self.cell.seed);
         self.cell.faults.extend(&arguments.faults.fault);
         if let Some(planners) = arguments.planners {

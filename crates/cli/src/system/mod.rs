@@ -25,8 +25,8 @@ const DIRECTORY_VARIABLE: &str = "RATN_RUNTIME_DIR";
 /// In a runtime directory: the config of the system that runs there.
 const CONFIG_FILE: &str = "system.toml";
 const CELL: &str = "cell";
-/// The kind of object that has to be carried upright.
-const BOWL: &str = "bowl";
+/// The kinds of objects that have to be carried upright.
+const UPRIGHT: [&str; 2] = ["bowl", "cup"];
 /// The roles of a system on one machine, in the order in which they are started.
 const ROLES: [&str; 4] = ["resource-manager", "world-pool", CELL, "process-manager"];
 
@@ -117,15 +117,15 @@ impl System {
         self.processes.one_ended().await
     }
 
-    /// How many objects are really where the task was to bring them, as only the cell knows, and how far a bowl leaned at the most while it
-    /// was held, in radians.
+    /// How many objects are really where the task was to bring them, as only the cell knows, and how far a bowl or a cup leaned at the most
+    /// while it was held, in radians.
     pub(crate) async fn in_place(&self) -> anyhow::Result<(usize, f64)> {
         let channel = Channels::new().get(&self.directory.find(CELL)?)?;
         let truth = CellServiceClient::new(channel).get_ground_truth(GetGroundTruthRequest {}).await;
         let truth = truth.context("the cell does not say where its objects are")?.into_inner();
-        let count = truth.boxes.iter().filter(|one| one.in_place && !one.held).count();
-        let bowls = truth.boxes.iter().filter(|one| one.kind == BOWL);
-        Ok((count, bowls.map(|bowl| bowl.greatest_tilt_rad).fold(0.0, f64::max)))
+        let count = truth.objects.iter().filter(|one| one.in_place && !one.held).count();
+        let upright = truth.objects.iter().filter(|one| UPRIGHT.contains(&one.kind.as_str()));
+        Ok((count, upright.map(|one| one.greatest_tilt_rad).fold(0.0, f64::max)))
     }
 
     /// Ends what was started for it.

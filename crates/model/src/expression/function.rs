@@ -13,6 +13,9 @@ use std::f64::consts::TAU;
 /// Classes that are wider than the fingers open, and open at the top.
 const HELD_BY_THE_RIM: [&str; 2] = ["Bowl", "Plate"];
 
+/// Classes that are round, and narrower than the fingers open.
+const HELD_AROUND: [&str; 2] = ["Can", "Cup"];
+
 /// As many alternatives as a planner takes.
 const MAX_TURNS: i64 = 64;
 
@@ -208,9 +211,15 @@ fn grasp_poses(object: &Value) -> Result<Value, String> {
     };
     let edges = size.iter().map(number).collect::<Result<Vec<f64>, _>>()?;
     let [x, y, z] = <[f64; 3]>::try_from(edges).map_err(|_| expected())?;
-    let round =
-        matches!(object.field("class"), Some(Value::String(class)) if HELD_BY_THE_RIM.contains(&class.as_str()));
-    let grasps = if round { grasp::at_rim(centre, [x, y, z]) } else { grasp::from_above(centre, [x, y, z]).to_vec() };
+    let class = match object.field("class") {
+        Some(Value::String(class)) => class.as_str(),
+        _ => "",
+    };
+    let grasps = match class {
+        rim if HELD_BY_THE_RIM.contains(&rim) => grasp::at_rim(centre, [x, y, z]),
+        round if HELD_AROUND.contains(&round) => grasp::around(centre, [x, y, z]),
+        _ => grasp::from_above(centre, [x, y, z]).to_vec(),
+    };
     Ok(Value::List(grasps.into_iter().map(Value::Pose).collect()))
 }
 

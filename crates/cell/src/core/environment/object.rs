@@ -44,6 +44,10 @@ const FOOT: f64 = 0.6;
 /// How much of a fork's length its handle is, and how wide that is as a part of its head.
 const HANDLE: f64 = 0.7;
 const HANDLE_WIDTH: f64 = 0.4;
+/// The topmost part of a wall, as the camera sees it (`ratn_perception::model`): outwards as a part of the radius, upwards as one of the
+/// height.
+const BOWL_RIM: [f64; 2] = [0.09, 0.44];
+const PLATE_RIM: [f64; 2] = [0.28, 0.58];
 /// How far down from the rim fingers hold what they hold by its rim, and how much of its round they meet as a flat wall, in metres.
 const RIM_M: f64 = 0.02;
 const RIM_WIDTH_M: f64 = 0.03;
@@ -106,7 +110,7 @@ impl Model {
     }
 
     /// The cuboid of it that fingers at `tool` (in its frame, closing along y) can close around: all of a box or a cup, a fork's
-    /// handle or head, of what is wider the wall next to them.
+    /// handle or head, of what is wider the wall next to them. Of what is round only as wide a part as lies flat enough.
     pub fn grip_part(&self, tool: &Pose) -> (Pose, [f64; 3]) {
         let [x, y, z] = self.size;
         let [at_x, at_y, _] = tool.position;
@@ -122,7 +126,8 @@ impl Model {
             }
             Kind::Cup => {
                 let closing = tool.rotate([0.0, 1.0, 0.0]);
-                (Pose::from_rpy([0.0; 3], 0.0, 0.0, closing[1].atan2(closing[0])), self.size)
+                // Flat fingers meet its round at a line each: what is farther to the side slides out from between them.
+                (Pose::from_rpy([0.0; 3], 0.0, 0.0, closing[1].atan2(closing[0])), [x, RIM_WIDTH_M, z])
             }
             Kind::Plate | Kind::Bowl => {
                 let turned = Pose::from_rpy([0.0; 3], 0.0, 0.0, at_y.atan2(at_x));
@@ -131,6 +136,19 @@ impl Model {
                 (turned.compose(&Pose::at((x - thickness) / 2.0, 0.0, 0.0)), [thickness, RIM_WIDTH_M, z])
             }
         }
+    }
+
+    /// By how much its rim leans outwards, in radians, where that is so much that fingers which close around it from above slide off:
+    /// friction holds up to a lean of its own angle.
+    pub fn slips_off(&self) -> Option<f64> {
+        let [x, _, z] = self.size;
+        let [outwards, upwards] = match self.kind {
+            Kind::Bowl => BOWL_RIM,
+            Kind::Plate => PLATE_RIM,
+            Kind::Box | Kind::Cup | Kind::Fork => return None,
+        };
+        let slope = outwards * x / 2.0 / (upwards * z);
+        (slope > self.kind.friction()).then(|| slope.atan())
     }
 
     /// What turns about its upright axis leave the same.

@@ -17,8 +17,8 @@ const PAPER: [(Goods, f64, Option<f64>, f64); 5] = [
     (Goods::Boxes(1), 81.3, Some(73.5), 72.3),
     (Goods::Boxes(2), 123.7, Some(107.3), 97.3),
     (Goods::Boxes(3), 164.2, Some(141.5), 116.5),
-    (Goods::Dishes { bowls: 2, forks: 2 }, 169.2, None, 122.9),
-    (Goods::Dishes { bowls: 3, forks: 3 }, 255.4, None, 207.2),
+    (Goods::Dishes { bowls: 2, forks: 2, cups: 0, plates: 0 }, 169.2, None, 122.9),
+    (Goods::Dishes { bowls: 3, forks: 3, cups: 0, plates: 0 }, 255.4, None, 207.2),
 ];
 
 /// What a task brings somewhere.
@@ -26,8 +26,8 @@ const PAPER: [(Goods, f64, Option<f64>, f64); 5] = [
 pub(super) enum Goods {
     /// Boxes, onto the base.
     Boxes(u32),
-    /// Tableware, onto the table.
-    Dishes { bowls: u32, forks: u32 },
+    /// Tableware, onto a table that plates lie on.
+    Dishes { bowls: u32, forks: u32, cups: u32, plates: u32 },
 }
 
 /// One run to be made.
@@ -46,7 +46,7 @@ pub(super) struct Outcome {
     pub(super) timeline: Timeline,
     /// What stands where it should in the cell's ground truth.
     pub(super) delivered: usize,
-    /// How far a bowl leaned at the most while it was held.
+    /// How far a bowl or a cup leaned at the most while it was held.
     pub(super) greatest_tilt_rad: f64,
     /// How the task ended, as a sentence.
     pub(super) end: String,
@@ -173,10 +173,10 @@ impl Goods {
     pub(super) fn of(arguments: &DemoArguments) -> Result<Goods, Failure> {
         match *arguments {
             DemoArguments { scenario: Setting::Boxes, boxes, .. } => Ok(Goods::Boxes(boxes)),
-            DemoArguments { bowls: 0, forks: 0, .. } => {
-                Err(Failure::Refused("ratn: no bowls and no forks: there is nothing to set".to_owned()))
+            DemoArguments { bowls: 0, forks: 0, cups: 0, .. } => {
+                Err(Failure::Refused("ratn: no bowls, no forks and no cups: there is nothing to set".to_owned()))
             }
-            DemoArguments { bowls, forks, .. } => Ok(Goods::Dishes { bowls, forks }),
+            DemoArguments { bowls, forks, cups, plates, .. } => Ok(Goods::Dishes { bowls, forks, cups, plates }),
         }
     }
 
@@ -184,7 +184,7 @@ impl Goods {
     pub(super) fn count(&self) -> usize {
         match *self {
             Goods::Boxes(boxes) => boxes as usize,
-            Goods::Dishes { bowls, forks } => (bowls + forks) as usize,
+            Goods::Dishes { bowls, forks, cups, plates } => (bowls + forks + cups + plates) as usize,
         }
     }
 
@@ -193,7 +193,9 @@ impl Goods {
         let set = |name: &str, value: u32| (name.to_owned(), value.to_string());
         match *self {
             Goods::Boxes(boxes) => vec![set("boxes", boxes)],
-            Goods::Dishes { bowls, forks } => vec![set("bowls", bowls), set("forks", forks)],
+            Goods::Dishes { bowls, forks, cups, plates } => {
+                vec![set("bowls", bowls), set("forks", forks), set("cups", cups), set("plates", plates)]
+            }
         }
     }
 
@@ -215,7 +217,9 @@ impl Goods {
     fn to_json(self) -> Value {
         match self {
             Goods::Boxes(boxes) => json!({ "scenario": "boxes", "boxes": boxes }),
-            Goods::Dishes { bowls, forks } => json!({ "scenario": "table", "bowls": bowls, "forks": forks }),
+            Goods::Dishes { bowls, forks, cups, plates } => {
+                json!({ "scenario": "table", "bowls": bowls, "forks": forks, "cups": cups, "plates": plates })
+            }
         }
     }
 }
@@ -228,10 +232,22 @@ impl fmt::Display for Goods {
         };
         match *self {
             Goods::Boxes(boxes) => f.write_str(&many(boxes, "box", "boxes")),
-            Goods::Dishes { bowls, forks: 0 } => f.write_str(&many(bowls, "bowl", "bowls")),
-            Goods::Dishes { bowls: 0, forks } => f.write_str(&many(forks, "fork", "forks")),
-            Goods::Dishes { bowls, forks } => {
-                write!(f, "{} and {}", many(bowls, "bowl", "bowls"), many(forks, "fork", "forks"))
+            Goods::Dishes { bowls, forks, cups, plates } => {
+                let all = [
+                    (bowls, "bowl", "bowls"),
+                    (forks, "fork", "forks"),
+                    (cups, "cup", "cups"),
+                    (plates, "plate", "plates"),
+                ];
+                let some: Vec<String> = all
+                    .into_iter()
+                    .filter(|kind| kind.0 > 0)
+                    .map(|(number, one, more)| many(number, one, more))
+                    .collect();
+                match &some[..] {
+                    [most @ .., last] if !most.is_empty() => write!(f, "{} and {last}", most.join(", ")),
+                    _ => f.write_str(&some.concat()),
+                }
             }
         }
     }

@@ -16,7 +16,7 @@ pub struct Placed {
 
 /// What the ground truth says of an object.
 #[derive(Debug, Clone, PartialEq)]
-pub struct TrueBox {
+pub struct TrueObject {
     /// Its name in the cell.
     pub id: String,
     /// What it is.
