@@ -134,6 +134,9 @@ impl Isa {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx512 => unsafe { nearest_avx512(blocks, dimensions, count, to) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx2 => unsafe { nearest_avx2(blocks, dimensions, count, to) },
             _ => nearest::nearest(blocks, dimensions, count, to),
         }
     }
@@ -166,6 +169,12 @@ fn touching_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx2")]
 fn nearest_avx512(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> (usize, f32) {
+    nearest::nearest(blocks, dimensions, count, to)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn nearest_avx2(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> (usize, f32) {
     nearest::nearest(blocks, dimensions, count, to)
 }
 
@@ -340,9 +349,11 @@ mod x86 {
         }
         #[inline(always)]
         fn peak(self) -> f32 {
-            let mut block = Block([f32::NEG_INFINITY; 16]);
-            self.store(&mut block);
-            block.0.into_iter().fold(f32::NEG_INFINITY, f32::max)
+            unsafe {
+                let four = _mm_max_ps(_mm256_castps256_ps128(self.0), _mm256_extractf128_ps::<1>(self.0));
+                let two = _mm_max_ps(four, _mm_movehl_ps(four, four));
+                _mm_cvtss_f32(_mm_max_ss(two, _mm_movehdup_ps(two)))
+            }
         }
         #[inline(always)]
         fn abs(self) -> Self {
