@@ -6,7 +6,7 @@ mod result;
 
 use super::run::{on_system, starting};
 use super::{blocking_here, check};
-use crate::arguments::{Budget, DemoArguments, SystemArguments};
+use crate::arguments::{Budget, DemoArguments, GoodsArguments, SystemArguments};
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
 use crate::output;
@@ -129,11 +129,13 @@ async fn one_run(
     let mut config = config.clone();
     config.apply(&SystemArguments {
         scene: Some(arguments.scenario),
-        boxes: Some(arguments.boxes),
-        bowls: Some(arguments.bowls),
-        forks: Some(arguments.forks),
-        cups: Some(arguments.cups),
-        plates: Some(arguments.plates),
+        goods: GoodsArguments {
+            boxes: Some(arguments.boxes),
+            bowls: Some(arguments.bowls),
+            forks: Some(arguments.forks),
+            cups: Some(arguments.cups),
+            plates: Some(arguments.plates),
+        },
         planners: Some(plan.planners),
         speed: Some(arguments.speed),
         seed: Some(arguments.seed),

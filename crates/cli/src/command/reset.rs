@@ -55,13 +55,14 @@ async fn reset(
     let seed = arguments.seed.unwrap_or(before.seed);
     let as_many = |kind: &str| before.objects.iter().filter(|one| one.kind == kind).count();
     let many = |given: Option<u32>, kind: &str| given.map_or_else(|| u32::try_from(as_many(kind)), Ok);
+    let goods = &arguments.goods;
     let request = ResetRequest {
         seed,
-        boxes: many(arguments.boxes, "box")?,
-        bowls: many(arguments.bowls, "bowl")?,
-        forks: many(arguments.forks, "fork")?,
-        cups: many(arguments.cups, "cup")?,
-        plates: many(arguments.plates, "plate")?,
+        boxes: many(goods.boxes, "box")?,
+        bowls: many(goods.bowls, "bowl")?,
+        forks: many(goods.forks, "fork")?,
+        cups: many(goods.cups, "cup")?,
+        plates: many(goods.plates, "plate")?,
     };
     let objects = cell.reset(request).await.context("the scene is not laid anew")?.into_inner().objects;
     let (_, facts) = world.root().await.context("the scene is new, the facts are not forgotten")?;

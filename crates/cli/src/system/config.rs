@@ -117,11 +117,11 @@ impl SystemConfig {
     pub(crate) fn apply(&mut self, arguments: &SystemArguments) {
         self.speed = arguments.speed.unwrap_or(self.speed);
         self.cell.scene = arguments.scene.unwrap_or(self.cell.scene);
-        self.cell.boxes = arguments.boxes.map_or(self.cell.boxes, |n| n as usize);
-        self.cell.bowls = arguments.bowls.map_or(self.cell.bowls, |n| n as usize);
-        self.cell.forks = arguments.forks.map_or(self.cell.forks, |n| n as usize);
-        self.cell.cups = arguments.cups.map_or(self.cell.cups, |n| n as usize);
-        self.cell.plates = arguments.plates.map_or(self.cell.plates, |n| n as usize);
+        self.cell.boxes = arguments.goods.boxes.map_or(self.cell.boxes, |n| n as usize);
+        self.cell.bowls = arguments.goods.bowls.map_or(self.cell.bowls, |n| n as usize);
+        self.cell.forks = arguments.goods.forks.map_or(self.cell.forks, |n| n as usize);
+        self.cell.cups = arguments.goods.cups.map_or(self.cell.cups, |n| n as usize);
+        self.cell.plates = arguments.goods.plates.map_or(self.cell.plates, |n| n as usize);
         self.cell.seed = arguments.seed.unwrap_or(self.cell.seed);
         self.cell.faults.extend(&arguments.faults.fault);
         if let Some(planners) = arguments.planners {
@@ -163,6 +163,7 @@ impl SystemConfig {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use crate::arguments::GoodsArguments;
     use proptest::collection::vec;
     use proptest::prelude::*;
 
@@ -178,7 +179,7 @@ mod tests {
     fn the_command_line_overrides_it() {
         let mut config = SystemConfig::load(None).unwrap();
         config.apply(&SystemArguments {
-            boxes: Some(5),
+            goods: GoodsArguments { boxes: Some(5), ..GoodsArguments::default() },
             planners: Some(1),
             speed: Some(8.0),
             seed: Some(7),

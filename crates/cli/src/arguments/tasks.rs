@@ -1,0 +1,166 @@
+//! What is said of tasks: how they are checked, run, steered, reported and simulated, and of planning problems.
+
+use super::values::{chart, makespan, padding, setting, speed};
+use crate::task_control::control::Word;
+use clap::{Args, ValueEnum};
+use std::path::PathBuf;
+
+/// How tasks are executed, on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum ModeArgument {
+    /// One state after the other, as written
+    Hsm,
+    /// As parallel as its dependencies allow
+    Cdtn,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct CheckArguments {
+    /// The task file
+    #[arg(value_name = "TASK")]
+    pub(crate) task: PathBuf,
+    /// The system to check it against; without it the built-in default
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Only check: leave out the simulation that says what keeps the task sequential
+    #[arg(long)]
+    pub(crate) no_simulation: bool,
+    /// Give a parameter of the task a value for the simulation, `boxes=3`; may be repeated
+    #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
+    pub(crate) set: Vec<(String, String)>,
+    /// How many elements a list has that an action answers, in the simulation
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u16).range(0..=100))]
+    pub(crate) elements: u16,
+    /// Take durations from event logs of earlier runs of the task, or folders of them
+    #[arg(long, value_name = "LOG", num_args = 1..)]
+    pub(crate) learn: Vec<PathBuf>,
+    /// Print one JSON document on standard output
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct RunArguments {
+    /// The task file; with --resume the one that the log names unless given
+    #[arg(value_name = "TASK", required_unless_present = "resume")]
+    pub(crate) task: Option<PathBuf>,
+    /// Go on with the run of this event log, whose task control was killed, on the system that it was on
+    #[arg(long, value_name = "LOG", conflicts_with_all = ["mode", "set", "seed", "log", "learn", "speed"])]
+    pub(crate) resume: Option<PathBuf>,
+    /// Learn durations and the shares of outcomes from event logs of earlier runs of the task, or folders of them
+    #[arg(long, value_name = "LOG", num_args = 1..)]
+    pub(crate) learn: Vec<PathBuf>,
+    /// How it is executed
+    #[arg(long, value_enum, default_value = "cdtn")]
+    pub(crate) mode: ModeArgument,
+    /// Give a parameter of the task a value, `boxes=3`; may be repeated
+    #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
+    pub(crate) set: Vec<(String, String)>,
+    /// Write the event log here
+    #[arg(long, value_name = "FILE")]
+    pub(crate) log: Option<PathBuf>,
+    /// Write a Gantt chart; `.svg` or `.html`
+    #[arg(long, value_name = "FILE", value_parser = chart)]
+    pub(crate) gantt: Option<PathBuf>,
+    /// What every random choice is derived from
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub(crate) seed: u64,
+    /// The system's config, TOML; without it the built-in default
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Where a running system's endpoint files are; without it, a system is started where none runs
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+    /// Robot's seconds per second; a running system's own or the config's unless given
+    #[arg(long, value_name = "X", value_parser = speed)]
+    pub(crate) speed: Option<f64>,
+    /// Print one JSON document on standard output
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ControlArguments {
+    /// What the run shall do
+    #[arg(value_enum)]
+    pub(crate) word: Word,
+    /// Where the endpoint files of the run's system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ReportArguments {
+    /// The event log
+    #[arg(value_name = "LOG")]
+    pub(crate) log: PathBuf,
+    /// Print one JSON document
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Write a Gantt chart; `.svg` or `.html`
+    #[arg(long, value_name = "FILE", value_parser = chart)]
+    pub(crate) gantt: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct TablesArguments {
+    /// Print one JSON array
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Write a Gantt chart of every run into this folder
+    #[arg(long, value_name = "DIR")]
+    pub(crate) gantt: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct SimulateArguments {
+    /// A job shop: a line with the numbers of jobs and machines, then per job a line of pairs of machine and duration
+    #[arg(long, value_name = "FILE")]
+    pub(crate) jobshop: PathBuf,
+    /// The best makespan known; of well-known instances it is known
+    #[arg(long, value_name = "N", value_parser = makespan)]
+    pub(crate) best: Option<f64>,
+    /// Orders to look at whenever much of what is to be done has changed; 0 for plain dispatch
+    #[arg(long, value_name = "N", default_value_t = ratn_simulation::jobshop::DEFAULT_ORDERS)]
+    pub(crate) orders: usize,
+    /// What every random choice is derived from
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub(crate) seed: u64,
+    /// Print one JSON document on standard output
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PlanArguments {
+    /// The robot, with collision shapes or spheres
+    #[arg(long, value_name = "URDF")]
+    pub(crate) robot: PathBuf,
+    /// Where the packages are that the robot's meshes are named by (`package://NAME/...`)
+    #[arg(long, value_name = "DIR")]
+    pub(crate) packages: Vec<PathBuf>,
+    /// Which links may touch; without it neighbours, and links that touch in the middle of all limits
+    #[arg(long, value_name = "FILE")]
+    pub(crate) srdf: Option<PathBuf>,
+    /// Problems in JSON: `joints`, and per class `objects`, `start` and `goal`
+    #[arg(long, value_name = "FILE")]
+    pub(crate) problems: PathBuf,
+    /// What the samples are derived from
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) seed: u64,
+    /// Samples per problem before it is given up
+    #[arg(long, value_name = "N", default_value_t = 100_000)]
+    pub(crate) iterations: usize,
+    /// Solve each problem this often and take the least times
+    #[arg(long, value_name = "N", default_value_t = 15)]
+    pub(crate) repeat: usize,
+    /// How much larger the robot's shapes are taken
+    #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = padding)]
+    pub(crate) padding_mm: f64,
+    /// Print one JSON array, with every problem
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// In JSON, also print the paths
+    #[arg(long, requires = "json")]
+    pub(crate) paths: bool,
+}
