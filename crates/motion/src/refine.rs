@@ -1,12 +1,15 @@
 //! Anytime improvement: as long as there is time, the path gets shorter.
 //!
-//! Four ways, chosen at random: shortcuts between two points of the path; corners moved towards where the path would rather be;
-//! other ends that the path can turn to on its way; and a new search where a shorter path could run at all (the ellipsoids
-//! between the start and the ends). The best path is never lost. Its motions are as certain as the space checks them.
+//! Five ways, chosen at random: shortcuts between two points of the path; corners moved towards where the path would rather be;
+//! other ends that the path can turn to on its way; a new search where a shorter path could run at all (the ellipsoids
+//! between the start and the ends); and a tree of shortest ways that grows there from step to step (`rrt_star`), takes in the path
+//! whenever that has become shorter, and gives back what is shorter still. The best path is never lost. Its motions are as
+//! certain as the space checks them.
 
 use crate::connect::{ConnectError, grow};
 use crate::ellipsoid;
 use crate::pace::Control;
+use crate::rrt_star::RrtStar;
 use crate::simplify::{path_length, shortened};
 use crate::space::{Space, State, between, distance};
 use rand::{RngExt, SeedableRng};
@@ -21,6 +24,29 @@ const SEARCH_ITERATIONS: usize = 200;
 /// How far a corner is moved off its way at most, in radians, and as a share of the sides next to it.
 const STRAY: f32 = 0.1;
 const STRAY_SHARE: f32 = 0.25;
+
+/// Samples of the tree in one step.
+const TREE_SAMPLES: usize = 8;
+
+/// How often each way is chosen, of the sum of all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Shares {
+    /// Shortcuts between two points of the path.
+    pub shortcut: u32,
+    /// Corners moved.
+    pub corner: u32,
+    /// Other ends.
+    pub turn: u32,
+    /// New searches.
+    pub search: u32,
+    /// Samples of the tree.
+    pub tree: u32,
+}
+
+impl Shares {
+    /// For arms: with seven joints new searches find more than the tree does (docs/performance.md).
+    pub const MIXED: Shares = Shares { shortcut: 42, corner: 38, turn: 8, search: 11, tree: 1 };
+}
 
 /// Where a path may end.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,12 +65,23 @@ pub struct Refinement {
     end: usize,
     ends: Vec<End>,
     random: ChaCha8Rng,
+    shares: Shares,
+    tree: Option<RrtStar>,
+    /// What the tree has taken in last.
+    adopted: Vec<State>,
 }
 
 impl Refinement {
     /// Begins with a path that leads to the end with the index `end`.
     pub fn new(path: Vec<State>, end: usize, ends: Vec<End>, seed: u64) -> Refinement {
-        Refinement { path, end, ends, random: ChaCha8Rng::seed_from_u64(seed) }
+        let random = ChaCha8Rng::seed_from_u64(seed);
+        Refinement { path, end, ends, random, shares: Shares::MIXED, tree: None, adopted: Vec::new() }
+    }
+
+    /// With other shares; their sum is not zero.
+    #[must_use]
+    pub fn with_shares(self, shares: Shares) -> Refinement {
+        Refinement { shares, ..self }
     }
 
     /// The shortest path so far.
@@ -77,11 +114,23 @@ impl Refinement {
     /// # Errors
     /// What `control` said, when that was not to go on; the path is whole all the same.
     pub fn step(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
-        match self.random.random_range(0..100) {
-            0..45 => self.shortcut(space),
-            45..85 => self.move_corner(space),
-            85..97 => self.turn(space),
-            _ => return self.search_again(space, control),
+        let Shares { shortcut, corner, turn, search, tree } = self.shares;
+        let mut drawn = self.random.random_range(0..shortcut + corner + turn + search + tree);
+        let mut is = |share: u32| {
+            let here = drawn < share;
+            drawn = drawn.wrapping_sub(share);
+            here
+        };
+        if is(shortcut) {
+            self.shortcut(space);
+        } else if is(corner) {
+            self.move_corner(space);
+        } else if is(turn) {
+            self.turn(space);
+        } else if is(search) {
+            return self.search_again(space, control);
+        } else {
+            return self.grow_tree(space, control);
         }
         Ok(())
     }
@@ -188,5 +237,23 @@ impl Refinement {
             Err(ConnectError::Cancelled) => Err(Control::Cancelled),
             Err(_) => Ok(()),
         }
+    }
+
+    /// Grows the tree of shortest ways, and follows it where it knows a shorter one.
+    fn grow_tree(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
+        let bound = self.length();
+        let tree = self.tree.get_or_insert_with(|| RrtStar::new(&self.path[0], space.joints()));
+        if self.adopted != self.path {
+            tree.adopt(&self.path, &self.ends, self.end);
+            self.adopted.clone_from(&self.path);
+        }
+        let grown = tree.grow(space, &self.ends, bound, TREE_SAMPLES, &mut self.random, control);
+        if let Some((end, length)) = tree.best(&self.ends)
+            && length < bound - LEAST_GAIN
+            && let Some(path) = tree.path(end)
+        {
+            (self.path, self.end) = (path, end);
+        }
+        grown
     }
 }

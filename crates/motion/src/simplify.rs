@@ -1,6 +1,6 @@
 //! Makes a path shorter and rounder: shortcuts over its vertices, then its corners cut (Chaikin's refinement, CGIP 1974, whose
-//! limit is the quadratic B-spline), every new motion validated, parts of validated motions taken as validated. In the end
-//! the whole is made sure of between its postures too.
+//! limit is the quadratic B-spline), every new motion validated, parts of validated motions taken as validated, and nothing that was
+//! found not to be free tried again. In the end the whole is made sure of between its postures too.
 
 use crate::connect::{Budget, ConnectError, connect, mend};
 use crate::pace::Control;
@@ -12,8 +12,12 @@ const ROUNDS: usize = 6;
 /// Motions validated at the most.
 const MAX_CHECKS: usize = 96;
 
-/// A cut that saves less than this part of the whole is not tried.
+/// A cut that saves less than this part of the whole is not tried, and a round that saves less is the last.
+const LEAST_CUT: f32 = 0.003;
 const LEAST_SAVING: f32 = 0.002;
+
+/// A vertex that is less off the straight motion past it, by what that saves in radians, is none.
+const STRAIGHT: f32 = 1e-4;
 
 /// Shares of the shorter side that a corner is cut at.
 const SHARES: [f32; 3] = [1.0, 0.5, 0.25];
@@ -71,25 +75,62 @@ pub(crate) fn shortened(
     path: &[State],
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<Vec<State>, ConnectError> {
-    let mut work = Work { space, path: path.to_vec(), checks: 0, control, stopped: None };
+    let path = without_straight(path).into_iter().map(Vertex::after_shortcuts).collect();
+    let mut work = Work { space, path, checks: 0, control, stopped: None };
     work.shorten();
     for _ in 0..ROUNDS {
-        let before = path_length(&work.path);
+        let before = work.length();
         work.cut_corners();
         work.shorten_neighbours();
-        if work.is_over() || path_length(&work.path) > before * (1.0 - LEAST_SAVING) {
+        if work.is_over() || work.length() > before * (1.0 - LEAST_SAVING) {
             break;
         }
     }
     if work.stopped == Some(Control::Cancelled) {
         return Err(ConnectError::Cancelled);
     }
-    Ok(work.path)
+    Ok(work.path.into_iter().map(|vertex| vertex.state).collect())
+}
+
+/// The same path without the vertices on straight motions, as a search that grows by steps leaves them.
+fn without_straight(path: &[State]) -> Vec<State> {
+    let mut kept = vec![path[0]];
+    for pair in path[1..].windows(2) {
+        if saving(&kept[kept.len() - 1], &pair[0], &pair[1]) > STRAIGHT {
+            kept.push(pair[0]);
+        }
+    }
+    if path.len() > 1 {
+        kept.push(path[path.len() - 1]);
+    }
+    kept
+}
+
+/// How much shorter the straight motion from `a` to `b` is than that over `v`.
+fn saving(a: &State, v: &State, b: &State) -> f32 {
+    distance(a, v) + distance(v, b) - distance(a, b)
+}
+
+/// A vertex, and what is known not to be free about it as long as its neighbours stay.
+#[derive(Clone)]
+struct Vertex {
+    state: State,
+    /// The straight motion between its neighbours.
+    is_needed: bool,
+    /// Every cut that saves enough.
+    is_sharp: bool,
+}
+
+impl Vertex {
+    /// Shortcuts leave no vertex that could be left out.
+    fn after_shortcuts(state: State) -> Vertex {
+        Vertex { state, is_needed: true, is_sharp: false }
+    }
 }
 
 struct Work<'a> {
     space: &'a mut Space,
-    path: Vec<State>,
+    path: Vec<Vertex>,
     checks: usize,
     control: &'a mut dyn FnMut(usize) -> Control,
     stopped: Option<Control>,
@@ -98,6 +139,15 @@ struct Work<'a> {
 impl Work<'_> {
     fn is_over(&self) -> bool {
         self.stopped.is_some() || self.checks >= MAX_CHECKS
+    }
+
+    fn length(&self) -> f32 {
+        self.path.windows(2).map(|pair| distance(&pair[0].state, &pair[1].state)).sum()
+    }
+
+    /// A vertex between its neighbours.
+    fn corner(&self, at: usize) -> (State, State, State) {
+        (self.path[at - 1].state, self.path[at].state, self.path[at + 1].state)
     }
 
     fn is_free(&mut self, from: &State, to: &State) -> bool {
@@ -112,12 +162,22 @@ impl Work<'_> {
         self.space.is_free_motion(from, to)
     }
 
+    /// Puts others in the place of a vertex; its neighbours get new ones.
+    fn replace(&mut self, at: usize, new: &[State]) {
+        // One that takes its place has the same neighbours.
+        let is_needed = new.len() == 1 && self.path[at].is_needed;
+        self.path.splice(at..=at, new.iter().map(|state| Vertex { state: *state, is_needed, is_sharp: false }));
+        for neighbour in [at - 1, at + new.len()] {
+            (self.path[neighbour].is_needed, self.path[neighbour].is_sharp) = (false, false);
+        }
+    }
+
     /// From each vertex as far as a straight motion leads.
     fn shorten(&mut self) {
         let mut from = 0;
         while from + 2 < self.path.len() {
             for to in (from + 2..self.path.len()).rev() {
-                let (a, b) = (self.path[from], self.path[to]);
+                let (a, b) = (self.path[from].state, self.path[to].state);
                 if self.is_free(&a, &b) {
                     self.path.drain(from + 1..to);
                     break;
@@ -131,11 +191,12 @@ impl Work<'_> {
     fn shorten_neighbours(&mut self) {
         let mut middle = 1;
         while middle + 1 < self.path.len() {
-            let (a, v, b) = (self.path[middle - 1], self.path[middle], self.path[middle + 1]);
-            let saving = distance(&a, &v) + distance(&v, &b) - distance(&a, &b);
-            if saving > LEAST_SAVING * 0.5 && self.is_free(&a, &b) {
-                self.path.remove(middle);
+            let (a, v, b) = self.corner(middle);
+            let is_worth_it = !self.path[middle].is_needed && saving(&a, &v, &b) > LEAST_SAVING * 0.5;
+            if is_worth_it && self.is_free(&a, &b) {
+                self.replace(middle, &[]);
             } else {
+                self.path[middle].is_needed = true;
                 middle += 1;
             }
         }
@@ -143,32 +204,38 @@ impl Work<'_> {
 
     /// Replaces corners by shorter ones.
     fn cut_corners(&mut self) {
-        let least = LEAST_SAVING * path_length(&self.path);
+        let least = LEAST_CUT * self.length();
         let mut middle = 1;
         while middle + 1 < self.path.len() {
-            let (a, v, b) = (self.path[middle - 1], self.path[middle], self.path[middle + 1]);
-            let (before, after) = (distance(&a, &v), distance(&v, &b));
-            let shorter = before.min(after);
-            for share in SHARES {
-                let cut = shorter * share;
-                let p = between(&v, &a, cut / before);
-                let q = between(&v, &b, cut / after);
-                if 2.0 * cut - distance(&p, &q) < least {
-                    break;
+            match if self.path[middle].is_sharp { None } else { self.cut(middle, least) } {
+                Some(new) => {
+                    self.replace(middle, &new);
+                    middle += new.len();
                 }
-                if self.is_free(&p, &q) {
-                    // A cut that reaches a neighbour leaves no new vertex there.
-                    let new: Vec<State> = [(p, cut < before), (q, cut < after)]
-                        .into_iter()
-                        .filter_map(|(state, inside)| inside.then_some(state))
-                        .collect();
-                    middle += new.len().saturating_sub(1);
-                    let at = self.path.iter().position(|s| *s == v).unwrap_or(middle);
-                    self.path.splice(at..=at, new);
-                    break;
+                None => {
+                    self.path[middle].is_sharp = true;
+                    middle += 1;
                 }
             }
-            middle += 1;
         }
+    }
+
+    /// What a vertex is replaced by where it is cut, if that is free; a cut that reaches a neighbour leaves no new vertex there.
+    fn cut(&mut self, at: usize, least: f32) -> Option<Vec<State>> {
+        let (a, v, b) = self.corner(at);
+        let (before, after) = (distance(&a, &v), distance(&v, &b));
+        for share in SHARES {
+            let cut = before.min(after) * share;
+            let p = between(&v, &a, cut / before);
+            let q = between(&v, &b, cut / after);
+            if 2.0 * cut - distance(&p, &q) < least {
+                return None;
+            }
+            if self.is_free(&p, &q) {
+                let new = [(p, cut < before), (q, cut < after)];
+                return Some(new.into_iter().filter_map(|(state, inside)| inside.then_some(state)).collect());
+            }
+        }
+        None
     }
 }

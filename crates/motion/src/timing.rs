@@ -1,11 +1,12 @@
 //! When the arm is where: a path becomes a trajectory within the joints' velocity, acceleration and jerk limits.
 //!
-//! Every part starts and ends at rest. The corners of the free part are rounded (a quintic Bézier curve per corner, straight at
-//! both ends, as wide as the neighbours and the obstacles leave room for; without room the arm stops there). How fast each piece
-//! is followed is for a [`Timing`] to say; ours is [`PhasePlane`].
+//! Every part starts and ends at rest. The corners of the free part are rounded in two ways, each by itself (`blend`) and all along
+//! (`spline`), and the quicker one is taken. How fast each piece is followed is for a [`Timing`] to say; ours is [`PhasePlane`].
 
+use crate::blend::rounded;
 use crate::collision::{between, distance, length};
 use crate::robot::{Joint, Joints, Robot};
+use crate::spline::smoothed;
 use crate::trajectory::{Curve, Knot};
 use ratn_model::value::Trajectory;
 
@@ -21,18 +22,6 @@ pub trait Timing<const N: usize = 7> {
 /// keeps within its limit (the integral of a box is a ramp), then slowed down by what sampling and bends leave over the limits.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct PhasePlane;
-
-/// The widest that a corner is cut on each side, in radians.
-const BLEND_RAD: f64 = 0.5;
-
-/// How often a blend that touches something is halved before the arm stops at the corner instead.
-const BLEND_HALVINGS: usize = 4;
-
-/// Where its control points are on each side, from its end to the corner.
-const CONTROLS: [f64; 3] = [0.0, 0.4, 0.8];
-
-/// Points of a Bézier curve.
-const BLEND_POINTS: usize = 96;
 
 /// Path length between two points of the phase plane, in radians.
 const STEP_RAD: f64 = 0.01;
@@ -72,83 +61,37 @@ pub fn timed<const N: usize>(
     timing: &dyn Timing<N>,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
 ) -> Curve<N> {
-    let mut pieces = Vec::new();
-    for part in parts {
-        match part {
-            Part::Free(path) => pieces.extend(rounded(path, is_free)),
-            Part::Straight(path) => pieces.push(path.clone()),
-        }
-    }
-    let start = pieces.first().and_then(|piece| piece.first()).copied().unwrap_or([0.0; N]);
+    let first = parts.first().and_then(|part| match part {
+        Part::Free(path) | Part::Straight(path) => path.first(),
+    });
+    let start = first.copied().unwrap_or([0.0; N]);
     let mut knots = vec![Knot { time_s: 0.0, positions: start, velocities: [0.0; N] }];
-    for piece in pieces {
-        let offset = knots[knots.len() - 1].time_s;
-        let timed = timing.time(&piece, joints, speed);
-        knots.extend(timed.into_iter().skip(1).map(|knot| Knot { time_s: knot.time_s + offset, ..knot }));
+    for part in parts {
+        let follow = |pieces: &[Vec<[f64; N]>]| {
+            let mut knots = knots[knots.len() - 1..].to_vec();
+            for piece in pieces {
+                let offset = knots[knots.len() - 1].time_s;
+                let timed = timing.time(piece, joints, speed);
+                knots.extend(timed.into_iter().skip(1).map(|knot| Knot { time_s: knot.time_s + offset, ..knot }));
+            }
+            knots
+        };
+        let quickest = match part {
+            Part::Straight(path) => follow(std::slice::from_ref(path)),
+            Part::Free(path) => {
+                let by_blends = follow(&rounded(path, is_free));
+                let by_spline = match path.len() {
+                    // Where there is no corner both are the same.
+                    0..3 => None,
+                    _ => Some(follow(&rounded(&smoothed(path, is_free), is_free))),
+                };
+                let end_s = |knots: &[Knot<N>]| knots[knots.len() - 1].time_s;
+                by_spline.filter(|spline| end_s(spline) < end_s(&by_blends)).unwrap_or(by_blends)
+            }
+        };
+        knots.extend_from_slice(&quickest[1..]);
     }
     Curve::new(knots)
-}
-
-/// The path with rounded corners, cut where the arm has to stop.
-fn rounded<const N: usize>(
-    path: &[[f64; N]],
-    is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
-) -> Vec<Vec<[f64; N]>> {
-    let mut pieces = Vec::new();
-    let mut piece = vec![path[0]];
-    for window in path.windows(3) {
-        let [before, corner, after] = [window[0], window[1], window[2]];
-        let (near, far) = (distance(&before, &corner), distance(&corner, &after));
-        let mut width = BLEND_RAD.min(near / 2.0).min(far / 2.0);
-        let mut curve = None;
-        for _ in 0..=BLEND_HALVINGS {
-            if width < STEP_RAD {
-                break;
-            }
-            let from = between(&corner, &before, width / near);
-            let to = between(&corner, &after, width / far);
-            let points = bezier(&from, &corner, &to);
-            if is_free_along(&points, is_free) {
-                curve = Some(points);
-                break;
-            }
-            width /= 2.0;
-        }
-        match curve {
-            Some(points) => piece.extend(points),
-            None => {
-                piece.push(corner);
-                pieces.push(std::mem::replace(&mut piece, vec![corner]));
-            }
-        }
-    }
-    piece.push(path[path.len() - 1]);
-    pieces.push(piece);
-    pieces
-}
-
-/// The curve whose control points are on the two sides: without bend where it begins and ends.
-fn bezier<const N: usize>(from: &[f64; N], corner: &[f64; N], to: &[f64; N]) -> Vec<[f64; N]> {
-    let before = CONTROLS.map(|share| between(from, corner, share));
-    let after = CONTROLS.map(|share| between(to, corner, share));
-    let controls = [before[0], before[1], before[2], after[2], after[1], after[0]];
-    let point = |i: usize| {
-        let t = i as f64 / BLEND_POINTS as f64;
-        let mut level = controls;
-        for count in (1..controls.len()).rev() {
-            for k in 0..count {
-                level[k] = between(&level[k], &level[k + 1], t);
-            }
-        }
-        level[0]
-    };
-    (0..=BLEND_POINTS).map(point).collect()
-}
-
-fn is_free_along<const N: usize>(curve: &[[f64; N]], is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool) -> bool {
-    // Every eighth point: the chords between them stay within a fraction of a milliradian of the curve.
-    let points: Vec<&[f64; N]> = curve.iter().step_by(8).collect();
-    points.windows(2).all(|pair| is_free(pair[0], pair[1]))
 }
 
 impl<const N: usize> Timing<N> for PhasePlane {
