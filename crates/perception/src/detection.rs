@@ -6,10 +6,10 @@
 
 use crate::camera::{Camera, DepthImage};
 use crate::fit::start::Outline;
-use crate::fit::{Evidence, Fit};
+use crate::fit::{Covariance, Evidence, Fit};
 use crate::mask::Ball;
 pub use crate::model::{Model, ObjectClass, Symmetry};
-use crate::vector::{length, sub};
+use crate::vector::{Vector, length, scale, sub};
 use crate::view::View;
 use ratn_model::pose::Pose;
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -79,16 +79,24 @@ const MAX_APART: f64 = 0.12;
 const SEARCH_MARGIN: f64 = 0.15;
 /// How far a known object may have moved, in metres.
 const MAX_DISPLACEMENT: f64 = 0.08;
+/// How far from a region's pose its surface is, and how far from below a known object, in metres, as normal distributions' deviations.
+const REGION_DEVIATION: f64 = 0.02;
+const PRIOR_DEVIATION: f64 = 0.01;
 /// How much the sizes of a known object may differ from what is seen, in metres, and how much of them.
 const SIZE_SLACK: (f64, f64) = (0.025, 0.25);
 /// A difference of scores by which one class is e times as likely as another.
 const SCORE_SCALE: f64 = 0.06;
+/// Classes whose scores differ by less are compared with more points.
+const CLOSE: f64 = 0.15;
 /// What does not average out over an object's points: noise also decides which of them are told from the surface, and from which
 /// side an edge is seen. As a part of one point's deviation along its ray, as measured on random tables.
 const COMMON_NOISE: f64 = 0.12;
 /// Points, rays beside them, and iterations, to tell what something could be and to say where it is.
 const COARSE: (usize, usize, usize) = (140, 60, 8);
 const FINE: (usize, usize, usize) = (500, 200, 9);
+
+/// Starts that are followed to tell which way round a fork lies, iterations for that, and to say where it does.
+const RELIEF: (usize, usize, usize) = (3, 3, 10);
 
 /// Every object of these classes on the surface, those nearest to the camera first. `body` is where the robot is itself.
 ///
@@ -101,7 +109,7 @@ pub fn segment(
     classes: &[ObjectClass],
     body: &[Ball],
 ) -> Result<Vec<Detection>, DetectionError> {
-    let mut found = objects_on(image, camera, region, classes, body)?;
+    let mut found = objects_on(image, camera, region, classes, body, REGION_DEVIATION)?;
     let eye = camera.pose.position;
     // To the centimetre, then by y: what noise tells apart is not told apart.
     let key = |object: &Detection| {
@@ -126,9 +134,16 @@ pub fn locate(
     let reach = prior.size[0].hypot(prior.size[1]) + 2.0 * SEARCH_MARGIN;
     let below = Pose::at(0.0, 0.0, -prior.size[2] / 2.0);
     let region = Region { pose: prior.pose.compose(&below), size: [reach, reach] };
-    let mut found = objects_on(image, camera, &region, classes, body)?;
-    found.retain(|object| object.pose.distance(&prior.pose) <= MAX_DISPLACEMENT && alike(prior, object));
-    Ok(found.into_iter().min_by(|a, b| a.pose.distance(&prior.pose).total_cmp(&b.pose.distance(&prior.pose))))
+    let nearest_on = |deviation: f64| -> Result<Option<Detection>, DetectionError> {
+        let mut found = objects_on(image, camera, &region, classes, body, deviation)?;
+        found.retain(|object| object.pose.distance(&prior.pose) <= MAX_DISPLACEMENT && alike(prior, object));
+        Ok(found.into_iter().min_by(|a, b| a.pose.distance(&prior.pose).total_cmp(&b.pose.distance(&prior.pose))))
+    };
+    // On the surface it stood on; else on the one that is seen most of, where it may have got to.
+    match nearest_on(PRIOR_DEVIATION)? {
+        Some(found) => Ok(Some(found)),
+        None => nearest_on(f64::INFINITY),
+    }
 }
 
 /// Whether an object could be the one seen before, by its size.
@@ -144,77 +159,125 @@ fn objects_on(
     region: &Region,
     classes: &[ObjectClass],
     body: &[Ball],
+    deviation: f64,
 ) -> Result<Vec<Detection>, DetectionError> {
-    let mut view = View::new(image, camera, region, body)?;
-    let mut found: Vec<(Fit, Detection)> = Vec::new();
+    let mut view = View::new(image, camera, region, body, deviation)?;
+    let mut found: Vec<Explained> = Vec::new();
     // Large clusters first: a steep side can come apart from its top, and must not make a second object in the same place.
     let mut fragments = Vec::new();
     for cluster in 0..view.clusters.len() {
         match explanation(&view, cluster, classes) {
-            Some((fit, object)) => {
-                if !is_taken(&found, &fit) {
-                    found.push((fit, object));
-                }
-            }
-            None => fragments.push(cluster),
+            Some(explained) if !explained.is_taken(&found) => found.push(explained),
+            _ => fragments.push(cluster),
         }
     }
-    // What is hollow comes apart where its far side is seen over its near one.
-    for (i, a) in fragments.iter().enumerate() {
-        for b in &fragments[i + 1..] {
+    // What is hollow comes apart where its far side is seen over its near one. One side may look like a smaller thing.
+    let mut parts = Vec::new();
+    for fragment in fragments {
+        let whole = found.iter().enumerate().find_map(|(i, part)| {
+            let whole = view.joined(part.cluster, fragment, MAX_APART)?;
+            let whole = explanation(&view, whole, classes)?;
+            (whole.score <= part.score).then_some((i, whole))
+        });
+        match whole {
+            Some((i, whole)) => found[i] = whole,
+            None => parts.push(fragment),
+        }
+    }
+    for (i, a) in parts.iter().enumerate() {
+        for b in &parts[i + 1..] {
             let Some(whole) = view.joined(*a, *b, MAX_APART) else { continue };
-            if let Some((fit, object)) = explanation(&view, whole, classes)
-                && !is_taken(&found, &fit)
+            if let Some(explained) = explanation(&view, whole, classes)
+                && !explained.is_taken(&found)
             {
-                found.push((fit, object));
+                found.push(explained);
             }
         }
     }
-    Ok(found.into_iter().map(|(_, object)| object).collect())
+    Ok(found.into_iter().map(|explained| explained.object).collect())
 }
 
-/// Whether something stands there already.
-fn is_taken(found: &[(Fit, Detection)], fit: &Fit) -> bool {
-    found.iter().any(|(other, _)| other.covers(fit.at()) || fit.covers(other.at()))
+/// What a cluster is.
+struct Explained {
+    cluster: usize,
+    fit: Fit,
+    /// How badly its fit explains it.
+    score: f64,
+    object: Detection,
+}
+
+impl Explained {
+    /// Whether something stands there already.
+    fn is_taken(&self, found: &[Explained]) -> bool {
+        found.iter().any(|other| other.fit.covers(self.fit.at()) || self.fit.covers(other.fit.at()))
+    }
 }
 
 /// What a cluster is, if a model explains it.
-fn explanation(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Option<(Fit, Detection)> {
-    let (fit, share) = classify(view, cluster, classes)?;
+fn explanation(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Option<Explained> {
+    let tried = likeliest(view, cluster, classes);
+    let best = tried.first()?.1;
     let evidence = view.evidence(cluster, FINE.0, FINE.1);
-    let fit = fit.refined(&evidence, FINE.2);
+    // Those that come close are told apart by more points.
+    let close = tried.iter().filter(|(_, score)| score - best < CLOSE);
+    let mut close: Vec<(Fit, f64)> =
+        close.map(|(fit, _)| fit.clone().refined(&evidence, FINE.2).scored(&evidence)).collect();
+    close.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let (fit, score) = close.swap_remove(0);
     let explained = fit.explains(&evidence);
-    if explained < MIN_EXPLAINED || fit.score(&evidence) > MAX_SCORE {
+    if explained < MIN_EXPLAINED || score > MAX_SCORE {
         return None;
     }
-    let object = detection(view, &fit, &evidence, explained * share);
-    Some((fit, object))
+    let far = tried.iter().filter(|(_, score)| score - best >= CLOSE).map(|(_, rival)| best - rival);
+    let rivals: f64 = close.iter().map(|(_, rival)| score - rival).chain(far).map(|d| (d / SCORE_SCALE).exp()).sum();
+    let confidence = explained / (1.0 + rivals);
+    let (fit, covariance, common) = if fit.class == ObjectClass::Fork {
+        let (fit, covariance) = lying(view, &fit);
+        (fit, covariance, [0.0; 3])
+    } else {
+        let covariance = fit.covariance(&evidence);
+        let common = common(&fit, &evidence);
+        (fit, covariance, common)
+    };
+    let object = detection(view, &fit, &covariance, common, confidence);
+    Some(Explained { cluster, fit, score, object })
 }
 
-/// The model that explains a cluster best, and how likely its class is among those tried.
-fn classify(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Option<(Fit, f64)> {
+/// Where a fork lies, by the depths around it; whichever way round explains them better.
+fn lying(view: &View<'_>, fit: &Fit) -> (Fit, Covariance) {
+    let relief = view.relief(fit);
+    let starts = relief.starts(fit).into_iter().take(RELIEF.0);
+    let refined = starts.map(|start| relief.refined(start, RELIEF.1)).min_by(|a, b| a.1.total_cmp(&b.1));
+    let (near, ..) = refined.unwrap_or_else(|| relief.refined(fit.clone(), RELIEF.1));
+    let (fit, _, covariance) = view.relief(&near).refined(near, RELIEF.2);
+    (fit, covariance)
+}
+
+/// What noise has in common over an object's points: a shift along the ray.
+fn common(fit: &Fit, evidence: &Evidence) -> Vector {
+    let [x, y] = fit.at();
+    let away = sub([x, y, 0.0], evidence.eye);
+    scale(away, COMMON_NOISE * evidence.sigma / length(away))
+}
+
+/// Of each class that a cluster could be the best fit to some of its points and how badly it explains them, the likeliest first.
+fn likeliest(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Vec<(Fit, f64)> {
     let evidence = view.evidence(cluster, COARSE.0, COARSE.1);
-    let starts = Outline::of(&evidence.points)?.starts(&evidence.points, classes);
-    let tried: Vec<(Fit, f64)> = starts
-        .into_iter()
-        .map(|start| {
-            let fit = start.refined(&evidence, COARSE.2);
-            let score = fit.score(&evidence);
-            (fit, score)
-        })
-        .collect();
-    let (best, score) = tried.iter().min_by(|a, b| a.1.total_cmp(&b.1))?.clone();
-    // Of each other class its best fit.
-    let rivals: f64 = ObjectClass::ALL
-        .into_iter()
-        .filter(|class| *class != best.class)
-        .filter_map(|class| tried.iter().filter(|(fit, _)| fit.class == class).map(|(_, s)| *s).min_by(f64::total_cmp))
-        .map(|rival| ((score - rival) / SCORE_SCALE).exp())
-        .sum();
-    Some((best, 1.0 / (1.0 + rivals)))
+    let Some(outline) = Outline::of(&evidence.points) else { return Vec::new() };
+    let mut tried: Vec<(Fit, f64)> = Vec::new();
+    for start in outline.starts(&evidence.points, classes) {
+        let (fit, score) = start.refined(&evidence, COARSE.2).scored(&evidence);
+        match tried.iter_mut().find(|(other, _)| other.class == fit.class) {
+            Some(other) if other.1 > score => *other = (fit, score),
+            Some(_) => {}
+            None => tried.push((fit, score)),
+        }
+    }
+    tried.sort_by(|a, b| a.1.total_cmp(&b.1));
+    tried
 }
 
-fn detection(view: &View<'_>, fit: &Fit, evidence: &Evidence, confidence: f64) -> Detection {
+fn detection(view: &View<'_>, fit: &Fit, planar: &Covariance, common: Vector, confidence: f64) -> Detection {
     let (mut model, mut yaw) = (fit.model(), fit.yaw());
     if let Model::Box { size } = &mut model
         && size[0] < size[1]
@@ -229,12 +292,16 @@ fn detection(view: &View<'_>, fit: &Fit, evidence: &Evidence, confidence: f64) -
     }
     let [x, y] = fit.at();
     let standing = Pose::from_rpy([x, y, model.size()[2] / 2.0], 0.0, 0.0, yaw);
-    Detection { model, pose: view.frame.compose(&standing), covariance: covariance(view, fit, evidence), confidence }
+    Detection {
+        model,
+        pose: view.frame.compose(&standing),
+        covariance: covariance(view, fit, planar, common),
+        confidence,
+    }
 }
 
 /// The fit's covariance and the plane's together, turned into the world.
-fn covariance(view: &View<'_>, fit: &Fit, evidence: &Evidence) -> [[f64; 6]; 6] {
-    let planar = fit.covariance(evidence);
+fn covariance(view: &View<'_>, fit: &Fit, planar: &Covariance, common: Vector) -> [[f64; 6]; 6] {
     let mut local = [[0.0; 6]; 6];
     // x, y and yaw are the fit's, height and slopes the plane's; half of the height's error is the centre's.
     for (i, row) in [0, 1, 5].into_iter().enumerate() {
@@ -245,12 +312,9 @@ fn covariance(view: &View<'_>, fit: &Fit, evidence: &Evidence) -> [[f64; 6]; 6] 
     local[2][2] = view.plane_variance[0] + planar.height / 4.0;
     local[3][3] = view.plane_variance[1];
     local[4][4] = view.plane_variance[1];
-    let [x, y] = fit.at();
-    let away = sub([x, y, 0.0], evidence.eye);
-    let common = COMMON_NOISE * evidence.sigma / length(away);
     for (i, row) in local.iter_mut().take(3).enumerate() {
         for (j, entry) in row.iter_mut().take(3).enumerate() {
-            *entry += common * common * away[i] * away[j];
+            *entry += common[i] * common[j];
         }
     }
     if fit.class.symmetry() == Symmetry::Round {

@@ -6,11 +6,14 @@
 //! over place, yaw and the model's own dimensions, by Levenberg and Marquardt, with weights that fade beyond a cut-off which
 //! shrinks as the fit settles. Objects stand upright: the frame's z = 0 is the surface.
 
+mod placed;
+pub(crate) mod relief;
 pub(crate) mod start;
 
 use crate::model::{Model, ObjectClass, Symmetry};
 use crate::normal::Normal;
-use crate::vector::{Vector, length as length_of, sub};
+use crate::vector::Vector;
+use placed::{Deepest, Placed};
 
 /// What was measured of a cluster and around it, in the frame of the supporting surface.
 #[derive(Debug, Clone)]
@@ -55,8 +58,6 @@ const DIFFERENCE: f64 = 1e-4;
 const FIRST_CUT_OFF: f64 = 0.015;
 /// How much of it the next has.
 const CUT_OFF_FADE: f64 = 0.7;
-/// How exactly the deepest place of a ray is found, in metres.
-const RESOLUTION: f64 = 0.002;
 /// A point this near, or within three deviations, is explained, in metres.
 const EXPLAINED: f64 = 0.004;
 /// The variance of what the evidence does not determine, in metres² and radians².
@@ -81,6 +82,13 @@ impl Fit {
         self.parameters[YAW]
     }
 
+    /// The same turned about its axis, in radians.
+    pub(crate) fn turned(&self, by: f64) -> Fit {
+        let mut turned = self.clone();
+        turned.parameters[YAW] += by;
+        turned
+    }
+
     pub(crate) fn model(&self) -> Model {
         self.class.model(&self.parameters[FIRST_DIMENSION..FIRST_DIMENSION + self.class.ranges().len()])
     }
@@ -90,13 +98,15 @@ impl Fit {
         let last_cut_off = (3.0 * evidence.sigma).max(EXPLAINED);
         let mut cut_off = FIRST_CUT_OFF.max(last_cut_off);
         let (mut here, mut damping) = (self, 1e-3);
+        let mut residuals = here.residuals(evidence);
         for _ in 0..iterations {
-            let used = here.used(evidence);
-            let (normal, cost) = here.linearised(evidence, &used, cut_off);
+            let used = residuals.used(evidence);
+            let normal = here.linearised(evidence, &residuals, &used, cut_off);
             let Some(next) = here.stepped(&normal, damping) else { break };
-            if next.cost(evidence, &used, cut_off) <= cost {
+            let next_residuals = next.residuals(evidence);
+            if next_residuals.cost(&used, cut_off) <= residuals.cost(&used, cut_off) {
                 let moved = here.parameters.iter().zip(next.parameters).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-                here = next;
+                (here, residuals) = (next, next_residuals);
                 damping = (damping * 0.3).max(1e-6);
                 if moved < SETTLED && cut_off <= last_cut_off {
                     break;
@@ -112,7 +122,14 @@ impl Fit {
     /// How badly it explains the evidence, per point: 0 is perfect, 1 not at all.
     pub(crate) fn score(&self, evidence: &Evidence) -> f64 {
         let cut_off = (3.0 * evidence.sigma).max(EXPLAINED);
-        self.cost(evidence, &evidence.points, cut_off) * 2.0 / cut_off.powi(2) / evidence.points.len().max(1) as f64
+        let all = vec![true; evidence.points.len()];
+        self.residuals(evidence).cost(&all, cut_off) * 2.0 / cut_off.powi(2) / all.len().max(1) as f64
+    }
+
+    /// With its score.
+    pub(crate) fn scored(self, evidence: &Evidence) -> (Fit, f64) {
+        let score = self.score(evidence);
+        (self, score)
     }
 
     /// How many of the points lie on its surface, 0 to 1.
@@ -193,40 +210,28 @@ impl Fit {
         std::array::from_fn(|i| moved[i].as_ref().map_or(0.0, |p| (distance(p) - here) / DIFFERENCE))
     }
 
-    /// The points that the model has above the floor: chosen by where the model is, not by where noise has put them.
-    fn used(&self, evidence: &Evidence) -> Vec<Vector> {
+    fn residuals(&self, evidence: &Evidence) -> Residuals {
         let placed = Placed::of(self, evidence.eye);
-        let above = |p: &&Vector| p[2] - placed.distance(**p) > evidence.floor;
-        evidence.points.iter().filter(above).copied().collect()
+        Residuals {
+            points: evidence.points.iter().map(|p| placed.distance(*p)).collect(),
+            rays: evidence.free.iter().filter_map(|end| placed.deepest(evidence, *end)).collect(),
+        }
     }
 
-    fn linearised(&self, evidence: &Evidence, used: &[Vector], cut_off: f64) -> (Normal, f64) {
-        let (placed, moved) = (Placed::of(self, evidence.eye), self.neighbours(evidence.eye));
-        let (mut normal, mut cost) = (Normal::default(), 0.0);
-        for point in used {
-            let residual = placed.distance(*point);
-            cost += robust(residual, cut_off);
-            let weight = weight(residual, cut_off);
-            if weight > 0.0 {
-                normal.add(&self.slope(&moved, residual, |p| p.distance(*point)), residual, weight);
+    fn linearised(&self, evidence: &Evidence, residuals: &Residuals, used: &[bool], cut_off: f64) -> Normal {
+        let moved = self.neighbours(evidence.eye);
+        let mut normal = Normal::default();
+        for ((point, residual), used) in evidence.points.iter().zip(&residuals.points).zip(used) {
+            let weight = weight(*residual, cut_off);
+            if *used && weight > 0.0 {
+                normal.add(&self.slope(&moved, *residual, |p| p.distance(*point)), *residual, weight);
             }
         }
-        for end in &evidence.free {
-            let Some(ray) = placed.deepest(evidence, *end) else { continue };
-            if ray.depth < 0.0 {
-                cost += robust(ray.depth, cut_off);
-                let slope = self.slope(&moved, ray.depth, |p| p.model.fill_distance(p.local(ray.place)));
-                normal.add(&slope, ray.depth, weight(ray.depth, cut_off).max(RAY_WEIGHT));
-            }
+        for ray in residuals.rays.iter().filter(|ray| ray.depth < 0.0) {
+            let slope = self.slope(&moved, ray.depth, |p| p.model.fill_distance(p.local(ray.place)));
+            normal.add(&slope, ray.depth, weight(ray.depth, cut_off).max(RAY_WEIGHT));
         }
-        (normal, cost)
-    }
-
-    fn cost(&self, evidence: &Evidence, points: &[Vector], cut_off: f64) -> f64 {
-        let placed = Placed::of(self, evidence.eye);
-        let on_surface = points.iter().map(|p| robust(placed.distance(*p), cut_off));
-        let free = evidence.free.iter().filter_map(|end| placed.deepest(evidence, *end));
-        on_surface.sum::<f64>() + free.map(|ray| robust(ray.depth.min(0.0), cut_off)).sum::<f64>()
+        normal
     }
 
     fn stepped(&self, normal: &Normal, damping: f64) -> Option<Fit> {
@@ -247,6 +252,27 @@ impl Fit {
     }
 }
 
+/// How far the evidence is from a fit.
+struct Residuals {
+    /// Of each point, in metres.
+    points: Vec<f64>,
+    /// Of the rays that pass near it.
+    rays: Vec<Deepest>,
+}
+
+impl Residuals {
+    /// The points that the model has above the floor: chosen by where the model is, not by where noise has put them.
+    fn used(&self, evidence: &Evidence) -> Vec<bool> {
+        self.points.iter().zip(&evidence.points).map(|(residual, p)| p[2] - residual > evidence.floor).collect()
+    }
+
+    fn cost(&self, used: &[bool], cut_off: f64) -> f64 {
+        let points = self.points.iter().zip(used).filter(|(_, used)| **used).map(|(r, _)| robust(*r, cut_off));
+        let rays = self.rays.iter().map(|ray| robust(ray.depth.min(0.0), cut_off));
+        points.sum::<f64>() + rays.sum::<f64>()
+    }
+}
+
 /// What a ray through the model keeps at least of its weight, however deep: it is no stray.
 const RAY_WEIGHT: f64 = 0.2;
 
@@ -259,92 +285,4 @@ fn robust(residual: f64, cut_off: f64) -> f64 {
 fn weight(residual: f64, cut_off: f64) -> f64 {
     let part = (residual / cut_off).powi(2).min(1.0);
     3.0 * (1.0 - part).powi(2)
-}
-
-/// A fit ready for many questions.
-#[derive(Debug, Clone, Copy)]
-struct Placed {
-    model: Model,
-    at: Vector,
-    sin: f64,
-    cos: f64,
-    /// The camera in its frame.
-    eye: Vector,
-}
-
-/// The place of a ray that is deepest within the model, or nearest to it.
-struct Deepest {
-    place: Vector,
-    /// Signed distance there.
-    depth: f64,
-}
-
-impl Placed {
-    fn of(fit: &Fit, eye: Vector) -> Placed {
-        let model = fit.model();
-        let (sin, cos) = fit.yaw().sin_cos();
-        let at = [fit.parameters[0], fit.parameters[1], model.size()[2] / 2.0];
-        let mut placed = Placed { model, at, sin, cos, eye };
-        placed.eye = placed.local(eye);
-        placed
-    }
-
-    /// How far a point is from the surface that the camera sees.
-    fn distance(&self, point: Vector) -> f64 {
-        self.model.distance(self.local(point), self.eye)
-    }
-
-    /// A point in the model's frame.
-    fn local(&self, p: Vector) -> Vector {
-        let (x, y) = (p[0] - self.at[0], p[1] - self.at[1]);
-        [self.cos * x + self.sin * y, self.cos * y - self.sin * x, p[2] - self.at[2]]
-    }
-
-    /// Where the ray from the eye to `end` is deepest, above the floor; `None` where it passes well clear. Golden section: along
-    /// a line the distance to a convex body has one minimum.
-    fn deepest(&self, evidence: &Evidence, end: Vector) -> Option<Deepest> {
-        let eye = evidence.eye;
-        let fall = eye[2] - end[2];
-        let [length, width, height] = self.model.size();
-        if fall < 1e-3 || eye[2] <= height || height <= evidence.floor {
-            return None;
-        }
-        let at = |z: f64| -> Vector {
-            let t = (eye[2] - z) / fall;
-            std::array::from_fn(|i| eye[i] + t * (end[i] - eye[i]))
-        };
-        let (top, bottom) = (at(height), at(evidence.floor));
-        if self.passes_clear(top, bottom, length.hypot(width) / 2.0) {
-            return None;
-        }
-        let point = |s: f64| -> Vector { std::array::from_fn(|i| top[i] + s * (bottom[i] - top[i])) };
-        let depth = |s: f64| self.model.fill_distance(self.local(point(s)));
-        const GOLDEN: f64 = 0.618_033_988_749_895;
-        let (mut low, mut high) = (0.0, 1.0);
-        let (mut a, mut b) = (high - GOLDEN * (high - low), low + GOLDEN * (high - low));
-        let (mut depth_a, mut depth_b) = (depth(a), depth(b));
-        let mut left = length_of(sub(bottom, top));
-        while left > RESOLUTION {
-            left *= GOLDEN;
-            if depth_a < depth_b {
-                (high, b, depth_b) = (b, a, depth_a);
-                a = high - GOLDEN * (high - low);
-                depth_a = depth(a);
-            } else {
-                (low, a, depth_a) = (a, b, depth_b);
-                b = low + GOLDEN * (high - low);
-                depth_b = depth(b);
-            }
-        }
-        let (s, depth) = if depth_a < depth_b { (a, depth_a) } else { (b, depth_b) };
-        Some(Deepest { place: point(s), depth })
-    }
-
-    /// Whether a segment seen from above stays outside a circle around the model.
-    fn passes_clear(&self, top: Vector, bottom: Vector, radius: f64) -> bool {
-        let (dx, dy) = (bottom[0] - top[0], bottom[1] - top[1]);
-        let (px, py) = (self.at[0] - top[0], self.at[1] - top[1]);
-        let t = ((px * dx + py * dy) / (dx * dx + dy * dy).max(1e-12)).clamp(0.0, 1.0);
-        (px - t * dx).powi(2) + (py - t * dy).powi(2) > (radius + 0.004).powi(2)
-    }
 }

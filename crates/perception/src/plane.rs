@@ -23,6 +23,8 @@ const VOTERS: usize = 1500;
 const INLIER: f64 = 0.008;
 /// How steep the plane may be in the region's frame.
 const MAX_SLOPE: f64 = 0.1;
+/// How steep it usually is there: what leads from one surface down to another is steeper.
+const SLOPE_DEVIATION: f64 = 0.03;
 /// With fewer inliers there is no plane.
 const MIN_INLIERS: usize = 40;
 
@@ -46,27 +48,30 @@ impl Plane {
         Pose { position: [0.0, 0.0, self.height], quaternion_xyzw: quaternion.map(|q| q / norm) }
     }
 
-    /// The plane that most points lie on.
-    pub(crate) fn find(points: &[Vector], seed: u64) -> Option<Plane> {
+    /// The plane that most points lie on, each counting less the steeper and the farther from z = 0 the plane is: by a normal
+    /// distribution with this deviation, in metres. So of two surfaces the one that is meant is found, and where there is one alone, that one.
+    pub(crate) fn find(points: &[Vector], deviation: f64, seed: u64) -> Option<Plane> {
         let stride = points.len().div_ceil(VOTERS).max(1);
         let voters: Vec<Vector> = points.iter().step_by(stride).copied().collect();
         if voters.len() < MIN_INLIERS {
             return None;
         }
         let mut random = ChaCha8Rng::seed_from_u64(seed);
-        let mut best: Option<(usize, Plane)> = None;
-        for _ in 0..ATTEMPTS {
-            let mut pick = || voters[random.random_range(0..voters.len())];
+        let mut best: Option<(f64, Plane)> = None;
+        // Every other sample is of points near where the plane should be: it may be a small part of what is seen.
+        let near: Vec<Vector> = voters.iter().filter(|p| p[2].abs() < 2.0 * deviation).copied().collect();
+        for attempt in 0..ATTEMPTS {
+            let from = if attempt % 2 == 0 && near.len() >= MIN_INLIERS { &near } else { &voters };
+            let mut pick = || from[random.random_range(0..from.len())];
             let Some(plane) = Plane::through(pick(), pick(), pick()) else { continue };
             let votes = voters.iter().filter(|p| plane.above(**p).abs() < INLIER).count();
-            if best.is_none_or(|(most, _)| votes > most) {
-                best = Some((votes, plane));
+            let slope = plane.slope_x.hypot(plane.slope_y) / SLOPE_DEVIATION;
+            let worth = votes as f64 * (-0.5 * ((plane.height / deviation).powi(2) + slope * slope)).exp();
+            if votes >= MIN_INLIERS && best.is_none_or(|(most, _)| worth > most) {
+                best = Some((worth, plane));
             }
         }
-        let (votes, mut plane) = best?;
-        if votes < MIN_INLIERS {
-            return None;
-        }
+        let (_, mut plane) = best?;
         for _ in 0..2 {
             let inliers = points.iter().copied().filter(|p| plane.above(*p).abs() < INLIER);
             plane = Plane::least_squares(inliers).unwrap_or(plane);
@@ -130,7 +135,7 @@ mod tests {
         let grid = (0..1600).map(|i| (f64::from(i % 40) / 40.0, f64::from(i / 40) / 40.0));
         let points: Vec<Vector> =
             grid.map(|(x, y)| [x, y, if (x * 7.0 + y * 5.0) % 1.0 < 0.35 { 0.09 } else { truth.at(x, y) }]).collect();
-        let found = Plane::find(&points, 5).unwrap();
+        let found = Plane::find(&points, 0.02, 5).unwrap();
         assert!((found.at(0.5, 0.5) - truth.at(0.5, 0.5)).abs() < 1e-6);
         assert!((found.slope_x - truth.slope_x).abs() < 1e-6);
     }
@@ -146,6 +151,16 @@ mod tests {
 
     #[test]
     fn three_points_are_not_a_plane() {
-        assert_eq!(Plane::find(&[[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], 0), None);
+        assert_eq!(Plane::find(&[[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], 0.02, 0), None);
+    }
+
+    #[test]
+    fn of_two_surfaces_the_one_that_is_meant_is_found_and_one_alone_is_found_anywhere() {
+        // A board of 5 cm that takes a quarter of the view.
+        let grid = (0..1600).map(|i| (f64::from(i % 40) / 40.0, f64::from(i / 40) / 40.0));
+        let points: Vec<Vector> = grid.map(|(x, y)| [x, y, if x < 0.25 { 0.0 } else { -0.05 }]).collect();
+        assert!(Plane::find(&points, 0.01, 5).unwrap().height.abs() < 1e-6);
+        let alone: Vec<Vector> = points.into_iter().filter(|p| p[2] < 0.0).collect();
+        assert!((Plane::find(&alone, 0.01, 5).unwrap().height + 0.05).abs() < 1e-6);
     }
 }

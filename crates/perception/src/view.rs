@@ -4,11 +4,12 @@
 use crate::camera::{Camera, DepthImage};
 use crate::cluster;
 use crate::detection::{DetectionError, Region};
-use crate::fit::Evidence;
+use crate::fit::relief::{Depth, Relief};
+use crate::fit::{Evidence, Fit};
 use crate::level;
 use crate::mask::{Ball, Mask};
 use crate::plane::Plane;
-use crate::vector::{Vector, length, median, sub};
+use crate::vector::{Vector, cross, dot, length, median, sub};
 use ratn_model::pose::Pose;
 
 /// How far above or below its given pose the surface may be, in metres.
@@ -30,8 +31,13 @@ const LEAST_FALL: f64 = 0.2;
 const LEAST_SIGMA: f64 = 0.0004;
 /// Which pixels around a cluster's are asked whether they see past it, in steps along rows and columns.
 const BESIDE: [isize; 4] = [1, 2, 3, 5];
+/// How far around a fork, along it and across, depths are compared with what they should be, and how high above or below the surface, in metres.
+const AROUND: [f64; 2] = [0.035, 0.012];
+const LOW: f64 = 0.035;
+/// Not more of them, about.
+const MOST_DEPTHS: f64 = 1200.0;
 /// What stands on the plane lifts it by about so much of its points' deviation: low parts are taken for it.
-const LIFT: f64 = 0.1;
+const LIFT: f64 = 0.08;
 /// RANSAC's choices: any number does; the same image gives the same objects.
 const SEED: u64 = 0x5EED;
 
@@ -83,14 +89,29 @@ impl Rays {
     }
 
     fn point(&self, pixel: usize, depth: f64) -> Vector {
-        let (column, row) = ((pixel % self.width) as f64, (pixel / self.width) as f64);
-        std::array::from_fn(|i| {
-            self.eye[i] + depth * (self.origin[i] + column * self.per_column[i] + row * self.per_row[i])
-        })
+        let way = self.way(pixel % self.width, pixel / self.width);
+        std::array::from_fn(|i| self.eye[i] + depth * way[i])
+    }
+
+    /// The direction of a pixel's ray: times the depth it is the way from the eye.
+    fn way(&self, column: usize, row: usize) -> Vector {
+        std::array::from_fn(|i| self.origin[i] + column as f64 * self.per_column[i] + row as f64 * self.per_row[i])
+    }
+
+    /// Column and row at which a point appears; `None` behind the camera.
+    fn pixel(&self, point: Vector) -> Option<[f64; 2]> {
+        let to = sub(point, self.eye);
+        // The axes are orthogonal, those of columns and rows as long as a pixel at a depth of 1.
+        let ahead = cross(self.per_column, self.per_row);
+        let depth = dot(to, ahead) / length(ahead);
+        let at = |axis: Vector| (dot(to, axis) / depth - dot(self.origin, axis)) / dot(axis, axis);
+        (depth > 1e-6).then(|| [at(self.per_column), at(self.per_row)])
     }
 }
 
 impl<'a> View<'a> {
+    /// `deviation`: how far from its given pose the surface is, in metres, as a normal distribution's.
+    ///
     /// # Errors
     /// [`DetectionError`] when the surface is not in the image.
     pub(crate) fn new(
@@ -98,6 +119,7 @@ impl<'a> View<'a> {
         camera: &Camera,
         region: &Region,
         body: &[Ball],
+        deviation: f64,
     ) -> Result<View<'a>, DetectionError> {
         let (width, height) = (image.width, image.height);
         if (width, height) != (camera.intrinsics.width, camera.intrinsics.height) || image.depth.len() != width * height
@@ -105,7 +127,7 @@ impl<'a> View<'a> {
             return Err(DetectionError::WrongCamera { width, height });
         }
         let near = near_surface(image, camera, region);
-        let plane = Plane::find(&near, SEED).ok_or(DetectionError::NoPlane { points: near.len() })?;
+        let plane = Plane::find(&near, deviation, SEED).ok_or(DetectionError::NoPlane { points: near.len() })?;
         let (sigma_above, on_plane) = scatter(&near, &plane);
         let frame = region.pose.compose(&plane.frame());
         let half = region.size.map(|edge| edge / 2.0);
@@ -213,6 +235,48 @@ impl<'a> View<'a> {
             floor: self.floor,
             sigma: self.sigma,
             pitch: length(sub(first, self.rays.eye)) * length(self.rays.per_column),
+        }
+    }
+
+    /// The depths around a fork, as it lies now.
+    pub(crate) fn relief(&self, fit: &Fit) -> Relief {
+        let [long, width, height] = fit.model().size();
+        let (along, across) = (long / 2.0 + AROUND[0], width / 2.0 + AROUND[1]);
+        let (sin, cos) = fit.yaw().sin_cos();
+        let [x, y] = fit.at();
+        let corners = [(along, across), (along, -across), (-along, across), (-along, -across)]
+            .map(|(u, v)| [x + cos * u - sin * v, y + sin * u + cos * v]);
+        let seen = corners.into_iter().flat_map(|[x, y]| [0.0, height].map(|z| self.rays.pixel([x, y, z])));
+        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+        for pixel in seen.flatten() {
+            for axis in 0..2 {
+                low[axis] = low[axis].min(pixel[axis]);
+                high[axis] = high[axis].max(pixel[axis]);
+            }
+        }
+        let size = [self.image.width, self.image.height];
+        let range = |axis: usize| (low[axis].max(0.0) as usize)..((high[axis].max(0.0) as usize + 1).min(size[axis]));
+        let mut depths = Vec::new();
+        for row in range(1) {
+            for column in range(0) {
+                let Some(depth) = valid(self.image.depth[row * self.image.width + column]) else { continue };
+                let way = self.rays.way(column, row);
+                // Where the ray reaches the surface, and how high what it met is.
+                let surface = -self.rays.eye[2] / way[2];
+                let (u, v) = (self.rays.eye[0] + surface * way[0] - x, self.rays.eye[1] + surface * way[1] - y);
+                let beside = (cos * u + sin * v).abs() > along || (cos * v - sin * u).abs() > across;
+                if !beside && (self.rays.eye[2] + depth * way[2]).abs() < LOW {
+                    depths.push(Depth { way, depth });
+                }
+            }
+        }
+        let stride = (depths.len() as f64 / MOST_DEPTHS).ceil().max(1.0) as usize;
+        let distance = length(sub([x, y, 0.0], self.rays.eye));
+        Relief {
+            eye: self.rays.eye,
+            depths: depths.into_iter().step_by(stride).collect(),
+            sigma: self.sigma,
+            pitch: distance * length(self.rays.per_column),
         }
     }
 

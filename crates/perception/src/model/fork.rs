@@ -55,6 +55,102 @@ pub(super) fn fill_distance(length: f64, point: Vector) -> f64 {
     length * ((across.max(0.0).powi(2) + aside.max(0.0).powi(2)).sqrt() + across.max(aside).min(0.0))
 }
 
+/// The strip in parts, as rays from above meet it: of a fork of unit length in its frame, but with z = 0 at the table.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Strip([Part; NODES.len() - 1]);
+
+/// A straight part of the strip: the middle of its cross section goes from `start` along `along`.
+#[derive(Debug, Clone, Copy)]
+struct Part {
+    start: [f64; 2],
+    along: [f64; 2],
+    length: f64,
+    /// At its start, and how much it grows by a unit of length.
+    width: [f64; 2],
+    /// Whether a free end is at its start, and at its end.
+    ends: [bool; 2],
+}
+
+impl Strip {
+    pub(crate) fn new() -> Strip {
+        Strip(std::array::from_fn(|i| {
+            let (a, b) = (NODES[i], NODES[i + 1]);
+            let (dx, dz) = (b.x - a.x, b.z - a.z);
+            let length = dx.hypot(dz);
+            Part {
+                start: [a.x, a.z],
+                along: [dx / length, dz / length],
+                length,
+                width: [a.width, (b.width - a.width) / length],
+                ends: [i == 0, i + 2 == NODES.len()],
+            }
+        }))
+    }
+
+    /// How much of a pixel sees the strip, 0 to 1, and how far along its ray, in lengths of `way`. A pixel is as wide as `pixel`; of
+    /// the tines' gaps it sees as much as their sides leave open.
+    pub(crate) fn met(&self, eye: Vector, way: Vector, pixel: f64) -> Option<(f64, f64)> {
+        // Where the ray is half-way up the fork; within how much of that it passes all heights of it.
+        let half = size(1.0)[2] / 2.0;
+        let down = way[2].min(-1e-9);
+        let at = (half - eye[2]) / down;
+        let (x, y) = (eye[0] + at * way[0], eye[1] + at * way[1]);
+        let (slack_x, slack_y) = (pixel + half * (way[0] / down).abs(), pixel + half * (way[1] / down).abs());
+        if y.abs() > size(1.0)[1] / 2.0 + slack_y {
+            return None;
+        }
+        let mut best: Option<(f64, f64)> = None;
+        let near =
+            |part: &&Part| x + slack_x >= part.start[0] && x - slack_x <= part.start[0] + part.along[0] * part.length;
+        for part in self.0.iter().filter(near) {
+            if let Some((covered, at)) = part.met(eye, way, pixel)
+                && best.is_none_or(|(most, first)| covered > most || (covered == most && at < first))
+            {
+                best = Some((covered, at));
+            }
+        }
+        best
+    }
+}
+
+impl Part {
+    fn met(&self, eye: Vector, way: Vector, pixel: f64) -> Option<(f64, f64)> {
+        let [ux, uz] = self.along;
+        let (ex, ez) = (eye[0] - self.start[0], eye[2] - self.start[1]);
+        let (off, fall) = (ux * ez - uz * ex, ux * way[2] - uz * way[0]);
+        if fall > -1e-9 {
+            return None;
+        }
+        // Through the upper side and out of the lower one.
+        let [enters, leaves] = [THICKNESS / 2.0, -THICKNESS / 2.0].map(|side| (side - off) / fall);
+        let [s, s_leaving] = [enters, leaves].map(|t| ux * (ex + t * way[0]) + uz * (ez + t * way[2]));
+        let (low, high) = (s.min(s_leaving), s.max(s_leaving));
+        let soft = |beyond: f64| (0.5 - beyond / pixel).clamp(0.0, 1.0);
+        let within = |beyond: f64, is_end: bool| if is_end { soft(beyond) } else { f64::from(u8::from(beyond <= 0.0)) };
+        let lengthwise = within(-high, self.ends[0]) * within(low - self.length, self.ends[1]);
+        if lengthwise <= 0.0 {
+            return None;
+        }
+        let width = self.width[0] + self.width[1] * s.clamp(0.0, self.length);
+        let (y, y_leaving) = (eye[1] + enters * way[1], eye[1] + leaves * way[1]);
+        let nearest = if y * y_leaving < 0.0 { 0.0 } else { y.abs().min(y_leaving.abs()) };
+        let mut covered = lengthwise * soft(nearest - width / 2.0);
+        if covered <= 0.0 {
+            return None;
+        }
+        if self.ends[1] {
+            let pitch = width / (TINES as f64 - 1.0 + TINE);
+            covered *= (TINE + (y - y_leaving).abs() / pitch).min(1.0);
+        }
+        // Through a side or an end of the strip it is met later.
+        let later = |outside: f64, way: f64| if outside > 0.0 { (outside / way.abs().max(1e-9)).min(1.0) } else { 0.0 };
+        let aside = later(y.abs() - width / 2.0, y - y_leaving);
+        let past = if self.ends[0] { -s } else { 0.0 }.max(if self.ends[1] { s - self.length } else { 0.0 });
+        let beyond = later(past, s - s_leaving);
+        Some((covered, enters + aside.max(beyond) * (leaves - enters)))
+    }
+}
+
 /// For a fork of unit length: how far a point is above the strip's middle (below is negative), and beside its edge.
 fn offsets(length: f64, point: Vector) -> (f64, f64) {
     let [x, y, z] = point.map(|c| c / length);
