@@ -1,8 +1,9 @@
 //! PNG files to look at: a depth image in colours, with what was found drawn into it.
 
 use crate::camera::{Camera, DepthImage};
-use crate::detection::Detection;
+use crate::detection::{Detection, Symmetry};
 use ratn_model::pose::Pose;
+use std::f64::consts::TAU;
 
 /// A picture, three bytes a pixel, row by row from the upper left.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -24,6 +25,11 @@ pub struct PictureError {
     source: png::EncodingError,
 }
 
+/// The colours of outlines and of x axes.
+const OUTLINE: [u8; 3] = [255, 255, 255];
+const AXIS: [u8; 3] = [255, 255, 0];
+/// Straight pieces that a circle is drawn with.
+const SIDES: u32 = 48;
 /// Points a line is drawn with.
 const STROKES: usize = 160;
 /// Edges of a box, by the bits of its corners.
@@ -48,14 +54,30 @@ impl Picture {
         Picture { width: image.width, height: image.height, rgb }
     }
 
-    /// Draws the outline of what was found: its bounding box, and its x axis from the middle.
+    /// Draws the outline of what was found: of what is round its circles above and below, of everything else its bounding box and its x
+    /// axis from the middle.
     pub fn draw(&mut self, camera: &Camera, found: &Detection) {
         let half = found.model.size().map(|edge| edge / 2.0);
+        if found.model.class().symmetry() == Symmetry::Round {
+            for side in 0..SIDES {
+                let [here, next] = [side, side + 1].map(|side| {
+                    let (sin, cos) = (TAU * f64::from(side) / f64::from(SIDES)).sin_cos();
+                    [half[0] * cos, half[0] * sin]
+                });
+                for z in [-half[2], half[2]] {
+                    self.line(camera, &found.pose, [here[0], here[1], z], [next[0], next[1], z], OUTLINE);
+                }
+                if side % (SIDES / 4) == 0 {
+                    self.line(camera, &found.pose, [here[0], here[1], -half[2]], [here[0], here[1], half[2]], OUTLINE);
+                }
+            }
+            return;
+        }
         let corner = |i: usize| [0, 1, 2].map(|axis| if i >> axis & 1 == 0 { -half[axis] } else { half[axis] });
         for (a, b) in EDGES {
-            self.line(camera, &found.pose, corner(a), corner(b), [255, 255, 255]);
+            self.line(camera, &found.pose, corner(a), corner(b), OUTLINE);
         }
-        self.line(camera, &found.pose, [0.0, 0.0, half[2]], [half[0], 0.0, half[2]], [255, 255, 0]);
+        self.line(camera, &found.pose, [0.0, 0.0, half[2]], [half[0], 0.0, half[2]], AXIS);
     }
 
     /// The picture as a PNG file.
@@ -137,6 +159,16 @@ mod tests {
         let [column, row] = camera.intrinsics.project([0.1, 0.1, 1.4]).unwrap();
         let pixel = 3 * (row.round() as usize * width + column.round() as usize);
         assert_eq!(&drawn.rgb[pixel..pixel + 3], &[255, 255, 255]);
+        // A bowl is round: its rim is drawn, the corners of the box around it are not.
+        let bowl = Detection { model: ObjectClass::Bowl.model(&[0.08, 0.06]), ..at(0.0) };
+        let mut round = blank.clone();
+        round.draw(&camera, &bowl);
+        let is_drawn = |point: [f64; 3]| {
+            let [column, row] = camera.intrinsics.project(point).unwrap();
+            let pixel = 3 * (row.round() as usize * width + column.round() as usize);
+            round.rgb[pixel..pixel + 3] == [255, 255, 255]
+        };
+        assert!(is_drawn([0.08, 0.0, 1.47]) && is_drawn([0.0, 0.08, 1.53]) && !is_drawn([0.08, 0.08, 1.47]));
         let mut beside = blank.clone();
         beside.draw(&camera, &at(20.0));
         assert_eq!(beside, blank);
