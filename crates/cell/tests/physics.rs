@@ -6,6 +6,7 @@ use ratn_cell::core::environment::{Environment, FLOOR, Furniture, Kind, Model, S
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::robot::{Configuration, Robot};
+use std::f64::consts::FRAC_PI_2;
 use std::time::Instant;
 
 const BOX: Model = Model { kind: Kind::Box, size: [0.12, 0.08, 0.10] };
@@ -165,6 +166,90 @@ fn what_is_restored_goes_on_as_what_was_saved_also_from_the_middle_of_a_fall() {
         other.step(&robot, &stowed());
     }
     assert_eq!(one.digest(), other.digest());
+}
+
+/// The base after so many seconds of a drive at 0.4 m/s that turns; it takes two seconds to be that fast, and two to stand again.
+fn driven(seconds: f64) -> Configuration {
+    let ramp = |t: f64| 0.1 * t.clamp(0.0, 2.0).powi(2) + 0.4 * (t - 2.0).max(0.0);
+    let way = ramp(seconds.min(7.0)) - ramp((seconds.min(7.0) - 5.0).max(0.0));
+    Configuration { base: [-way, 0.1 * way, 0.5 * way], ..stowed() }
+}
+
+fn step_at(step: u32) -> Configuration {
+    driven(f64::from(step) * STEP.as_secs_f64())
+}
+
+fn seen_from_base(configuration: &Configuration, pose: &Pose) -> Pose {
+    let [x, y, heading] = configuration.base;
+    Pose::from_rpy([x, y, 0.0], 0.0, 0.0, heading).inverse().compose(pose)
+}
+
+/// A box, a bowl and a lying box on the deck.
+fn loaded() -> (Robot, Environment) {
+    let bowl = Model { kind: Kind::Bowl, size: [0.125, 0.125, 0.05] };
+    let lying = Pose::from_rpy([-0.52, 0.2, aimm::DECK_HEIGHT_M + 0.04], FRAC_PI_2, 0.0, 0.3);
+    let on_deck = |x: f64, height: f64| Pose::at(x, 0.0, aimm::DECK_HEIGHT_M + height / 2.0);
+    world(&[(BOX, on_deck(-0.22, 0.10)), (bowl, on_deck(-0.4, 0.05)), (BOX, lying)])
+}
+
+#[test]
+fn what_stands_on_a_deck_that_drives_gently_is_taken_along_and_stands_where_it_stood() {
+    let (robot, mut environment) = loaded();
+    let before: Vec<Pose> = (0..3).map(|i| environment.state(i).pose).collect();
+    let mut rode = 0;
+    for step in 0..1800 {
+        environment.step(&robot, &step_at(step));
+        rode += u32::from(environment.state(0).rides.is_some());
+    }
+    // The drive takes 7 s; nothing rides before it has stood still on the deck for a while.
+    assert!((1500..1700).contains(&rode), "{rode} steps");
+    settle(&robot, &mut environment, &step_at(1800), 1.0);
+    for (i, before) in before.iter().enumerate() {
+        let slid = seen_from_base(&step_at(1800), &environment.state(i).pose).distance(before);
+        assert!(slid < 0.002, "{i} slid by {slid} m");
+        assert_eq!(environment.rests_on(i), Some(Support::Named("base")));
+    }
+}
+
+#[test]
+fn what_rides_slides_on_when_the_base_stops_dead() {
+    let (robot, mut environment) = loaded();
+    (0..1000).for_each(|step| environment.step(&robot, &step_at(step)));
+    assert!(environment.state(0).rides.is_some());
+    let before = environment.state(0).pose;
+    settle(&robot, &mut environment, &step_at(999), 3.0);
+    let slid = environment.state(0).pose.distance(&before);
+    // v² / 2 μ g is 14 mm.
+    assert!((0.008..0.02).contains(&slid), "{slid} m");
+}
+
+#[test]
+fn what_rides_is_let_go_when_something_falls_onto_the_deck() {
+    let (robot, mut environment) = loaded();
+    (0..700).for_each(|step| environment.step(&robot, &step_at(step)));
+    let rider = environment.state(1).pose;
+    assert!(environment.state(0).rides.is_some());
+    environment.put(2, &Pose::at(rider.position[0], rider.position[1], rider.position[2] + 0.2));
+    (700..720).for_each(|step| environment.step(&robot, &step_at(step)));
+    assert!((0..3).all(|i| environment.state(i).rides.is_none()));
+}
+
+#[test]
+fn what_rode_when_it_was_saved_goes_on_riding_alike() {
+    let (robot, mut one) = loaded();
+    (0..700).for_each(|step| one.step(&robot, &step_at(step)));
+    let saved = one.save(&robot, &step_at(699));
+    assert!(saved.objects.iter().all(|(_, state)| state.rides.is_some()));
+    let mut other = Environment::restore(&robot, &step_at(699), &[table()], &saved);
+    for step in 700..1300 {
+        one.step(&robot, &step_at(step));
+        other.step(&robot, &step_at(step));
+        assert_eq!(one.digest(), other.digest(), "step {step}");
+    }
+    // Where it is put back, the base stands, and what rode is still as fast as it was.
+    let mut put_back = Environment::restore(&robot, &step_at(699), &[table()], &saved);
+    put_back.step(&robot, &step_at(699));
+    assert!(put_back.state(0).rides.is_none() && !put_back.is_at_rest());
 }
 
 #[test]

@@ -1,11 +1,12 @@
 //! The environment's physics: rigid bodies, friction, a fixed step.
 //!
 //! rapier3d moves what can be moved; floor and furniture stand still, and the robot's links go where its joints are, whatever is
-//! in their way. `grip` says what the fingers can hold. Nothing here reads a clock: the step is fixed, time is the number of steps,
+//! in their way. `grip` says what the fingers can hold, `riding` what goes along with a base that drives. Nothing here reads a clock: the step is fixed, time is the number of steps,
 //! and the same steps with the same joints give the same world to the last bit on one machine ([`Environment::digest`]).
 
 mod grip;
 mod object;
+mod riding;
 mod world;
 
 pub use grip::{Grip, Hold, Load, Slip};

@@ -40,7 +40,7 @@ const WALL_M: f64 = 0.004;
 /// How many slabs a round wall has.
 const SLABS: u32 = 16;
 /// The foot of plates and bowls, as a part of their greatest width.
-const FOOT: f64 = 0.6;
+pub(super) const FOOT: f64 = 0.6;
 /// How much of a fork's length its handle is, and how wide that is as a part of its head.
 const HANDLE: f64 = 0.7;
 const HANDLE_WIDTH: f64 = 0.4;

@@ -1,12 +1,13 @@
 //! The bodies and their steps.
 
 use super::object::{Kind, Model};
+use super::riding::Riding;
 use rapier3d::math::{Pose as Pose32, Vector};
 use rapier3d::parry::query::contact;
 use rapier3d::prelude::{
     BroadPhaseBvh, CCDSolver, ColliderBuilder, ColliderHandle, ColliderSet, Group, ImpulseJointSet,
     IntegrationParameters, InteractionGroups, InteractionTestMode, IslandManager, MultibodyJointSet, NarrowPhase,
-    PhysicsPipeline, RigidBodyBuilder, RigidBodyHandle, RigidBodySet, RigidBodyType, SoftBodySet,
+    PhysicsPipeline, RigidBody, RigidBodyBuilder, RigidBodyHandle, RigidBodySet, RigidBodyType, SoftBodySet,
 };
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
@@ -33,9 +34,12 @@ const TOUCH_M: f32 = 0.003;
 /// How steep a support may be: the least upward part of its normal.
 const LEVEL: f32 = 0.7;
 /// What fell out of the world is not followed any farther, in metres below the floor.
-const LOST_M: f32 = -5.0;
+pub(super) const LOST_M: f32 = -5.0;
 /// How much fingers and links rub.
-const ROBOT_FRICTION: f32 = 0.6;
+pub(super) const ROBOT_FRICTION: f32 = 0.6;
+
+/// What a link is that moves.
+const LINK: RigidBodyType = RigidBodyType::KinematicPositionBased;
 
 const OF_ROBOT: Group = Group::GROUP_1;
 const OF_OBJECTS: Group = Group::GROUP_2;
@@ -63,6 +67,9 @@ pub struct ObjectState {
     pub at_rest: bool,
     /// It goes where it is put, [`Environment::carry`].
     pub carried: bool,
+    /// It goes where the base goes: where it is as seen from there.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rides: Option<Pose>,
 }
 
 /// What an environment can be made of again: see [`Environment::save`].
@@ -94,9 +101,10 @@ pub struct Environment {
     supports: Vec<(ColliderHandle, String)>,
     links: Vec<RobotBody>,
     /// Where the robot's base was at the last step.
-    base: [f64; 3],
+    pub(super) base: [f64; 3],
     fingers_solid: bool,
     objects: Vec<Body>,
+    pub(super) riding: Riding,
 }
 
 /// One body of a robot's link.
@@ -105,7 +113,12 @@ struct RobotBody {
     body: RigidBodyHandle,
     collider: ColliderHandle,
     finger: bool,
+    link: usize,
+    /// As seen from its link.
+    pose: Pose,
     at: Pose32,
+    /// It did not move in the last step.
+    stands: bool,
 }
 
 #[derive(Clone)]
@@ -129,6 +142,7 @@ impl Environment {
             spin: [0.0; 3],
             at_rest: true,
             carried: false,
+            rides: None,
         };
         let objects = objects.iter().map(|(model, pose)| (model.clone(), state(pose))).collect();
         Environment::restore(robot, configuration, furniture, &Saved { steps: 0, objects })
@@ -166,6 +180,7 @@ impl Environment {
             base: configuration.base,
             fingers_solid: true,
             objects: Vec::new(),
+            riding: Riding::restored(riders(saved)),
         };
         environment.furnish();
         environment.add_robot(robot, configuration);
@@ -178,11 +193,20 @@ impl Environment {
     /// What it can be restored from. It is itself made again from that, so that both go on alike: what the solver remembers of
     /// past contacts is not part of the state.
     pub fn save(&mut self, robot: &Robot, configuration: &Configuration) -> Saved {
-        let saved = Saved { steps: self.steps, objects: self.states().collect() };
-        let solid = self.fingers_solid;
-        *self = Environment::restore(robot, configuration, &self.furniture, &saved);
-        self.set_fingers_solid(solid);
+        let saved = self.saved();
+        self.make_again(robot, configuration, &saved);
         saved
+    }
+
+    pub(super) fn saved(&self) -> Saved {
+        Saved { steps: self.steps, objects: self.states().collect() }
+    }
+
+    /// What stands there becomes what was saved; nothing else of it changes.
+    pub(super) fn make_again(&mut self, robot: &Robot, configuration: &Configuration, saved: &Saved) {
+        let solid = self.fingers_solid;
+        *self = Environment::restore(robot, configuration, &self.furniture, saved);
+        self.set_fingers_solid(solid);
     }
 
     /// The time of the last step.
@@ -197,10 +221,7 @@ impl Environment {
 
     /// Whether every object stands still, or goes only where it is carried.
     pub fn is_at_rest(&self) -> bool {
-        self.objects.iter().all(|o| {
-            let body = &self.bodies[o.body];
-            body.is_sleeping() || !body.is_dynamic() || body.translation().z < LOST_M
-        })
+        !self.riding.is_under_way() && self.objects.iter().all(|o| !self.moves(&self.bodies[o.body]))
     }
 
     /// Time goes on and nothing happens, up to the last step that is not after `until`: for when all is at rest.
@@ -217,15 +238,23 @@ impl Environment {
 
     /// One step, in which the robot's joints come to `configuration`.
     pub fn step(&mut self, robot: &Robot, configuration: &Configuration) {
+        self.take_along(robot, configuration);
+        let before = std::mem::replace(&mut self.base, configuration.base);
         // A contact that is taken over from the step before has its points where the carrier was then: on a deck that turns, things
         // would creep outwards.
-        self.parameters.contact_recycling = self.base == configuration.base;
-        self.base = configuration.base;
-        for (link, (_, pose, _)) in self.links.iter_mut().zip(robot.shapes(configuration)) {
-            if link.at != pose {
-                link.at = pose;
-                self.bodies[link.body].set_next_kinematic_position(pose);
+        self.parameters.contact_recycling = before == configuration.base;
+        let poses = robot.poses(configuration);
+        for link in &mut self.links {
+            let (body, pose) = (&mut self.bodies[link.body], to_f32(&poses[link.link].compose(&link.pose)));
+            let stands = link.at == pose;
+            if stands != link.stands {
+                // A body that is put where it is has the speed that rounding gives it, and nothing on it would ever sleep.
+                body.set_body_type(if stands { RigidBodyType::Fixed } else { LINK }, !stands);
             }
+            if !stands {
+                body.set_next_kinematic_position(pose);
+            }
+            (link.at, link.stands) = (pose, stands);
         }
         self.pipeline.step(
             self.gravity,
@@ -243,17 +272,19 @@ impl Environment {
             &(),
         );
         self.steps += 1;
+        self.board(robot, configuration, before);
     }
 
     /// Where an object is and how it moves.
     pub fn state(&self, object: usize) -> ObjectState {
-        let body = &self.bodies[self.objects[object].body];
+        let (body, rides) = (self.body(object), self.riding.seat(object));
         ObjectState {
             pose: to_f64(body.position()),
             velocity: body.linvel().to_array().map(f64::from),
             spin: body.angvel().to_array().map(f64::from),
             at_rest: body.is_sleeping(),
-            carried: body.is_kinematic(),
+            carried: body.is_kinematic() && rides.is_none(),
+            rides,
         }
     }
 
@@ -274,6 +305,7 @@ impl Environment {
 
     /// An object goes where it is put from now on, and is at `pose` after the next step. What it meets it pushes.
     pub fn carry(&mut self, object: usize, pose: &Pose) {
+        self.alight(object);
         let body = &mut self.bodies[self.objects[object].body];
         if !body.is_kinematic() {
             body.set_body_type(RigidBodyType::KinematicPositionBased, true);
@@ -283,6 +315,7 @@ impl Environment {
 
     /// An object is left to itself where it is, moving as it was told.
     pub fn let_go(&mut self, object: usize, pose: &Pose, velocity: [f64; 3]) {
+        self.alight(object);
         let body = &mut self.bodies[self.objects[object].body];
         body.set_body_type(RigidBodyType::Dynamic, true);
         body.set_position(to_f32(pose), true);
@@ -338,6 +371,21 @@ impl Environment {
         best.map(|(_, support)| support)
     }
 
+    /// An object's body.
+    pub(super) fn body(&self, object: usize) -> &RigidBody {
+        &self.bodies[self.objects[object].body]
+    }
+
+    /// The same, to be changed.
+    pub(super) fn body_mut(&mut self, object: usize) -> &mut RigidBody {
+        &mut self.bodies[self.objects[object].body]
+    }
+
+    /// Whether something to stand on is a link of the robot.
+    pub(super) fn is_of_robot(&self, name: &str) -> bool {
+        name != FLOOR && self.furniture.iter().all(|piece| piece.name != name)
+    }
+
     /// What all objects come to, and the time.
     pub fn digest(&self) -> Digest {
         let mut digester = Digester::default();
@@ -381,19 +429,22 @@ impl Environment {
     }
 
     fn add_robot(&mut self, robot: &Robot, configuration: &Configuration) {
-        for (link, pose, shape) in robot.shapes(configuration) {
+        let bodies = robot.links.iter().flat_map(|link| &link.bodies);
+        for ((link, pose, shape), of_link) in robot.shapes(configuration).into_iter().zip(bodies) {
             let name = &robot.links[link].name;
-            let body = self.bodies.insert(RigidBodyBuilder::kinematic_position_based().pose(pose));
+            let body = self.bodies.insert(RigidBodyBuilder::new(LINK).pose(pose));
             let collider = ColliderBuilder::new(shape).friction(ROBOT_FRICTION).collision_groups(robot_groups());
             let collider = self.colliders.insert_with_parent(collider, body, &mut self.bodies);
             self.supports.push((collider, name.clone()));
-            self.links.push(RobotBody { body, collider, finger: name.starts_with("finger"), at: pose });
+            let finger = name.starts_with("finger");
+            self.links.push(RobotBody { body, collider, finger, link, pose: of_link.pose, at: pose, stands: false });
         }
     }
 
     fn add(&mut self, model: &Model, state: &ObjectState) {
         let vector = |v: [f64; 3]| Vector::from_array(v.map(|c| c as f32));
-        let kind = if state.carried { RigidBodyType::KinematicPositionBased } else { RigidBodyType::Dynamic };
+        let placed = state.carried || state.rides.is_some();
+        let kind = if placed { RigidBodyType::KinematicPositionBased } else { RigidBodyType::Dynamic };
         let mut body = RigidBodyBuilder::new(kind)
             .pose(to_f32(&state.pose))
             .linvel(vector(state.velocity))
@@ -428,6 +479,12 @@ pub enum Support<'a> {
     Named(&'a str),
     /// Another object.
     Object(usize),
+}
+
+/// What rode when it was saved.
+fn riders(saved: &Saved) -> Vec<(usize, Pose)> {
+    let states = saved.objects.iter().enumerate();
+    states.filter_map(|(i, (_, state))| state.rides.map(|seat| (i, seat))).collect()
 }
 
 fn groups(of: Group, with: Group) -> InteractionGroups {
