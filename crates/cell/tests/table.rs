@@ -90,13 +90,19 @@ fn set_table(bench: &mut Bench) {
     }
     let mut set = [0; KINDS.len()];
     for i in 0..found.len() {
-        let (name, seen, _) = found[i].clone();
-        let (class, size) = (seen.model.class(), seen.model.size());
+        let (name, before, _) = found[i].clone();
+        let class = before.model.class();
         let Some(row) = KINDS.iter().position(|(known, _)| *known == class) else { panic!() };
         let kind = KINDS[row].1;
         if kind == Kind::Plate {
             continue;
         }
+        // A finger may have pushed it a little meanwhile.
+        let now = look(bench, ON_RACK).into_iter().filter(|seen| seen.model.class() == class);
+        let off = |seen: &Detection| seen.pose.distance(&before.pose);
+        let seen = now.min_by(|a, b| off(a).total_cmp(&off(b))).unwrap();
+        let size = seen.model.size();
+        found[i] = (name.clone(), seen.clone(), Placement::World(seen.pose));
         let request = |bench: &Bench, goals: Vec<Pose>| PlanRequest {
             start: bench.arm(),
             goals: goals.into_iter().map(Goal::Pose).collect(),

@@ -47,7 +47,7 @@ struct Row {
 const BOWLS: Row = Row { x: 0.83, rack_y: -0.06, table_y: 0.10, between: 0.19 };
 const FORKS: Row = Row { x: 0.62, ..BOWLS };
 /// Between bowls and forks, so far from the forks' middles that the hand fits in between.
-const CUPS: Row = Row { x: 0.745, rack_y: -0.155, ..BOWLS };
+const CUPS: Row = Row { x: 0.735, rack_y: -0.155, ..BOWLS };
 /// On the table nearer to their bowls' left sides, which leaves the last one on it.
 const CUPS_ON_TABLE: Row = Row { x: 0.73, table_y: 0.175, ..CUPS };
 /// As far apart as the table is long enough for, so that the camera tells them apart.
@@ -58,13 +58,15 @@ const SPREAD_M: f64 = 0.008;
 const SPREAD_RAD: f64 = 0.25;
 /// The same of plates, which the table has hardly room for.
 const PLATE_SPREAD_M: f64 = 0.002;
-/// How far apart what is round stands at the least, in metres.
-const APART_M: f64 = 0.02;
+/// How far things are apart on the rack at the least, and plates, in metres: what the detector needs to find one of them again in a picture
+/// of few frames, and all of them in one of many.
+const APART_M: f64 = 0.03;
+const PLATES_APART_M: f64 = 0.018;
 /// Least and greatest radius and height of bowls, cups and plates, and length of forks, in metres.
 const BOWL_RADIUS: [f64; 2] = [0.058, 0.066];
 const BOWL_HEIGHT: [f64; 2] = [0.046, 0.056];
 const FORK_LENGTH: [f64; 2] = [0.17, 0.19];
-const CUP_RADIUS: [f64; 2] = [0.033, 0.036];
+const CUP_RADIUS: [f64; 2] = [0.032, 0.035];
 const CUP_HEIGHT: [f64; 2] = [0.075, 0.09];
 const PLATE_RADIUS: [f64; 2] = [0.085, 0.086];
 const PLATE_HEIGHT: [f64; 2] = [0.022, 0.026];
@@ -95,14 +97,23 @@ pub fn is_in_place(kind: Kind, pose: &Pose) -> bool {
     upright && (ahead || kind != Kind::Fork) && places(kind).iter().any(|place| off(place) <= MAX_OFF_PLACE_M)
 }
 
-/// Whether the camera tells round things from each other.
+/// Whether the camera tells things from each other: every round one from all others.
 pub(super) fn are_apart(placed: &[Placed]) -> bool {
-    let near = |a: &Placed, b: &Placed| {
-        let [x, y] = [0, 1].map(|i| a.pose.position[i] - b.pose.position[i]);
-        x.hypot(y) < (a.model.size[0] + b.model.size[0]) / 2.0 + APART_M
+    let apart = |round: &Placed, other: &Placed| {
+        let [x, y, _] = other.pose.inverse().compose(&round.pose).position;
+        let (between, reach) = match other.model.kind {
+            // From the middle of the round one to the nearest of a fork's middle line.
+            Kind::Fork => {
+                let [length, width, _] = other.model.size;
+                ((x.abs() - length / 2.0).max(0.0).hypot(y), width / 2.0)
+            }
+            _ => (x.hypot(y), other.model.size[0] / 2.0),
+        };
+        let least = if round.model.kind == Kind::Plate { PLATES_APART_M } else { APART_M };
+        between >= round.model.size[0] / 2.0 + reach + least
     };
-    let round: Vec<&Placed> = placed.iter().filter(|object| object.model.is_round()).collect();
-    round.iter().enumerate().all(|(i, a)| round[..i].iter().all(|b| !near(a, b)))
+    let mut round = placed.iter().filter(|object| object.model.is_round());
+    round.all(|a| placed.iter().filter(|b| b.id != a.id).all(|b| apart(a, b)))
 }
 
 /// A random rack, and plates on the table.
