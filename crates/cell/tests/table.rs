@@ -102,7 +102,7 @@ fn set_table(bench: &mut Bench) {
         let off = |seen: &Detection| seen.pose.distance(&before.pose);
         let seen = now.min_by(|a, b| off(a).total_cmp(&off(b))).unwrap();
         let size = seen.model.size();
-        found[i] = (name.clone(), seen.clone(), Placement::World(seen.pose));
+        found[i] = (name.clone(), seen, Placement::World(seen.pose));
         let request = |bench: &Bench, goals: Vec<Pose>| PlanRequest {
             start: bench.arm(),
             goals: goals.into_iter().map(Goal::Pose).collect(),
