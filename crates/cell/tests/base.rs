@@ -51,11 +51,7 @@ fn off(bench: &Bench, goal: [f64; 3]) -> f64 {
 fn load(bench: &mut Bench) -> Pose {
     bench.reach_for(0);
     bench.done(grasp());
-    let held = bench.cell.ground_truth()[0].clone();
-    let tool = bench.cell.robot().tool_pose(&bench.cell.configuration());
-    let in_tool = tool.inverse().compose(&held.pose);
-    let slot = aimm::slots()[4].compose(&Pose::at(0.0, 0.0, held.size[2] / 2.0 + 0.003));
-    bench.go(vec![Goal::Pose(slot.compose(&in_tool.inverse()))], 0.10, 0.10);
+    bench.carry();
     bench.done(Request::Release);
     bench.go(vec![Goal::Joints(aimm::OBSERVATION)], 0.10, 0.0);
     stow(bench);

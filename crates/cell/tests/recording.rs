@@ -74,11 +74,7 @@ fn saved(bench: &mut Bench) -> Box<Snapshot> {
 
 /// Carries what is held to a place on the deck; where everything is then.
 fn deliver(bench: &mut Bench) -> String {
-    let held = bench.cell.ground_truth().into_iter().find(|b| b.held).unwrap();
-    let tool = bench.cell.robot().tool_pose(&bench.cell.configuration());
-    let in_tool = tool.inverse().compose(&held.pose);
-    let slot = aimm::slots()[4].compose(&ratn_model::pose::Pose::at(0.0, 0.0, held.size[2] / 2.0 + 0.003));
-    bench.go(vec![Goal::Pose(slot.compose(&in_tool.inverse()))], 0.10, 0.10);
+    bench.carry();
     bench.done(Request::Release);
     bench.pass(3.0);
     // How far it leaned is looked at step by step, and steps may fall elsewhere.

@@ -51,6 +51,10 @@ const MAX_CANDIDATES: usize = 64;
 /// Of a hundred steps of improvement, those that look for a new candidate.
 const NEW_CANDIDATES: i32 = 8;
 
+/// How deep the fingers and what they hold press into what they touch on the way to a goal: no deeper than measurements are off, as far
+/// as a goal can be reached so; in metres. What they press into deeper may be pushed away.
+const PRESSES_M: [f64; 2] = [0.002, CONTACT_TOLERANCE_M];
+
 /// A path must have become this much shorter to be worth a word, in radians.
 const LEAST_REPORT_RAD: f32 = 1e-3;
 
@@ -171,6 +175,8 @@ struct Planning<'a> {
     random: ChaCha8Rng,
     goals: Vec<Goal>,
     approach_m: f64,
+    /// How deep an approach may press into what it touches.
+    press_m: f64,
     candidates: Vec<Candidate>,
 }
 
@@ -197,6 +203,7 @@ pub fn plan(
         random: ChaCha8Rng::seed_from_u64(request.seed),
         goals: request.goals.clone(),
         approach_m: request.approach_m,
+        press_m: CONTACT_TOLERANCE_M,
         candidates: Vec::new(),
     };
     let depart = match planning.depart(request) {
@@ -265,7 +272,7 @@ impl Planning<'_> {
         }
         let failed = |reason: String| PlanError::Depart { depart_m: request.depart_m, reason };
         let postures = line(&self.reach, &start, [0.0, 0.0, request.depart_m]).map_err(|e| failed(e.to_string()))?;
-        match self.straight_collision(&postures) {
+        match self.straight_collision(&postures, CONTACT_TOLERANCE_M) {
             Some(collision) => Err(failed(collision.to_string())),
             None => match self.checker.collision(&postures[postures.len() - 1], Contact::None) {
                 Some(collision) => Err(failed(format!("at its end {collision}"))),
@@ -274,41 +281,48 @@ impl Planning<'_> {
         }
     }
 
-    fn straight_collision(&mut self, postures: &[Joints]) -> Option<Collision> {
-        let contact = Contact::Gripper(CONTACT_TOLERANCE_M);
+    fn straight_collision(&mut self, postures: &[Joints], press_m: f64) -> Option<Collision> {
+        let contact = Contact::Gripper(press_m);
         let first = self.checker.collision(&postures[0], contact);
         first.or_else(|| postures.windows(2).find_map(|w| self.checker.edge_collision(&w[0], &w[1], contact)))
     }
 
-    /// Fills the list of candidates.
+    /// Fills the list of candidates: those that press into nothing, or else all.
     fn find_candidates(&mut self, near: &Joints, pace: &mut Pace<'_>) -> Result<(), PlanError> {
         let mut reasons: Vec<String> = Vec::new();
         for (wanted, attempts) in SOLUTIONS {
+            let mut postures = Vec::new();
             for goal in self.goals.clone() {
-                let postures = match goal {
-                    Goal::Joints(posture) => vec![posture],
+                match goal {
+                    Goal::Joints(posture) => postures.push(posture),
                     Goal::Pose(pose) => {
                         let found = self.postures(&pose, near, wanted, attempts, pace)?;
                         if found.is_empty() {
                             let [x, y, z] = pose.position;
                             reasons.push(format!("the arm does not reach ({x:.3}, {y:.3}, {z:.3})"));
                         }
-                        found
-                    }
-                };
-                for posture in postures {
-                    pace.poll()?;
-                    match self.candidate(&posture) {
-                        Ok(candidate) => self.candidates.push(candidate),
-                        Err(reason) => reasons.push(reason),
+                        postures.extend(found);
                     }
                 }
             }
-            if !self.candidates.is_empty() {
-                let cost = |c: &Candidate| distance(near, &joints(self.robot, &c.door)) + c.length_rad;
-                self.candidates.sort_by(|a, b| cost(a).total_cmp(&cost(b)));
-                return Ok(());
+            let mut refused = Vec::new();
+            for press_m in PRESSES_M {
+                self.press_m = press_m;
+                refused.clear();
+                for posture in &postures {
+                    pace.poll()?;
+                    match self.candidate(posture) {
+                        Ok(candidate) => self.candidates.push(candidate),
+                        Err(reason) => refused.push(reason),
+                    }
+                }
+                if !self.candidates.is_empty() {
+                    let cost = |c: &Candidate| distance(near, &joints(self.robot, &c.door)) + c.length_rad;
+                    self.candidates.sort_by(|a, b| cost(a).total_cmp(&cost(b)));
+                    return Ok(());
+                }
             }
+            reasons.append(&mut refused);
         }
         reasons.sort();
         reasons.dedup();
@@ -352,7 +366,7 @@ impl Planning<'_> {
         if self.approach_m > 0.0 {
             let up = [0.0, 0.0, self.approach_m];
             approach = line(&self.reach, goal, up).map_err(|e: LineError| format!("approaching the goal, {e}"))?;
-            if let Some(collision) = self.straight_collision(&approach) {
+            if let Some(collision) = self.straight_collision(&approach, self.press_m) {
                 return Err(format!("approaching the goal, {collision}"));
             }
             approach.reverse();

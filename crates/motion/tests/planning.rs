@@ -15,6 +15,7 @@ use ratn_motion::robot::Robot;
 use ratn_motion::trajectory::ArmTrajectory;
 use ratn_motion::validate::{Violation, validate_trajectory};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use std::f64::consts::{FRAC_PI_4, PI};
 use std::time::{Duration, Instant};
 
 /// The whole trajectory touches nothing but with the gripper, checked exactly and four times as densely as it was planned.
@@ -81,6 +82,50 @@ fn nine_boxes_are_carried_until_the_deck_is_full() {
             carry(&mut cell, &format!("box_{}", i + 1), i);
         }
     }
+}
+
+#[test]
+fn a_neighbour_is_pressed_only_where_no_other_way_to_take_hold_leads_past_it() {
+    let mut shorter = 0;
+    for i in 0..8 {
+        let around = |step: i32, radius: f64| {
+            let angle = f64::from(step) * FRAC_PI_4;
+            [0.7 + radius * angle.cos(), -0.1 + radius * angle.sin()]
+        };
+        let mut cell = Cell::with_boxes(0, 1);
+        let mut stand = |name: &str, [x, y]: [f64; 2], radius: f64| {
+            let placement = Placement::World(Pose::at(x, y, aimm::TABLE_HEIGHT_M + 0.05));
+            cell.scene.objects.push(SceneObject {
+                name: name.into(),
+                shape: Shape::Cylinder { radius, length: 0.1 },
+                placement,
+            });
+        };
+        stand("can", around(i, 0.0), 0.035);
+        // A finger 55 mm beside the can's middle presses into it, by less than is allowed.
+        stand("post", around(i, 0.085), 0.02);
+        let yaws = (0..4).map(|k| f64::from(k) * FRAC_PI_4);
+        let [x, y] = around(i, 0.0);
+        let goals: Vec<Goal> =
+            yaws.map(|yaw| Goal::Pose(Pose::from_rpy([x, y, aimm::TABLE_HEIGHT_M + 0.06], PI, 0.0, yaw))).collect();
+        let to = |goals: &[Goal]| {
+            let request = Request { approach_m: aimm::APPROACH_M, ..request(cell.arm, goals.to_vec()) };
+            cell.plan(&Request { improvement_iterations: 200, ..request })
+        };
+        let mut exact = Checker::new(&cell.robot, &cell.scene, 0.0);
+        let mut presses = |plan: &Plan| exact.collision(&plan.end, Contact::Gripper(0.002)).is_some();
+        let alone: Vec<Plan> = goals.iter().filter_map(|goal| to(&[*goal]).ok()).collect();
+        let shortest = alone.iter().min_by(|a, b| a.length_rad.total_cmp(&b.length_rad)).unwrap();
+        shorter += i32::from(presses(shortest));
+        assert!(!presses(&to(&goals).unwrap()), "{i}");
+        // Where there is no other way it is pressed.
+        let pressing: Vec<Goal> =
+            goals.into_iter().filter(|goal| to(&[*goal]).is_ok_and(|plan| presses(&plan))).collect();
+        if !pressing.is_empty() {
+            assert!(presses(&to(&pressing).unwrap()));
+        }
+    }
+    assert!(shorter > 0);
 }
 
 #[test]

@@ -7,6 +7,7 @@ use ratn_cell::core::cell::Cell;
 use ratn_cell::core::protocol::{Command, Ending, Event, Product, Request, Ticket};
 use ratn_cell::core::recording::Line;
 use ratn_model::id::LeaseId;
+use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Trajectory;
 use ratn_motion::aimm;
@@ -101,6 +102,15 @@ impl Bench {
         let truth = self.cell.ground_truth()[index].clone();
         let goals = aimm::grasp_poses(&truth.pose, truth.size).map(Goal::Pose).to_vec();
         self.go(goals, 0.0, 0.10);
+    }
+
+    /// Carries what is held to the middle of the deck, 3 mm above it; where it has to be then.
+    pub(crate) fn carry(&mut self) -> Pose {
+        let held = self.cell.ground_truth().into_iter().find(|object| object.held).expect("something is held");
+        let in_tool = self.cell.robot().tool_pose(&self.cell.configuration()).inverse().compose(&held.pose);
+        let slot = aimm::slots()[4].compose(&Pose::at(0.0, 0.0, held.size[2] / 2.0 + 0.003));
+        self.go(vec![Goal::Pose(slot.compose(&in_tool.inverse()))], 0.10, 0.10);
+        slot
     }
 }
 
