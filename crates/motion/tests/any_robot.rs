@@ -17,7 +17,6 @@ use ratn_motion::geometry::{Body, Geometry};
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
 use ratn_motion::pace::Control;
 use ratn_motion::problems::{Problem, Problems};
-use ratn_motion::refine::{End, Refinement};
 use ratn_motion::simplify::{path_length, simplify};
 use ratn_motion::space::{Isa, Obstacle, Space, State, between};
 use ratn_motion::spheres::cover;
@@ -292,61 +291,6 @@ fn a_way_that_slips_through_a_thin_plate_is_mended_or_refused() {
         assert!(!space.is_swept());
     }
     assert!(slipped > 1 && mended > 0, "{slipped} slipped, {mended} mended");
-}
-
-#[test]
-fn improvement_comes_down_to_the_shortest_way_from_a_path_on_the_wrong_side() {
-    let slide = |name, parent, child, axis| {
-        format!(
-            "<joint name='{name}' type='prismatic'><parent link='{parent}'/><child link='{child}'/><axis xyz='{axis}'/>\
-             <limit lower='-2' upper='2' effort='1' velocity='1'/></joint>"
-        )
-    };
-    let urdf = format!(
-        "<robot name='disc'><link name='floor'/><link name='rail'/><link name='disc'><collision><geometry>\
-         <sphere radius='0.05'/></geometry></collision></link>{}{}</robot>",
-        slide("x", "floor", "rail", "1 0 0"),
-        slide("y", "rail", "disc", "0 1 0")
-    );
-    let mechanism = Mechanism::read(&urdf, None, &[]).unwrap();
-    let geometry = Geometry::Box { half: [0.1, 0.9, 0.5] };
-    let wall = Obstacle { name: "wall".into(), pose: Pose::at(0.0, 0.3, 0.0), geometry };
-    let walls = [wall];
-    let exact = Exact::new(&mechanism, &walls);
-    let mut space = Space::new(&mechanism, &walls);
-    space.set_swept(true);
-    let state = |x: f32, y: f32| -> State { std::array::from_fn(|j| [x, y].get(j).copied().unwrap_or(0.0)) };
-    let first = vec![state(-1.0, 0.0), state(-0.3, 1.5), state(0.3, 1.5), state(1.0, 0.0)];
-    // Below the wall: to its corner, round it at the radius of the disc, along its end, and the same again.
-    let (aside, below, radius) = (0.9_f64, 0.6_f64, 0.05_f64);
-    let corner = aside.hypot(below);
-    let turn = (below / aside).atan() + (radius / corner).asin();
-    let shortest = (2.0 * ((corner * corner - radius * radius).sqrt() + radius * turn) + 0.2) as f32;
-    for seed in 0..4 {
-        let improve = |space: &mut Space, iterations: usize| {
-            let end = End { state: first[3], rest: 0.0 };
-            let mut refinement = Refinement::new(first.clone(), 0, vec![end], seed);
-            let mut lengths = vec![refinement.length()];
-            for _ in 0..iterations {
-                refinement.step(space, &mut go_on).unwrap();
-                lengths.push(refinement.length());
-            }
-            let postures: Vec<Vec<f64>> = refinement.path().iter().map(|s| positions(&mechanism, s)).collect();
-            assert_eq!(exact.touch_along(&postures, 128.0), None);
-            lengths
-        };
-        let lengths = improve(&mut space, 4_000);
-        assert!(lengths.is_sorted_by(|a, b| b <= a), "the best path was lost");
-        let excess = |iterations: usize| lengths[iterations] / shortest - 1.0;
-        assert!(
-            excess(0) > 0.3 && excess(1_000) < 0.02 && excess(4_000) < 0.005,
-            "{} {}",
-            excess(1_000),
-            excess(4_000)
-        );
-        assert!(excess(4_000) > -0.001, "shorter than the shortest by {}", -excess(4_000));
-        assert_eq!(improve(&mut space, 300), lengths[..=300], "the same seed improves in the same way");
-    }
 }
 
 #[test]

@@ -2,6 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
+#[path = "common/ball.rs"]
+mod ball;
+
+use ball::RADIUS;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
@@ -16,9 +20,6 @@ use ratn_motion::simplify::path_length;
 use ratn_motion::space::{Obstacle, Space, State};
 use ratn_motion::timing::{Part, PhasePlane, timed};
 
-/// Of the disc, in metres.
-const RADIUS: f64 = 0.05;
-
 const NONE: Shares = Shares { shortcut: 0, corner: 0, turn: 0, search: 0, tree: 0 };
 
 fn go_on(_: usize) -> Control {
@@ -29,23 +30,8 @@ fn at<const N: usize>(positions: [f32; N]) -> State {
     std::array::from_fn(|j| positions.get(j).copied().unwrap_or(0.0))
 }
 
-/// A ball on rails along the first axes.
 fn ball(axes: usize) -> Mechanism {
-    let mut urdf = String::from("<robot name='ball'><link name='l0'/>");
-    for (i, axis) in ["1 0 0", "0 1 0", "0 0 1"].iter().enumerate().take(axes) {
-        let shape = if i + 1 == axes {
-            format!("<collision><geometry><sphere radius='{RADIUS}'/></geometry></collision>")
-        } else {
-            String::new()
-        };
-        urdf += &format!(
-            "<link name='l{}'>{shape}</link><joint name='j{i}' type='prismatic'><parent link='l{i}'/>\
-             <child link='l{}'/><axis xyz='{axis}'/><limit lower='-2' upper='2' effort='1' velocity='1'/></joint>",
-            i + 1,
-            i + 1
-        );
-    }
-    Mechanism::read(&(urdf + "</robot>"), None, &[]).unwrap()
+    Mechanism::read(&ball::urdf(axes), None, &[]).unwrap()
 }
 
 /// From 1 m before it to 1 m behind: 0.6 m to its lower end, 1.2 m to its upper end.
@@ -59,6 +45,17 @@ fn round_the_end(aside: f64) -> f64 {
     let corner = 0.9_f64.hypot(aside);
     let turn = (aside / 0.9).atan() + (RADIUS / corner).asin();
     2.0 * ((corner * corner - RADIUS * RADIUS).sqrt() + RADIUS * turn) + 0.2
+}
+
+/// A path round the end that is farther away.
+fn above() -> Vec<State> {
+    vec![at([-1.0, 0.0]), at([-0.3, 1.5]), at([0.3, 1.5]), at([1.0, 0.0])]
+}
+
+fn assert_untouched(mechanism: &Mechanism, walls: &[Obstacle], path: &[State]) {
+    let joints = mechanism.joints.len();
+    let path: Vec<Vec<f64>> = path.iter().map(|s| s[..joints].iter().map(|q| f64::from(*q)).collect()).collect();
+    assert_eq!(Exact::new(mechanism, walls).touch_along(&path, 128.0), None);
 }
 
 #[test]
@@ -87,12 +84,40 @@ fn the_tree_alone_comes_down_to_the_shortest_way_as_samples_grow() {
 }
 
 #[test]
+fn improvement_comes_down_to_the_shortest_way_from_a_path_on_the_wrong_side() {
+    let (mechanism, walls) = (ball(2), wall());
+    let shortest = round_the_end(0.6) as f32;
+    let mut space = Space::new(&mechanism, &walls);
+    space.set_swept(true);
+    for seed in 0..4 {
+        let mut improve = |iterations: usize| {
+            let end = End { state: above()[3], rest: 0.0 };
+            let mut refinement = Refinement::new(above(), 0, vec![end], seed);
+            let mut lengths = vec![refinement.length()];
+            for _ in 0..iterations {
+                refinement.step(&mut space, &mut go_on).unwrap();
+                lengths.push(refinement.length());
+            }
+            assert_untouched(&mechanism, &walls, refinement.path());
+            lengths
+        };
+        let lengths = improve(4_000);
+        assert!(lengths.is_sorted_by(|a, b| b <= a), "the best path was lost");
+        let excess = |iterations: usize| lengths[iterations] / shortest - 1.0;
+        let found = [0, 1_000, 4_000].map(excess);
+        assert!(found[0] > 0.3 && found[1] < 0.02 && found[2] < 0.005, "{found:?}");
+        assert!(found[2] > -0.001, "shorter than the shortest by {}", -found[2]);
+        assert_eq!(improve(300), lengths[..=300], "the same seed improves in the same way");
+    }
+}
+
+#[test]
 fn the_tree_finds_the_shorter_side_that_no_shortcut_leads_to() {
     let mechanism = ball(2);
     let walls = wall();
     let mut space = Space::new(&mechanism, &walls);
     space.set_swept(true);
-    let above = vec![at([-1.0, 0.0]), at([-0.3, 1.5]), at([0.3, 1.5]), at([1.0, 0.0])];
+    let above = above();
     for seed in 0..3 {
         let mut improved = |shares: Shares, steps: usize| {
             let ends = vec![End { state: above[3], rest: 0.0 }];
@@ -102,11 +127,10 @@ fn the_tree_finds_the_shorter_side_that_no_shortcut_leads_to() {
                 refinement.step(&mut space, &mut go_on).unwrap();
                 assert!(refinement.length() <= before + 1e-6, "the best path was lost");
             }
-            let path: Vec<Vec<f64>> =
-                refinement.path().iter().map(|s| s[..2].iter().map(|q| f64::from(*q)).collect()).collect();
-            assert_eq!(Exact::new(&mechanism, &walls).touch_along(&path, 128.0), None);
-            assert_eq!((refinement.path()[0], refinement.path()[path.len() - 1]), (above[0], above[3]));
-            f64::from(path_length(refinement.path()))
+            let path = refinement.path();
+            assert_untouched(&mechanism, &walls, path);
+            assert_eq!((path[0], path[path.len() - 1]), (above[0], above[3]));
+            f64::from(path_length(path))
         };
         let stuck = improved(Shares { shortcut: 1, corner: 1, ..NONE }, 2_000);
         assert!(stuck > round_the_end(1.2) * 0.999, "{stuck}");

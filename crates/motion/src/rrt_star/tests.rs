@@ -1,5 +1,8 @@
 //! The tree is one, and its costs are those of its ways.
 
+#[path = "../../tests/common/ball.rs"]
+mod ball;
+
 use super::*;
 use crate::geometry::Geometry;
 use crate::mechanism::Mechanism;
@@ -41,21 +44,9 @@ fn state(x: f32, y: f32) -> State {
     std::array::from_fn(|j| [x, y].get(j).copied().unwrap_or(0.0))
 }
 
-/// A disc between posts on a floor.
+/// A ball between posts.
 fn posts() -> Space {
-    let slide = |name, parent, child, axis| {
-        format!(
-            "<joint name='{name}' type='prismatic'><parent link='{parent}'/><child link='{child}'/><axis \
-             xyz='{axis}'/><limit lower='-2' upper='2' effort='1' velocity='1'/></joint>"
-        )
-    };
-    let urdf = format!(
-        "<robot name='disc'><link name='floor'/><link name='rail'/><link name='disc'><collision><geometry>\
-         <sphere radius='0.05'/></geometry></collision></link>{}{}</robot>",
-        slide("x", "floor", "rail", "1 0 0"),
-        slide("y", "rail", "disc", "0 1 0")
-    );
-    let mechanism = Mechanism::read(&urdf, None, &[]).unwrap();
+    let mechanism = Mechanism::read(&ball::urdf(2), None, &[]).unwrap();
     let post = |i: i32| {
         let pose = Pose::at(f64::from(i % 3 - 1) * 0.6, f64::from(i / 3 - 1) * 0.6, 0.0);
         Obstacle { name: format!("post {i}"), pose, geometry: Geometry::Cylinder { radius: 0.2, half_length: 1.0 } }
