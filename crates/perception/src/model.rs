@@ -189,6 +189,14 @@ impl Model {
         }
     }
 
+    /// How much the topmost part of its wall leans outwards, in radians from upright; none for what has no rim.
+    pub fn rim_lean(&self) -> Option<f64> {
+        match *self {
+            Model::Round { kind, radius, height } => revolved::rim_lean(kind, radius, height),
+            Model::Box { .. } | Model::Fork { .. } => None,
+        }
+    }
+
     /// How far a point of its frame is from its surface as seen from `eye`, in metres; negative behind it.
     pub(crate) fn distance(&self, point: Vector, eye: Vector) -> f64 {
         match *self {

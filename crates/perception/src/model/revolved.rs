@@ -24,6 +24,12 @@ fn wall(kind: Round, radius: f64, height: f64) -> impl Iterator<Item = Point> + 
     shape(kind).iter().map(move |[r, z]| [r * (radius - half), half + z * (height - WALL)])
 }
 
+/// How much the topmost part of the wall leans outwards, in radians from upright; none for what is closed.
+pub(super) fn rim_lean(kind: Round, radius: f64, height: f64) -> Option<f64> {
+    let (below, rim) = pairs(wall(kind, radius, height)).last()?;
+    Some((rim[0] - below[0]).atan2(rim[1] - below[1]))
+}
+
 /// How edge-on a wall has to be seen for both of its sides to be taken for seen: the cosine between its normal and the ray.
 const EDGE_ON: f64 = 0.15;
 

@@ -44,10 +44,6 @@ pub(super) const FOOT: f64 = 0.6;
 /// How much of a fork's length its handle is, and how wide that is as a part of its head.
 const HANDLE: f64 = 0.7;
 const HANDLE_WIDTH: f64 = 0.4;
-/// The topmost part of a wall, as the camera sees it (`ratn_perception::model`): outwards as a part of the radius, upwards as one of the
-/// height.
-const BOWL_RIM: [f64; 2] = [0.09, 0.44];
-const PLATE_RIM: [f64; 2] = [0.28, 0.58];
 /// How far down from the rim fingers hold what they hold by its rim, and how much of its round they meet as a flat wall, in metres.
 const RIM_M: f64 = 0.02;
 const RIM_WIDTH_M: f64 = 0.03;
@@ -141,14 +137,9 @@ impl Model {
     /// By how much its rim leans outwards, in radians, where that is so much that fingers which close around it from above slide off:
     /// friction holds up to a lean of its own angle.
     pub fn slips_off(&self) -> Option<f64> {
-        let [x, _, z] = self.size;
-        let [outwards, upwards] = match self.kind {
-            Kind::Bowl => BOWL_RIM,
-            Kind::Plate => PLATE_RIM,
-            Kind::Box | Kind::Cup | Kind::Fork => return None,
-        };
-        let slope = outwards * x / 2.0 / (upwards * z);
-        (slope > self.kind.friction()).then(|| slope.atan())
+        let is_held_by_it = matches!(self.kind, Kind::Bowl | Kind::Plate);
+        let lean = self.seen().rim_lean().filter(|_| is_held_by_it)?;
+        (lean.tan() > self.kind.friction()).then_some(lean)
     }
 
     /// What turns about its upright axis leave the same.
