@@ -1,5 +1,5 @@
-//! Measures what shortens and times paths: `cargo run --release -p ratn-motion --example shorten -- WHAT [URDF SRDF PROBLEMS]`.
-//! WHAT is `simplify`, `time`, or `refine` and shares of its ways, as in `refine:42,38,8,11,1:42,38,8,0,12`. Beside the file's problems,
+//! Measures what shortens and times paths, and the checks that all of it is made of: `cargo run --release -p ratn-motion --example shorten -- WHAT [URDF SRDF PROBLEMS]`.
+//! WHAT is `batch`, `simplify`, `time`, or `refine` and shares of its ways, as in `refine:42,38,8,11,1:42,38,8,0,12`. Beside the file's problems,
 //! if there is one, the robots among random things of four kinds.
 
 #![allow(
@@ -20,7 +20,7 @@ use ratn_motion::pace::Control;
 use ratn_motion::problems::Problems;
 use ratn_motion::refine::{End, Refinement, Shares};
 use ratn_motion::simplify::{path_length, simplify};
-use ratn_motion::space::{Obstacle, Space, State};
+use ratn_motion::space::{Isa, Obstacle, Space, State};
 use ratn_motion::timing::{Part, PhasePlane, timed};
 use std::time::Instant;
 
@@ -269,6 +269,30 @@ fn durations(mechanisms: &[(String, Mechanism)], tasks: &[Task]) {
     }
 }
 
+/// What a batch of postures costs that are all free, close to the start of each task.
+fn batches(mechanisms: &[(String, Mechanism)], tasks: &[Task]) {
+    const CHECKS: u32 = 2_000;
+    println!("class, instructions, postures of a batch, batches measured, median us of one");
+    for class in classes(tasks) {
+        for isa in Isa::available() {
+            let mut costs = Vec::new();
+            for task in tasks.iter().filter(|task| task.class == class) {
+                let mut space = Space::with_isa(&mechanisms[task.mechanism].1, &task.obstacles, isa);
+                let delta: State = std::array::from_fn(|j| 0.1 * (task.goal[j] - task.start[j]));
+                if !space.check_batch(&task.start, &delta) {
+                    continue;
+                }
+                let begin = Instant::now();
+                let free = (0..CHECKS).filter(|_| space.check_batch(&task.start, std::hint::black_box(&delta))).count();
+                costs.push(begin.elapsed().as_secs_f64() * 1e6 / free as f64);
+            }
+            if !costs.is_empty() {
+                println!("{class:20} {isa:?} {} {} {:.3}", isa.width(), costs.len(), rank(costs, 0.5));
+            }
+        }
+    }
+}
+
 fn main() {
     let mut mechanisms = Vec::new();
     let tasks = tasks(&mut mechanisms);
@@ -276,8 +300,9 @@ fn main() {
     let words: Vec<&str> = what.split(':').collect();
     match words[..] {
         ["refine", ref variants @ ..] => refine(&mechanisms, &tasks, variants),
+        ["batch"] => batches(&mechanisms, &tasks),
         ["simplify"] => simplification(&mechanisms, &tasks),
         ["time"] => durations(&mechanisms, &tasks),
-        _ => panic!("simplify, time or refine:SHARES"),
+        _ => panic!("batch, simplify, time or refine:SHARES"),
     }
 }
