@@ -5,7 +5,7 @@ mod circumstances;
 
 pub use circumstances::{Circumstances, MAX_EVENTS, Mischief, Trigger};
 
-use crate::random::Dice;
+use crate::dice::Dice;
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::{Lookout, Problem, Search};
 use ratn_executive::protocol::{Command, Event, Goal, Learned, LogEntry, LogLine, Mode, Origin};

@@ -4,7 +4,7 @@
 //! Which messages go wrong follows from a seed and from what they are about (path and attempt), never from the time: the same
 //! run has the same faults.
 
-use crate::random::Hash;
+use crate::dice::Hash;
 use ratn_executive::protocol::Event;
 
 /// More events than this is an endless run.
@@ -79,7 +79,7 @@ impl Mischief {
         self.crossing_percent > 0 && self.dice("cancel", path, attempt).percent(self.crossing_percent)
     }
 
-    fn dice(&self, kind: &str, path: &str, attempt: u32) -> crate::random::Dice {
+    fn dice(&self, kind: &str, path: &str, attempt: u32) -> crate::dice::Dice {
         let mut hash = Hash(self.seed);
         hash.add(kind);
         hash.add(path);

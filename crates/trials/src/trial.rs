@@ -5,11 +5,11 @@
 use super::story::{Act, Real, Story, are_beside, story};
 use super::weak;
 use super::{Dice, Features, HashOracle, RESOURCES, is_in_routine, state_of};
-use crate::run::{Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
 use ratn_executive::protocol::{Event, Mode};
 use ratn_model::catalogue::ResourceOffer;
 use ratn_model::program::{Program, StateKind};
 use ratn_model::tolerance::Tolerance;
+use ratn_simulation::run::{Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;

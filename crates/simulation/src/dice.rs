@@ -33,22 +33,28 @@ impl Dice {
 
 /// A hash of texts and numbers (FNV-1a).
 #[derive(Debug, Clone)]
-pub(crate) struct Hash(pub(crate) u64);
+pub struct Hash(
+    /// What it begins with, and what it has come to.
+    pub u64,
+);
 
 impl Hash {
-    pub(crate) fn add(&mut self, text: &str) {
+    /// Adds a text and its end.
+    pub fn add(&mut self, text: &str) {
         for byte in text.bytes().chain([0xff]) {
             self.0 = (self.0 ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
         }
     }
 
-    pub(crate) fn add_number(&mut self, number: u64) {
+    /// Adds a number.
+    pub fn add_number(&mut self, number: u64) {
         for byte in number.to_le_bytes() {
             self.0 = (self.0 ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
         }
     }
 
-    pub(crate) fn dice(&self) -> Dice {
+    /// Dice that follow from all that was added.
+    pub fn dice(&self) -> Dice {
         Dice(self.0)
     }
 }

@@ -5,8 +5,8 @@
 
 use ratn_executive::protocol::{Command, Event, LogEntry, Mode, Note};
 use ratn_model::id::{InstanceId, LeaseId};
-use ratn_simulation::random::{Conditions, Features, execute, listing, program};
 use ratn_simulation::run::Run;
+use ratn_trials::{Conditions, Features, execute, listing, program};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 

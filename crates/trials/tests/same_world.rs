@@ -8,7 +8,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "a test may panic and print its seed")]
 
 use ratn_executive::protocol::Mode;
-use ratn_simulation::random::{
+use ratn_trials::{
     Conditions, Features, Shrunk, Verdict, execute, listing, program, shrink, trial, trial_from_outside,
 };
 use std::sync::Arc;

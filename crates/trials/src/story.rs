@@ -2,12 +2,12 @@
 //! which changes became real.
 
 use super::{around, is_in_routine, is_preemptive, plain, state_of};
-use crate::run::Run;
 use ratn_executive::protocol::{Command, Event, LogEntry, Note};
 use ratn_model::fact::Change;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, State, StateKind};
 use ratn_model::value::Value;
+use ratn_simulation::run::Run;
 use std::collections::BTreeMap;
 
 /// One goal of a PIA.

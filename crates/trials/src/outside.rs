@@ -6,12 +6,12 @@
 use super::Dice;
 use super::story::story;
 use super::trial::{Conditions, Verdict, compare, execute_under};
-use crate::run::{Run, RunError, Trigger};
 use ratn_executive::protocol::{Command, Event, LogEntry, Mode};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::Revision;
 use ratn_model::program::Program;
 use ratn_model::value::Value;
+use ratn_simulation::run::{Run, RunError, Trigger};
 use std::sync::Arc;
 
 /// More events in HSM mode than this is a program that is left out.

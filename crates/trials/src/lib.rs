@@ -12,7 +12,6 @@
 //! | smaller programs that fail alike | `shrink`, `rewrite` |
 
 mod annotations;
-mod dice;
 mod features;
 mod generator;
 mod listing;
@@ -24,13 +23,13 @@ mod story;
 mod trial;
 mod weak;
 
-pub use dice::Dice;
-pub(crate) use dice::Hash;
 pub use features::Features;
 pub use generator::program;
 pub use listing::listing;
 pub use oracle::HashOracle;
 pub use outside::trial_from_outside;
+pub use ratn_simulation::dice::Dice;
+pub(crate) use ratn_simulation::dice::Hash;
 pub use shrink::{Shrunk, shrink};
 pub use trial::{Conditions, Verdict, execute, trial};
 

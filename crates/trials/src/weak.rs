@@ -4,10 +4,10 @@
 
 use super::story::story;
 use super::trial::same_end;
-use crate::run::Run;
 use ratn_executive::protocol::{Command, LogEntry, Note};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, StateKind};
+use ratn_simulation::run::Run;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// The first promise that is not kept.

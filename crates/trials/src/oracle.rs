@@ -6,15 +6,15 @@
 //! three actions per region, whatever else may shift the end of an action (messages that are late, workers that die: some tens
 //! of seconds) never changes which ends first, so that the outcome is one function of the program in both modes.
 
-use super::dice::{Dice, Hash};
 use super::{AGAIN, ARGUMENTS, FOUND, PREDICATES, is_preemptive, plain, state_of};
-use crate::run::{Answer, Oracle, Performance};
+use super::{Dice, Hash};
 use ratn_executive::protocol::Goal;
 use ratn_model::expression::{EffectExpr, Expr, FactExpr, Lookup, Scope};
 use ratn_model::fact::{FactKey, FactPattern, Footprint, Term};
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, SUCCESS, State, StateKind};
 use ratn_model::value::Value;
+use ratn_simulation::run::{Answer, Oracle, Performance};
 use ratn_world::world::World;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
