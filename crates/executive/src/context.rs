@@ -1,6 +1,6 @@
 //! What every part of the executive works with while it handles one event.
 
-use crate::analysis::Analysis;
+use crate::plan::Plan;
 use crate::protocol::{Command, Note};
 use ratn_model::fact::Change;
 use ratn_model::id::InstanceId;
@@ -12,7 +12,8 @@ use ratn_world::world::World;
 /// What every part of the executive works with.
 pub(crate) struct Context<'a> {
     pub(crate) program: &'a Program,
-    pub(crate) analysis: &'a Analysis,
+    /// What follows from the program alone.
+    pub(crate) plan: &'a Plan,
     /// The mirror of the root world model.
     pub(crate) root: &'a mut World,
     /// The moment of the event.

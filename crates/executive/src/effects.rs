@@ -1,6 +1,6 @@
 //! What a finished node changed: its declared effects with what was measured put in.
 
-use crate::analysis::NodeNature;
+use crate::plan::NodeNature;
 use ratn_model::expression::{EffectExpr, EvaluateError, Scope};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::program::{SUCCESS, State};

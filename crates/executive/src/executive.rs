@@ -1,9 +1,9 @@
 //! One run of one task, in either mode.
 
-use crate::analysis::Analysis;
 use crate::context::Context;
 use crate::interpreter::{Interpreter, Progress};
 use crate::lookahead::Problem;
+use crate::plan::Plan;
 use crate::protocol::{Command, Event, Mode};
 use crate::window::{End, Window};
 use ratn_model::expression::EffectExpr;
@@ -25,7 +25,7 @@ use std::time::Duration;
 /// instance 0. The last command is [`Command::End`]; events after it are ignored.
 pub struct Executive {
     program: Arc<Program>,
-    analysis: Analysis,
+    plan: Arc<Plan>,
     tolerance: Tolerance,
     root: World,
     last_instance: u64,
@@ -45,10 +45,10 @@ enum State {
 impl Executive {
     /// For one run of a checked program.
     pub fn new(program: Arc<Program>, tolerance: Tolerance) -> Executive {
-        let analysis = Analysis::of(&program);
+        let plan = Arc::new(Plan::of(&program));
         Executive {
             program,
-            analysis,
+            plan,
             tolerance,
             root: World::default(),
             last_instance: 0,
@@ -66,10 +66,8 @@ impl Executive {
                 if matches!(self.state, State::Fresh) {
                     self.root = World::from_facts(world, revision);
                     self.seed = seed;
-                    let window = || {
-                        let (program, analysis) = (&self.program, &self.analysis);
-                        Window::new(program, analysis, &parameters, capacity, learned, self.tolerance)
-                    };
+                    let window =
+                        || Window::new(&self.program, &self.plan, &parameters, capacity, learned, self.tolerance);
                     let window = (mode == Mode::Cdtn).then(|| Box::new(window()));
                     self.start(now, window, &parameters, &mut commands);
                 }
@@ -101,7 +99,7 @@ impl Executive {
         let mut commands = Vec::new();
         let context = Context {
             program: &program,
-            analysis: &self.analysis,
+            plan: &self.plan,
             root: &mut self.root,
             now,
             last_instance: &mut self.last_instance,
@@ -124,7 +122,7 @@ impl Executive {
         let program = self.program.clone();
         let mut context = Context {
             program: &program,
-            analysis: &self.analysis,
+            plan: &self.plan,
             root: &mut self.root,
             now,
             last_instance: &mut self.last_instance,
@@ -166,7 +164,7 @@ impl Executive {
         let program = self.program.clone();
         let mut context = Context {
             program: &program,
-            analysis: &self.analysis,
+            plan: &self.plan,
             root: &mut self.root,
             now,
             last_instance: &mut self.last_instance,

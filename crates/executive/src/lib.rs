@@ -21,7 +21,6 @@
 //! becomes a window in 26 ms. An event allocates 10 to 17 times; another allocator changes little, so what is left is work: of a
 //! third each, growing the window by one, finding out that one may begin, and finishing and retiring one.
 
-mod analysis;
 mod binding;
 mod context;
 mod effects;
@@ -29,5 +28,6 @@ pub mod executive;
 mod hold;
 mod interpreter;
 pub mod lookahead;
+mod plan;
 pub mod protocol;
 mod window;

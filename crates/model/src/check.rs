@@ -30,10 +30,11 @@ pub(crate) mod types;
 
 use crate::catalogue::Catalogue;
 use crate::diagnostic::Findings;
-use crate::expression::{EffectExpr, Expr};
+use crate::expression::Expr;
 use crate::id::StateId;
 use crate::load::Places;
 use crate::program::{Location, Program, State, StateKind};
+use crate::slot::Slot;
 use graph::ControlFlow;
 use std::collections::BTreeMap;
 
@@ -69,9 +70,14 @@ pub(crate) fn check(
 }
 
 impl<'a> Subject<'a> {
-    /// Where a part of a state stands.
+    /// Where a part of a state stands in the file.
     pub(crate) fn place(&self, state: &State, part: &str) -> Location {
         self.places.of(state.id, part, state.location)
+    }
+
+    /// Where an expression of a state stands in the file.
+    pub(crate) fn place_of(&self, state: &State, slot: Slot<'_>) -> Location {
+        self.place(state, &slot.to_string())
     }
 
     /// The state and those around it, innermost first.
@@ -81,56 +87,11 @@ impl<'a> Subject<'a> {
     }
 }
 
-/// Every expression of a state with the name of its part.
-pub(crate) fn expressions<'a>(program: &'a Program, state: &'a State) -> Vec<(String, &'a Expr)> {
-    let mut all: Vec<(String, &Expr)> = Vec::new();
-    match &state.kind {
-        StateKind::Action { inputs, .. } => all.extend(inputs.iter().map(|(port, e)| (format!("in.{port}"), e))),
-        StateKind::Sequence { outputs, .. } => {
-            let own = if state.id == Program::ROOT { &program.outputs } else { outputs };
-            all.extend(own.iter().map(|o| (format!("outputs.{}", o.name), &o.value)));
-        }
-        StateKind::ForEach { collection, .. } => all.push(("for".to_owned(), collection)),
-        StateKind::While { predicate, .. } => all.push(("while".to_owned(), predicate)),
-        StateKind::Concurrency { decide, outputs, .. } => {
-            all.extend(decide.iter().map(|(outcome, e)| (format!("decide.{outcome}"), e)));
-            all.extend(outputs.iter().map(|o| (format!("outputs.{}", o.name), &o.value)));
-        }
-        StateKind::Condition { predicate, .. } => all.push(("condition".to_owned(), predicate)),
-    }
-    all.extend(state.variables.iter().map(|(name, e)| (format!("variables.{name}"), e)));
-    all.extend(state.assign.iter().map(|(name, e)| (format!("assign.{name}"), e)));
-    let annotations = &state.annotations;
-    all.extend(annotations.requires.iter().enumerate().map(|(i, e)| (format!("requires.{i}"), e)));
-    all.extend(annotations.duration_s.iter().map(|e| ("duration".to_owned(), e)));
-    for (i, resource) in annotations.resources.iter().enumerate() {
-        all.extend(resource.expressions().map(|e| (format!("resources.{i}"), e)));
-    }
-    let facts = annotations.reads.iter().flatten().map(|fact| ("reads", fact));
-    let senses = match &annotations.nature {
-        crate::program::Nature::Senses(facts) => facts.as_slice(),
-        _ => &[],
-    };
-    for (part, fact) in facts.chain(senses.iter().map(|fact| ("senses", fact))) {
-        all.extend(fact.arguments.iter().flatten().map(|e| (part.to_owned(), e)));
-    }
-    for (outcome, effects) in &annotations.effects {
-        effects.iter().for_each(|effect| effect_expressions(effect, &format!("effects.{outcome}"), &mut all));
-    }
+/// Every expression of a state that is evaluated somewhere: what regions share is only compared.
+pub(crate) fn expressions<'a>(program: &'a Program, state: &'a State) -> Vec<(Slot<'a>, &'a Expr)> {
+    let mut all = program.expressions(state);
+    all.retain(|(slot, _)| *slot != Slot::Shared);
     all
-}
-
-pub(crate) fn effect_expressions<'a>(effect: &'a EffectExpr, part: &str, all: &mut Vec<(String, &'a Expr)>) {
-    let (fact, value) = match effect {
-        EffectExpr::Set(fact, value) | EffectExpr::Increase(fact, value) => (Some(fact), Some(value)),
-        EffectExpr::Delete(fact) => (Some(fact), None),
-        EffectExpr::ForEach { collection, effects, .. } => {
-            effects.iter().for_each(|inner| effect_expressions(inner, part, all));
-            (None, Some(collection))
-        }
-    };
-    all.extend(fact.into_iter().flat_map(|f| f.arguments.iter().flatten()).map(|e| (part.to_owned(), e)));
-    all.extend(value.map(|e| (part.to_owned(), e)));
 }
 
 /// An expression with the names of states instead of their ids.

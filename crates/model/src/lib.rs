@@ -19,6 +19,7 @@ pub mod parameters;
 pub mod pose;
 pub mod program;
 pub mod resource;
+pub mod slot;
 pub mod time;
 pub mod tolerance;
 pub mod value;

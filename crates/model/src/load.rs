@@ -277,8 +277,8 @@ fn world(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<EffectExpr> {
             fields.error("invalid-expression", item.at, message, "use constants and parameters");
         }
         let mut parts = Vec::new();
-        effects.iter().for_each(|effect| check::effect_expressions(effect, "world", &mut parts));
-        if let Some(problem) = parts.iter().find_map(|(_, expr)| check::constants::problem(expr)) {
+        effects.iter().for_each(|effect| effect.each_expression(&mut |expr| parts.push(expr)));
+        if let Some(problem) = parts.into_iter().find_map(check::constants::problem) {
             fields.error(check::constants::RULE, item.at, problem.to_string(), check::constants::HELP);
         }
         for i in initial.len()..initial.len() + effects.len() {

@@ -1,9 +1,9 @@
 //! Programs with something taken out: every reference to it goes, the numbers of states are made dense again. Names and paths of
 //! what stays are as they were, so that the oracle says the same of it.
 
-use ratn_model::expression::{EffectExpr, Expr, FactExpr};
+use ratn_model::expression::Expr;
 use ratn_model::id::StateId;
-use ratn_model::program::{Nature, Program, State, StateKind, Target};
+use ratn_model::program::{Program, StateKind, Target};
 use ratn_model::value::Value;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -44,9 +44,9 @@ pub(super) fn without(program: &Program, id: StateId) -> Program {
             },
             Target::Outcome(_) => true,
         });
-        expressions(state, &renumber);
+        state.each_expression_mut(&mut |_, expression| expression.rewrite(&mut |part| renumber(part)));
     }
-    next.outputs.iter_mut().for_each(|output| part_of(&mut output.value, &renumber));
+    next.outputs.iter_mut().for_each(|output| output.value.rewrite(&mut |part| renumber(part)));
     next
 }
 
@@ -57,62 +57,5 @@ fn lists(kind: &mut StateKind) -> Vec<&mut Vec<StateId>> {
         StateKind::ForEach { body, .. } | StateKind::While { body, .. } => vec![body],
         StateKind::Condition { then, otherwise, .. } => vec![then, otherwise],
         StateKind::Concurrency { regions, .. } => vec![regions],
-    }
-}
-
-/// Every expression of a state, part by part.
-fn expressions(state: &mut State, change: &dyn Fn(&mut Expr)) {
-    match &mut state.kind {
-        StateKind::Action { inputs, .. } => inputs.iter_mut().for_each(|(_, e)| part_of(e, change)),
-        StateKind::Sequence { outputs, .. } => outputs.iter_mut().for_each(|o| part_of(&mut o.value, change)),
-        StateKind::ForEach { collection, .. } => part_of(collection, change),
-        StateKind::While { predicate, .. } | StateKind::Condition { predicate, .. } => part_of(predicate, change),
-        StateKind::Concurrency { decide, outputs, .. } => {
-            decide.iter_mut().for_each(|(_, e)| part_of(e, change));
-            outputs.iter_mut().for_each(|o| part_of(&mut o.value, change));
-        }
-    }
-    state.variables.iter_mut().chain(&mut state.assign).for_each(|(_, e)| part_of(e, change));
-    let a = &mut state.annotations;
-    a.requires.iter_mut().for_each(|e| part_of(e, change));
-    a.reads.iter_mut().flatten().for_each(|f| fact(f, change));
-    if let Nature::Senses(facts) = &mut a.nature {
-        facts.iter_mut().for_each(|f| fact(f, change));
-    }
-    a.effects.values_mut().flatten().for_each(|e| effect(e, change));
-}
-
-fn part_of(expression: &mut Expr, change: &dyn Fn(&mut Expr)) {
-    change(expression);
-    match expression {
-        Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } | Expr::Unknown(_) => {}
-        Expr::Field(of, _) | Expr::Unary(_, of) => part_of(of, change),
-        Expr::Index(a, b) | Expr::Binary(_, a, b) => {
-            part_of(a, change);
-            part_of(b, change);
-        }
-        Expr::List(items) | Expr::Call(_, items) | Expr::Query(items) => {
-            items.iter_mut().for_each(|item| part_of(item, change));
-        }
-        Expr::Map(fields) => fields.iter_mut().for_each(|(_, item)| part_of(item, change)),
-        Expr::Fact(f) | Expr::Exists(f) => fact(f, change),
-    }
-}
-
-fn fact(f: &mut FactExpr, change: &dyn Fn(&mut Expr)) {
-    f.arguments.iter_mut().flatten().for_each(|argument| part_of(argument, change));
-}
-
-fn effect(of: &mut EffectExpr, change: &dyn Fn(&mut Expr)) {
-    match of {
-        EffectExpr::Set(f, value) | EffectExpr::Increase(f, value) => {
-            fact(f, change);
-            part_of(value, change);
-        }
-        EffectExpr::Delete(f) => fact(f, change),
-        EffectExpr::ForEach { collection, effects, .. } => {
-            part_of(collection, change);
-            effects.iter_mut().for_each(|e| effect(e, change));
-        }
     }
 }

@@ -5,6 +5,7 @@
 use super::story::story;
 use super::trial::same_end;
 use ratn_executive::protocol::{Command, LogEntry, Note};
+use ratn_model::expression::EffectExpr;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, StateKind};
 use ratn_simulation::run::Run;
@@ -53,33 +54,18 @@ fn inside(program: &Program, id: StateId) -> Vec<StateId> {
 }
 
 fn written(program: &Program, region: StateId) -> BTreeSet<String> {
-    use ratn_model::expression::EffectExpr;
-    fn predicates(effect: &EffectExpr, into: &mut BTreeSet<String>) {
-        match effect {
-            EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => {
-                into.insert(fact.predicate.clone());
-            }
-            EffectExpr::ForEach { effects, .. } => effects.iter().for_each(|e| predicates(e, into)),
-        }
-    }
-    let mut all = BTreeSet::new();
-    for id in inside(program, region) {
-        program.state(id).annotations.effects.values().flatten().for_each(|e| predicates(e, &mut all));
-    }
-    all
+    let states = inside(program, region);
+    let effects = states.iter().flat_map(|id| program.state(*id).annotations.effects.values().flatten());
+    effects.flat_map(EffectExpr::written).map(|fact| fact.predicate.clone()).collect()
 }
 
 fn read(program: &Program, region: StateId) -> BTreeSet<String> {
-    let mut all = BTreeSet::new();
-    for id in inside(program, region) {
-        // What is looked up anywhere stands in the text of the state.
-        let text = format!("{:?}", program.state(id));
-        for predicate in 0..super::PREDICATES {
-            let name = format!("p{predicate}");
-            if text.contains(&format!("predicate: \"{name}\"")) {
-                all.insert(name);
-            }
-        }
+    let mut all = written(program, region);
+    for state in inside(program, region).into_iter().map(|id| program.state(id)) {
+        let annotations = &state.annotations;
+        let looked_up = state.expressions().into_iter().flat_map(|(_, expression)| expression.fact_expressions());
+        let named = annotations.reads.iter().flatten().chain(annotations.senses()).chain(&annotations.shared);
+        all.extend(looked_up.chain(named).map(|fact| fact.predicate.clone()));
     }
     all
 }

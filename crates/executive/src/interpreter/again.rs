@@ -4,8 +4,8 @@
 
 use super::node::GoalEnd;
 use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase};
-use crate::analysis::NodeNature;
 use crate::context::Context;
+use crate::plan::NodeNature;
 use crate::protocol::Command;
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Program, StateKind};
@@ -78,7 +78,7 @@ impl Interpreter {
         let crashes = current.crashes;
         self.give_back(context, &given);
         let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
-        if context.analysis.state(id).nature == NodeNature::Irreversible || crashes >= limit {
+        if context.plan.state(id).nature == NodeNature::Irreversible || crashes >= limit {
             return self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
         }
         match self.threads.get(&thread).and_then(|thread| thread.routine) {

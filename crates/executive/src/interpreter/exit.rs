@@ -157,7 +157,7 @@ impl Interpreter {
         instance: InstanceId,
         outputs: &Outputs,
     ) -> Result<(), String> {
-        let wanted = &context.analysis.state(state.id).operations;
+        let wanted = &context.plan.state(state.id).operations;
         if wanted.is_empty() {
             return Ok(());
         }

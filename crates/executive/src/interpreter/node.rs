@@ -2,10 +2,10 @@
 
 use super::again::duration;
 use super::{Current, Interpreter, Phase, Target};
-use crate::analysis::NodeNature;
 use crate::binding::{self, Outputs};
 use crate::context::{Context, Made};
 use crate::effects;
+use crate::plan::NodeNature;
 use crate::protocol::{Command, Goal, Note};
 use ratn_model::expression::FactExpr;
 use ratn_model::fact::{FactKey, Footprint};
@@ -64,7 +64,7 @@ impl Interpreter {
         if self.routine_of(thread).is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty()) {
             return self.set_phase(thread, Phase::Stalled);
         }
-        let wanted = &context.analysis.state(id).requirements;
+        let wanted = &context.plan.state(id).requirements;
         if self.routine_of(thread).is_some() || wanted.is_empty() {
             return self.go_on(context, thread);
         }
@@ -99,7 +99,7 @@ impl Interpreter {
 
     pub(super) fn is_pia(&self, context: &Context<'_>, thread: u64) -> bool {
         let current = self.threads.get(&thread).and_then(|thread| thread.current.as_ref());
-        current.is_some_and(|c| context.analysis.state(c.state).nature == NodeNature::Irreversible)
+        current.is_some_and(|c| context.plan.state(c.state).nature == NodeNature::Irreversible)
     }
 
     pub(super) fn granted(&mut self, context: &mut Context<'_>, thread: u64, lease: Lease) {
@@ -134,7 +134,7 @@ impl Interpreter {
 
     pub(super) fn project_or_run(&mut self, context: &mut Context<'_>, thread: u64) {
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
-        let analysis = context.analysis.state(current.state);
+        let analysis = context.plan.state(current.state);
         if !analysis.requirements.iter().any(|r| r.kind == WORLD_MODEL) {
             return self.run(context, thread);
         }
@@ -240,7 +240,7 @@ impl Interpreter {
             }
         }
         context.note(Note::Finished { instance, outcome: outcome.as_str().into() });
-        let nature = context.analysis.state(id).nature;
+        let nature = context.plan.state(id).nature;
         let declared = effects::declared(state, nature, &outcome);
         let changes =
             self.with_scope(context, thread, Some(&outputs), |s| effects::actual(declared, &outcome, &measured, s));

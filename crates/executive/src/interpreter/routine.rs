@@ -41,7 +41,7 @@ impl Interpreter {
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let (id, instance, attempt, path) = (current.state, current.instance, current.attempt, current.path.clone());
         let state = context.program.state(id);
-        let wanted = &context.analysis.state(id).requirements;
+        let wanted = &context.plan.state(id).requirements;
         let requirements = self.with_scope(context, thread, None, |scope| binding::requirements(state, wanted, scope));
         let requirements = match requirements {
             Ok(requirements) => requirements,

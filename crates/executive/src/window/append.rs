@@ -3,9 +3,9 @@
 use super::Window;
 use super::environment::{Binding, Link, Producer};
 use super::instance::{Instance, Role, Status, Wait, gives_outputs};
-use super::plan::{Outcome, Predicate};
-use crate::analysis::NodeNature;
 use crate::context::Context;
+use crate::plan::NodeNature;
+use crate::plan::{Outcome, Predicate};
 use crate::protocol::Note;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::State;
@@ -55,7 +55,7 @@ impl Window {
             }
         }
         let nature = match role {
-            Role::Node => context.analysis.state(state.id).nature,
+            Role::Node => context.plan.state(state.id).nature,
             _ => NodeNature::Computes,
         };
         let duration_s = match role {

@@ -4,10 +4,10 @@ use super::Window;
 use super::environment::assigned;
 use super::instance::{Ended, Seen, Status, Wait};
 use super::ready::{Readiness, not_bound, senses_of};
-use crate::analysis::NodeNature;
 use crate::binding::{self, Outputs};
 use crate::context::Context;
 use crate::interpreter::{Interpreter, Routine, Target};
+use crate::plan::NodeNature;
 use crate::protocol::{Command, Goal, Note};
 use ratn_model::expression::Scope;
 use ratn_model::fact::{Change, Footprint};
@@ -186,7 +186,7 @@ impl Window {
             self.hold.has_begun();
         }
         let state = context.program.state(instance.state);
-        let analysis = context.analysis.state(instance.state);
+        let analysis = context.plan.state(instance.state);
         let is_routine = !matches!(state.kind, StateKind::Action { .. });
         let Some(instance) = self.instances.get(id) else { return };
         let attempt = instance.attempt;
@@ -263,7 +263,7 @@ impl Window {
         let Some(instance) = self.instances.get(id) else { return };
         let sight = self.sight(context);
         let state = context.program.state(instance.state);
-        let analysis = context.analysis.state(instance.state);
+        let analysis = context.plan.state(instance.state);
         let environment = &instance.environment;
         let outputs = self
             .plan

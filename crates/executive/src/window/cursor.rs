@@ -2,7 +2,7 @@
 
 use super::environment::Environment;
 use super::instance::{Line, Segment};
-use super::plan::Outcome;
+use crate::plan::Outcome;
 use ratn_model::id::{InstanceId, StateId};
 use std::sync::Arc;
 

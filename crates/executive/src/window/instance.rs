@@ -1,11 +1,12 @@
 //! One visit of a state in the window.
 
 use super::environment::{Environment, Producer};
-use super::plan::{Outcome, Outcomes};
-use crate::analysis::NodeNature;
 use crate::binding::Outputs;
 use crate::context::Made;
 use crate::interpreter::Interpreter;
+use crate::plan::NodeNature;
+pub(crate) use crate::plan::gives_outputs;
+use crate::plan::{Outcome, Outcomes};
 use ratn_model::fact::{FactKey, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, StateId};
 use ratn_model::measurement::Evidence;
@@ -261,9 +262,4 @@ impl Instance {
     pub(crate) fn is_orphan(&self) -> bool {
         self.detached && self.arms.is_empty()
     }
-}
-
-/// Whether outputs and assignments count after this outcome.
-pub(crate) fn gives_outputs(outcome: &str) -> bool {
-    !matches!(outcome, ABORTED | ratn_model::program::PREEMPTED)
 }

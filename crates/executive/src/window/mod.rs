@@ -26,7 +26,6 @@ mod instance;
 mod instances;
 mod iterate;
 mod outside;
-mod plan;
 mod priority;
 mod ready;
 mod retire;
@@ -39,18 +38,17 @@ mod timers;
 mod twins;
 mod view;
 
-use crate::analysis::Analysis;
 use crate::binding;
 use crate::context::{Context, in_circles};
 use crate::hold::Hold;
 use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
+use crate::plan::{Plan, Predicate};
 use crate::protocol::{Command, Event, Learned, Note};
 use concurrency::{Fork, Thread};
 use cursor::{Cursor, Todo};
 use environment::{Binding, Environment, Link, assigned};
 use instance::{Changed, Ended, Instance, Line, Role, Segment, Status, Wait};
 use instances::Instances;
-use plan::{Plan, Predicate};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, STOPPED, SUCCESS, StateKind};
 use ratn_model::resource::Quantity;
@@ -116,13 +114,13 @@ impl Window {
     /// A window at the beginning of the program.
     pub(crate) fn new(
         program: &Program,
-        analysis: &Analysis,
+        plan: &Arc<Plan>,
         parameters: &BTreeMap<String, Value>,
         capacity: BTreeMap<String, Quantity>,
         learned: Learned,
         tolerance: Tolerance,
     ) -> Window {
-        let plan = Arc::new(Plan::of(program, analysis));
+        let plan = plan.clone();
         let mut environment = Environment::new(&plan);
         for (name, value) in parameters {
             environment.variables.declare(name, Binding::Known(value.clone()));
@@ -293,7 +291,6 @@ impl Window {
     fn sight<'a>(&'a self, context: &'a Context<'_>) -> Sight<'a> {
         Sight {
             program: context.program,
-            analysis: context.analysis,
             plan: &self.plan,
             root: context.root,
             instances: &self.instances,

@@ -61,8 +61,8 @@ impl Window {
             let environment = &instance.environment;
             let own = self.plan.state(instance.state);
             let needs = match instance.role {
-                Role::Node => context.analysis.state(instance.state).flows.as_slice(),
-                _ => own.flows.as_slice(),
+                Role::Node => context.plan.state(instance.state).start_flows.as_slice(),
+                _ => own.start_flows.as_slice(),
             };
             let assigned = own.variables.iter().filter_map(|name| match environment.variables.get(name)? {
                 Binding::Assigned(producer) => Some(producer),
@@ -123,7 +123,7 @@ impl Window {
             return;
         }
         let state = context.program.state(instance.state);
-        let wanted = &context.analysis.state(instance.state).requirements;
+        let wanted = &context.plan.state(instance.state).requirements;
         if wanted.iter().any(|r| r.operation == ResourceOperation::Consume) {
             // A grant that crosses the withdrawal has used it up already: asking twice would use it up twice.
             return;
@@ -165,7 +165,7 @@ impl Window {
         let others = self.active.iter().filter_map(|id| self.instances.get(*id));
         let taken = others
             .filter(|other| self.is_speculative(other.segment))
-            .filter(|other| context.analysis.state(other.state).needs_world)
+            .filter(|other| context.plan.state(other.state).needs_world)
             .count();
         let rooms = capacity.units() as usize;
         rooms <= 1 || taken + 1 < rooms
@@ -178,7 +178,7 @@ impl Window {
             return;
         }
         let needs = |state| -> Vec<(String, Quantity)> {
-            let blocks = context.analysis.state(state).requirements.iter();
+            let blocks = context.plan.state(state).requirements.iter();
             let blocks = blocks.filter(|r| r.operation == ResourceOperation::Block);
             blocks.map(|r| (r.kind.clone(), r.count)).collect()
         };
@@ -220,7 +220,7 @@ impl Window {
             instance.role == Role::Node && instance.ended.is_none() && self.is_likeliest(instance.segment)
         };
         for instance in self.instances.iter().filter(open).take(MAX_TASKS) {
-            let analysis = context.analysis.state(instance.state);
+            let analysis = context.plan.state(instance.state);
             let blocks = analysis.requirements.iter().filter(|r| r.operation == ResourceOperation::Block);
             let runs = matches!(instance.status, Status::Granted | Status::Projecting | Status::Running);
             let elapsed_s = if runs { context.now.since(instance.began).as_secs_f64() } else { 0.0 };

@@ -6,12 +6,12 @@
 use super::Window;
 use super::environment::{Binding, Link};
 use super::instance::{Instance, Role, Seen, Wait};
-use super::plan::MAX_OUTCOMES;
 use super::view::{Blocked, Sight, View};
-use crate::analysis::NodeNature;
 use crate::binding::{self, BindError, Outputs};
 use crate::context::Context;
-use ratn_model::expression::{EffectExpr, Expr, FactExpr};
+use crate::plan::MAX_OUTCOMES;
+use crate::plan::NodeNature;
+use ratn_model::expression::{Expr, FactExpr};
 use ratn_model::fact::{FactKey, Footprint};
 use ratn_model::id::InstanceId;
 use ratn_model::program::StateKind;
@@ -61,7 +61,7 @@ impl Window {
     }
 
     fn examine_node(&self, context: &Context<'_>, instance: &Instance, view: &View<'_>, seen: &mut Seen) -> Readiness {
-        let analysis = context.analysis.state(instance.state);
+        let analysis = context.plan.state(instance.state);
         let plan = self.plan.state(instance.state);
         let state = context.program.state(instance.state);
         let is_pia = instance.is_pia();
@@ -81,7 +81,7 @@ impl Window {
             return Readiness::Waits(Wait::Decision(decision));
         }
         let sight = self.sight(context);
-        if let Some(producer) = missing(sight, instance, &analysis.flows, &plan.variables) {
+        if let Some(producer) = missing(sight, instance, &analysis.start_flows, &plan.variables) {
             return Readiness::Waits(Wait::Data(producer));
         }
         if let Some(writer) = view.operator_of(&plan.kinds) {
@@ -131,7 +131,7 @@ impl Window {
     /// The facts that a computing or sensing node reads, as they are at its place; a sensing one only when the environment
     /// shows them so.
     pub(super) fn look(&self, context: &Context<'_>, instance: &Instance, view: &View<'_>) -> Result<Seen, Wait> {
-        let analysis = context.analysis.state(instance.state);
+        let analysis = context.plan.state(instance.state);
         let reads = match &analysis.reads {
             Some(facts) => FactExpr::footprint(facts, view),
             None => Footprint::Everything,
@@ -161,7 +161,7 @@ impl Window {
         match instance.nature {
             NodeNature::Computes => None,
             NodeNature::Senses => {
-                let senses = FactExpr::footprint(&context.analysis.state(instance.state).senses, view);
+                let senses = FactExpr::footprint(&context.plan.state(instance.state).senses, view);
                 let writer = others().find(|other| other.is_pia() && self.writes(context, other).overlaps(&senses));
                 let about_to = || {
                     let heads = self.threads.values().filter_map(|thread| self.instances.get(thread.head?));
@@ -210,7 +210,7 @@ impl Window {
         let sight = self.sight(context);
         let view = sight.view(instance, None);
         let state = context.program.state(instance.state);
-        let analysis = context.analysis.state(instance.state);
+        let analysis = context.plan.state(instance.state);
         let mut reads = match (instance.role, &analysis.reads) {
             (Role::Node, Some(facts)) => FactExpr::footprint(facts, &view),
             (Role::Node, None) => Footprint::Everything,
@@ -221,10 +221,7 @@ impl Window {
         reads = reads.union(facts_of(&state.annotations.requires, &view));
         reads = reads.union(FactExpr::footprint(&analysis.senses, &view));
         // What its effects are made of is read when it ends.
-        let effects = state.annotations.effects.values();
-        let looked_up: Vec<FactExpr> =
-            effects.flat_map(|effects| EffectExpr::fact_expressions(effects)).cloned().collect();
-        reads = reads.union(FactExpr::footprint(&looked_up, &view));
+        reads = reads.union(FactExpr::footprint(&analysis.effect_lookups, &view));
         (reads, self.writes(context, instance))
     }
 
@@ -255,7 +252,7 @@ pub(super) fn facts_of(expressions: &[Expr], view: &View<'_>) -> Footprint {
 
 /// What a sensing instance looks at.
 pub(super) fn senses_of(context: &Context<'_>, sight: Sight<'_>, instance: &Instance) -> Footprint {
-    FactExpr::footprint(&context.analysis.state(instance.state).senses, &sight.view(instance, None))
+    FactExpr::footprint(&context.plan.state(instance.state).senses, &sight.view(instance, None))
 }
 
 /// The first older instance whose output or assignment is needed and not there yet.

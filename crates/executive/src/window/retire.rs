@@ -6,11 +6,11 @@
 use super::Window;
 use super::cursor::{Cursor, Todo};
 use super::instance::{Changed, Instance, Line, Role, Status, Wait, gives_outputs};
-use super::plan::{Effects, Outcome};
-use crate::analysis::NodeNature;
 use crate::binding;
 use crate::context::{Context, Made};
 use crate::effects;
+use crate::plan::NodeNature;
+use crate::plan::{Effects, Outcome};
 use crate::protocol::{Command, Note};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, SUCCESS, StateKind};
@@ -180,7 +180,7 @@ impl Window {
 
     /// Effects and resource operations happen. The outcome by which it is left, and why.
     fn make_real(&mut self, context: &mut Context<'_>, id: InstanceId) -> (Arc<str>, String) {
-        let (program, analysis) = (context.program, context.analysis);
+        let (program, plan) = (context.program, context.plan);
         let aborted = |reason: String| (Arc::from(ABORTED), reason);
         let Some(instance) = self.instances.get(id) else { return aborted(String::new()) };
         let state = program.state(instance.state);
@@ -215,7 +215,7 @@ impl Window {
             Changed::Declared(measured, evidence) => effects::actual(declared, &outcome, measured, &view)
                 .map(|changes| Made { changes, evidence: evidence.clone() }),
         };
-        let wanted = &analysis.state(instance.state).operations;
+        let wanted = &plan.state(instance.state).operations;
         let operations = if is_routine || wanted.is_empty() || outcome.as_ref() != SUCCESS {
             // A routine has performed its own.
             Ok(Vec::new())

@@ -6,9 +6,9 @@
 use super::Window;
 use super::environment::ASSIGNED;
 use super::instance::{Ended, Instance, Seen, Status, Wait};
-use crate::analysis::NodeNature;
 use crate::binding::Seed;
 use crate::context::Context;
+use crate::plan::NodeNature;
 use crate::protocol::Note;
 use ratn_model::id::InstanceId;
 use ratn_model::program::StateKind;

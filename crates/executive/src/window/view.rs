@@ -7,9 +7,8 @@
 use super::environment::{Binding, Link, Producer, assigned};
 use super::instance::{Changed, Instance, Role};
 use super::instances::Instances;
-use super::plan::{EVERYTHING, Effects, Plan, Predicate};
-use crate::analysis::Analysis;
 use crate::binding::Outputs;
+use crate::plan::{EVERYTHING, Effects, Plan, Predicate};
 use ratn_model::expression::{EffectExpr, EvaluateError, Lookup, Scope};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{InstanceId, StateId};
@@ -27,7 +26,6 @@ const MAX_DEPTH: u32 = 48;
 #[derive(Clone, Copy)]
 pub(crate) struct Sight<'a> {
     pub(crate) program: &'a Program,
-    pub(crate) analysis: &'a Analysis,
     pub(crate) plan: &'a Plan,
     pub(crate) root: &'a World,
     pub(crate) instances: &'a Instances,
@@ -382,7 +380,7 @@ impl<'a> View<'a> {
         let is_routine = writer.role == Role::Node
             && !matches!(self.sight.program.state(writer.state).kind, StateKind::Action { .. });
         if is_routine {
-            return match &self.sight.analysis.state(writer.state).writes {
+            return match &self.sight.plan.state(writer.state).may_write {
                 Some(effects) => EffectExpr::footprint(effects, &view),
                 None => Footprint::Everything,
             };

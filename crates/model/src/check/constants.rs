@@ -5,28 +5,29 @@ use crate::diagnostic::Findings;
 use crate::expression::scope::NothingKnown;
 use crate::expression::{EvaluateError, Expr, FactExpr, Function};
 use crate::program::{State, StateKind};
+use crate::slot::Slot;
 use crate::value::Value;
 
 pub(crate) const RULE: &str = "invalid-constant";
 pub(crate) const HELP: &str = "it fails whenever it is evaluated: write a value that there is";
 
-pub(super) fn check(subject: &Subject<'_>, state: &State, part: &str, expr: &Expr, findings: &mut Findings) {
+pub(super) fn check(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: &Expr, findings: &mut Findings) {
     let problem = match problem(expr) {
         Some(EvaluateError::Wrong { problem, .. }) => Some(problem),
-        Some(EvaluateError::NotYetKnown { .. }) | None => joints(subject, state, part, expr),
+        Some(EvaluateError::NotYetKnown { .. }) | None => joints(subject, state, slot, expr),
     };
     if let Some(problem) = problem {
         let message = format!("`{}`: {problem}", named(subject.program, expr));
-        findings.error(RULE, subject.place(state, part), &state.path, message, HELP);
+        findings.error(RULE, subject.place_of(state, slot), &state.path, message, HELP);
     }
 }
 
 /// Joint positions of another number than the provider's.
-fn joints(subject: &Subject<'_>, state: &State, part: &str, expr: &Expr) -> Option<String> {
+fn joints(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: &Expr) -> Option<String> {
     let StateKind::Action { provider, .. } = &state.kind else { return None };
     let wanted = subject.catalogue.providers.get(provider)?.joints?;
     let Ok(Value::Joints(found)) = expr.evaluate(&NothingKnown) else { return None };
-    let fits = !part.starts_with("in.") || usize::try_from(wanted).is_ok_and(|wanted| wanted == found.len());
+    let fits = !matches!(slot, Slot::Input(_)) || usize::try_from(wanted).is_ok_and(|wanted| wanted == found.len());
     (!fits).then(|| format!("`{provider}` has {wanted} joints, and these are the positions of {}", found.len()))
 }
 

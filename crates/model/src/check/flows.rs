@@ -9,34 +9,35 @@ use crate::diagnostic::Findings;
 use crate::expression::Expr;
 use crate::id::StateId;
 use crate::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind};
+use crate::slot::Slot;
 use petgraph::graph::{DiGraph, NodeIndex};
 use std::collections::BTreeSet;
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let program = subject.program;
-    let flows: Vec<(&State, String, StateId, &str)> = program
+    let flows: Vec<(&State, Slot<'_>, StateId, &str)> = program
         .states
         .iter()
         .flat_map(|state| {
             let parts = expressions(program, state);
-            parts.into_iter().flat_map(move |(part, expr)| {
-                ports(expr).into_iter().map(move |(from, port)| (state, part.clone(), from, port))
+            parts.into_iter().flat_map(move |(slot, expr)| {
+                ports(expr).into_iter().map(move |(from, port)| (state, slot, from, port))
             })
         })
         .collect();
     let graph = graph(program, flows.iter().map(|(to, _, from, _)| (*from, to.id)));
     let control = subject.control;
-    for (to, part, from, port) in flows {
-        let at = subject.place(to, &part);
+    for (to, slot, from, port) in flows {
+        let at = subject.place_of(to, slot);
         let source = program.state(from);
         let flow = format!("`{}.{port}`", source.name);
         let is_region =
             matches!(source.parent.map(|parent| &program.state(parent).kind), Some(StateKind::Concurrency { .. }));
-        let (surely, maybe) = written(control, program, to, &part, from);
-        let relation = relation(subject, to, &part, source);
+        let (surely, maybe) = written(control, to, slot, from);
+        let relation = relation(subject, to, slot, source);
         let hidden = matches!(relation, Relation::Hidden(_));
         let beside = matches!(relation, Relation::Beside);
-        if !hidden && !beside && (surely || source.defaults.contains_key(port) || (is_region && at_join(to, &part))) {
+        if !hidden && !beside && (surely || source.defaults.contains_key(port) || (is_region && at_join(to, slot))) {
             continue;
         }
         if !hidden && !beside && maybe {
@@ -111,7 +112,7 @@ enum Relation<'a> {
     Hidden(&'a State),
 }
 
-fn relation<'a>(subject: &Subject<'a>, to: &State, part: &str, from: &'a State) -> Relation<'a> {
+fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a State) -> Relation<'a> {
     let up: Vec<&'a State> = subject.around(to.id).collect();
     let down: Vec<&'a State> = subject.around(from.id).collect();
     if from.id == to.id {
@@ -126,8 +127,7 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, part: &str, from: &'a State) 
     };
     let (shared, side) = (down[depth], down[depth - 1]);
     if shared.id == to.id {
-        let at_its_end = part.starts_with("outputs.") || part.starts_with("effects.");
-        let at_its_end = at_its_end || part.starts_with("assign.") || part.starts_with("decide.") || part == "while";
+        let at_its_end = is_at_end(slot) || matches!(slot, Slot::Decide(_) | Slot::While);
         if !at_its_end || matches!(to.kind, StateKind::ForEach { .. } | StateKind::Condition { .. }) {
             return Relation::Inside;
         }
@@ -159,28 +159,29 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, part: &str, from: &'a State) 
     if depth > 1 { Relation::Hidden(side) } else { Relation::Before }
 }
 
-/// Whether the source has surely, and whether it may have, written its outputs when the part of the target is evaluated.
-fn written(control: &ControlFlow, program: &Program, to: &State, part: &str, from: StateId) -> (bool, bool) {
-    let contains = !matches!(to.kind, StateKind::Action { .. });
-    let is_loop = matches!(to.kind, StateKind::While { .. });
-    let is_concurrency = matches!(to.kind, StateKind::Concurrency { .. });
-    if is_concurrency && (part.starts_with("decide.") || part.starts_with("outputs.")) {
+/// Whether the source has surely, and whether it may have, written its outputs when the expression of the target is evaluated.
+fn written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> (bool, bool) {
+    let in_the_middle = match slot {
+        Slot::Decide(_) | Slot::While => true,
+        Slot::Output(_) => matches!(to.kind, StateKind::Concurrency { .. }),
+        _ => false,
+    };
+    if in_the_middle {
         return control.written(Point::Middle(to.id), from);
     }
-    if is_loop && part == "while" {
-        return control.written(Point::Middle(to.id), from);
-    }
-    let at_end = part.starts_with("outputs.") || part.starts_with("effects.") || part.starts_with("assign.");
-    if !contains || !at_end {
+    if matches!(to.kind, StateKind::Action { .. }) || !is_at_end(slot) {
         return control.written(Point::Begin(to.id), from);
     }
     // What an output is made of may be missing where the state is left by an outcome of its own; then it is not written.
-    let only = part.strip_prefix("effects.").or(part.starts_with("outputs.").then_some(SUCCESS));
+    let only = match slot {
+        Slot::Effect(outcome) => Some(outcome),
+        Slot::Output(_) => Some(SUCCESS),
+        _ => None,
+    };
     let outcomes = control.outcomes(to.id).iter().enumerate().filter(|(_, outcome)| match only {
         Some(only) => outcome.as_str() == only,
         None => !matches!(outcome.as_str(), ABORTED | PREEMPTED),
     });
-    let _ = program;
     outcomes
         .map(|(number, _)| Point::End(to.id, number))
         .filter(|point| control.is_reached(*point))
@@ -188,9 +189,13 @@ fn written(control: &ControlFlow, program: &Program, to: &State, part: &str, fro
         .fold((true, false), |(surely, maybe), (s, m)| (surely && s, maybe || m))
 }
 
-fn at_join(to: &State, part: &str) -> bool {
+fn is_at_end(slot: Slot<'_>) -> bool {
+    matches!(slot, Slot::Output(_) | Slot::Effect(_) | Slot::Assign(_))
+}
+
+fn at_join(to: &State, slot: Slot<'_>) -> bool {
     matches!(to.kind, StateKind::Concurrency { .. })
-        && (part.starts_with("decide.") || part.starts_with("outputs.") || part.starts_with("effects."))
+        && matches!(slot, Slot::Decide(_) | Slot::Output(_) | Slot::Effect(_))
 }
 
 fn ports(expr: &Expr) -> Vec<(StateId, &str)> {

@@ -3,9 +3,8 @@
 
 use super::{Subject, expressions, named};
 use crate::diagnostic::Findings;
-use crate::expression::{EffectExpr, Expr, FactExpr, Function};
+use crate::expression::{EffectExpr, Expr, Function};
 use crate::load::distance;
-use crate::program::Nature;
 use std::collections::BTreeSet;
 
 /// So long a name may differ in two letters, a shorter one in one.
@@ -17,13 +16,13 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let program = subject.program;
     let known = predicates(subject);
     for state in &program.states {
-        for (part, expr) in expressions(program, state) {
+        for (slot, expr) in expressions(program, state) {
             for fact in expr.fact_expressions() {
                 if known.contains(fact.predicate.as_str()) || fact.arguments.iter().any(Option::is_none) {
                     continue;
                 }
                 let Some((name, usage, takes)) = meant(&fact.predicate, fact.arguments.len()) else { continue };
-                let at = subject.place(state, &part);
+                let at = subject.place_of(state, slot);
                 let whole = named(program, &Expr::Fact(fact.clone()));
                 let message = format!("`{whole}` is read as a fact, and nothing in the task says that there is one");
                 let help = format!(
@@ -63,30 +62,19 @@ fn edits(a: &str, b: &str) -> usize {
 fn predicates<'a>(subject: &Subject<'a>) -> BTreeSet<&'a str> {
     let program = subject.program;
     let mut known = BTreeSet::new();
-    program.initial.iter().for_each(|effect| written(effect, &mut known));
+    let written = |effect: &'a EffectExpr| effect.written().into_iter().map(|fact| fact.predicate.as_str());
+    known.extend(program.initial.iter().flat_map(written));
     for state in &program.states {
         let annotations = &state.annotations;
-        annotations.effects.values().flatten().for_each(|effect| written(effect, &mut known));
-        let sensed: &[FactExpr] = match &annotations.nature {
-            Nature::Senses(facts) => facts,
-            _ => &[],
-        };
-        known.extend(annotations.reads.iter().flatten().chain(sensed).map(|fact| fact.predicate.as_str()));
+        known.extend(annotations.effects.values().flatten().flat_map(written));
+        let named = annotations.reads.iter().flatten().chain(annotations.senses());
+        known.extend(named.map(|fact| fact.predicate.as_str()));
         for (_, expr) in expressions(program, state) {
             let open = expr.fact_expressions().into_iter().filter(|fact| fact.arguments.iter().any(Option::is_none));
             known.extend(open.map(|fact| fact.predicate.as_str()));
         }
     }
     known
-}
-
-fn written<'a>(effect: &'a EffectExpr, known: &mut BTreeSet<&'a str>) {
-    match effect {
-        EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => {
-            known.insert(&fact.predicate);
-        }
-        EffectExpr::ForEach { effects, .. } => effects.iter().for_each(|inner| written(inner, known)),
-    }
 }
 
 #[cfg(test)]

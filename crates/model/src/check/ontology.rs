@@ -7,7 +7,7 @@ use crate::expression::scope::NothingKnown;
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::fact::{FactKey, FactPattern};
 use crate::ontology::{Ontology, Violation};
-use crate::program::{Location, Nature, Program, State};
+use crate::program::{Location, Program, State};
 use crate::value::Value;
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
@@ -28,15 +28,12 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
 fn of_state(subject: &Subject<'_>, ontology: &Ontology, state: &State, findings: &mut Findings) {
     let annotations = &state.annotations;
     let at = |part: &str| subject.place(state, part);
-    for (part, expr) in expressions(subject.program, state) {
-        let mut said = Said { ontology, at: at(&part), path: &state.path, findings };
+    for (slot, expr) in expressions(subject.program, state) {
+        let mut said = Said { ontology, at: subject.place_of(state, slot), path: &state.path, findings };
         expr.fact_expressions().into_iter().for_each(|fact| said.fact(fact));
     }
-    let sensed: &[FactExpr] = match &annotations.nature {
-        Nature::Senses(facts) => facts,
-        _ => &[],
-    };
-    for (part, facts) in [("reads", annotations.reads.as_deref().unwrap_or_default()), ("senses", sensed)] {
+    for (part, facts) in [("reads", annotations.reads.as_deref().unwrap_or_default()), ("senses", annotations.senses())]
+    {
         let mut said = Said { ontology, at: at(part), path: &state.path, findings };
         facts.iter().for_each(|fact| said.fact(fact));
     }

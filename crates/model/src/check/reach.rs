@@ -113,12 +113,9 @@ fn touched(program: &Program, region: &State) -> Touched {
         });
         touched.operated.extend(operations.map(|r| r.kind.clone()));
         let is_action = matches!(state.kind, StateKind::Action { .. });
-        let senses: &[FactExpr] = match &annotations.nature {
-            Nature::Senses(facts) => facts,
-            _ => &[],
-        };
         let looked_up = expressions.iter().flat_map(|(_, e)| e.fact_expressions());
-        let facts: Vec<FactExpr> = annotations.reads.iter().flatten().chain(senses).chain(looked_up).cloned().collect();
+        let named = annotations.reads.iter().flatten().chain(annotations.senses());
+        let facts: Vec<FactExpr> = named.chain(looked_up).cloned().collect();
         let open_reads = is_action && annotations.reads.is_none() && annotations.nature != Nature::Computes;
         let open_writes = is_action
             && annotations.nature != Nature::Computes

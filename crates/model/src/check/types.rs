@@ -4,6 +4,7 @@ use super::{Subject, Variables, constants, expressions, named};
 use crate::diagnostic::Findings;
 use crate::expression::{BinaryOperator, EffectExpr, Expr, Function, UnaryOperator};
 use crate::program::{Program, State, StateKind, TaskOutput};
+use crate::slot::Slot;
 use crate::value::{Type, Value};
 use std::collections::BTreeMap;
 
@@ -15,23 +16,23 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     for state in &program.states {
         let types = Types { program, state, variables: variables(subject, state), indirection: 0 };
         let quantified = quantified(state);
-        for (part, expr) in expressions(program, state) {
+        for (slot, expr) in expressions(program, state) {
             // Quantified effects bind variables of their own; their elements are checked at run time.
             let bound = expr.variables().iter().any(|name| quantified.contains(name));
-            if bound && part.starts_with("effects.") {
+            if bound && matches!(slot, Slot::Effect(_)) {
                 continue;
             }
-            let at = subject.place(state, &part);
+            let at = subject.place_of(state, slot);
             match types.of(expr) {
                 Err(message) => findings.error("type-mismatch", at, &state.path, message, ""),
                 Ok(found) => {
-                    if let Some(wanted) = wanted(subject, state, &part)
+                    if let Some(wanted) = wanted(subject, state, slot)
                         && !fits(&wanted, &found, expr)
                     {
-                        let message = format!("`{}` is {wanted}; `{}` is {found}", what(&part), named(program, expr));
+                        let message = format!("`{}` is {wanted}; `{}` is {found}", what(slot), named(program, expr));
                         findings.error("type-mismatch", at, &state.path, message, "");
                     } else {
-                        constants::check(subject, state, &part, expr, findings);
+                        constants::check(subject, state, slot, expr, findings);
                     }
                 }
             }
@@ -76,31 +77,28 @@ fn fits(wanted: &Type, found: &Type, expr: &Expr) -> bool {
     wanted.accepts_type(found) || *expr == Expr::Literal(Value::Null)
 }
 
-fn what(part: &str) -> &str {
-    match part.split_once('.') {
-        Some(("in" | "outputs", name)) => name,
-        Some((part, _)) => part,
-        None => part,
+fn what(slot: Slot<'_>) -> String {
+    match slot {
+        Slot::Input(name) | Slot::Output(name) => name.to_owned(),
+        Slot::Requires(_) => "requires".to_owned(),
+        Slot::Decide(_) => "decide".to_owned(),
+        other => other.to_string(),
     }
 }
 
-fn wanted(subject: &Subject<'_>, state: &State, part: &str) -> Option<Type> {
-    match (part.split_once('.'), &state.kind) {
-        (Some(("in", port)), StateKind::Action { provider, action, .. }) => {
+fn wanted(subject: &Subject<'_>, state: &State, slot: Slot<'_>) -> Option<Type> {
+    match (slot, &state.kind) {
+        (Slot::Input(port), StateKind::Action { provider, action, .. }) => {
             let signature = subject.catalogue.action(provider, action)?;
             signature.inputs.get(port).or_else(|| signature.optional.get(port)).cloned()
         }
-        (Some(("outputs", name)), StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) => {
+        (Slot::Output(name), StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) => {
             let own = if state.id == Program::ROOT { &subject.program.outputs } else { outputs };
             own.iter().find(|output| output.name == name).map(|output| output.ty.clone())
         }
-        (Some(("requires" | "decide", _)), _) => Some(Type::Bool),
-        (None, _) => match part {
-            "for" => Some(Type::List(Box::new(Type::Any))),
-            "condition" | "while" => Some(Type::Bool),
-            "duration" => Some(Type::Float),
-            _ => None,
-        },
+        (Slot::Requires(_) | Slot::Decide(_) | Slot::Condition | Slot::While, _) => Some(Type::Bool),
+        (Slot::Collection, _) => Some(Type::List(Box::new(Type::Any))),
+        (Slot::Duration, _) => Some(Type::Float),
         _ => None,
     }
 }

@@ -3,10 +3,9 @@
 //! States get other ids and paths. A variable of the library that is called like one in sight where it is used gets the path of
 //! that state before its name: the two have nothing to do with each other.
 
-use crate::expression::Expr;
-use crate::expression::walk::Rewrite;
+use crate::expression::{EffectExpr, Expr};
 use crate::id::StateId;
-use crate::program::{Exceptions, Nature, Program, State, StateKind, Target};
+use crate::program::{Exceptions, Program, State, StateKind, Target};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Puts the states of a library below the state at this place, which is its root from then on; `in_sight` are the variables there.
@@ -15,7 +14,7 @@ pub(crate) fn graft(states: &mut Vec<State>, at: StateId, library: &Program, in_
     let taken = bound(library).into_iter().filter(|name| in_sight.contains(*name));
     let renamed = taken.map(|name| (name.to_owned(), format!("{path}/{name}"))).collect();
     // The root becomes the state itself; the others come behind all there are.
-    let mut moving = Moving { at, offset: states.len() as u64, renamed };
+    let moving = Moving { at, offset: states.len() as u64, renamed };
     for state in library.states.iter().skip(1) {
         let mut state = state.clone();
         state.id = moving.moved(state.id);
@@ -29,7 +28,7 @@ pub(crate) fn graft(states: &mut Vec<State>, at: StateId, library: &Program, in_
         states.push(state);
     }
     let mut outputs = library.outputs.clone();
-    outputs.iter_mut().for_each(|output| output.value.rewrite(&mut moving));
+    outputs.iter_mut().for_each(|output| output.value.rewrite(&mut |part| moving.expression(part)));
     let children = library.states[0].children().map(|child| moving.moved(child)).collect();
     let root = &mut states[at.0 as usize];
     root.defaults.clone_from(&library.states[0].defaults);
@@ -59,8 +58,8 @@ struct Moving {
     renamed: BTreeMap<String, String>,
 }
 
-impl Rewrite for Moving {
-    fn expression(&mut self, expr: &mut Expr) {
+impl Moving {
+    fn expression(&self, expr: &mut Expr) {
         match expr {
             Expr::Port { state, .. } => *state = self.moved(*state),
             Expr::Variable(name) => self.variable(name),
@@ -68,14 +67,20 @@ impl Rewrite for Moving {
         }
     }
 
-    fn variable(&mut self, name: &mut String) {
+    fn variable(&self, name: &mut String) {
         if let Some(new) = self.renamed.get(name) {
             name.clone_from(new);
         }
     }
-}
 
-impl Moving {
+    /// The variables that a quantified effect binds.
+    fn quantifiers(&self, effect: &mut EffectExpr) {
+        if let EffectExpr::ForEach { variable, effects, .. } = effect {
+            self.variable(variable);
+            effects.iter_mut().for_each(|inner| self.quantifiers(inner));
+        }
+    }
+
     fn moved(&self, id: StateId) -> StateId {
         if id == Program::ROOT { self.at } else { StateId(id.0 - 1 + self.offset) }
     }
@@ -84,53 +89,31 @@ impl Moving {
         list.iter_mut().for_each(|id| *id = self.moved(*id));
     }
 
-    fn state(&mut self, state: &mut State) {
+    fn state(&self, state: &mut State) {
         match &mut state.kind {
-            StateKind::Action { inputs, .. } => inputs.iter_mut().for_each(|(_, value)| value.rewrite(self)),
-            StateKind::Sequence { children, outputs } => {
-                self.ids(children);
-                outputs.iter_mut().for_each(|output| output.value.rewrite(self));
-            }
-            StateKind::ForEach { variable, index, collection, body } => {
+            StateKind::Action { .. } => {}
+            StateKind::Sequence { children, .. } => self.ids(children),
+            StateKind::ForEach { variable, index, body, .. } => {
                 self.ids(body);
-                collection.rewrite(self);
                 std::iter::once(variable).chain(index).for_each(|name| self.variable(name));
             }
-            StateKind::While { predicate, index, body, .. } => {
+            StateKind::While { index, body, .. } => {
                 self.ids(body);
-                predicate.rewrite(self);
                 index.iter_mut().for_each(|name| self.variable(name));
             }
-            StateKind::Condition { predicate, then, otherwise } => {
+            StateKind::Condition { then, otherwise, .. } => {
                 self.ids(then);
                 self.ids(otherwise);
-                predicate.rewrite(self);
             }
-            StateKind::Concurrency { regions, decide, outputs, .. } => {
-                self.ids(regions);
-                decide.iter_mut().for_each(|(_, holds)| holds.rewrite(self));
-                outputs.iter_mut().for_each(|output| output.value.rewrite(self));
-            }
+            StateKind::Concurrency { regions, .. } => self.ids(regions),
         }
         for target in state.transitions.values_mut() {
             if let Target::State(id) = target {
                 *id = self.moved(*id);
             }
         }
-        for (name, value) in state.variables.iter_mut().chain(&mut state.assign) {
-            self.variable(name);
-            value.rewrite(self);
-        }
-        let annotations = &mut state.annotations;
-        if let Nature::Senses(facts) = &mut annotations.nature {
-            facts.iter_mut().for_each(|fact| fact.rewrite(self));
-        }
-        annotations.reads.iter_mut().flatten().chain(&mut annotations.shared).for_each(|fact| fact.rewrite(self));
-        annotations.requires.iter_mut().chain(&mut annotations.duration_s).for_each(|e| e.rewrite(self));
-        annotations.effects.values_mut().flatten().for_each(|effect| effect.rewrite(self));
-        for resource in &mut annotations.resources {
-            resource.attributes.iter_mut().for_each(|(_, e)| e.rewrite(self));
-            resource.conditions.iter_mut().for_each(|condition| condition.value.rewrite(self));
-        }
+        state.variables.iter_mut().chain(&mut state.assign).for_each(|(name, _)| self.variable(name));
+        state.annotations.effects.values_mut().flatten().for_each(|effect| self.quantifiers(effect));
+        state.each_expression_mut(&mut |_, expression| expression.rewrite(&mut |part| self.expression(part)));
     }
 }

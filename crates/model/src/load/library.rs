@@ -10,7 +10,6 @@ use super::{Loading, names::suggestion};
 use crate::diagnostic::{Diagnostic, Findings};
 use crate::expression::Expr;
 use crate::expression::scope::NothingKnown;
-use crate::expression::walk::Rewrite;
 use crate::id::StateId;
 use crate::program::Program;
 use std::cell::RefCell;
@@ -163,7 +162,7 @@ pub(crate) fn parameters(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) 
     // Its own variables begin with what its parameters give; all are evaluated outside of the state.
     let own = library.states[0].variables.iter().map(|(name, value)| {
         let mut value = value.clone();
-        value.rewrite(&mut Given(&bound));
+        value.rewrite(&mut |part| give(&bound, part));
         (name.clone(), value)
     });
     let own: Vec<_> = own.collect();
@@ -171,17 +170,11 @@ pub(crate) fn parameters(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) 
     bound
 }
 
-/// Expressions in place of variables.
-struct Given<'a>(&'a [(String, Expr)]);
-
-impl Rewrite for Given<'_> {
-    fn expression(&mut self, expr: &mut Expr) {
-        if let Expr::Variable(name) = expr
-            && let Some((_, value)) = self.0.iter().find(|(given, _)| given == name)
-        {
-            *expr = value.clone();
-        }
+/// Puts the expression of a variable in its place.
+fn give(bound: &[(String, Expr)], expr: &mut Expr) {
+    if let Expr::Variable(name) = expr
+        && let Some((_, value)) = bound.iter().find(|(given, _)| given == name)
+    {
+        *expr = value.clone();
     }
-
-    fn variable(&mut self, _: &mut String) {}
 }

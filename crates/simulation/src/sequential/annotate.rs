@@ -1,10 +1,11 @@
 //! States that say too little, and what they would say if nothing of it were so.
 
 use ratn_model::catalogue::Catalogue;
-use ratn_model::expression::{Expr, FactExpr};
+use ratn_model::expression::FactExpr;
 use ratn_model::id::StateId;
 use ratn_model::program::{Annotations, Nature, Program, SUCCESS, State, StateKind};
 use ratn_model::resource::ResourceOperation;
+use ratn_model::slot::Slot;
 
 /// What an action does not say, in the words of the task file; empty of every other state.
 pub(super) fn missing(program: &Program, catalogue: &Catalogue, id: StateId) -> Vec<&'static str> {
@@ -56,10 +57,6 @@ pub(super) fn annotated(program: &Program, catalogue: &Catalogue, ids: &[StateId
 
 /// The facts that its inputs and preconditions look up.
 fn named_facts(state: &State) -> Vec<FactExpr> {
-    let inputs = match &state.kind {
-        StateKind::Action { inputs, .. } => inputs.as_slice(),
-        _ => &[],
-    };
-    let expressions = inputs.iter().map(|(_, expression)| expression).chain(&state.annotations.requires);
-    expressions.flat_map(Expr::fact_expressions).cloned().collect()
+    let named = state.expressions().into_iter().filter(|(slot, _)| matches!(slot, Slot::Input(_) | Slot::Requires(_)));
+    named.flat_map(|(_, expression)| expression.fact_expressions()).cloned().collect()
 }

@@ -3,8 +3,9 @@
 use ratn_executive::protocol::{Command, LogEntry, LogLine, Note};
 use ratn_model::expression::Expr;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{Nature, Program, State, StateKind};
+use ratn_model::program::{Nature, Program, State};
 use ratn_model::resource::ResourceOperation;
+use ratn_model::slot::Slot;
 use ratn_model::time::Timestamp;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -115,20 +116,14 @@ fn bond(program: &Program, before: StateId, behind: StateId) -> Bond {
         std::iter::successors(Some(before), |id| program.state(*id).parent).any(|ancestor| ancestor == id)
     };
     let takes = |expression: &Expr| expression.flows().into_iter().any(is_of_before);
-    let inputs = match &state.kind {
-        StateKind::Action { inputs, .. } => inputs.as_slice(),
-        _ => &[],
+    let takes_in = |state: &State, is_meant: fn(Slot<'_>) -> bool| {
+        state.expressions().into_iter().any(|(slot, expression)| is_meant(slot) && takes(expression))
     };
-    if inputs.iter().any(|(_, expression)| takes(expression)) {
+    if takes_in(state, |slot| matches!(slot, Slot::Input(_))) {
         return Bond::Output;
     }
-    let decides = around().any(|state| match &state.kind {
-        StateKind::ForEach { collection: decided, .. }
-        | StateKind::While { predicate: decided, .. }
-        | StateKind::Condition { predicate: decided, .. } => takes(decided),
-        _ => false,
-    });
-    if decides {
+    let decides = |slot: Slot<'_>| matches!(slot, Slot::Collection | Slot::While | Slot::Condition);
+    if around().any(|state| takes_in(state, decides)) {
         return Bond::Decision;
     }
     if let Some(kind) = blocked(program, state).find(|kind| blocked(program, program.state(before)).any(|k| k == *kind))

@@ -2,7 +2,6 @@
 
 use super::MAX_CONDITIONS;
 use super::plan::PlanError;
-use crate::expression::walk::Rewrite;
 use crate::expression::{BinaryOperator, Expr, FactExpr, Function, UnaryOperator};
 
 /// A condition whose facts stand by themselves.
@@ -149,13 +148,11 @@ impl TakeOut<'_> {
             }
             Expr::List(items) | Expr::Call(_, items) => items.iter_mut().for_each(|item| self.strict(item)),
             Expr::Map(fields) => fields.iter_mut().for_each(|(_, item)| self.strict(item)),
-            Expr::Fact(_) => self.expression(expr),
+            Expr::Fact(_) => self.take(expr),
         }
     }
-}
 
-impl Rewrite for TakeOut<'_> {
-    fn expression(&mut self, expr: &mut Expr) {
+    fn take(&mut self, expr: &mut Expr) {
         let Expr::Fact(fact) = expr else { return };
         self.made.hidden += 1;
         self.made.count += 1;
@@ -171,6 +168,4 @@ impl Rewrite for TakeOut<'_> {
             self.problem = Some(problem);
         }
     }
-
-    fn variable(&mut self, _: &mut String) {}
 }

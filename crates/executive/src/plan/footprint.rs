@@ -1,0 +1,99 @@
+//! The facts that a state reads, senses, looks up and may write.
+
+use super::outcomes::{EVERYTHING, Ends};
+use super::{Names, Predicate, Subject, is_action, nature};
+use crate::effects;
+use ratn_model::expression::{EffectExpr, FactExpr};
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, ResourceExpr, State, StateKind};
+use ratn_model::slot::Slot;
+use std::collections::BTreeSet;
+
+/// The facts that a state reads; `None`: it may read every fact.
+pub(super) fn reads(subject: &Subject<'_>, requirements: &[ResourceExpr]) -> Option<Vec<FactExpr>> {
+    let mut all: Vec<FactExpr> = Vec::new();
+    for state in &subject.contained {
+        match &state.annotations.reads {
+            Some(reads) => all.extend(reads.iter().cloned()),
+            // A sensing node reads what it senses; any other action without the annotation reads everything.
+            None if is_action(state) && !matches!(state.annotations.nature, Nature::Senses(_)) => return None,
+            None => {}
+        }
+        for (slot, expression) in state.expressions() {
+            let is_read = match slot {
+                Slot::Duration | Slot::Reads | Slot::Senses | Slot::Shared => false,
+                // The ends of the parts of one node lie within that node.
+                Slot::Effect(_) | Slot::Resource(..) => subject.contains_others(),
+                _ => true,
+            };
+            if is_read {
+                all.extend(expression.fact_expressions().into_iter().cloned());
+            }
+        }
+    }
+    all.extend(subject.around.iter().flat_map(|state| &state.annotations.reads).flatten().cloned());
+    let selectors = requirements.iter().flat_map(|r| r.expressions());
+    all.extend(selectors.flat_map(|expression| expression.fact_expressions()).cloned());
+    Some(all)
+}
+
+/// The facts that a state senses, with those of what it contains.
+pub(super) fn senses(subject: &Subject<'_>) -> Vec<FactExpr> {
+    subject.contained.iter().flat_map(|state| state.annotations.senses()).cloned().collect()
+}
+
+/// The facts that the effects of a state look up, whatever its outcome.
+pub(super) fn effect_lookups(state: &State) -> Vec<FactExpr> {
+    state.annotations.effects.values().flat_map(|effects| EffectExpr::fact_expressions(effects)).cloned().collect()
+}
+
+/// The effects of every outcome with which the nodes inside of a state may end while the state goes on or ends well. `None`: it may
+/// write every fact.
+pub(super) fn may_write(subject: &Subject<'_>) -> Option<Vec<EffectExpr>> {
+    let each = subject.contained.iter().map(|state| own_writes(subject, state));
+    each.collect::<Option<Vec<_>>>().map(|all| all.concat())
+}
+
+fn own_writes(subject: &Subject<'_>, state: &State) -> Option<Vec<EffectExpr>> {
+    if !is_action(state) {
+        return Some(state.annotations.effects.values().flatten().cloned().collect());
+    }
+    let mut all = Vec::new();
+    for outcome in subject.program.outcomes(state.id) {
+        match effects::declared(state, nature::own(state), outcome) {
+            Some(declared) => all.extend(declared.iter().cloned()),
+            None if matches!(outcome, ABORTED | PREEMPTED) && ends_all(subject, state, outcome) => {}
+            None => return None,
+        }
+    }
+    Some(all)
+}
+
+/// Whether the whole ends by this outcome when a state inside of it does: no transition on the way handles it.
+fn ends_all(subject: &Subject<'_>, state: &State, outcome: &str) -> bool {
+    let outwards = std::iter::successors(Some(state), |inner| {
+        inner.parent.filter(|_| inner.id != subject.state.id).map(|parent| subject.program.state(parent))
+    });
+    let passes = |state: &State| {
+        !matches!(state.kind, StateKind::Concurrency { .. }) && !state.transitions.contains_key(outcome)
+    };
+    outwards.into_iter().all(passes)
+}
+
+/// The predicates that a state writes with an outcome that is computed ahead; [`EVERYTHING`] alone if it may write every fact.
+pub(super) fn writes(
+    subject: &Subject<'_>,
+    ends: &Ends,
+    may_write: Option<&[EffectExpr]>,
+    names: &mut Names,
+) -> BTreeSet<Predicate> {
+    let writes: BTreeSet<Predicate> = if subject.is_routine() {
+        let Some(effects) = may_write else { return BTreeSet::from([EVERYTHING]) };
+        effects.iter().flat_map(EffectExpr::written).map(|fact| names.of_predicate(&fact.predicate)).collect()
+    } else {
+        let ahead = ends.arms.iter().fold(0, |all, arm| all | arm.outcomes);
+        // Outcomes beyond the bits of the set are exceptional.
+        let numbered = ends.predicates.iter().take(super::MAX_OUTCOMES).enumerate();
+        numbered.filter(|(number, _)| ahead & (1 << number) != 0).flat_map(|(_, all)| all).copied().collect()
+    };
+    if writes.contains(&EVERYTHING) { BTreeSet::from([EVERYTHING]) } else { writes }
+}

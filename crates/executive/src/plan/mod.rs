@@ -1,0 +1,278 @@
+//! What follows from a program alone, per state, before anything runs. The plan is made once per run, and both modes look at it.
+//!
+//! | file | what it finds out |
+//! |---|---|
+//! | [`nature`] | whether a node computes, senses or is irreversible |
+//! | [`resources`] | what it asks of the resource manager, and what it does to resources at its end |
+//! | [`outcomes`] | where its outcomes lead, which of them are computed ahead, what each of them changes |
+//! | [`footprint`] | the facts that it reads, senses, looks up and may write |
+//! | [`flows`] | the outputs and variables that its expressions use |
+//!
+//! Hierarchies and routines are resolved here: a routine is one node, so its plan speaks of what it contains, too. Predicates and kinds of
+//! task resources are numbered ([`Predicate`]), so that tables of writers are indexed by small numbers.
+
+mod flows;
+mod footprint;
+mod nature;
+mod outcomes;
+mod resources;
+
+pub(crate) use nature::NodeNature;
+pub(crate) use outcomes::{ArmPlan, EVERYTHING, Effects, MAX_OUTCOMES, Outcome, Outcomes, gives_outputs};
+
+use ratn_model::expression::{EffectExpr, FactExpr};
+use ratn_model::id::StateId;
+use ratn_model::program::{Exceptions, Program, ResourceExpr, State, StateKind, Target, WORLD_MODEL};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// The number of a predicate, or of the task resources of one kind: an index into tables of writers.
+pub(crate) type Predicate = usize;
+
+/// The plan of a program.
+#[derive(Debug)]
+pub(crate) struct Plan {
+    states: Vec<StatePlan>,
+    names: Names,
+    /// How many predicates there are, [`EVERYTHING`] and the kinds of task resources included.
+    pub(crate) width: usize,
+}
+
+/// The plan of one state.
+#[derive(Debug)]
+pub(crate) struct StatePlan {
+    /// What it does to the environment, with what it contains.
+    pub(crate) nature: NodeNature,
+    /// An action or a routine: executed as one node.
+    pub(crate) is_node: bool,
+    /// A composite state that is one node.
+    pub(crate) is_routine: bool,
+    /// A region of a concurrency.
+    pub(crate) is_region: bool,
+    /// Younger PIAs may run beside it.
+    pub(crate) imprecise: bool,
+    /// Of an action: its provider and its name there.
+    pub(crate) action: Option<(Arc<str>, Arc<str>)>,
+
+    /// `success`, the state's own, `aborted`, `preempted`.
+    pub(crate) outcomes: Vec<Arc<str>>,
+    /// Where each outcome leads.
+    pub(crate) targets: Vec<Target>,
+    /// The continuations that are computed ahead: outcomes with one target. The first contains `success`.
+    pub(crate) arms: Vec<ArmPlan>,
+    /// What each outcome changes.
+    pub(crate) effects: Vec<Effects>,
+    /// The predicates that the effects of each outcome write.
+    pub(crate) effect_predicates: Vec<Vec<Predicate>>,
+    /// The outcomes with which the exit of this composite state has something to do: effects, outputs, assignments, resources.
+    pub(crate) exits: Outcomes,
+    /// States of its lists may be visited more than once in one activation.
+    pub(crate) repeats: bool,
+
+    /// What it acquires when it starts: blocks (its own and those of the hierarchies around it and of what it contains, merged by
+    /// maximum), consumes and exists.
+    pub(crate) requirements: Vec<ResourceExpr>,
+    /// What it does to resources when it ends with success.
+    pub(crate) operations: Vec<ResourceExpr>,
+    /// Whether it works on a projection of the world model.
+    pub(crate) needs_world: bool,
+    /// The kinds of task resources that it depends on: those it blocks, consumes, creates, deletes or looks for.
+    pub(crate) kinds: Vec<Predicate>,
+    /// The kinds of task resources that it creates, deletes or consumes; of a node, with what it contains.
+    pub(crate) operated: Vec<Predicate>,
+
+    /// The facts that it reads, with those that its expressions look up, and those of the hierarchies around it and of what it
+    /// contains. `None`: it may read every fact.
+    pub(crate) reads: Option<Vec<FactExpr>>,
+    /// The facts that it senses, with those of what it contains.
+    pub(crate) senses: Vec<FactExpr>,
+    /// The facts that its effects look up, whatever its outcome.
+    pub(crate) effect_lookups: Vec<FactExpr>,
+    /// The effects that it may have, with those of what it contains, if it does not end by a failure that nothing handles. `None`:
+    /// it may write every fact.
+    pub(crate) may_write: Option<Vec<EffectExpr>>,
+    /// The predicates and kinds that it writes with an outcome that is computed ahead. If it may write every fact: [`EVERYTHING`]
+    /// and the kinds.
+    pub(crate) writes: Vec<Predicate>,
+
+    /// The states whose outputs it needs before it starts; of a routine, those outside of it.
+    pub(crate) start_flows: Vec<StateId>,
+    /// The states whose outputs any of its expressions reads; of a routine, those outside of it.
+    pub(crate) flows: Vec<StateId>,
+    /// The variables that any of its expressions reads; of a routine, with what it contains.
+    pub(crate) variables: Vec<String>,
+    /// The variables to which it assigns; of a routine, with what it contains.
+    pub(crate) assigns: Vec<String>,
+    /// Some state, or the task, reads its outputs.
+    pub(crate) is_read: bool,
+    /// The states inside of it whose outputs are read: they are forgotten when it is entered.
+    pub(crate) read_inside: Vec<StateId>,
+}
+
+impl Plan {
+    /// The plan of a checked program.
+    pub(crate) fn of(program: &Program) -> Plan {
+        let mut names = Names::default();
+        let transitions = outcomes::Transitions::of(program);
+        let operated = resources::operated_anywhere(program);
+        let read = flows::read_anywhere(program);
+        let of = |state| StatePlan::of(&Subject::of(program, state), &transitions, &operated, &read, &mut names);
+        let states = program.states.iter().map(of).collect();
+        let mut plan = Plan { states, width: names.numbers.len() + 1, names };
+        for id in &read {
+            for parent in std::iter::successors(program.state(*id).parent, |id| program.state(*id).parent) {
+                plan.states[index(parent)].read_inside.push(*id);
+            }
+        }
+        plan
+    }
+
+    /// The plan of one state.
+    pub(crate) fn state(&self, id: StateId) -> &StatePlan {
+        &self.states[index(id)]
+    }
+
+    /// The number of a predicate; `None` if the program never writes it by name.
+    pub(crate) fn predicate(&self, name: &str) -> Option<Predicate> {
+        self.names.numbers.get(name).copied()
+    }
+
+    /// All predicates and kinds.
+    pub(crate) fn predicates(&self) -> impl Iterator<Item = Predicate> {
+        0..self.width
+    }
+
+    /// How many states there are.
+    pub(crate) fn len(&self) -> usize {
+        self.states.len()
+    }
+}
+
+impl StatePlan {
+    fn of(
+        subject: &Subject<'_>,
+        transitions: &outcomes::Transitions,
+        operated: &BTreeSet<&str>,
+        read: &BTreeSet<StateId>,
+        names: &mut Names,
+    ) -> StatePlan {
+        let (program, state) = (subject.program, subject.state);
+        let nature = nature::of(subject);
+        let may_write = footprint::may_write(subject);
+        let ends = outcomes::of(subject, transitions, nature, names);
+        let mut writes = footprint::writes(subject, &ends, may_write.as_deref(), names);
+        let resources = resources::of(subject, operated, names);
+        writes.extend(&resources.operated);
+        let exits = if subject.is_node { 0 } else { outcomes::exits(state, &ends, &resources.operations) };
+        let around = state.parent.map(|parent| &program.state(parent).kind);
+        let exceptions = state.annotations.exceptions.unwrap_or(program.exceptions);
+        StatePlan {
+            nature,
+            is_node: subject.is_node,
+            is_routine: subject.is_routine(),
+            is_region: matches!(around, Some(StateKind::Concurrency { .. })),
+            imprecise: nature == NodeNature::Irreversible && exceptions == Exceptions::Imprecise,
+            action: match &state.kind {
+                StateKind::Action { provider, action, .. } => Some((Arc::from(&**provider), Arc::from(&**action))),
+                _ => None,
+            },
+            outcomes: ends.names,
+            targets: ends.targets,
+            arms: ends.arms,
+            effects: ends.effects,
+            effect_predicates: ends.predicates,
+            exits,
+            repeats: transitions.repeats(state.id),
+            needs_world: resources.requirements.iter().any(|r| r.kind == WORLD_MODEL),
+            kinds: resources.kinds,
+            operated: resources.operated,
+            reads: footprint::reads(subject, &resources.requirements),
+            senses: footprint::senses(subject),
+            effect_lookups: footprint::effect_lookups(state),
+            may_write,
+            writes: writes.into_iter().collect(),
+            requirements: resources.requirements,
+            operations: resources.operations,
+            start_flows: flows::start_flows(subject),
+            flows: flows::flows(subject),
+            variables: flows::variables(subject),
+            assigns: flows::assigns(subject).into_iter().collect(),
+            is_read: read.contains(&state.id),
+            read_inside: Vec::new(),
+        }
+    }
+
+    /// The number of an outcome by its name.
+    pub(crate) fn outcome(&self, name: &str) -> Option<Outcome> {
+        self.outcomes.iter().position(|outcome| &**outcome == name)
+    }
+}
+
+/// The state that a plan is made of, with its place in the tree.
+struct Subject<'a> {
+    program: &'a Program,
+    state: &'a State,
+    is_node: bool,
+    /// The state and all that it contains, in the order of the program.
+    contained: Vec<&'a State>,
+    /// The states around it, innermost first.
+    around: Vec<&'a State>,
+}
+
+impl<'a> Subject<'a> {
+    fn of(program: &'a Program, state: &'a State) -> Subject<'a> {
+        let mut contained = vec![state];
+        let mut next = 0;
+        while next < contained.len() {
+            contained.extend(contained[next].children().map(|child| program.state(child)));
+            next += 1;
+        }
+        contained.sort_by_key(|state| state.id);
+        let around = std::iter::successors(state.parent, |id| program.state(*id).parent);
+        let is_node = is_action(state) || state.is_routine();
+        Subject { program, state, is_node, contained, around: around.map(|id| program.state(id)).collect() }
+    }
+
+    fn is_routine(&self) -> bool {
+        self.is_node && !is_action(self.state)
+    }
+
+    fn contains_others(&self) -> bool {
+        self.contained.len() > 1
+    }
+
+    /// The states that are executed when it is: of a node all that it contains, of any other state itself alone.
+    fn executed(&self) -> &[&'a State] {
+        if self.is_node { &self.contained } else { std::slice::from_ref(&self.state) }
+    }
+}
+
+/// The numbers of predicates and kinds, given as they are met. 0 is [`EVERYTHING`].
+#[derive(Debug, Default)]
+struct Names {
+    numbers: BTreeMap<String, Predicate>,
+}
+
+impl Names {
+    fn of_predicate(&mut self, name: &str) -> Predicate {
+        if let Some(known) = self.numbers.get(name) {
+            return *known;
+        }
+        let next = self.numbers.len() + 1;
+        self.numbers.insert(name.to_owned(), next);
+        next
+    }
+
+    /// The task resources of a kind stand among the predicates under a name that no predicate has.
+    fn of_kind(&mut self, kind: &str) -> Predicate {
+        self.of_predicate(&format!("#{kind}"))
+    }
+}
+
+fn index(id: StateId) -> usize {
+    id.0 as usize
+}
+
+fn is_action(state: &State) -> bool {
+    matches!(state.kind, StateKind::Action { .. })
+}

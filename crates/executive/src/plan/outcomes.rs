@@ -1,0 +1,183 @@
+//! How a state may end: where each outcome leads, which of them are computed ahead, and what each of them changes.
+
+use super::nature::NodeNature;
+use super::{Names, Predicate, Subject, index};
+use crate::effects;
+use ratn_model::expression::EffectExpr;
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, PREEMPTED, Program, ResourceExpr, SUCCESS, State, StateKind, Target};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// Writers that may write every fact stand under this number.
+pub(crate) const EVERYTHING: Predicate = 0;
+
+/// An outcome of a state: its place in [`super::StatePlan::outcomes`].
+pub(crate) type Outcome = usize;
+
+/// A set of outcomes by bits; a state has at most [`MAX_OUTCOMES`].
+pub(crate) type Outcomes = u64;
+
+/// More outcomes than this are exceptional, whatever they lead to.
+pub(crate) const MAX_OUTCOMES: usize = 64;
+
+/// Outcomes that lead to the same place and agree on whether there are outputs.
+#[derive(Debug, Clone)]
+pub(crate) struct ArmPlan {
+    /// All of them.
+    pub(crate) outcomes: Outcomes,
+    /// One of them, for looking up target and name.
+    pub(crate) outcome: Outcome,
+    /// All of them change the same; else the changes are known only when the node has ended.
+    pub(crate) same_effects: bool,
+}
+
+/// What an outcome changes.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Effects {
+    /// Any fact; known when the node has ended.
+    Unknown,
+    /// These.
+    Declared(Vec<EffectExpr>),
+}
+
+/// Whether a state that ends so has outputs and assigns.
+pub(crate) fn gives_outputs(outcome: &str) -> bool {
+    !matches!(outcome, ABORTED | PREEMPTED)
+}
+
+/// The outcomes of all states, and where those lead that are not connected.
+pub(super) struct Transitions {
+    outcomes: Vec<Vec<String>>,
+    next: Vec<Option<StateId>>,
+    repeats: Vec<bool>,
+}
+
+impl Transitions {
+    pub(super) fn of(program: &Program) -> Transitions {
+        let mut next = vec![None; program.states.len()];
+        let mut repeats = vec![false; program.states.len()];
+        for state in &program.states {
+            for list in state.lists() {
+                for (place, child) in list.iter().enumerate() {
+                    next[index(*child)] = list.get(place + 1).copied();
+                }
+                repeats[index(state.id)] |= leads_back(program, list);
+            }
+        }
+        Transitions { outcomes: program.all_outcomes(), next, repeats }
+    }
+
+    /// Whether states of the lists of a state may be visited more than once in one activation.
+    pub(super) fn repeats(&self, id: StateId) -> bool {
+        self.repeats[index(id)]
+    }
+
+    fn target(&self, state: &State, outcome: &str) -> Target {
+        match (state.transitions.get(outcome), outcome, self.next[index(state.id)]) {
+            (Some(target), _, _) => target.clone(),
+            (None, SUCCESS, Some(next)) => Target::State(next),
+            (None, outcome, _) => Target::Outcome(outcome.to_owned()),
+        }
+    }
+}
+
+/// Whether a transition leads from a state of a list to itself or to a state before it.
+fn leads_back(program: &Program, list: &[StateId]) -> bool {
+    let position: BTreeMap<StateId, usize> = list.iter().enumerate().map(|(place, id)| (*id, place)).collect();
+    list.iter().any(|id| {
+        program.state(*id).transitions.values().any(|target| match target {
+            Target::State(to) => position.get(to) <= position.get(id),
+            Target::Outcome(_) => false,
+        })
+    })
+}
+
+/// How one state may end; everything by outcome.
+pub(super) struct Ends {
+    pub(super) names: Vec<Arc<str>>,
+    pub(super) targets: Vec<Target>,
+    pub(super) arms: Vec<ArmPlan>,
+    pub(super) effects: Vec<Effects>,
+    pub(super) predicates: Vec<Vec<Predicate>>,
+}
+
+pub(super) fn of(subject: &Subject<'_>, transitions: &Transitions, nature: NodeNature, names: &mut Names) -> Ends {
+    let state = subject.state;
+    let outcomes = &transitions.outcomes[index(state.id)];
+    let targets: Vec<Target> = outcomes.iter().map(|outcome| transitions.target(state, outcome)).collect();
+    let effects: Vec<Effects> = outcomes.iter().map(|outcome| changes(subject, nature, outcome)).collect();
+    Ends {
+        arms: arms(state, outcomes, &targets, &effects),
+        predicates: effects.iter().map(|effects| predicates(effects, names).into_iter().collect()).collect(),
+        names: outcomes.iter().map(|outcome| Arc::from(outcome.as_str())).collect(),
+        targets,
+        effects,
+    }
+}
+
+/// What an outcome changes. A routine has changed what the nodes inside of it have changed.
+fn changes(subject: &Subject<'_>, nature: NodeNature, outcome: &str) -> Effects {
+    let state = subject.state;
+    let declared = if subject.is_routine() {
+        None
+    } else if subject.is_node {
+        effects::declared(state, nature, outcome)
+    } else {
+        Some(state.annotations.effects.get(outcome).map_or(&[][..], Vec::as_slice))
+    };
+    declared.map_or(Effects::Unknown, |declared| Effects::Declared(declared.to_vec()))
+}
+
+/// The continuations that are computed ahead: those of outcomes that are not exceptional.
+fn arms(state: &State, outcomes: &[String], targets: &[Target], effects: &[Effects]) -> Vec<ArmPlan> {
+    let exceptional = |number: usize| {
+        let outcome = outcomes[number].as_str();
+        let marked = state.annotations.exceptional.iter().any(|marked| marked == outcome);
+        let unhandled = !state.transitions.contains_key(outcome) || targets[number] == targets[0];
+        marked || (!gives_outputs(outcome) && unhandled) || number >= MAX_OUTCOMES
+    };
+    let mut arms: Vec<ArmPlan> = Vec::new();
+    for number in (0..outcomes.len()).filter(|number| !exceptional(*number)) {
+        let same = |arm: &&mut ArmPlan| {
+            targets[arm.outcome] == targets[number]
+                && gives_outputs(&outcomes[arm.outcome]) == gives_outputs(&outcomes[number])
+        };
+        match arms.iter_mut().find(same) {
+            Some(arm) => {
+                arm.outcomes |= 1 << number;
+                arm.same_effects &= effects[arm.outcome] == effects[number];
+            }
+            None => arms.push(ArmPlan { outcomes: 1 << number, outcome: number, same_effects: true }),
+        }
+    }
+    arms
+}
+
+/// The predicates that effects write.
+fn predicates(effects: &Effects, names: &mut Names) -> BTreeSet<Predicate> {
+    match effects {
+        Effects::Unknown => BTreeSet::from([EVERYTHING]),
+        Effects::Declared(effects) => {
+            effects.iter().flat_map(EffectExpr::written).map(|fact| names.of_predicate(&fact.predicate)).collect()
+        }
+    }
+}
+
+/// The outcomes with which the exit of a composite state has something to do.
+pub(super) fn exits(state: &State, ends: &Ends, operations: &[ResourceExpr]) -> Outcomes {
+    let has_outputs = match &state.kind {
+        StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } => !outputs.is_empty(),
+        _ => false,
+    };
+    let gives = has_outputs || !state.assign.is_empty();
+    let mut exits = 0;
+    for (number, outcome) in ends.names.iter().enumerate().take(MAX_OUTCOMES) {
+        let changes = ends.effects[number] != Effects::Declared(Vec::new());
+        let operates = number == 0 && !operations.is_empty();
+        if changes || operates || (gives_outputs(outcome) && gives) {
+            exits |= 1 << number;
+        }
+    }
+    exits
+}

@@ -1,0 +1,82 @@
+//! What a state asks of the resource manager when it starts, and what it does to resources when it ends.
+
+use super::{Names, Predicate, Subject, is_action};
+use ratn_model::program::{Program, ResourceExpr, State};
+use ratn_model::resource::{Quantity, ResourceClass, ResourceOperation};
+use std::collections::BTreeSet;
+
+/// The resources of one state; its fields are those of [`super::StatePlan`].
+pub(super) struct Resources {
+    pub(super) requirements: Vec<ResourceExpr>,
+    pub(super) operations: Vec<ResourceExpr>,
+    pub(super) kinds: Vec<Predicate>,
+    pub(super) operated: Vec<Predicate>,
+}
+
+/// The resources of one state, given the kinds that any state of the program operates on.
+pub(super) fn of(subject: &Subject<'_>, operated_anywhere: &BTreeSet<&str>, names: &mut Names) -> Resources {
+    let requirements = requirements(subject);
+    let operations = operations(subject.state);
+    let operated: BTreeSet<&str> = if subject.is_node {
+        subject.contained.iter().flat_map(|state| operated(state)).collect()
+    } else {
+        operations.iter().map(|r| r.kind.as_str()).collect()
+    };
+    let of_the_task = |r: &&ResourceExpr| {
+        operated_anywhere.contains(r.kind.as_str()) && r.class.is_none_or(|class| class == ResourceClass::Task)
+    };
+    let used = requirements.iter().filter(of_the_task).map(|r| r.kind.as_str());
+    let numbers: Vec<Predicate> = operated.iter().map(|kind| names.of_kind(kind)).collect();
+    let kinds: BTreeSet<Predicate> = used.map(|kind| names.of_kind(kind)).chain(numbers.iter().copied()).collect();
+    Resources { kinds: kinds.into_iter().collect(), operated: numbers, requirements, operations }
+}
+
+/// The kinds of resources that a state, without what it contains, changes rather than holds.
+pub(super) fn operated(state: &State) -> impl Iterator<Item = &str> {
+    let changes = |r: &&ResourceExpr| !matches!(r.operation, ResourceOperation::Block | ResourceOperation::Exists);
+    state.annotations.resources.iter().filter(changes).map(|r| r.kind.as_str())
+}
+
+/// The kinds of resources that any state changes.
+pub(super) fn operated_anywhere(program: &Program) -> BTreeSet<&str> {
+    program.states.iter().flat_map(operated).collect()
+}
+
+/// Blocks of one state add up, those of states inside of each other merge by maximum. What an action consumes and what has to
+/// exist add up as they are, but only from the state itself and what it contains.
+fn requirements(subject: &Subject<'_>) -> Vec<ResourceExpr> {
+    let within = subject.contained.iter().map(|state| (state, true));
+    let around = subject.around.iter().map(|state| (state, false));
+    let mut merged: Vec<ResourceExpr> = Vec::new();
+    for (state, is_within) in within.chain(around) {
+        let mut blocked: Vec<ResourceExpr> = Vec::new();
+        for wanted in &state.annotations.resources {
+            match wanted.operation {
+                ResourceOperation::Block => merge(&mut blocked, wanted, |have, more| have + more),
+                ResourceOperation::Exists if is_within => merged.push(wanted.clone()),
+                ResourceOperation::Consume if is_action(state) => merged.push(wanted.clone()),
+                _ => {}
+            }
+        }
+        blocked.iter().for_each(|wanted| merge(&mut merged, wanted, Quantity::max));
+    }
+    merged
+}
+
+fn merge(into: &mut Vec<ResourceExpr>, wanted: &ResourceExpr, counts: impl FnOnce(Quantity, Quantity) -> Quantity) {
+    let same = |have: &&mut ResourceExpr| have.operation == wanted.operation && have.selects_the_same(wanted);
+    match into.iter_mut().find(same) {
+        Some(have) => have.count = counts(have.count, wanted.count),
+        None => into.push(wanted.clone()),
+    }
+}
+
+/// What is done at the end. A composite state consumes at its exit; an action has consumed when it acquired.
+fn operations(state: &State) -> Vec<ResourceExpr> {
+    let at_end = |r: &&ResourceExpr| match r.operation {
+        ResourceOperation::Create | ResourceOperation::Delete => true,
+        ResourceOperation::Consume => !is_action(state),
+        ResourceOperation::Block | ResourceOperation::Exists => false,
+    };
+    state.annotations.resources.iter().filter(at_end).cloned().collect()
+}
