@@ -37,17 +37,26 @@ actions.move = { optional = { a = "any" } }
 #[derive(Default)]
 struct Cup {
     motions: Vec<String>,
+    /// Every motion ends `aborted`.
+    aborts: bool,
+    /// The first attempt of everything else crashes.
+    crashes: bool,
 }
 
 impl Oracle for Cup {
-    fn perform(&mut self, path: &str, _: u32, goal: &Goal, world: &World) -> Performance {
+    fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, world: &World) -> Performance {
         let x = world.get(&fact("at", "cup")).cloned().unwrap_or_else(|| text("nowhere"));
         if &*goal.provider == "arm" {
             let input = goal.inputs.get("a").map(|a| format!("({a})")).unwrap_or_default();
             self.motions.push(format!("{path}{input}"));
         }
         let outputs = BTreeMap::from([("x".to_owned(), x)]);
-        let answer = Answer::Finished { outcome: "success".to_owned(), outputs, measured: Vec::new() };
+        let is_motion = &*goal.provider == "arm";
+        let outcome = if is_motion && self.aborts { "aborted" } else { "success" }.to_owned();
+        let answer = match attempt {
+            1 if self.crashes && !is_motion => Answer::Crashed,
+            _ => Answer::Finished { outcome, outputs, measured: Vec::new() },
+        };
         Performance { duration_s: goal.expected_s.unwrap_or(1.0), answer }
     }
 }
@@ -62,6 +71,10 @@ fn text(text: &str) -> Value {
 
 /// Runs a task while these facts change at five seconds; its motions in order, and the run.
 fn disturbed(states: &str, mode: Mode, facts: &[(FactKey, Option<Value>)]) -> (Vec<String>, Run) {
+    disturbed_with(Cup::default(), states, mode, facts)
+}
+
+fn disturbed_with(mut cup: Cup, states: &str, mode: Mode, facts: &[(FactKey, Option<Value>)]) -> (Vec<String>, Run) {
     let long =
         states.replace("MOVE", "action: arm/move, pia: true, resources: [{ block: Arm }], duration: 10").replace(
             "THINK",
@@ -84,7 +97,6 @@ fn disturbed(states: &str, mode: Mode, facts: &[(FactKey, Option<Value>)]) -> (V
     };
     let event = Event::WorldChanged { revision: Revision(99), facts: facts.to_vec() };
     let circumstances = Circumstances { events: vec![(Trigger::At(5.0), event)], ..Circumstances::default() };
-    let mut cup = Cup::default();
     let run = run_under(setup, &mut cup, circumstances).unwrap();
     (cup.motions, run)
 }
@@ -228,4 +240,70 @@ fn what_is_behind_the_join_of_regions_is_computed_again() {
   - after: { THINK, reads: ['at(cup)', 'gone()'] }
   - grasp: { MOVE, in: { a: after.x }, reads: [], effects: [] }";
     check(states, &cup_at("shelf"), &["both/left/go", "grasp(shelf)"]);
+}
+
+/// The cup is taken away at five seconds.
+fn no_cup() -> [(FactKey, Option<Value>); 1] {
+    [(fact("at", "cup"), Some(text("floor")))]
+}
+
+#[test]
+fn a_motion_is_not_tried_again_when_its_precondition_has_gone() {
+    let grasp = "
+states:
+  - grasp: { MOVE, requires: ['at(cup) = table'], reads: [], effects: [], retry: 2 }
+";
+    // The change comes during the pause.
+    let pause = "
+states:
+  - grasp: { action: arm/move, pia: true, resources: [{ block: Arm }], duration: 4, requires: ['at(cup) = table'],
+      reads: [], effects: [], retry: { count: 2, backoff: 3 } }
+";
+    for (task, end_s) in [(grasp, 10.0), (pause, 7.0)] {
+        for mode in [Mode::Hsm, Mode::Cdtn] {
+            let cup = Cup { aborts: true, ..Cup::default() };
+            let (motions, run) = disturbed_with(cup, task, mode, &no_cup());
+            assert_eq!(motions, ["grasp"], "{mode:?}");
+            assert_eq!((run.outcome.as_str(), run.end_s), ("aborted", end_s), "{mode:?}");
+            assert!(run.reason.contains("precondition"), "{mode:?}: {}", run.reason);
+        }
+    }
+}
+
+#[test]
+fn a_motion_is_tried_again_while_its_precondition_holds() {
+    let grasp = "
+states:
+  - grasp: { MOVE, requires: ['at(cup) = table'], reads: [], effects: [], retry: 2 }
+";
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let cup = Cup { aborts: true, ..Cup::default() };
+        let (motions, run) = disturbed_with(cup, grasp, mode, &[(fact("at", "plate"), Some(text("floor")))]);
+        assert_eq!((motions.len(), run.end_s), (3, 30.0), "{mode:?}");
+    }
+}
+
+#[test]
+fn an_attempt_that_crashed_asks_for_nothing_again_when_its_precondition_has_gone() {
+    let task = "
+states:
+  - plan: { action: brain/think, computes: true, resources: [{ block: Brain }, world_model], duration: 6, requires: ['at(cup) = table'], reads: [] }
+";
+    let in_routine = "
+states:
+  - both:
+      routine: true
+      states:
+        - move: { action: arm/move, pia: true, resources: [{ block: Arm }], duration: 1, reads: [], effects: [] }
+        - plan: { action: brain/think, computes: true, resources: [{ block: Brain }, world_model], duration: 6, requires: ['at(cup) = table'], reads: [] }
+";
+    for task in [task, in_routine] {
+        for mode in [Mode::Hsm, Mode::Cdtn] {
+            let (_, run) = disturbed_with(Cup { crashes: true, ..Cup::default() }, task, mode, &no_cup());
+            assert_eq!(run.outcome, "aborted", "{mode:?}: {}", run.reason);
+            assert!(run.reason.contains("precondition"), "{mode:?}: {}", run.reason);
+            let acquires = run.log.iter().filter(|l| matches!(l.entry, LogEntry::Command(Command::Acquire { .. })));
+            assert_eq!(acquires.count(), 1, "{mode:?}");
+        }
+    }
 }

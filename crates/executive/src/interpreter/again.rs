@@ -82,6 +82,7 @@ impl Interpreter {
             return self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
         }
         match self.threads.get(&thread).and_then(|thread| thread.routine) {
+            Some(_) if !self.may_try(context, thread) => {}
             // In a race who waits loses: the others keep the lease, and what is left of it has to do.
             Some(routine) if self.uses_lease(routine) && is_in_race(context.program, id) => {
                 self.project_or_run(context, thread);

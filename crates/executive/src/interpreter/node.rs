@@ -43,19 +43,14 @@ impl Interpreter {
         if let Some(thread) = self.threads.get_mut(&thread) {
             thread.current = Some(current);
         }
-        let state = context.program.state(id);
-        if state.is_routine() {
-            return self.try_now(context, thread);
-        }
-        match self.with_scope(context, thread, None, |scope| binding::unmet(state, scope)) {
-            Ok(None) => self.try_now(context, thread),
-            Ok(Some(reason)) => self.end_node(context, thread, reason),
-            Err(error) => self.end_node(context, thread, error.reason()),
-        }
+        self.try_now(context, thread);
     }
 
-    /// Begins a try, unless the operator holds it.
+    /// Begins a try, unless a precondition does not hold or the operator lets nothing begin.
     pub(super) fn try_now(&mut self, context: &mut Context<'_>, thread: u64) {
+        if !self.may_try(context, thread) {
+            return;
+        }
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let (id, instance) = (current.state, current.instance);
         if self.is_held(context, thread) {
@@ -76,6 +71,20 @@ impl Interpreter {
             }
             Err(error) => self.end_node(context, thread, error.reason()),
         }
+    }
+
+    /// Whether the preconditions hold in the world as it is; else the node ends `aborted`. They are looked at before every try: the
+    /// world may have been changed since the last one.
+    pub(super) fn may_try(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
+        let Some(current) = self.current(thread) else { return false };
+        let state = context.program.state(current.state);
+        let reason = match self.with_scope(context, thread, None, |scope| binding::unmet(state, scope)) {
+            Ok(None) => return true,
+            Ok(Some(reason)) => reason,
+            Err(error) => error.reason(),
+        };
+        self.end_node(context, thread, reason);
+        false
     }
 
     /// The operator lets something begin.
