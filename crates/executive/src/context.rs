@@ -78,7 +78,12 @@ impl From<Vec<Change>> for Made {
     }
 }
 
-/// Why a run ends that goes on without an action: `path` is where it is.
+/// More visits than this without an action between them, and the task goes in circles. Each thread of control counts its own: one per
+/// state that is entered and one per iteration that begins. The count is 0 again when the goal of an action is started, and where a
+/// routine begins and ends.
+pub(crate) const MAX_IDLE_VISITS: u32 = 100_000;
+
+/// Why a run ends that goes on without an action: `path` is that of the innermost list it is in.
 pub(crate) fn in_circles(path: &str) -> String {
     let place = if path.is_empty() { String::new() } else { format!("{path}: ") };
     format!("{place}the task goes in circles without doing anything; does what its loop looks at ever change?")

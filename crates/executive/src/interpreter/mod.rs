@@ -114,6 +114,8 @@ struct Thread {
     current: Option<Current>,
     /// The routine that it is in.
     routine: Option<u64>,
+    /// Its visits since it last started something; see [`crate::context::MAX_IDLE_VISITS`].
+    idle_visits: u32,
 }
 
 /// How far an action is.
@@ -156,6 +158,8 @@ pub(crate) struct Interpreter {
     last_routine: u64,
     target: Target,
     hold: Hold,
+    /// Why everything ends: a thread goes in circles.
+    in_circles: Option<String>,
 }
 
 /// The thread of the state itself, and the routine of the window that it executes.
@@ -185,8 +189,14 @@ impl Interpreter {
         target: Target,
     ) -> Interpreter {
         let todo = Todo::Done { outcome: String::new(), reason: String::new() };
-        let main =
-            Thread { frames: Vec::new(), variables, todo, current: None, routine: routine.as_ref().map(|_| MAIN) };
+        let main = Thread {
+            frames: Vec::new(),
+            variables,
+            todo,
+            current: None,
+            routine: routine.as_ref().map(|_| MAIN),
+            idle_visits: 0,
+        };
         Interpreter {
             threads: BTreeMap::from([(MAIN, main)]),
             last_thread: MAIN,
@@ -196,6 +206,7 @@ impl Interpreter {
             last_routine: MAIN,
             target,
             hold: Hold::default(),
+            in_circles: None,
         }
     }
 
@@ -328,7 +339,8 @@ impl Interpreter {
             Target::Actual => &*context.root,
             Target::Projection { world, .. } => world,
         };
-        let none = Thread { frames: Vec::new(), variables: Vec::new(), todo: Todo::Busy, current: None, routine: None };
+        let (frames, variables, todo) = (Vec::new(), Vec::new(), Todo::Busy);
+        let none = Thread { frames, variables, todo, current: None, routine: None, idle_visits: 0 };
         let thread = self.threads.get(&thread).unwrap_or(&none);
         let names = Scoped { interpreter: self, thread, program: context.program };
         use_scope(&Bindings { names: &names, outputs, world, unknown: &Footprint::NOTHING })

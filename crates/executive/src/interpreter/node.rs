@@ -197,6 +197,7 @@ impl Interpreter {
             current.phase = Phase::Running;
             current.timeout = timeout;
         }
+        self.has_begun_something(thread);
         context.commands.extend(timeout.map(|at| Command::Wake { at }));
         context.note(Note::Running { instance, attempt });
         context.commands.push(Command::Start { instance, attempt, goal: Box::new(goal) });

@@ -23,7 +23,8 @@ impl Interpreter {
                 iteration: None,
                 variables: variables.len(),
             };
-            let region = Thread { frames: vec![frame], variables: variables.clone(), todo, current: None, routine };
+            let (frames, variables) = (vec![frame], variables.clone());
+            let region = Thread { frames, variables, todo, current: None, routine, idle_visits: 0 };
             self.threads.insert(self.last_thread, region);
         }
         self.set(thread, Todo::Join { state, path, regions: threads });

@@ -54,6 +54,7 @@ impl Interpreter {
         let lease = begun.current.take().and_then(|current| current.lease);
         begun.routine = Some(number);
         self.routines.insert(number, Routine { requirements, lease, visit: Some((thread, id, instance)) });
+        self.has_begun_something(thread);
         self.enter_composite(context, thread, id, path);
     }
 
@@ -66,6 +67,7 @@ impl Interpreter {
             return;
         };
         of.routine = None;
+        of.idle_visits = 0;
         context.note(Note::Finished { instance, outcome: outcome.into() });
         self.give_up(context, number);
         debug_assert!(matches!(self.target, Target::Actual), "a routine on a projection is the window's");

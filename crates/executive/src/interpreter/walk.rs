@@ -2,19 +2,16 @@
 
 use super::{Frame, Interpreter, MAIN, Progress, Todo};
 use crate::binding::{self, child_path};
-use crate::context::{Context, in_circles};
+use crate::context::{Context, MAX_IDLE_VISITS, in_circles};
 use crate::protocol::Note;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Program, SUCCESS, StateKind, Target};
 use ratn_model::value::Value;
 
-/// So many steps without an event between them go in circles: some four for an iteration that does nothing.
-const MAX_STEPS: usize = 400_000;
-
 impl Interpreter {
     /// Lets every thread go on until all wait for events, or the state has ended.
     pub(super) fn advance(&mut self, context: &mut Context<'_>) -> Progress {
-        for _ in 0..MAX_STEPS {
+        loop {
             let ready = self.threads.iter().find(|(id, thread)| match &thread.todo {
                 Todo::Enter(..) | Todo::Ended { .. } | Todo::Iterate => true,
                 Todo::Busy => false,
@@ -32,12 +29,29 @@ impl Interpreter {
                 Todo::Join { state, path, regions } => self.join(context, id, state, path, &regions),
                 Todo::Done { outcome, reason } => return Progress::Ended { outcome, reason },
             }
+            if let Some(reason) = self.in_circles.clone() {
+                self.abort(context);
+                return Progress::Ended { outcome: ABORTED.to_owned(), reason };
+            }
         }
-        let mut frames = self.threads.values().flat_map(|thread| &thread.frames);
-        let innermost = frames.rfind(|frame| frame.iteration.is_some());
-        let reason = in_circles(innermost.map_or("", |frame| &frame.path));
-        self.abort(context);
-        Progress::Ended { outcome: ABORTED.to_owned(), reason }
+    }
+
+    /// A thread enters a state or begins an iteration; false if it has done so too often without starting anything.
+    fn count_visit(&mut self, thread: u64) -> bool {
+        let Some(thread) = self.threads.get_mut(&thread) else { return false };
+        thread.idle_visits += 1;
+        if thread.idle_visits > MAX_IDLE_VISITS {
+            let innermost = thread.frames.last();
+            self.in_circles = Some(in_circles(innermost.map_or("", |frame| &frame.path)));
+        }
+        thread.idle_visits <= MAX_IDLE_VISITS
+    }
+
+    /// A thread has started the goal of an action, or a routine begins.
+    pub(super) fn has_begun_something(&mut self, thread: u64) {
+        if let Some(thread) = self.threads.get_mut(&thread) {
+            thread.idle_visits = 0;
+        }
     }
 
     /// A state has ended, as far as its thread is concerned.
@@ -51,6 +65,9 @@ impl Interpreter {
         let program = context.program;
         let state = program.state(id);
         let path = path.unwrap_or_else(|| self.visit(thread, id, &state.name));
+        if self.is_inside(thread) && !self.count_visit(thread) {
+            return;
+        }
         if let StateKind::Action { .. } = state.kind {
             return self.begin(context, thread, id, &path);
         }
@@ -63,6 +80,11 @@ impl Interpreter {
             return self.begin(context, thread, id, &path);
         }
         self.enter_composite(context, thread, id, path);
+    }
+
+    /// Whether a thread is not just at the beginning of a routine of the window, whose visit the window has counted.
+    fn is_inside(&self, thread: u64) -> bool {
+        self.threads.get(&thread).is_some_and(|thread| !thread.frames.is_empty() || thread.routine.is_none())
     }
 
     /// A composite state is entered; what it requires holds.
@@ -233,6 +255,9 @@ impl Interpreter {
     }
 
     fn begin_iteration(&mut self, program: &Program, thread: u64) {
+        if !self.count_visit(thread) {
+            return;
+        }
         self.bind_iteration(program, thread);
         let Some(frame) = self.threads.get(&thread).and_then(|thread| thread.frames.last()) else { return };
         let body = match &program.state(frame.owner).kind {
