@@ -121,7 +121,7 @@ impl Interpreter {
         let Some(thread) = self.threads.get_mut(&thread) else { return };
         for (name, value) in assigned {
             if let Some(variable) = thread.variables.iter_mut().rev().find(|(n, _)| *n == name) {
-                variable.1 = value;
+                variable.1 = Arc::new(value);
             }
         }
     }

@@ -109,7 +109,8 @@ enum Todo {
 /// A thread of control: the state's, or a region's.
 struct Thread {
     frames: Vec<Frame>,
-    variables: Vec<(String, Value)>,
+    /// The innermost last. Regions share the values: a long list is not copied at every fork.
+    variables: Vec<(String, Arc<Value>)>,
     todo: Todo,
     current: Option<Current>,
     /// The routine that it is in.
@@ -189,6 +190,7 @@ impl Interpreter {
         target: Target,
     ) -> Interpreter {
         let todo = Todo::Done { outcome: String::new(), reason: String::new() };
+        let variables = variables.into_iter().map(|(name, value)| (name, Arc::new(value))).collect();
         let main = Thread {
             frames: Vec::new(),
             variables,
@@ -236,7 +238,7 @@ impl Interpreter {
     /// The value of a variable outside of the state it executes.
     pub(crate) fn variable(&self, name: &str) -> Option<&Value> {
         let main = self.threads.get(&MAIN)?;
-        main.variables.iter().rev().find(|(n, _)| n == name).map(|(_, value)| value)
+        main.variables.iter().rev().find(|(n, _)| n == name).map(|(_, value)| &**value)
     }
 
     /// The changes it has made to its projection; none in the actual world, where they are real already.
@@ -356,7 +358,7 @@ struct Scoped<'a> {
 impl Names for Scoped<'_> {
     fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
         let known = self.thread.variables.iter().rev().find(|(n, _)| n == name);
-        known.map(|(_, value)| Cow::Borrowed(value))
+        known.map(|(_, value)| Cow::Borrowed(&**value))
     }
 
     fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {

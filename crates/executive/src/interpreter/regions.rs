@@ -4,6 +4,7 @@ use super::{Interpreter, Thread, Todo};
 use crate::context::Context;
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind};
+use std::sync::Arc;
 
 impl Interpreter {
     /// Every region begins, each with its own copy of the variables.
@@ -105,7 +106,7 @@ impl Interpreter {
             let Some(theirs) = self.threads.get(region).map(|region| region.variables.clone()) else { continue };
             let Some(thread) = self.threads.get_mut(&thread) else { return };
             for ((own, old), new) in thread.variables.iter_mut().zip(&before).zip(theirs) {
-                if new.1 != old.1 {
+                if !Arc::ptr_eq(&new.1, &old.1) && new.1 != old.1 {
                     own.1 = new.1;
                 }
             }

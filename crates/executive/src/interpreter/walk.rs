@@ -7,6 +7,7 @@ use crate::protocol::Note;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Program, SUCCESS, StateKind, Target};
 use ratn_model::value::Value;
+use std::sync::Arc;
 
 impl Interpreter {
     /// Lets every thread go on until all wait for events, or the state has ended.
@@ -96,7 +97,7 @@ impl Interpreter {
         let mut bound = Vec::new();
         for (name, value) in &state.variables {
             match self.with_scope(context, thread, None, |scope| value.evaluate(scope)) {
-                Ok(value) => bound.push((name.clone(), value)),
+                Ok(value) => bound.push((name.clone(), Arc::new(value))),
                 Err(error) => {
                     let reason = format!("{path}: variable `{name}`: {error}");
                     return self.ended(thread, id, ABORTED, reason);
@@ -272,11 +273,11 @@ impl Interpreter {
         let Some(frame) = thread.frames.last() else { return };
         let Some((number, elements)) = &frame.iteration else { return };
         thread.variables.truncate(frame.variables);
-        let count = Value::Int(i64::try_from(*number).unwrap_or(i64::MAX));
+        let count = Arc::new(Value::Int(i64::try_from(*number).unwrap_or(i64::MAX)));
         match &program.state(frame.owner).kind {
             StateKind::ForEach { variable, index, .. } => {
                 let element = elements.as_ref().and_then(|all| all.get(*number)).cloned();
-                thread.variables.extend(element.map(|element| (variable.clone(), element)));
+                thread.variables.extend(element.map(|element| (variable.clone(), Arc::new(element))));
                 thread.variables.extend(index.clone().map(|index| (index, count)));
             }
             StateKind::While { index, .. } => thread.variables.extend(index.clone().map(|index| (index, count))),
