@@ -204,15 +204,15 @@ states:
     ))
 }
 
-/// A PIA that writes `at(0)`, and readers of all facts about `at`.
-pub fn watched(readers: usize) -> Program {
+/// A PIA that writes one fact, `at(written)`, and readers of all facts about `at`.
+pub fn watched(written: i64, readers: usize) -> Program {
     let reader = |number| format!("  - r{number}: {{ THINK_ON_WORLD, reads: [\"at(?)\"] }}\n");
     let readers: String = (0..readers).map(reader).collect();
     load(&format!(
         "task: bench
 horizon: 1000
 states:
-  - move: {{ action: arm/move, pia: true, reads: [], effects: [\"at(0) = 1\"], resources: [{{ block: Arm }}] }}
+  - move: {{ action: arm/move, pia: true, reads: [], effects: [\"at({written}) = 1\"], resources: [{{ block: Arm }}] }}
 {readers}"
     ))
 }
