@@ -93,6 +93,40 @@ impl Executive {
         window.waits(&self.program)
     }
 
+    /// What is wrong between two events, if anything: a broken promise of the executive. For tests; costs the whole window.
+    ///
+    /// # Errors
+    /// The promise.
+    pub fn check_invariants(&self) -> Result<(), String> {
+        match &self.state {
+            State::Cdtn(window) => window.check_invariants(),
+            State::Fresh | State::Hsm(_) | State::Ended => Ok(()),
+        }
+    }
+
+    /// Whether anything could go on that was not woken: everything that waits is looked at again. For tests; costs the whole window.
+    ///
+    /// # Errors
+    /// What could have gone on.
+    pub fn check_quiescence(&mut self, now: Timestamp) -> Result<(), String> {
+        let program = self.program.clone();
+        let plan = self.plan.clone();
+        let mut commands = Vec::new();
+        let mut context = Context {
+            program: &program,
+            plan: &plan,
+            root: &mut self.root,
+            now,
+            last_instance: &mut self.last_instance,
+            seed: self.seed,
+            commands: &mut commands,
+        };
+        match &mut self.state {
+            State::Cdtn(window) => window.check_quiescence(&mut context),
+            State::Fresh | State::Hsm(_) | State::Ended => Ok(()),
+        }
+    }
+
     /// What is still to be done, as far as it is certain, for a look ahead ([`crate::lookahead`]); nothing in HSM mode.
     pub fn outlook(&mut self, now: Timestamp) -> Problem {
         let program = self.program.clone();

@@ -230,6 +230,11 @@ impl Interpreter {
         self.threads.values().flat_map(|thread| &thread.current).any(|current| current.instance == instance)
     }
 
+    /// Whether it has ended because a thread went on and on without an action.
+    pub(crate) fn is_in_circles(&self) -> bool {
+        self.in_circles.is_some()
+    }
+
     /// What the states it executed have written.
     pub(crate) fn outputs(&self) -> &BTreeMap<StateId, Outputs> {
         &self.outputs

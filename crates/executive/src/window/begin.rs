@@ -1,37 +1,54 @@
 //! How a node begins: its resources, its projection, its goal.
 
 use super::Window;
-use super::environment::assigned;
-use super::instance::{Ended, Seen, Status, Wait};
-use super::ready::{Readiness, not_bound, senses_of};
-use crate::binding::{self, Outputs};
+use super::graph::instance::{Ended, Instance, Status};
+use super::growth::environment::assigned;
+use super::memory::{Purpose, Seen, View};
+use super::ready::{self, Readiness, not_bound};
+use super::results::Known;
+use super::waits::{Timer, Wait};
+use crate::binding::{self, Outputs, Seed};
 use crate::context::Context;
 use crate::interpreter::{Interpreter, Routine, Target};
 use crate::plan::NodeNature;
-use crate::protocol::{Command, Goal, Note};
-use ratn_model::expression::Scope;
+use crate::protocol::{Command, Event, Goal, Note};
+use ratn_model::expression::{FactExpr, Scope};
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::InstanceId;
 use ratn_model::measurement::Evidence;
 use ratn_model::program::{ABORTED, StateKind};
-use ratn_model::resource::Requirement;
+use ratn_model::resource::{Requirement, ResourceOperation};
 use std::sync::Arc;
 
 impl Window {
     /// Looks at a node that has not begun.
     pub(super) fn begin(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let (readiness, seen, used) = self.readiness(context, id);
-        match readiness {
-            Readiness::Waits(wait) => self.wait(id, wait),
-            Readiness::Failed(reason) => {
-                // What made it fail may come out otherwise.
-                self.depend(id, &used);
-                if let Some(instance) = self.instances.get_mut(id) {
-                    instance.seen = Some(Box::new(seen));
-                }
+        self.follow_root(context);
+        let looked = self.look(context, id, None, |instance, view| {
+            let mut seen = Seen::default();
+            let readiness = self.readiness(context, instance, view, &mut seen);
+            // What made it fail may come out otherwise, too; a PIA's inputs are final.
+            let is_made = matches!(readiness, Readiness::Ready(..) | Readiness::Failed(_));
+            if is_made && !instance.is_pia() {
+                view.use_outputs(view.sight.producers_of(view.instance));
+                view.register(Purpose::Result);
+            }
+            (readiness, seen)
+        });
+        match looked {
+            None => {}
+            Some((Readiness::Waits(wait), _)) => self.wait(id, wait),
+            Some((Readiness::Failed(reason), seen)) => {
+                self.graph.set_seen(id, Some(seen));
                 self.fail(context, id, reason);
             }
-            Readiness::Ready(requirements, inputs) => self.acquire(context, id, requirements, inputs, seen, &used),
+            Some((Readiness::Ready(requirements, inputs), seen)) => {
+                let is_pia = self.graph.get(id).is_some_and(Instance::is_pia);
+                if is_pia && self.goes_in_circles(context, id) {
+                    return;
+                }
+                self.acquire(context, id, requirements, inputs, seen);
+            }
         }
     }
 
@@ -44,14 +61,12 @@ impl Window {
 
     /// A routine that did not run leaves the variables that it would assign as they were.
     fn unassigned(&self, context: &Context<'_>, id: InstanceId) -> Outputs {
-        let Some(instance) = self.instances.get(id) else { return Outputs::new() };
-        let own = self.plan.state(instance.state);
-        if !own.is_routine {
-            return Outputs::new();
-        }
-        let view = self.sight(context).view(instance, None);
-        let value = |name: &String| Some((assigned(name), view.variable(name)?.into_owned()));
-        own.assigns.iter().filter_map(value).collect()
+        let outputs = self.look(context, id, None, |instance, view| {
+            let own = context.plan.state(instance.state);
+            let value = |name: &String| Some((assigned(name), view.variable(name)?.into_owned()));
+            if own.is_routine { own.assigns.iter().filter_map(value).collect() } else { Outputs::new() }
+        });
+        outputs.unwrap_or_default()
     }
 
     fn acquire(
@@ -61,19 +76,14 @@ impl Window {
         requirements: Vec<Requirement>,
         inputs: Option<Outputs>,
         seen: Seen,
-        used: &[InstanceId],
     ) {
-        self.depend(id, used);
-        let Some(instance) = self.instances.get_mut(id) else { return };
+        let Some(instance) = self.graph.get(id) else { return };
         let is_pia = instance.is_pia();
-        if is_pia {
-            instance.seen = None;
-        } else {
-            if !instance.seen.as_deref().is_some_and(|before| before.is_like(&seen)) {
-                // What failed before was made of something else: its tries begin again.
-                instance.tries = 1;
-            }
-            instance.seen = Some(Box::new(seen));
+        let is_like_before = is_pia || instance.seen().is_some_and(|before| before.is_like(&seen));
+        self.graph.set_seen(id, (!is_pia).then_some(seen));
+        if !is_like_before {
+            // What failed before was made of something else: its tries begin again.
+            self.graph.forget_tries(id);
         }
         if self.reuse(context, id) {
             return;
@@ -81,59 +91,94 @@ impl Window {
         if is_pia {
             self.clear_view(context, id);
         }
-        let Some(instance) = self.instances.get(id) else { return };
+        let Some(instance) = self.graph.get(id) else { return };
         if requirements.is_empty() {
-            self.active.insert(id);
-            self.set_status(id, Status::Granted, Wait::Nothing);
+            self.dispatch.begin(&self.graph, context.plan, instance);
+            self.graph.grant(id, None, context.now);
             self.launch(context, id, inputs);
             return;
         }
-        if !self.leaves_room(context, instance, &requirements) {
-            self.wait(id, Wait::Room);
-            self.stalled.push(id);
-            return;
+        if !self.dispatch.leaves_room(&self.graph, instance, &requirements) {
+            self.dispatch.stall(id);
+            return self.wait(id, Wait::Room);
         }
-        let priority = self.priority(instance);
-        self.active.insert(id);
-        self.set_status(id, Status::Acquiring, Wait::Resources);
-        if let Some(instance) = self.instances.get_mut(id) {
-            instance.asked_with = priority;
-        }
+        let priority = self.dispatch.priority(&self.graph, instance);
+        self.dispatch.begin(&self.graph, context.plan, instance);
+        self.graph.acquire(id, priority);
+        self.wait(id, Wait::Resources);
         context.commands.push(Command::Acquire { instance: id, requirements, priority });
-        self.preempt_for(context, id);
     }
 
-    /// What a result is made of is told to those it is made of.
-    fn depend(&mut self, id: InstanceId, used: &[InstanceId]) {
-        let Some(instance) = self.instances.get(id) else { return };
-        if instance.is_pia() {
-            return;
+    /// Takes over a result that is there, or waits for the one that is being computed; whether it did.
+    fn reuse(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.graph.get(id) else { return false };
+        let speculative = self.graph.is_speculative(instance.segment);
+        if !is_cacheable(context, instance) || (!speculative && self.results.is_empty()) {
+            return false;
         }
-        let mut producers: Vec<InstanceId> = used.to_vec();
-        producers.extend(self.producers_of(instance));
-        producers.sort_unstable();
-        producers.dedup();
-        for producer in producers {
-            if let Some(producer) = self.instances.get_mut(producer) {
-                producer.users.push(id);
+        let seed = self.seed(context, instance);
+        let Some(seen) = instance.seen() else { return false };
+        match self.results.find(&self.graph, id, seed, seen) {
+            Some(Known::Result(mut ended)) => {
+                // What it assigns may be made of what differs between the branches.
+                ended.outputs.retain(|port, _| !port.starts_with(super::growth::environment::ASSIGNED));
+                if let Err(problem) = self.assign(context, id, &mut ended) {
+                    *ended = Ended { changes: ended.changes.clone(), ..Ended::aborted(problem) };
+                }
+                context.note(Note::Reused { instance: id });
+                context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
+                self.end_instance(id, *ended);
+                true
+            }
+            Some(Known::Busy(busy)) => {
+                self.wait(id, Wait::Twin(busy));
+                true
+            }
+            None => {
+                if speculative {
+                    self.results.note_twin(id, seed);
+                }
+                false
             }
         }
     }
 
+    /// A result that is about to be discarded is kept.
+    pub(super) fn keep_result(&mut self, context: &Context<'_>, id: InstanceId) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let (Some(seen), Some(ended)) = (instance.seen(), instance.ended()) else { return };
+        // A failure to begin is no result.
+        let is_none = !ended.reason.is_empty() && ended.outputs.is_empty();
+        if !is_cacheable(context, instance) || self.is_ending || is_none {
+            return;
+        }
+        let (seed, seen, ended) = (self.seed(context, instance), seen.clone(), ended.clone());
+        self.results.keep(seed, seen, ended);
+    }
+
+    /// What a visit's random choices are derived from.
+    fn seed(&self, context: &Context<'_>, instance: &Instance) -> u64 {
+        let state = context.program.state(instance.state);
+        let mut seed = Seed::of(context.seed);
+        let environment = &instance.environment;
+        environment.path_parts(&state.name, instance.visit, instance.iteration, |part| seed.add(part.as_bytes()));
+        let tries = instance.node().map_or(1, |node| node.tries);
+        seed.of_try(if state.annotations.deterministic { 1 } else { tries })
+    }
+
     /// A motion may begin: sensing nodes that would see it, and have not begun or are speculative, step back.
     fn clear_view(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let stepping_back: Vec<InstanceId> = {
-            let Some(instance) = self.instances.get(id) else { return };
-            let sight = self.sight(context);
-            let writes = self.writes(context, instance);
-            let active = self.active.iter().filter_map(|id| self.instances.get(*id));
-            active
-                .filter(|other| {
-                    other.nature == NodeNature::Senses && senses_of(context, sight, other).overlaps(&writes)
-                })
-                .map(|other| other.id)
-                .collect()
+        let Some(instance) = self.graph.get(id) else { return };
+        let sensing = self.dispatch.active().filter_map(|id| self.graph.get(id)).filter(|other| other.is_sensing());
+        let sensing: Vec<InstanceId> = sensing.map(|other| other.id).collect();
+        if sensing.is_empty() {
+            return;
+        }
+        let writes = self.writes(context, instance);
+        let would_see = |other: &InstanceId| {
+            self.graph.get(*other).is_some_and(|other| self.senses(context, other).overlaps(&writes))
         };
+        let stepping_back: Vec<InstanceId> = sensing.into_iter().filter(would_see).collect();
         for other in stepping_back {
             self.step_back(context, other, Wait::Writer(id));
         }
@@ -141,108 +186,156 @@ impl Window {
 
     /// It gives back what it has and begins again later.
     pub(super) fn step_back(&mut self, context: &mut Context<'_>, id: InstanceId, wait: Wait) {
-        self.stop_instance(context, id);
-        if let Some(instance) = self.instances.get_mut(id) {
-            instance.status = Status::Expanded;
-            instance.attempt += 1;
-        }
+        self.stop_node(context, id);
+        self.graph.begin_again(id);
         self.wait(id, wait);
     }
 
-    /// It has its resources: it gets its projection, then its goal starts.
+    /// An answer of the resource manager or of the world pool.
+    pub(super) fn answered(&mut self, context: &mut Context<'_>, event: Event) {
+        match event {
+            Event::Granted { instance: id, lease } => {
+                if !matches!(self.status(id), Some(Status::Acquiring { .. })) {
+                    return self.in_routine(context, Event::Granted { instance: id, lease });
+                }
+                self.graph.grant(id, Some(lease), context.now);
+                let is_held = self.graph.get(id).is_some_and(Instance::is_pia) && !self.hold.lets_begin();
+                if is_held {
+                    return self.wait(id, Wait::Pause);
+                }
+                self.proceed(context, id);
+            }
+            Event::Refused { instance: id, reason } => {
+                if !matches!(self.status(id), Some(Status::Acquiring { .. })) {
+                    return self.in_routine(context, Event::Refused { instance: id, reason });
+                }
+                self.rest(id);
+                self.fail(context, id, format!("its resources were refused: {reason}"));
+            }
+            Event::Projected { instance: id, attempt, projection } => {
+                let is_awaited = self.graph.node(id).is_some_and(|node| {
+                    node.attempt == attempt && matches!(node.status, Status::Projecting(_))
+                });
+                if !is_awaited {
+                    return self.in_routine(context, Event::Projected { instance: id, attempt, projection });
+                }
+                self.graph.projected(id, projection);
+                self.launch(context, id, None);
+            }
+            _ => {}
+        }
+    }
+
+    fn status(&self, id: InstanceId) -> Option<&Status> {
+        self.graph.node(id).map(|node| &node.status)
+    }
+
+    /// It has its resources. While it waited for them the world at its place may have changed, within tolerances or where nobody
+    /// could know that it looks there: it looks again.
     pub(super) fn proceed(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.instances.get(id) else { return };
-        let sight = self.sight(context);
-        // While it waited for its resources an older instance may have changed what it would look at.
-        let looked = if instance.is_pia() || instance.projection.is_some() {
-            None
-        } else {
-            let view = sight.view(instance, None);
-            Some(self.look(context, instance, &view).map(|seen| (seen, view.used())))
-        };
-        match looked {
-            None => {}
-            Some(Err(wait)) => return self.step_back(context, id, wait),
-            Some(Ok((seen, used))) => {
-                self.depend(id, &used);
-                if let Some(instance) = self.instances.get_mut(id)
-                    && let Some(before) = &mut instance.seen
-                {
-                    if before.facts != seen.facts {
-                        instance.tries = 1;
+        self.follow_root(context);
+        let Some(nature) = self.graph.node(id).map(|node| node.nature) else { return };
+        if nature != NodeNature::Irreversible {
+            let looked = self.look(context, id, None, |_, view| {
+                let looked = ready::look(context, view, nature);
+                if looked.is_ok() {
+                    view.register(Purpose::Result);
+                }
+                looked
+            });
+            match looked {
+                None => return,
+                Some(Err(wait)) => return self.step_back(context, id, wait),
+                Some(Ok(mut seen)) => {
+                    let Some(before) = self.graph.get(id).and_then(Instance::seen) else { return };
+                    seen.inputs = before.inputs;
+                    if !before.saw_the_same(&seen) {
+                        self.graph.forget_tries(id);
                     }
-                    before.facts = seen.facts;
-                    before.read = seen.read;
+                    self.graph.set_seen(id, Some(seen));
                 }
             }
         }
         self.launch(context, id, None);
     }
 
-    /// What it reads is as it was when it asked.
+    /// What it reads is as it was when it asked: it gets its projection, then its goal starts.
     fn launch(&mut self, context: &mut Context<'_>, id: InstanceId, known: Option<Outputs>) {
-        let Some(instance) = self.instances.get(id) else { return };
-        if instance.is_pia() && instance.projection.is_none() {
+        let Some(instance) = self.graph.get(id) else { return };
+        let Some(node) = instance.node() else { return };
+        let Status::Granted(held) = &node.status else { return };
+        let own = context.plan.state(instance.state);
+        if held.projection.is_none() && instance.is_pia() {
             self.hold.has_begun();
         }
-        let state = context.program.state(instance.state);
-        let analysis = context.plan.state(instance.state);
-        let is_routine = !matches!(state.kind, StateKind::Action { .. });
-        let Some(instance) = self.instances.get(id) else { return };
-        let attempt = instance.attempt;
-        let view = self.sight(context).view(instance, None);
-        if analysis.needs_world && instance.projection.is_none() && !is_routine {
-            let reads = match &analysis.reads {
-                Some(facts) => ratn_model::expression::FactExpr::footprint(facts, &view),
-                None => Footprint::Everything,
-            };
-            let Ok(by_writer) = view.changes_by_writer(&reads) else {
-                let wait = view.blocker().map_or(Wait::Order, Wait::World);
-                return self.step_back(context, id, wait);
-            };
-            let lease = instance.lease.as_ref().map(|l| (l.id, l.token));
-            let base = context.root.revision();
-            let (writers, changes) = self.named(context, by_writer);
-            self.set_status(id, Status::Projecting, Wait::Nothing);
-            context.commands.push(Command::Project { instance: id, attempt, base, changes, writers, reads, lease });
-            return;
+        if own.needs_world && held.projection.is_none() && !own.is_routine {
+            return self.project(context, id);
         }
-        if is_routine {
-            drop(view);
-            context.note(Note::Running { instance: id, attempt });
-            self.set_status(id, Status::Running, Wait::Nothing);
+        if own.is_routine {
+            context.note(Note::Running { instance: id, attempt: node.attempt });
             return self.start_routine(context, id);
         }
+        self.start_goal(context, id, known);
+    }
+
+    fn project(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let looked = self.look(context, id, None, |instance, view| {
+            let reads = match &context.plan.state(instance.state).reads {
+                Some(facts) => FactExpr::footprint(facts, view),
+                None => Footprint::Everything,
+            };
+            let by_writer = view.changes_by_writer(&reads).map_err(|blocked| Wait::World(blocked.0));
+            by_writer.map(|by_writer| (reads, by_writer))
+        });
+        let (reads, by_writer) = match looked {
+            None => return,
+            Some(Err(wait)) => return self.step_back(context, id, wait),
+            Some(Ok(looked)) => looked,
+        };
+        let Some(node) = self.graph.node(id) else { return };
+        let Status::Granted(held) = &node.status else { return };
+        let (attempt, lease) = (node.attempt, held.lease.as_ref().map(|lease| (lease.id, lease.token)));
+        let base = context.root.revision();
+        let (writers, changes) = self.named(context, by_writer);
+        self.graph.project(id);
+        context.commands.push(Command::Project { instance: id, attempt, base, changes, writers, reads, lease });
+    }
+
+    fn start_goal(&mut self, context: &mut Context<'_>, id: InstanceId, known: Option<Outputs>) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let state = context.program.state(instance.state);
         let StateKind::Action { inputs, .. } = &state.kind else { return };
-        let Some((provider, action)) = self.plan.state(instance.state).action.clone() else { return };
-        let bound = match known {
-            Some(inputs) => Ok(inputs),
-            None => binding::inputs(state, inputs, &view),
+        let Some((provider, action)) = context.plan.state(instance.state).action.clone() else { return };
+        let looked = self.look(context, id, None, |_, view| {
+            let bound = match &known {
+                Some(inputs) => Ok(inputs.clone()),
+                None => binding::inputs(state, inputs, view).map_err(|error| not_bound(view, &error)),
+            };
+            (bound, binding::expected_s(state, view))
+        });
+        let (inputs, expected_s) = match looked {
+            Some((Ok(inputs), expected_s)) => (inputs, expected_s),
+            Some((Err(Readiness::Waits(wait)), _)) => return self.step_back(context, id, wait),
+            Some((Err(Readiness::Failed(reason)), _)) => return self.finish(context, id, Ended::aborted(reason)),
+            Some((Err(Readiness::Ready(..)), _)) | None => return,
         };
-        let inputs = match bound {
-            Ok(inputs) => inputs,
-            Err(error) => {
-                return match not_bound(&view, &error) {
-                    Readiness::Waits(wait) => self.step_back(context, id, wait),
-                    _ => self.finish(context, id, Ended::aborted(error.reason())),
-                };
-            }
-        };
+        let Some(node) = self.graph.node(id) else { return };
+        let Status::Granted(held) = &node.status else { return };
+        let attempt = node.attempt;
         let goal = Goal {
             provider,
             action,
             inputs,
             seed: self.seed(context, instance),
-            lease: instance.lease.as_deref().cloned(),
-            projection: instance.projection,
-            expected_s: binding::expected_s(state, &view),
+            lease: held.lease.as_deref().cloned(),
+            projection: held.projection,
+            expected_s,
             timeout_s: state.annotations.timeout_s,
         };
-        drop(view);
         if let Some(timeout_s) = state.annotations.timeout_s {
-            self.set_timer(context, timeout_s, super::timers::Timer::Timeout(id, attempt));
+            self.set_timer(context, timeout_s, Timer::Timeout(id, attempt));
         }
-        self.set_status(id, Status::Running, Wait::Nothing);
+        self.graph.run(id);
         context.note(Note::Running { instance: id, attempt });
         context.commands.push(Command::Start { instance: id, attempt, goal: Box::new(goal) });
     }
@@ -260,51 +353,102 @@ impl Window {
     }
 
     fn start_routine(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.instances.get(id) else { return };
-        let sight = self.sight(context);
-        let state = context.program.state(instance.state);
-        let analysis = context.plan.state(instance.state);
-        let environment = &instance.environment;
-        let outputs = self
-            .plan
-            .state(instance.state)
-            .flows
-            .iter()
-            .filter_map(|state| Some((*state, sight.outputs_of(environment.producer(*state)?)?.clone())))
-            .collect();
-        let view = sight.view(instance, None);
-        let names = environment.variables.iter().map(|(name, _)| name);
-        let variables = names
-            .filter_map(|name| Some((name.to_string(), view.variable(name)?.into_owned())))
-            .chain(
-                environment.loop_variables(context.program).map(|(name, value)| (name.to_owned(), value.into_owned())),
-            )
-            .collect();
-        let target = if instance.is_pia() {
+        let Some((is_pia, state)) = self.graph.get(id).map(|instance| (instance.is_pia(), instance.state)) else { return };
+        let looked = self.look(context, id, None, |instance, view| {
+            let own = context.plan.state(instance.state);
+            let environment = &view.instance.environment;
+            let sight = view.sight;
+            let flows = own.flows.iter();
+            let outputs =
+                flows.filter_map(|state| Some((*state, sight.outputs_of(environment.producer(*state)?)?.clone()))).collect();
+            let by_writer = if is_pia {
+                Ok(Vec::new())
+            } else {
+                let reads = match &own.reads {
+                    Some(facts) => FactExpr::footprint(facts, view),
+                    None => Footprint::Everything,
+                };
+                view.changes_by_writer(&reads)
+            };
+            let requirements = binding::requirements(context.program.state(instance.state), &own.requirements, view);
+            (variables(context, view), outputs, by_writer, requirements)
+        });
+        let Some((variables, outputs, by_writer, requirements)) = looked else { return };
+        let target = if is_pia {
             Target::Actual
         } else {
-            let reads = match &analysis.reads {
-                Some(facts) => ratn_model::expression::FactExpr::footprint(facts, &view),
-                None => Footprint::Everything,
+            let by_writer = match by_writer {
+                Ok(by_writer) => by_writer,
+                Err(blocked) => return self.step_back(context, id, Wait::World(blocked.0)),
             };
-            let (writers, changes) = self.named(context, view.changes_by_writer(&reads).unwrap_or_default());
+            let (writers, changes) = self.named(context, by_writer);
             let world = context.root.project(&changes).unwrap_or_else(|_| context.root.clone());
             let before = changes.len();
             let base = context.root.revision();
             Target::Projection { base, changes, writers, before, evidence: Evidence::new(), world }
         };
-        let requirements = match binding::requirements(state, &analysis.requirements, &view) {
+        let requirements = match requirements {
             Ok(requirements) => requirements,
             Err(error) => return self.finish(context, id, Ended::aborted(error.reason())),
         };
-        let routine = Routine { requirements, lease: instance.lease.as_deref().cloned(), visit: None };
-        drop(view);
+        let lease = self.graph.take_held(id).lease.map(|lease| *lease);
+        let routine = Routine { requirements, lease, visit: None };
         let mut interpreter = Box::new(Interpreter::of_routine(variables, outputs, routine, target));
-        let (state, path) = (instance.state, self.path(context.program, id));
+        let path = self.path(context.program, id);
         let progress = interpreter.start(context, state, &path);
-        if let Some(instance) = self.instances.get_mut(id) {
-            instance.routine = Some(interpreter);
-        }
+        self.graph.run_routine(id, interpreter);
         self.routine_progressed(context, id, progress);
     }
+
+    /// Who waits for the resource manager asks again if its priority has changed.
+    pub(super) fn ask_again(&mut self, context: &mut Context<'_>) {
+        for id in self.dispatch.misplaced(&self.graph) {
+            let Some(instance) = self.graph.get(id) else { continue };
+            let wanted = &context.plan.state(instance.state).requirements;
+            if wanted.iter().any(|r| r.operation == ResourceOperation::Consume) {
+                // A grant that crosses the withdrawal has used it up already: asking twice would use it up twice.
+                continue;
+            }
+            let priority = self.dispatch.priority(&self.graph, instance);
+            let state = context.program.state(instance.state);
+            let bound = self.look(context, id, None, |_, view| binding::requirements(state, wanted, view));
+            let Some(Ok(requirements)) = bound else { continue };
+            context.commands.push(Command::Withdraw { instance: id });
+            context.commands.push(Command::Acquire { instance: id, requirements, priority });
+            self.graph.acquire(id, priority);
+            if let Some(instance) = self.graph.get(id) {
+                self.dispatch.asks_again(&self.graph, instance);
+            }
+        }
+    }
+
+    /// Speculative holders give way to certain nodes, and whoever waits for room begins where there is some; whether anybody did.
+    pub(super) fn give_way(&mut self, context: &mut Context<'_>) -> bool {
+        let in_the_way = self.dispatch.in_the_way(&self.graph, context.plan);
+        let first = self.dispatch.take_stalled(&self.graph);
+        let changed = !in_the_way.is_empty() || !first.is_empty();
+        for (holder, by) in in_the_way {
+            context.note(Note::Preempted { instance: holder, by });
+            self.step_back(context, holder, Wait::Nothing);
+            self.waits.enqueue(&mut self.graph, holder);
+        }
+        for id in first {
+            self.waits.enqueue(&mut self.graph, id);
+        }
+        changed
+    }
+}
+
+fn is_cacheable(context: &Context<'_>, instance: &Instance) -> bool {
+    instance.node().is_some_and(|node| node.nature == NodeNature::Computes)
+        && matches!(context.program.state(instance.state).kind, StateKind::Action { .. })
+}
+
+/// The variables in sight, with their values.
+fn variables(context: &Context<'_>, view: &View<'_>) -> Vec<(String, ratn_model::value::Value)> {
+    let environment = &view.instance.environment;
+    let names = environment.variables.iter().map(|(name, _)| name);
+    let scoped = names.filter_map(|name| Some((name.to_string(), view.variable(name)?.into_owned())));
+    let looping = environment.loop_variables(context.program);
+    scoped.chain(looping.map(|(name, value)| (name.to_owned(), value.into_owned()))).collect()
 }

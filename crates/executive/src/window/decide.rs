@@ -1,34 +1,63 @@
 //! What the window decides by itself, without a worker: conditions, lists of loops, deciders, what composite states do at
 //! their ends, the end of the task.
 
-use super::cursor::Todo;
-use super::environment::{ASSIGNED, assigned};
-use super::instance::{Ended, Role, Seen, Wait, gives_outputs};
-use super::ready::{facts_of, not_bound};
-use super::{End, Window, outside};
+use super::graph::instance::{Ended, Instance, Role};
+use super::growth::environment::{ASSIGNED, assigned};
+use super::memory::settled::{undecidable, unsettled};
+use super::memory::{Purpose, Seen, facts_of};
+use super::outside::remembered;
+use super::ready::{Readiness, not_bound};
+use super::waits::Wait;
+use super::{End, Window};
 use crate::binding::{BindError, Outputs};
 use crate::context::Context;
+use crate::plan::gives_outputs;
 use crate::protocol::Note;
-use ratn_model::expression::Expr;
+use ratn_model::expression::{Expr, Scope};
 use ratn_model::id::InstanceId;
-use ratn_model::program::{ABORTED, SUCCESS, StateKind};
+use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, StateKind};
 use ratn_model::value::Value;
 
 impl Window {
+    /// What a decision from these expressions waits for.
+    fn undecidable(&mut self, context: &Context<'_>, id: InstanceId, from: &[&Expr]) -> Option<Wait> {
+        undecidable(&mut self.graph, &self.memory, context, id, from)
+    }
+
+    /// A node with several ways on has ended: its outcome decides once it cannot change any more.
+    pub(super) fn decide_by_outcome(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        if let Some(blocker) = unsettled(&mut self.graph, &self.memory, context, id) {
+            return self.wait(id, Wait::Settling(blocker));
+        }
+        let Some(instance) = self.graph.get(id) else { return };
+        let Some(ended) = instance.ended() else { return };
+        // `requires` is evaluated on the actual world when it retires, and may make another outcome of it.
+        if !context.program.state(instance.state).annotations.requires.is_empty() {
+            return self.wait(id, Wait::Order);
+        }
+        let number = context.plan.state(instance.state).outcome(&ended.outcome);
+        let decision = ended.outcome.to_string();
+        match number.and_then(|number| instance.arm_of(number)) {
+            Some(arm) => {
+                let path = self.path(context.program, id);
+                context.note(Note::Decided { instance: id, path, decision });
+                self.take_arm(context, id, arm);
+            }
+            None => self.wait(id, Wait::Order),
+        }
+    }
+
     /// A condition, or the test of a `while`.
     pub(super) fn decide(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.instances.get(id) else { return };
+        let Some(instance) = self.graph.get(id) else { return };
         let state = context.program.state(instance.state);
-        let names = match instance.role {
-            Role::Test => ["again", "done"],
-            _ => ["then", "else"],
-        };
+        let names = names_of(instance);
         let (StateKind::Condition { predicate, .. } | StateKind::While { predicate, .. }) = &state.kind else { return };
-        if let Some(wait) = self.undecidable(context, instance, std::slice::from_ref(predicate)) {
+        if let Some(wait) = self.undecidable(context, id, &[predicate]) {
             return self.wait(id, wait);
         }
-        let view = self.sight(context).view(instance, None);
-        let taken = match predicate.holds(&view) {
+        let Some(decision) = self.look(context, id, None, |_, view| predicate.holds(view)) else { return };
+        let taken = match decision {
             Ok(true) => 0,
             Ok(false) => 1,
             Err(error) => {
@@ -36,7 +65,6 @@ impl Window {
                 return self.end_instance(id, Ended::aborted(reason));
             }
         };
-        drop(view);
         let path = self.path(context.program, id);
         context.note(Note::Decided { instance: id, path, decision: names[taken].to_owned() });
         self.end_instance(id, Ended::with(names[taken], Outputs::new()));
@@ -45,14 +73,14 @@ impl Window {
 
     /// The list of a loop.
     pub(super) fn count(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.instances.get(id) else { return };
+        let Some(instance) = self.graph.get(id) else { return };
         let state = context.program.state(instance.state);
         let StateKind::ForEach { collection, .. } = &state.kind else { return };
-        if let Some(wait) = self.undecidable(context, instance, std::slice::from_ref(collection)) {
+        if let Some(wait) = self.undecidable(context, id, &[collection]) {
             return self.wait(id, wait);
         }
-        let view = self.sight(context).view(instance, None);
-        let elements = match collection.evaluate(&view) {
+        let Some(elements) = self.look(context, id, None, |_, view| collection.evaluate(view)) else { return };
+        let elements = match elements {
             Ok(Value::List(elements)) => elements,
             Ok(other) => {
                 let reason = format!("it loops over a {}, not a list", other.type_name());
@@ -63,178 +91,182 @@ impl Window {
                 return self.end_instance(id, Ended::aborted(reason));
             }
         };
-        drop(view);
         let path = self.path(context.program, id);
         context.note(Note::Decided { instance: id, path, decision: elements.len().to_string() });
         let looked = !collection.fact_expressions().is_empty();
-        let outputs = looked.then(|| outside::remembered(&elements)).into_iter().collect();
+        let outputs = looked.then(|| remembered(&elements)).into_iter().collect();
         self.end_instance(id, Ended::success(outputs));
-        self.unroll(context, id, elements);
+        self.growth.unroll(&self.graph, context, id, elements);
     }
 
     /// The decider over the outcomes of regions.
     pub(super) fn decide_join(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.instances.get(id) else { return };
+        let Some(instance) = self.graph.get(id) else { return };
         let state = context.program.state(instance.state);
         let StateKind::Concurrency { regions, decide, .. } = &state.kind else { return };
-        let expressions: Vec<Expr> = decide.iter().map(|(_, expression)| expression.clone()).collect();
+        let expressions: Vec<&Expr> = decide.iter().map(|(_, expression)| expression).collect();
         if !expressions.is_empty()
-            && let Some(wait) = self.undecidable(context, instance, &expressions)
+            && let Some(wait) = self.undecidable(context, id, &expressions)
         {
             return self.wait(id, wait);
         }
-        let (visit, plan) = (instance.visit, self.plan.clone());
-        let view = self.sight(context).view(instance, None);
-        let mut decision = None;
-        for (outcome, holds) in decide {
-            match holds.holds(&view) {
-                Ok(false) => {}
-                Ok(true) => decision = Some((outcome.clone(), None)),
-                Err(error) => {
-                    let reason = BindError::at(format_args!("`decide.{outcome}`"), state)(error).reason();
-                    decision = Some((ABORTED.to_owned(), Some(reason)));
+        let decided = self.look(context, id, None, |_, view| {
+            for (outcome, holds) in decide {
+                match holds.holds(view) {
+                    Ok(false) => {}
+                    Ok(true) => return (outcome.clone(), None),
+                    Err(error) => {
+                        let reason = BindError::at(format_args!("`decide.{outcome}`"), state)(error).reason();
+                        return (ABORTED.to_owned(), Some(reason));
+                    }
                 }
             }
-            if decision.is_some() {
-                break;
-            }
-        }
-        let (outcome, reason) = decision.unwrap_or_else(|| {
-            let outcomes: Vec<String> = regions
-                .iter()
-                .filter_map(|region| {
-                    use ratn_model::expression::Scope;
-                    view.port(*region, "outcome").and_then(|value| match value.as_ref() {
-                        Value::String(outcome) => Some(outcome.clone()),
-                        _ => None,
-                    })
-                })
-                .collect();
-            (Window::default_outcome(&outcomes).to_owned(), None)
+            let outcome = |value: &Value| match value {
+                Value::String(outcome) => Some(outcome.clone()),
+                _ => None,
+            };
+            let outcomes: Vec<String> =
+                regions.iter().filter_map(|region| view.port(*region, "outcome").as_deref().and_then(outcome)).collect();
+            (default_outcome(&outcomes).to_owned(), None)
         });
-        drop(view);
+        let Some((outcome, reason)) = decided else { return };
         let path = self.path(context.program, id);
         context.note(Note::Decided { instance: id, path: path.clone(), decision: outcome.clone() });
         self.end_instance(id, Ended::with(outcome.as_str(), Outputs::new()));
-        let own = plan.state(state.id);
+        let own = context.plan.state(state.id);
         let number = own.outcome(&outcome).unwrap_or(own.outcomes.len() - 2);
-        if let Some(cursor) = self.cursors.iter_mut().find(|cursor| cursor.todo == Todo::Await(id)) {
-            let variables = cursor.environment.variables.len();
-            cursor.todo = Todo::Exit { state: state.id, visit, outcome: number, variables };
-            let reason = reason.map(|reason| format!("{path}: {reason}"));
-            cursor.because = reason.map(Into::into).or(cursor.because.take());
-        }
+        let because = reason.map(|reason| format!("{path}: {reason}").into());
+        self.growth.leave_join(&self.graph, id, number, because);
     }
 
     /// Variables at the entry of a composite state; outputs and assignments at its exit.
     pub(super) fn compute_boundary(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.instances.get(id) else { return };
+        self.follow_root(context);
+        let Some(instance) = self.graph.get(id) else { return };
+        let Some(marker) = instance.marker() else { return };
+        let own = context.plan.state(instance.state);
+        let leaves_by = own.outcomes[marker.leaves_by].clone();
+        let outcome = if marker.role == Role::Entry { SUCCESS.into() } else { leaves_by };
+        let computed = self.compute_parts(context, instance);
+        let (ended, seen) = match computed {
+            Ok((outputs, seen)) => (Ended::with(outcome, outputs), seen),
+            Err((Readiness::Failed(reason), seen)) => (Ended::aborted(reason), seen),
+            Err((Readiness::Waits(wait), _)) => return self.wait(id, wait),
+            Err((Readiness::Ready(..), _)) => return,
+        };
+        self.graph.set_seen(id, Some(seen));
+        self.end_instance(id, ended);
+    }
+
+    /// The values of what is computed at a boundary, in order, each under its name; and what they are made of.
+    fn compute_parts(
+        &self,
+        context: &Context<'_>,
+        instance: &Instance,
+    ) -> Result<(Outputs, Seen), (Readiness, Seen)> {
         let state = context.program.state(instance.state);
-        let own = self.plan.state(instance.state);
-        let leaves_by = own.outcomes[instance.leaves_by].clone();
-        let mut parts: Vec<(String, &Expr, String)> = Vec::new();
-        match instance.role {
-            Role::Entry => {
-                parts.extend(state.variables.iter().map(|(n, e)| (assigned(n), e, format!("variable `{n}`"))));
-            }
-            _ if gives_outputs(&leaves_by) => {
-                if let StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } = &state.kind {
-                    parts.extend(outputs.iter().map(|o| (o.name.clone(), &o.value, format!("output `{}`", o.name))));
-                }
-                let assigns = state.assign.iter();
-                parts.extend(assigns.map(|(n, e)| (assigned(n), e, format!("`assign` of `{n}`"))));
-            }
-            _ => {}
-        }
+        let parts = parts_of(context, instance);
+        let is_success = |outcome: &str| outcome == SUCCESS;
+        let marker_outcome = instance.marker().map_or(0, |marker| marker.leaves_by);
+        let leaves_by = &context.plan.state(instance.state).outcomes[marker_outcome];
         let mut outputs = Outputs::new();
         let mut seen = Seen::default();
-        let mut used = Vec::new();
-        let mut failed = None;
-        for (name, expression, what) in &parts {
+        for (name, expression, what) in parts {
             // Assignments may be made of the outputs.
-            let view = self.sight(context).view(instance, Some(&outputs));
-            let facts = facts_of(std::slice::from_ref(*expression), &view);
-            let value = expression.evaluate(&view);
-            if !facts.is_nothing() {
-                seen.facts.extend(view.facts(&facts).unwrap_or_default());
-                seen.read.push(facts);
-            }
-            used.extend(view.used());
-            match value {
-                Ok(value) => drop(outputs.insert(name.clone(), value)),
-                Err(error) => {
+            let before = outputs.clone();
+            let value = self.look(context, instance.id, Some(&before), |instance, view| {
+                let mut looked = Seen::default();
+                let value = expression.evaluate(view).map_err(|error| {
                     // Left by an outcome of its own, before it was written: there is nobody to wait for.
                     let missing = error.is_not_yet_known() && view.blocker().is_none();
-                    if missing && &*leaves_by != SUCCESS && !name.starts_with(ASSIGNED) {
-                        continue;
-                    }
-                    let error = BindError::at(what.clone(), state)(error);
-                    failed = Some(not_bound(&view, &error));
-                    break;
+                    let is_left_out = missing && !is_success(leaves_by) && !name.starts_with(ASSIGNED);
+                    (!is_left_out).then(|| not_bound(view, &BindError::at(&what, state)(error)))
+                });
+                let facts = facts_of([expression], view);
+                // What is not known is waited for, or has failed.
+                let _ = view.see(facts, &mut looked);
+                let is_made = !matches!(value, Err(Some(Readiness::Waits(_))));
+                if is_made {
+                    // What made it fail may come out otherwise, too.
+                    view.use_outputs(view.sight.producers_of(view.instance));
+                    view.register(Purpose::Result);
                 }
+                debug_assert!(instance.marker().is_some(), "only markers are boundaries");
+                (value, looked)
+            });
+            let Some((value, looked)) = value else { break };
+            seen.extend(looked);
+            match value {
+                Ok(value) => drop(outputs.insert(name, value)),
+                Err(None) => {}
+                Err(Some(failed)) => return Err((failed, seen)),
             }
         }
-        if let Some(super::ready::Readiness::Waits(wait)) = failed {
-            return self.wait(id, wait);
-        }
-        // What made it fail may come out otherwise, too.
-        if !parts.is_empty() {
-            used.extend(self.producers_of(instance));
-            used.sort_unstable();
-            used.dedup();
-            for producer in used {
-                if let Some(producer) = self.instances.get_mut(producer) {
-                    producer.users.push(id);
-                }
-            }
-        }
-        let Some(instance) = self.instances.get_mut(id) else { return };
-        instance.seen = Some(Box::new(seen));
-        let outcome = if instance.role == Role::Entry { SUCCESS.into() } else { leaves_by };
-        let ended = match failed {
-            Some(super::ready::Readiness::Failed(reason)) => Ended::aborted(reason),
-            _ => Ended::with(outcome, outputs),
-        };
-        self.end_instance(id, ended);
+        Ok((outputs, seen))
     }
 
     /// Everything older has retired: the task is over.
     pub(super) fn end_run(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some(instance) = self.instances.get(id) else { return };
+        let Some(instance) = self.graph.get(id) else { return };
         if !instance.is_head {
             return self.wait(id, Wait::Order);
         }
-        if let Some(beside) = self.detached.first() {
-            return self.wait(id, Wait::Data(*beside));
+        if let Some(beside) = self.graph.detached().first().copied() {
+            return self.wait(id, Wait::Data(beside));
         }
-        let outcome = self.plan.state(instance.state).outcomes[instance.leaves_by].to_string();
-        let reason = instance.left_because.as_ref().map_or(String::new(), ToString::to_string);
+        let Some(marker) = instance.marker() else { return };
+        let outcome = context.plan.state(instance.state).outcomes[marker.leaves_by].to_string();
+        let reason = marker.because.as_ref().map_or(String::new(), ToString::to_string);
         let mut end = End { outcome, outputs: Outputs::new(), reason };
-        if end.outcome == ratn_model::program::SUCCESS {
+        if end.outcome == SUCCESS {
             end.reason = String::new();
-            let view = self.sight(context).view(instance, None);
-            for output in &context.program.outputs {
-                match output.value.evaluate(&view) {
-                    Ok(value) => {
-                        end.outputs.insert(output.name.clone(), value);
-                    }
-                    Err(error) => {
-                        let reason = format!("output `{}`: {error}", output.name);
-                        end = End { outcome: ABORTED.to_owned(), outputs: Outputs::new(), reason };
-                        break;
-                    }
-                }
+            let outputs = self.look(context, id, None, |_, view| {
+                let value = |output: &ratn_model::program::TaskOutput| {
+                    let value = output.value.evaluate(view);
+                    let named = |error| format!("output `{}`: {error}", output.name);
+                    value.map(|value| (output.name.clone(), value)).map_err(named)
+                };
+                context.program.outputs.iter().map(value).collect::<Result<Outputs, String>>()
+            });
+            match outputs {
+                Some(Ok(outputs)) => end.outputs = outputs,
+                Some(Err(reason)) => end = End { outcome: ABORTED.to_owned(), outputs: Outputs::new(), reason },
+                None => {}
             }
         }
         self.end = Some(end);
     }
+}
 
-    pub(super) fn end_instance(&mut self, id: InstanceId, ended: Ended) {
-        if let Some(instance) = self.instances.get_mut(id) {
-            instance.status = super::instance::Status::Finished;
-            instance.ended = Some(Box::new(ended));
-        }
-        self.wake_waiters(id);
-        self.enqueue(id);
+/// The two decisions of a condition or of a test.
+pub(super) fn names_of(instance: &Instance) -> [&'static str; 2] {
+    if instance.role() == Some(Role::Test) { ["again", "done"] } else { ["then", "else"] }
+}
+
+/// The outcome of a concurrency whose decider says nothing.
+fn default_outcome(outcomes: &[String]) -> &'static str {
+    if outcomes.iter().all(|outcome| outcome == SUCCESS) {
+        SUCCESS
+    } else if outcomes.iter().any(|outcome| outcome == ABORTED) {
+        ABORTED
+    } else {
+        PREEMPTED
     }
+}
+
+/// What is computed at a boundary: under which name, from which expression, and what it is for messages.
+fn parts_of<'p>(context: &Context<'p>, instance: &Instance) -> Vec<(String, &'p Expr, String)> {
+    let state = context.program.state(instance.state);
+    let own = context.plan.state(instance.state);
+    let mut parts: Vec<(String, &Expr, String)> = Vec::new();
+    let Some(marker) = instance.marker() else { return parts };
+    if marker.role == Role::Entry {
+        parts.extend(state.variables.iter().map(|(n, e)| (assigned(n), e, format!("variable `{n}`"))));
+    } else if gives_outputs(&own.outcomes[marker.leaves_by]) {
+        if let StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } = &state.kind {
+            parts.extend(outputs.iter().map(|o| (o.name.clone(), &o.value, format!("output `{}`", o.name))));
+        }
+        parts.extend(state.assign.iter().map(|(n, e)| (assigned(n), e, format!("`assign` of `{n}`"))));
+    }
+    parts
 }

@@ -1,36 +1,53 @@
 //! Retirement: what becomes real. Every line retires in program order, so the root is the world after a prefix of the program
 //! (per region), and a failure leaves it so.
 //!
-//! A PIA with imprecise exceptions is passed over while it runs: it retires when it ends, and younger ones may run beside it.
+//! A PIA with imprecise exceptions is passed over while it runs: it retires when it ends, and younger ones may run beside it. The
+//! exit of a state, and the end of a region, wait for those inside.
 
 use super::Window;
-use super::cursor::{Cursor, Todo};
-use super::instance::{Changed, Instance, Line, Role, Status, Wait, gives_outputs};
+use super::graph::instance::{Changed, Instance, Role, Status};
+use super::growth::Departure;
+use super::memory::Source;
+use super::waits::Wait;
 use crate::binding;
-use crate::context::{Context, Made};
+use crate::context::{Context, MAX_IDLE_VISITS, Made, in_circles};
 use crate::effects;
-use crate::plan::NodeNature;
-use crate::plan::{Effects, Outcome};
+use crate::plan::{Effects, NodeNature, Outcome, gives_outputs};
 use crate::protocol::{Command, Note};
+use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::InstanceId;
-use ratn_model::program::{ABORTED, SUCCESS, StateKind};
-use smallvec::SmallVec;
+use ratn_model::program::{ABORTED, SUCCESS};
+use ratn_model::value::Value;
+use std::collections::BTreeMap;
 use std::sync::Arc;
+
+/// What became real.
+struct Real {
+    /// The outcome by which the instance is left, and why.
+    outcome: Arc<str>,
+    reason: String,
+    changes: Vec<Change>,
+    /// What the facts were that it wrote; only where somebody has looked at what it would write.
+    before: BTreeMap<FactKey, Option<Value>>,
+}
 
 impl Window {
     /// Retires what can be; whether there was anything.
     pub(super) fn retire(&mut self, context: &mut Context<'_>) -> bool {
         let mut retired = false;
         let mut last = None;
-        while let Some(line) = self.next_line_after(last) {
+        while let Some(line) = self.graph.next_active_line(last) {
             last = Some(line);
-            while let Some(id) = self.head_of(line) {
-                if self.pass_over(id) {
+            while self.end.is_none()
+                && let Some(id) = self.graph.head_of(line)
+            {
+                if self.passes(context, id) {
+                    self.graph.pass_over(id);
                     retired = true;
                     continue;
                 }
-                let finished = self.instances.get(id).is_some_and(|head| head.status == Status::Finished);
-                if !finished || !self.retire_head(context, id) {
+                let has_ended = self.graph.get(id).is_some_and(|head| head.ended().is_some());
+                if !has_ended || !self.retire_head(context, id) {
                     break;
                 }
                 retired = true;
@@ -39,106 +56,110 @@ impl Window {
         retired
     }
 
-    fn next_line_after(&self, last: Option<Line>) -> Option<Line> {
-        let from = last.map_or(0, |line| line + 1);
-        self.threads.range(from..).find(|(_, thread)| thread.is_active).map(|(line, _)| *line)
-    }
-
-    fn head_of(&self, line: Line) -> Option<InstanceId> {
-        let thread = self.threads.get(&line)?;
-        if thread.open_regions == 0 { thread.head } else { None }
-    }
-
-    /// A running imprecise PIA lets younger ones begin.
-    fn pass_over(&mut self, id: InstanceId) -> bool {
-        let Some(instance) = self.instances.get_mut(id) else { return false };
-        let passes = instance.status == Status::Running
-            && instance.is_pia()
-            && instance.arms.len() == 1
-            && self.plan.state(instance.state).imprecise;
-        if passes {
-            instance.detached = true;
-            let (line, next) = (instance.line, instance.arms[0].next);
-            let position = instance.position;
-            self.detached.insert(id);
-            self.advance(line, position, next);
-        }
-        passes
-    }
-
-    fn advance(&mut self, line: Line, position: u64, next: Option<InstanceId>) {
-        if let Some(thread) = self.threads.get_mut(&line) {
-            thread.head = None;
-            thread.floor = position + 1;
-        }
-        self.set_head(line, next);
+    /// Whether an imprecise PIA runs and lets younger ones begin.
+    fn passes(&self, context: &Context<'_>, id: InstanceId) -> bool {
+        self.graph.get(id).is_some_and(|head| {
+            head.is_pia()
+                && head.arms.len() == 1
+                && context.plan.state(head.state).imprecise
+                && head.node().is_some_and(|node| node.status.is_running())
+        })
     }
 
     /// The oldest instance of a line becomes real; false when it may not yet.
     fn retire_head(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
-        let Some(instance) = self.instances.get(id) else { return false };
+        let Some(instance) = self.graph.get(id) else { return false };
         if let Some(beside) = self.conflict_beside(context, instance) {
             self.wait(id, Wait::World(beside));
             return false;
         }
-        if let Some(beside) = self.producer_beside(instance).or_else(|| self.inside_beside(instance)) {
+        let sight = self.sight(context);
+        let beside = self.producer_beside(sight, instance).or_else(|| self.inside_beside(instance));
+        if let Some(beside) = beside {
             self.wait(id, Wait::Data(beside));
             return false;
         }
-        let role = instance.role;
-        let users = self.take_users(id);
-        let (outcome, reason) = self.make_real(context, id);
-        match role {
-            Role::Fork => self.begin_regions(context, id),
-            Role::RegionEnd => self.region_ended(context, id),
-            Role::End => {}
-            _ => self.go_on(context, id, &outcome, reason),
+        let (role, line, position) = (instance.role(), instance.line, instance.position);
+        if self.goes_in_circles(context, id) {
+            return true;
         }
-        self.compare(context, users);
+        let real = self.make_real(context, id);
+        self.tell_of_real(context, id, &real);
+        if self.end.is_some() {
+            return true;
+        }
+        match role {
+            Some(Role::Fork) => {
+                self.remove_retired(context, id);
+                self.graph.begin_regions(id, line, position);
+            }
+            Some(Role::RegionEnd) => {
+                self.remove_retired(context, id);
+                self.graph.end_region(line);
+            }
+            Some(Role::End) => {}
+            _ => self.follow(context, id, &real.outcome, real.reason),
+        }
+        // Nothing younger may become real that was made of what came out otherwise.
+        self.revise(context);
         true
     }
 
-    /// Of the exit of a state: an imprecise PIA inside of it that still runs. By how it ends the state may be left otherwise.
-    fn inside_beside(&self, exit: &Instance) -> Option<InstanceId> {
-        if exit.role != Role::Exit {
-            return None;
-        }
-        let is_inside = |id: &&InstanceId| {
-            let frames = self.instances.get(**id).and_then(|inside| inside.environment.frames.as_deref());
-            **id < exit.id && std::iter::successors(frames, |f| f.below.as_deref()).any(|f| f.owner == exit.state)
+    /// Whether a line has gone on for too long without an action; then the run has ended.
+    pub(super) fn goes_in_circles(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.graph.get(id) else { return false };
+        let is_too_long = self.graph.idle_visits(instance.line).saturating_add(instance.visits_before) > MAX_IDLE_VISITS;
+        let routine = instance.ended().filter(|ended| ended.in_circles).map(|ended| ended.reason.clone());
+        let reason = match routine {
+            Some(reason) => reason,
+            None if is_too_long => in_circles(instance.environment.frames.as_ref().map_or("", |frame| &frame.path)),
+            None => return false,
         };
-        self.detached.iter().find(is_inside).copied()
+        self.stop(context, ABORTED, reason);
+        true
+    }
+
+    /// Of the exit of a state, or the end of a region: an imprecise PIA inside that still runs. By how it ends the state may be
+    /// left otherwise.
+    fn inside_beside(&self, end: &Instance) -> Option<InstanceId> {
+        let role = end.role()?;
+        let is_inside = |id: &&InstanceId| {
+            let Some(inside) = self.graph.get(**id).filter(|inside| inside.id < end.id) else { return false };
+            let mut frames = std::iter::successors(inside.environment.frames.as_deref(), |frame| frame.below.as_deref());
+            match role {
+                Role::RegionEnd => inside.line == end.line,
+                _ => frames.any(|frame| frame.owner == end.state),
+            }
+        };
+        matches!(role, Role::Exit | Role::RegionEnd).then(|| self.graph.detached().iter().find(is_inside).copied())?
     }
 
     /// The line goes on behind an instance that is real, where its outcome leads.
-    fn go_on(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: &str, reason: String) {
-        let Some(instance) = self.instances.get(id) else { return };
-        let plan = self.plan.clone();
-        let own = plan.state(instance.state);
-        let arm = match instance.role {
-            Role::Condition | Role::Test => (!is_failure(outcome)).then_some(0),
-            Role::Join => Some(0),
-            Role::Exit if own.outcomes[instance.leaves_by].as_ref() == outcome => Some(0),
-            Role::Exit => None,
-            Role::Entry | Role::Loop => (outcome == SUCCESS).then_some(0),
-            _ => own.outcome(outcome).and_then(|n| instance.arms.iter().position(|arm| arm.outcomes & (1 << n) != 0)),
+    fn follow(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: &str, reason: String) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let own = context.plan.state(instance.state);
+        let arm = match instance.marker() {
+            None => own.outcome(outcome).and_then(|number| instance.arm_of(number)),
+            Some(marker) => match marker.role {
+                Role::Condition | Role::Test => gives_outputs(outcome).then_some(0),
+                Role::Exit => (own.outcomes[marker.leaves_by].as_ref() == outcome).then_some(0),
+                Role::Entry | Role::Loop => (outcome == SUCCESS).then_some(0),
+                Role::Join | Role::Fork | Role::RegionEnd | Role::End => Some(0),
+            },
         };
-        match arm {
-            Some(arm) => {
-                if instance.arms.len() > 1 {
-                    self.take_arm(context, id, arm);
-                }
-                let next = self.instances.get(id).and_then(|instance| instance.arms.first()?.next);
-                if let Some(instance) = self.remove_retired(context, id)
-                    && !instance.2
-                {
-                    self.advance(instance.0, instance.1, next);
-                }
-            }
-            None => {
-                let number = own.outcome(outcome).unwrap_or(own.outcomes.len() - 2);
-                self.leave_path(context, id, number, reason);
-            }
+        let Some(arm) = arm else {
+            let number = own.outcome(outcome).unwrap_or(own.outcomes.len() - 2);
+            return self.leave_path(context, id, number, reason);
+        };
+        if instance.arms.len() > 1 {
+            self.take_arm(context, id, arm);
+        }
+        let Some(instance) = self.graph.get(id) else { return };
+        let (line, position, is_detached) = (instance.line, instance.position, instance.is_detached());
+        let next = instance.arms.first().and_then(|arm| arm.next);
+        self.remove_retired(context, id);
+        if !is_detached {
+            self.graph.advance(line, position, next);
         }
     }
 
@@ -146,208 +167,200 @@ impl Window {
     /// its outcome leads.
     fn leave_path(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: Outcome, reason: String) {
         let path = self.path(context.program, id);
-        let Some(instance) = self.instances.get(id) else { return };
-        let (line, state, position, producer) =
-            (instance.line, instance.state, instance.position, instance.producer.clone());
-        let is_node = instance.role == Role::Node;
         let because: Arc<str> = if reason.is_empty() { path.into() } else { format!("{path}: {reason}").into() };
-        let mut environment = instance.environment.clone();
-        environment.test = None;
-        self.squash_behind(context, id);
-        self.remove_retired(context, id);
-        self.next_order += 1;
-        self.cursors.push(Cursor {
-            environment,
-            tail: None,
-            line,
-            segment: 0,
-            position: position + 1,
-            todo: Todo::Leave(state, outcome),
-            probability: 1.0,
-            because: Some(because),
-            idle: 0,
-            order: self.next_order,
-        });
-        if is_node {
-            let cursor = self.cursors.len() - 1;
-            self.produce(cursor, producer, state, outcome);
-        }
-        if let Some(thread) = self.threads.get_mut(&line) {
-            thread.head = None;
-            thread.floor = position + 1;
-        }
+        self.cut_behind(context, id);
+        self.remove_and_depart(context, id, outcome, because);
     }
 
-    /// Effects and resource operations happen. The outcome by which it is left, and why.
-    fn make_real(&mut self, context: &mut Context<'_>, id: InstanceId) -> (Arc<str>, String) {
-        let (program, plan) = (context.program, context.plan);
-        let aborted = |reason: String| (Arc::from(ABORTED), reason);
-        let Some(instance) = self.instances.get(id) else { return aborted(String::new()) };
-        let state = program.state(instance.state);
-        let Some(ended) = instance.ended.as_deref() else { return aborted("it never ended".to_owned()) };
-        let (mut outcome, mut reason) = (ended.outcome.clone(), ended.reason.clone());
-        let own = self.plan.state(instance.state);
-        let view = self.sight(context).view(instance, Some(&ended.outputs));
-        // What began on a projection had its preconditions checked there, if at all; now the actual world decides.
-        let checks = match instance.role {
-            Role::Node => instance.nature != NodeNature::Irreversible && !is_failure(&outcome),
-            Role::Entry => outcome.as_ref() == SUCCESS,
-            _ => false,
-        };
-        if checks && !state.annotations.requires.is_empty() {
-            match binding::unmet(state, &view) {
-                Ok(None) => {}
-                Ok(Some(unmet)) => return aborted(unmet),
-                Err(error) => return aborted(error.reason()),
+    fn remove_and_depart(&mut self, context: &mut Context<'_>, id: InstanceId, outcome: Outcome, because: Arc<str>) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let (line, position, state) = (instance.line, instance.position, instance.state);
+        let producer = instance.producer.clone().filter(|_| instance.role().is_none());
+        let environment = instance.environment.clone();
+        self.remove_retired(context, id);
+        let departure = Departure { environment, line, position, state, outcome, because };
+        self.growth.depart(context, departure, producer);
+        self.graph.advance(line, position, None);
+    }
+
+    /// Effects and resource operations happen.
+    fn make_real(&mut self, context: &mut Context<'_>, id: InstanceId) -> Real {
+        let mut real = Real { outcome: ABORTED.into(), reason: String::new(), changes: Vec::new(), before: BTreeMap::new() };
+        let Some((outcome, made, operations)) = self.what_happens(context, id, &mut real) else { return real };
+        let made = match made {
+            Ok(made) => made,
+            Err(problem) => {
+                real.reason = problem;
+                return real;
             }
-        }
-        if !matches!(instance.role, Role::Node | Role::Exit) {
-            return (outcome, reason);
-        }
-        let is_routine = instance.role == Role::Node && !matches!(state.kind, StateKind::Action { .. });
-        let declared = match own.outcome(&outcome).map(|number| &own.effects[number]) {
-            Some(Effects::Declared(declared)) => Some(declared.as_slice()),
-            _ => None,
         };
-        let made = match &ended.changes {
-            Changed::Exactly(made) => Ok(made.clone()),
-            Changed::Declared(..) if is_routine => Ok(Made::default()),
-            Changed::Declared(measured, evidence) => effects::actual(declared, &outcome, measured, &view)
-                .map(|changes| Made { changes, evidence: evidence.clone() }),
-        };
-        let wanted = &plan.state(instance.state).operations;
-        let operations = if is_routine || wanted.is_empty() || outcome.as_ref() != SUCCESS {
-            // A routine has performed its own.
-            Ok(Vec::new())
-        } else {
-            binding::requirements(state, wanted, &view)
-        };
-        drop(view);
-        match made {
-            Ok(made) => {
-                let writer = self.path(program, id);
-                if let Err(problem) = context.commit(id, writer, made) {
-                    return aborted(problem);
-                }
+        if !made.changes.is_empty() {
+            let has_readers = self.graph.get(id).is_some_and(|instance| instance.memory.has_users());
+            if has_readers {
+                let written = made.changes.iter().filter_map(|change| match change {
+                    Change::Set { fact, .. } | Change::Increase { fact, .. } => Some(fact),
+                    Change::Delete { .. } => None,
+                });
+                real.before = written.map(|fact| (fact.clone(), context.root.get(fact).cloned())).collect();
             }
-            Err(problem) => return aborted(problem.to_string()),
+            let changes = if has_readers { made.changes.clone() } else { Vec::new() };
+            let writer = self.path(context.program, id);
+            if let Err(problem) = context.commit(id, writer, made) {
+                real.reason = problem;
+                return real;
+            }
+            real.changes = changes;
         }
         match operations {
             Ok(operations) if operations.is_empty() => {}
             Ok(operations) => context.commands.push(Command::Operate { instance: id, operations }),
-            Err(error) => (outcome, reason) = aborted(error.reason()),
+            Err(reason) => {
+                real.reason = reason;
+                return real;
+            }
         }
-        (outcome, reason)
+        real.outcome = outcome;
+        real
+    }
+
+    /// The outcome of an instance, its changes and its resource operations, on the actual world; `None` where what it required does
+    /// not hold: it never happened. Its reason stands in `real` then.
+    #[expect(clippy::type_complexity, reason = "three parts of one answer, used once")]
+    fn what_happens(
+        &self,
+        context: &Context<'_>,
+        id: InstanceId,
+        real: &mut Real,
+    ) -> Option<(Arc<str>, Result<Made, String>, Result<Vec<ratn_model::resource::Requirement>, String>)> {
+        let instance = self.graph.get(id)?;
+        let Some(ended) = instance.ended() else {
+            real.reason = "it never ended".to_owned();
+            return None;
+        };
+        let state = context.program.state(instance.state);
+        let own = context.plan.state(instance.state);
+        // What began on a projection had its preconditions checked there, if at all; now the actual world decides.
+        let checks = match instance.role() {
+            None => instance.node().is_some_and(|node| node.nature != NodeNature::Irreversible) && gives_outputs(&ended.outcome),
+            Some(Role::Entry) => ended.outcome.as_ref() == SUCCESS,
+            Some(_) => false,
+        };
+        real.reason.clone_from(&ended.reason);
+        if checks && !state.annotations.requires.is_empty() {
+            let unmet = self.look(context, id, Some(&ended.outputs), |_, view| binding::unmet(state, view))?;
+            match unmet {
+                Ok(None) => {}
+                Ok(Some(unmet)) => {
+                    real.reason = unmet;
+                    return None;
+                }
+                Err(error) => {
+                    real.reason = error.reason();
+                    return None;
+                }
+            }
+        }
+        let outcome = ended.outcome.clone();
+        if !matches!(instance.role(), None | Some(Role::Exit)) {
+            return Some((outcome, Ok(Made::default()), Ok(Vec::new())));
+        }
+        let declared = match own.outcome(&outcome).map(|number| &own.effects[number]) {
+            Some(Effects::Declared(declared)) => Some(declared.as_slice()),
+            _ => None,
+        };
+        let is_routine = own.is_routine && instance.role().is_none();
+        let made = match &ended.changes {
+            Changed::Exactly(made) => Ok(made.clone()),
+            Changed::Declared(..) if is_routine => Ok(Made::default()),
+            Changed::Declared(measured, _) if declared.is_some_and(<[_]>::is_empty) && measured.is_empty() => {
+                Ok(Made::default())
+            }
+            Changed::Declared(measured, evidence) => {
+                let changes = self.look(context, id, Some(&ended.outputs), |_, view| {
+                    effects::actual(declared, &outcome, measured, view).map_err(|problem| problem.to_string())
+                })?;
+                changes.map(|changes| Made { changes, evidence: evidence.clone() })
+            }
+        };
+        // A routine has performed its own.
+        let operations = if is_routine || own.operations.is_empty() || outcome.as_ref() != SUCCESS {
+            Ok(Vec::new())
+        } else {
+            self.look(context, id, Some(&ended.outputs), |_, view| {
+                binding::requirements(state, &own.operations, view).map_err(|error| error.reason())
+            })?
+        };
+        Some((outcome, made, operations))
+    }
+
+    /// What was made of predicted effects is compared with what they came to.
+    fn tell_of_real(&mut self, context: &mut Context<'_>, id: InstanceId, real: &Real) {
+        let users = self.take_users(id);
+        if users.is_empty() {
+            return;
+        }
+        let Some(instance) = self.graph.get(id) else { return };
+        let has_readers = users.iter().any(|user| user.of == Source::World);
+        let difference = if has_readers {
+            let before = |key: &FactKey| match real.before.get(key) {
+                Some(before) => before.clone(),
+                None => context.root.get(key).cloned(),
+            };
+            self.sight(context).compare_with_actual(instance, &real.changes, self.tolerance_of(context), before)
+        } else {
+            Default::default()
+        };
+        // A failure that was not computed ahead has no outputs.
+        let has_outputs = instance.ended().is_some() && real.outcome.as_ref() == instance.ended().map_or("", |e| &*e.outcome);
+        self.tell(context, id, &users, &difference, !has_outputs, false);
     }
 
     /// An imprecise PIA that others were let pass by has ended.
     pub(super) fn retire_detached(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let users = self.take_users(id);
-        let (outcome, reason) = self.make_real(context, id);
-        self.detached.remove(&id);
-        let Some(instance) = self.instances.get(id) else { return };
-        let number = self.plan.state(instance.state).outcome(&outcome);
-        let expected = number.is_some_and(|n| instance.arms.first().is_some_and(|arm| arm.outcomes & (1 << n) != 0));
-        if expected || instance.is_orphan() || !self.threads.contains_key(&instance.line) {
+        let real = self.make_real(context, id);
+        self.tell_of_real(context, id, &real);
+        let Some(instance) = self.graph.get(id) else { return };
+        let own = context.plan.state(instance.state);
+        let number = own.outcome(&real.outcome);
+        let is_expected = number.is_some_and(|number| instance.arm_of(number).is_some());
+        if is_expected || instance.is_orphan() || !self.graph.has_line(instance.line) {
             self.remove_retired(context, id);
         } else {
-            let number = number.unwrap_or(self.plan.state(instance.state).outcomes.len() - 2);
-            self.leave_path(context, id, number, reason);
+            let number = number.unwrap_or(own.outcomes.len() - 2);
+            self.leave_path(context, id, number, real.reason);
         }
-        self.compare(context, users);
+        self.revise(context);
     }
 
     /// A motion that has ended, and whose path was left before it could retire: what it did stands.
     pub(super) fn retire_orphan(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        self.make_real(context, id);
-        self.leave_head(id);
+        let real = self.make_real(context, id);
+        self.tell_of_real(context, id, &real);
         self.remove_retired(context, id);
     }
 
-    /// Takes a retired instance out of the window: its line, its position, whether its line had passed it before.
-    fn remove_retired(&mut self, context: &mut Context<'_>, id: InstanceId) -> Option<(Line, u64, bool)> {
-        self.wake_waiters(id);
-        let instance = self.instances.remove(id)?;
-        self.active.remove(&id);
-        if instance.role == Role::Node {
+    /// Takes a retired instance out of the window.
+    fn remove_retired(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        self.waits.wake(&mut self.graph, id);
+        let Some(instance) = self.graph.remove(id) else { return };
+        self.forget(id);
+        let started = instance.node().is_some_and(|node| match &node.status {
+            Status::Finished(ended) => node.has_acted || ended.reason.is_empty(),
+            _ => false,
+        });
+        self.graph.count_visits(instance.line, instance.visits_before, started);
+        if instance.role().is_none() {
             context.note(Note::Retired { instance: id });
         }
-        if instance.role == Role::Join {
-            self.joins.remove(&id);
-            self.forks.retain(|_, fork| fork.join != Some(id));
+        if instance.role() == Some(Role::Join) {
+            self.growth.forget_joined(&self.graph);
         }
-        if let (Some(producer), Some(ended)) = (&instance.producer, instance.ended) {
-            let good = gives_outputs(&ended.outcome) || instance.role == Role::RegionEnd;
-            let mut outputs = ended.outputs;
-            if !good {
-                outputs.retain(|port, _| port.starts_with(super::environment::ASSIGNED));
-            }
-            let _ = producer.real.set(outputs);
+        let Some(producer) = &instance.producer else { return };
+        let Some(ended) = instance.ended() else { return };
+        let mut outputs = ended.outputs.clone();
+        if !gives_outputs(&ended.outcome) && instance.role() != Some(Role::RegionEnd) {
+            outputs.retain(|port, _| port.starts_with(super::growth::environment::ASSIGNED));
         }
-        Some((instance.line, instance.position, instance.detached))
+        let _ = producer.real.set(outputs);
     }
-
-    fn begin_regions(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some((line, position, _)) = self.remove_retired(context, id) else { return };
-        let Some(fork) = self.forks.get(&id) else { return };
-        let (regions, join) = (fork.regions.clone(), fork.join);
-        if let Some(thread) = self.threads.get_mut(&line) {
-            thread.open_regions = regions.len();
-            thread.floor = position + 1;
-            thread.head = None;
-        }
-        for region in &regions {
-            let head = self.threads.get_mut(region).and_then(|thread| {
-                thread.is_active = true;
-                thread.head
-            });
-            self.set_head(*region, head);
-        }
-        if regions.is_empty() {
-            self.set_head(line, join);
-        }
-    }
-
-    fn region_ended(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some((region, _, _)) = self.remove_retired(context, id) else { return };
-        let Some(fork) = self.threads.remove(&region).and_then(|thread| thread.fork) else { return };
-        let Some(fork) = self.forks.get(&fork) else { return };
-        let (line, join) = (fork.line, fork.join);
-        let Some(thread) = self.threads.get_mut(&line) else { return };
-        thread.open_regions -= 1;
-        if thread.open_regions == 0 {
-            self.set_head(line, join);
-        }
-    }
-
-    /// The oldest instance of a line from now on.
-    pub(super) fn set_head(&mut self, line: Line, head: Option<InstanceId>) {
-        let Some(thread) = self.threads.get_mut(&line) else { return };
-        thread.head = head;
-        let Some(instance) = head.and_then(|head| self.instances.get_mut(head)) else { return };
-        thread.floor = instance.position;
-        if thread.is_active && thread.open_regions == 0 {
-            instance.is_head = true;
-            let id = instance.id;
-            self.enqueue(id);
-        }
-    }
-
-    fn take_users(&mut self, id: InstanceId) -> SmallVec<[InstanceId; 2]> {
-        let mut users = self.instances.get_mut(id).map(|i| std::mem::take(&mut i.users)).unwrap_or_default();
-        users.sort_unstable();
-        users.dedup();
-        users
-    }
-
-    /// What was made of predicted effects is compared with what they came to.
-    fn compare(&mut self, context: &mut Context<'_>, users: SmallVec<[InstanceId; 2]>) {
-        for user in users {
-            self.revalidate(context, user);
-        }
-    }
-}
-
-fn is_failure(outcome: &str) -> bool {
-    !gives_outputs(outcome)
 }

@@ -1,20 +1,22 @@
 //! Loops: their iterations are appended one behind the other, as far as the list is known or a test is decided or predicted.
 
-use super::Window;
+use super::append::What;
 use super::cursor::Todo;
 use super::environment::Iteration;
-use super::instance::Role;
+use super::Growth;
 use crate::context::Context;
+use crate::window::graph::instance::Role;
+use crate::window::graph::Graph;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
 use std::sync::Arc;
 
-impl Window {
+impl Growth {
     /// The list of a loop is known: its iterations begin.
-    pub(super) fn unroll(&mut self, context: &Context<'_>, waits_for: InstanceId, elements: Vec<Value>) {
+    pub(crate) fn unroll(&mut self, graph: &Graph, context: &Context<'_>, waits_for: InstanceId, elements: Vec<Value>) {
         let Some(index) = self.cursors.iter().position(|cursor| cursor.todo == Todo::Await(waits_for)) else { return };
-        let Some(instance) = self.instances.get(waits_for) else { return };
+        let Some(instance) = graph.get(waits_for) else { return };
         let (state, visit) = (context.program.state(instance.state), instance.visit);
         let path: Arc<str> = self.cursors[index].environment.path(&state.name, visit, None).into();
         let base = self.cursors[index].environment.variables.len();
@@ -26,17 +28,19 @@ impl Window {
     }
 
     /// The innermost loop goes on to its next iteration, or ends.
-    pub(super) fn iterate(&mut self, context: &mut Context<'_>, index: usize) {
+    pub(super) fn iterate(&mut self, graph: &mut Graph, context: &mut Context<'_>, index: usize) {
         let program = context.program;
+        self.cursors[index].visits += 1;
         let Some(frame) = self.top_frame(index) else { return };
         let (owner, visit, base) = (frame.owner, frame.visit, frame.variables);
         let Some(iteration) = &mut frame.iteration else { return };
         iteration.index = iteration.index.wrapping_add(1);
-        let (number, elements) = (iteration.index, iteration.elements.clone());
+        let number = iteration.index;
+        let ends = iteration.elements.as_ref().map(|elements| number >= elements.len());
         frame.visits.clear();
-        match elements {
-            Some(elements) if number < elements.len() => self.begin_iteration(index, program),
-            Some(_) => self.leave_frame(index, 0),
+        match ends {
+            Some(false) => self.begin_iteration(index, program),
+            Some(true) => self.leave_frame(index, 0),
             None => {
                 let state = program.state(owner);
                 // The test stands where the loop stands, not in its body.
@@ -45,9 +49,9 @@ impl Window {
                 let inside = environment.frames.clone();
                 environment.frames = inside.as_ref().and_then(|frame| frame.below.clone());
                 environment.test = Some(Box::new((owner, Iteration { index: number, elements: None })));
-                let test = self.append(context, index, state, Role::Test, visit, Some(number), 0);
+                let test = self.append(graph, context, index, state, What::marker(Role::Test), (visit, Some(number)));
                 self.cursors[index].environment.test = None;
-                self.branch_on_test(context, index, test, visit, number);
+                self.branch_on_test(graph, context, index, test, visit, number);
             }
         }
     }

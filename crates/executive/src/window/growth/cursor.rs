@@ -1,35 +1,33 @@
 //! Where the window grows: one cursor per open end of a path. It holds the environment of the next instance.
 
 use super::environment::Environment;
-use super::instance::{Line, Segment};
 use crate::plan::Outcome;
+use crate::window::graph::instance::{LineId, SegmentId};
 use ratn_model::id::{InstanceId, StateId};
 use std::sync::Arc;
 
 /// An open end.
 #[derive(Debug, Clone)]
-pub(crate) struct Cursor {
-    pub(crate) environment: Environment,
+pub(super) struct Cursor {
+    pub(super) environment: Environment,
     /// The youngest instance on its path and the arm of it that it follows; may have retired since.
-    pub(crate) tail: Option<(InstanceId, usize)>,
-    pub(crate) line: Line,
-    pub(crate) segment: Segment,
+    pub(super) tail: Option<(InstanceId, usize)>,
+    pub(super) line: LineId,
+    pub(super) segment: SegmentId,
     /// How many instances of its line are before it.
-    pub(crate) position: u64,
-    pub(crate) todo: Todo,
-    /// How likely its path is taken.
-    pub(crate) probability: f32,
+    pub(super) position: u64,
+    pub(super) todo: Todo,
     /// Why it left by an outcome that is not success.
-    pub(crate) because: Option<Arc<str>>,
-    /// Steps since an instance came of one.
-    pub(crate) idle: usize,
+    pub(super) because: Option<Arc<str>>,
+    /// States entered and iterations begun since the last instance.
+    pub(super) visits: u32,
     /// Cursors grow in this order.
-    pub(crate) order: u64,
+    pub(super) order: u64,
 }
 
 /// What a cursor does next.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Todo {
+pub(super) enum Todo {
     /// Visit a state.
     Enter(StateId),
     /// A state has ended: follow the outcome.

@@ -6,15 +6,14 @@ use std::collections::VecDeque;
 
 /// The table of instances. Ids grow; what has left the window leaves a hole until everything older has left, too.
 #[derive(Default)]
-pub(crate) struct Instances {
+pub(super) struct Instances {
     first: u64,
     slots: VecDeque<Option<Box<Instance>>>,
     alive: usize,
 }
 
 impl Instances {
-    /// How many there are.
-    pub(crate) fn len(&self) -> usize {
+    pub(super) fn len(&self) -> usize {
         self.alive
     }
 
@@ -22,17 +21,17 @@ impl Instances {
         id.0.checked_sub(self.first).and_then(|place| usize::try_from(place).ok())
     }
 
-    pub(crate) fn get(&self, id: InstanceId) -> Option<&Instance> {
+    pub(super) fn get(&self, id: InstanceId) -> Option<&Instance> {
         self.slots.get(self.place(id)?)?.as_deref()
     }
 
-    pub(crate) fn get_mut(&mut self, id: InstanceId) -> Option<&mut Instance> {
+    pub(super) fn get_mut(&mut self, id: InstanceId) -> Option<&mut Instance> {
         let place = self.place(id)?;
         self.slots.get_mut(place)?.as_deref_mut()
     }
 
     /// Adds the youngest.
-    pub(crate) fn push(&mut self, instance: Instance) {
+    pub(super) fn push(&mut self, instance: Box<Instance>) {
         if self.slots.is_empty() {
             self.first = instance.id.0;
         }
@@ -40,11 +39,11 @@ impl Instances {
         while self.first + (self.slots.len() as u64) < instance.id.0 {
             self.slots.push_back(None);
         }
-        self.slots.push_back(Some(Box::new(instance)));
+        self.slots.push_back(Some(instance));
         self.alive += 1;
     }
 
-    pub(crate) fn remove(&mut self, id: InstanceId) -> Option<Box<Instance>> {
+    pub(super) fn remove(&mut self, id: InstanceId) -> Option<Box<Instance>> {
         let place = self.place(id)?;
         let removed = self.slots.get_mut(place)?.take()?;
         self.alive -= 1;
@@ -56,12 +55,16 @@ impl Instances {
     }
 
     /// All, oldest id first.
-    pub(crate) fn iter(&self) -> impl DoubleEndedIterator<Item = &Instance> {
+    pub(super) fn iter(&self) -> impl DoubleEndedIterator<Item = &Instance> {
         self.slots.iter().filter_map(Option::as_deref)
     }
 
+    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = &mut Instance> {
+        self.slots.iter_mut().filter_map(Option::as_deref_mut)
+    }
+
     /// The ids that are in use, and holes between them.
-    pub(crate) fn ids(&self) -> std::ops::Range<u64> {
+    pub(super) fn ids(&self) -> std::ops::Range<u64> {
         self.first..self.first + self.slots.len() as u64
     }
 }

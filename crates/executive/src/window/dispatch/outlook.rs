@@ -1,0 +1,60 @@
+//! What is still to be done, as a scheduling problem for a look-ahead: of an undecided decision the likelier way on.
+
+use super::{DEFAULT_DURATION_S, Dispatch, blocks};
+use crate::lookahead::{Problem, Task};
+use crate::window::graph::instance::{Instance, LineId};
+use crate::window::memory::Sight;
+use ratn_model::id::InstanceId;
+use ratn_model::time::Timestamp;
+use std::collections::BTreeMap;
+
+/// A window is looked ahead for so many nodes; what comes later keeps its longest remaining path.
+const MAX_TASKS: usize = 2_000;
+
+/// What takes longer is planned as if it took so long, in seconds: a year.
+const LONGEST_S: f64 = 365.0 * 24.0 * 3600.0;
+
+impl Dispatch {
+    pub(crate) fn outlook(&self, sight: Sight<'_>, now: Timestamp) -> Problem {
+        let graph = sight.graph;
+        let mut places: BTreeMap<InstanceId, usize> = BTreeMap::new();
+        let mut tasks: Vec<Task> = Vec::new();
+        // Per line, the last PIA and what came since: a PIA waits for all of it.
+        let mut since: BTreeMap<LineId, Vec<usize>> = BTreeMap::new();
+        let is_open = |instance: &&Instance| {
+            instance.role().is_none() && instance.ended().is_none() && graph.is_likeliest(instance.segment)
+        };
+        for instance in graph.iter().filter(is_open).take(MAX_TASKS) {
+            let began = instance.node().and_then(|node| node.status.since());
+            let elapsed_s = began.map_or(0.0, |began| now.since(began).as_secs_f64());
+            let mut after: Vec<usize> = Vec::new();
+            if began.is_none() {
+                after.extend(sight.producers_of(instance).filter_map(|producer| places.get(&producer)));
+                after.extend(instance.waiting.wait().on().and_then(|on| places.get(&on)));
+                if instance.is_pia() {
+                    after.extend(since.get(&instance.line).into_iter().flatten());
+                }
+                after.sort_unstable();
+                after.dedup();
+            }
+            let line = since.entry(instance.line).or_default();
+            if instance.is_pia() {
+                line.clear();
+            }
+            line.push(tasks.len());
+            places.insert(instance.id, tasks.len());
+            let duration_s = instance.dispatch.duration_s.unwrap_or(DEFAULT_DURATION_S);
+            tasks.push(Task {
+                instance: instance.id,
+                duration_s: (f64::from(duration_s) - elapsed_s).clamp(0.0, LONGEST_S),
+                is_running: began.is_some(),
+                is_speculative: graph.is_speculative(instance.segment),
+                urgency_s: f64::from(instance.dispatch.remaining_s.unwrap_or(duration_s)),
+                probability: graph.probability(instance.segment),
+                demands: blocks(sight.plan, instance).map(|(kind, count)| (kind.to_owned(), count)).collect(),
+                after,
+            });
+        }
+        Problem { tasks, capacity: self.capacity.clone() }
+    }
+}

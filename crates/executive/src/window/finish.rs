@@ -1,0 +1,267 @@
+//! How a node's attempt ends: with a result, without an answer, too late; and what is tried again.
+
+use super::Window;
+use super::graph::instance::{Changed, Ended, Held, Instance, Status};
+use super::growth::environment::assigned;
+use super::waits::{Timer, Wait};
+use crate::binding;
+use crate::context::Context;
+use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
+use crate::plan::gives_outputs;
+use crate::protocol::{Command, Event, Note};
+use ratn_model::id::InstanceId;
+use ratn_model::program::{ABORTED, PREEMPTED, STOPPED, SUCCESS, StateKind};
+use std::time::Duration;
+
+impl Window {
+    /// An attempt has ended, with or without an answer.
+    pub(super) fn attempt_ended(&mut self, context: &mut Context<'_>, event: Event) {
+        let (Event::Finished { instance: id, attempt, .. } | Event::Crashed { instance: id, attempt, .. }) = &event else {
+            return;
+        };
+        let (id, attempt) = (*id, *attempt);
+        let node = self.graph.node(id).filter(|node| node.attempt == attempt);
+        match (event, node.map(|node| &node.status)) {
+            (Event::Finished { outcome, outputs, measured, evidence, reason, .. }, Some(Status::Running(_))) => {
+                let changes = Changed::Declared(measured, evidence);
+                let Some(instance) = self.graph.get(id) else { return };
+                let own = context.plan.state(instance.state);
+                let known = own.outcome(&outcome).map(|number| own.outcomes[number].clone());
+                let outcome = known.unwrap_or_else(|| outcome.into());
+                self.goal_ended(context, id, Ended { outcome, outputs, reason, changes, in_circles: false });
+            }
+            (
+                Event::Crashed { reason, .. },
+                Some(Status::Acquiring { .. } | Status::Granted(_) | Status::Projecting(_) | Status::Running(_)),
+            ) => {
+                self.crashed(context, id, &reason);
+            }
+            (event, _) => self.in_routine(context, event),
+        }
+    }
+
+    /// What is due happens.
+    pub(super) fn fire(&mut self, context: &mut Context<'_>) {
+        while let Some(timer) = self.waits.next_due(context.now) {
+            match timer {
+                Timer::Retry(id) => self.waits.enqueue(&mut self.graph, id),
+                Timer::Timeout(id, attempt) => {
+                    let Some(instance) = self.graph.get(id) else { continue };
+                    let is_running = instance.node().is_some_and(|node| node.attempt == attempt && node.status.is_running());
+                    if !is_running {
+                        continue;
+                    }
+                    let limit = context.program.state(instance.state).annotations.timeout_s.unwrap_or_default();
+                    context.commands.push(Command::Cancel { instance: id, attempt });
+                    self.goal_ended(context, id, Ended::aborted(format!("it took longer than {limit} s")));
+                }
+                Timer::Deadline => {
+                    let limit = context.program.deadline_s.unwrap_or_default();
+                    self.stop(context, ABORTED, format!("the task took longer than its deadline of {limit} s"));
+                }
+            }
+        }
+    }
+
+    /// A goal has ended: that is the result, unless it is tried again.
+    fn goal_ended(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let tries = instance.node().map_or(1, |node| node.tries);
+        let retry = context.program.state(instance.state).annotations.retry;
+        let Some(retry) = retry.filter(|retry| {
+            &*ended.outcome == ABORTED && tries <= retry.count && !instance.is_orphan()
+        }) else {
+            return self.finish(context, id, ended);
+        };
+        let pause_s = retry.backoff_s * f64::from(2_u32.saturating_pow(tries - 1));
+        self.give_back(context, id);
+        let not_before = context.now + Duration::try_from_secs_f64(pause_s).unwrap_or_default();
+        self.graph.try_again(id, not_before);
+        self.wait(id, Wait::Backoff);
+        self.rest(id);
+        if not_before <= context.now {
+            self.waits.enqueue(&mut self.graph, id);
+        } else {
+            self.set_timer(context, pause_s, Timer::Retry(id));
+        }
+    }
+
+    /// A node's result is known: it gives back what it held.
+    pub(super) fn finish(&mut self, context: &mut Context<'_>, id: InstanceId, mut ended: Ended) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let state = context.program.state(instance.state);
+        let own = context.plan.state(instance.state);
+        let failed = |ended: &Ended, problem: String| Ended { changes: ended.changes.clone(), ..Ended::aborted(problem) };
+        if let StateKind::Action { outputs, .. } = &state.kind
+            && &*ended.outcome == SUCCESS
+            && let Some(problem) = binding::missing_output(outputs, &ended.outputs)
+        {
+            ended = failed(&ended, problem);
+        }
+        if &*ended.outcome == STOPPED && own.outcome(STOPPED).is_none() {
+            ended.outcome = PREEMPTED.into();
+        }
+        if own.outcome(&ended.outcome).is_none() {
+            let problem = format!("it ended with `{}`, which is no outcome of its action", ended.outcome);
+            ended = failed(&ended, problem);
+        }
+        if let Err(problem) = self.assign(context, id, &mut ended) {
+            ended = failed(&ended, problem);
+        }
+        context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
+        let (has_acted, is_detached) =
+            instance.node().map_or((false, false), |node| (node.status.is_running(), node.is_detached));
+        self.give_back(context, id);
+        self.graph.set_acted(id, has_acted);
+        self.rest(id);
+        self.end_instance(id, ended);
+        if is_detached {
+            self.retire_detached(context, id);
+        }
+    }
+
+    /// An instance has ended: whoever waited for it is looked at, and whoever has used what was predicted of it.
+    pub(super) fn end_instance(&mut self, id: InstanceId, ended: Ended) {
+        self.graph.end(id, ended);
+        self.memory.mark(id);
+        self.waits.wake(&mut self.graph, id);
+        self.waits.enqueue(&mut self.graph, id);
+    }
+
+    /// What an action assigns to variables is part of its result.
+    pub(super) fn assign(&self, context: &Context<'_>, id: InstanceId, ended: &mut Ended) -> Result<(), String> {
+        let Some(instance) = self.graph.get(id) else { return Ok(()) };
+        let state = context.program.state(instance.state);
+        let is_action = matches!(state.kind, StateKind::Action { .. });
+        if state.assign.is_empty() || !is_action || !gives_outputs(&ended.outcome) {
+            return Ok(());
+        }
+        let outputs = ended.outputs.clone();
+        let values = self.look(context, id, Some(&outputs), |_, view| {
+            let value = |(name, expression): &(String, ratn_model::expression::Expr)| {
+                let part = format_args!("`assign` of `{name}`");
+                let value = expression.evaluate(view).map_err(binding::BindError::at(part, state));
+                value.map(|value| (assigned(name), value)).map_err(|error| error.reason())
+            };
+            state.assign.iter().map(value).collect::<Result<Vec<_>, String>>()
+        });
+        ended.outputs.extend(values.unwrap_or(Ok(Vec::new()))?);
+        Ok(())
+    }
+
+    /// An attempt ended without an answer.
+    fn crashed(&mut self, context: &mut Context<'_>, id: InstanceId, reason: &str) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let Some(node) = instance.node() else { return };
+        let limit = context.program.state(instance.state).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
+        let (is_pia, attempt) = (instance.is_pia(), node.attempt);
+        let is_held = is_pia && matches!(node.status, Status::Granted(_));
+        self.give_back(context, id);
+        self.rest(id);
+        if is_held {
+            // It had not begun: what it held is gone, and it asks again when it may.
+            self.graph.begin_again(id);
+            return self.waits.enqueue(&mut self.graph, id);
+        }
+        let crashes = self.graph.count_crash(id);
+        if is_pia || crashes >= limit {
+            return self.finish(context, id, Ended::aborted(format!("crashed in attempt {attempt}: {reason}")));
+        }
+        self.graph.begin_again(id);
+        self.waits.enqueue(&mut self.graph, id);
+    }
+
+    /// It does not hold anything any more, nor does it act or look.
+    pub(super) fn rest(&mut self, id: InstanceId) {
+        self.dispatch.end(id);
+        self.waits.wake(&mut self.graph, id);
+    }
+
+    /// Gives back what a node holds.
+    pub(super) fn give_back(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Held { lease, projection, .. } = self.graph.take_held(id);
+        let lease = lease.map(|lease| lease.id);
+        if lease.is_some() || projection.is_some() {
+            context.commands.push(Command::Release { instance: id, lease, projection });
+        }
+    }
+
+    /// Takes back what was asked for a node; it holds nothing afterwards.
+    pub(super) fn stop_node(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(node) = self.graph.node(id) else { return };
+        let attempt = node.attempt;
+        match &node.status {
+            Status::Acquiring { .. } => context.commands.push(Command::Withdraw { instance: id }),
+            Status::Projecting(_) | Status::Running(_) => {
+                context.commands.push(Command::Cancel { instance: id, attempt });
+            }
+            Status::RunningRoutine(..) => {
+                if let Some(interpreter) = self.graph.interpreter(id) {
+                    interpreter.abort(context);
+                }
+                self.graph.end_routine(id);
+            }
+            Status::Expanded | Status::Granted(_) | Status::Finished(_) => {}
+        }
+        self.give_back(context, id);
+        self.rest(id);
+    }
+
+    // ── routines ──
+
+    /// An event for the nodes inside of a routine.
+    pub(super) fn in_routine(&mut self, context: &mut Context<'_>, event: Event) {
+        let inside = match &event {
+            Event::Granted { instance, .. }
+            | Event::Refused { instance, .. }
+            | Event::Projected { instance, .. }
+            | Event::Finished { instance, .. }
+            | Event::Crashed { instance, .. } => *instance,
+            _ => return,
+        };
+        let mut active = self.dispatch.active();
+        let routine = active.find(|id| match self.status_of_routine(*id) {
+            Some(interpreter) => interpreter.is_at(inside),
+            None => false,
+        });
+        drop(active);
+        if let Some(routine) = routine {
+            self.tell_routine(context, routine, event);
+        }
+    }
+
+    fn status_of_routine(&self, id: InstanceId) -> Option<&crate::interpreter::Interpreter> {
+        match &self.graph.node(id)?.status {
+            Status::RunningRoutine(interpreter, _) => Some(interpreter),
+            _ => None,
+        }
+    }
+
+    /// Time has passed for the nodes inside of routines, too.
+    pub(super) fn wake_routines(&mut self, context: &mut Context<'_>) {
+        let routines: Vec<InstanceId> =
+            self.dispatch.active().filter(|id| self.status_of_routine(*id).is_some()).collect();
+        for routine in routines {
+            self.tell_routine(context, routine, Event::Woken);
+        }
+    }
+
+    fn tell_routine(&mut self, context: &mut Context<'_>, id: InstanceId, event: Event) {
+        let Some(interpreter) = self.graph.interpreter(id) else { return };
+        let progress = interpreter.handle(context, event);
+        self.routine_progressed(context, id, progress);
+    }
+
+    pub(super) fn routine_progressed(&mut self, context: &mut Context<'_>, id: InstanceId, progress: Progress) {
+        let Progress::Ended { outcome, reason } = progress else { return };
+        let Some(state) = self.graph.get(id).map(|instance: &Instance| instance.state) else { return };
+        let Some(routine) = self.graph.end_routine(id) else { return };
+        let mut outputs = routine.outputs().get(&state).cloned().unwrap_or_default();
+        for name in &context.plan.state(state).assigns {
+            outputs.extend(routine.variable(name).map(|value| (assigned(name), value.clone())));
+        }
+        let in_circles = routine.is_in_circles();
+        let changes = Changed::Exactly(routine.into_made());
+        self.finish(context, id, Ended { outcome: outcome.into(), outputs, reason, changes, in_circles });
+    }
+}

@@ -1,0 +1,142 @@
+//! One more instance behind the last one of a path, and what is seen from behind it: its outputs, what it assigns, its effects.
+
+use super::environment::{Binding, Link, Producer};
+use super::Growth;
+use crate::context::Context;
+use crate::plan::{Outcome, Predicate, gives_outputs};
+use crate::protocol::Note;
+use crate::window::dispatch::DispatchCell;
+use crate::window::graph::instance::{Body, Instance, Marker, Node, Role, Status};
+use crate::window::graph::Graph;
+use crate::window::memory::MemoryCell;
+use crate::window::waits::WaitCell;
+use ratn_model::id::{InstanceId, StateId};
+use ratn_model::program::State;
+use ratn_model::time::Timestamp;
+use smallvec::SmallVec;
+use std::sync::{Arc, OnceLock};
+
+/// What is appended: a node, or a marker that leaves its state by an outcome.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum What {
+    Node,
+    Marker(Role, Outcome),
+}
+
+impl What {
+    pub(super) fn marker(role: Role) -> What {
+        What::Marker(role, 0)
+    }
+}
+
+impl Growth {
+    pub(super) fn append(
+        &mut self,
+        graph: &mut Graph,
+        context: &mut Context<'_>,
+        index: usize,
+        state: &State,
+        what: What,
+        (visit, iteration): (u32, Option<usize>),
+    ) -> InstanceId {
+        let id = context.new_instance();
+        let own = context.plan.state(state.id);
+        let cursor = &mut self.cursors[index];
+        let (line, segment, position) = (cursor.line, cursor.segment, cursor.position);
+        cursor.position += 1;
+        let environment = cursor.environment.clone();
+        let tail = cursor.tail.replace((id, 0));
+        let writes_outputs = match what {
+            What::Node | What::Marker(Role::Exit, _) => own.is_read || !own.assigns.is_empty(),
+            What::Marker(Role::Entry | Role::RegionEnd, _) => true,
+            What::Marker(..) => false,
+        };
+        let body = match what {
+            What::Node => Body::Node(Node {
+                nature: own.nature,
+                status: Status::Expanded,
+                attempt: 1,
+                tries: 1,
+                crashes: 0,
+                not_before: Timestamp(0),
+                seen: None,
+                has_acted: false,
+                is_detached: false,
+            }),
+            What::Marker(role, leaves_by) => Body::Marker(Marker {
+                role,
+                leaves_by,
+                because: cursor.because.clone(),
+                ended: None,
+                seen: None,
+            }),
+        };
+        let path = (what == What::Node).then(|| environment.path(&state.name, visit, iteration));
+        let instance = Box::new(Instance {
+            id,
+            state: state.id,
+            visit,
+            iteration,
+            environment,
+            producer: writes_outputs.then(|| Arc::new(Producer { instance: id, real: OnceLock::new() })),
+            line,
+            segment,
+            position,
+            visits_before: std::mem::take(&mut cursor.visits),
+            arms: SmallVec::new(),
+            is_head: false,
+            is_settled: false,
+            body,
+            memory: MemoryCell::default(),
+            waiting: WaitCell::default(),
+            dispatch: DispatchCell::default(),
+        });
+        let speculative = graph.append(instance, tail);
+        if let Some(path) = path {
+            context.note(Note::Expanded { instance: id, state: state.id, path, speculative });
+        }
+        self.grown += 1;
+        id
+    }
+
+    /// The environment behind an instance that ends by an outcome.
+    pub(super) fn come_after(
+        &mut self,
+        graph: &Graph,
+        context: &Context<'_>,
+        index: usize,
+        instance: InstanceId,
+        link: Link,
+        writes: &[Predicate],
+    ) {
+        let Some((state, producer)) = graph.get(instance).map(|i| (i.state, i.producer.clone())) else { return };
+        for predicate in writes {
+            self.cursors[index].environment.writers.set(*predicate, Some(link));
+        }
+        self.produce(context, index, producer, state, link.outcome);
+    }
+
+    /// Its outputs and what it assigns are seen from here on.
+    pub(super) fn produce(
+        &mut self,
+        context: &Context<'_>,
+        index: usize,
+        producer: Option<Arc<Producer>>,
+        id: StateId,
+        outcome: Outcome,
+    ) {
+        let own = context.plan.state(id);
+        let environment = &mut self.cursors[index].environment;
+        let good = gives_outputs(&own.outcomes[outcome]);
+        if let Some(producer) = producer {
+            if own.is_read && good {
+                environment.producers.set(id.0 as usize, Some(producer.clone()));
+            }
+            if good || own.is_routine {
+                for name in &own.assigns {
+                    environment.variables.assign(name, Binding::Assigned(producer.clone()));
+                }
+            }
+        }
+    }
+}
