@@ -3,16 +3,17 @@
 
 pub(crate) mod script;
 
-use ratn_executive::protocol::{Command, LogEntry, Mode, Note};
+use ratn_executive::protocol::{Command, Goal, LogEntry, Mode, Note};
 use ratn_model::catalogue::{Catalogue, ResourceOffer};
 use ratn_model::fact::{FactKey, Term};
 use ratn_model::id::InstanceId;
 use ratn_model::load::{Files, load_with};
-use ratn_model::program::{Nature, Program, StateKind};
+use ratn_model::program::{Nature, Program, State, StateKind};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
-use ratn_simulation::run::{Circumstances, Oracle, Run, Setup, run_under};
+use ratn_simulation::run::{Answer, Circumstances, Oracle, Performance, Run, Setup, run_under};
+use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -57,6 +58,18 @@ pub(crate) fn setup(program: Program, mode: Mode) -> Setup {
         world: Vec::new(),
         tolerance: Tolerance::ROBOT,
         latency: Duration::ZERO,
+    }
+}
+
+/// Providers that end each goal with an outcome and an output `x`, after its declared duration, 1 s where none is declared.
+pub(crate) struct Providers<F>(pub(crate) F);
+
+impl<F: FnMut(&str, u32, &Goal, &World) -> (&'static str, Value)> Oracle for Providers<F> {
+    fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, world: &World) -> Performance {
+        let (outcome, x) = (self.0)(path, attempt, goal, world);
+        let outputs = BTreeMap::from([("x".to_owned(), x)]);
+        let answer = Answer::Finished { outcome: outcome.to_owned(), outputs, measured: Vec::new() };
+        Performance { duration_s: goal.expected_s.unwrap_or(1.0), answer }
     }
 }
 
@@ -108,26 +121,42 @@ pub(crate) fn invalidated(run: &Run) -> Vec<(String, String)> {
     run.log.iter().filter_map(|line| again(&line.entry)).collect()
 }
 
-/// The goals of PIAs in the order in which they started, with what they were given: `grasp {a: 1}`.
-pub(crate) fn acts(program: &Program, run: &Run) -> Vec<String> {
-    let mut pias: BTreeMap<InstanceId, String> = BTreeMap::new();
-    let mut acts = Vec::new();
+/// The goals of PIAs in the order in which they started, with what they were given: `grasp {a: 1}`. By region, because regions have
+/// no order among each other; what is in no region is under the empty path.
+pub(crate) fn acts(program: &Program, run: &Run) -> BTreeMap<String, Vec<String>> {
+    let mut pias: BTreeMap<InstanceId, (String, String)> = BTreeMap::new();
+    let mut acts: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for line in &run.log {
         match &line.entry {
             LogEntry::Command(Command::Note(Note::Expanded { instance, state, path, .. })) => {
                 let state = program.state(*state);
                 let acts = matches!(state.kind, StateKind::Action { .. });
                 if acts && state.annotations.nature == Nature::Irreversible {
-                    pias.insert(*instance, path.clone());
+                    pias.insert(*instance, (region(program, state), path.clone()));
                 }
             }
             LogEntry::Command(Command::Start { instance, goal, .. }) => {
-                acts.extend(pias.get(instance).map(|path| format!("{path} {}", inputs(&goal.inputs))));
+                if let Some((region, path)) = pias.get(instance) {
+                    acts.entry(region.clone()).or_default().push(format!("{path} {}", inputs(&goal.inputs)));
+                }
             }
             _ => {}
         }
     }
     acts
+}
+
+/// The path of the innermost region that a state is in.
+fn region(program: &Program, state: &State) -> String {
+    let mut inner = state;
+    while let Some(parent) = inner.parent {
+        let outer = program.state(parent);
+        if matches!(outer.kind, StateKind::Concurrency { .. }) {
+            return inner.path.clone();
+        }
+        inner = outer;
+    }
+    String::new()
 }
 
 /// `{a: 1, b: [2, 3]}`
