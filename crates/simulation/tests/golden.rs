@@ -12,18 +12,21 @@ use ratn_executive::protocol::{Command, Event, LogEntry, Mode, Note};
 use ratn_model::fact::FactKey;
 use ratn_model::id::InstanceId;
 use ratn_model::program::Program;
+use ratn_model::resource::Quantity;
 use ratn_model::value::Value;
 use ratn_simulation::run::{Run, RunError};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 use support::script::Script;
 use support::{NoFiles, acts, facts, inputs, load};
 
-/// A folder of `tests/scenarios`.
+/// A folder of `tests/scenarios`, and what comes of it in each of its modes.
 struct Scenario {
     folder: PathBuf,
     program: Program,
     script: Script,
+    runs: Vec<(&'static str, Result<Run, RunError>, Script)>,
 }
 
 impl Scenario {
@@ -32,18 +35,14 @@ impl Scenario {
         let task = std::fs::read_to_string(&file).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
         let program = load(&task, &file.display().to_string(), &NoFiles);
         let script = Script::from_toml(&std::fs::read_to_string(folder.join("script.toml")).unwrap_or_default());
-        Scenario { folder, program, script }
-    }
-
-    /// In which modes it is run.
-    fn modes(&self) -> impl Iterator<Item = (&'static str, Mode)> {
-        let wanted = |name: &str| self.script.modes.is_empty() || self.script.modes.iter().any(|wanted| wanted == name);
-        [("hsm", Mode::Hsm), ("cdtn", Mode::Cdtn)].into_iter().filter(move |(name, _)| wanted(name))
-    }
-
-    fn run(&self, mode: Mode) -> (Result<Run, RunError>, Script) {
-        let mut script = self.script.clone();
-        (script.run(&self.program, mode), script)
+        let wanted = |name: &str| script.modes.is_empty() || script.modes.iter().any(|wanted| wanted == name);
+        let modes = [("hsm", Mode::Hsm), ("cdtn", Mode::Cdtn)].into_iter().filter(|(name, _)| wanted(name));
+        let run = |(name, mode)| {
+            let mut script = script.clone();
+            (name, script.run(&program, mode), script)
+        };
+        let runs = modes.map(run).collect();
+        Scenario { folder, program, script, runs }
     }
 
     fn name(&self) -> String {
@@ -52,15 +51,24 @@ impl Scenario {
 
     /// What comes of it in all of its modes.
     fn transcript(&self) -> String {
-        let mut all = String::new();
-        for (name, mode) in self.modes() {
-            let (run, script) = self.run(mode);
-            let told = run.map_or_else(|error| format!("{error}\n"), |run| transcript(&run, &script));
-            all += &format!("== {name}\n{told}");
-        }
-        all
+        let told = |(name, run, script): &(&str, Result<Run, RunError>, Script)| {
+            let told = run.as_ref().map_or_else(|error| format!("{error}\n"), |run| transcript(run, script));
+            format!("== {name}\n{told}")
+        };
+        self.runs.iter().map(told).collect()
+    }
+
+    /// How it ended by the theorem, in each of its modes: outcome, outputs, facts, task resources, and what was started that is a PIA.
+    fn ends(&self) -> Vec<Result<End, String>> {
+        let end = |run: &Run| {
+            let acts = acts(&self.program, run);
+            (run.outcome.clone(), run.outputs.clone(), facts(run), run.units.clone(), acts)
+        };
+        self.runs.iter().map(|(_, run, _)| run.as_ref().map(end).map_err(ToString::to_string)).collect()
     }
 }
+
+type End = (String, BTreeMap<String, Value>, Vec<String>, BTreeMap<String, Quantity>, BTreeMap<String, Vec<String>>);
 
 /// `seconds verb path`, in the order in which it happens, and how it ended.
 fn transcript(run: &Run, script: &Script) -> String {
@@ -131,12 +139,16 @@ fn transcript(run: &Run, script: &Script) -> String {
     text
 }
 
-fn scenarios() -> Vec<Scenario> {
-    let all = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/scenarios");
-    let mut folders: Vec<PathBuf> = std::fs::read_dir(&all).unwrap().map(|entry| entry.unwrap().path()).collect();
-    folders.retain(|path| path.is_dir());
-    folders.sort();
-    folders.into_iter().map(Scenario::of).collect()
+/// All of them; they are run once for all tests.
+fn scenarios() -> &'static [Scenario] {
+    static SCENARIOS: OnceLock<Vec<Scenario>> = OnceLock::new();
+    SCENARIOS.get_or_init(|| {
+        let all = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/scenarios");
+        let mut folders: Vec<PathBuf> = std::fs::read_dir(&all).unwrap().map(|entry| entry.unwrap().path()).collect();
+        folders.retain(|path| path.is_dir());
+        folders.sort();
+        folders.into_iter().map(Scenario::of).collect()
+    })
 }
 
 #[test]
@@ -144,8 +156,8 @@ fn every_scenario_goes_as_its_transcript_says() {
     let update = std::env::var_os("UPDATE").is_some();
     let mut different = Vec::new();
     let scenarios = scenarios();
-    assert!(scenarios.len() >= 50, "there are only {} scenarios", scenarios.len());
-    for scenario in &scenarios {
+    assert!(scenarios.len() >= 95, "there are only {} scenarios", scenarios.len());
+    for scenario in scenarios {
         let actual = scenario.transcript();
         let file = scenario.folder.join("transcript.txt");
         let expected = std::fs::read_to_string(&file).unwrap_or_default();
@@ -165,14 +177,8 @@ fn every_scenario_goes_as_its_transcript_says() {
 fn both_modes_end_alike() {
     let mut different = Vec::new();
     for scenario in scenarios() {
-        if scenario.modes().count() < 2 {
-            continue;
-        }
-        let [hsm, cdtn] = support::MODES.map(|mode| {
-            let run = scenario.run(mode).0.map_err(|error| error.to_string())?;
-            let acts = acts(&scenario.program, &run);
-            Ok::<_, String>((run.outcome.clone(), run.outputs.clone(), facts(&run), run.units.clone(), acts))
-        });
+        let ends = scenario.ends();
+        let [hsm, cdtn] = ends.as_slice() else { continue };
         let name = scenario.name();
         match &scenario.script.differs {
             None if hsm.is_err() || hsm != cdtn => {
