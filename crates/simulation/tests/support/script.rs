@@ -61,10 +61,10 @@ pub(crate) struct Script {
     pub(crate) inputs: bool,
     pub(crate) ends_only: bool,
     resources: BTreeMap<String, u32>,
-    pub(crate) durations: BTreeMap<String, f64>,
-    pub(crate) outcomes: BTreeMap<String, OneOrMore>,
-    pub(crate) outputs: BTreeMap<String, BTreeMap<String, toml::Value>>,
-    pub(crate) measured: BTreeMap<String, BTreeMap<String, toml::Value>>,
+    durations: BTreeMap<String, f64>,
+    outcomes: BTreeMap<String, OneOrMore>,
+    outputs: BTreeMap<String, BTreeMap<String, toml::Value>>,
+    measured: BTreeMap<String, BTreeMap<String, toml::Value>>,
     answers: BTreeMap<String, Vec<Reply>>,
     crashes: BTreeMap<String, u32>,
     events: Vec<Outside>,
@@ -77,7 +77,7 @@ pub(crate) struct Script {
 
 #[derive(Debug, Clone, Deserialize)]
 #[serde(untagged)]
-pub(crate) enum OneOrMore {
+enum OneOrMore {
     One(String),
     More(Vec<String>),
 }
