@@ -3,43 +3,20 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
-use ratn_executive::protocol::{Goal, Mode};
-use ratn_model::catalogue::Catalogue;
-use ratn_model::load::{Files, load_with};
-use ratn_model::tolerance::Tolerance;
+mod support;
+
+use ratn_executive::protocol::Goal;
+use ratn_model::load::Files;
 use ratn_model::value::Value;
-use ratn_simulation::run::{Answer, Oracle, Performance, Run, Setup, run};
+use ratn_simulation::run::{Run, run};
 use ratn_world::world::World;
-use std::collections::BTreeMap;
-use std::sync::Arc;
-use std::time::Duration;
+use support::{MODES, Providers, facts, load, setup};
 
-const CATALOGUE: &str = r#"
-[resources]
-Brain = { class = "process", count = 2 }
-Arm = { class = "module", count = 1, actuates = true }
-WorldModel = { class = "world", count = 8 }
-
-[providers.brain]
-resource = "Brain"
-actions.think = { optional = { a = "any" }, outputs = { x = "any" } }
-
-[providers.arm]
-resource = "Arm"
-actions.move = { optional = { a = "any" }, outputs = { x = "any" }, outcomes = ["empty"] }
-"#;
-
-/// Puts out what it is given; `move` of 40 or more finds nothing.
-struct Echo;
-
-impl Oracle for Echo {
-    fn perform(&mut self, _: &str, _: u32, goal: &Goal, _: &World) -> Performance {
-        let given = goal.inputs.get("a").cloned().unwrap_or(Value::Null);
-        let nothing = &*goal.action == "move" && given.as_number().is_some_and(|number| number >= 40.0);
-        let outcome = if nothing { "empty" } else { "success" }.to_owned();
-        let outputs = BTreeMap::from([("x".to_owned(), given)]);
-        Performance { duration_s: 1.0, answer: Answer::Finished { outcome, outputs, measured: Vec::new() } }
-    }
+/// Puts out what it is given; an arm that is given 40 or more finds nothing.
+fn echo(_: &str, _: u32, goal: &Goal, _: &World) -> (&'static str, Value) {
+    let given = goal.inputs.get("a").cloned().unwrap_or(Value::Null);
+    let nothing = &*goal.provider == "arm" && given.as_number().is_some_and(|number| number >= 40.0);
+    (if nothing { "empty" } else { "success" }, given)
 }
 
 struct Shelf;
@@ -73,7 +50,7 @@ states:
           assign: { sum: think.x }
           resources: [{ block: Brain }, world_model]
   - go:
-      action: arm/move
+      action: arm/grasp
       in: { a: $sum }
       reads: []
       effects: { success: ["moved($n) = x"], empty: ["moved($n) = 0"] }
@@ -90,29 +67,8 @@ states:
 "#;
 
 fn both(task: &str) -> [Run; 2] {
-    let catalogue = Catalogue::from_toml(CATALOGUE).unwrap();
-    let loaded = load_with(task, "task.yaml", &catalogue, &Shelf).unwrap_or_else(|problems| {
-        panic!("{}", problems.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))
-    });
-    let program = Arc::new(loaded.program);
-    let resources: Vec<_> = catalogue.resources.clone().into_iter().collect();
-    [Mode::Hsm, Mode::Cdtn].map(|mode| {
-        let setup = Setup {
-            program: Arc::clone(&program),
-            mode,
-            parameters: program.bind_parameters(&[]).unwrap(),
-            seed: 7,
-            resources: resources.clone(),
-            world: Vec::new(),
-            tolerance: Tolerance::ROBOT,
-            latency: Duration::ZERO,
-        };
-        run(setup, &mut Echo).unwrap()
-    })
-}
-
-fn facts(run: &Run) -> Vec<String> {
-    run.world.iter().map(|(key, fact)| format!("{key} = {}", fact.value)).collect()
+    let program = load(task, "task.yaml", &Shelf);
+    MODES.map(|mode| run(setup(program.clone(), mode), &mut Providers(echo)).unwrap())
 }
 
 #[test]

@@ -2,26 +2,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
+mod support;
+
 use ratn_executive::protocol::{Goal, Mode};
-use ratn_model::catalogue::Catalogue;
-use ratn_model::fact::{FactKey, Term};
-use ratn_model::load::{Files, load_with};
-use ratn_model::tolerance::Tolerance;
+use ratn_model::load::Files;
 use ratn_model::value::Value;
-use ratn_simulation::run::{Answer, Oracle, Performance, Run, Setup, run};
+use ratn_simulation::run::{Run, run};
 use ratn_world::world::World;
-use std::collections::BTreeMap;
-use std::sync::Arc;
-use std::time::Duration;
-
-const CATALOGUE: &str = r#"
-[resources]
-Arm = { class = "module", count = 1, actuates = true }
-
-[providers.arm]
-resource = "Arm"
-actions.take = { outputs = { what = "any" } }
-"#;
+use support::{MODES, Providers, fact, load, setup, text};
 
 const TASK: &str = "
 task: grab
@@ -29,11 +17,11 @@ ontology: hand.ttl
 world: [\"held(arm) = nothing\"]
 states:
   - grab:
-      action: arm/take
-      out: { what: any }
+      action: arm/move
+      out: { x: any }
       pia: true
       reads: []
-      effects: [\"held(arm) = what\"]
+      effects: [\"held(arm) = x\"]
       resources: [{ block: Arm }]
 ";
 
@@ -48,45 +36,20 @@ impl Files for Hand {
     }
 }
 
-struct Takes(Value);
-
-impl Oracle for Takes {
-    fn perform(&mut self, _: &str, _: u32, _: &Goal, _: &World) -> Performance {
-        let outputs = BTreeMap::from([("what".to_owned(), self.0.clone())]);
-        let answer = Answer::Finished { outcome: "success".to_owned(), outputs, measured: Vec::new() };
-        Performance { duration_s: 1.0, answer }
-    }
-}
-
-fn take(what: Value, mode: Mode) -> Run {
-    perform(TASK, &Hand, what, mode)
-}
-
-fn perform(task: &str, files: &dyn Files, what: Value, mode: Mode) -> Run {
-    let catalogue = Catalogue::from_toml(CATALOGUE).unwrap();
-    let program = load_with(task, "task.yaml", &catalogue, files).unwrap().program;
-    let setup = Setup {
-        program: Arc::new(program),
-        mode,
-        parameters: BTreeMap::new(),
-        seed: 1,
-        resources: catalogue.resources.clone().into_iter().collect(),
-        world: Vec::new(),
-        tolerance: Tolerance::EXACT,
-        latency: Duration::ZERO,
-    };
-    run(setup, &mut Takes(what)).unwrap()
+/// A run in which the arm takes this.
+fn take(task: &str, files: &dyn Files, what: &Value, mode: Mode) -> Run {
+    let mut providers = Providers(|_: &str, _: u32, _: &Goal, _: &World| ("success", what.clone()));
+    run(setup(load(task, "task.yaml", files), mode), &mut providers).unwrap()
 }
 
 #[test]
 fn an_effect_outside_the_range_is_not_made_real_and_its_state_is_aborted() {
-    let held = FactKey { predicate: "held".to_owned(), arguments: vec![Term::Name("arm".to_owned())] };
-    let text = |text: &str| Value::String(text.to_owned());
-    for mode in [Mode::Hsm, Mode::Cdtn] {
-        let good = take(text("cup"), mode);
+    let held = fact("held(arm)");
+    for mode in MODES {
+        let good = take(TASK, &Hand, &text("cup"), mode);
         assert_eq!((good.outcome.as_str(), good.world.get(&held)), ("success", Some(&text("cup"))), "{mode:?}");
         for wrong in [Value::Int(3), text("elephant")] {
-            let bad = take(wrong, mode);
+            let bad = take(TASK, &Hand, &wrong, mode);
             assert_eq!((bad.outcome.as_str(), bad.world.get(&held)), ("aborted", Some(&text("nothing"))), "{mode:?}");
             let log = format!("{:?}", bad.log);
             assert!(log.contains("[outside-range]"), "{mode:?}: {log}");
@@ -100,8 +63,8 @@ ontology: shelf.ttl
 world: [\"on(cup, table)\"]
 states:
   - look:
-      action: arm/take
-      out: { what: any }
+      action: arm/move
+      out: { x: any }
       pia: true
       reads: []
       effects: [EFFECTS]
@@ -121,19 +84,15 @@ impl Files for Shelf {
 
 #[test]
 fn a_second_fact_of_a_functional_predicate_is_not_made_real_unless_the_first_goes() {
-    let on = |what: &str| {
-        let name = |name: &str| Term::Name(name.to_owned());
-        FactKey { predicate: "on".to_owned(), arguments: vec![name("cup"), name(what)] }
-    };
-    for mode in [Mode::Hsm, Mode::Cdtn] {
+    for mode in MODES {
         for (effects, outcome) in [
-            ("\"on(cup, what)\"", "aborted"),
-            ("\"delete on(cup, ?)\", \"on(cup, what)\"", "success"),
-            ("\"on(cup, table) = false\", \"on(cup, what)\"", "success"),
+            ("\"on(cup, x)\"", "aborted"),
+            ("\"delete on(cup, ?)\", \"on(cup, x)\"", "success"),
+            ("\"on(cup, table) = false\", \"on(cup, x)\"", "success"),
         ] {
-            let run = perform(&MOVES.replace("EFFECTS", effects), &Shelf, Value::String("shelf".to_owned()), mode);
+            let run = take(&MOVES.replace("EFFECTS", effects), &Shelf, &text("shelf"), mode);
             assert_eq!(run.outcome, outcome, "{mode:?} {effects}");
-            assert_eq!(run.world.get(&on("shelf")).is_some(), outcome == "success", "{mode:?} {effects}");
+            assert_eq!(run.world.get(&fact("on(cup, shelf)")).is_some(), outcome == "success", "{mode:?} {effects}");
             assert_eq!(
                 format!("{:?}", run.log).contains("[not-functional]"),
                 outcome == "aborted",

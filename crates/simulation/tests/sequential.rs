@@ -2,32 +2,17 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
-use ratn_model::catalogue::Catalogue;
+mod support;
+
 use ratn_simulation::sequential::{Assumptions, Obstacle, Sequential, sequential};
 use std::collections::BTreeMap;
-
-const CATALOGUE: &str = r#"
-[resources]
-Brain = { class = "process", count = 2 }
-Arm = { class = "module", count = 1, actuates = true }
-WorldModel = { class = "world", count = 8 }
-
-[providers.brain]
-resource = "Brain"
-actions.think = { optional = { a = "any" }, outputs = { x = "any", list = "list<string>" } }
-
-[providers.arm]
-resource = "Arm"
-actions.move = { optional = { a = "any" }, outputs = { x = "any" } }
-"#;
+use support::{NoFiles, catalogue, load};
 
 fn check(text: &str) -> Result<Sequential, Obstacle> {
-    let catalogue = Catalogue::from_toml(CATALOGUE).unwrap();
-    let loaded = ratn_model::load::load(text, "task.yaml", &catalogue);
-    let program = loaded.unwrap_or_else(|findings| panic!("{findings:?}")).program;
+    let program = load(text, "task.yaml", &NoFiles);
     let parameters = program.bind_parameters(&[]).unwrap();
     let assumptions = Assumptions { parameters, elements: 2, durations_s: BTreeMap::new(), units: BTreeMap::new() };
-    sequential(&program, &catalogue, &assumptions)
+    sequential(&program, &catalogue(), &assumptions)
 }
 
 fn move_arm(name: &str, input: &str, seconds: u32) -> String {
@@ -102,7 +87,7 @@ fn an_action_without_a_duration_is_named() {
 #[test]
 fn a_loop_over_an_answer_runs_over_as_many_elements_as_are_assumed() {
     let task = format!(
-        "task: t\nstates:\n  - look: {{ action: brain/think, computes: true, reads: [], resources: [{{ block: Brain }}], \
+        "task: t\nstates:\n  - look: {{ action: eye/look, computes: true, reads: [], resources: [{{ block: Eye }}], \
          duration: 1 }}\n  - for: thing in look.list\n    do:\n    {}",
         move_arm("go", "$thing", 5)
     );

@@ -1,0 +1,359 @@
+//! What the golden scenarios cannot say of the elements of a task program: programs that no file makes, seeds, tables of like cases,
+//! and the executive with the test as its shell, so that grants, crashes and requests of the user come at any moment.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
+
+mod support;
+
+use ratn_executive::executive::Executive;
+use ratn_executive::protocol::{Command, Event, Goal, Learned, Mode, Origin};
+use ratn_model::expression::Expr;
+use ratn_model::fact::{FactKey, Term};
+use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
+use ratn_model::measurement::{Certainty, Measurement};
+use ratn_model::program::{Program, StateKind, Target};
+use ratn_model::resource::Lease;
+use ratn_model::time::Timestamp;
+use ratn_model::tolerance::Tolerance;
+use ratn_model::value::Value;
+use ratn_simulation::run::{Run, run};
+use ratn_world::world::World;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use support::{MODES, NoFiles, Providers, acts, facts, load, setup, starts};
+
+const THINK: &str = "action: brain/judge, resources: [{ block: Brain }]";
+const MOVE: &str = "action: arm/grasp, resources: [{ block: Arm }]";
+const TURN: &str = "action: head/turn, resources: [{ block: Head }]";
+const NOTE: &str = "action: pen/note, resources: [{ block: Pen }]";
+
+/// A task's text with its actions written short.
+fn task(text: &str) -> String {
+    let long = text.replace("THINK", THINK).replace("MOVE", MOVE).replace("TURN", TURN).replace("NOTE", NOTE);
+    format!("task: t\n{long}")
+}
+
+/// In both modes, with providers that end so by the path.
+fn both(program: Program, end: impl Fn(&str) -> (&'static str, Value)) -> [Run; 2] {
+    MODES.map(|mode| {
+        let mut providers = Providers(|path: &str, _: u32, _: &Goal, _: &World| end(path));
+        run(setup(program.clone(), mode), &mut providers).unwrap()
+    })
+}
+
+/// The seeds of the tries of `look`, which are aborted until the last.
+fn seeds(text: &str, tries: usize, mode: Mode) -> Vec<u64> {
+    let mut seeds = Vec::new();
+    let mut providers = Providers(|path: &str, _: u32, goal: &Goal, _: &World| {
+        if path != "look" {
+            return ("success", Value::Null);
+        }
+        seeds.push(goal.seed);
+        (if seeds.len() < tries { "aborted" } else { "success" }, Value::Int(1))
+    });
+    let run = run(setup(load(&task(text), "task.yaml", &NoFiles), mode), &mut providers).unwrap();
+    assert_eq!((run.outcome.as_str(), seeds.len()), ("success", tries), "{}", run.reason);
+    seeds
+}
+
+#[test]
+fn null_counts_as_false_for_a_while() {
+    let text = task(
+        "states:
+  - look: { THINK }
+  - loop: { while: look.x, do: [ never: { MOVE } ] }",
+    );
+    for run in both(load(&text, "task.yaml", &NoFiles), |_| ("success", Value::Null)) {
+        assert_eq!((run.outcome.as_str(), starts(&run).len()), ("success", 1), "{}", run.reason);
+    }
+}
+
+#[test]
+fn an_output_without_a_value_is_left_out_unless_the_outcome_is_success() {
+    let text = task(
+        "outcomes: [none]
+states:
+  - part:
+      outcomes: [none]
+      outputs: { x: look.x, y: look.x }
+      states:
+        - look: { THINK, transitions: { empty: none, success: success } }
+        - later: { THINK, transitions: { success: look } }
+      transitions: { none: say, success: say }
+  - say: { NOTE, in: { value: part.y }, transitions: { success: none } }",
+    );
+    // `check` refuses an output that is not written on every way; a program need not come through it.
+    let mut program = load(&text.replace("success: success", "success: later"), "task.yaml", &NoFiles);
+    let later = program.states.iter().find(|state| state.name == "later").unwrap().id;
+    let StateKind::Sequence { outputs, .. } = &mut program.states[1].kind else { panic!("`part` is a hierarchy") };
+    outputs[0].value = Expr::Port { state: later, port: "x".to_owned() };
+    let look = &mut program.states.iter_mut().find(|state| state.name == "look").unwrap().transitions;
+    look.insert("success".to_owned(), Target::Outcome("success".to_owned()));
+    let end = |path: &str| (if path == "part/look" { "empty" } else { "success" }, Value::Int(1));
+    for run in both(program.clone(), end) {
+        assert_eq!(run.outcome, "none", "{}", run.reason);
+        assert_eq!(acts(&program, &run)[""].last().unwrap(), "say {value: 1}");
+    }
+    for run in both(program, |_| ("success", Value::Int(1))) {
+        assert_eq!(run.outcome, "aborted");
+        assert!(run.reason.contains("output `x`"), "{}", run.reason);
+    }
+}
+#[test]
+fn every_try_has_a_seed_of_its_own_and_it_is_the_same_in_both_modes() {
+    let text = "states: [ look: { THINK, retry: { count: 3, backoff: 0.5 } }, then: { MOVE } ]";
+    let [hsm, cdtn] = MODES.map(|mode| seeds(text, 3, mode));
+    assert!(hsm[0] != hsm[1] && hsm[1] != hsm[2] && hsm[0] != hsm[2], "{hsm:?}");
+    assert_eq!(hsm, cdtn);
+}
+
+#[test]
+fn a_deterministic_state_is_tried_again_with_the_same_seed() {
+    let text = "states: [ look: { THINK, computes: true, reads: [], deterministic: true, retry: 1 } ]";
+    let seeds = seeds(text, 2, Mode::Hsm);
+    assert_eq!(seeds[0], seeds[1]);
+}
+
+#[test]
+fn what_cannot_be_evaluated_is_aborted_and_can_be_handled() {
+    for (state, what) in [
+        ("bad: { NOTE, in: { value: '1 / look.x' }, transitions: { aborted: mend } }", "an input"),
+        ("bad: { condition: look.x, then: [], transitions: { aborted: mend } }", "a predicate"),
+        ("bad: { while: look.x, do: [], transitions: { aborted: mend } }", "the predicate of a loop"),
+        ("bad: { for: i in look.x, do: [], transitions: { aborted: mend } }", "a list"),
+        ("bad: { THINK, requires: ['look.x = 7'], transitions: { aborted: mend } }", "a precondition"),
+        (
+            "bad: { requires: ['look.x = 7'], states: [ inside: { MOVE } ], transitions: { aborted: mend } }",
+            "a hierarchy's",
+        ),
+        (
+            "bad: { variables: { v: '1 / look.x' }, states: [ inside: { MOVE } ], transitions: { aborted: mend } }",
+            "a variable",
+        ),
+        ("bad: { outputs: { v: '1 / look.x' }, states: [], transitions: { aborted: mend } }", "an output"),
+        (
+            "bad: { concurrency: barrier, outcomes: [o], regions: [ l: { states: [] } ], decide: { o: look.x }, transitions: { aborted: mend } }",
+            "a decider",
+        ),
+    ] {
+        let text = task(&format!("states: [ look: {{ THINK }}, {state}, never: {{ MOVE }}, mend: {{ TURN }} ]"));
+        for run in both(load(&text, "task.yaml", &NoFiles), |path| ("success", Value::Int(i64::from(path != "look")))) {
+            assert_eq!(run.outcome, "success", "{what}: {}", run.reason);
+            assert_eq!(starts(&run), ["0 look", "1 mend"], "{what}");
+        }
+    }
+}
+
+#[test]
+fn effects_are_those_of_the_outcome_by_which_a_composite_is_left() {
+    let text = task(
+        "world: ['state(part) = new']
+states:
+  - part:
+      effects: { success: ['state(part) = done'], aborted: ['state(part) = broken'], none: ['state(part) = empty'] }
+      outcomes: [none]
+      states: [ look: { THINK, effects: { success: [], empty: [], aborted: [] }, transitions: { empty: none } } ]
+      transitions: { none: end, aborted: end }
+  - end: { TURN, effects: [] }",
+    );
+    for (outcome, fact) in [("success", "done"), ("empty", "empty"), ("aborted", "broken")] {
+        let end = |path: &str| (if path == "part/look" { outcome } else { "success" }, Value::Int(1));
+        for run in both(load(&text, "task.yaml", &NoFiles), end) {
+            assert_eq!(facts(&run), [format!("state(part) = {fact}")]);
+        }
+    }
+}
+
+/// The executive with this test as its shell.
+struct Bench {
+    executive: Executive,
+    now: u64,
+    commands: Vec<Command>,
+}
+
+impl Bench {
+    fn new(text: &str, mode: Mode) -> Bench {
+        let program = Arc::new(load(&task(text), "task.yaml", &NoFiles));
+        let mut bench =
+            Bench { executive: Executive::new(program.clone(), Tolerance::EXACT), now: 0, commands: Vec::new() };
+        bench.tell(Event::Started {
+            task: program.name.clone(),
+            digest: program.digest.clone(),
+            mode,
+            parameters: BTreeMap::new(),
+            seed: 7,
+            world: Vec::new(),
+            revision: Revision(0),
+            capacity: BTreeMap::new(),
+            learned: Learned::default(),
+            origin: Origin::default(),
+        });
+        bench
+    }
+
+    fn tell(&mut self, event: Event) {
+        self.now += 1;
+        let commands = self.executive.handle(Timestamp(self.now * 1_000_000_000), event);
+        self.commands.extend(commands);
+    }
+
+    /// Takes the commands since the last time, as short words.
+    fn heard(&mut self) -> Vec<String> {
+        let word = |command: Command| match command {
+            Command::Acquire { instance, .. } => Some(format!("acquire {}", instance.0)),
+            Command::Release { lease, .. } => Some(format!("release {}", lease.map_or(0, |lease| lease.0))),
+            Command::Start { instance, attempt, goal } => {
+                Some(format!("start {}.{attempt} under {}", instance.0, goal.lease.map_or(0, |lease| lease.id.0)))
+            }
+            Command::End { outcome, .. } => Some(format!("end {outcome}")),
+            _ => None,
+        };
+        std::mem::take(&mut self.commands).into_iter().filter_map(word).collect()
+    }
+
+    fn grant(&mut self, instance: u64, lease: u64) {
+        let lease = Lease { id: LeaseId(lease), token: FencingToken(lease), resources: Vec::new() };
+        self.tell(Event::Granted { instance: InstanceId(instance), lease });
+    }
+
+    fn finish(&mut self, instance: u64, attempt: u32) {
+        self.tell(Event::Finished {
+            instance: InstanceId(instance),
+            attempt,
+            outcome: "success".to_owned(),
+            outputs: BTreeMap::from([("x".to_owned(), Value::Int(1))]),
+            measured: Vec::new(),
+            evidence: Vec::new(),
+            reason: String::new(),
+        });
+    }
+
+    fn crash(&mut self, instance: u64, attempt: u32) {
+        self.tell(Event::Crashed { instance: InstanceId(instance), attempt, reason: "its worker died".to_owned() });
+    }
+}
+
+#[test]
+fn while_paused_no_pia_begins_and_what_computes_goes_on() {
+    let text = "states:
+  - look: { THINK, computes: true, reads: [] }
+  - go: { MOVE }
+  - go_on: { MOVE }
+  - look_on: { THINK, computes: true, reads: [] }";
+    let mut bench = Bench::new(text, Mode::Hsm);
+    bench.tell(Event::PauseRequested);
+    assert_eq!(bench.heard(), ["acquire 1"]);
+    bench.grant(1, 1);
+    bench.finish(1, 1);
+    assert_eq!(bench.heard(), ["start 1.1 under 1", "release 1"]);
+    bench.tell(Event::StepRequested);
+    bench.grant(2, 2);
+    bench.finish(2, 1);
+    assert_eq!(bench.heard(), ["acquire 2", "start 2.1 under 2", "release 2"]);
+    bench.tell(Event::ResumeRequested);
+    bench.grant(3, 3);
+    bench.tell(Event::PauseRequested);
+    bench.finish(3, 1);
+    assert_eq!(bench.heard(), ["acquire 3", "start 3.1 under 3", "acquire 4", "release 3"]);
+}
+
+#[test]
+fn a_pia_that_gets_its_resources_during_a_pause_begins_when_the_pause_ends() {
+    let mut bench = Bench::new("states: [ go: { MOVE } ]", Mode::Hsm);
+    bench.tell(Event::PauseRequested);
+    bench.grant(1, 1);
+    assert_eq!(bench.heard(), ["acquire 1"]);
+    bench.tell(Event::ResumeRequested);
+    bench.finish(1, 1);
+    assert_eq!(bench.heard(), ["start 1.1 under 1", "release 1", "end success"]);
+}
+
+#[test]
+fn a_step_lets_one_of_several_regions_begin() {
+    let text = "states: [ both: { concurrency: barrier, regions: [ left: { MOVE }, right: { TURN } ] } ]";
+    let mut bench = Bench::new(text, Mode::Hsm);
+    bench.tell(Event::PauseRequested);
+    bench.tell(Event::StepRequested);
+    bench.grant(2, 1);
+    bench.grant(1, 2);
+    assert_eq!(bench.heard(), ["acquire 1", "acquire 2", "start 2.1 under 1"]);
+    bench.tell(Event::StepRequested);
+    assert_eq!(bench.heard(), ["start 1.1 under 2"]);
+}
+
+#[test]
+fn a_routine_whose_worker_died_asks_anew_when_none_of_its_regions_uses_its_lease() {
+    let text = "states:
+  - both:
+      routine: true
+      states:
+        - fork:
+            concurrency: barrier
+            regions:
+              - left: { THINK, computes: true, reads: [] }
+              - right: { THINK, computes: true, reads: [] }";
+    let mut bench = Bench::new(text, Mode::Cdtn);
+    bench.grant(1, 1);
+    assert_eq!(bench.heard(), ["acquire 1", "start 3.1 under 1", "start 4.1 under 1"]);
+    bench.crash(3, 1);
+    assert_eq!(bench.heard(), [""; 0]);
+    bench.crash(4, 1);
+    assert_eq!(bench.heard(), ["acquire 3", "release 1"]);
+    bench.grant(3, 2);
+    bench.finish(3, 2);
+    bench.finish(4, 2);
+    assert_eq!(bench.heard(), ["start 3.2 under 2", "start 4.2 under 2", "release 2", "end success"]);
+}
+
+#[test]
+fn in_a_race_a_region_whose_worker_died_does_not_wait_for_the_others() {
+    let text = "states:
+  - race:
+      concurrency: preemptive
+      regions:
+        - left: { THINK, computes: true, reads: [] }
+        - right: { THINK, computes: true, reads: [] }";
+    let mut bench = Bench::new(text, Mode::Cdtn);
+    bench.grant(1, 1);
+    assert_eq!(bench.heard(), ["acquire 1", "start 4.1 under 1", "start 5.1 under 1"]);
+    bench.crash(4, 1);
+    assert_eq!(bench.heard(), ["start 4.2 under 1"]);
+    bench.finish(4, 2);
+    assert_eq!(bench.heard(), ["release 1", "end success"]);
+}
+
+#[test]
+fn what_was_measured_is_committed_with_who_wrote_it_and_how_sure_it_is() {
+    let text = "states:
+  - part:
+      effects: { success: ['done() = true'] }
+      states: [ look: { THINK, senses: [], effects: ['seen(cup) = 1', 'guessed(cup) = 2'] } ]
+  - go: { MOVE }";
+    let cup = |predicate: &str| FactKey { predicate: predicate.to_owned(), arguments: vec![Term::Name("cup".into())] };
+    let certainty = Some(Certainty::Confidence(0.75));
+    let evidence = vec![(cup("seen"), Measurement { source: "camera-1".to_owned(), certainty })];
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let mut bench = Bench::new(text, mode);
+        let asked = bench.commands.iter().find_map(|command| match command {
+            Command::Acquire { instance, .. } => Some(instance.0),
+            _ => None,
+        });
+        let look = asked.unwrap();
+        bench.grant(look, 1);
+        bench.tell(Event::Finished {
+            instance: InstanceId(look),
+            attempt: 1,
+            outcome: "success".to_owned(),
+            outputs: BTreeMap::from([("x".to_owned(), Value::Int(1))]),
+            measured: vec![(cup("seen"), Value::Int(3))],
+            evidence: evidence.clone(),
+            reason: String::new(),
+        });
+        let committed = std::mem::take(&mut bench.commands).into_iter().filter_map(|command| match command {
+            Command::Commit { writer, changes, evidence, .. } => Some((writer, changes.len(), evidence)),
+            _ => None,
+        });
+        let expected = [("part/look".to_owned(), 2, evidence.clone()), ("part".to_owned(), 1, Vec::new())];
+        assert_eq!(committed.collect::<Vec<_>>(), expected, "{mode:?}");
+    }
+}
