@@ -192,6 +192,9 @@ impl Executive {
 
     fn step(&mut self, now: Timestamp, event: Event, commands: &mut Vec<Command>) {
         if let Event::WorldChanged { facts, .. } = &event {
+            if let State::Cdtn(window) = &mut self.state {
+                window.compare_outside(&self.program, &self.root, facts);
+            }
             let fact = |(fact, value): &(FactKey, Option<Value>)| (fact.clone(), value.clone());
             self.root.overwrite(facts.iter().map(fact));
         }

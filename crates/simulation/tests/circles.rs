@@ -14,7 +14,9 @@ fn end_of(states: &str) -> (String, String) {
         let run = simulate(&task, mode, &mut Providers(|_: &str, _: u32, _: &_, _: &_| ("success", Value::Int(1))));
         (run.outcome, run.reason)
     });
-    assert_eq!(ends[0], ends[1], "both modes");
+    // Where exactly the limit is reached may differ: a node that was expanded ahead is not known to start.
+    assert_eq!(ends[0].0, ends[1].0, "both modes: {ends:?}");
+    assert!(ends[1].1.is_empty() || ends[1].1.contains("goes in circles"), "{}", ends[1].1);
     let [end, _] = ends;
     end
 }

@@ -66,14 +66,15 @@ impl Search {
     pub fn new(problem: &Problem, seed: u64) -> Result<Search, ProblemError> {
         let network = Network::of(problem)?;
         let size = network.len();
-        let in_order = |urgency_ms: &dyn Fn(usize) -> i64| {
+        let in_order = |urgency: &dyn Fn(usize) -> i64| {
             let mut order: Vec<Place> = (0..size as Place).collect();
-            order.sort_by_key(|place| (Reverse(urgency_ms(*place as usize)), *place));
+            order.sort_by_key(|place| (Reverse(urgency(*place as usize)), *place));
             order
         };
         let present = in_order(&|at| {
             let task = &problem.tasks[at];
-            (task.urgency_s * task.probability * 1000.0).round() as i64
+            // The bits of a positive float are in its order: what is unlikely is small and still tells itself from another.
+            i64::from(((task.urgency_s * task.probability).max(0.0) as f32).to_bits())
         });
         let longest = in_order(&|at| i64::try_from(network.remaining[at]).unwrap_or(i64::MAX));
         let mut search = Search {

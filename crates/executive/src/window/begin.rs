@@ -213,9 +213,10 @@ impl Window {
                 self.fail(context, id, format!("its resources were refused: {reason}"));
             }
             Event::Projected { instance: id, attempt, projection } => {
-                let is_awaited = self.graph.node(id).is_some_and(|node| {
-                    node.attempt == attempt && matches!(node.status, Status::Projecting(_))
-                });
+                let is_awaited = self
+                    .graph
+                    .node(id)
+                    .is_some_and(|node| node.attempt == attempt && matches!(node.status, Status::Projecting(_)));
                 if !is_awaited {
                     return self.in_routine(context, Event::Projected { instance: id, attempt, projection });
                 }
@@ -353,14 +354,17 @@ impl Window {
     }
 
     fn start_routine(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let Some((is_pia, state)) = self.graph.get(id).map(|instance| (instance.is_pia(), instance.state)) else { return };
+        let Some((is_pia, state)) = self.graph.get(id).map(|instance| (instance.is_pia(), instance.state)) else {
+            return;
+        };
         let looked = self.look(context, id, None, |instance, view| {
             let own = context.plan.state(instance.state);
             let environment = &view.instance.environment;
             let sight = view.sight;
             let flows = own.flows.iter();
-            let outputs =
-                flows.filter_map(|state| Some((*state, sight.outputs_of(environment.producer(*state)?)?.clone()))).collect();
+            let outputs = flows
+                .filter_map(|state| Some((*state, sight.outputs_of(environment.producer(*state)?)?.clone())))
+                .collect();
             let by_writer = if is_pia {
                 Ok(Vec::new())
             } else {

@@ -125,8 +125,10 @@ impl Window {
                 Value::String(outcome) => Some(outcome.clone()),
                 _ => None,
             };
-            let outcomes: Vec<String> =
-                regions.iter().filter_map(|region| view.port(*region, "outcome").as_deref().and_then(outcome)).collect();
+            let outcomes: Vec<String> = regions
+                .iter()
+                .filter_map(|region| view.port(*region, "outcome").as_deref().and_then(outcome))
+                .collect();
             (default_outcome(&outcomes).to_owned(), None)
         });
         let Some((outcome, reason)) = decided else { return };
@@ -159,11 +161,7 @@ impl Window {
     }
 
     /// The values of what is computed at a boundary, in order, each under its name; and what they are made of.
-    fn compute_parts(
-        &self,
-        context: &Context<'_>,
-        instance: &Instance,
-    ) -> Result<(Outputs, Seen), (Readiness, Seen)> {
+    fn compute_parts(&self, context: &Context<'_>, instance: &Instance) -> Result<(Outputs, Seen), (Readiness, Seen)> {
         let state = context.program.state(instance.state);
         let parts = parts_of(context, instance);
         let is_success = |outcome: &str| outcome == SUCCESS;
@@ -214,6 +212,10 @@ impl Window {
         if let Some(beside) = self.graph.detached().first().copied() {
             return self.wait(id, Wait::Data(beside));
         }
+        if self.goes_in_circles(context, id) {
+            return;
+        }
+        let Some(instance) = self.graph.get(id) else { return };
         let Some(marker) = instance.marker() else { return };
         let outcome = context.plan.state(instance.state).outcomes[marker.leaves_by].to_string();
         let reason = marker.because.as_ref().map_or(String::new(), ToString::to_string);

@@ -16,7 +16,8 @@ use std::time::Duration;
 impl Window {
     /// An attempt has ended, with or without an answer.
     pub(super) fn attempt_ended(&mut self, context: &mut Context<'_>, event: Event) {
-        let (Event::Finished { instance: id, attempt, .. } | Event::Crashed { instance: id, attempt, .. }) = &event else {
+        let (Event::Finished { instance: id, attempt, .. } | Event::Crashed { instance: id, attempt, .. }) = &event
+        else {
             return;
         };
         let (id, attempt) = (*id, *attempt);
@@ -47,7 +48,8 @@ impl Window {
                 Timer::Retry(id) => self.waits.enqueue(&mut self.graph, id),
                 Timer::Timeout(id, attempt) => {
                     let Some(instance) = self.graph.get(id) else { continue };
-                    let is_running = instance.node().is_some_and(|node| node.attempt == attempt && node.status.is_running());
+                    let is_running =
+                        instance.node().is_some_and(|node| node.attempt == attempt && node.status.is_running());
                     if !is_running {
                         continue;
                     }
@@ -68,9 +70,9 @@ impl Window {
         let Some(instance) = self.graph.get(id) else { return };
         let tries = instance.node().map_or(1, |node| node.tries);
         let retry = context.program.state(instance.state).annotations.retry;
-        let Some(retry) = retry.filter(|retry| {
-            &*ended.outcome == ABORTED && tries <= retry.count && !instance.is_orphan()
-        }) else {
+        let Some(retry) =
+            retry.filter(|retry| &*ended.outcome == ABORTED && tries <= retry.count && !instance.is_orphan())
+        else {
             return self.finish(context, id, ended);
         };
         let pause_s = retry.backoff_s * f64::from(2_u32.saturating_pow(tries - 1));
@@ -91,7 +93,8 @@ impl Window {
         let Some(instance) = self.graph.get(id) else { return };
         let state = context.program.state(instance.state);
         let own = context.plan.state(instance.state);
-        let failed = |ended: &Ended, problem: String| Ended { changes: ended.changes.clone(), ..Ended::aborted(problem) };
+        let failed =
+            |ended: &Ended, problem: String| Ended { changes: ended.changes.clone(), ..Ended::aborted(problem) };
         if let StateKind::Action { outputs, .. } = &state.kind
             && &*ended.outcome == SUCCESS
             && let Some(problem) = binding::missing_output(outputs, &ended.outputs)

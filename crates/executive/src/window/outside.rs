@@ -13,17 +13,26 @@ use crate::context::Context;
 use ratn_model::expression::Expr;
 use ratn_model::fact::{FactKey, FactPattern, Footprint};
 use ratn_model::id::InstanceId;
-use ratn_model::program::StateKind;
+use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
+use ratn_world::world::World;
 
 /// In the outputs of a loop that has looked into the world: its list.
 const ELEMENTS: &str = "elements";
 
 impl Window {
+    /// The root is about to be changed so from outside.
+    pub(crate) fn compare_outside(&mut self, program: &Program, root: &World, facts: &[(FactKey, Option<Value>)]) {
+        let base = self.tolerance;
+        self.memory.compare_outside(root, facts, |key| program.tolerances.of(&key.predicate, base));
+    }
+
     /// These facts are otherwise in the root than they were.
     pub(super) fn world_changed<'a>(&mut self, context: &mut Context<'_>, facts: impl Iterator<Item = &'a FactKey>) {
-        let patterns: Vec<FactPattern> = facts.map(FactPattern::of).collect();
-        self.memory.root_changed(context.root, patterns.iter().cloned());
+        let changed: Vec<FactPattern> = facts.map(FactPattern::of).collect();
+        self.memory.root_changed(context.root, changed.iter().cloned());
+        let changed = Footprint::Patterns(changed);
+        let patterns = self.memory.take_news_from_outside();
         let all: Vec<InstanceId> = self.graph.iter().map(|instance| instance.id).collect();
         self.graph.unsettle_all();
         for id in &all {
@@ -34,7 +43,6 @@ impl Window {
             }
         }
         self.revise(context);
-        let changed = Footprint::Patterns(patterns);
         for id in &all {
             if self.decides_otherwise(context, *id, &changed) {
                 self.reopen(context, *id);
@@ -45,7 +53,12 @@ impl Window {
     }
 
     /// The first of some facts of the root that an instance has looked at, and no writer between hides from it.
-    fn has_seen<'p>(&self, context: &Context<'_>, id: InstanceId, patterns: &'p [FactPattern]) -> Option<&'p FactPattern> {
+    fn has_seen<'p>(
+        &self,
+        context: &Context<'_>,
+        id: InstanceId,
+        patterns: &'p [FactPattern],
+    ) -> Option<&'p FactPattern> {
         let seen = self.graph.get(id)?.seen()?;
         let mut looked_at = patterns.iter().filter(|pattern| seen.overlaps(pattern));
         looked_at.find(|pattern| {
@@ -63,7 +76,9 @@ impl Window {
             (StateKind::Condition { predicate, .. }, Some(Role::Condition)) => vec![predicate],
             (StateKind::While { predicate, .. }, Some(Role::Test)) => vec![predicate],
             (StateKind::ForEach { collection, .. }, Some(Role::Loop)) => vec![collection],
-            (StateKind::Concurrency { decide, .. }, Some(Role::Join)) => decide.iter().map(|(_, holds)| holds).collect(),
+            (StateKind::Concurrency { decide, .. }, Some(Role::Join)) => {
+                decide.iter().map(|(_, holds)| holds).collect()
+            }
             _ => return false,
         };
         let decides = self.look(context, id, None, |instance, view| {

@@ -7,7 +7,7 @@
 use super::Window;
 use super::graph::instance::{Changed, Instance, Role, Status};
 use super::growth::Departure;
-use super::memory::Source;
+use super::memory::{Difference, Source, User};
 use super::waits::Wait;
 use crate::binding;
 use crate::context::{Context, MAX_IDLE_VISITS, Made, in_circles};
@@ -18,6 +18,7 @@ use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, SUCCESS};
 use ratn_model::value::Value;
+use smallvec::SmallVec;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -29,6 +30,14 @@ struct Real {
     changes: Vec<Change>,
     /// What the facts were that it wrote; only where somebody has looked at what it would write.
     before: BTreeMap<FactKey, Option<Value>>,
+}
+
+/// What the users of an instance that becomes real are to be told.
+struct News {
+    users: SmallVec<[User; 2]>,
+    difference: Difference,
+    /// It has no outputs after all.
+    is_open: bool,
 }
 
 impl Window {
@@ -84,10 +93,7 @@ impl Window {
             return true;
         }
         let real = self.make_real(context, id);
-        self.tell_of_real(context, id, &real);
-        if self.end.is_some() {
-            return true;
-        }
+        let news = self.news_of_real(context, id, &real);
         match role {
             Some(Role::Fork) => {
                 self.remove_retired(context, id);
@@ -101,6 +107,7 @@ impl Window {
             _ => self.follow(context, id, &real.outcome, real.reason),
         }
         // Nothing younger may become real that was made of what came out otherwise.
+        self.tell_news(context, id, &news);
         self.revise(context);
         true
     }
@@ -108,12 +115,18 @@ impl Window {
     /// Whether a line has gone on for too long without an action; then the run has ended.
     pub(super) fn goes_in_circles(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id) else { return false };
-        let is_too_long = self.graph.idle_visits(instance.line).saturating_add(instance.visits_before) > MAX_IDLE_VISITS;
+        let is_too_long =
+            self.graph.idle_visits(instance.line).saturating_add(instance.visits_before) > MAX_IDLE_VISITS;
         let routine = instance.ended().filter(|ended| ended.in_circles).map(|ended| ended.reason.clone());
         let reason = match routine {
             Some(reason) => reason,
-            None if is_too_long => in_circles(instance.environment.frames.as_ref().map_or("", |frame| &frame.path)),
-            None => return false,
+            None if !is_too_long => return false,
+            // The test of a loop stands beside the loop.
+            None if instance.role() == Some(Role::Test) => {
+                let name = &context.program.state(instance.state).name;
+                in_circles(&instance.environment.path(name, instance.visit, None))
+            }
+            None => in_circles(instance.environment.frames.as_ref().map_or("", |frame| &frame.path)),
         };
         self.stop(context, ABORTED, reason);
         true
@@ -125,7 +138,8 @@ impl Window {
         let role = end.role()?;
         let is_inside = |id: &&InstanceId| {
             let Some(inside) = self.graph.get(**id).filter(|inside| inside.id < end.id) else { return false };
-            let mut frames = std::iter::successors(inside.environment.frames.as_deref(), |frame| frame.below.as_deref());
+            let mut frames =
+                std::iter::successors(inside.environment.frames.as_deref(), |frame| frame.below.as_deref());
             match role {
                 Role::RegionEnd => inside.line == end.line,
                 _ => frames.any(|frame| frame.owner == end.state),
@@ -185,7 +199,8 @@ impl Window {
 
     /// Effects and resource operations happen.
     fn make_real(&mut self, context: &mut Context<'_>, id: InstanceId) -> Real {
-        let mut real = Real { outcome: ABORTED.into(), reason: String::new(), changes: Vec::new(), before: BTreeMap::new() };
+        let mut real =
+            Real { outcome: ABORTED.into(), reason: String::new(), changes: Vec::new(), before: BTreeMap::new() };
         let Some((outcome, made, operations)) = self.what_happens(context, id, &mut real) else { return real };
         let made = match made {
             Ok(made) => made,
@@ -241,7 +256,10 @@ impl Window {
         let own = context.plan.state(instance.state);
         // What began on a projection had its preconditions checked there, if at all; now the actual world decides.
         let checks = match instance.role() {
-            None => instance.node().is_some_and(|node| node.nature != NodeNature::Irreversible) && gives_outputs(&ended.outcome),
+            None => {
+                instance.node().is_some_and(|node| node.nature != NodeNature::Irreversible)
+                    && gives_outputs(&ended.outcome)
+            }
             Some(Role::Entry) => ended.outcome.as_ref() == SUCCESS,
             Some(_) => false,
         };
@@ -294,31 +312,31 @@ impl Window {
     }
 
     /// What was made of predicted effects is compared with what they came to.
-    fn tell_of_real(&mut self, context: &mut Context<'_>, id: InstanceId, real: &Real) {
+    fn news_of_real(&mut self, context: &Context<'_>, id: InstanceId, real: &Real) -> News {
         let users = self.take_users(id);
-        if users.is_empty() {
-            return;
-        }
-        let Some(instance) = self.graph.get(id) else { return };
-        let has_readers = users.iter().any(|user| user.of == Source::World);
-        let difference = if has_readers {
+        let mut news = News { users, difference: Difference::default(), is_open: false };
+        let Some(instance) = self.graph.get(id).filter(|_| !news.users.is_empty()) else { return news };
+        if news.users.iter().any(|user| user.of == Source::World) {
             let before = |key: &FactKey| match real.before.get(key) {
                 Some(before) => before.clone(),
                 None => context.root.get(key).cloned(),
             };
-            self.sight(context).compare_with_actual(instance, &real.changes, self.tolerance_of(context), before)
-        } else {
-            Default::default()
-        };
+            news.difference =
+                self.sight(context).compare_with_actual(instance, &real.changes, self.tolerance_of(context), before);
+        }
         // A failure that was not computed ahead has no outputs.
-        let has_outputs = instance.ended().is_some() && real.outcome.as_ref() == instance.ended().map_or("", |e| &*e.outcome);
-        self.tell(context, id, &users, &difference, !has_outputs, false);
+        news.is_open = instance.ended().is_none_or(|ended| ended.outcome != real.outcome);
+        news
+    }
+
+    fn tell_news(&mut self, context: &mut Context<'_>, id: InstanceId, news: &News) {
+        self.tell(context, id, &news.users, &news.difference, news.is_open, false);
     }
 
     /// An imprecise PIA that others were let pass by has ended.
     pub(super) fn retire_detached(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let real = self.make_real(context, id);
-        self.tell_of_real(context, id, &real);
+        let news = self.news_of_real(context, id, &real);
         let Some(instance) = self.graph.get(id) else { return };
         let own = context.plan.state(instance.state);
         let number = own.outcome(&real.outcome);
@@ -329,14 +347,16 @@ impl Window {
             let number = number.unwrap_or(own.outcomes.len() - 2);
             self.leave_path(context, id, number, real.reason);
         }
+        self.tell_news(context, id, &news);
         self.revise(context);
     }
 
     /// A motion that has ended, and whose path was left before it could retire: what it did stands.
     pub(super) fn retire_orphan(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let real = self.make_real(context, id);
-        self.tell_of_real(context, id, &real);
+        let news = self.news_of_real(context, id, &real);
         self.remove_retired(context, id);
+        self.tell_news(context, id, &news);
     }
 
     /// Takes a retired instance out of the window.

@@ -52,7 +52,9 @@ impl Window {
         for user in users {
             match (user.of, user.purpose) {
                 (Source::Outputs, Purpose::Effects) => self.memory.mark(user.id),
-                (Source::World, Purpose::Effects) if is_known_now || !difference.is_empty() => self.memory.mark(user.id),
+                (Source::World, Purpose::Effects) if is_known_now || !difference.is_empty() => {
+                    self.memory.mark(user.id)
+                }
                 (Source::Outputs, Purpose::Result) if is_open => {
                     self.invalidate(context, user.id, "an input is computed again".to_owned());
                 }

@@ -106,11 +106,6 @@ impl WaitCell {
     pub(crate) fn waiters(&self) -> &[InstanceId] {
         &self.waiters
     }
-
-    /// Whether it will be looked at.
-    pub(crate) fn is_queued(&self) -> bool {
-        self.is_queued
-    }
 }
 
 /// What happens by itself.

@@ -172,8 +172,6 @@ pub(crate) enum Changed {
 #[derive(Debug, Clone)]
 pub(crate) struct Arm {
     pub(crate) outcomes: Outcomes,
-    /// The one that the path assumes where they differ in effects.
-    pub(crate) outcome: Outcome,
     pub(crate) next: Option<InstanceId>,
     pub(crate) segment: SegmentId,
 }

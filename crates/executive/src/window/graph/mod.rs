@@ -18,7 +18,7 @@ mod lines;
 mod node;
 mod prune;
 
-use crate::plan::{Outcome, Outcomes, Predicate};
+use crate::plan::{Outcomes, Predicate};
 use crate::window::dispatch::DispatchCell;
 use crate::window::growth::environment::{Environment, Link};
 use crate::window::memory::Seen;
@@ -126,19 +126,19 @@ impl Graph {
     }
 
     /// It goes on one way.
-    pub(crate) fn single_arm(&mut self, id: InstanceId, outcomes: Outcomes, outcome: Outcome) {
+    pub(crate) fn single_arm(&mut self, id: InstanceId, outcomes: Outcomes) {
         if let Some(instance) = self.instances.get_mut(id) {
             let segment = instance.segment;
-            instance.arms = smallvec![Arm { outcomes, outcome, next: None, segment }];
+            instance.arms = smallvec![Arm { outcomes, next: None, segment }];
         }
     }
 
     /// One more way on from a decision, with its share of all of them: its segment.
-    pub(crate) fn open_arm(&mut self, id: InstanceId, outcomes: Outcomes, outcome: Outcome, share: f64) -> SegmentId {
+    pub(crate) fn open_arm(&mut self, id: InstanceId, outcomes: Outcomes, share: f64) -> SegmentId {
         let parent = self.instances.get(id).map_or(0, |instance| instance.segment);
         let segment = self.branches.open(parent, id, share);
         if let Some(instance) = self.instances.get_mut(id) {
-            instance.arms.push(Arm { outcomes, outcome, next: None, segment });
+            instance.arms.push(Arm { outcomes, next: None, segment });
         }
         segment
     }
@@ -149,7 +149,7 @@ impl Graph {
         let mut arm = 0;
         if let Some(fork) = self.instances.get_mut(id) {
             arm = fork.arms.len();
-            fork.arms.push(Arm { outcomes: 0, outcome: 0, next: None, segment: fork.segment });
+            fork.arms.push(Arm { outcomes: 0, next: None, segment: fork.segment });
             let around = fork.line;
             let record = || Fork { line: around, regions: Vec::new(), join: None };
             self.forks.entry(id).or_insert_with(record).regions.push(line);
@@ -176,7 +176,7 @@ impl Graph {
         if let Some(instance) = self.instances.get_mut(join) {
             instance.environment = environment;
         }
-        self.single_arm(join, Outcomes::MAX, 0);
+        self.single_arm(join, Outcomes::MAX);
         let Some(record) = self.forks.get_mut(&fork) else { return };
         record.join = Some(join);
         let line = record.line;

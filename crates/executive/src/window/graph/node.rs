@@ -1,7 +1,7 @@
 //! The life of a node: the changes of its status, each with what the status owns.
 
-use super::instance::{Body, Held, Instance, Node, Status};
 use super::Graph;
+use super::instance::{Body, Held, Instance, Node, Status};
 use crate::interpreter::Interpreter;
 use ratn_model::id::{InstanceId, ProjectionId};
 use ratn_model::resource::Lease;

@@ -1,7 +1,7 @@
 //! What is lost when a path is left: the instances behind it, their branches, their lines.
 
-use super::instance::{LineId, Role, SegmentId};
 use super::Graph;
+use super::instance::{LineId, Role, SegmentId};
 use ratn_model::id::InstanceId;
 use smallvec::smallvec;
 use std::collections::BTreeSet;

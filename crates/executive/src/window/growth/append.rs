@@ -1,13 +1,13 @@
 //! One more instance behind the last one of a path, and what is seen from behind it: its outputs, what it assigns, its effects.
 
-use super::environment::{Binding, Link, Producer};
 use super::Growth;
+use super::environment::{Binding, Link, Producer};
 use crate::context::Context;
 use crate::plan::{Outcome, Predicate, gives_outputs};
 use crate::protocol::Note;
 use crate::window::dispatch::DispatchCell;
-use crate::window::graph::instance::{Body, Instance, Marker, Node, Role, Status};
 use crate::window::graph::Graph;
+use crate::window::graph::instance::{Body, Instance, Marker, Node, Role, Status};
 use crate::window::memory::MemoryCell;
 use crate::window::waits::WaitCell;
 use ratn_model::id::{InstanceId, StateId};
@@ -63,14 +63,13 @@ impl Growth {
                 has_acted: false,
                 is_detached: false,
             }),
-            What::Marker(role, leaves_by) => Body::Marker(Marker {
-                role,
-                leaves_by,
-                because: cursor.because.clone(),
-                ended: None,
-                seen: None,
-            }),
+            What::Marker(role, leaves_by) => {
+                Body::Marker(Marker { role, leaves_by, because: cursor.because.clone(), ended: None, seen: None })
+            }
         };
+        if what == What::Node {
+            cursor.idle_visits = 0;
+        }
         let path = (what == What::Node).then(|| environment.path(&state.name, visit, iteration));
         let instance = Box::new(Instance {
             id,

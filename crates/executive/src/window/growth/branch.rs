@@ -2,9 +2,9 @@
 //!
 //! What follows the same condition on both arms is expanded twice: they are two futures.
 
+use super::Growth;
 use super::cursor::{Cursor, Todo};
 use super::environment::{Iteration, Link};
-use super::Growth;
 use crate::context::Context;
 use crate::plan::{Outcome, Outcomes};
 use crate::window::graph::Graph;
@@ -80,7 +80,7 @@ impl Growth {
         match own.arms.as_slice() {
             [] => self.cursors[index].todo = Todo::Done,
             [arm] => {
-                graph.single_arm(instance, arm.outcomes, arm.outcome);
+                graph.single_arm(instance, arm.outcomes);
                 let link = link(arm.outcome, !arm.same_effects);
                 self.come_after(graph, context, index, instance, link, &own.writes);
                 self.cursors[index].todo = Todo::Leave(id, arm.outcome);
@@ -121,7 +121,7 @@ impl Growth {
         let template = self.cursors[index].clone();
         let mut cursors = Vec::with_capacity(ways.len());
         for (number, ((outcome, outcomes, _), share)) in ways.iter().zip(shares).enumerate() {
-            let segment = graph.open_arm(instance, *outcomes, *outcome, share / total);
+            let segment = graph.open_arm(instance, *outcomes, share / total);
             let order = self.next_order();
             let cursor = Cursor { tail: Some((instance, number)), segment, order, ..template.clone() };
             if number == 0 {

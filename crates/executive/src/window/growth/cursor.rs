@@ -21,8 +21,18 @@ pub(super) struct Cursor {
     pub(super) because: Option<Arc<str>>,
     /// States entered and iterations begun since the last instance.
     pub(super) visits: u32,
+    /// And since the last node.
+    pub(super) idle_visits: u32,
     /// Cursors grow in this order.
     pub(super) order: u64,
+}
+
+impl Cursor {
+    /// A state is entered or an iteration begun.
+    pub(super) fn count_visit(&mut self) {
+        self.visits += 1;
+        self.idle_visits += 1;
+    }
 }
 
 /// What a cursor does next.

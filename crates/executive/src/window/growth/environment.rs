@@ -2,9 +2,9 @@
 //! variables are, which older instance wrote each port last (register renaming), and which older instances write each
 //! predicate (memory renaming). Copies share everything.
 
-use crate::plan::{Outcome, Plan, Predicate};
 use super::table::Table;
 use crate::binding::Outputs;
+use crate::plan::{Outcome, Plan, Predicate};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;

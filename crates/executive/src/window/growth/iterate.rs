@@ -1,12 +1,12 @@
 //! Loops: their iterations are appended one behind the other, as far as the list is known or a test is decided or predicted.
 
+use super::Growth;
 use super::append::What;
 use super::cursor::Todo;
 use super::environment::Iteration;
-use super::Growth;
 use crate::context::Context;
-use crate::window::graph::instance::Role;
 use crate::window::graph::Graph;
+use crate::window::graph::instance::Role;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
@@ -30,7 +30,6 @@ impl Growth {
     /// The innermost loop goes on to its next iteration, or ends.
     pub(super) fn iterate(&mut self, graph: &mut Graph, context: &mut Context<'_>, index: usize) {
         let program = context.program;
-        self.cursors[index].visits += 1;
         let Some(frame) = self.top_frame(index) else { return };
         let (owner, visit, base) = (frame.owner, frame.visit, frame.variables);
         let Some(iteration) = &mut frame.iteration else { return };
@@ -64,6 +63,7 @@ impl Growth {
             _ => None,
         };
         let base = frame.variables;
+        self.cursors[index].count_visit();
         self.cursors[index].environment.variables.truncate(base);
         self.cursors[index].todo = body.map_or(Todo::Iterate, |first| Todo::Enter(*first));
     }

@@ -79,6 +79,7 @@ impl Growth {
             todo: Todo::Enter(Program::ROOT),
             because: None,
             visits: 0,
+            idle_visits: 0,
             order: 0,
         };
         Growth {
@@ -136,13 +137,12 @@ impl Growth {
 
     fn may_grow(&self, graph: &Graph, index: usize) -> bool {
         let cursor = &self.cursors[index];
-        !matches!(cursor.todo, Todo::Await(_) | Todo::Done)
-            && cursor.position < graph.floor(cursor.line) + self.horizon
+        !matches!(cursor.todo, Todo::Await(_) | Todo::Done) && cursor.position < graph.floor(cursor.line) + self.horizon
     }
 
     fn step(&mut self, graph: &mut Graph, context: &mut Context<'_>, index: usize) {
         let cursor = &mut self.cursors[index];
-        if cursor.visits > MAX_IDLE_VISITS {
+        if cursor.idle_visits > MAX_IDLE_VISITS {
             let path = cursor.environment.frames.as_ref().map_or("", |frame| &frame.path);
             cursor.because = Some(in_circles(path).into());
             return self.end_of_task(graph, context, index, ABORTED);
@@ -174,7 +174,12 @@ impl Growth {
     }
 
     /// An instance ended otherwise than was computed ahead: its path goes on where its outcome leads.
-    pub(crate) fn depart(&mut self, context: &Context<'_>, departure: Departure, producer: Option<Arc<environment::Producer>>) {
+    pub(crate) fn depart(
+        &mut self,
+        context: &Context<'_>,
+        departure: Departure,
+        producer: Option<Arc<environment::Producer>>,
+    ) {
         let Departure { mut environment, line, position, state, outcome, because } = departure;
         environment.test = None;
         let order = self.next_order();
@@ -187,6 +192,7 @@ impl Growth {
             todo: Todo::Leave(state, outcome),
             because: Some(because),
             visits: 0,
+            idle_visits: 0,
             order,
         });
         let index = self.cursors.len() - 1;
@@ -211,6 +217,7 @@ impl Growth {
             todo: Todo::Await(id),
             because,
             visits: 0,
+            idle_visits: 0,
             order,
         });
         let index = self.cursors.len() - 1;
@@ -218,8 +225,8 @@ impl Growth {
         match role {
             Some(Role::Condition) => self.branch_on_condition(graph, context, index, id, visit),
             Some(Role::Test) => self.branch_on_test(graph, context, index, id, visit, iteration.unwrap_or(0)),
-            Some(Role::Loop) => graph.single_arm(id, 1, 0),
-            Some(Role::Join) => graph.single_arm(id, u64::MAX, 0),
+            Some(Role::Loop) => graph.single_arm(id, 1),
+            Some(Role::Join) => graph.single_arm(id, u64::MAX),
             _ => {}
         }
     }

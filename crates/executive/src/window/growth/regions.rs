@@ -1,10 +1,10 @@
 //! Regions: threads of control that begin at a fork and end at a join. Each is a line of its own, with its own horizon, order
 //! and heads.
 
+use super::Growth;
 use super::append::What;
 use super::cursor::{Cursor, Todo};
 use super::environment::{Binding, Environment, Frame, Link, Producer};
-use super::Growth;
 use crate::context::Context;
 use crate::plan::Predicate;
 use crate::window::graph::instance::{Ended, Role};
@@ -65,7 +65,7 @@ impl Growth {
                 fork: Some(fork),
             };
             let order = self.next_order();
-            let mut cursor = Cursor { line, position: 0, order, ..template.clone() };
+            let mut cursor = Cursor { line, position: 0, order, idle_visits: 0, ..template.clone() };
             cursor.environment.frames = Some(Arc::new(frame));
             cursor.tail = Some((fork, arm));
             cursor.todo = Todo::Enter(*region);
@@ -105,12 +105,11 @@ impl Growth {
     /// Forks whose regions have each come to one end that nothing in the region can change: what follows the join is expanded.
     pub(super) fn join_regions(&mut self, graph: &mut Graph, context: &mut Context<'_>) {
         let is_single = |regions: &Regions, ends: &Vec<RegionExit>| match ends.as_slice() {
-            [exit] => graph
-                .get(exit.end)
-                .is_none_or(|end| graph.is_same_stretch(end.segment, regions.waiting.segment)),
+            [exit] => graph.get(exit.end).is_none_or(|end| graph.is_same_stretch(end.segment, regions.waiting.segment)),
             _ => false,
         };
-        let is_ready = |regions: &Regions| !regions.is_joined && regions.ends.iter().all(|ends| is_single(regions, ends));
+        let is_ready =
+            |regions: &Regions| !regions.is_joined && regions.ends.iter().all(|ends| is_single(regions, ends));
         let ready: Vec<InstanceId> =
             self.regions.iter().filter(|(_, regions)| is_ready(regions)).map(|(id, _)| *id).collect();
         for id in ready {

@@ -1,9 +1,9 @@
 //! Walking the program: a cursor enters a state, leaves it by an outcome, and follows where that leads.
 
+use super::Growth;
 use super::append::What;
 use super::cursor::Todo;
 use super::environment::{Binding, Frame, Iteration, Link};
-use super::Growth;
 use crate::context::Context;
 use crate::plan::{Outcome, Predicate};
 use crate::window::graph::Graph;
@@ -18,7 +18,7 @@ impl Growth {
         let state = context.program.state(id);
         let plan = context.plan;
         let own = plan.state(id);
-        self.cursors[index].visits += 1;
+        self.cursors[index].count_visit();
         let visit = self.count_visit(context, index, id);
         if own.is_node {
             let instance = self.append(graph, context, index, state, What::Node, (visit, None));
@@ -38,7 +38,7 @@ impl Growth {
         let computed = bound.iter().any(|(_, value)| value.is_none());
         let entry = (computed || !state.annotations.requires.is_empty()).then(|| {
             let entry = self.append(graph, context, index, state, What::marker(Role::Entry), (visit, None));
-            graph.single_arm(entry, 1, 0);
+            graph.single_arm(entry, 1);
             graph.get(entry).and_then(|entry| entry.producer.clone())
         });
         for (name, value) in bound {
@@ -56,7 +56,7 @@ impl Growth {
             StateKind::Sequence { children, .. } => self.begin_list(index, id, visit, path, base, children),
             StateKind::ForEach { .. } => {
                 let instance = self.append(graph, context, index, state, What::marker(Role::Loop), (visit, None));
-                graph.single_arm(instance, 1, 0);
+                graph.single_arm(instance, 1);
                 self.cursors[index].todo = Todo::Await(instance);
             }
             StateKind::While { body_first, .. } => {
@@ -66,7 +66,6 @@ impl Growth {
                 let frame = self.frame(index, id, visit, path, base, Some(iteration));
                 self.cursors[index].environment.frames = Some(frame);
                 if *body_first {
-                    self.cursors[index].visits += 1;
                     self.begin_iteration(index, context.program);
                 } else {
                     self.cursors[index].todo = Todo::Iterate;
@@ -200,7 +199,7 @@ impl Growth {
             let state = context.program.state(id);
             let what = What::Marker(Role::Exit, outcome);
             let instance = self.append(graph, context, index, state, what, (visit, None));
-            graph.single_arm(instance, 1, 0);
+            graph.single_arm(instance, 1);
             self.cursors[index].environment.variables.truncate(kept);
             let operated: &[Predicate] = if outcome == 0 { &own.operated } else { &[] };
             let writes: Vec<Predicate> = own.effect_predicates[outcome].iter().chain(operated).copied().collect();
@@ -212,13 +211,7 @@ impl Growth {
         cursor.todo = Todo::Leave(id, outcome);
     }
 
-    pub(super) fn end_of_task(
-        &mut self,
-        graph: &mut Graph,
-        context: &mut Context<'_>,
-        index: usize,
-        outcome: &str,
-    ) {
+    pub(super) fn end_of_task(&mut self, graph: &mut Graph, context: &mut Context<'_>, index: usize, outcome: &str) {
         let root = context.plan.state(Program::ROOT);
         let outcome = root.outcome(outcome).unwrap_or(root.outcomes.len() - 2);
         let state = context.program.state(Program::ROOT);

@@ -95,7 +95,7 @@ impl Deviation {
     pub(crate) fn sentence(&self) -> String {
         let said = |value: &Option<Value>| value.as_ref().map_or("nothing".to_owned(), ToString::to_string);
         match (&self.was, &self.is) {
-            (None, None) => format!("{} is computed again", self.pattern),
+            (None, None) => format!("what it read, {}, is computed again", self.pattern),
             (was, is) => format!("{} was {}, as predicted, and came out as {}", self.pattern, said(was), said(is)),
         }
     }

@@ -264,7 +264,9 @@ impl<'a> Sight<'a> {
                         return Ok(value);
                     }
                 }
-                Part::Blocked(footprint) if Looked::at(&footprint).overlaps(&pattern) => return Err(Blocked(writer.id)),
+                Part::Blocked(footprint) if Looked::at(&footprint).overlaps(&pattern) => {
+                    return Err(Blocked(writer.id));
+                }
                 Part::Blocked(_) | Part::Open => {}
             }
         }

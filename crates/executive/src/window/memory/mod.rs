@@ -21,6 +21,7 @@
 mod difference;
 mod digests;
 mod forecast;
+mod outside;
 mod overlay;
 mod seen;
 pub(crate) mod settled;
@@ -32,6 +33,7 @@ use crate::plan::Plan;
 pub(crate) use difference::{Deviation, Difference};
 use digests::Digests;
 use forecast::Forecast;
+use outside::Outside;
 use ratn_model::id::InstanceId;
 use ratn_model::program::Program;
 use ratn_world::world::World;
@@ -84,6 +86,7 @@ pub(crate) struct Memory {
     digests: RefCell<Digests>,
     /// Instances whose outputs or effects may be otherwise than their users know.
     stale: BTreeSet<InstanceId>,
+    outside: Outside,
 }
 
 /// Forecasts that are made of forecasts that are made of forecasts: beyond a depth, the innermost is made first.
@@ -169,7 +172,11 @@ impl Memory {
     }
 
     /// The root has changed so.
-    pub(crate) fn root_changed<'c>(&self, root: &World, changes: impl Iterator<Item = ratn_model::fact::FactPattern> + 'c) {
+    pub(crate) fn root_changed<'c>(
+        &self,
+        root: &World,
+        changes: impl Iterator<Item = ratn_model::fact::FactPattern> + 'c,
+    ) {
         self.digests.borrow_mut().update(root, changes);
     }
 }

@@ -88,7 +88,8 @@ impl Overlay {
             .collect();
         for (place, pattern) in self.deleted.iter().enumerate() {
             for (key, fact) in below.matching(pattern) {
-                let counted = self.keys.contains_key(key) || self.deleted[..place].iter().any(|other| other.matches(key));
+                let counted =
+                    self.keys.contains_key(key) || self.deleted[..place].iter().any(|other| other.matches(key));
                 if !counted && looked(key) {
                     all.push((key, Some(&fact.value), None));
                 }
@@ -138,7 +139,8 @@ mod tests {
         });
         let expected: Vec<_> = after.iter().map(|(key, fact)| (key.clone(), fact.value.clone())).collect();
         assert_eq!(visited, expected);
-        let differing: Vec<String> = overlay.differing(&below, |_| true).iter().map(|(key, ..)| key.to_string()).collect();
+        let differing: Vec<String> =
+            overlay.differing(&below, |_| true).iter().map(|(key, ..)| key.to_string()).collect();
         assert_eq!(differing, ["p(-1)", "p(3)", "p(4)"]);
     }
 }
