@@ -9,6 +9,8 @@
 //! | programs | `generator`, `annotations`, `features`, `listing` |
 //! | their world | `oracle`, `dice` |
 //! | both modes beside each other | `trial`, `outside`, `story`, `weak` |
+//! | both modes beside a plain evaluation of the program | `reference` |
+//! | every run once more from its log | `replay` |
 //! | smaller programs that fail alike | `shrink`, `rewrite` |
 
 mod annotations;
@@ -17,6 +19,8 @@ mod generator;
 mod listing;
 mod oracle;
 mod outside;
+mod reference;
+mod replay;
 mod rewrite;
 mod shrink;
 mod story;
