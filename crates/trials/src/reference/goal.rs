@@ -132,6 +132,7 @@ impl Reference<'_> {
                 value => drop(inputs.insert(port.clone(), value)),
             }
         }
+        let facts = self.shown(state, &place);
         let expected_s = estimate_s(state, &place);
         let seed = seed(self.seed, path, if state.annotations.deterministic { 1 } else { tries });
         let goal = Goal {
@@ -147,8 +148,7 @@ impl Reference<'_> {
         if state.annotations.nature == Nature::Irreversible {
             self.told.acts.push((path.to_owned(), goal_text(&goal)));
         }
-        // Only for the oracle, which sees as much of it as it is entitled to.
-        let facts = self.told.facts.iter().map(|(key, value)| (key.clone(), value.clone()));
+        // A world only because the oracle wants one.
         let world = World::from_facts(facts, Revision(0));
         let performance = self.oracle.perform(path, attempt, &goal, &world);
         self.come_from_outside(path);

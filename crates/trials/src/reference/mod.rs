@@ -16,7 +16,7 @@
 //! |---|---|
 //! | facts and effects | `facts`, `effects` |
 //! | expressions | `evaluate`, `function`, `query` |
-//! | what runs | `walk` (states that contain others), `goal` (one action), `resources` |
+//! | what runs | `walk` (states that contain others), `goal` (one action), `shown` (what its provider sees), `resources` |
 
 mod compare;
 mod effects;
@@ -26,6 +26,7 @@ mod function;
 mod goal;
 mod query;
 mod resources;
+mod shown;
 mod walk;
 
 pub(super) use compare::{disagreement, end};
