@@ -12,15 +12,15 @@ use ratn_model::catalogue::ResourceOffer;
 use ratn_model::program::{Program, StateKind};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
-use ratn_simulation::run::{Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
+use ratn_simulation::run::{Circumstances, Mischief, Oracle, Run, RunError, Setup, Trigger, run_under};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
 /// More events in HSM mode than this is a program that is left out.
-const MAX_HSM_EVENTS: usize = 6_000;
+pub(super) const MAX_HSM_EVENTS: usize = 6_000;
 /// So many more events than HSM mode may CDTN mode take, which computes what is never needed, too.
-const MAX_CDTN_EVENTS: usize = 60;
+pub(super) const MAX_CDTN_EVENTS: usize = 60;
 
 /// What a program is tried under.
 #[derive(Debug, Clone, PartialEq)]
@@ -146,6 +146,15 @@ fn against_reference(
 
 /// What the reference says of a program.
 fn should_be(program: &Program, conditions: &Conditions, outside: &[(Trigger, Event)]) -> Result<Told, Fail> {
+    should_be_with(program, conditions, outside, &mut oracle(program, conditions))
+}
+
+pub(super) fn should_be_with(
+    program: &Program,
+    conditions: &Conditions,
+    outside: &[(Trigger, Event)],
+    oracle: &mut dyn Oracle,
+) -> Result<Told, Fail> {
     let task_resources = RESOURCES.iter().filter(|(_, class, _)| *class == ResourceClass::Task);
     reference::evaluate(Given {
         program,
@@ -154,12 +163,12 @@ fn should_be(program: &Program, conditions: &Conditions, outside: &[(Trigger, Ev
         facts: BTreeMap::new(),
         units: task_resources.map(|(kind, _, n)| ((*kind).to_owned(), Quantity::whole(*n).thousandths())).collect(),
         outside: outside.to_vec(),
-        oracle: &mut oracle(program, conditions),
+        oracle,
     })
 }
 
 /// What nodes do under these conditions.
-fn oracle<'a>(program: &'a Program, conditions: &Conditions) -> HashOracle<'a> {
+pub(super) fn oracle<'a>(program: &'a Program, conditions: &Conditions) -> HashOracle<'a> {
     HashOracle {
         program,
         seed: conditions.seed,
@@ -184,7 +193,19 @@ pub(super) fn execute_under(
     conditions: &Conditions,
     mode: Mode,
     max_events: usize,
+    outside: Vec<(Trigger, Event)>,
+) -> Result<Run, RunError> {
+    run_with(program, conditions, mode, max_events, outside, &mut oracle(program, conditions))
+}
+
+/// A run with an oracle of the caller's.
+pub(super) fn run_with(
+    program: &Arc<Program>,
+    conditions: &Conditions,
+    mode: Mode,
+    max_events: usize,
     mut outside: Vec<(Trigger, Event)>,
+    oracle: &mut dyn Oracle,
 ) -> Result<Run, RunError> {
     let seed = conditions.seed;
     let setup = Setup {
@@ -200,14 +221,13 @@ pub(super) fn execute_under(
         tolerance: Tolerance::EXACT,
         latency: Duration::from_secs_f64(conditions.latency_s),
     };
-    let mut oracle = oracle(program, conditions);
     let percent = conditions.mischief_percent;
     let mischief = Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent };
     if conditions.pauses {
         outside.extend(pauses(seed));
     }
     let circumstances = Circumstances { orders: conditions.orders, max_events, events: outside, mischief };
-    run_under(setup, &mut oracle, circumstances)
+    run_under(setup, oracle, circumstances)
 }
 
 /// A pause, a step and what ends both.

@@ -19,13 +19,23 @@ pub(in super::super) fn disagreement(program: &Program, told: &Told, run: &Run, 
         .or_else(|| (told.changes != story.changes).then(|| differ("what became real", &told.changes, &story.changes)))
 }
 
-/// Outcome, outputs, world and task resources.
-pub(in super::super) fn end(told: &Told, run: &Run) -> Option<String> {
+/// Whatever does not depend on the world: how the task and its actions ended.
+pub(in super::super) fn outcomes(told: &Told, run: &Run, story: &Story) -> Option<String> {
+    task(told, run).or_else(|| results(told, story))
+}
+
+/// Outcome and outputs.
+fn task(told: &Told, run: &Run) -> Option<String> {
     if told.outcome != run.outcome {
         return Some(differ("outcomes", &told.outcome, (&run.outcome, &run.reason)));
     }
-    if told.outputs != run.outputs {
-        return Some(differ("outputs", &told.outputs, &run.outputs));
+    (told.outputs != run.outputs).then(|| differ("outputs", &told.outputs, &run.outputs))
+}
+
+/// Outcome, outputs, world and task resources.
+pub(in super::super) fn end(told: &Told, run: &Run) -> Option<String> {
+    if let Some(problem) = task(told, run) {
+        return Some(problem);
     }
     if !told.facts.iter().eq(run.world.iter().map(|(key, fact)| (key, &fact.value))) {
         let show = |all: Vec<(String, &Value)>| all.iter().map(|(k, v)| format!("{k} = {v}")).collect::<Vec<_>>();

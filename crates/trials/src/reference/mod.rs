@@ -29,7 +29,7 @@ mod resources;
 mod shown;
 mod walk;
 
-pub(super) use compare::{disagreement, end};
+pub(super) use compare::{disagreement, end, outcomes};
 
 use super::story::Real;
 use evaluate::{Place, Read};
