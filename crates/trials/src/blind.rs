@@ -18,6 +18,9 @@ use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+/// Of a hundred visits, so many fail: it is failures that are looked at.
+const FAILURES_PERCENT: u64 = 20;
+
 /// Shows another oracle neither the world nor the inputs: only path and try are left.
 struct Blindfold<'a>(&'a mut dyn Oracle);
 
@@ -31,6 +34,7 @@ impl Oracle for Blindfold<'_> {
 /// Runs the program, without what depends on facts, in both modes, and compares the outcomes.
 pub fn trial_blind(program: &Program, conditions: &Conditions) -> Verdict {
     let program = Arc::new(without_facts(program));
+    let conditions = &Conditions { failures_percent: FAILURES_PERCENT, ..conditions.clone() };
     let run = |mode, events| {
         run_with(&program, conditions, mode, events, Vec::new(), &mut Blindfold(&mut oracle(&program, conditions)))
     };
