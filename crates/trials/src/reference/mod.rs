@@ -29,6 +29,9 @@ mod resources;
 mod shown;
 mod walk;
 
+#[cfg(test)]
+mod tests;
+
 pub(super) use compare::{disagreement, end, outcomes};
 
 use super::story::Real;
