@@ -2,6 +2,7 @@
 //! facts): every PIA started on a decided path with final inputs and its preconditions true, and the run ends with nothing left
 //! over. The last is checked by the simulation itself, and in every run.
 
+use super::reference;
 use super::story::Story;
 use super::trial::same_end;
 use ratn_executive::protocol::{Command, LogEntry, Note};
@@ -15,7 +16,7 @@ pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run, (_, told): &(Sto
     if let Some(path) = told.undone.first() {
         return Some(format!("{path} was discarded or computed again after it had started, and it is a PIA"));
     }
-    inputs_were_final(program, cdtn).or_else(|| {
+    inputs_were_final(program, cdtn).or_else(|| reference::unmet(program, cdtn)).or_else(|| {
         // Without failures and without shared facts the world is HSM mode's all the same.
         let fails = fails(hsm) || fails(cdtn);
         (!fails && !shares(program)).then(|| same_end(hsm, cdtn)).flatten()

@@ -16,6 +16,7 @@
 //! |---|---|
 //! | facts and effects | `facts`, `effects` |
 //! | expressions | `evaluate`, `function`, `query` |
+//! | what is known of a run's log alone | `preconditions` |
 //! | what runs | `walk` (states that contain others), `goal` (one action), `shown` (what its provider sees), `resources` |
 
 mod compare;
@@ -24,6 +25,7 @@ mod evaluate;
 mod facts;
 mod function;
 mod goal;
+mod preconditions;
 mod query;
 mod resources;
 mod shown;
@@ -33,6 +35,7 @@ mod walk;
 mod tests;
 
 pub(super) use compare::{disagreement, end, outcomes};
+pub(super) use preconditions::unmet;
 
 use super::story::Real;
 use evaluate::{Place, Read};

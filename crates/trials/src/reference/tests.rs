@@ -10,6 +10,7 @@ use ratn_model::expression::parse::{NameError, Names, parse_expression};
 use ratn_model::expression::{BinaryOperator, Expr, FactExpr, Function, Lookup, Scope, UnaryOperator};
 use ratn_model::fact::{FactKey, FactPattern, Term};
 use ratn_model::id::StateId;
+use ratn_model::program::Program;
 use ratn_model::value::Value;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -57,19 +58,10 @@ impl Scope for Plain<'_> {
     }
 }
 
-fn read(expr: &Expr, facts: &Facts, v: &Value) -> Result<Value, Fail> {
-    let program = program(0, &Features::BASIC);
+fn read(program: &Program, expr: &Expr, facts: &Facts, v: &Value) -> Result<Value, Fail> {
     let (outputs, regions): (BTreeMap<StateId, Outputs>, _) = Default::default();
     let variables = vec![("v".to_owned(), v.clone())];
-    expr.read(&Place {
-        program: &program,
-        facts,
-        outputs: &outputs,
-        regions: &regions,
-        variables,
-        own: None,
-        row: Vec::new(),
-    })
+    expr.read(&Place { program, facts, outputs: &outputs, regions: &regions, variables, own: None, row: Vec::new() })
 }
 
 fn key(predicate: &str, arguments: &[Term]) -> FactKey {
@@ -78,6 +70,7 @@ fn key(predicate: &str, arguments: &[Term]) -> FactKey {
 
 #[test]
 fn queries_have_the_answers_that_the_documents_say() {
+    let program = program(0, &Features::BASIC);
     let name = |name: &str| Term::Name(name.to_owned());
     let facts = Facts::from([
         (key("on", &[name("cup"), name("table")]), Value::Bool(true)),
@@ -102,14 +95,14 @@ fn queries_have_the_answers_that_the_documents_say() {
         ("not exists (weight(spoon))", true),
     ] {
         let expr = parse_expression(text, &mut NoNames).unwrap();
-        assert_eq!(read(&expr, &facts, &Value::Null), Ok(Value::Bool(expected)), "{text}");
+        assert_eq!(read(&program, &expr, &facts, &Value::Null), Ok(Value::Bool(expected)), "{text}");
         assert_eq!(expr.evaluate(&Plain(&facts, &Value::Null)), Ok(Value::Bool(expected)), "{text}");
     }
 }
 
 #[test]
 fn random_expressions_have_one_value() {
-    let mut values = 0;
+    let (program, mut values) = (program(0, &Features::BASIC), 0);
     for seed in 0..20_000 {
         let mut dice = Dice(seed);
         let facts: Facts = (0..dice.below(5))
@@ -117,7 +110,7 @@ fn random_expressions_have_one_value() {
             .collect();
         let (expr, v) = (expression(&mut dice, 4), literal(&mut dice));
         let model = expr.evaluate(&Plain(&facts, &v));
-        match (read(&expr, &facts, &v), &model) {
+        match (read(&program, &expr, &facts, &v), &model) {
             (Err(Fail::NotMine(_)), _) => {}
             (Ok(value), Ok(other)) => {
                 assert!(
