@@ -10,7 +10,7 @@ use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::{Lookout, Problem, Search};
 use ratn_executive::protocol::{Command, Event, Goal, Learned, LogEntry, LogLine, Mode, Origin};
 use ratn_model::catalogue::ResourceOffer;
-use ratn_model::fact::{Change, FactKey};
+use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::program::Program;
 use ratn_model::resource::{Quantity, ResourceClass, ResourceOperation};
@@ -22,6 +22,9 @@ use ratn_world::world::World;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
+
+/// So many facts of the executive's mirror are compared with the root's at each revision.
+const COMPARED_FACTS: usize = 256;
 
 /// What the providers do.
 pub trait Oracle {
@@ -135,6 +138,8 @@ struct Simulation<'a> {
     root: World,
     /// What the root was at each revision.
     roots: BTreeMap<Revision, World>,
+    /// The revision at which the executive's mirror was last found to be the root.
+    mirrored: Option<Revision>,
     projections: BTreeMap<ProjectionId, World>,
     /// What projections were asked for: the world pool makes one per instance and attempt.
     projected: BTreeSet<(InstanceId, u32)>,
@@ -206,6 +211,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
         session,
         roots: BTreeMap::from([(root.revision(), root.clone())]),
         root,
+        mirrored: None,
         projections: BTreeMap::new(),
         projected: BTreeSet::new(),
         told: BTreeSet::new(),
@@ -266,6 +272,10 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
             }
         }
         simulation.check(&executive)?;
+        if simulation.circumstances.checks {
+            executive.check_invariants().map_err(|problem| simulation.broken(problem))?;
+            executive.check_quiescence(now).map_err(|problem| simulation.broken(problem))?;
+        }
         if let Some((outcome, outputs, reason)) = simulation.end.take() {
             let units = simulation.task_resources();
             let log = std::mem::take(&mut simulation.log);
@@ -395,7 +405,7 @@ impl Simulation<'_> {
                 }
                 self.answers();
             }
-            Command::Project { instance, attempt, base, changes, writers, lease, reads: _ } => {
+            Command::Project { instance, attempt, base, changes, writers, lease, reads } => {
                 if writers.len() != changes.len() || writers.iter().any(|writer| writer.is_empty()) {
                     return Err(self.broken(format!("of a change that {instance} builds on nobody is named")));
                 }
@@ -407,7 +417,7 @@ impl Simulation<'_> {
                 let Some(below) = self.roots.get(&base) else {
                     return Err(self.broken(format!("projection on {base}, the root is {}", self.root.revision())));
                 };
-                let world = below.project(&changes).map_err(|e| self.broken(e))?;
+                let world = shown(below.project(&changes).map_err(|e| self.broken(e))?, &reads);
                 if !self.projected.insert((instance, attempt)) {
                     return Err(self.broken(format!("a second projection for attempt {attempt} of {instance}")));
                 }
@@ -559,11 +569,9 @@ impl Simulation<'_> {
         }
     }
 
-    fn check(&self, executive: &Executive) -> Result<(), RunError> {
+    fn check(&mut self, executive: &Executive) -> Result<(), RunError> {
         self.pool.check_invariants().map_err(|e| self.broken(e))?;
-        if executive.root().revision() != self.root.revision() {
-            return Err(self.broken("the executive's mirror is not the root"));
-        }
+        self.check_mirror(executive.root())?;
         if executive.has_ended()
             && (!self.leases.is_empty() || !self.projections.is_empty() || !self.waiters.is_empty())
         {
@@ -576,6 +584,41 @@ impl Simulation<'_> {
         }
         Ok(())
     }
+
+    /// The executive's mirror has the revision and the facts of the root. Facts are compared where a revision is new: all of them in a
+    /// small world, else some, others each time.
+    fn check_mirror(&mut self, mirror: &World) -> Result<(), RunError> {
+        let revision = self.root.revision();
+        if mirror.revision() != revision {
+            return Err(
+                self.broken(format!("the executive's mirror is at {}, the root at {revision}", mirror.revision()))
+            );
+        }
+        if self.mirrored == Some(revision) {
+            return Ok(());
+        }
+        self.mirrored = Some(revision);
+        if mirror.len() != self.root.len() {
+            return Err(self.broken(format!("the mirror has {} facts, the root {}", mirror.len(), self.root.len())));
+        }
+        let step = self.root.len().div_ceil(COMPARED_FACTS).max(1);
+        let facts = self.root.iter().skip(revision.0 as usize % step).step_by(step);
+        for (key, fact) in facts {
+            let mirrored = mirror.get(key);
+            if mirrored != Some(&fact.value) {
+                let problem = format!("{key} = {} in the root, {mirrored:?} in the executive's mirror", fact.value);
+                return Err(self.broken(problem));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What a projection shows of a world, as the world pool does it: the facts that are read, and no others.
+fn shown(world: World, reads: &Footprint) -> World {
+    let Footprint::Patterns(patterns) = reads else { return world };
+    let facts = patterns.iter().flat_map(|read| world.matching(read));
+    World::from_facts(facts.map(|(key, fact)| (key.clone(), fact.value.clone())), world.revision())
 }
 
 fn is_answer(entry: &Entry, to: InstanceId, of: u32) -> bool {

@@ -242,13 +242,11 @@ fn a_chain_of_effects_comes_to_its_sum() {
 }
 
 #[test]
-#[ignore = "until the window's redesign"]
 fn a_chain_of_effects_that_one_state_reads_costs_as_much_as_it_is_long() {
     is_linear("a loop of n() = n() + 1", [1_000, 10_000], |n| count_to(n, &counting(n), 1));
 }
 
 #[test]
-#[ignore = "until the window's redesign"]
 fn a_chain_of_effects_that_every_iteration_reads_costs_as_much_as_it_is_long() {
     is_linear("a loop of n() = n() + 1 and a reader", [1_000, 10_000], |n| {
         count_to(n, &counting_and_reading(n), n + 1)
@@ -256,7 +254,6 @@ fn a_chain_of_effects_that_every_iteration_reads_costs_as_much_as_it_is_long() {
 }
 
 #[test]
-#[ignore = "until the window's redesign"]
 fn what_check_says_of_a_chain_of_effects_costs_as_much_as_it_is_long() {
     is_linear("check", [100, 1_000], check_counting);
 }
@@ -320,19 +317,16 @@ fn a_deviation_goes_along_a_chain_to_its_end() {
 }
 
 #[test]
-#[ignore = "until the window's redesign"]
 fn a_hundred_thousand_effects_made_of_each_other_need_no_stack() {
     effects_made_of_each_other(100_000);
 }
 
 #[test]
-#[ignore = "until the window's redesign"]
 fn a_hundred_thousand_outputs_made_of_each_other_need_no_stack() {
     outputs_made_of_each_other(100_000);
 }
 
 #[test]
-#[ignore = "until the window's redesign"]
 fn a_deviation_costs_as_much_as_there_are_facts_in_view() {
     is_linear("a deviation", [1_000, 10_000], |facts| {
         let task = format!(
@@ -381,7 +375,6 @@ fn stays(live: [isize; 2]) {
 }
 
 #[test]
-#[ignore = "until the window's redesign"]
 fn a_loop_of_a_hundred_thousand_iterations_needs_constant_memory() {
     stays(live_in_a_loop(
         "      - think: { action: brain/think, in: { a: $i }, computes: true, reads: [], resources: [{ block: Brain }] }
@@ -392,7 +385,6 @@ fn a_loop_of_a_hundred_thousand_iterations_needs_constant_memory() {
 }
 
 #[test]
-#[ignore = "until the window's redesign"]
 fn a_loop_of_a_hundred_thousand_undecided_conditions_needs_constant_memory() {
     stays(live_in_a_loop(
         "      - look: { action: eye/look, senses: ['n()'], effects: [], resources: [{ block: Eye }] }

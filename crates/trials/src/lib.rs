@@ -8,21 +8,27 @@
 //! |---|---|
 //! | programs | `generator`, `annotations`, `features`, `listing` |
 //! | their world | `oracle`, `dice` |
-//! | both modes beside each other | `trial`, `outside`, `story`, `weak` |
+//! | both modes beside each other | `trial`, `outside`, `story`, `weak`, `blind` |
+//! | both modes beside a plain evaluation of the program | `reference` |
+//! | every run once more from its log | `replay` |
 //! | smaller programs that fail alike | `shrink`, `rewrite` |
 
 mod annotations;
+mod blind;
 mod features;
 mod generator;
 mod listing;
 mod oracle;
 mod outside;
+mod reference;
+mod replay;
 mod rewrite;
 mod shrink;
 mod story;
 mod trial;
 mod weak;
 
+pub use blind::trial_blind;
 pub use features::Features;
 pub use generator::program;
 pub use listing::listing;

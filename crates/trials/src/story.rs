@@ -2,7 +2,7 @@
 //! which changes became real.
 
 use super::{around, is_in_routine, is_preemptive, plain, state_of};
-use ratn_executive::protocol::{Command, Event, LogEntry, Note};
+use ratn_executive::protocol::{Command, Event, Goal, LogEntry, Note};
 use ratn_model::fact::Change;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, State, StateKind};
@@ -24,8 +24,43 @@ pub(super) struct Act {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Real {
     pub(super) outcome: String,
-    /// Inputs and outputs of the last attempt; `None` where it was taken from another's.
-    pub(super) data: Option<(BTreeMap<String, Value>, BTreeMap<String, Value>)>,
+    pub(super) data: Data,
+}
+
+/// Inputs and outputs.
+type Ports = (BTreeMap<String, Value>, BTreeMap<String, Value>);
+
+/// What went into an action and came out of it.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Data {
+    /// It failed; why is not compared.
+    Untold,
+    /// Of the last attempt.
+    Of(Ports),
+    /// A result was reused, the log does not say which: one of those that were computed at this path.
+    OneOf(Vec<Ports>),
+}
+
+impl Real {
+    pub(super) fn new(outcome: String, data: Option<Ports>) -> Real {
+        Real { outcome, data: data.map_or(Data::Untold, Data::Of) }
+    }
+
+    /// Whether both may be the same result.
+    pub(super) fn may_be(&self, other: &Real) -> bool {
+        let data = match (&self.data, &other.data) {
+            (Data::Untold, _) | (_, Data::Untold) => true,
+            (Data::Of(a), Data::Of(b)) => a == b,
+            (Data::Of(one), Data::OneOf(all)) | (Data::OneOf(all), Data::Of(one)) => all.contains(one),
+            (Data::OneOf(some), Data::OneOf(others)) => some.iter().any(|one| others.contains(one)),
+        };
+        self.outcome == other.outcome && data
+    }
+}
+
+/// The try and the inputs of a goal.
+pub(super) fn goal_text(goal: &Goal) -> String {
+    format!("{:x} {:?}", goal.seed, goal.inputs)
 }
 
 /// A run.
@@ -59,6 +94,7 @@ struct Life {
 pub(super) fn story(program: &Program, run: &Run) -> Story {
     let mut lives: BTreeMap<InstanceId, Life> = BTreeMap::new();
     let mut running: Vec<usize> = Vec::new();
+    let mut answers: BTreeMap<String, Vec<Ports>> = BTreeMap::new();
     let mut story = Story::default();
     for line in &run.log {
         match &line.entry {
@@ -88,8 +124,11 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
                 Note::Retired { instance } => {
                     if let Some(life) = lives.get(instance).filter(|life| life.tells) {
                         // Why something failed to begin, or to end, is not compared.
-                        let told = !life.reused && !matches!(life.outcome.as_str(), ABORTED | PREEMPTED);
-                        let data = told.then(|| (life.inputs.clone().unwrap_or_default(), life.outputs.clone()));
+                        let data = match life.outcome.as_str() {
+                            ABORTED | PREEMPTED => Data::Untold,
+                            _ if life.reused => Data::OneOf(answers.get(&life.path).cloned().unwrap_or_default()),
+                            _ => Data::Of((life.inputs.clone().unwrap_or_default(), life.outputs.clone())),
+                        };
                         let result = Real { outcome: life.outcome.clone(), data };
                         story.retired.entry(life.path.clone()).or_default().push(result);
                     }
@@ -116,7 +155,7 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
                 if life.irreversible {
                     // A try of its own that ended before it.
                     running.retain(|act| Some(*act) != life.started);
-                    let goal = format!("{:x} {:?}", goal.seed, goal.inputs);
+                    let goal = goal_text(goal);
                     story.acts.push(Act { path: life.path.clone(), goal, running: running.clone() });
                     life.started = Some(story.acts.len() - 1);
                     running.extend(life.started);
@@ -140,6 +179,10 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
                 let is_answer = |life: &&mut Life| life.attempt == *attempt && life.outcome.is_empty();
                 if let Some(life) = lives.get_mut(instance).filter(is_answer) {
                     life.outputs.clone_from(outputs);
+                    if !life.irreversible {
+                        let ports = (life.inputs.clone().unwrap_or_default(), outputs.clone());
+                        answers.entry(life.path.clone()).or_default().push(ports);
+                    }
                     running.retain(|act| Some(*act) != life.started);
                 }
             }

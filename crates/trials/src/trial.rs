@@ -2,22 +2,25 @@
 //!
 //! A log is in the order of events, so what is checked of every start of a PIA in it holds at every moment of the run.
 
-use super::story::{Act, Real, Story, are_beside, story};
+use super::reference::{self, Fail, Given, Told};
+use super::replay::replayed;
+use super::story::{Act, Story, are_beside, story};
 use super::weak;
 use super::{Dice, Features, HashOracle, RESOURCES, is_in_routine, state_of};
 use ratn_executive::protocol::{Event, Mode};
 use ratn_model::catalogue::ResourceOffer;
 use ratn_model::program::{Program, StateKind};
+use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
-use ratn_simulation::run::{Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
+use ratn_simulation::run::{Circumstances, Mischief, Oracle, Run, RunError, Setup, Trigger, run_under};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
 /// More events in HSM mode than this is a program that is left out.
-const MAX_HSM_EVENTS: usize = 6_000;
+pub(super) const MAX_HSM_EVENTS: usize = 6_000;
 /// So many more events than HSM mode may CDTN mode take, which computes what is never needed, too.
-const MAX_CDTN_EVENTS: usize = 60;
+pub(super) const MAX_CDTN_EVENTS: usize = 60;
 
 /// What a program is tried under.
 #[derive(Debug, Clone, PartialEq)]
@@ -96,10 +99,82 @@ pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: 
         Ok(run) => run,
         Err(problem) => return Verdict::Differs(format!("CDTN mode: {problem}")),
     };
-    let problem = if conditions.weak { weak::problem(program, &hsm, &cdtn) } else { problem(program, &hsm, &cdtn) };
-    match problem {
+    for (mode, run) in [("HSM", &hsm), ("CDTN", &cdtn)] {
+        if let Some(problem) = replayed(program, run) {
+            return Verdict::Differs(format!("{mode} mode: {problem}"));
+        }
+    }
+    let stories = (story(program, &hsm), story(program, &cdtn));
+    let problem = if conditions.weak {
+        weak::problem(program, &hsm, &cdtn, &stories)
+    } else {
+        problem(program, &hsm, &cdtn, &stories)
+    };
+    match problem.or_else(|| against_reference(program, conditions, outside, (&hsm, &cdtn), &stories)) {
         Some(problem) => Verdict::Differs(problem),
-        None => Verdict::Same { hsm_s: hsm.end_s, cdtn_s: cdtn.end_s, acts: story(program, &cdtn).acts.len() },
+        None => Verdict::Same { hsm_s: hsm.end_s, cdtn_s: cdtn.end_s, acts: stories.1.acts.len() },
+    }
+}
+
+/// What either mode did otherwise than the reference says.
+fn against_reference(
+    program: &Arc<Program>,
+    conditions: &Conditions,
+    outside: &[(Trigger, Event)],
+    (hsm, cdtn): (&Run, &Run),
+    (before, after): &(Story, Story),
+) -> Option<String> {
+    // What one region does another sees, at what moment ever.
+    if conditions.weak && weak::shares(program) {
+        return None;
+    }
+    let told = match should_be(program, conditions, outside) {
+        Ok(told) => told,
+        Err(Fail::NotMine(_)) => return None,
+        Err(problem) => return Some(format!("the reference does not come to an end: {problem:?}")),
+    };
+    let of = |mode: &str, problem: Option<String>| problem.map(|p| format!("{mode} mode and the reference: {p}"));
+    of("HSM", reference::disagreement(program, &told, hsm, before)).or_else(|| {
+        // What is beside or behind an imprecise failure is not the prefix of a program.
+        match conditions.weak {
+            true if weak::fails(hsm) || weak::fails(cdtn) => None,
+            true => of("CDTN", reference::end(&told, cdtn)),
+            false => of("CDTN", reference::disagreement(program, &told, cdtn, after)),
+        }
+    })
+}
+
+/// What the reference says of a program.
+fn should_be(program: &Program, conditions: &Conditions, outside: &[(Trigger, Event)]) -> Result<Told, Fail> {
+    should_be_with(program, conditions, outside, &mut oracle(program, conditions))
+}
+
+pub(super) fn should_be_with(
+    program: &Program,
+    conditions: &Conditions,
+    outside: &[(Trigger, Event)],
+    oracle: &mut dyn Oracle,
+) -> Result<Told, Fail> {
+    let task_resources = RESOURCES.iter().filter(|(_, class, _)| *class == ResourceClass::Task);
+    reference::evaluate(Given {
+        program,
+        seed: conditions.seed,
+        parameters: BTreeMap::new(),
+        facts: BTreeMap::new(),
+        units: task_resources.map(|(kind, _, n)| ((*kind).to_owned(), Quantity::whole(*n).thousandths())).collect(),
+        outside: outside.to_vec(),
+        oracle,
+    })
+}
+
+/// What nodes do under these conditions.
+pub(super) fn oracle<'a>(program: &'a Program, conditions: &Conditions) -> HashOracle<'a> {
+    HashOracle {
+        program,
+        seed: conditions.seed,
+        failures_percent: conditions.failures_percent,
+        crashes_percent: conditions.crashes_percent,
+        deviations_percent: conditions.deviations_percent,
     }
 }
 
@@ -118,7 +193,19 @@ pub(super) fn execute_under(
     conditions: &Conditions,
     mode: Mode,
     max_events: usize,
+    outside: Vec<(Trigger, Event)>,
+) -> Result<Run, RunError> {
+    run_with(program, conditions, mode, max_events, outside, &mut oracle(program, conditions))
+}
+
+/// A run with an oracle of the caller's.
+pub(super) fn run_with(
+    program: &Arc<Program>,
+    conditions: &Conditions,
+    mode: Mode,
+    max_events: usize,
     mut outside: Vec<(Trigger, Event)>,
+    oracle: &mut dyn Oracle,
 ) -> Result<Run, RunError> {
     let seed = conditions.seed;
     let setup = Setup {
@@ -134,20 +221,14 @@ pub(super) fn execute_under(
         tolerance: Tolerance::EXACT,
         latency: Duration::from_secs_f64(conditions.latency_s),
     };
-    let mut oracle = HashOracle {
-        program,
-        seed,
-        failures_percent: conditions.failures_percent,
-        crashes_percent: conditions.crashes_percent,
-        deviations_percent: conditions.deviations_percent,
-    };
     let percent = conditions.mischief_percent;
     let mischief = Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent };
     if conditions.pauses {
         outside.extend(pauses(seed));
     }
-    let circumstances = Circumstances { orders: conditions.orders, max_events, events: outside, mischief };
-    run_under(setup, &mut oracle, circumstances)
+    let circumstances =
+        Circumstances { orders: conditions.orders, max_events, events: outside, mischief, checks: true };
+    run_under(setup, oracle, circumstances)
 }
 
 /// A pause, a step and what ends both.
@@ -172,18 +253,17 @@ fn differ(what: &str, hsm: impl std::fmt::Debug, cdtn: impl std::fmt::Debug) -> 
 }
 
 /// The first clause of the theorem that does not hold.
-fn problem(program: &Program, hsm: &Run, cdtn: &Run) -> Option<String> {
-    let (before, after) = (story(program, hsm), story(program, cdtn));
-    closure(program, &before, &after)
+fn problem(program: &Program, hsm: &Run, cdtn: &Run, (before, after): &(Story, Story)) -> Option<String> {
+    closure(program, before, after)
         .or_else(|| same_end(hsm, cdtn))
         .or_else(|| {
             let missing: Vec<&str> = before.acts.iter().skip(after.acts.len()).map(|act| act.path.as_str()).collect();
             (before.acts.len() != after.acts.len())
                 .then(|| format!("PIAs that never started, of the last: {missing:?}"))
         })
-        .or_else(|| actuators(program, &before, &after))
-        .or_else(|| changes(&before, &after))
-        .or_else(|| retired(&before, &after))
+        .or_else(|| actuators(program, before, after))
+        .or_else(|| changes(before, after))
+        .or_else(|| retired(before, after))
 }
 
 /// Outcome, outputs, world and task resources.
@@ -260,10 +340,8 @@ fn retired(hsm: &Story, cdtn: &Story) -> Option<String> {
     if paths(hsm) != paths(cdtn) {
         return differ("retired instances", paths(hsm), paths(cdtn));
     }
-    let same =
-        |a: &Real, b: &Real| a.outcome == b.outcome && (a.data.is_none() || b.data.is_none() || a.data == b.data);
     let all = hsm.retired.iter().zip(&cdtn.retired);
     let mut pairs = all.flat_map(|((path, a), (_, b))| a.iter().zip(b).map(move |(a, b)| (path, a, b)));
-    let (path, a, b) = pairs.find(|(_, a, b)| !same(a, b))?;
+    let (path, a, b) = pairs.find(|(_, a, b)| !a.may_be(b))?;
     differ(&format!("the results of {path}"), a, b)
 }

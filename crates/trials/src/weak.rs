@@ -2,7 +2,8 @@
 //! facts): every PIA started on a decided path with final inputs and its preconditions true, and the run ends with nothing left
 //! over. The last is checked by the simulation itself, and in every run.
 
-use super::story::story;
+use super::reference;
+use super::story::Story;
 use super::trial::same_end;
 use ratn_executive::protocol::{Command, LogEntry, Note};
 use ratn_model::expression::EffectExpr;
@@ -12,25 +13,27 @@ use ratn_simulation::run::Run;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// The first promise that is not kept.
-pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run) -> Option<String> {
-    let told = story(program, cdtn);
+pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run, (_, told): &(Story, Story)) -> Option<String> {
     if let Some(path) = told.undone.first() {
         return Some(format!("{path} was discarded or computed again after it had started, and it is a PIA"));
     }
-    inputs_were_final(program, cdtn).or_else(|| {
+    inputs_were_final(program, cdtn).or_else(|| reference::unmet(program, cdtn)).or_else(|| {
         // Without failures and without shared facts the world is HSM mode's all the same.
-        let fails = [hsm, cdtn].iter().any(|run| {
-            run.log.iter().any(|line| {
-                matches!(&line.entry, LogEntry::Command(Command::Note(Note::Finished { outcome, .. }))
-                    if matches!(&**outcome, ABORTED | PREEMPTED))
-            })
-        });
+        let fails = fails(hsm) || fails(cdtn);
         (!fails && !shares(program)).then(|| same_end(hsm, cdtn)).flatten()
     })
 }
 
+/// Whether anything ended `aborted` or `preempted`, in vain or not.
+pub(super) fn fails(run: &Run) -> bool {
+    run.log.iter().any(|line| {
+        matches!(&line.entry, LogEntry::Command(Command::Note(Note::Finished { outcome, .. }))
+            if matches!(&**outcome, ABORTED | PREEMPTED))
+    })
+}
+
 /// Whether regions of a concurrency write facts of each other.
-fn shares(program: &Program) -> bool {
+pub(super) fn shares(program: &Program) -> bool {
     program.states.iter().any(|state| match &state.kind {
         StateKind::Concurrency { regions, preemptive: false, .. } => {
             let all: Vec<BTreeSet<String>> = regions.iter().map(|region| written(program, *region)).collect();

@@ -9,7 +9,7 @@
 
 use ratn_executive::protocol::Mode;
 use ratn_trials::{
-    Conditions, Features, Shrunk, Verdict, execute, listing, program, shrink, trial, trial_from_outside,
+    Conditions, Features, Shrunk, Verdict, execute, listing, program, shrink, trial, trial_blind, trial_from_outside,
 };
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -160,6 +160,21 @@ fn without_the_theorem_s_assumptions_what_acts_is_still_decided_and_final() {
     let programs = number("RATN_PROGRAMS", 2000) / 4;
     let sum = try_programs(1 << 40, programs, &Features::WEAK);
     assert!(sum.failed.is_empty(), "the programs of these seeds fail: {:?}", sum.failed);
+}
+
+/// Decisions that depend on no fact, imprecise motions that fail: the outcomes are HSM mode's all the same.
+#[test]
+fn imprecise_programs_that_look_at_no_fact_end_alike_in_both_modes() {
+    let (first, count) = (number("RATN_FIRST", 1 << 40), number("RATN_PROGRAMS", 2000));
+    let mut failed = Vec::new();
+    for seed in first..first + count {
+        let (made, conditions) = (program(seed, &Features::WEAK), Conditions::of(seed, &Features::WEAK));
+        if let Verdict::Differs(problem) = trial_blind(&made, &conditions) {
+            eprintln!("seed {seed}: {problem}\n{conditions:?}\n{}", listing(&made));
+            failed.push(seed);
+        }
+    }
+    assert!(failed.is_empty(), "{} programs of {count} end otherwise: {failed:?}", failed.len());
 }
 
 /// A program of a seed, disturbed from outside, and what comes of it.

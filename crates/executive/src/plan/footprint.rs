@@ -18,9 +18,10 @@ pub(super) fn reads(subject: &Subject<'_>, requirements: &[ResourceExpr]) -> Opt
             None if is_action(state) && !matches!(state.annotations.nature, Nature::Senses(_)) => return None,
             None => {}
         }
+        all.extend(state.annotations.senses().iter().cloned());
         for (slot, expression) in state.expressions() {
             let is_read = match slot {
-                Slot::Duration | Slot::Reads | Slot::Senses | Slot::Shared => false,
+                Slot::Duration | Slot::Shared => false,
                 // The ends of the parts of one node lie within that node.
                 Slot::Effect(_) | Slot::Resource(..) => subject.contains_others(),
                 _ => true,

@@ -174,7 +174,6 @@ impl Window {
                 }
             };
             reads = reads.union(facts_of(&state.annotations.requires, view));
-            reads = reads.union(FactExpr::footprint(&own.senses, view));
             // What its effects are made of is read when it ends.
             reads = reads.union(FactExpr::footprint(&own.effect_lookups, view));
             let ended = instance.ended().and_then(|ended| own.outcome(&ended.outcome));
@@ -218,7 +217,6 @@ pub(super) fn look(context: &Context<'_>, view: &View<'_>, nature: NodeNature) -
             let writer = view.sight.writer_of(view.instance, Looked::at(&senses));
             return Err(writer.map_or(Wait::Order, Wait::Environment));
         }
-        view.see(senses, &mut seen).map_err(blocked)?;
     }
     let reads = match &own.reads {
         Some(facts) => FactExpr::footprint(facts, view),

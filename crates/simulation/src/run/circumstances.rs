@@ -21,11 +21,20 @@ pub struct Circumstances {
     pub events: Vec<(Trigger, Event)>,
     /// How messages go wrong.
     pub mischief: Mischief,
+    /// After every event the executive's invariants are checked, and that nobody could go on who was not woken. Costs the whole
+    /// window each time.
+    pub checks: bool,
 }
 
 impl Default for Circumstances {
     fn default() -> Circumstances {
-        Circumstances { orders: 0, max_events: MAX_EVENTS, events: Vec::new(), mischief: Mischief::default() }
+        Circumstances {
+            orders: 0,
+            max_events: MAX_EVENTS,
+            events: Vec::new(),
+            mischief: Mischief::default(),
+            checks: false,
+        }
     }
 }
 

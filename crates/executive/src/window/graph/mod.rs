@@ -458,6 +458,10 @@ impl Graph {
             for arm in &instance.arms {
                 let Some(next) = arm.next else { continue };
                 let Some(next) = self.get(next) else {
+                    if instance.is_detached() {
+                        // What follows it on its line may have retired before it.
+                        continue;
+                    }
                     return Err(format!("{} is followed by {next}, which is not in the window", instance.id));
                 };
                 if next.id <= instance.id {

@@ -1,0 +1,98 @@
+//! What a run did beside what it should have done.
+
+use super::Told;
+use crate::state_of;
+use crate::story::Story;
+use ratn_model::program::{Program, StateKind};
+use ratn_model::value::Value;
+use ratn_simulation::run::Run;
+use std::collections::BTreeMap;
+
+/// The goals of PIAs in order, by thread of control.
+type Threads<'a> = BTreeMap<String, Vec<(&'a str, &'a str)>>;
+
+/// The first thing that a run did otherwise.
+pub(in super::super) fn disagreement(program: &Program, told: &Told, run: &Run, story: &Story) -> Option<String> {
+    end(told, run)
+        .or_else(|| acts(program, told, story))
+        .or_else(|| results(told, story))
+        .or_else(|| (told.changes != story.changes).then(|| differ("what became real", &told.changes, &story.changes)))
+}
+
+/// Whatever does not depend on the world: how the task and its actions ended.
+pub(in super::super) fn outcomes(told: &Told, run: &Run, story: &Story) -> Option<String> {
+    task(told, run).or_else(|| results(told, story))
+}
+
+/// Outcome and outputs.
+fn task(told: &Told, run: &Run) -> Option<String> {
+    if told.outcome != run.outcome {
+        return Some(differ("outcomes", &told.outcome, (&run.outcome, &run.reason)));
+    }
+    (told.outputs != run.outputs).then(|| differ("outputs", &told.outputs, &run.outputs))
+}
+
+/// Outcome, outputs, world and task resources.
+pub(in super::super) fn end(told: &Told, run: &Run) -> Option<String> {
+    if let Some(problem) = task(told, run) {
+        return Some(problem);
+    }
+    if !told.facts.iter().eq(run.world.iter().map(|(key, fact)| (key, &fact.value))) {
+        let show = |all: Vec<(String, &Value)>| all.iter().map(|(k, v)| format!("{k} = {v}")).collect::<Vec<_>>();
+        let expected = show(told.facts.iter().map(|(key, value)| (key.to_string(), value)).collect());
+        let found = show(run.world.iter().map(|(key, fact)| (key.to_string(), &fact.value)).collect());
+        return Some(differ("worlds", expected, found));
+    }
+    let left: BTreeMap<&str, u64> = told.units.iter().filter(|(_, n)| **n > 0).map(|(k, n)| (&**k, *n)).collect();
+    let found = run.units.iter().map(|(kind, units)| (&**kind, units.thousandths())).filter(|(_, n)| *n > 0);
+    let found: BTreeMap<&str, u64> = found.collect();
+    (left != found).then(|| differ("task resources", left, found))
+}
+
+fn acts(program: &Program, told: &Told, story: &Story) -> Option<String> {
+    let expected = threads(program, told.acts.iter().map(|(path, goal)| (&**path, &**goal)));
+    let found = threads(program, story.acts.iter().map(|act| (&*act.path, &*act.goal)));
+    (expected != found).then(|| differ("PIAs", expected, found))
+}
+
+fn threads<'a>(program: &Program, acts: impl Iterator<Item = (&'a str, &'a str)>) -> Threads<'a> {
+    let has_regions = program.states.iter().any(|state| matches!(state.kind, StateKind::Concurrency { .. }));
+    let mut threads = Threads::new();
+    for act in acts {
+        let of = if has_regions { thread(program, act.0) } else { "" };
+        threads.entry(of.to_owned()).or_default().push(act);
+    }
+    threads
+}
+
+/// The visit of the innermost region around a path.
+fn thread<'a>(program: &Program, path: &'a str) -> &'a str {
+    let mut end = path.len();
+    while end > 0 {
+        let around = state_of(program, &path[..end]).and_then(|state| state.parent);
+        if around.is_some_and(|id| matches!(program.state(id).kind, StateKind::Concurrency { .. })) {
+            return &path[..end];
+        }
+        end = path[..end].rfind('/').unwrap_or(0);
+    }
+    ""
+}
+
+fn results(told: &Told, story: &Story) -> Option<String> {
+    let paths = |all: &BTreeMap<String, Vec<_>>| all.iter().map(|(p, all)| (p.clone(), all.len())).collect::<Vec<_>>();
+    if paths(&told.results) != paths(&story.retired) {
+        return Some(differ("retired instances", paths(&told.results), paths(&story.retired)));
+    }
+    for ((path, expected), found) in told.results.iter().zip(story.retired.values()) {
+        for (expected, found) in expected.iter().zip(found) {
+            if !expected.may_be(found) {
+                return Some(differ(&format!("the results of {path}"), expected, found));
+            }
+        }
+    }
+    None
+}
+
+fn differ(what: &str, reference: impl std::fmt::Debug, run: impl std::fmt::Debug) -> String {
+    format!("{what} differ:\n reference {reference:#?}\n run       {run:#?}")
+}

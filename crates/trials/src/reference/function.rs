@@ -1,0 +1,75 @@
+//! The built-in functions but those that know a gripper.
+
+use super::Fail;
+use super::evaluate::{LONGEST_LIST, number, order, wrong};
+use ratn_model::expression::Function;
+use ratn_model::pose::Pose;
+use ratn_model::value::Value;
+use std::cmp::Ordering;
+
+/// The value of a call.
+pub(super) fn call(function: Function, arguments: &[Value]) -> Result<Value, Fail> {
+    match (function, arguments) {
+        (Function::GraspPose | Function::PlacePose, _) => Err(Fail::NotMine("what knows a gripper")),
+        (Function::Len, [Value::List(items)]) => Ok(Value::Int(items.len() as i64)),
+        (Function::Len, [Value::Map(fields)]) => Ok(Value::Int(fields.len() as i64)),
+        (Function::Len, [Value::Joints(joints)]) => Ok(Value::Int(joints.len() as i64)),
+        (Function::Len, [Value::String(text)]) => Ok(Value::Int(text.chars().count() as i64)),
+        (Function::Range, [Value::Int(to)]) => range(0, *to),
+        (Function::Range, [Value::Int(from), Value::Int(to)]) => range(*from, *to),
+        (Function::Min, [Value::List(items)]) => best(items, Ordering::Less),
+        (Function::Max, [Value::List(items)]) => best(items, Ordering::Greater),
+        (Function::Min, items) => best(items, Ordering::Less),
+        (Function::Max, items) => best(items, Ordering::Greater),
+        (Function::Abs, [Value::Int(i)]) => i.checked_abs().map_or_else(|| wrong("too large"), |i| Ok(Value::Int(i))),
+        (Function::Abs, [x]) => Ok(Value::Float(number(x)?.abs())),
+        (Function::Pose, [x, y, z]) => Ok(Value::Pose(Pose::at(number(x)?, number(y)?, number(z)?))),
+        (Function::Pose, [x, y, z, roll, pitch, yaw]) => {
+            let at = [number(x)?, number(y)?, number(z)?];
+            Ok(Value::Pose(Pose::from_rpy(at, number(roll)?, number(pitch)?, number(yaw)?)))
+        }
+        (Function::Joints, [_, ..]) => {
+            Ok(Value::Joints(arguments.iter().map(number).collect::<Result<Vec<f64>, Fail>>()?))
+        }
+        (Function::Compose, [Value::Pose(a), Value::Pose(b)]) => Ok(Value::Pose(a.compose(b))),
+        (Function::Inverse, [Value::Pose(a)]) => Ok(Value::Pose(a.inverse())),
+        (Function::Between, [Value::Pose(a), Value::Pose(b)]) => Ok(Value::Pose(a.inverse().compose(b))),
+        (Function::Concat, [_, ..]) => {
+            let mut text = String::new();
+            for part in arguments {
+                match part {
+                    Value::String(part) => text.push_str(part),
+                    Value::Int(i) => text.push_str(&i.to_string()),
+                    other => return wrong(format!("{other} is no text")),
+                }
+            }
+            Ok(Value::String(text))
+        }
+        (Function::Repeat, [value, Value::Int(times)]) if *times >= 0 && *times as usize <= LONGEST_LIST => {
+            Ok(Value::List((0..*times).map(|_| value.clone()).collect()))
+        }
+        (Function::Take, [Value::List(items), Value::Int(count)]) if *count >= 0 => {
+            Ok(Value::List(items[..items.len().min(*count as usize)].to_vec()))
+        }
+        _ => wrong(format!("{} of {arguments:?}", function.name())),
+    }
+}
+
+fn range(from: i64, to: i64) -> Result<Value, Fail> {
+    if to.saturating_sub(from) > LONGEST_LIST as i64 {
+        return wrong("too long");
+    }
+    Ok(Value::List((from..to).map(Value::Int).collect()))
+}
+
+fn best(items: &[Value], wanted: Ordering) -> Result<Value, Fail> {
+    let Some(mut best) = items.first() else { return wrong("the best of nothing") };
+    // One alone has to have an order, too.
+    order(best, best)?;
+    for item in items {
+        if order(item, best)? == wanted {
+            best = item;
+        }
+    }
+    Ok(best.clone())
+}

@@ -1,0 +1,262 @@
+//! One action: its tries, what it answers, and what its end changes.
+//!
+//! What ends without an answer (a goal that had no time left, a worker that died too often, a precondition that does not hold) ends
+//! `aborted` and changes nothing, not even by the effects of `aborted`: nobody knows how far it came.
+
+use super::evaluate::{Place, Read};
+use super::walk::assign;
+use super::{Fail, Outputs, Reference, effects, fails};
+use crate::story::{Real, goal_text};
+use ratn_executive::protocol::{Event, Goal};
+use ratn_model::fact::FactKey;
+use ratn_model::id::Revision;
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, STOPPED, SUCCESS, State, StateKind};
+use ratn_model::resource::ResourceOperation;
+use ratn_model::value::{Type, Value};
+use ratn_simulation::run::{Answer, Performance, Trigger};
+use ratn_world::world::World;
+
+/// So often a computing or sensing action is tried whose worker dies, unless it says otherwise.
+const ATTEMPTS: u32 = 3;
+
+/// How a goal answered.
+struct Ended {
+    outcome: String,
+    outputs: Outputs,
+    measured: Vec<(FactKey, Value)>,
+}
+
+impl Reference<'_> {
+    /// Visits an action; its outcome.
+    pub(super) fn action(
+        &mut self,
+        state: &State,
+        path: &str,
+        variables: &mut Vec<(String, Value)>,
+        in_routine: bool,
+    ) -> Result<String, Fail> {
+        let mut inputs = Outputs::new();
+        let ended = fails(self.tries(state, path, variables, in_routine, &mut inputs))?;
+        let Ok(mut ended) = ended else {
+            self.tell(path, in_routine, ABORTED, (inputs, Outputs::new()));
+            return Ok(ABORTED.to_owned());
+        };
+        let assigned = self.answered(state, &mut ended, variables)?;
+        let Ended { outcome, outputs, measured } = ended;
+        // Both modes log the outcome before they make the effects; that an effect has no value makes it `aborted` all the same.
+        self.tell(path, in_routine, &outcome, (inputs, outputs.clone()));
+        let made = self.effects_of(state, &outcome, &outputs, &measured, variables);
+        let made = made.and_then(|()| match &*outcome {
+            SUCCESS => self.operates(state, variables, &outputs),
+            _ => Ok(()),
+        });
+        if fails(made)?.is_err() {
+            return Ok(ABORTED.to_owned());
+        }
+        if is_good(&outcome) {
+            self.outputs.insert(state.id, outputs);
+            assign(variables, assigned);
+        }
+        Ok(outcome)
+    }
+
+    /// Notes a result as the story of a run does: nothing of what is in a routine, and not why something failed.
+    fn tell(&mut self, path: &str, in_routine: bool, outcome: &str, ports: (Outputs, Outputs)) {
+        if !in_routine {
+            let result = Real::new(outcome.to_owned(), is_good(outcome).then_some(ports));
+            self.told.results.entry(path.to_owned()).or_default().push(result);
+        }
+    }
+
+    /// Tries until there is an answer that counts.
+    fn tries(
+        &mut self,
+        state: &State,
+        path: &str,
+        variables: &[(String, Value)],
+        in_routine: bool,
+        inputs: &mut Outputs,
+    ) -> Result<Ended, Fail> {
+        let (mut tries, mut attempt, mut crashes) = (1, 1, 0);
+        let annotations = &state.annotations;
+        loop {
+            self.meets(state, &variables.to_vec())?;
+            if !in_routine {
+                self.asks(state, variables)?;
+            }
+            let (goal, performance) = self.perform(state, path, variables, tries, attempt)?;
+            *inputs = goal.inputs;
+            attempt += 1;
+            let answer = match annotations.timeout_s {
+                Some(limit) if performance.duration_s > limit => None,
+                _ => Some(performance.answer),
+            };
+            let ended = match answer {
+                Some(Answer::Crashed | Answer::LeaseLost) => {
+                    crashes += 1;
+                    if is_irreversible(state) || crashes >= annotations.attempts.unwrap_or(ATTEMPTS) {
+                        return Err(Fail::Wrong("its worker died".to_owned()));
+                    }
+                    continue;
+                }
+                Some(Answer::Finished { outcome, outputs, measured }) => Some(Ended { outcome, outputs, measured }),
+                None => None,
+            };
+            let has_aborted = ended.as_ref().is_none_or(|ended| ended.outcome == ABORTED);
+            if has_aborted && annotations.retry.is_some_and(|retry| tries <= retry.count) {
+                tries += 1;
+                continue;
+            }
+            return ended.ok_or_else(|| Fail::Wrong("it took too long".to_owned()));
+        }
+    }
+
+    /// One goal.
+    fn perform(
+        &mut self,
+        state: &State,
+        path: &str,
+        variables: &[(String, Value)],
+        tries: u32,
+        attempt: u32,
+    ) -> Result<(Goal, Performance), Fail> {
+        let StateKind::Action { provider, action, inputs: ports, .. } = &state.kind else {
+            return Err(Fail::NotMine("a goal of what is no action"));
+        };
+        let place = self.place(variables, None);
+        let mut inputs = Outputs::new();
+        for (port, value) in ports {
+            match value.read(&place)? {
+                // An optional port that is not given.
+                Value::Null => {}
+                value => drop(inputs.insert(port.clone(), value)),
+            }
+        }
+        let facts = self.shown(state, &place);
+        let expected_s = estimate_s(state, &place);
+        let seed = seed(self.seed, path, if state.annotations.deterministic { 1 } else { tries });
+        let goal = Goal {
+            provider: provider.as_str().into(),
+            action: action.as_str().into(),
+            inputs,
+            seed,
+            lease: None,
+            projection: None,
+            expected_s,
+            timeout_s: state.annotations.timeout_s,
+        };
+        if state.annotations.nature == Nature::Irreversible {
+            self.told.acts.push((path.to_owned(), goal_text(&goal)));
+        }
+        // A world only because the oracle wants one.
+        let world = World::from_facts(facts, Revision(0));
+        let performance = self.oracle.perform(path, attempt, &goal, &world);
+        self.come_from_outside(path);
+        Ok((goal, performance))
+    }
+
+    /// What changes from outside when a goal of this path starts.
+    fn come_from_outside(&mut self, path: &str) {
+        let (now, later) = std::mem::take(&mut self.outside)
+            .into_iter()
+            .partition(|(trigger, _)| *trigger == Trigger::Starts(path.to_owned()));
+        self.outside = later;
+        for (_, event) in Vec::<(Trigger, Event)>::from_iter(now) {
+            let Event::WorldChanged { facts, .. } = event else { continue };
+            for (key, value) in facts {
+                match value {
+                    Some(value) => drop(self.told.facts.insert(key, value)),
+                    None => drop(self.told.facts.remove(&key)),
+                }
+            }
+        }
+    }
+
+    /// An answer that does not fit its action is a failure; what the state assigns.
+    fn answered(
+        &self,
+        state: &State,
+        ended: &mut Ended,
+        variables: &Vec<(String, Value)>,
+    ) -> Result<Vec<(String, Value)>, Fail> {
+        let own = |name: &str| state.outcomes.iter().any(|known| known == name);
+        let is_known = |name: &str| [SUCCESS, ABORTED, PREEMPTED].contains(&name) || own(name);
+        let mut has_failed = false;
+        if let StateKind::Action { outputs: declared, .. } = &state.kind {
+            let is_written = |(port, ty): (&String, &Type)| ended.outputs.get(port).is_some_and(|v| ty.accepts(v));
+            has_failed = ended.outcome == SUCCESS && !declared.iter().all(is_written);
+        }
+        if ended.outcome == STOPPED && !own(STOPPED) {
+            ended.outcome = PREEMPTED.to_owned();
+        }
+        let mut assigned = Vec::new();
+        if !has_failed && is_known(&ended.outcome) && is_good(&ended.outcome) {
+            match fails(self.assigned(state, variables, &ended.outputs))? {
+                Ok(values) => assigned = values,
+                Err(_) => has_failed = true,
+            }
+        }
+        if has_failed || !is_known(&ended.outcome) {
+            ended.outcome = ABORTED.to_owned();
+            ended.outputs.clear();
+        }
+        Ok(assigned)
+    }
+
+    fn effects_of(
+        &mut self,
+        state: &State,
+        outcome: &str,
+        outputs: &Outputs,
+        measured: &[(FactKey, Value)],
+        variables: &[(String, Value)],
+    ) -> Result<(), Fail> {
+        let declared = state.annotations.effects.get(outcome);
+        let changes_nothing = match state.annotations.nature {
+            _ if operates_resources(state) => false,
+            Nature::Computes => true,
+            Nature::Senses(_) => outcome != SUCCESS,
+            Nature::Irreversible => false,
+        };
+        let predicted = match declared {
+            Some(effects) => effects::bound(effects, &self.place(variables, Some(outputs)))?,
+            None => Vec::new(),
+        };
+        let changes = effects::with_measured(predicted, measured, declared.is_some() || changes_nothing)?;
+        self.change(changes)
+    }
+}
+
+fn is_good(outcome: &str) -> bool {
+    !matches!(outcome, ABORTED | PREEMPTED)
+}
+
+/// The declared estimate, where it is one.
+fn estimate_s(state: &State, place: &Place<'_>) -> Option<f64> {
+    let seconds = match state.annotations.duration_s.as_ref()?.read(place).ok()? {
+        Value::Int(i) => i as f64,
+        Value::Float(x) => x,
+        _ => return None,
+    };
+    (seconds.is_finite() && seconds >= 0.0).then_some(seconds)
+}
+
+/// What changes resources is potentially irreversible, whatever it says.
+fn is_irreversible(state: &State) -> bool {
+    state.annotations.nature == Nature::Irreversible || operates_resources(state)
+}
+
+fn operates_resources(state: &State) -> bool {
+    let changes = |operation| !matches!(operation, ResourceOperation::Block | ResourceOperation::Exists);
+    state.annotations.resources.iter().any(|line| changes(line.operation))
+}
+
+/// The seed of a try: FNV-1a over the run's seed, the path and, from the second on, the number of the try.
+fn seed(run: u64, path: &str, tries: u32) -> u64 {
+    let mut bytes = run.to_le_bytes().to_vec();
+    bytes.extend(path.bytes());
+    if tries > 1 {
+        bytes.extend(tries.to_le_bytes());
+    }
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3))
+}

@@ -1,0 +1,191 @@
+//! The reference: a second, slow and plain evaluation of a task program, one state after the other, as docs/task-files.md says it.
+//!
+//! Both modes are compared with it, so a mistake that they share is found, too. It shares no behaviour with them: expressions, facts,
+//! patterns, queries, effects, bindings, transitions, loops, retries and resource sums are read and counted here once more,
+//! without an index and without cleverness. What it does share:
+//!
+//! - the plain data of `ratn-model` (`Program`, `State`, `Expr`, `Value`, `FactKey`, `Change`), the arithmetic of poses
+//!   and what an ontology says of one change;
+//! - the [`Oracle`], which is the environment. It wants a `World`, so one is built from the facts only to be handed to it.
+//!
+//! There is no clock. A goal that takes longer than its timeout is one that has aborted; regions run one after another,
+//! which is the same because they touch nothing of each other. What depends on time (preemptive concurrencies, deadlines)
+//! or on a wait without an end (resources that are never there) is [`Fail::NotMine`]: there is no verdict.
+//!
+//! | | |
+//! |---|---|
+//! | facts and effects | `facts`, `effects` |
+//! | expressions | `evaluate`, `function`, `query` |
+//! | what is known of a run's log alone | `preconditions` |
+//! | what runs | `walk` (states that contain others), `goal` (one action), `shown` (what its provider sees), `resources` |
+
+mod compare;
+mod effects;
+mod evaluate;
+mod facts;
+mod function;
+mod goal;
+mod preconditions;
+mod query;
+mod resources;
+mod shown;
+mod walk;
+
+#[cfg(test)]
+mod tests;
+
+pub(super) use compare::{disagreement, end, outcomes};
+pub(super) use preconditions::unmet;
+
+use super::story::Real;
+use evaluate::{Place, Read};
+use facts::Facts;
+use ratn_executive::protocol::Event;
+use ratn_model::fact::Change;
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, Program, SUCCESS};
+use ratn_model::value::Value;
+use ratn_simulation::run::{Oracle, Trigger};
+use std::collections::BTreeMap;
+
+/// Output ports of one state.
+type Outputs = BTreeMap<String, Value>;
+
+/// No run of the reference has more visits and iterations.
+const MAX_STEPS: usize = 50_000;
+
+/// Why something has no value, or did not happen.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Fail {
+    /// It needs what was never written.
+    Unwritten(String),
+    /// It can have no value here.
+    Wrong(String),
+    /// The reference does not evaluate this: there is no verdict on the program.
+    NotMine(&'static str),
+}
+
+/// What should become of a program.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct Told {
+    pub(super) outcome: String,
+    pub(super) outputs: Outputs,
+    pub(super) facts: Facts,
+    /// Thousandths of task resources that are left, by kind.
+    pub(super) units: BTreeMap<String, u64>,
+    /// The goals of PIAs in one order that the program allows: path, and seed with inputs.
+    pub(super) acts: Vec<(String, String)>,
+    /// How actions that are in no routine ended, by path.
+    pub(super) results: BTreeMap<String, Vec<Real>>,
+    /// What was changed, by predicate.
+    pub(super) changes: BTreeMap<String, Vec<Change>>,
+}
+
+/// What a program is evaluated with.
+pub(super) struct Given<'a> {
+    pub(super) program: &'a Program,
+    pub(super) seed: u64,
+    pub(super) parameters: BTreeMap<String, Value>,
+    pub(super) facts: Facts,
+    /// Thousandths of the task resources that there are, by kind.
+    pub(super) units: BTreeMap<String, u64>,
+    /// What changes from outside when a goal starts.
+    pub(super) outside: Vec<(Trigger, Event)>,
+    pub(super) oracle: &'a mut dyn Oracle,
+}
+
+/// A program under evaluation.
+struct Reference<'a> {
+    program: &'a Program,
+    seed: u64,
+    oracle: &'a mut dyn Oracle,
+    outside: Vec<(Trigger, Event)>,
+    /// Of all states, what their latest visits wrote.
+    outputs: BTreeMap<StateId, Outputs>,
+    /// How regions ended.
+    regions: BTreeMap<StateId, String>,
+    steps: usize,
+    told: Told,
+}
+
+/// Evaluates a program from its start to its end.
+///
+/// # Errors
+/// [`Fail::NotMine`].
+pub(super) fn evaluate(given: Given<'_>) -> Result<Told, Fail> {
+    let Given { program, seed, parameters, facts, units, outside, oracle } = given;
+    let mut reference = Reference {
+        program,
+        seed,
+        oracle,
+        outside,
+        outputs: BTreeMap::new(),
+        regions: BTreeMap::new(),
+        steps: 0,
+        told: Told { facts, units, ..Told::default() },
+    };
+    let mut variables: Vec<(String, Value)> = parameters.into_iter().collect();
+    reference.told.outcome = reference.task(&mut variables)?;
+    Ok(reference.told)
+}
+
+impl Reference<'_> {
+    fn task(&mut self, variables: &mut Vec<(String, Value)>) -> Result<String, Fail> {
+        let program = self.program;
+        if program.deadline_s.is_some() {
+            return Err(Fail::NotMine("a deadline"));
+        }
+        let initial = effects::bound(&program.initial, &self.place(variables, None));
+        let begun = match fails(initial)? {
+            Ok(changes) => self.change(changes),
+            Err(problem) => Err(problem),
+        };
+        if fails(begun)?.is_err() {
+            return Ok(ABORTED.to_owned());
+        }
+        let outcome = self.visit(Program::ROOT, "", variables, false)?;
+        if outcome == SUCCESS {
+            for output in &program.outputs {
+                let value = output.value.read(&self.place(variables, None));
+                match fails(value)? {
+                    Ok(value) => drop(self.told.outputs.insert(output.name.clone(), value)),
+                    Err(_) => {
+                        self.told.outputs.clear();
+                        return Ok(ABORTED.to_owned());
+                    }
+                }
+            }
+        }
+        Ok(outcome)
+    }
+
+    /// Where names get their values now.
+    fn place<'p>(&'p self, variables: &[(String, Value)], own: Option<&'p Outputs>) -> Place<'p> {
+        Place {
+            program: self.program,
+            facts: &self.told.facts,
+            outputs: &self.outputs,
+            regions: &self.regions,
+            variables: variables.to_vec(),
+            own,
+            row: Vec::new(),
+        }
+    }
+
+    /// Changes happen, all of them or none.
+    fn change(&mut self, changes: Vec<Change>) -> Result<(), Fail> {
+        self.told.facts = effects::applied(&self.told.facts, &changes, self.program.ontology.as_ref())?;
+        for change in changes {
+            self.told.changes.entry(change.pattern().predicate).or_default().push(change);
+        }
+        Ok(())
+    }
+}
+
+/// A failure of the program is a result; what the reference does not evaluate ends the evaluation.
+fn fails<T>(result: Result<T, Fail>) -> Result<Result<T, Fail>, Fail> {
+    match result {
+        Err(Fail::NotMine(what)) => Err(Fail::NotMine(what)),
+        other => Ok(other),
+    }
+}

@@ -1,0 +1,293 @@
+//! States that contain others: which state comes next, and what happens when one is left.
+
+use super::evaluate::Read;
+use super::{Fail, MAX_STEPS, Outputs, Reference, effects, fails};
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind, Target};
+use ratn_model::value::Value;
+use std::collections::BTreeMap;
+
+/// Variables in sight; the last of a name counts.
+type Variables = Vec<(String, Value)>;
+
+impl Reference<'_> {
+    /// Visits a state at a path; its outcome.
+    pub(super) fn visit(
+        &mut self,
+        id: StateId,
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<String, Fail> {
+        let program = self.program;
+        let state = program.state(id);
+        self.steps += 1;
+        if self.steps > MAX_STEPS {
+            return Err(Fail::NotMine("a run without an end"));
+        }
+        if let StateKind::Action { .. } = state.kind {
+            return self.action(state, path, variables, in_routine);
+        }
+        if fails(self.meets(state, variables))?.is_err() {
+            return Ok(ABORTED.to_owned());
+        }
+        let begins_routine = state.is_routine() && !in_routine;
+        if begins_routine && fails(self.asks(state, variables))?.is_err() {
+            return Ok(ABORTED.to_owned());
+        }
+        self.forget(id);
+        let outside = variables.len();
+        for (name, value) in &state.variables {
+            // None sees another.
+            let mut seen = variables.clone();
+            seen.truncate(outside);
+            match fails(value.read(&self.place(&seen, None)))? {
+                Ok(value) => variables.push((name.clone(), value)),
+                Err(_) => {
+                    variables.truncate(outside);
+                    return Ok(ABORTED.to_owned());
+                }
+            }
+        }
+        let inside = in_routine || begins_routine;
+        let left = match &state.kind {
+            StateKind::Action { .. } => None,
+            StateKind::Sequence { children, .. } => Some(self.list(children, path, variables, inside)?),
+            StateKind::Condition { predicate, then, otherwise } => {
+                match fails(predicate.is_true(&self.place(variables, None)))? {
+                    Ok(true) => Some(self.list(then, path, variables, inside)?),
+                    Ok(false) => Some(self.list(otherwise, path, variables, inside)?),
+                    Err(_) => None,
+                }
+            }
+            StateKind::ForEach { variable, index, collection, body } => {
+                match fails(collection.read(&self.place(variables, None)))? {
+                    Ok(Value::List(elements)) => {
+                        let mut left = SUCCESS.to_owned();
+                        for (number, element) in elements.into_iter().enumerate() {
+                            let before = variables.len();
+                            variables.push((variable.clone(), element));
+                            variables.extend(index.clone().map(|name| (name, Value::Int(number as i64))));
+                            left = self.list(body, &format!("{path}[{number}]"), variables, inside)?;
+                            variables.truncate(before);
+                            if left != SUCCESS {
+                                break;
+                            }
+                        }
+                        Some(left)
+                    }
+                    _ => None,
+                }
+            }
+            StateKind::While { predicate, body_first, index, body } => {
+                self.repeat(predicate, *body_first, index.as_deref(), body, path, variables, inside)?
+            }
+            StateKind::Concurrency { preemptive: true, .. } => {
+                return Err(Fail::NotMine("a preemptive concurrency"));
+            }
+            StateKind::Concurrency { regions, decide, .. } => {
+                Some(self.regions(regions, decide, path, variables, inside)?)
+            }
+        };
+        // What it is decided by has no value: it fails as the state, and its end changes nothing.
+        let Some(left) = left else {
+            variables.truncate(outside);
+            return Ok(ABORTED.to_owned());
+        };
+        let end = self.leave(state, &left, variables);
+        // The task's own variables are seen by its outputs.
+        if id != Program::ROOT {
+            variables.truncate(outside);
+        }
+        match fails(end)? {
+            Ok(assigned) => {
+                assign(variables, assigned);
+                Ok(left)
+            }
+            Err(_) => Ok(ABORTED.to_owned()),
+        }
+    }
+
+    /// Every precondition holds.
+    pub(super) fn meets(&self, state: &State, variables: &Variables) -> Result<(), Fail> {
+        for required in &state.annotations.requires {
+            if !required.is_true(&self.place(variables, None))? {
+                return Err(Fail::Wrong(format!("{required} does not hold")));
+            }
+        }
+        Ok(())
+    }
+
+    /// The values that a state assigns, where it ends well.
+    pub(super) fn assigned(
+        &self,
+        state: &State,
+        variables: &Variables,
+        own: &Outputs,
+    ) -> Result<Vec<(String, Value)>, Fail> {
+        let place = self.place(variables, Some(own));
+        state.assign.iter().map(|(name, value)| Ok((name.clone(), value.read(&place)?))).collect()
+    }
+
+    /// A list of states along their transitions; by which outcome it is left.
+    fn list(
+        &mut self,
+        list: &[StateId],
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<String, Fail> {
+        let mut visits: BTreeMap<StateId, u32> = BTreeMap::new();
+        let Some(mut current) = list.first().copied() else { return Ok(SUCCESS.to_owned()) };
+        loop {
+            let state = self.program.state(current);
+            let visit = visits.entry(current).or_default();
+            *visit += 1;
+            let name = if *visit == 1 { state.name.clone() } else { format!("{}#{visit}", state.name) };
+            let outcome = self.visit(current, &below(path, &name), variables, in_routine)?;
+            match state.transitions.get(&outcome) {
+                Some(Target::State(next)) => current = *next,
+                Some(Target::Outcome(by)) => return Ok(by.clone()),
+                None if outcome != SUCCESS => return Ok(outcome),
+                None => {
+                    let place = list.iter().position(|id| *id == current);
+                    match place.and_then(|place| list.get(place + 1)) {
+                        Some(next) => current = *next,
+                        None => return Ok(SUCCESS.to_owned()),
+                    }
+                }
+            }
+        }
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "all of it is one loop")]
+    fn repeat(
+        &mut self,
+        predicate: &ratn_model::expression::Expr,
+        body_first: bool,
+        index: Option<&str>,
+        body: &[StateId],
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<Option<String>, Fail> {
+        let before = variables.len();
+        for number in 0.. {
+            self.steps += 1;
+            if self.steps > MAX_STEPS {
+                return Err(Fail::NotMine("a loop without an end"));
+            }
+            variables.extend(index.map(|name| (name.to_owned(), Value::Int(number))));
+            if number > 0 || !body_first {
+                let again = fails(predicate.is_true(&self.place(variables, None)))?;
+                if again != Ok(true) {
+                    variables.truncate(before);
+                    return Ok(again.ok().map(|_| SUCCESS.to_owned()));
+                }
+            }
+            let left = self.list(body, &format!("{path}[{number}]"), variables, in_routine)?;
+            variables.truncate(before);
+            if left != SUCCESS {
+                return Ok(Some(left));
+            }
+        }
+        Ok(None)
+    }
+
+    /// All regions, one after another; the outcome.
+    fn regions(
+        &mut self,
+        regions: &[StateId],
+        decide: &[(String, ratn_model::expression::Expr)],
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<String, Fail> {
+        let before = variables.clone();
+        let mut outcomes = Vec::new();
+        for region in regions {
+            let mut own = before.clone();
+            let name = &self.program.state(*region).name;
+            let outcome = self.visit(*region, &below(path, name), &mut own, in_routine)?;
+            for (number, variable) in own.into_iter().enumerate() {
+                if variable.1 != before[number].1 {
+                    variables[number] = variable;
+                }
+            }
+            outcomes.push((*region, outcome));
+        }
+        // How a region ended is seen when all have.
+        for (region, outcome) in &outcomes {
+            self.regions.insert(*region, outcome.clone());
+        }
+        for (outcome, holds) in decide {
+            match fails(holds.is_true(&self.place(variables, None)))? {
+                Ok(true) => return Ok(outcome.clone()),
+                Ok(false) => {}
+                Err(_) => return Ok(ABORTED.to_owned()),
+            }
+        }
+        let by = |wanted: &str| outcomes.iter().any(|(_, outcome)| outcome == wanted);
+        let all_well = outcomes.iter().all(|(_, outcome)| outcome == SUCCESS);
+        Ok(if all_well {
+            SUCCESS
+        } else if by(ABORTED) {
+            ABORTED
+        } else {
+            PREEMPTED
+        }
+        .to_owned())
+    }
+
+    /// What happens when a state is left: outputs, effects and resources; what it assigns.
+    fn leave(&mut self, state: &State, outcome: &str, variables: &Variables) -> Result<Vec<(String, Value)>, Fail> {
+        let is_good = !matches!(outcome, ABORTED | PREEMPTED);
+        let mut written = Outputs::new();
+        if let (true, StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) =
+            (is_good, &state.kind)
+        {
+            for output in outputs {
+                match output.value.read(&self.place(variables, Some(&written))) {
+                    Ok(value) => drop(written.insert(output.name.clone(), value)),
+                    // It was left early, before that was written.
+                    Err(Fail::Unwritten(_)) if outcome != SUCCESS => {}
+                    Err(problem) => return Err(problem),
+                }
+            }
+        }
+        let assigned = if is_good { self.assigned(state, variables, &written)? } else { Vec::new() };
+        if let Some(declared) = state.annotations.effects.get(outcome) {
+            let changes = effects::bound(declared, &self.place(variables, Some(&written)))?;
+            self.change(changes)?;
+        }
+        if outcome == SUCCESS {
+            self.operates(state, variables, &written)?;
+        }
+        if is_good && matches!(state.kind, StateKind::Sequence { .. } | StateKind::Concurrency { .. }) {
+            self.outputs.insert(state.id, written);
+        }
+        Ok(assigned)
+    }
+
+    /// What the states inside wrote when it was entered before is not seen.
+    fn forget(&mut self, id: StateId) {
+        for child in self.program.state(id).children() {
+            self.outputs.remove(&child);
+            self.regions.remove(&child);
+            self.forget(child);
+        }
+    }
+}
+
+/// Variables get new values, each the innermost of its name.
+pub(super) fn assign(variables: &mut Variables, assigned: Vec<(String, Value)>) {
+    for (name, value) in assigned {
+        if let Some(variable) = variables.iter_mut().rev().find(|(known, _)| *known == name) {
+            variable.1 = value;
+        }
+    }
+}
+
+fn below(path: &str, name: &str) -> String {
+    if path.is_empty() { name.to_owned() } else { format!("{path}/{name}") }
+}
