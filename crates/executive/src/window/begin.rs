@@ -27,8 +27,11 @@ impl Window {
         let looked = self.look(context, id, None, |instance, view| {
             let mut seen = Seen::default();
             let readiness = self.readiness(context, instance, view, &mut seen);
-            // What made it fail may come out otherwise, too; a PIA's inputs are final.
-            let is_made = matches!(readiness, Readiness::Ready(..) | Readiness::Failed(_));
+            // What made it fail may come out otherwise, too, and so may what a sensing node waits to see; a PIA's inputs are final.
+            let is_made = match readiness {
+                Readiness::Ready(..) | Readiness::Failed(_) => true,
+                Readiness::Waits(wait) => matches!(wait, Wait::Environment(_) | Wait::Order),
+            };
             if is_made && !instance.is_pia() {
                 view.use_outputs(view.sight.producers_of(view.instance));
                 view.register(Purpose::Result);

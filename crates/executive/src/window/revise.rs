@@ -48,6 +48,13 @@ impl Window {
         is_open: bool,
         is_known_now: bool,
     ) {
+        for user in users.iter().filter(|user| user.of == Source::World && user.purpose == Purpose::Result) {
+            // Whoever waits for the environment to look as it does at its place looks again.
+            let waits = self.graph.get(user.id).is_some_and(|user| user.is_sensing() && !user.is_under_way());
+            if waits {
+                self.waits.enqueue(&mut self.graph, user.id);
+            }
+        }
         let patterns: Vec<FactPattern> = difference.deviations.iter().map(|d| d.pattern.clone()).collect();
         for user in users {
             match (user.of, user.purpose) {

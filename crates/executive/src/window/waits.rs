@@ -151,7 +151,11 @@ impl Waits {
     /// Whoever waits for it is looked at again.
     pub(crate) fn wake(&mut self, graph: &mut Graph, id: InstanceId) {
         let Some(cell) = graph.waiting(id) else { return };
-        for waiter in std::mem::take(&mut cell.waiters) {
+        let mut waiters = std::mem::take(&mut cell.waiters);
+        // In program order, whoever asked first, and however often.
+        waiters.sort_unstable();
+        waiters.dedup();
+        for waiter in waiters {
             self.enqueue(graph, waiter);
         }
     }
