@@ -80,6 +80,11 @@ fn expressions(state: &mut State, change: &dyn Fn(&mut Expr)) {
         facts.iter_mut().for_each(|f| fact(f, change));
     }
     a.effects.values_mut().flatten().for_each(|e| effect(e, change));
+    a.duration_s.iter_mut().for_each(|e| part_of(e, change));
+    for resource in &mut a.resources {
+        resource.attributes.iter_mut().for_each(|(_, e)| part_of(e, change));
+        resource.conditions.iter_mut().for_each(|condition| part_of(&mut condition.value, change));
+    }
 }
 
 fn part_of(expression: &mut Expr, change: &dyn Fn(&mut Expr)) {

@@ -4,10 +4,9 @@
 
 use super::story::{Act, Real, Story, are_beside, story};
 use super::weak;
-use super::{Dice, Features, HashOracle, RESOURCES, is_in_routine, state_of};
-use ratn_executive::protocol::{Event, Mode};
-use ratn_model::catalogue::ResourceOffer;
-use ratn_model::program::{Program, StateKind};
+use super::{Dice, Features, HashOracle, around, attributes, is_in_routine, is_long, offers, state_of};
+use ratn_executive::protocol::{Event, Learned, Mode};
+use ratn_model::program::{Program, SUCCESS, State, StateKind};
 use ratn_model::tolerance::Tolerance;
 use ratn_simulation::run::{Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
 use std::collections::{BTreeMap, BTreeSet};
@@ -18,6 +17,10 @@ use std::time::Duration;
 const MAX_HSM_EVENTS: usize = 6_000;
 /// So many more events than HSM mode may CDTN mode take, which computes what is never needed, too.
 const MAX_CDTN_EVENTS: usize = 60;
+
+pub(super) fn max_hsm_events(program: &Program) -> usize {
+    MAX_HSM_EVENTS * if is_long(program) { 20 } else { 1 }
+}
 
 /// What a program is tried under.
 #[derive(Debug, Clone, PartialEq)]
@@ -40,6 +43,14 @@ pub struct Conditions {
     pub pauses: bool,
     /// Orders that a look ahead tries.
     pub orders: usize,
+    /// Of a hundred states, for how many nothing is ever granted.
+    pub refused_percent: u64,
+    /// Emergency stops.
+    pub stops: bool,
+    /// After so many events the run is resumed from its log.
+    pub resume_after: Option<usize>,
+    /// Earlier runs have taught something, right or wrong.
+    pub learned: bool,
 }
 
 /// What came of a trial.
@@ -65,7 +76,7 @@ impl Conditions {
     pub fn of(seed: u64, features: &Features) -> Conditions {
         let mut dice = Dice(seed ^ 0x5eed_c0de);
         let mut some = |chance: u64, much: u64| if dice.percent(chance) { much } else { 0 };
-        Conditions {
+        let mut conditions = Conditions {
             seed,
             weak: features.weak,
             failures_percent: some(50, 5),
@@ -75,7 +86,21 @@ impl Conditions {
             mischief_percent: some(40, 20),
             pauses: some(15, 1) == 1,
             orders: some(15, 12) as usize,
+            refused_percent: 0,
+            stops: false,
+            resume_after: None,
+            learned: false,
+        };
+        if features.incidents {
+            conditions.refused_percent = some(12, 8);
+            conditions.stops = some(50, 1) == 1;
+            let after = some(30, 1 + seed % 150) as usize;
+            conditions.resume_after = (after > 0).then_some(after);
         }
+        if features.estimates {
+            conditions.learned = some(25, 1) == 1;
+        }
+        conditions
     }
 }
 
@@ -86,7 +111,7 @@ pub fn trial(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
 
 /// The same, while this comes from outside.
 pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: &[(Trigger, Event)]) -> Verdict {
-    let hsm = match execute_under(program, conditions, Mode::Hsm, MAX_HSM_EVENTS, outside.to_vec()) {
+    let hsm = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), outside.to_vec()) {
         Ok(run) => run,
         Err(RunError::Endless(_)) => return Verdict::LeftOut,
         Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
@@ -96,7 +121,13 @@ pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: 
         Ok(run) => run,
         Err(problem) => return Verdict::Differs(format!("CDTN mode: {problem}")),
     };
-    let problem = if conditions.weak { weak::problem(program, &hsm, &cdtn) } else { problem(program, &hsm, &cdtn) };
+    let problem = if conditions.weak && weak::is_blind(program) {
+        weak::blind_problem(program, &hsm, &cdtn)
+    } else if conditions.weak {
+        weak::problem(program, &hsm, &cdtn)
+    } else {
+        problem(program, &hsm, &cdtn)
+    };
     match problem {
         Some(problem) => Verdict::Differs(problem),
         None => Verdict::Same { hsm_s: hsm.end_s, cdtn_s: cdtn.end_s, acts: story(program, &cdtn).acts.len() },
@@ -124,12 +155,9 @@ pub(super) fn execute_under(
     let setup = Setup {
         program: program.clone(),
         mode,
-        parameters: BTreeMap::new(),
+        parameters: program.parameters.iter().filter_map(|p| Some((p.name.clone(), p.default.clone()?))).collect(),
         seed,
-        resources: RESOURCES
-            .iter()
-            .map(|(kind, class, units)| ((*kind).to_owned(), ResourceOffer::new(*class, *units)))
-            .collect(),
+        resources: offers(),
         world: Vec::new(),
         tolerance: Tolerance::EXACT,
         latency: Duration::from_secs_f64(conditions.latency_s),
@@ -140,14 +168,51 @@ pub(super) fn execute_under(
         failures_percent: conditions.failures_percent,
         crashes_percent: conditions.crashes_percent,
         deviations_percent: conditions.deviations_percent,
+        stops: conditions.stops,
     };
     let percent = conditions.mischief_percent;
     let mischief = Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent };
     if conditions.pauses {
         outside.extend(pauses(seed));
     }
-    let circumstances = Circumstances { orders: conditions.orders, max_events, events: outside, mischief };
+    let circumstances = Circumstances {
+        orders: conditions.orders,
+        max_events,
+        events: outside,
+        mischief,
+        refused: refused(program, conditions),
+        resume_after: conditions.resume_after,
+        learned: if conditions.learned { learned(program, seed) } else { Learned::default() },
+        attributes: attributes(),
+    };
     run_under(setup, &mut oracle, circumstances)
+}
+
+/// States that are never granted anything, by their paths. What is inside of a routine asks for nothing itself, as a rule.
+fn refused(program: &Program, conditions: &Conditions) -> BTreeSet<String> {
+    let mut dice = Dice(conditions.seed ^ 0x4ef5ed);
+    let mut chosen = |state: &&State| {
+        let inside = around(program, state).skip(1).any(State::is_routine);
+        !inside && dice.percent(conditions.refused_percent)
+    };
+    program.states.iter().filter(|state| chosen(state)).map(|state| state.path.clone()).collect()
+}
+
+/// What earlier runs may have taught: anything.
+fn learned(program: &Program, seed: u64) -> Learned {
+    let mut dice = Dice(seed ^ 0x1ea4);
+    let mut learned = Learned::default();
+    for state in &program.states {
+        if dice.percent(40) {
+            learned.durations_s.insert(state.path.clone(), dice.below(300) as f64 / 10.0);
+        }
+        if dice.percent(40) {
+            let shares = [SUCCESS, "aborted", "again", "done", "then", "else", "found"]
+                .map(|outcome| (outcome.to_owned(), dice.below(11) as f64 / 10.0));
+            learned.outcomes.insert(state.path.clone(), BTreeMap::from(shares));
+        }
+    }
+    learned
 }
 
 /// A pause, a step and what ends both.
@@ -172,9 +237,12 @@ fn differ(what: &str, hsm: impl std::fmt::Debug, cdtn: impl std::fmt::Debug) -> 
 }
 
 /// The first clause of the theorem that does not hold.
-fn problem(program: &Program, hsm: &Run, cdtn: &Run) -> Option<String> {
+pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run) -> Option<String> {
     let (before, after) = (story(program, hsm), story(program, cdtn));
-    closure(program, &before, &after)
+    let undone = after.undone.first();
+    undone
+        .map(|path| format!("{path} was discarded or computed again after it had started, and it is a PIA"))
+        .or_else(|| closure(program, &before, &after))
         .or_else(|| same_end(hsm, cdtn))
         .or_else(|| {
             let missing: Vec<&str> = before.acts.iter().skip(after.acts.len()).map(|act| act.path.as_str()).collect();
@@ -203,10 +271,7 @@ pub(super) fn same_end(hsm: &Run, cdtn: &Run) -> Option<String> {
 
 /// The PIAs started are at every moment some of HSM mode's, each once, with all that come before them in the program started and
 /// ended.
-fn closure(program: &Program, hsm: &Story, cdtn: &Story) -> Option<String> {
-    if let Some(path) = cdtn.undone.first() {
-        return Some(format!("{path} was discarded or computed again after it had started, and it is a PIA"));
-    }
+pub(super) fn closure(program: &Program, hsm: &Story, cdtn: &Story) -> Option<String> {
     let has_regions = program.states.iter().any(|s| matches!(s.kind, StateKind::Concurrency { .. }));
     let place: BTreeMap<(&str, &str), usize> =
         hsm.acts.iter().enumerate().map(|(n, act)| ((act.path.as_str(), act.goal.as_str()), n)).collect();

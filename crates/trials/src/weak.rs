@@ -28,6 +28,39 @@ pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run) -> Option<String
     })
 }
 
+/// Whether nothing in the program looks at the world.
+pub(super) fn is_blind(program: &Program) -> bool {
+    let blind = |state: &ratn_model::program::State| {
+        let text =
+            format!("{:?} {:?} {:?} {:?}", state.kind, state.variables, state.assign, state.annotations.requires);
+        let looks = text.contains("predicate: \"p");
+        let effects = format!("{:?}", state.annotations.effects);
+        let reads = match (&state.kind, &state.annotations.nature) {
+            (StateKind::Action { .. }, Nature::Senses(facts)) => !facts.is_empty(),
+            (StateKind::Action { .. }, _) => state.annotations.reads.as_ref().is_none_or(|reads| !reads.is_empty()),
+            _ => false,
+        };
+        !looks && !reads && !effects.contains("Fact(") && !effects.contains("Increase(")
+    };
+    program.states.iter().all(blind)
+}
+
+/// Of programs that never look at the world, with imprecise motions: both modes come to the same end by the same outcomes, and
+/// what HSM mode does CDTN mode does, too. What it does besides, it had begun before the failure of the motion beside.
+pub(super) fn blind_problem(program: &Program, hsm: &Run, cdtn: &Run) -> Option<String> {
+    if hsm.outcome != cdtn.outcome || hsm.outputs != cdtn.outputs {
+        return Some(format!(
+            "HSM mode ends {} {:?} ({}), CDTN mode {} {:?} ({})",
+            hsm.outcome, hsm.outputs, hsm.reason, cdtn.outcome, cdtn.outputs, cdtn.reason
+        ));
+    }
+    let acts = |run: &Run| -> BTreeSet<(String, String)> {
+        story(program, run).acts.into_iter().map(|act| (act.path, act.goal)).collect()
+    };
+    let (before, after) = (acts(hsm), acts(cdtn));
+    before.difference(&after).next().map(|(path, _)| format!("{path} never starts in CDTN mode"))
+}
+
 /// Whether regions of a concurrency write facts of each other.
 fn shares(program: &Program) -> bool {
     program.states.iter().any(|state| match &state.kind {
@@ -52,7 +85,7 @@ fn inside(program: &Program, id: StateId) -> Vec<StateId> {
     all
 }
 
-fn written(program: &Program, region: StateId) -> BTreeSet<String> {
+pub(super) fn written(program: &Program, region: StateId) -> BTreeSet<String> {
     use ratn_model::expression::EffectExpr;
     fn predicates(effect: &EffectExpr, into: &mut BTreeSet<String>) {
         match effect {
@@ -74,7 +107,7 @@ fn read(program: &Program, region: StateId) -> BTreeSet<String> {
     for id in inside(program, region) {
         // What is looked up anywhere stands in the text of the state.
         let text = format!("{:?}", program.state(id));
-        for predicate in 0..super::PREDICATES {
+        for predicate in 0..super::generator::facts::LAST {
             let name = format!("p{predicate}");
             if text.contains(&format!("predicate: \"{name}\"")) {
                 all.insert(name);

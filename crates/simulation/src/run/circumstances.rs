@@ -5,7 +5,9 @@
 //! run has the same faults.
 
 use crate::dice::Hash;
-use ratn_executive::protocol::Event;
+use ratn_executive::protocol::{Event, Learned};
+use ratn_model::value::Value;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// More events than this is an endless run.
 pub const MAX_EVENTS: usize = 1_000_000;
@@ -21,11 +23,28 @@ pub struct Circumstances {
     pub events: Vec<(Trigger, Event)>,
     /// How messages go wrong.
     pub mischief: Mischief,
+    /// States that are refused whatever they ask for, by their paths without visits.
+    pub refused: BTreeSet<String>,
+    /// After so many events the executive is thrown away, and another one made from the log goes on.
+    pub resume_after: Option<usize>,
+    /// What earlier runs have taught.
+    pub learned: Learned,
+    /// Attributes of the resources of a kind, one after the other.
+    pub attributes: BTreeMap<String, Vec<BTreeMap<String, Value>>>,
 }
 
 impl Default for Circumstances {
     fn default() -> Circumstances {
-        Circumstances { orders: 0, max_events: MAX_EVENTS, events: Vec::new(), mischief: Mischief::default() }
+        Circumstances {
+            orders: 0,
+            max_events: MAX_EVENTS,
+            events: Vec::new(),
+            mischief: Mischief::default(),
+            refused: BTreeSet::new(),
+            resume_after: None,
+            learned: Learned::default(),
+            attributes: BTreeMap::new(),
+        }
     }
 }
 
