@@ -106,6 +106,9 @@ pub fn program(seed: u64, features: &Features) -> Program {
     if features.tolerance {
         tolerance::declare(&mut program, &mut maker.dice);
     }
+    if features.blind {
+        make_blind(&mut program);
+    }
     create_in_routines(&mut program);
     supplies::one_tool_per_routine(&mut program);
     let regions = program.states.iter().filter(|state| is_preemptive(state));
@@ -129,6 +132,29 @@ fn create_in_routines(program: &mut Program) {
             }
         }
         program.states[id.0 as usize].annotations.resources.retain(|r| r.operation != ResourceOperation::Consume);
+    }
+}
+
+/// Nothing looks at the world any more, and no change depends on it.
+fn make_blind(program: &mut Program) {
+    use ratn_model::program::Nature;
+    let looked_up = |part: &mut Expr| match part {
+        Expr::Fact(_) => *part = Expr::Literal(Value::Int(0)),
+        Expr::Exists(_) | Expr::Query(_) => *part = Expr::Literal(Value::Bool(false)),
+        _ => {}
+    };
+    for state in &mut program.states {
+        let is_action = matches!(state.kind, StateKind::Action { .. });
+        let a = &mut state.annotations;
+        a.requires.clear();
+        a.reads = is_action.then(Vec::new);
+        if let Nature::Senses(facts) = &mut a.nature {
+            facts.clear();
+        }
+        for effects in a.effects.values_mut() {
+            effects.retain(|effect| !matches!(effect, EffectExpr::Increase(..)));
+        }
+        crate::rewrite::expressions(state, &looked_up);
     }
 }
 

@@ -12,7 +12,7 @@
 
 use super::outside::trial_at_any_moment;
 use super::story::story;
-use super::trial::{Conditions, Verdict, closure, compare, execute_under, max_hsm_events, same_end};
+use super::trial::{Conditions, Verdict, closure, difference, execute_under, max_hsm_events, same_end};
 use super::{Dice, is_preemptive};
 use ratn_executive::protocol::{Command, Event, LogEntry, Mode};
 use ratn_model::fact::Change;
@@ -38,30 +38,25 @@ pub fn trial_interrupted(program: &Arc<Program>, conditions: &Conditions) -> Ver
                 return Verdict::LeftOut;
             }
             let path = acts[dice.below(acts.len() as u64) as usize].path.clone();
-            let outside = [(Trigger::Starts(path), ask())];
-            if has_regions {
-                parts(program, conditions, &whole, &outside, PREEMPTED)
-            } else {
-                compare(program, conditions, &outside)
-            }
+            parts(program, conditions, &whole, (&[(Trigger::Starts(path), ask())], PREEMPTED), !has_regions)
         }
-        1 => parts(program, conditions, &whole, &[(Trigger::At(at), ask())], PREEMPTED),
+        1 => parts(program, conditions, &whole, (&[(Trigger::At(at), ask())], PREEMPTED), false),
         2 => {
             let mut limited = (**program).clone();
             limited.deadline_s = Some(at);
-            parts(&Arc::new(limited), conditions, &whole, &[], ABORTED)
+            parts(&Arc::new(limited), conditions, &whole, (&[], ABORTED), false)
         }
         _ => trial_at_any_moment(program, conditions, &whole),
     }
 }
 
-/// Both modes do the first of what HSM mode does undisturbed.
+/// Both modes do the first of what HSM mode does undisturbed, end by this outcome, and maybe end alike.
 fn parts(
     program: &Arc<Program>,
     conditions: &Conditions,
     whole: &Run,
-    outside: &[(Trigger, Event)],
-    outcome: &str,
+    (outside, outcome): (&[(Trigger, Event)], &str),
+    alike: bool,
 ) -> Verdict {
     let mut ends = Vec::new();
     for mode in [Mode::Hsm, Mode::Cdtn] {
@@ -73,9 +68,12 @@ fn parts(
         if let Some(problem) = is_no_part(program, whole, &part, outcome) {
             return Verdict::Differs(format!("{mode:?} mode, interrupted: {problem}"));
         }
-        ends.push((part.end_s, story(program, &part).acts.len()));
+        ends.push(part);
     }
-    Verdict::Same { hsm_s: ends[0].0, cdtn_s: ends[1].0, acts: ends[1].1 }
+    if alike && let Some(problem) = difference(program, &ends[0], &ends[1]) {
+        return Verdict::Differs(format!("interrupted at the same place: {problem}"));
+    }
+    Verdict::Same { hsm_s: ends[0].end_s, cdtn_s: ends[1].end_s, acts: story(program, &ends[1]).acts.len() }
 }
 
 fn is_no_part(program: &Program, whole: &Run, part: &Run, outcome: &str) -> Option<String> {

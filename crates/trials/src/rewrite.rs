@@ -61,7 +61,7 @@ fn lists(kind: &mut StateKind) -> Vec<&mut Vec<StateId>> {
 }
 
 /// Every expression of a state, part by part.
-fn expressions(state: &mut State, change: &dyn Fn(&mut Expr)) {
+pub(super) fn expressions(state: &mut State, change: &dyn Fn(&mut Expr)) {
     match &mut state.kind {
         StateKind::Action { inputs, .. } => inputs.iter_mut().for_each(|(_, e)| part_of(e, change)),
         StateKind::Sequence { outputs, .. } => outputs.iter_mut().for_each(|o| part_of(&mut o.value, change)),

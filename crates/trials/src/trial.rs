@@ -91,6 +91,12 @@ impl Conditions {
             resume_after: None,
             learned: false,
         };
+        if features.blind {
+            conditions.failures_percent = 20;
+        }
+        if features.patterns {
+            conditions.deviations_percent = some(70, 50);
+        }
         if features.incidents {
             conditions.refused_percent = some(12, 8);
             conditions.stops = some(50, 1) == 1;
@@ -238,11 +244,16 @@ fn differ(what: &str, hsm: impl std::fmt::Debug, cdtn: impl std::fmt::Debug) -> 
 
 /// The first clause of the theorem that does not hold.
 pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run) -> Option<String> {
-    let (before, after) = (story(program, hsm), story(program, cdtn));
-    let undone = after.undone.first();
+    let undone = story(program, cdtn).undone.into_iter().next();
     undone
         .map(|path| format!("{path} was discarded or computed again after it had started, and it is a PIA"))
-        .or_else(|| closure(program, &before, &after))
+        .or_else(|| difference(program, hsm, cdtn))
+}
+
+/// The first thing that both modes did not do alike.
+pub(super) fn difference(program: &Program, hsm: &Run, cdtn: &Run) -> Option<String> {
+    let (before, after) = (story(program, hsm), story(program, cdtn));
+    closure(program, &before, &after)
         .or_else(|| same_end(hsm, cdtn))
         .or_else(|| {
             let missing: Vec<&str> = before.acts.iter().skip(after.acts.len()).map(|act| act.path.as_str()).collect();
@@ -309,7 +320,8 @@ fn actuators(program: &Program, hsm: &Story, cdtn: &Story) -> Option<String> {
                 all.entry(resource.kind.clone()).or_default().push(act.path.clone());
             }
         }
-        all.remove(super::PART);
+        // Of these there are several, or what is had of them are parts: regions may have them in any order.
+        [super::PART, super::TOOL, super::POWER, super::BATTERY].iter().for_each(|kind| drop(all.remove(*kind)));
         all
     };
     let (hsm, cdtn) = (by_actuator(hsm), by_actuator(cdtn));

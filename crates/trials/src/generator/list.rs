@@ -130,6 +130,12 @@ impl Maker {
         let id = self.push(name, path.clone(), Some(parent));
         let composite = depth < 3 && self.dice.percent(38);
         let kinds = if room.is_preemptive { 1 } else { 9 };
+        if composite && self.features.blind && !room.is_preemptive && self.dice.percent(40) {
+            // Where motions run beside each other, and one fails, is what it is about.
+            let kind = self.barrier(id, &path, depth, room, visible);
+            self.at(id).kind = kind;
+            return id;
+        }
         if composite
             && self.features.patterns
             && !room.is_preemptive

@@ -50,7 +50,13 @@ impl Maker {
         let mut inner = visible.clone();
         inner.variables.push("n".to_owned());
         let mut body = Vec::new();
-        for number in 0..1 + self.dice.below(2) {
+        if self.dice.percent(50) {
+            // Each of them makes a number of the number before.
+            body = self.counting(id, "loop", room, &inner, facts::COUNTER);
+            body.truncate(3);
+            self.states.truncate(body.last().map_or(0, |last| last.0 as usize + 1));
+        }
+        for number in body.len() as u64..1 + self.dice.below(2) {
             let name = format!("l{number}");
             let part = self.push(name.clone(), format!("loop/{name}"), Some(id));
             let kind = self.action(part, room, &inner);

@@ -16,19 +16,25 @@ struct Link {
     reads: Vec<FactExpr>,
     effects: Vec<EffectExpr>,
     inputs: Vec<(String, Expr)>,
+    duration_s: Option<f64>,
 }
 
 impl Link {
     fn computes(reads: Vec<FactExpr>) -> Link {
-        Link { nature: Nature::Computes, reads, effects: Vec::new(), inputs: Vec::new() }
+        Link { nature: Nature::Computes, reads, effects: Vec::new(), inputs: Vec::new(), duration_s: None }
     }
 
     fn acts(effects: Vec<EffectExpr>) -> Link {
-        Link { nature: Nature::Irreversible, reads: Vec::new(), effects, inputs: Vec::new() }
+        Link { nature: Nature::Irreversible, reads: Vec::new(), effects, inputs: Vec::new(), duration_s: None }
     }
 
     fn writing(self, effects: Vec<EffectExpr>) -> Link {
         Link { effects, ..self }
+    }
+
+    /// It takes so long that what is behind it is computed meanwhile.
+    fn slowly(self) -> Link {
+        Link { duration_s: Some(20.0), ..self }
     }
 
     fn with(mut self, port: &str, value: Expr) -> Link {
@@ -111,6 +117,7 @@ impl Maker {
             annotations.effects.insert(ABORTED.to_owned(), Vec::new());
             annotations.effects.insert(PREEMPTED.to_owned(), Vec::new());
         }
+        annotations.duration_s = link.duration_s.map(|seconds| Expr::Literal(Value::Float(seconds)));
         let mut inputs = link.inputs;
         let variables = visible.variables.iter().enumerate();
         inputs.extend(variables.map(|(n, variable)| (format!("variable{n}"), Expr::Variable(variable.clone()))));
@@ -134,7 +141,7 @@ impl Maker {
         let held = of(first, Expr::Literal(Value::Int(0)));
         let slow = self.link(id, path, room, visible, Link::computes(Vec::new()));
         let says = Expr::Literal(Value::Int(self.dice.below(3) as i64));
-        let grasp = Link::acts(vec![EffectExpr::Set(held.clone(), says)]).with("in0", x_of(slow));
+        let grasp = Link::acts(vec![EffectExpr::Set(held.clone(), says)]).with("in0", x_of(slow)).slowly();
         let grasp = self.link(id, path, room, visible, grasp);
         let held = if self.dice.percent(30) { every(first) } else { held };
         let own = Expr::Output("list".to_owned());
@@ -202,7 +209,14 @@ impl Maker {
     }
 
     /// Writers that make a number of the number before, and readers.
-    fn counting(&mut self, id: StateId, path: &str, room: &Room, visible: &Visible, predicate: u64) -> Vec<StateId> {
+    pub(super) fn counting(
+        &mut self,
+        id: StateId,
+        path: &str,
+        room: &Room,
+        visible: &Visible,
+        predicate: u64,
+    ) -> Vec<StateId> {
         let fact = of(predicate, Expr::Literal(Value::Int(0)));
         let mut children = Vec::new();
         let count = 2 + self.dice.below(5);
@@ -225,6 +239,7 @@ impl Maker {
                 Some(last) if self.dice.percent(60) => link.with("in0", x_of(*last)),
                 _ => link,
             };
+            let link = if link.nature == Nature::Irreversible && self.dice.percent(30) { link.slowly() } else { link };
             children.push(self.link(id, path, room, visible, link));
         }
         children
@@ -240,7 +255,7 @@ impl Maker {
         (first, second): (u64, u64),
     ) -> Vec<StateId> {
         let start = EffectExpr::Set(of(first, one()), Expr::Output("x".to_owned()));
-        let mut children = vec![self.link(id, path, room, visible, Link::acts(vec![start]))];
+        let mut children = vec![self.link(id, path, room, visible, Link::acts(vec![start]).slowly())];
         let mut last = self.link(id, path, room, visible, Link::computes(vec![every(first)]));
         children.push(last);
         for _ in 0..1 + self.dice.below(3) {
