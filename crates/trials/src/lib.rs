@@ -1,8 +1,19 @@
 //! Random task programs and a random but fixed world for them: the *oracle* of the safety theorem.
 //!
-//! A program is made of everything that the task model has ([`Features`]), annotated truly but often only in part. What a node
+//! A program is made of what the task model has ([`Features`]; what is never made, `generator` says), annotated truly but often
+//! only in part. What a node
 //! does is a hash of what it is entitled to see: its path with visit numbers and its try, its inputs, and the facts that it
 //! declares to read, sense or require. Any read from a wrong world changes the result, and with it everything after.
+//!
+//! What is compared, by what happens to a run:
+//!
+//! | | |
+//! |---|---|
+//! | failures, crashes, lost leases, late messages, pauses and steps, refused resources, emergency stops, a resume | everything: [`trial`] |
+//! | the world changes from outside at the start of a PIA | everything: [`trial_from_outside`] |
+//! | it changes at any time; the user ends the run; a deadline | everything where one place of the program is meant, else what is done is a part of what is done undisturbed: [`trial_interrupted`] |
+//! | motions with imprecise exceptions, shared facts | that what acts is decided and final; without failures, the world |
+//! | the same where nothing looks at the world ([`Features::IMPRECISE`]) | the outcome, and that all PIAs of HSM mode start |
 //!
 //! | | |
 //! |---|---|
@@ -67,7 +78,7 @@ pub fn offers() -> Vec<(String, ResourceOffer)> {
     let battery = ResourceOffer {
         divisible: true,
         renewable: false,
-        ..ResourceOffer::new(ResourceClass::System, part(1_000_000))
+        ..ResourceOffer::new(ResourceClass::System, part(10_000_000))
     };
     let more = [
         (TOOL.to_owned(), ResourceOffer::new(ResourceClass::Process, 3)),

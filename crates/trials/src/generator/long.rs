@@ -62,6 +62,8 @@ impl Maker {
             let kind = self.action(part, room, &inner);
             self.at(part).kind = kind;
             self.at(part).outcomes.clear();
+            // There are not so many of these.
+            self.at(part).annotations.resources.retain(|resource| resource.kind != PART);
             self.only_usual_effects(part);
             inner.ports.push(part);
             body.push(part);
