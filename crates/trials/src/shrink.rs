@@ -177,7 +177,7 @@ fn simplify(program: &mut Program, at: usize, what: usize) {
         26 => a.duration_s = None,
         27 => a.attempts = None,
         28 => a.resources.retain(|r| ![TOOL, POWER, BATTERY].contains(&r.kind.as_str())),
-        29 => state.variables.clear(),
+        29 => state.variables.iter_mut().for_each(|(_, value)| *value = Expr::Literal(Value::Int(0))),
         30 => {
             if let StateKind::ForEach { collection: Expr::Call(Function::Range, to), .. } = &mut state.kind
                 && let [Expr::Literal(Value::Int(many))] = to.as_mut_slice()

@@ -11,9 +11,9 @@ impl Maker {
         if !self.features.long {
             return None;
         }
-        match self.dice.below(1_000) {
-            0..8 => Some((self.chain(room, visible), visible.clone(), Vec::new())),
-            8..10 => Some((self.thousand(room, visible), visible.clone(), Vec::new())),
+        match self.dice.below(1_500) {
+            0..5 => Some((self.chain(room, visible), visible.clone(), Vec::new())),
+            5..7 => Some((self.thousand(room, visible), visible.clone(), Vec::new())),
             _ => None,
         }
     }
