@@ -2,14 +2,16 @@
 //! order, and with the inputs, of HSM mode.
 //!
 //! `RATN_PROGRAMS` is how many programs (2,000), `RATN_FIRST` the seed to begin with (0), `RATN_FEATURES` is `basic`, `all` (what
-//! it is unless given) or `weak`. A seed that fails is printed with the smallest program found that still does, and with the events
+//! was made first, and what it is unless given), `everything`, `weak` or `imprecise`. A seed that fails is printed with the smallest program found that still does, and with the events
 //! of that one's runs where `RATN_LOG` is set.
 
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "a test may panic and print its seed")]
 
 use ratn_executive::protocol::Mode;
+use ratn_model::program::Program;
 use ratn_trials::{
-    Conditions, Features, Shrunk, Verdict, execute, listing, program, shrink, trial, trial_blind, trial_from_outside,
+    Conditions, Features, Shrunk, Verdict, execute, listing, program, shrink_by, trial, trial_from_outside,
+    trial_interrupted,
 };
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -43,8 +45,16 @@ fn print_logs(left: Shrunk) {
     }
 }
 
+/// How a program is tried.
+type Trial = fn(&Arc<Program>, &Conditions) -> Verdict;
+
 /// Programs of the seeds from `first` on, on all processors. A few failures end it.
 fn try_programs(first: u64, count: u64, features: &Features) -> Sum {
+    try_by(trial, first, count, features)
+}
+
+/// The same for any trial.
+fn try_by(trial: Trial, first: u64, count: u64, features: &Features) -> Sum {
     const MAX_FAILURES: usize = 3;
     let next = AtomicU64::new(0);
     let failures = AtomicU64::new(0);
@@ -75,7 +85,7 @@ fn try_programs(first: u64, count: u64, features: &Features) -> Sum {
                 Verdict::Differs(problem) => {
                     failures.fetch_add(1, Ordering::Relaxed);
                     sum.failed.push(seed);
-                    let left = shrink(Arc::unwrap_or_clone(made), conditions, problem.clone());
+                    let left = shrink_by(trial, Arc::unwrap_or_clone(made), conditions, problem.clone());
                     eprintln!(
                         "seed {seed}: {problem}\nshrunk to: {}\n{:?}\n{}",
                         left.problem,
@@ -109,8 +119,10 @@ fn random_programs_leave_the_same_world_in_both_modes() {
     let features = match std::env::var("RATN_FEATURES").as_deref() {
         Ok("basic") => Features::BASIC,
         Ok("weak") => Features::WEAK,
+        Ok("everything") => Features::EVERYTHING,
+        Ok("imprecise") => Features::IMPRECISE,
         Ok("all") | Err(_) => Features::ALL,
-        Ok(other) => panic!("RATN_FEATURES: basic, all or weak, not {other}"),
+        Ok(other) => panic!("RATN_FEATURES: basic, all, everything, weak or imprecise, not {other}"),
     };
     let (first, count) = (number("RATN_FIRST", 0), number("RATN_PROGRAMS", 2000));
     let sum = try_programs(first, count, &features);
@@ -162,57 +174,41 @@ fn without_the_theorem_s_assumptions_what_acts_is_still_decided_and_final() {
     assert!(sum.failed.is_empty(), "the programs of these seeds fail: {:?}", sum.failed);
 }
 
-/// Decisions that depend on no fact, imprecise motions that fail: the outcomes are HSM mode's all the same.
+/// What seed the programs of the newer features begin with.
+const FURTHER: u64 = 1 << 41;
+
 #[test]
-fn imprecise_programs_that_look_at_no_fact_end_alike_in_both_modes() {
-    let (first, count) = (number("RATN_FIRST", 1 << 40), number("RATN_PROGRAMS", 2000));
-    let mut failed = Vec::new();
-    for seed in first..first + count {
-        let (made, conditions) = (program(seed, &Features::WEAK), Conditions::of(seed, &Features::WEAK));
-        if let Verdict::Differs(problem) = trial_blind(&made, &conditions) {
-            eprintln!("seed {seed}: {problem}\n{conditions:?}\n{}", listing(&made));
-            failed.push(seed);
-        }
-    }
-    assert!(failed.is_empty(), "{} programs of {count} end otherwise: {failed:?}", failed.len());
+fn random_programs_of_everything_leave_the_same_world_in_both_modes() {
+    let count = number("RATN_PROGRAMS", 2000);
+    let sum = try_programs(FURTHER, count, &Features::EVERYTHING);
+    assert!(sum.failed.is_empty(), "the programs of these seeds fail: {:?}", sum.failed);
+    assert!(sum.left_out * 10 <= sum.programs, "{} of {} programs are too long to compare", sum.left_out, sum.programs);
 }
 
-/// A program of a seed, disturbed from outside, and what comes of it.
-fn disturbed(seed: u64) -> Verdict {
-    let features = Features { regions: false, preemptive: false, ..Features::ALL };
-    let (made, conditions) = (Arc::new(program(seed, &features)), Conditions::of(seed, &features));
-    let verdict = trial_from_outside(&made, &conditions);
-    if let Verdict::Differs(problem) = &verdict {
-        eprintln!("seed {seed}: {problem}\n{conditions:?}\n{}", listing(&made));
+/// Nothing looks at the world, imprecise motions fail: the outcomes are HSM mode's all the same.
+#[test]
+fn where_an_imprecise_motion_s_failure_leads_is_the_same_in_both_modes() {
+    let sum = try_programs(FURTHER, number("RATN_PROGRAMS", 2000) / 2, &Features::IMPRECISE);
+    assert!(sum.failed.is_empty(), "the programs of these seeds fail: {:?}", sum.failed);
+}
+
+#[test]
+fn random_programs_that_are_interrupted_do_the_first_of_what_they_would_have_done() {
+    let count = number("RATN_PROGRAMS", 2000) / 2;
+    for features in [Features::ALL, Features::EVERYTHING] {
+        let sum = try_by(trial_interrupted, FURTHER, count, &features);
+        assert!(sum.failed.is_empty(), "the programs of these seeds fail: {:?}", sum.failed);
+        assert!(sum.left_out * 2 < sum.programs, "most are compared");
     }
-    verdict
 }
 
 #[test]
 fn random_programs_leave_the_same_world_in_both_modes_although_it_changes_from_outside() {
     let (first, count) = (number("RATN_FIRST", 0), number("RATN_PROGRAMS", 2000) / 2);
-    let next = AtomicU64::new(first);
-    let compared = AtomicU64::new(0);
-    let failed = std::sync::Mutex::new(Vec::new());
-    let processors = std::thread::available_parallelism().map_or(1, usize::from);
-    std::thread::scope(|scope| {
-        for _ in 0..processors {
-            scope.spawn(|| {
-                loop {
-                    let seed = next.fetch_add(1, Ordering::Relaxed);
-                    if seed >= first + count || failed.lock().unwrap().len() >= 3 {
-                        return;
-                    }
-                    match disturbed(seed) {
-                        Verdict::Same { .. } => drop(compared.fetch_add(1, Ordering::Relaxed)),
-                        Verdict::LeftOut => {}
-                        Verdict::Differs(_) => failed.lock().unwrap().push(seed),
-                    }
-                }
-            });
-        }
-    });
-    let failed = failed.into_inner().unwrap();
-    assert!(failed.is_empty(), "the programs of these seeds fail: {failed:?}");
-    assert!(compared.into_inner() * 2 > count, "most are compared");
+    let alone = Features { regions: false, preemptive: false, ..Features::ALL };
+    for features in [alone, Features::EVERYTHING] {
+        let sum = try_by(trial_from_outside, first, count, &features);
+        assert!(sum.failed.is_empty(), "the programs of these seeds fail: {:?}", sum.failed);
+        assert!(sum.left_out * 2 < sum.programs, "most are compared");
+    }
 }
