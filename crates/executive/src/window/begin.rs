@@ -157,6 +157,7 @@ impl Window {
         }
         let (seed, seen, ended) = (self.seed(context, instance), seen.clone(), ended.clone());
         self.results.keep(seed, seen, ended);
+        self.wake_twins(id);
     }
 
     /// What a visit's random choices are derived from.

@@ -128,7 +128,15 @@ impl Window {
         self.graph.end(id, ended);
         self.memory.mark(id);
         self.waits.wake(&mut self.graph, id);
+        self.wake_twins(id);
         self.waits.enqueue(&mut self.graph, id);
+    }
+
+    /// There is a result: whoever waits for another instance that computes the same can have it.
+    pub(super) fn wake_twins(&mut self, id: InstanceId) {
+        for twin in self.results.twins_of(id) {
+            self.waits.wake(&mut self.graph, twin);
+        }
     }
 
     /// What an action assigns to variables is part of its result.

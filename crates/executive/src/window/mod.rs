@@ -165,8 +165,8 @@ impl Window {
             if self.end.is_some() {
                 return self.end.take();
             }
+            self.follow_root(context);
             if !changed && !self.waits.is_due(&self.graph) {
-                self.follow_root(context);
                 return None;
             }
         }
@@ -265,10 +265,15 @@ impl Window {
 
     /// What is known of the root's facts takes the commits into account that were made since.
     fn follow_root(&mut self, context: &Context<'_>) {
+        let mut has_changed = false;
         for command in &context.commands[self.followed.min(context.commands.len())..] {
             if let Command::Commit { changes, .. } = command {
                 self.memory.root_changed(context.root, changes.iter().map(Change::pattern));
+                has_changed = true;
             }
+        }
+        if has_changed {
+            self.waits.environment_changed(&mut self.graph);
         }
         self.followed = context.commands.len();
     }
@@ -298,15 +303,19 @@ impl Window {
     /// Who could go on and was not woken, if anybody: everything that waits is looked at again.
     pub(crate) fn check_quiescence(&mut self, context: &mut Context<'_>) -> Result<(), String> {
         let all: Vec<InstanceId> = self.graph.iter().map(|instance| instance.id).collect();
-        let before = context.commands.len();
         for id in all {
+            let waited = self.graph.get(id).map(|instance| instance.waiting.wait());
+            let before = context.commands.len();
             self.waits.enqueue(&mut self.graph, id);
+            let end = self.go_on(context);
+            if let Some(command) = context.commands.get(before) {
+                let path = self.path(context.program, id);
+                return Err(format!("{path} ({waited:?}) could have gone on and was not woken: {command:?}"));
+            }
+            if end.is_some() {
+                return Err("the run could have ended".to_owned());
+            }
         }
-        let end = self.go_on(context);
-        match context.commands.get(before) {
-            Some(command) => Err(format!("somebody could have gone on and was not woken: {command:?}")),
-            None if end.is_some() => Err("the run could have ended".to_owned()),
-            None => Ok(()),
-        }
+        Ok(())
     }
 }

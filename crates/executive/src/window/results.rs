@@ -72,6 +72,12 @@ impl Results {
         }
     }
 
+    /// The others that compute what this one does.
+    pub(crate) fn twins_of(&self, id: InstanceId) -> Vec<InstanceId> {
+        let twins = self.seeds.get(&id).and_then(|seed| self.twins.get(seed));
+        twins.into_iter().flatten().copied().filter(|other| *other != id).collect()
+    }
+
     /// An instance has left the window.
     pub(crate) fn forget(&mut self, id: InstanceId) {
         if let Some(seed) = self.seeds.remove(&id) {

@@ -123,6 +123,8 @@ pub(crate) enum Timer {
 #[derive(Debug, Default)]
 pub(crate) struct Waits {
     queue: VecDeque<InstanceId>,
+    /// Those that wait for the environment to look otherwise: whatever becomes real may do that.
+    for_environment: BTreeSet<InstanceId>,
     timers: BTreeSet<(Timestamp, Timer)>,
 }
 
@@ -134,6 +136,9 @@ impl Waits {
         if matches!(before, Wait::Sensing(_)) && !matches!(wait, Wait::Sensing(_)) {
             // Sensing nodes let a motion go first that is about to begin; now it is not.
             self.wake(graph, id);
+        }
+        if matches!(wait, Wait::Environment(_)) {
+            self.for_environment.insert(id);
         }
         if let Some(on) = wait.on() {
             match graph.waiting(on) {
@@ -182,6 +187,13 @@ impl Waits {
             }
         }
         None
+    }
+
+    /// The environment has changed: whoever waits for that is looked at again.
+    pub(crate) fn environment_changed(&mut self, graph: &mut Graph) {
+        for id in std::mem::take(&mut self.for_environment) {
+            self.enqueue(graph, id);
+        }
     }
 
     /// Whether somebody is to be looked at.
