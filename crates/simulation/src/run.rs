@@ -281,6 +281,8 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
         simulation.check(&executive)?;
         if simulation.circumstances.checks {
             executive.check_invariants().map_err(|problem| simulation.broken(problem))?;
+        }
+        if simulation.circumstances.examines {
             executive.check_quiescence(now).map_err(|problem| simulation.broken(problem))?;
         }
         if let Some(after) = &mut resume_after {

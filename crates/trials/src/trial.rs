@@ -143,7 +143,8 @@ pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: 
     } else {
         problem(program, &hsm, &cdtn, &stories)
     };
-    match problem.or_else(|| against_reference(program, conditions, outside, (&hsm, &cdtn), &stories)) {
+    let problem = problem.or_else(|| against_reference(program, conditions, outside, (&hsm, &cdtn), &stories));
+    match problem.or_else(|| not_woken(program, conditions, events, outside)) {
         Some(problem) => Verdict::Differs(problem),
         None => Verdict::Same { hsm_s: hsm.end_s, cdtn_s: cdtn.end_s, acts: stories.1.acts.len() },
     }
@@ -234,45 +235,69 @@ pub fn execute(
     execute_under(program, conditions, mode, max_events, Vec::new())
 }
 
+/// A run, and once more from its log.
 pub(super) fn execute_under(
     program: &Arc<Program>,
     conditions: &Conditions,
     mode: Mode,
     max_events: usize,
-    mut outside: Vec<(Trigger, Event)>,
+    outside: Vec<(Trigger, Event)>,
 ) -> Result<Run, RunError> {
+    let circumstances = Circumstances { resume_after: conditions.resume_after, ..circumstances(program, conditions) };
+    let run = run_as(program, conditions, mode, outside, Circumstances { max_events, ..circumstances })?;
+    match replayed(program, &run) {
+        Some(problem) => Err(RunError::Broken { at_s: run.end_s, problem }),
+        None => Ok(run),
+    }
+}
+
+/// Who could have gone on in CDTN mode and was not woken, if anybody.
+pub(super) fn not_woken(
+    program: &Arc<Program>,
+    conditions: &Conditions,
+    max_events: usize,
+    outside: &[(Trigger, Event)],
+) -> Option<String> {
+    let circumstances = Circumstances { examines: true, max_events, ..circumstances(program, conditions) };
+    let run = run_as(program, conditions, Mode::Cdtn, outside.to_vec(), circumstances);
+    run.err().map(|problem| format!("CDTN mode, examined: {problem}"))
+}
+
+fn circumstances(program: &Program, conditions: &Conditions) -> Circumstances {
     let seed = conditions.seed;
+    let percent = conditions.mischief_percent;
+    Circumstances {
+        orders: conditions.orders,
+        events: if conditions.pauses { pauses(seed) } else { Vec::new() },
+        mischief: Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent },
+        checks: true,
+        refused: refused(program, conditions),
+        learned: if conditions.learned { learned(program, seed) } else { Learned::default() },
+        attributes: attributes(),
+        ..Circumstances::default()
+    }
+}
+
+fn run_as(
+    program: &Arc<Program>,
+    conditions: &Conditions,
+    mode: Mode,
+    mut outside: Vec<(Trigger, Event)>,
+    mut circumstances: Circumstances,
+) -> Result<Run, RunError> {
     let setup = Setup {
         program: program.clone(),
         mode,
         parameters: parameters(program),
-        seed,
+        seed: conditions.seed,
         resources: offers(),
         world: Vec::new(),
         tolerance: Tolerance::EXACT,
         latency: Duration::from_secs_f64(conditions.latency_s),
     };
-    let percent = conditions.mischief_percent;
-    let mischief = Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent };
-    if conditions.pauses {
-        outside.extend(pauses(seed));
-    }
-    let circumstances = Circumstances {
-        orders: conditions.orders,
-        max_events,
-        events: outside,
-        mischief,
-        checks: true,
-        refused: refused(program, conditions),
-        resume_after: conditions.resume_after,
-        learned: if conditions.learned { learned(program, seed) } else { Learned::default() },
-        attributes: attributes(),
-    };
-    let run = run_under(setup, &mut oracle(program, conditions), circumstances)?;
-    match replayed(program, &run) {
-        Some(problem) => Err(RunError::Broken { at_s: run.end_s, problem }),
-        None => Ok(run),
-    }
+    outside.append(&mut circumstances.events);
+    circumstances.events = outside;
+    run_under(setup, &mut oracle(program, conditions), circumstances)
 }
 
 /// States that are never granted anything, by their paths. What is inside of a routine asks for nothing itself, as a rule.

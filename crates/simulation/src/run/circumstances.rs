@@ -23,9 +23,11 @@ pub struct Circumstances {
     pub events: Vec<(Trigger, Event)>,
     /// How messages go wrong.
     pub mischief: Mischief,
-    /// After every event the executive's invariants are checked, and that nobody could go on who was not woken. Costs the whole
-    /// window each time.
+    /// After every event the executive's invariants are checked. Costs the whole window each time.
     pub checks: bool,
+    /// After every event it is checked that nobody could go on who was not woken. Everything that waits is looked at for that, which
+    /// may change who is looked at first later: such a run is not, command by command, the run without.
+    pub examines: bool,
     /// States that are refused whatever they ask for, by their paths without visits.
     pub refused: BTreeSet<String>,
     /// After so many events the executive is thrown away, and another one made from the log goes on.
@@ -44,6 +46,7 @@ impl Default for Circumstances {
             events: Vec::new(),
             mischief: Mischief::default(),
             checks: false,
+            examines: false,
             refused: BTreeSet::new(),
             resume_after: None,
             learned: Learned::default(),
