@@ -47,6 +47,9 @@ fn main() {
                 .unwrap_or_else(|_| Verdict::Differs("it panics".to_owned()));
             let mut sums = sums.lock().unwrap_or_else(|e| e.into_inner());
             sums.0 += 1;
+            if sums.0 % 1_000 == 0 {
+                println!("{} {}: {sums:?} programs, left out, failed", word(1), word(2));
+            }
             match verdict {
                 Verdict::Same { .. } => {}
                 Verdict::LeftOut => sums.1 += 1,
@@ -68,5 +71,9 @@ fn main() {
             scope.spawn(worker);
         }
     });
-    println!("{sums:?} programs, left out, failed; without a verdict: {reasons:?}");
+    println!(
+        "{sums:?} programs, left out, failed; without a verdict: {reasons:?}",
+        sums = sums.into_inner(),
+        reasons = reasons.into_inner()
+    );
 }
