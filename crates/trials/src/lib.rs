@@ -9,11 +9,14 @@
 //!
 //! | | |
 //! |---|---|
-//! | failures, crashes, lost leases, late messages, pauses and steps, refused resources, emergency stops, a resume | everything: [`trial`] |
+//! | nothing, failures, crashes, lost leases, late messages, pauses and steps, refused resources, emergency stops, a resume | everything: [`trial`] |
 //! | the world changes from outside at the start of a PIA | everything: [`trial_from_outside`] |
 //! | it changes at any time; the user ends the run; a deadline | everything where one place of the program is meant, else what is done is a part of what is done undisturbed: [`trial_interrupted`] |
 //! | motions with imprecise exceptions, shared facts | that what acts is decided and final; without failures, the world |
-//! | the same where nothing looks at the world ([`Features::IMPRECISE`]) | the outcome, and that all PIAs of HSM mode start |
+//! | the same where nothing looks at the world ([`Features::IMPRECISE`]) | the outcome, every result of HSM mode, and that all its PIAs start |
+//!
+//! Every run is replayed from its log, and the executive's invariants hold after each of its events. CDTN mode's is made once more, and
+//! after each moment everything that waits is looked at again: nobody could have gone on who was not woken.
 //!
 //! | | |
 //! |---|---|

@@ -25,7 +25,7 @@ pub struct Circumstances {
     pub mischief: Mischief,
     /// After every event the executive's invariants are checked. Costs the whole window each time.
     pub checks: bool,
-    /// After every event it is checked that nobody could go on who was not woken. Everything that waits is looked at for that, which
+    /// After the last event of every moment it is checked that nobody could go on who was not woken. Everything that waits is looked at for that, which
     /// may change who is looked at first later: such a run is not, command by command, the run without.
     pub examines: bool,
     /// States that are refused whatever they ask for, by their paths without visits.

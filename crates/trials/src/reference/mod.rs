@@ -10,7 +10,8 @@
 //!
 //! There is no clock. A goal that takes longer than its timeout is one that has aborted; regions run one after another,
 //! which is the same because they touch nothing of each other. What depends on time (preemptive concurrencies, deadlines)
-//! or on a wait without an end (resources that are never there) is [`Fail::NotMine`]: there is no verdict.
+//! or on a wait without an end (resources that are never there) is [`Fail::NotMine`]: there is no verdict. What is refused, it is told
+//! by the paths of the states.
 //!
 //! | | |
 //! |---|---|
