@@ -18,7 +18,7 @@ mod lines;
 mod node;
 mod prune;
 
-use crate::plan::{Outcomes, Predicate};
+use crate::plan::{Chain, Outcomes};
 use crate::window::dispatch::DispatchCell;
 use crate::window::growth::environment::{Environment, Link};
 use crate::window::memory::Seen;
@@ -48,8 +48,8 @@ pub(crate) struct Graph {
     lines: Lines,
     branches: Branches,
     forks: BTreeMap<InstanceId, Fork>,
-    /// Of joins whose regions wrote the same predicate: all their links.
-    joins: BTreeMap<InstanceId, Vec<(Predicate, Link)>>,
+    /// Of joins, the links of chains in which writers of several regions stand.
+    joins: BTreeMap<InstanceId, Vec<(Chain, Link)>>,
     /// Imprecise PIAs that still run although younger instances have retired.
     detached: BTreeSet<InstanceId>,
     /// To be looked at: new ones, and those that have become heads.
@@ -170,7 +170,7 @@ impl Graph {
         fork: InstanceId,
         join: InstanceId,
         environment: Environment,
-        links: Vec<(Predicate, Link)>,
+        links: Vec<(Chain, Link)>,
     ) {
         self.joins.insert(join, links);
         if let Some(instance) = self.instances.get_mut(join) {
@@ -186,7 +186,7 @@ impl Graph {
     }
 
     /// The writers of a predicate in the regions before a join, where several wrote it.
-    pub(crate) fn joined(&self, join: InstanceId) -> Option<&[(Predicate, Link)]> {
+    pub(crate) fn joined(&self, join: InstanceId) -> Option<&[(Chain, Link)]> {
         self.joins.get(&join).map(Vec::as_slice)
     }
 

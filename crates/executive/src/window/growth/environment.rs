@@ -4,7 +4,7 @@
 
 use super::table::Table;
 use crate::binding::Outputs;
-use crate::plan::{Outcome, Plan, Predicate};
+use crate::plan::{Chain, Outcome, Plan};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
@@ -16,7 +16,7 @@ use std::sync::{Arc, OnceLock};
 pub(crate) struct Environment {
     pub(crate) frames: Option<Arc<Frame>>,
     pub(crate) variables: Variables,
-    /// By predicate, the youngest older instance that writes it.
+    /// By chain, the youngest older instance that stands in it.
     pub(crate) writers: Table<Link>,
     /// Of the test of a `while`: its iteration, which is not begun yet.
     pub(crate) test: Option<Box<(StateId, Iteration)>>,
@@ -125,7 +125,7 @@ impl Environment {
             frames: None,
             variables: Variables::default(),
             test: None,
-            writers: Table::new(plan.width),
+            writers: Table::new(plan.chains()),
             producers: Table::new(2 * plan.len()),
         }
     }
@@ -158,8 +158,8 @@ impl Environment {
         self.producers.get(state.0 as usize)
     }
 
-    pub(crate) fn writer(&self, predicate: Predicate) -> Option<Link> {
-        self.writers.get(predicate).copied()
+    pub(crate) fn writer(&self, chain: Chain) -> Option<Link> {
+        self.writers.get(chain).copied()
     }
 
     /// The path of a state visited here.

@@ -6,7 +6,7 @@ use super::append::What;
 use super::cursor::{Cursor, Todo};
 use super::environment::{Binding, Environment, Frame, Link, Producer};
 use crate::context::Context;
-use crate::plan::Predicate;
+use crate::plan::Chain;
 use crate::window::graph::instance::{Ended, Role};
 use crate::window::graph::{Graph, Pruned};
 use ratn_model::id::{InstanceId, StateId};
@@ -127,7 +127,7 @@ impl Growth {
         let StateKind::Concurrency { regions, .. } = &state.kind else { return };
         let states = context.plan.len();
         let before = self.cursors[index].environment.clone();
-        let mut merged: BTreeMap<Predicate, Vec<Link>> = BTreeMap::new();
+        let mut merged: BTreeMap<Chain, Vec<Link>> = BTreeMap::new();
         for (region, RegionExit { environment, producer, .. }) in regions.iter().zip(&ends) {
             for (predicate, link) in environment.writers.iter() {
                 if before.writer(predicate) != Some(*link) {
