@@ -22,6 +22,11 @@ pub(crate) struct Seen {
 }
 
 impl Seen {
+    /// These facts were looked at, whatever they were: no other result is made of the same.
+    pub(crate) fn look_at(&mut self, read: Footprint) {
+        self.read.push(read);
+    }
+
     /// Whether the same is computed of it.
     pub(crate) fn is_like(&self, other: &Seen) -> bool {
         self.inputs == other.inputs && self.facts == other.facts && self.read == other.read
