@@ -14,6 +14,7 @@ use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
 use ratn_simulation::run::{Circumstances, Mischief, Oracle, Run, RunError, Setup, Trigger, run_under};
 use std::collections::{BTreeMap, BTreeSet};
+use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -226,9 +227,21 @@ pub(super) fn run_with(
     if conditions.pauses {
         outside.extend(pauses(seed));
     }
-    let circumstances =
-        Circumstances { orders: conditions.orders, max_events, events: outside, mischief, checks: true };
+    let circumstances = Circumstances {
+        orders: conditions.orders,
+        max_events,
+        events: outside,
+        mischief,
+        checks: true,
+        checkpoint_every: Some(checkpoint_every(seed)),
+    };
     run_under(setup, oracle, circumstances)
+}
+
+/// Often, seldom or in between: what is replayed from the log is never interrupted so.
+fn checkpoint_every(seed: u64) -> NonZeroUsize {
+    let some = NonZeroUsize::MIN;
+    some.saturating_add(Dice(seed ^ 0xc4ec).below(9) as usize)
 }
 
 /// A pause, a step and what ends both.

@@ -6,6 +6,7 @@
 
 use crate::dice::Hash;
 use ratn_executive::protocol::Event;
+use std::num::NonZeroUsize;
 
 /// More events than this is an endless run.
 pub const MAX_EVENTS: usize = 1_000_000;
@@ -24,6 +25,8 @@ pub struct Circumstances {
     /// After every event the executive's invariants are checked, and that nobody could go on who was not woken. Costs the whole
     /// window each time.
     pub checks: bool,
+    /// After every so many events the executive's state is written down, and the run goes on with an executive that is made of it.
+    pub checkpoint_every: Option<NonZeroUsize>,
 }
 
 impl Default for Circumstances {
@@ -34,6 +37,7 @@ impl Default for Circumstances {
             events: Vec::new(),
             mischief: Mischief::default(),
             checks: false,
+            checkpoint_every: None,
         }
     }
 }
