@@ -1,5 +1,9 @@
 //! One run of one task, in either mode.
 
+mod checkpoint;
+
+pub use checkpoint::RestoreError;
+
 use crate::analysis::Analysis;
 use crate::context::Context;
 use crate::interpreter::{Interpreter, Progress};
@@ -33,6 +37,8 @@ pub struct Executive {
     /// Of HSM mode.
     deadline: Option<Timestamp>,
     state: State,
+    /// STAND-IN for a real checkpoint: see [`checkpoint`].
+    history: Vec<(Timestamp, Event)>,
 }
 
 enum State {
@@ -55,12 +61,14 @@ impl Executive {
             seed: 0,
             deadline: None,
             state: State::Fresh,
+            history: Vec::new(),
         }
     }
 
     /// Takes an event; what the shell shall do now, in order.
     pub fn handle(&mut self, now: Timestamp, event: Event) -> Vec<Command> {
         let mut commands = Vec::with_capacity(8);
+        self.history.push((now, event.clone()));
         match event {
             Event::Started { mode, parameters, seed, world, revision, capacity, learned, .. } => {
                 if matches!(self.state, State::Fresh) {
