@@ -2,7 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-/// A checkpoint after so many events: replaying them takes some 0.1 s, and a run that is resumed a tenth of that more.
+/// A checkpoint after so many events: reading and replaying them takes 0.24 s (measured: 5 lines of 160 bytes an event, optimised
+/// build, busy machine of two cores), and twice as many may be behind the last one.
 pub(crate) const EVERY_EVENTS: u64 = 10_000;
 /// Or after so many bytes of the log, for lines are read and compared, too: events of some tasks carry trajectories and worlds.
 const EVERY_BYTES: u64 = 8 << 20;
