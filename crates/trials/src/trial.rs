@@ -241,7 +241,7 @@ pub(super) fn run_with(
 /// Often, seldom or in between: what is replayed from the log is never interrupted so.
 fn checkpoint_every(seed: u64) -> NonZeroUsize {
     let some = NonZeroUsize::MIN;
-    some.saturating_add(Dice(seed ^ 0xc4ec).below(9) as usize)
+    some.saturating_add(Dice(seed ^ 0xc4ec).below(30) as usize)
 }
 
 /// A pause, a step and what ends both.
