@@ -12,6 +12,7 @@
 //! | `node` | the life of one node |
 
 mod branches;
+mod checkpoint;
 pub(crate) mod instance;
 mod instances;
 mod lines;
@@ -30,11 +31,12 @@ use lines::Lines;
 pub(crate) use lines::MAIN;
 pub(crate) use prune::Pruned;
 use ratn_model::id::InstanceId;
+use serde::{Deserialize, Serialize};
 use smallvec::smallvec;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A fork whose join has not retired.
-#[derive(Debug)]
+#[derive(Debug, Serialize, Deserialize)]
 struct Fork {
     /// Where the fork stands.
     line: LineId,
@@ -43,6 +45,7 @@ struct Fork {
 }
 
 /// The graph.
+#[derive(Serialize, Deserialize)]
 pub(crate) struct Graph {
     instances: Instances,
     lines: Lines,

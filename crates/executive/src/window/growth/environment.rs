@@ -2,17 +2,22 @@
 //! variables are, which older instance wrote each port last (register renaming), and which older instances write each
 //! predicate (memory renaming). Copies share everything.
 
+mod checkpoint;
+
+pub(crate) use checkpoint::{Collector, Places, Restored};
+
 use super::table::Table;
 use crate::binding::Outputs;
 use crate::plan::{Chain, Outcome, Plan};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
+use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::sync::{Arc, OnceLock};
 
 /// A place's environment.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct Environment {
     pub(crate) frames: Option<Arc<Frame>>,
     pub(crate) variables: Variables,
@@ -25,7 +30,7 @@ pub(crate) struct Environment {
 }
 
 /// An instance as a writer, seen along one of its arms. Its own environment has the link to the next older one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Link {
     pub(crate) writer: InstanceId,
     /// The outcome that the path assumes.
@@ -35,9 +40,11 @@ pub(crate) struct Link {
 }
 
 /// An instance as the writer of outputs. They stand here once it has retired, for as long as somebody can name them.
-#[derive(Debug)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Producer {
+    #[serde(skip)]
     pub(crate) instance: InstanceId,
+    #[serde(skip)]
     pub(crate) real: OnceLock<Outputs>,
 }
 

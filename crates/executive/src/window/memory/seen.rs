@@ -8,10 +8,11 @@ use super::walk::Looked;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::InstanceId;
 use ratn_world::digest::Digest;
+use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 
 /// What a result was made of.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct Seen {
     /// The facts that it may have looked at.
     pub(crate) read: Vec<Footprint>,
