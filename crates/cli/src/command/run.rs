@@ -36,7 +36,7 @@ pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
         let interrupt = Interrupt::listen()?;
         let directory = public_directory(arguments.runtime_dir.as_deref());
         match (&arguments.resume, &arguments.task) {
-            (Some(log), task) => resume::run(arguments, log, task.as_deref(), &directory, &interrupt).await,
+            (Some(log), task) => Box::pin(resume::run(arguments, log, task.as_deref(), &directory, &interrupt)).await,
             (None, Some(task)) => Box::pin(begin(arguments, task, &directory, &interrupt)).await,
             (None, None) => Err(Failure::Refused("ratn: no task file is named".to_owned())),
         }

@@ -5,6 +5,7 @@
 //! `Executive::handle`: a goal has ended, resources were granted, or a projection was made. Divan warns of sizes that are larger than the
 //! largest with which a shape is measured.
 
+#![allow(clippy::disallowed_methods, reason = "a benchmark looks at the clock")]
 #![allow(
     missing_docs,
     unreachable_pub,

@@ -25,7 +25,8 @@ pub(super) fn start_flows(subject: &Subject<'_>) -> Vec<StateId> {
             }
         });
     }
-    without_inside(flows, subject)
+    // What an action of a loop reads of itself is of the visit before.
+    if subject.contains_others() { without_inside(flows, subject) } else { flows.into_iter().collect() }
 }
 
 /// The states whose outputs any expression of a state reads; of a routine, those outside of it.

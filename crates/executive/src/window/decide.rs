@@ -169,19 +169,19 @@ impl Window {
         let own = context.plan.state(instance.state);
         let leaves_by = own.outcomes[marker.leaves_by].clone();
         let outcome = if marker.role == Role::Entry { SUCCESS.into() } else { leaves_by };
-        let computed = self.compute_parts(context, instance);
-        let (ended, seen) = match computed {
-            Ok((outputs, seen)) => (Ended::with(outcome, outputs), seen),
-            Err((Readiness::Failed(reason), seen)) => (Ended::aborted(reason), seen),
-            Err((Readiness::Waits(wait), _)) => return self.wait(id, wait),
-            Err((Readiness::Ready(..), _)) => return,
+        let (computed, seen) = self.compute_parts(context, instance);
+        let ended = match computed {
+            Ok(outputs) => Ended::with(outcome, outputs),
+            Err(Readiness::Failed(reason)) => Ended::aborted(reason),
+            Err(Readiness::Waits(wait)) => return self.wait(id, wait),
+            Err(Readiness::Ready(..)) => return,
         };
         self.graph.set_seen(id, Some(seen));
         self.end_instance(id, ended);
     }
 
     /// The values of what is computed at a boundary, in order, each under its name; and what they are made of.
-    fn compute_parts(&self, context: &Context<'_>, instance: &Instance) -> Result<(Outputs, Seen), (Readiness, Seen)> {
+    fn compute_parts(&self, context: &Context<'_>, instance: &Instance) -> (Result<Outputs, Readiness>, Seen) {
         let state = context.program.state(instance.state);
         let parts = parts_of(context, instance);
         let is_success = |outcome: &str| outcome == SUCCESS;
@@ -219,10 +219,10 @@ impl Window {
             match value {
                 Ok(value) => drop(outputs.insert(name, value)),
                 Err(None) => {}
-                Err(Some(failed)) => return Err((failed, seen)),
+                Err(Some(failed)) => return (Err(failed), seen),
             }
         }
-        Ok((outputs, seen))
+        (Ok(outputs), seen)
     }
 
     /// Everything older has retired: the task is over.

@@ -1,15 +1,12 @@
 //! What a result was made of: which facts were looked at, and a digest of what they were.
 
 use super::digests::hash;
-use super::forecast::Chunk;
 use super::overlay::Overlay;
-use super::view::{Blocked, View};
+use super::view::{Blocked, ByWriter, View};
 use super::walk::Looked;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
-use ratn_model::id::InstanceId;
 use ratn_world::digest::Digest;
 use serde::{Deserialize, Serialize};
-use smallvec::SmallVec;
 
 /// What a result was made of.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -44,7 +41,7 @@ impl Seen {
     }
 }
 
-fn all<'c>(by_writer: &'c [(InstanceId, SmallVec<[Chunk; 2]>)]) -> impl Iterator<Item = &'c Change> {
+fn all(by_writer: &[ByWriter]) -> impl Iterator<Item = &Change> {
     by_writer.iter().flat_map(|(_, chunks)| chunks).flat_map(|chunk| chunk.iter())
 }
 

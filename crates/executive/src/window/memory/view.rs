@@ -18,6 +18,9 @@ use smallvec::SmallVec;
 use std::borrow::Cow;
 use std::cell::{Cell, RefCell};
 
+/// What one writer changes, each effect by itself.
+pub(super) type ByWriter = (InstanceId, SmallVec<[Chunk; 2]>);
+
 /// One instance's view.
 pub(crate) struct View<'a> {
     pub(crate) sight: Sight<'a>,
@@ -144,8 +147,8 @@ impl<'a> View<'a> {
     }
 
     /// The effects of older instances on some facts, in program order, each writer's together.
-    pub(crate) fn changes(&self, looked: Looked<'_>) -> Result<Vec<(InstanceId, SmallVec<[Chunk; 2]>)>, Blocked> {
-        let mut by_writer: Vec<(InstanceId, SmallVec<[Chunk; 2]>)> = Vec::new();
+    pub(crate) fn changes(&self, looked: Looked<'_>) -> Result<Vec<ByWriter>, Blocked> {
+        let mut by_writer: Vec<ByWriter> = Vec::new();
         if looked.is_nothing() {
             return Ok(by_writer);
         }
@@ -224,7 +227,7 @@ impl<'a> View<'a> {
             match self.sight.effects(writer, link, looked, &[]) {
                 Ok(chunks) => {
                     let all = chunks.iter().flat_map(|chunk| chunk.iter());
-                    let last = all.filter(|change| looked.overlaps(&change.pattern())).last();
+                    let last = all.rev().find(|change| looked.overlaps(&change.pattern()));
                     found = last.map(|change| match change {
                         Change::Set { value, .. } => Lookup::Holds(Cow::Owned(value.clone())),
                         Change::Delete { .. } | Change::Increase { .. } => Lookup::Absent,
