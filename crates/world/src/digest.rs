@@ -13,9 +13,70 @@ use std::fmt;
 #[serde(transparent)]
 pub struct Digest([u8; 32]);
 
-/// Makes a [`Digest`].
+/// Feeds what is digested to a hash; to BLAKE3 where the digest is to mean the content, on every machine and for ever.
 #[derive(Debug, Clone, Default)]
-pub struct Digester(blake3::Hasher);
+pub struct Digester<H = blake3::Hasher>(H);
+
+/// A hash that bytes can be fed to.
+pub trait Feed {
+    /// Feeds bytes.
+    fn feed(&mut self, bytes: &[u8]);
+}
+
+impl Feed for blake3::Hasher {
+    fn feed(&mut self, bytes: &[u8]) {
+        self.update(bytes);
+    }
+}
+
+/// A quick hash of 128 bits for what is compared within one process: a memo, not a proof. Two lanes of multiply and rotate, mixed at
+/// the end as SplitMix64 does.
+#[derive(Debug, Clone)]
+pub struct Quick {
+    lanes: [u64; 2],
+}
+
+impl Default for Quick {
+    fn default() -> Quick {
+        Quick { lanes: [0x243f_6a88_85a3_08d3, 0x1319_8a2e_0370_7344] }
+    }
+}
+
+impl Feed for Quick {
+    fn feed(&mut self, bytes: &[u8]) {
+        for chunk in bytes.chunks(8) {
+            let mut word = [0; 8];
+            word[..chunk.len()].copy_from_slice(chunk);
+            // How long the last chunk is counts, too.
+            let word = u64::from_le_bytes(word) ^ ((chunk.len() as u64) << 56);
+            let [a, b] = &mut self.lanes;
+            *a = (*a ^ word).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29);
+            *b = (*b ^ word.rotate_left(32)).wrapping_mul(0xc2b2_ae3d_27d4_eb4f).rotate_left(31);
+        }
+    }
+}
+
+impl Digester<Quick> {
+    /// What has been fed.
+    pub fn quick(&self) -> u128 {
+        let mix = |mut z: u64| {
+            z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+            z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+            z ^ (z >> 31)
+        };
+        let [a, b] = self.0.lanes;
+        u128::from(mix(a ^ b.rotate_left(17))) << 64 | u128::from(mix(b ^ a.rotate_left(41)))
+    }
+
+    /// Named values, the inputs of an action.
+    pub fn values(&mut self, values: &BTreeMap<String, Value>) {
+        self.number(values.len() as u64);
+        for (name, value) in values {
+            self.text(name);
+            self.value(value);
+        }
+    }
+}
 
 impl Digest {
     /// Of named values, the inputs of an action.
@@ -69,6 +130,13 @@ impl Digest {
 const END: u8 = 255;
 
 impl Digester {
+    /// What has been fed.
+    pub fn finish(&self) -> Digest {
+        Digest(*self.0.finalize().as_bytes())
+    }
+}
+
+impl<H: Feed> Digester<H> {
     /// A fact.
     pub fn fact(&mut self, key: &FactKey, value: &Value) {
         self.text(&key.predicate);
@@ -129,7 +197,7 @@ impl Digester {
             Value::Bytes(bytes) => {
                 self.tag(11);
                 self.number(bytes.len() as u64);
-                self.0.update(bytes);
+                self.0.feed(bytes);
             }
         }
     }
@@ -137,21 +205,16 @@ impl Digester {
     /// A text, with its length.
     pub fn text(&mut self, text: &str) {
         self.number(text.len() as u64);
-        self.0.update(text.as_bytes());
+        self.0.feed(text.as_bytes());
     }
 
     /// A number.
     pub fn number(&mut self, number: u64) {
-        self.0.update(&number.to_le_bytes());
-    }
-
-    /// What has been fed.
-    pub fn finish(&self) -> Digest {
-        Digest(*self.0.finalize().as_bytes())
+        self.0.feed(&number.to_le_bytes());
     }
 
     fn tag(&mut self, tag: u8) {
-        self.0.update(&[tag]);
+        self.0.feed(&[tag]);
     }
 
     fn term(&mut self, term: Option<&Term>) {
@@ -183,5 +246,32 @@ impl fmt::Display for Digest {
 impl fmt::Debug for Digest {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{self}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn quick_hashes_of_different_content_differ() {
+        let mut seen = BTreeSet::new();
+        for n in 0..20_000_i64 {
+            for value in
+                [Value::Int(n), Value::Float(n as f64), Value::String(n.to_string()), Value::List(vec![Value::Int(n)])]
+            {
+                let mut digester = Digester::<Quick>::default();
+                digester.values(&BTreeMap::from([("a".to_owned(), value)]));
+                assert!(seen.insert(digester.quick()), "{n}");
+            }
+        }
+        let text = |parts: &[&str]| {
+            let mut digester = Digester::<Quick>::default();
+            parts.iter().for_each(|part| digester.text(part));
+            digester.quick()
+        };
+        assert_ne!(text(&["ab", "c"]), text(&["a", "bc"]));
+        assert_ne!(text(&["", "a"]), text(&["a", ""]));
     }
 }

@@ -168,7 +168,7 @@ impl World {
         let World { overlay, revision, .. } = self.changed(|_| writer.as_ref(), changes)?;
         self.overlay = overlay;
         self.revision = revision;
-        self.settle();
+        self.store_overlay();
         Ok(revision)
     }
 
@@ -185,7 +185,7 @@ impl World {
     /// The next revision, in which this is written.
     pub fn write(&mut self, written: &Written) -> Revision {
         self.overlay.extend(written.iter().map(|(key, fact)| (Arc::clone(key), fact.clone())));
-        self.settle();
+        self.store_overlay();
         self.revision = Revision(self.revision.0 + 1);
         self.revision
     }
@@ -215,7 +215,7 @@ impl World {
         let writer = |place: usize| writers.get(place).filter(|writer| !writer.is_empty());
         let mut world = self.changed(writer, changes)?;
         if world.overlay.len() > OVERLAY_LIMIT {
-            world.settle();
+            world.store_overlay();
         }
         Ok(world)
     }
@@ -252,7 +252,7 @@ impl World {
     }
 
     /// Moves the overlay into the store.
-    fn settle(&mut self) {
+    fn store_overlay(&mut self) {
         for (key, fact) in std::mem::take(&mut self.overlay) {
             match fact {
                 Some(fact) => self.store.insert(&key, &fact),

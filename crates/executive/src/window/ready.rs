@@ -100,7 +100,7 @@ impl Window {
         if let (StateKind::Action { inputs, .. }, false) = (&state.kind, is_pia) {
             match binding::inputs(state, inputs, view) {
                 Ok(inputs) => {
-                    seen.inputs = ratn_world::digest::Digest::of_values(&inputs);
+                    seen.see_inputs(&inputs);
                     bound = Some(inputs);
                 }
                 Err(error) => return not_bound(view, &error),

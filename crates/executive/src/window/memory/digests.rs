@@ -2,11 +2,11 @@
 //! does not hash it anew each time.
 //!
 //! A sum does not depend on the order of facts, and a fact can be taken out of it: a multiset hash (Clarke et al. 2003), modulo
-//! 2¹²⁸, of BLAKE3 hashes.
+//! 2¹²⁸.
 
 use ratn_model::fact::{FactKey, FactPattern};
 use ratn_model::value::Value;
-use ratn_world::digest::Digester;
+use ratn_world::digest::{Digester, Quick};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
 
@@ -29,12 +29,9 @@ struct Sum {
 
 /// The hash of one fact.
 pub(super) fn hash(key: &FactKey, value: &Value) -> u128 {
-    let mut digester = Digester::default();
+    let mut digester = Digester::<Quick>::default();
     digester.fact(key, value);
-    let bytes = digester.finish();
-    let mut first = [0; 16];
-    first.copy_from_slice(&bytes.as_bytes()[..16]);
-    u128::from_le_bytes(first)
+    digester.quick()
 }
 
 impl Digests {

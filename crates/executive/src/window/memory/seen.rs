@@ -5,8 +5,10 @@ use super::overlay::Overlay;
 use super::view::{Blocked, ByWriter, View};
 use super::walk::Looked;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
-use ratn_world::digest::Digest;
+use ratn_model::value::Value;
+use ratn_world::digest::{Digester, Quick};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// What a result was made of.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -16,13 +18,20 @@ pub(crate) struct Seen {
     /// What they came to, one number per pattern.
     facts: Vec<u128>,
     /// What its inputs come to.
-    pub(crate) inputs: Digest,
+    pub(crate) inputs: u128,
 }
 
 impl Seen {
     /// These facts were looked at, whatever they were: no other result is made of the same.
     pub(crate) fn look_at(&mut self, read: Footprint) {
         self.read.push(read);
+    }
+
+    /// The inputs of an action.
+    pub(crate) fn see_inputs(&mut self, inputs: &BTreeMap<String, Value>) {
+        let mut digester = Digester::<Quick>::default();
+        digester.values(inputs);
+        self.inputs = digester.quick();
     }
 
     /// Whether the same is computed of it.
