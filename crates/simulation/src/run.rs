@@ -2,13 +2,14 @@
 //! called directly.
 
 mod circumstances;
+mod resume;
 
 pub use circumstances::{Circumstances, MAX_EVENTS, Mischief, Trigger};
 
 use crate::dice::Dice;
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::{Lookout, Problem, Search};
-use ratn_executive::protocol::{Command, Event, Goal, Learned, LogEntry, LogLine, Mode, Origin};
+use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode, Origin};
 use ratn_model::catalogue::ResourceOffer;
 use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
@@ -150,6 +151,8 @@ struct Simulation<'a> {
     leases: BTreeMap<LeaseId, InstanceId>,
     /// Leases that ended by themselves.
     lost: BTreeSet<LeaseId>,
+    /// Whose requests are going to be refused.
+    refusing: BTreeSet<InstanceId>,
     grants: BTreeMap<InstanceId, u32>,
     circumstances: Circumstances,
     paths: BTreeMap<InstanceId, String>,
@@ -185,6 +188,7 @@ pub fn run_looking_ahead(setup: Setup, oracle: &mut dyn Oracle, orders: usize) -
 /// As [`run`].
 pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumstances) -> Result<Run, RunError> {
     let (orders, max_events) = (circumstances.orders, circumstances.max_events);
+    let (mut resume_after, learned) = (circumstances.resume_after, circumstances.learned.clone());
     let mut root = World::default();
     let initial: Vec<Change> =
         setup.world.iter().map(|(fact, value)| Change::Set { fact: fact.clone(), value: value.clone() }).collect();
@@ -201,6 +205,8 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
             let mut spec =
                 ResourceSpec::new(offer.class, kind.clone()).id(format!("{kind}-{number}")).capacity(capacity);
             (spec.divisible, spec.renewable) = (offer.divisible, offer.renewable);
+            let attributes = circumstances.attributes.get(kind).and_then(|all| all.get(number as usize - 1));
+            spec.attributes.extend(attributes.cloned().unwrap_or_default());
             pool.create(Timestamp(0), None, spec).map_err(|e| broken(Timestamp(0), e.to_string()))?;
         }
     }
@@ -219,6 +225,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
         waiters: BTreeMap::new(),
         leases: BTreeMap::new(),
         lost: BTreeSet::new(),
+        refusing: BTreeSet::new(),
         grants: BTreeMap::new(),
         circumstances,
         paths: BTreeMap::new(),
@@ -243,7 +250,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
             world: simulation.root.iter().map(|(k, f)| (k.clone(), f.value.clone())).collect(),
             revision: simulation.root.revision(),
             capacity: setup.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
-            learned: Learned::default(),
+            learned,
             origin: Origin::default(),
         },
     );
@@ -274,7 +281,19 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
         simulation.check(&executive)?;
         if simulation.circumstances.checks {
             executive.check_invariants().map_err(|problem| simulation.broken(problem))?;
+        }
+        // A timer that is due now, but not yet heard of, wakes whom it is for.
+        let is_over = simulation.agenda.first_key_value().is_none_or(|((next, _), _)| *next > now);
+        if simulation.circumstances.examines && is_over {
             executive.check_quiescence(now).map_err(|problem| simulation.broken(problem))?;
+        }
+        if let Some(after) = &mut resume_after {
+            *after = after.saturating_sub(1);
+            if *after == 0 && simulation.end.is_none() {
+                resume_after = None;
+                let fresh = Executive::new(setup.program.clone(), setup.tolerance);
+                executive = resume::resumed(fresh, &simulation.log).map_err(|problem| simulation.broken(problem))?;
+            }
         }
         if let Some((outcome, outputs, reason)) = simulation.end.take() {
             let units = simulation.task_resources();
@@ -332,6 +351,8 @@ impl Simulation<'_> {
             Entry::Event(Event::Projected { projection, .. }) if !self.projections.contains_key(&projection) => {
                 return Ok(None);
             }
+            // So is a refusal of what was withdrawn.
+            Entry::Event(Event::Refused { instance, .. }) if !self.refusing.remove(&instance) => return Ok(None),
             Entry::Event(event) => event,
             Entry::Loss { lease, instance, attempt } => {
                 self.lose(lease)?;
@@ -362,7 +383,9 @@ impl Simulation<'_> {
             resources.iter().find(|id| matches!(class(id), Some(ResourceClass::Process | ResourceClass::Module)));
         let Some(resource) = worker.and_then(|id| self.pool.get(id)) else { return Ok(()) };
         self.pool.delete(self.now, None, &resource.id).map_err(|e| self.broken(e))?;
-        let spec = ResourceSpec::new(resource.class, &resource.kind).id(&resource.id).capacity(resource.capacity);
+        let mut spec = ResourceSpec::new(resource.class, &resource.kind).id(&resource.id).capacity(resource.capacity);
+        let attributes = resource.attributes.iter();
+        spec.attributes.extend(attributes.map(|(name, value)| (name.to_owned(), value.clone())));
         self.pool.create(self.now, None, spec).map_err(|e| self.broken(e))?;
         // With whatever else is under it, it is still to be given back.
         if !self.pool.leases().iter().any(|held| held.id == lease) {
@@ -378,6 +401,15 @@ impl Simulation<'_> {
         Duration::from_nanos(self.dice.below(most))
     }
 
+    fn is_refused(&self, instance: InstanceId) -> bool {
+        let refused = &self.circumstances.refused;
+        let plain = |path: &String| {
+            let parts = path.split('/').map(|part| part.split(['[', '#']).next().unwrap_or(part));
+            parts.collect::<Vec<_>>().join("/")
+        };
+        !refused.is_empty() && self.paths.get(&instance).is_some_and(|path| refused.contains(&plain(path)))
+    }
+
     fn broken(&self, problem: impl ToString) -> RunError {
         RunError::Broken { at_s: self.now.seconds(), problem: problem.to_string() }
     }
@@ -391,6 +423,12 @@ impl Simulation<'_> {
                 self.paths.insert(instance, path);
             }
             Command::Note(_) => {}
+            Command::Acquire { instance, .. } if self.is_refused(instance) => {
+                let reason = "nobody grants it anything".to_owned();
+                self.refusing.insert(instance);
+                let late = self.late();
+                self.at(late, Event::Refused { instance, reason });
+            }
             Command::Acquire { instance, requirements, priority } => {
                 let request = AcquireRequest::new(self.session.clone(), requirements).priority(priority);
                 let waiter = self.pool.acquire(self.now, request).map_err(|e| self.broken(e))?;
@@ -400,7 +438,7 @@ impl Simulation<'_> {
             Command::Withdraw { instance } => {
                 if let Some(waiter) = self.waiters.remove(&instance) {
                     self.pool.cancel(self.now, waiter).map_err(|e| self.broken(e))?;
-                } else {
+                } else if !self.refusing.remove(&instance) {
                     self.take_back_grant(instance)?;
                 }
                 self.answers();

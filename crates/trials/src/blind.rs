@@ -1,60 +1,22 @@
-//! Imprecise programs whose decisions do not depend on facts: their outcomes are the same in both modes, after failures, too.
+//! Programs that look at no fact, with imprecise motions that fail ([`super::Features::IMPRECISE`]): their outcomes are the same in
+//! both modes.
 //!
 //! Where motions are imprecise, a failure leaves a world that HSM mode never has, so worlds are not compared. But what is decided
-//! by ports, literals and outcomes alone, with an oracle that sees only path and try, does not depend on the world. So the
-//! task's outcome and outputs, and the result of every state that HSM mode retired, are what they are in HSM mode. CDTN mode may have
-//! retired more: motions that ran beside the one that failed.
+//! by ports, literals and outcomes alone, with an oracle that sees only path, try and inputs, does not depend on the world. So the
+//! task's outcome and outputs, and the result of every state that HSM mode retired, are what they are in HSM mode, and what HSM
+//! mode does CDTN mode does, too. It may have done more: motions that ran beside the one that failed.
 
-use super::reference;
-use super::story::{Story, story};
-use super::trial::{Conditions, MAX_CDTN_EVENTS, MAX_HSM_EVENTS, Verdict, oracle, run_with, should_be_with};
-use ratn_executive::protocol::{Goal, Mode};
-use ratn_model::expression::Expr;
-use ratn_model::program::Program;
-use ratn_model::value::Value;
-use ratn_simulation::run::{Oracle, Performance, Run, RunError};
-use ratn_world::world::World;
-use std::collections::BTreeMap;
-use std::sync::Arc;
+use super::story::Story;
+use ratn_simulation::run::Run;
+use std::collections::BTreeSet;
 
-/// Of a hundred visits, so many fail: it is failures that are looked at.
-const FAILURES_PERCENT: u64 = 20;
-
-/// Shows another oracle neither the world nor the inputs: only path and try are left.
-struct Blindfold<'a>(&'a mut dyn Oracle);
-
-impl Oracle for Blindfold<'_> {
-    fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, _: &World) -> Performance {
-        let goal = Goal { inputs: BTreeMap::new(), ..goal.clone() };
-        self.0.perform(path, attempt, &goal, &World::default())
-    }
-}
-
-/// Runs the program, without what depends on facts, in both modes, and compares the outcomes.
-pub fn trial_blind(program: &Program, conditions: &Conditions) -> Verdict {
-    let program = Arc::new(without_facts(program));
-    let conditions = &Conditions { failures_percent: FAILURES_PERCENT, ..conditions.clone() };
-    let run = |mode, events| {
-        run_with(&program, conditions, mode, events, Vec::new(), &mut Blindfold(&mut oracle(&program, conditions)))
-    };
-    let hsm = match run(Mode::Hsm, MAX_HSM_EVENTS) {
-        Ok(run) => run,
-        Err(RunError::Endless(_)) => return Verdict::LeftOut,
-        Err(problem) => return Verdict::Differs(format!("blind, HSM mode: {problem}")),
-    };
-    let cdtn = match run(Mode::Cdtn, MAX_CDTN_EVENTS * hsm.log.len() + 10_000) {
-        Ok(run) => run,
-        Err(problem) => return Verdict::Differs(format!("blind, CDTN mode: {problem}")),
-    };
-    let (before, after) = (story(&program, &hsm), story(&program, &cdtn));
-    let mut eyes = oracle(&program, conditions);
-    let told = should_be_with(&program, conditions, &[], &mut Blindfold(&mut eyes));
-    let told = told.ok().and_then(|told| reference::outcomes(&told, &hsm, &before));
-    let told = told.map(|problem| format!("HSM mode and the reference: {problem}"));
-    match told.or_else(|| lost_outcome((&hsm, &before), (&cdtn, &after))) {
-        Some(problem) => Verdict::Differs(format!("blind, {problem}")),
-        None => Verdict::Same { hsm_s: hsm.end_s, cdtn_s: cdtn.end_s, acts: after.acts.len() },
-    }
+/// The first outcome or motion of HSM mode that CDTN mode does not have.
+pub(super) fn problem((hsm, before): (&Run, &Story), (cdtn, after): (&Run, &Story)) -> Option<String> {
+    lost_outcome((hsm, before), (cdtn, after)).or_else(|| {
+        let started: BTreeSet<(&str, &str)> = after.acts.iter().map(|act| (&*act.path, &*act.goal)).collect();
+        let missing = before.acts.iter().find(|act| !started.contains(&(&*act.path, &*act.goal)))?;
+        Some(format!("{} never starts in CDTN mode", missing.path))
+    })
 }
 
 /// The first outcome of HSM mode that CDTN mode does not have.
@@ -70,33 +32,20 @@ fn lost_outcome((hsm, before): (&Run, &Story), (cdtn, after): (&Run, &Story)) ->
     })
 }
 
-/// The program with constants where it looks facts up, and without preconditions.
-fn without_facts(program: &Program) -> Program {
-    let constant = |part: &mut Expr| match part {
-        Expr::Fact(_) => *part = Expr::Literal(Value::Int(1)),
-        Expr::Exists(_) | Expr::Query(_) => *part = Expr::Literal(Value::Bool(true)),
-        _ => {}
-    };
-    let mut program = program.clone();
-    for state in &mut program.states {
-        state.annotations.requires.clear();
-        // What holds a fact is a constant then, whatever its arguments were.
-        state.each_expression_mut(&mut |_, expression| expression.rewrite(&mut |part| constant(part)));
-    }
-    // The task's outputs may be of facts; those of its states are compared one by one.
-    program.outputs.retain(|output| output.value.fact_expressions().is_empty());
-    program
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
     use super::*;
+    use crate::story::story;
+    use ratn_executive::protocol::{Goal, Mode};
     use ratn_model::catalogue::{Catalogue, ResourceOffer};
     use ratn_model::resource::ResourceClass;
     use ratn_model::tolerance::Tolerance;
-    use ratn_simulation::run::{Answer, Setup, run};
+    use ratn_simulation::run::{Answer, Oracle, Performance, Setup, run};
+    use ratn_world::world::World;
+    use std::collections::BTreeMap;
+    use std::sync::Arc;
     use std::time::Duration;
 
     const CATALOGUE: &str = r#"

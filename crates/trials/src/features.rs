@@ -22,12 +22,34 @@ pub struct Features {
     pub measured: bool,
     /// Results that do not depend on the seed; small widths; exceptional outcomes.
     pub speculation: bool,
+    /// Facts of no, two and three arguments, individuals, wildcards, queries, records and their fields.
+    pub facts: bool,
+    /// Keys that come from ports, quantified effects within each other, lists that may be empty.
+    pub keys: bool,
+    /// Numeric effects of any amount, and such as are made of the fact itself.
+    pub amounts: bool,
+    /// A predicate that is measured within a tolerance, and ontologies.
+    pub tolerance: bool,
+    /// Hierarchies that see nothing of what is around them, and parameters.
+    pub libraries: bool,
+    /// Resources that are chosen by attributes, divisible, scarce, or never come back.
+    pub supplies: bool,
+    /// Durations, learned ones and learned outcomes; attempts of which none is left.
+    pub estimates: bool,
+    /// Shapes in which bugs were found that chance does not make: see `generator/patterns`.
+    pub patterns: bool,
+    /// Emergency stops, refused resources, runs that are resumed.
+    pub incidents: bool,
+    /// Loops of a thousand, chains of a hundred.
+    pub long: bool,
+    /// Nothing looks at the world, so that what is done never depends on it.
+    pub blind: bool,
     /// What the safety theorem excludes: imprecise exceptions, unordered resources, regions that share facts.
     pub weak: bool,
 }
 
 impl Features {
-    /// The whole model, under the assumptions of the safety theorem.
+    /// What was made first, under the assumptions of the safety theorem. What its seeds mean never changes.
     pub const ALL: Features = Features {
         transitions: true,
         whiles: true,
@@ -38,6 +60,17 @@ impl Features {
         effects: true,
         measured: true,
         speculation: true,
+        facts: false,
+        keys: false,
+        amounts: false,
+        tolerance: false,
+        libraries: false,
+        supplies: false,
+        estimates: false,
+        patterns: false,
+        incidents: false,
+        long: false,
+        blind: false,
         weak: false,
     };
 
@@ -52,9 +85,47 @@ impl Features {
         effects: false,
         measured: false,
         speculation: false,
+        facts: false,
+        keys: false,
+        amounts: false,
+        tolerance: false,
+        libraries: false,
+        supplies: false,
+        estimates: false,
+        patterns: false,
+        incidents: false,
+        long: false,
+        blind: false,
         weak: false,
     };
 
-    /// The whole model, without those assumptions.
+    /// [`Features::ALL`], without those assumptions.
     pub const WEAK: Features = Features { weak: true, ..Features::ALL };
+
+    /// The whole model, under the assumptions of the safety theorem.
+    pub const EVERYTHING: Features = Features {
+        facts: true,
+        keys: true,
+        amounts: true,
+        tolerance: true,
+        libraries: true,
+        supplies: true,
+        estimates: true,
+        patterns: true,
+        incidents: true,
+        long: true,
+        ..Features::ALL
+    };
+
+    /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
+    /// modes, whatever younger motions have done meanwhile.
+    pub const IMPRECISE: Features = Features {
+        effects: false,
+        measured: false,
+        blind: true,
+        weak: true,
+        libraries: true,
+        estimates: true,
+        ..Features::ALL
+    };
 }

@@ -9,6 +9,14 @@ pub fn listing(program: &Program) -> String {
     if program.exceptions == Exceptions::Imprecise {
         text += ", imprecise";
     }
+    for parameter in &program.parameters {
+        text +=
+            &format!(", ${} = {}", parameter.name, parameter.default.as_ref().map_or("?".into(), ToString::to_string));
+    }
+    if program.ontology.is_some() {
+        text += ", with an ontology";
+    }
+    text += &program.deadline_s.map(|limit| format!(", deadline {limit} s")).unwrap_or_default();
     let initial: Vec<String> = program.initial.iter().map(ToString::to_string).collect();
     text += &format!("\nworld {}\n", initial.join(", "));
     lines(program, program.state(Program::ROOT), "", &mut text);
@@ -69,7 +77,10 @@ fn said(program: &Program, state: &State) -> String {
     said.extend(a.requires.iter().map(|required| format!("requires {required}")));
     let resources = a.resources.iter().map(|r| {
         let unordered = if r.unordered { " unordered" } else { "" };
-        format!("{:?} {} {}{unordered}", r.operation, r.count, r.kind).to_lowercase()
+        let mut like: Vec<String> = r.attributes.iter().map(|(name, value)| format!("{name} = {value}")).collect();
+        like.extend(r.conditions.iter().map(ToString::to_string));
+        let like = if like.is_empty() { String::new() } else { format!(" where {}", like.join(", ")) };
+        format!("{:?} {} {}{like}{unordered}", r.operation, r.count, r.kind).to_lowercase()
     });
     said.extend(resources);
     for (outcome, target) in &state.transitions {
@@ -95,6 +106,8 @@ fn said(program: &Program, state: &State) -> String {
     }
     said.extend(a.retry.map(|retry| format!("retry {} after {} s", retry.count, retry.backoff_s)));
     said.extend(a.timeout_s.map(|limit| format!("timeout {limit} s")));
+    said.extend(a.attempts.map(|limit| format!("attempts {limit}")));
+    said.extend(a.duration_s.as_ref().map(|estimate| format!("duration {estimate}")));
     said.extend(a.exceptions.map(|exceptions| format!("{exceptions:?}").to_lowercase()));
     said.extend(a.routine.then(|| "routine".to_owned()));
     said.extend(a.deterministic.then(|| "deterministic".to_owned()));

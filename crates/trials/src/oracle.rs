@@ -6,13 +6,14 @@
 //! three actions per region, whatever else may shift the end of an action (messages that are late, workers that die: some tens
 //! of seconds) never changes which ends first, so that the outcome is one function of the program in both modes.
 
+use super::generator::tolerance::{OFF, TOLERANT};
 use super::{AGAIN, ARGUMENTS, FOUND, PREDICATES, is_preemptive, plain, state_of};
 use super::{Dice, Hash};
 use ratn_executive::protocol::Goal;
 use ratn_model::expression::{EffectExpr, Expr, FactExpr, Lookup, Scope};
 use ratn_model::fact::{FactKey, FactPattern, Footprint, Term};
 use ratn_model::id::StateId;
-use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, SUCCESS, State, StateKind};
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, STOPPED, SUCCESS, State, StateKind};
 use ratn_model::value::Value;
 use ratn_simulation::run::{Answer, Oracle, Performance};
 use ratn_world::world::World;
@@ -42,6 +43,8 @@ pub struct HashOracle<'a> {
     pub crashes_percent: u64,
     /// How many of a hundred effects are not measured as they were predicted.
     pub deviations_percent: u64,
+    /// Whether some of what ends `preempted` ends by an emergency stop instead.
+    pub stops: bool,
 }
 
 impl Oracle for HashOracle<'_> {
@@ -72,6 +75,7 @@ impl Oracle for HashOracle<'_> {
         if dice.percent(self.failures_percent) {
             return match dice.below(4) {
                 0 if state.annotations.timeout_s.is_some() => Performance { duration_s: 1e6, answer: failed(ABORTED) },
+                1 if self.stops && dice.percent(50) => Performance { duration_s, answer: failed(STOPPED) },
                 1 => Performance { duration_s, answer: failed(PREEMPTED) },
                 _ => Performance { duration_s, answer: failed(ABORTED) },
             };
@@ -80,7 +84,7 @@ impl Oracle for HashOracle<'_> {
         let x = dice.below(3) as i64;
         let list = (0..dice.below(4)).map(|_| Value::Int(dice.below(ARGUMENTS) as i64)).collect();
         let outputs = BTreeMap::from([("x".to_owned(), Value::Int(x)), ("list".to_owned(), Value::List(list))]);
-        let measured = self.measured(&mut dice, state, goal, &outcome);
+        let measured = self.measured(&mut dice, state, goal, (&outcome, x));
         Performance { duration_s, answer: Answer::Finished { outcome, outputs, measured } }
     }
 }
@@ -102,7 +106,9 @@ impl HashOracle<'_> {
             return LONG_S * (1 + hash.dice().below(3)) as f64 + shift;
         }
         hash.add_number(goal.seed);
-        0.5 + hash.dice().below(40) as f64 / 10.0
+        let usual = 0.5 + hash.dice().below(40) as f64 / 10.0;
+        // Some estimates are right.
+        goal.expected_s.filter(|_| hash.dice().percent(70)).map_or(usual, |expected| expected.min(TIMEOUT_S - 10.0))
     }
 
     fn fault(&self, path: &str, attempt: u32, state: &State, goal: &Goal) -> Option<Answer> {
@@ -113,6 +119,12 @@ impl HashOracle<'_> {
         let mut hash = Hash(self.seed);
         hash.add("fault");
         hash.add(path);
+        if state.annotations.attempts.is_some() && state.annotations.nature != Nature::Irreversible {
+            // Which attempt is the last is not the same in both modes: none answers, or all do.
+            hash.add("every attempt");
+            hash.add_number(goal.seed);
+            return hash.dice().percent(self.crashes_percent).then_some(Answer::Crashed);
+        }
         let chance = if state.annotations.nature == Nature::Irreversible {
             hash.add_number(goal.seed);
             self.failures_percent.div_ceil(3)
@@ -138,7 +150,14 @@ impl HashOracle<'_> {
     }
 
     /// Facts that are not as the effects of this outcome say.
-    fn measured(&self, dice: &mut Dice, state: &State, goal: &Goal, outcome: &str) -> Vec<(FactKey, Value)> {
+    /// With `x`, its output.
+    fn measured(
+        &self,
+        dice: &mut Dice,
+        state: &State,
+        goal: &Goal,
+        (outcome, x): (&str, i64),
+    ) -> Vec<(FactKey, Value)> {
         if self.deviations_percent == 0 {
             return Vec::new();
         }
@@ -147,8 +166,14 @@ impl HashOracle<'_> {
         match state.annotations.effects.get(outcome) {
             Some(effects) => {
                 for effect in effects {
-                    let EffectExpr::Set(fact, _) = effect else { continue };
+                    let EffectExpr::Set(fact, value) = effect else { continue };
                     let Some(key) = key(fact, &scope) else { continue };
+                    if is_tolerant(&key) {
+                        if !measured.iter().any(|(known, _)| *known == key) {
+                            measured.extend(self.nearly(dice, value, x).map(|value| (key, value)));
+                        }
+                        continue;
+                    }
                     if dice.percent(self.deviations_percent) && !measured.iter().any(|(known, _)| *known == key) {
                         measured.push((key, Value::Int(dice.below(4) as i64)));
                     }
@@ -164,6 +189,17 @@ impl HashOracle<'_> {
         measured
     }
 
+    /// A value of the predicate that has a tolerance: what was predicted or another, and a little beside it.
+    fn nearly(&self, dice: &mut Dice, predicted: &Expr, x: i64) -> Option<Value> {
+        let predicted = match predicted {
+            Expr::Literal(value) => value.as_number()?,
+            _ => x as f64,
+        };
+        let whole = if dice.percent(self.deviations_percent) { dice.below(4) as f64 } else { predicted };
+        let off = [0.0, OFF, -OFF][dice.below(3) as usize];
+        Some(Value::Float(whole + off))
+    }
+
     /// The facts that the node declares to read, sense or require, as the world it was given shows them.
     fn seen(&self, state: &State, goal: &Goal, world: &World) -> Vec<(String, String)> {
         let scope = InputScope { state, goal };
@@ -172,7 +208,7 @@ impl HashOracle<'_> {
             (Nature::Senses(facts), _) => facts.clone(),
             (_, Some(reads)) => reads.clone(),
             (_, None) => {
-                return world.iter().map(|(k, f)| (k.to_string(), f.value.to_string())).collect();
+                return world.iter().map(|(k, f)| (k.to_string(), coarse(k, &f.value))).collect();
             }
         };
         if !matches!(annotations.nature, Nature::Senses(_)) {
@@ -180,10 +216,23 @@ impl HashOracle<'_> {
         }
         let Footprint::Patterns(patterns) = FactExpr::footprint(&declared, &scope) else { return Vec::new() };
         let seen = |pattern: &FactPattern| -> Vec<(String, String)> {
-            world.matching(pattern).map(|(k, f)| (k.to_string(), f.value.to_string())).collect()
+            world.matching(pattern).map(|(k, f)| (k.to_string(), coarse(k, &f.value))).collect()
         };
         patterns.iter().flat_map(seen).collect()
     }
+}
+
+/// What a node makes of a value that it sees: of what may be off by a tolerance, the whole number.
+fn coarse(key: &FactKey, value: &Value) -> String {
+    match value.as_number().filter(|_| is_tolerant(key)) {
+        // Nothing is below nothing: -0 is 0.
+        Some(number) => (number.round() + 0.0).to_string(),
+        None => value.to_string(),
+    }
+}
+
+fn is_tolerant(key: &FactKey) -> bool {
+    key.predicate.strip_prefix('p').and_then(|number| number.parse().ok()) == Some(TOLERANT)
 }
 
 /// The largest visit number on a path.
@@ -198,25 +247,32 @@ fn key(fact: &FactExpr, scope: &InputScope<'_>) -> Option<FactKey> {
     Some(FactKey { predicate: pattern.predicate, arguments })
 }
 
-/// The variables of a node, which random programs always pass as inputs.
+/// The variables of a node, and the ports that its facts are looked up by: random programs always pass them as inputs.
 pub(super) struct InputScope<'a> {
     pub(super) state: &'a State,
     pub(super) goal: &'a Goal,
 }
 
+impl InputScope<'_> {
+    /// What is passed as an input is known.
+    fn input(&self, expression: &Expr) -> Option<Cow<'_, Value>> {
+        let StateKind::Action { inputs, .. } = &self.state.kind else { return None };
+        let port = inputs.iter().find(|(_, e)| e == expression).map(|(port, _)| port)?;
+        self.goal.inputs.get(port).map(Cow::Borrowed)
+    }
+}
+
 impl Scope for InputScope<'_> {
     fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
-        let StateKind::Action { inputs, .. } = &self.state.kind else { return None };
-        let port = inputs.iter().find(|(_, e)| *e == Expr::Variable(name.to_owned())).map(|(port, _)| port)?;
-        self.goal.inputs.get(port).map(Cow::Borrowed)
+        self.input(&Expr::Variable(name.to_owned()))
     }
 
     fn output(&self, _: &str) -> Option<Cow<'_, Value>> {
         None
     }
 
-    fn port(&self, _: StateId, _: &str) -> Option<Cow<'_, Value>> {
-        None
+    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
+        self.input(&Expr::Port { state, port: port.to_owned() })
     }
 
     fn fact(&self, _: &FactPattern) -> Lookup<'_> {

@@ -1,38 +1,109 @@
-//! The world changes from outside, once, while a PIA is under way: both modes then do the same.
+//! The world changes from outside, while a PIA is under way: both modes then do the same.
 //!
-//! When a PIA starts, everything older is real and nothing younger is, in both modes. So what changes at that moment changes at one place
-//! of the program, and the theorem holds as if the PIA had done it. Not beside regions, where others are at places of their own.
+//! When a PIA is under way, everything older is real and nothing younger is, in both modes. So what changes then changes at one place
+//! of the program, and the theorem holds as if the PIA had done it. Beside regions, where others are at places of their own, it
+//! holds as long as what changes is what only the PIA's own region may write: nobody else then reads it either.
+//!
+//! - [`trial_from_outside`]: at the start of some PIA, in both modes.
+//! - [`trial_at_any_moment`]: at some time in CDTN mode. Where a PIA was under way then, HSM mode is disturbed at the start of that
+//!   PIA. Where none was, or regions were, there is no place of the program to which the change belongs: the run ends, nothing is
+//!   left over, and no PIA was undone or started twice with the same goal.
 
-use super::Dice;
 use super::story::story;
-use super::trial::{Conditions, Verdict, compare, execute_under};
+use super::trial::{Conditions, Verdict, compare, execute_under, max_hsm_events, not_woken, problem};
+use super::{Dice, is_preemptive, state_of};
+use super::{around, weak};
 use ratn_executive::protocol::{Command, Event, LogEntry, Mode};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::Revision;
-use ratn_model::program::Program;
+use ratn_model::program::{Program, State, StateKind};
 use ratn_model::value::Value;
 use ratn_simulation::run::{Run, RunError, Trigger};
+use std::collections::BTreeSet;
 use std::sync::Arc;
-
-/// More events in HSM mode than this is a program that is left out.
-const MAX_EVENTS: usize = 6_000;
 
 /// Runs the program in both modes, while some facts become otherwise at the start of one of its PIAs, and compares.
 pub fn trial_from_outside(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
-    let undisturbed = match execute_under(program, conditions, Mode::Hsm, MAX_EVENTS, Vec::new()) {
+    let undisturbed = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), Vec::new()) {
         Ok(run) => run,
         Err(RunError::Endless(_)) => return Verdict::LeftOut,
         Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
     };
     let mut dice = Dice(conditions.seed ^ 0x0000_0075_1de5);
     let acts = story(program, &undisturbed).acts;
-    let facts = facts(&undisturbed, &mut dice);
+    let mut facts = facts(&undisturbed, &mut dice);
     if acts.is_empty() || facts.is_empty() {
         return Verdict::LeftOut;
     }
     let path = acts[dice.below(acts.len() as u64) as usize].path.clone();
+    if let Some(own) = own_predicates(program, &path) {
+        facts.retain(|(fact, _)| own.contains(&fact.predicate));
+        if facts.is_empty() {
+            return Verdict::LeftOut;
+        }
+    }
     let event = Event::WorldChanged { revision: Revision(0), facts };
     compare(program, conditions, &[(Trigger::Starts(path), event)])
+}
+
+/// Runs the program in CDTN mode, while some facts become otherwise at some time, and compares as far as that is defined.
+pub(super) fn trial_at_any_moment(program: &Arc<Program>, conditions: &Conditions, undisturbed: &Run) -> Verdict {
+    let mut dice = Dice(conditions.seed ^ 0x0000_a117_03e7);
+    let facts = facts(undisturbed, &mut dice);
+    if facts.is_empty() || program.states.iter().any(is_preemptive) {
+        return Verdict::LeftOut;
+    }
+    let at = dice.below(1_000) as f64 / 1_000.0 * undisturbed.end_s * 0.9;
+    let event = Event::WorldChanged { revision: Revision(0), facts: facts.clone() };
+    let most = 60 * undisturbed.log.len() + 10_000;
+    let cdtn = match execute_under(program, conditions, Mode::Cdtn, most, vec![(Trigger::At(at), event.clone())]) {
+        Ok(run) => run,
+        Err(problem) => return Verdict::Differs(format!("CDTN mode: {problem}")),
+    };
+    if let Some(problem) = not_woken(program, conditions, most, &[(Trigger::At(at), event.clone())]) {
+        return Verdict::Differs(problem);
+    }
+    let told = story(program, &cdtn);
+    if let Some(path) = told.undone.first() {
+        return Verdict::Differs(format!("{path} was discarded or computed again after it had started"));
+    }
+    let mut started = BTreeSet::new();
+    if let Some(act) = told.acts.iter().find(|act| !started.insert((&act.path, &act.goal))) {
+        return Verdict::Differs(format!("{} started twice", act.path));
+    }
+    let has_regions = program.states.iter().any(|state| matches!(state.kind, StateKind::Concurrency { .. }));
+    let acts = told.acts.len();
+    let same = |hsm_s: f64| Verdict::Same { hsm_s, cdtn_s: cdtn.end_s, acts };
+    let Some(path) = under_way(program, &cdtn).filter(|_| !has_regions) else { return same(undisturbed.end_s) };
+    let outside = vec![(Trigger::Starts(path), event)];
+    let hsm = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), outside) {
+        Ok(run) => run,
+        Err(RunError::Endless(_)) => return Verdict::LeftOut,
+        Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
+    };
+    match problem(program, &hsm, &cdtn, &(story(program, &hsm), told)) {
+        Some(problem) => Verdict::Differs(format!("the world changed at {at:.3} s: {problem}")),
+        None => same(hsm.end_s),
+    }
+}
+
+/// The PIA that was under way, in its first try, when the world changed.
+fn under_way(program: &Program, run: &Run) -> Option<String> {
+    let changed = run.log.iter().position(|line| matches!(line.entry, LogEntry::Event(Event::WorldChanged { .. })))?;
+    let until = Run { log: run.log[..changed].to_vec(), ..run.clone() };
+    let acts = story(program, &until);
+    let path = acts.running.first().map(|number| acts.acts[*number].path.clone())?;
+    (acts.acts.iter().filter(|act| act.path == path).count() == 1).then_some(path)
+}
+
+/// What only the region may write in which a PIA is; nothing where it is in none.
+fn own_predicates(program: &Program, path: &str) -> Option<BTreeSet<String>> {
+    let state = state_of(program, path)?;
+    let chain: Vec<&State> = around(program, state).collect();
+    let region = chain.windows(2).find(|pair| matches!(pair[1].kind, StateKind::Concurrency { .. }))?[0];
+    // In a race several regions may write the same.
+    let races = chain.iter().any(|state| is_preemptive(state));
+    Some(if races { BTreeSet::new() } else { weak::written(program, region.id) })
 }
 
 /// A few of the facts that a run wrote, each gone or with what another of its predicate was.

@@ -3,8 +3,8 @@
 
 use super::rewrite::without;
 use super::trial::{Conditions, Verdict, trial};
-use super::{around, is_preemptive};
-use ratn_model::expression::Expr;
+use super::{BATTERY, POWER, TOOL, around, is_preemptive};
+use ratn_model::expression::{EffectExpr, Expr, Function};
 use ratn_model::program::{Program, StateKind};
 use ratn_model::resource::Quantity;
 use ratn_model::value::Value;
@@ -26,6 +26,16 @@ pub struct Shrunk {
 
 /// The smallest program found that still fails, maybe in another way.
 pub fn shrink(program: Program, conditions: Conditions, problem: String) -> Shrunk {
+    shrink_by(trial, program, conditions, problem)
+}
+
+/// The same for another trial.
+pub fn shrink_by(
+    trial: fn(&Arc<Program>, &Conditions) -> Verdict,
+    program: Program,
+    conditions: Conditions,
+    problem: String,
+) -> Shrunk {
     let mut best = Shrunk { program, conditions, problem };
     let mut trials = 0;
     loop {
@@ -67,7 +77,7 @@ fn candidate(best: &Shrunk, step: usize) -> Option<(Program, Conditions)> {
         return Some((program, conditions));
     }
     let step = step - states;
-    const SITUATIONS: usize = 10;
+    const SITUATIONS: usize = 22;
     if step < SITUATIONS {
         match step {
             0 => conditions.crashes_percent = 0,
@@ -79,7 +89,20 @@ fn candidate(best: &Shrunk, step: usize) -> Option<(Program, Conditions)> {
             6 => conditions.orders = 0,
             7 => program.speculation_width = Program::DEFAULT_SPECULATION_WIDTH,
             8 => program.horizon = 60,
-            _ => program.outputs.clear(),
+            9 => program.outputs.clear(),
+            10 => conditions.refused_percent = 0,
+            11 => conditions.stops = false,
+            12 => conditions.resume_after = None,
+            13 => conditions.learned = false,
+            14 => program.ontology = None,
+            15 => program.tolerances = Default::default(),
+            16 => program.initial.clear(),
+            _ => {
+                let at = step - 17;
+                if at < program.initial.len() {
+                    program.initial.remove(at);
+                }
+            }
         }
         return Some((program, conditions));
     }
@@ -92,7 +115,7 @@ fn candidate(best: &Shrunk, step: usize) -> Option<(Program, Conditions)> {
 }
 
 /// As many ways as there are to simplify a state.
-const CHANGES: usize = 26;
+const CHANGES: usize = 48;
 
 fn simplify(program: &mut Program, at: usize, what: usize) {
     let state = &mut program.states[at];
@@ -146,10 +169,52 @@ fn simplify(program: &mut Program, at: usize, what: usize) {
                 facts.clear();
             }
         }
-        _ => {
+        25 => {
             if let Some(reads) = &mut a.reads {
                 reads.truncate(1);
             }
         }
+        26 => a.duration_s = None,
+        27 => a.attempts = None,
+        28 => a.resources.retain(|r| ![TOOL, POWER, BATTERY].contains(&r.kind.as_str())),
+        29 => state.variables.iter_mut().for_each(|(_, value)| *value = Expr::Literal(Value::Int(0))),
+        30 => {
+            if let StateKind::ForEach { collection: Expr::Call(Function::Range, to), .. } = &mut state.kind
+                && let [Expr::Literal(Value::Int(many))] = to.as_mut_slice()
+            {
+                *many /= 2;
+            }
+        }
+        31..35 => remove(&mut a.requires, what - 31),
+        35..38 => {
+            if let Some(reads) = &mut a.reads {
+                remove(reads, what - 35);
+            }
+        }
+        38..44 => a.effects.values_mut().for_each(|effects| remove(effects, what - 38)),
+        44 => a.effects.values_mut().flatten().for_each(|effect| {
+            if let EffectExpr::ForEach { effects, .. } = effect
+                && let [inner @ EffectExpr::ForEach { .. }] = effects.as_slice()
+            {
+                *effect = inner.clone();
+            }
+        }),
+        45 => a.effects.values_mut().flatten().for_each(|effect| {
+            if let EffectExpr::ForEach { collection, .. } = effect {
+                *collection = Expr::List(vec![Expr::Literal(Value::Int(0))]);
+            }
+        }),
+        46 => a.effects.values_mut().flatten().for_each(|effect| {
+            if let EffectExpr::Set(_, value) | EffectExpr::Increase(_, value) = effect {
+                *value = Expr::Literal(Value::Int(1));
+            }
+        }),
+        _ => a.exceptions = None,
+    }
+}
+
+fn remove<T>(from: &mut Vec<T>, at: usize) {
+    if at < from.len() {
+        from.remove(at);
     }
 }

@@ -74,6 +74,8 @@ pub(super) struct Story {
     pub(super) changes: BTreeMap<String, Vec<Change>>,
     /// PIAs that were discarded, or computed again, after they had started.
     pub(super) undone: Vec<String>,
+    /// The acts that had not ended.
+    pub(super) running: Vec<usize>,
 }
 
 #[derive(Default)]
@@ -194,6 +196,7 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
             _ => {}
         }
     }
+    story.running = running;
     story
 }
 

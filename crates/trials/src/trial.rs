@@ -2,17 +2,18 @@
 //!
 //! A log is in the order of events, so what is checked of every start of a PIA in it holds at every moment of the run.
 
+use super::blind;
 use super::reference::{self, Fail, Given, Told};
 use super::replay::replayed;
 use super::story::{Act, Story, are_beside, story};
 use super::weak;
-use super::{Dice, Features, HashOracle, RESOURCES, is_in_routine, state_of};
-use ratn_executive::protocol::{Event, Mode};
-use ratn_model::catalogue::ResourceOffer;
-use ratn_model::program::{Program, StateKind};
+use super::{Dice, Features, HashOracle, RESOURCES, around, attributes, is_in_routine, is_long, offers, state_of};
+use ratn_executive::protocol::{Event, Learned, Mode};
+use ratn_model::program::{Program, SUCCESS, State, StateKind};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
-use ratn_simulation::run::{Circumstances, Mischief, Oracle, Run, RunError, Setup, Trigger, run_under};
+use ratn_model::value::Value;
+use ratn_simulation::run::{Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
@@ -22,6 +23,10 @@ pub(super) const MAX_HSM_EVENTS: usize = 6_000;
 /// So many more events than HSM mode may CDTN mode take, which computes what is never needed, too.
 pub(super) const MAX_CDTN_EVENTS: usize = 60;
 
+pub(super) fn max_hsm_events(program: &Program) -> usize {
+    MAX_HSM_EVENTS * if is_long(program) { 20 } else { 1 }
+}
+
 /// What a program is tried under.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Conditions {
@@ -29,6 +34,8 @@ pub struct Conditions {
     pub seed: u64,
     /// Without the theorem's assumptions.
     pub weak: bool,
+    /// Nothing in the program looks at the world.
+    pub blind: bool,
     /// Of a hundred visits, how many fail.
     pub failures_percent: u64,
     /// Of a hundred attempts, how many crash.
@@ -43,6 +50,14 @@ pub struct Conditions {
     pub pauses: bool,
     /// Orders that a look ahead tries.
     pub orders: usize,
+    /// Of a hundred states, for how many nothing is ever granted.
+    pub refused_percent: u64,
+    /// Emergency stops.
+    pub stops: bool,
+    /// After so many events the run is resumed from its log.
+    pub resume_after: Option<usize>,
+    /// Earlier runs have taught something, right or wrong.
+    pub learned: bool,
 }
 
 /// What came of a trial.
@@ -68,9 +83,10 @@ impl Conditions {
     pub fn of(seed: u64, features: &Features) -> Conditions {
         let mut dice = Dice(seed ^ 0x5eed_c0de);
         let mut some = |chance: u64, much: u64| if dice.percent(chance) { much } else { 0 };
-        Conditions {
+        let mut conditions = Conditions {
             seed,
             weak: features.weak,
+            blind: features.blind,
             failures_percent: some(50, 5),
             crashes_percent: some(60, 12),
             deviations_percent: if features.measured { some(50, 30) } else { 0 },
@@ -78,7 +94,27 @@ impl Conditions {
             mischief_percent: some(40, 20),
             pauses: some(15, 1) == 1,
             orders: some(15, 12) as usize,
+            refused_percent: 0,
+            stops: false,
+            resume_after: None,
+            learned: false,
+        };
+        if features.blind {
+            conditions.failures_percent = 20;
         }
+        if features.patterns {
+            conditions.deviations_percent = some(70, 50);
+        }
+        if features.incidents {
+            conditions.refused_percent = some(12, 8);
+            conditions.stops = some(50, 1) == 1;
+            let after = some(30, 1 + seed % 150) as usize;
+            conditions.resume_after = (after > 0).then_some(after);
+        }
+        if features.estimates {
+            conditions.learned = some(25, 1) == 1;
+        }
+        conditions
     }
 }
 
@@ -89,7 +125,7 @@ pub fn trial(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
 
 /// The same, while this comes from outside.
 pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: &[(Trigger, Event)]) -> Verdict {
-    let hsm = match execute_under(program, conditions, Mode::Hsm, MAX_HSM_EVENTS, outside.to_vec()) {
+    let hsm = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), outside.to_vec()) {
         Ok(run) => run,
         Err(RunError::Endless(_)) => return Verdict::LeftOut,
         Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
@@ -99,18 +135,16 @@ pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: 
         Ok(run) => run,
         Err(problem) => return Verdict::Differs(format!("CDTN mode: {problem}")),
     };
-    for (mode, run) in [("HSM", &hsm), ("CDTN", &cdtn)] {
-        if let Some(problem) = replayed(program, run) {
-            return Verdict::Differs(format!("{mode} mode: {problem}"));
-        }
-    }
     let stories = (story(program, &hsm), story(program, &cdtn));
-    let problem = if conditions.weak {
+    let problem = if conditions.blind {
+        blind::problem((&hsm, &stories.0), (&cdtn, &stories.1))
+    } else if conditions.weak {
         weak::problem(program, &hsm, &cdtn, &stories)
     } else {
         problem(program, &hsm, &cdtn, &stories)
     };
-    match problem.or_else(|| against_reference(program, conditions, outside, (&hsm, &cdtn), &stories)) {
+    let problem = problem.or_else(|| against_reference(program, conditions, outside, (&hsm, &cdtn), &stories));
+    match problem.or_else(|| not_woken(program, conditions, events, outside)) {
         Some(problem) => Verdict::Differs(problem),
         None => Verdict::Same { hsm_s: hsm.end_s, cdtn_s: cdtn.end_s, acts: stories.1.acts.len() },
     }
@@ -125,7 +159,8 @@ fn against_reference(
     (before, after): &(Story, Story),
 ) -> Option<String> {
     // What one region does another sees, at what moment ever.
-    if conditions.weak && weak::shares(program) {
+    let shares = conditions.weak && weak::shares(program);
+    if shares && !conditions.blind {
         return None;
     }
     let told = match should_be(program, conditions, outside) {
@@ -134,6 +169,9 @@ fn against_reference(
         Err(problem) => return Some(format!("the reference does not come to an end: {problem:?}")),
     };
     let of = |mode: &str, problem: Option<String>| problem.map(|p| format!("{mode} mode and the reference: {p}"));
+    if shares {
+        return of("HSM", reference::outcomes(&told, hsm, before));
+    }
     of("HSM", reference::disagreement(program, &told, hsm, before)).or_else(|| {
         // What is beside or behind an imprecise failure is not the prefix of a program.
         match conditions.weak {
@@ -144,27 +182,35 @@ fn against_reference(
     })
 }
 
-/// What the reference says of a program.
-fn should_be(program: &Program, conditions: &Conditions, outside: &[(Trigger, Event)]) -> Result<Told, Fail> {
-    should_be_with(program, conditions, outside, &mut oracle(program, conditions))
+/// Why the reference has no verdict on a program, if it has none.
+pub fn no_verdict(program: &Program, conditions: &Conditions) -> Option<&'static str> {
+    if conditions.weak && !conditions.blind && weak::shares(program) {
+        return Some("regions that share facts");
+    }
+    match should_be(program, conditions, &[]) {
+        Err(Fail::NotMine(why)) => Some(why),
+        _ => None,
+    }
 }
 
-pub(super) fn should_be_with(
-    program: &Program,
-    conditions: &Conditions,
-    outside: &[(Trigger, Event)],
-    oracle: &mut dyn Oracle,
-) -> Result<Told, Fail> {
+/// What the reference says of a program.
+fn should_be(program: &Program, conditions: &Conditions, outside: &[(Trigger, Event)]) -> Result<Told, Fail> {
     let task_resources = RESOURCES.iter().filter(|(_, class, _)| *class == ResourceClass::Task);
     reference::evaluate(Given {
         program,
         seed: conditions.seed,
-        parameters: BTreeMap::new(),
+        parameters: parameters(program),
         facts: BTreeMap::new(),
         units: task_resources.map(|(kind, _, n)| ((*kind).to_owned(), Quantity::whole(*n).thousandths())).collect(),
+        refused: refused(program, conditions),
         outside: outside.to_vec(),
-        oracle,
+        oracle: &mut oracle(program, conditions),
     })
+}
+
+/// Parameters are what they are by default.
+fn parameters(program: &Program) -> BTreeMap<String, Value> {
+    program.parameters.iter().filter_map(|p| Some((p.name.clone(), p.default.clone()?))).collect()
 }
 
 /// What nodes do under these conditions.
@@ -175,6 +221,7 @@ pub(super) fn oracle<'a>(program: &'a Program, conditions: &Conditions) -> HashO
         failures_percent: conditions.failures_percent,
         crashes_percent: conditions.crashes_percent,
         deviations_percent: conditions.deviations_percent,
+        stops: conditions.stops,
     }
 }
 
@@ -188,6 +235,7 @@ pub fn execute(
     execute_under(program, conditions, mode, max_events, Vec::new())
 }
 
+/// A run, and once more from its log.
 pub(super) fn execute_under(
     program: &Arc<Program>,
     conditions: &Conditions,
@@ -195,40 +243,91 @@ pub(super) fn execute_under(
     max_events: usize,
     outside: Vec<(Trigger, Event)>,
 ) -> Result<Run, RunError> {
-    run_with(program, conditions, mode, max_events, outside, &mut oracle(program, conditions))
+    let circumstances = Circumstances { resume_after: conditions.resume_after, ..circumstances(program, conditions) };
+    let run = run_as(program, conditions, mode, outside, Circumstances { max_events, ..circumstances })?;
+    match replayed(program, &run) {
+        Some(problem) => Err(RunError::Broken { at_s: run.end_s, problem }),
+        None => Ok(run),
+    }
 }
 
-/// A run with an oracle of the caller's.
-pub(super) fn run_with(
+/// Who could have gone on in CDTN mode and was not woken, if anybody. Long programs are not examined, which would take minutes.
+pub(super) fn not_woken(
+    program: &Arc<Program>,
+    conditions: &Conditions,
+    max_events: usize,
+    outside: &[(Trigger, Event)],
+) -> Option<String> {
+    if is_long(program) {
+        return None;
+    }
+    let circumstances = Circumstances { examines: true, max_events, ..circumstances(program, conditions) };
+    let run = run_as(program, conditions, Mode::Cdtn, outside.to_vec(), circumstances);
+    run.err().map(|problem| format!("CDTN mode, examined: {problem}"))
+}
+
+fn circumstances(program: &Program, conditions: &Conditions) -> Circumstances {
+    let seed = conditions.seed;
+    let percent = conditions.mischief_percent;
+    Circumstances {
+        orders: conditions.orders,
+        events: if conditions.pauses { pauses(seed) } else { Vec::new() },
+        mischief: Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent },
+        checks: !is_long(program),
+        refused: refused(program, conditions),
+        learned: if conditions.learned { learned(program, seed) } else { Learned::default() },
+        attributes: attributes(),
+        ..Circumstances::default()
+    }
+}
+
+fn run_as(
     program: &Arc<Program>,
     conditions: &Conditions,
     mode: Mode,
-    max_events: usize,
     mut outside: Vec<(Trigger, Event)>,
-    oracle: &mut dyn Oracle,
+    mut circumstances: Circumstances,
 ) -> Result<Run, RunError> {
-    let seed = conditions.seed;
     let setup = Setup {
         program: program.clone(),
         mode,
-        parameters: BTreeMap::new(),
-        seed,
-        resources: RESOURCES
-            .iter()
-            .map(|(kind, class, units)| ((*kind).to_owned(), ResourceOffer::new(*class, *units)))
-            .collect(),
+        parameters: parameters(program),
+        seed: conditions.seed,
+        resources: offers(),
         world: Vec::new(),
         tolerance: Tolerance::EXACT,
         latency: Duration::from_secs_f64(conditions.latency_s),
     };
-    let percent = conditions.mischief_percent;
-    let mischief = Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent };
-    if conditions.pauses {
-        outside.extend(pauses(seed));
+    outside.append(&mut circumstances.events);
+    circumstances.events = outside;
+    run_under(setup, &mut oracle(program, conditions), circumstances)
+}
+
+/// States that are never granted anything, by their paths. What is inside of a routine asks for nothing itself, as a rule.
+fn refused(program: &Program, conditions: &Conditions) -> BTreeSet<String> {
+    let mut dice = Dice(conditions.seed ^ 0x4ef5ed);
+    let mut chosen = |state: &&State| {
+        let inside = around(program, state).skip(1).any(State::is_routine);
+        !inside && dice.percent(conditions.refused_percent)
+    };
+    program.states.iter().filter(|state| chosen(state)).map(|state| state.path.clone()).collect()
+}
+
+/// What earlier runs may have taught: anything.
+fn learned(program: &Program, seed: u64) -> Learned {
+    let mut dice = Dice(seed ^ 0x1ea4);
+    let mut learned = Learned::default();
+    for state in &program.states {
+        if dice.percent(40) {
+            learned.durations_s.insert(state.path.clone(), dice.below(300) as f64 / 10.0);
+        }
+        if dice.percent(40) {
+            let shares = [SUCCESS, "aborted", "again", "done", "then", "else", "found"]
+                .map(|outcome| (outcome.to_owned(), dice.below(11) as f64 / 10.0));
+            learned.outcomes.insert(state.path.clone(), BTreeMap::from(shares));
+        }
     }
-    let circumstances =
-        Circumstances { orders: conditions.orders, max_events, events: outside, mischief, checks: true };
-    run_under(setup, oracle, circumstances)
+    learned
 }
 
 /// A pause, a step and what ends both.
@@ -253,7 +352,16 @@ fn differ(what: &str, hsm: impl std::fmt::Debug, cdtn: impl std::fmt::Debug) -> 
 }
 
 /// The first clause of the theorem that does not hold.
-fn problem(program: &Program, hsm: &Run, cdtn: &Run, (before, after): &(Story, Story)) -> Option<String> {
+/// The first clause of the theorem that does not hold.
+pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run, stories: &(Story, Story)) -> Option<String> {
+    let undone = stories.1.undone.first();
+    undone
+        .map(|path| format!("{path} was discarded or computed again after it had started, and it is a PIA"))
+        .or_else(|| difference(program, hsm, cdtn, stories))
+}
+
+/// The first thing that both modes did not do alike.
+pub(super) fn difference(program: &Program, hsm: &Run, cdtn: &Run, (before, after): &(Story, Story)) -> Option<String> {
     closure(program, before, after)
         .or_else(|| same_end(hsm, cdtn))
         .or_else(|| {
@@ -283,10 +391,7 @@ pub(super) fn same_end(hsm: &Run, cdtn: &Run) -> Option<String> {
 
 /// The PIAs started are at every moment some of HSM mode's, each once, with all that come before them in the program started and
 /// ended.
-fn closure(program: &Program, hsm: &Story, cdtn: &Story) -> Option<String> {
-    if let Some(path) = cdtn.undone.first() {
-        return Some(format!("{path} was discarded or computed again after it had started, and it is a PIA"));
-    }
+pub(super) fn closure(program: &Program, hsm: &Story, cdtn: &Story) -> Option<String> {
     let has_regions = program.states.iter().any(|s| matches!(s.kind, StateKind::Concurrency { .. }));
     let place: BTreeMap<(&str, &str), usize> =
         hsm.acts.iter().enumerate().map(|(n, act)| ((act.path.as_str(), act.goal.as_str()), n)).collect();
@@ -324,7 +429,8 @@ fn actuators(program: &Program, hsm: &Story, cdtn: &Story) -> Option<String> {
                 all.entry(resource.kind.clone()).or_default().push(act.path.clone());
             }
         }
-        all.remove(super::PART);
+        // Of these there are several, or what is had of them are parts: regions may have them in any order.
+        [super::PART, super::TOOL, super::POWER, super::BATTERY].iter().for_each(|kind| drop(all.remove(*kind)));
         all
     };
     let (hsm, cdtn) = (by_actuator(hsm), by_actuator(cdtn));

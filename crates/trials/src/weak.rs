@@ -56,7 +56,7 @@ fn inside(program: &Program, id: StateId) -> Vec<StateId> {
     all
 }
 
-fn written(program: &Program, region: StateId) -> BTreeSet<String> {
+pub(super) fn written(program: &Program, region: StateId) -> BTreeSet<String> {
     let states = inside(program, region);
     let effects = states.iter().flat_map(|id| program.state(*id).annotations.effects.values().flatten());
     effects.flat_map(EffectExpr::written).map(|fact| fact.predicate.clone()).collect()

@@ -40,8 +40,14 @@ fn random_programs_come_to_the_same_with_and_without() {
             tolerance: Tolerance::EXACT,
             latency: if seed.is_multiple_of(2) { Duration::ZERO } else { Duration::from_millis(1500) },
         };
-        let oracle =
-            || HashOracle { program: &program, seed, failures_percent: 3, crashes_percent: 5, deviations_percent: 0 };
+        let oracle = || HashOracle {
+            program: &program,
+            seed,
+            failures_percent: 3,
+            crashes_percent: 5,
+            deviations_percent: 0,
+            stops: false,
+        };
         let hsm = run(setup(Mode::Hsm), &mut oracle()).unwrap();
         let ahead = run_looking_ahead(setup(Mode::Cdtn), &mut oracle(), ORDERS);
         let ahead = ahead.unwrap_or_else(|error| unreachable!("seed {seed}: {error}"));

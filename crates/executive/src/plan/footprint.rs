@@ -3,7 +3,8 @@
 use super::outcomes::{EVERYTHING, Ends};
 use super::{Names, Predicate, Subject, is_action, nature};
 use crate::effects;
-use ratn_model::expression::{EffectExpr, FactExpr};
+use ratn_model::expression::{EffectExpr, Expr, FactExpr};
+use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Nature, PREEMPTED, ResourceExpr, State, StateKind};
 use ratn_model::slot::Slot;
 use std::collections::BTreeSet;
@@ -34,7 +35,87 @@ pub(super) fn reads(subject: &Subject<'_>, requirements: &[ResourceExpr]) -> Opt
     all.extend(subject.around.iter().flat_map(|state| &state.annotations.reads).flatten().cloned());
     let selectors = requirements.iter().flat_map(|r| r.expressions());
     all.extend(selectors.flat_map(|expression| expression.fact_expressions()).cloned());
+    if subject.is_routine() {
+        // On a projection its parts change facts one after the other: those must be there as they are before. An ontology looks at
+        // others of the predicate, too.
+        let whole = subject.program.ontology.is_some();
+        for effect in subject.contained.iter().flat_map(|state| state.annotations.effects.values()).flatten() {
+            let any = |fact: &FactExpr| FactExpr { arguments: vec![None; fact.arguments.len()], ..fact.clone() };
+            all.extend(effect.written().into_iter().map(|fact| if whole { any(fact) } else { fact.clone() }));
+        }
+        let inside = Inside::of(subject);
+        all.iter_mut().for_each(|fact| inside.hide(fact));
+    }
     Some(all)
+}
+
+/// What is known inside of a routine only: seen from its place, it may be anything.
+struct Inside {
+    states: BTreeSet<StateId>,
+    variables: BTreeSet<String>,
+}
+
+/// The variables that an effect binds.
+fn quantified(effect: &EffectExpr, into: &mut BTreeSet<String>) {
+    if let EffectExpr::ForEach { variable, effects, .. } = effect {
+        into.insert(variable.clone());
+        effects.iter().for_each(|effect| quantified(effect, into));
+    }
+}
+
+impl Inside {
+    fn of(subject: &Subject<'_>) -> Inside {
+        let mut variables: BTreeSet<String> = BTreeSet::new();
+        for state in &subject.contained {
+            variables.extend(state.variables.iter().chain(&state.assign).map(|(name, _)| name.clone()));
+            match &state.kind {
+                StateKind::ForEach { variable, index, .. } => {
+                    variables.insert(variable.clone());
+                    variables.extend(index.clone());
+                }
+                StateKind::While { index, .. } => variables.extend(index.clone()),
+                _ => {}
+            }
+            state.annotations.effects.values().flatten().for_each(|effect| quantified(effect, &mut variables));
+        }
+        Inside { states: subject.contained.iter().map(|state| state.id).collect(), variables }
+    }
+
+    /// Whether a value may be another one inside than at the place of the routine.
+    fn has(&self, expression: &Expr) -> bool {
+        let mut has = false;
+        expression.visit(&mut |part| {
+            has |= match part {
+                Expr::Port { state, .. } => self.states.contains(state),
+                Expr::Variable(name) => self.variables.contains(name),
+                Expr::Fact(_) | Expr::Exists(_) | Expr::Query(_) | Expr::Output(_) => true,
+                _ => false,
+            };
+        });
+        has
+    }
+
+    /// Arguments that are known inside only become `?`.
+    fn hide(&self, fact: &mut FactExpr) {
+        for argument in &mut fact.arguments {
+            if argument.as_ref().is_some_and(|argument| self.has(argument)) {
+                *argument = None;
+            }
+        }
+    }
+
+    fn hide_in(&self, effect: &mut EffectExpr) {
+        match effect {
+            EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => self.hide(fact),
+            EffectExpr::ForEach { collection, effects, .. } => {
+                if self.has(collection) {
+                    // No scope has it: the variable may be anything.
+                    *collection = Expr::Output(String::new());
+                }
+                effects.iter_mut().for_each(|effect| self.hide_in(effect));
+            }
+        }
+    }
 }
 
 /// The facts that a state senses, with those of what it contains.
@@ -51,7 +132,12 @@ pub(super) fn effect_lookups(state: &State) -> Vec<FactExpr> {
 /// write every fact.
 pub(super) fn may_write(subject: &Subject<'_>) -> Option<Vec<EffectExpr>> {
     let each = subject.contained.iter().map(|state| own_writes(subject, state));
-    each.collect::<Option<Vec<_>>>().map(|all| all.concat())
+    let mut all = each.collect::<Option<Vec<_>>>()?.concat();
+    if subject.is_routine() {
+        let inside = Inside::of(subject);
+        all.iter_mut().for_each(|effect| inside.hide_in(effect));
+    }
+    Some(all)
 }
 
 fn own_writes(subject: &Subject<'_>, state: &State) -> Option<Vec<EffectExpr>> {

@@ -63,7 +63,7 @@ impl Window {
     }
 
     /// A routine that did not run leaves the variables that it would assign as they were.
-    fn unassigned(&self, context: &Context<'_>, id: InstanceId) -> Outputs {
+    pub(super) fn unassigned(&self, context: &Context<'_>, id: InstanceId) -> Outputs {
         let outputs = self.look(context, id, None, |instance, view| {
             let own = context.plan.state(instance.state);
             let value = |name: &String| Some((assigned(name), view.variable(name)?.into_owned()));

@@ -305,6 +305,10 @@ impl Window {
         let all: Vec<InstanceId> = self.graph.iter().map(|instance| instance.id).collect();
         for id in all {
             let waited = self.graph.get(id).map(|instance| instance.waiting.wait());
+            if waited == Some(Wait::Backoff) {
+                // Its timer may be due at this very moment.
+                continue;
+            }
             let before = context.commands.len();
             self.waits.enqueue(&mut self.graph, id);
             let end = self.go_on(context);

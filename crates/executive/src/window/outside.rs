@@ -32,13 +32,16 @@ impl Window {
         let changed: Vec<FactPattern> = facts.map(FactPattern::of).collect();
         self.memory.root_changed(context.root, changed.iter().cloned());
         let changed = Footprint::Patterns(changed);
-        let patterns = self.memory.take_news_from_outside();
+        let news = self.memory.take_news_from_outside();
         let all: Vec<InstanceId> = self.graph.iter().map(|instance| instance.id).collect();
         self.graph.unsettle_all();
         for id in &all {
             // What it changes may be made of these facts.
             self.memory.mark(*id);
-            if let Some(pattern) = self.has_seen(context, *id, &patterns) {
+            // Actions forgive what is tolerated; the window's own computations are exact.
+            let forgives = self.graph.get(*id).is_some_and(|instance| instance.role().is_none());
+            let patterns = if forgives { &news.otherwise } else { &news.changed };
+            if let Some(pattern) = self.has_seen(context, *id, patterns) {
                 self.invalidate(context, *id, format!("{pattern} was changed from outside"));
             }
         }

@@ -5,7 +5,7 @@
 //! exit of a state, and the end of a region, wait for those inside.
 
 use super::Window;
-use super::graph::instance::{Changed, Instance, Role, Status};
+use super::graph::instance::{Changed, Ended, Instance, Role, Status};
 use super::growth::Departure;
 use super::memory::{Difference, Source, User};
 use super::waits::Wait;
@@ -94,6 +94,7 @@ impl Window {
         }
         let real = self.make_real(context, id);
         let news = self.news_of_real(context, id, &real);
+        self.correct(context, id, &real);
         match role {
             Some(Role::Fork) => {
                 self.remove_retired(context, id);
@@ -329,6 +330,17 @@ impl Window {
         news
     }
 
+    /// A result that came to nothing when it was to become real was none: it has no outputs, and a routine leaves variables as they
+    /// were.
+    fn correct(&mut self, context: &Context<'_>, id: InstanceId, real: &Real) {
+        let Some(ended) = self.graph.get(id).and_then(Instance::ended) else { return };
+        if ended.outcome == real.outcome {
+            return;
+        }
+        let outputs = self.unassigned(context, id);
+        self.graph.end(id, Ended { outputs, ..Ended::aborted(real.reason.clone()) });
+    }
+
     fn tell_news(&mut self, context: &mut Context<'_>, id: InstanceId, news: &News) {
         self.tell(context, id, &news.users, &news.difference, news.is_open, false);
     }
@@ -337,6 +349,7 @@ impl Window {
     pub(super) fn retire_detached(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let real = self.make_real(context, id);
         let news = self.news_of_real(context, id, &real);
+        self.correct(context, id, &real);
         let Some(instance) = self.graph.get(id) else { return };
         let own = context.plan.state(instance.state);
         let number = own.outcome(&real.outcome);

@@ -8,7 +8,6 @@ use super::graph::instance::{Instance, Role};
 use super::memory::{Deviation, Difference, Purpose, Source, User};
 use crate::context::Context;
 use crate::protocol::Note;
-use ratn_model::fact::FactPattern;
 use ratn_model::id::InstanceId;
 use smallvec::SmallVec;
 
@@ -55,7 +54,6 @@ impl Window {
                 self.waits.enqueue(&mut self.graph, user.id);
             }
         }
-        let patterns: Vec<FactPattern> = difference.deviations.iter().map(|d| d.pattern.clone()).collect();
         for user in users {
             match (user.of, user.purpose) {
                 (Source::Outputs, Purpose::Effects) => self.memory.mark(user.id),
@@ -66,7 +64,7 @@ impl Window {
                     self.invalidate(context, user.id, "an input is computed again".to_owned());
                 }
                 (Source::World, Purpose::Result) if !difference.is_empty() => {
-                    if let Some(deviation) = self.concerns(context, user.id, id, difference, &patterns) {
+                    if let Some(deviation) = self.concerns(context, user.id, id, difference) {
                         self.invalidate(context, user.id, deviation.sentence());
                     }
                 }
@@ -82,13 +80,12 @@ impl Window {
         reader: InstanceId,
         writer: InstanceId,
         difference: &'d Difference,
-        patterns: &[FactPattern],
     ) -> Option<&'d Deviation> {
-        let seen = self.graph.get(reader)?.seen()?;
-        if !patterns.iter().any(|pattern| seen.overlaps(pattern)) {
-            return None;
-        }
-        let mut looked_at = difference.deviations.iter().filter(|deviation| seen.overlaps(&deviation.pattern));
+        let instance = self.graph.get(reader)?;
+        let seen = instance.seen()?;
+        // What is tolerated is forgiven by actions, which take their time; the window's own computations are exact.
+        let forgives = instance.role().is_none();
+        let mut looked_at = difference.that_count(forgives).filter(|deviation| seen.overlaps(&deviation.pattern));
         looked_at.find(|deviation| {
             let pattern = std::slice::from_ref(&deviation.pattern);
             self.look(context, reader, None, |_, view| view.is_visible(writer, pattern)).unwrap_or(false)

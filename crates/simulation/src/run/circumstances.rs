@@ -5,7 +5,9 @@
 //! run has the same faults.
 
 use crate::dice::Hash;
-use ratn_executive::protocol::Event;
+use ratn_executive::protocol::{Event, Learned};
+use ratn_model::value::Value;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// More events than this is an endless run.
 pub const MAX_EVENTS: usize = 1_000_000;
@@ -21,9 +23,19 @@ pub struct Circumstances {
     pub events: Vec<(Trigger, Event)>,
     /// How messages go wrong.
     pub mischief: Mischief,
-    /// After every event the executive's invariants are checked, and that nobody could go on who was not woken. Costs the whole
-    /// window each time.
+    /// After every event the executive's invariants are checked. Costs the whole window each time.
     pub checks: bool,
+    /// After the last event of every moment it is checked that nobody could go on who was not woken. Everything that waits is looked at for that, which
+    /// may change who is looked at first later: such a run is not, command by command, the run without.
+    pub examines: bool,
+    /// States that are refused whatever they ask for, by their paths without visits.
+    pub refused: BTreeSet<String>,
+    /// After so many events the executive is thrown away, and another one made from the log goes on.
+    pub resume_after: Option<usize>,
+    /// What earlier runs have taught.
+    pub learned: Learned,
+    /// Attributes of the resources of a kind, one after the other.
+    pub attributes: BTreeMap<String, Vec<BTreeMap<String, Value>>>,
 }
 
 impl Default for Circumstances {
@@ -34,6 +46,11 @@ impl Default for Circumstances {
             events: Vec::new(),
             mischief: Mischief::default(),
             checks: false,
+            examines: false,
+            refused: BTreeSet::new(),
+            resume_after: None,
+            learned: Learned::default(),
+            attributes: BTreeMap::new(),
         }
     }
 }

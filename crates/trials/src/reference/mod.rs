@@ -10,7 +10,8 @@
 //!
 //! There is no clock. A goal that takes longer than its timeout is one that has aborted; regions run one after another,
 //! which is the same because they touch nothing of each other. What depends on time (preemptive concurrencies, deadlines)
-//! or on a wait without an end (resources that are never there) is [`Fail::NotMine`]: there is no verdict.
+//! or on a wait without an end (resources that are never there) is [`Fail::NotMine`]: there is no verdict. What is refused, it is told
+//! by the paths of the states.
 //!
 //! | | |
 //! |---|---|
@@ -46,7 +47,7 @@ use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Program, SUCCESS};
 use ratn_model::value::Value;
 use ratn_simulation::run::{Oracle, Trigger};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Output ports of one state.
 type Outputs = BTreeMap<String, Value>;
@@ -89,6 +90,8 @@ pub(super) struct Given<'a> {
     pub(super) facts: Facts,
     /// Thousandths of the task resources that there are, by kind.
     pub(super) units: BTreeMap<String, u64>,
+    /// States that are refused whatever they ask for, by their paths without visits.
+    pub(super) refused: BTreeSet<String>,
     /// What changes from outside when a goal starts.
     pub(super) outside: Vec<(Trigger, Event)>,
     pub(super) oracle: &'a mut dyn Oracle,
@@ -99,6 +102,7 @@ struct Reference<'a> {
     program: &'a Program,
     seed: u64,
     oracle: &'a mut dyn Oracle,
+    refused: BTreeSet<String>,
     outside: Vec<(Trigger, Event)>,
     /// Of all states, what their latest visits wrote.
     outputs: BTreeMap<StateId, Outputs>,
@@ -113,11 +117,12 @@ struct Reference<'a> {
 /// # Errors
 /// [`Fail::NotMine`].
 pub(super) fn evaluate(given: Given<'_>) -> Result<Told, Fail> {
-    let Given { program, seed, parameters, facts, units, outside, oracle } = given;
+    let Given { program, seed, parameters, facts, units, refused, outside, oracle } = given;
     let mut reference = Reference {
         program,
         seed,
         oracle,
+        refused,
         outside,
         outputs: BTreeMap::new(),
         regions: BTreeMap::new(),

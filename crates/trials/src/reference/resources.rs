@@ -26,6 +26,9 @@ impl Reference<'_> {
         let blocks = around.flat_map(|id| &program.state(id).annotations.resources);
         wanted.extend(blocks.filter(|line| line.operation == Operation::Block));
         self.selected(&wanted, variables, None)?;
+        if !wanted.is_empty() && self.refused.contains(&state.path) {
+            return wrong("it is refused");
+        }
         for line in wanted {
             match line.operation {
                 Operation::Consume => self.take(line)?,

@@ -1,4 +1,4 @@
-//! In which facts two lists of changes differ, beyond the tolerances of the facts.
+//! In which facts two lists of changes differ, and whether that is beyond the tolerances of the facts.
 
 use ratn_model::fact::{Change, FactKey, FactPattern};
 use ratn_model::tolerance::Tolerance;
@@ -13,6 +13,8 @@ pub(crate) struct Deviation {
     pub(crate) was: Option<Value>,
     /// What it is; `None`: nothing is said of it, or it is gone.
     pub(crate) is: Option<Value>,
+    /// The fact counts as the same.
+    pub(crate) is_tolerated: bool,
 }
 
 /// All that came out otherwise.
@@ -26,14 +28,19 @@ impl Difference {
         self.deviations.is_empty()
     }
 
+    /// The deviations that count for whoever forgives what is tolerated, or does not.
+    pub(crate) fn that_count(&self, forgives: bool) -> impl Iterator<Item = &Deviation> {
+        self.deviations.iter().filter(move |deviation| !(forgives && deviation.is_tolerated))
+    }
+
     /// Whether no deviation is about several facts at once.
     pub(super) fn is_of_single_facts(&self) -> bool {
-        self.deviations.iter().all(|deviation| deviation.pattern.arguments.iter().all(Option::is_some))
+        self.that_count(true).all(|deviation| deviation.pattern.arguments.iter().all(Option::is_some))
     }
 
     /// What changes now, but for the facts that differ within the tolerance only: those as they were taken to be.
     pub(super) fn keep_otherwise(&self, was: &[Change], is: &[Change]) -> Vec<Change> {
-        let differs = |key: &FactKey| self.deviations.iter().any(|deviation| deviation.pattern.matches(key));
+        let differs = |key: &FactKey| self.that_count(true).any(|deviation| deviation.pattern.matches(key));
         let before = Final::of(was);
         let kept = |change: &Change| match change {
             Change::Set { fact, .. } if !differs(fact) => match before.keys.get(fact) {
@@ -47,7 +54,7 @@ impl Difference {
 
     /// These facts are not known any more, or were not compared.
     pub(super) fn add_unknown(&mut self, patterns: impl IntoIterator<Item = FactPattern>) {
-        let unknown = |pattern| Deviation { pattern, was: None, is: None };
+        let unknown = |pattern| Deviation { pattern, was: None, is: None, is_tolerated: false };
         self.deviations.extend(patterns.into_iter().map(unknown));
     }
 
@@ -77,15 +84,15 @@ impl Difference {
                 None => elsewhere(key),
             };
             let (was, is) = (of(&before), of(&now));
-            let same = match (&was, &is) {
+            if was.is_some() && was == is {
+                continue;
+            }
+            let is_tolerated = match (&was, &is) {
                 (Some(Some(was)), Some(Some(is))) => tolerance(key).equal(was, is),
-                (Some(was), Some(is)) => was == is,
                 _ => false,
             };
-            if !same {
-                let pattern = FactPattern::of(key);
-                self.deviations.push(Deviation { pattern, was: was.flatten(), is: is.flatten() });
-            }
+            let pattern = FactPattern::of(key);
+            self.deviations.push(Deviation { pattern, was: was.flatten(), is: is.flatten(), is_tolerated });
         }
     }
 }
@@ -142,7 +149,7 @@ mod tests {
     fn differing(was: &[Change], is: &[Change], number: f64) -> Vec<String> {
         let mut difference = Difference::default();
         difference.add(was, is, |_| Tolerance { number, ..Tolerance::EXACT }, |_| None);
-        difference.deviations.iter().map(|deviation| deviation.pattern.to_string()).collect()
+        difference.that_count(true).map(|deviation| deviation.pattern.to_string()).collect()
     }
 
     #[test]

@@ -427,6 +427,7 @@ impl<'a> Sight<'a> {
             Some(arm) if link.vague => {
                 (0..own.effects.len().min(64)).filter(|n| writer.arms[arm].outcomes & (1 << n) != 0).collect()
             }
+            None if link.vague => (0..own.effects.len()).collect(),
             _ => smallvec::smallvec![link.outcome],
         };
         let of = |outcome: usize| match &own.effects[outcome] {

@@ -18,8 +18,17 @@ const MAX_VERSIONS: usize = 8;
 pub(super) struct Outside {
     /// What facts were that have changed within their tolerance.
     seen: BTreeMap<FactKey, Vec<Option<Value>>>,
-    /// Facts that are otherwise, and nobody was told.
-    news: Vec<FactPattern>,
+    /// Facts that have changed, and nobody was told.
+    news: News,
+}
+
+/// Facts that have changed from outside.
+#[derive(Debug, Default)]
+pub(crate) struct News {
+    /// At all.
+    pub(crate) changed: Vec<FactPattern>,
+    /// Beyond the tolerance of what anybody has seen.
+    pub(crate) otherwise: Vec<FactPattern>,
 }
 
 impl Memory {
@@ -35,6 +44,7 @@ impl Memory {
             if was == *now {
                 continue;
             }
+            self.outside.news.changed.push(FactPattern::of(key));
             let mut versions = self.outside.seen.remove(key).unwrap_or_default();
             if !versions.contains(&was) {
                 versions.push(was);
@@ -46,13 +56,13 @@ impl Memory {
             if versions.len() <= MAX_VERSIONS && versions.iter().all(is_close) {
                 self.outside.seen.insert(key.clone(), versions);
             } else {
-                self.outside.news.push(FactPattern::of(key));
+                self.outside.news.otherwise.push(FactPattern::of(key));
             }
         }
     }
 
-    /// The facts that are otherwise than anybody has seen them.
-    pub(crate) fn take_news_from_outside(&mut self) -> Vec<FactPattern> {
+    /// The facts that have changed since this was asked last.
+    pub(crate) fn take_news_from_outside(&mut self) -> News {
         std::mem::take(&mut self.outside.news)
     }
 }

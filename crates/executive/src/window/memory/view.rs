@@ -136,7 +136,7 @@ impl<'a> View<'a> {
         let outputs = self.sight.outputs_of(producer).filter(|_| self.counts(producer));
         if outputs.is_none()
             && let Some(instance) = self.sight.graph.get(producer.instance)
-            && (instance.ended().is_none() || self.only_settled)
+            && (instance.ended().is_none() || !self.counts(producer))
         {
             self.blocker.set(Some(instance.id));
         }

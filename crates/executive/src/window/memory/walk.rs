@@ -76,7 +76,9 @@ impl<'a> View<'a> {
         let graph = self.sight.graph;
         let mut open: SmallVec<[Next; 4]> = SmallVec::new();
         let push = |open: &mut SmallVec<[Next; 4]>, predicate: Predicate, link: Option<Link>| {
-            if let Some(link) = link.filter(|link| graph.contains(link.writer)) {
+            let Some(link) = link.filter(|link| graph.contains(link.writer)) else { return };
+            // Several ways, over regions, may lead to the same writer.
+            if !open.iter().any(|next| next.predicate == predicate && next.link.writer == link.writer) {
                 open.push(Next { predicate, link });
             }
         };
@@ -110,10 +112,22 @@ impl<'a> View<'a> {
         // A younger writer that has retired already hides those that still run beside it.
         for id in graph.detached().iter().rev().filter(|id| **id < self.instance.id && !beside.contains(id)) {
             if let Some(writer) = graph.get(*id)
-                && !visit(writer, Link { writer: *id, outcome: 0, vague: false })
+                && !visit(writer, self.link_beside(writer))
             {
                 return;
             }
+        }
+    }
+}
+
+impl View<'_> {
+    /// A running PIA that no chain leads to any more: along the arm that it has, or along any if its path was left.
+    fn link_beside(&self, writer: &Instance) -> Link {
+        let arms = &self.sight.plan.state(writer.state).arms;
+        let own = writer.arms.first().and_then(|own| arms.iter().find(|arm| arm.outcomes == own.outcomes));
+        match own {
+            Some(arm) => Link { writer: writer.id, outcome: arm.outcome, vague: !arm.same_effects },
+            None => Link { writer: writer.id, outcome: 0, vague: true },
         }
     }
 }

@@ -1,11 +1,8 @@
 //! What the states of random programs are annotated with: true, but often only in part.
 
-use super::generator::{Maker, Room, Visible, fact_at};
-use super::{AGAIN, ARGUMENTS, EMPTY, FOUND, PART, PREDICATES};
-use ratn_model::expression::{BinaryOperator, EffectExpr, Expr, FactExpr, UnaryOperator};
-use ratn_model::program::{ABORTED, Annotations, Exceptions, Nature, ResourceExpr, Retry, SUCCESS, WORLD_MODEL};
-use ratn_model::resource::{ResourceClass, ResourceOperation};
-use ratn_model::value::Value;
+use super::*;
+use ratn_model::program::{Nature, ResourceExpr, Retry, STOPPED, WORLD_MODEL};
+use ratn_model::resource::ResourceClass;
 
 impl Maker {
     /// Of an action.
@@ -86,6 +83,9 @@ impl Maker {
                 }
             }
         }
+        if !room.is_alone && self.features.incidents {
+            annotations.effects.insert(STOPPED.to_owned(), Vec::new());
+        }
         if !room.is_alone && annotations.nature == Nature::Irreversible {
             // `preempted`, too, writes nothing of another region.
             annotations.effects.insert("preempted".to_owned(), Vec::new());
@@ -100,14 +100,24 @@ impl Maker {
                 annotations.retry = Some(Retry { count: 1 + self.dice.below(2) as u32, backoff_s });
             }
             if self.dice.percent(10) {
-                annotations.timeout_s = Some(super::oracle::TIMEOUT_S);
+                annotations.timeout_s = Some(crate::oracle::TIMEOUT_S);
             }
+        }
+        if !room.is_preemptive {
+            self.supplies(&mut annotations, room, visible);
+            self.estimates(&mut annotations, visible);
         }
         annotations
     }
 
     /// A precondition that holds more often than not.
     pub(super) fn required(&mut self, room: &Room, visible: &Visible) -> Expr {
+        if self.features.blind {
+            return Expr::Literal(Value::Bool(true));
+        }
+        if self.features.facts && self.dice.percent(30) {
+            return self.query(room, visible);
+        }
         let fact = self.fact(&room.readable, visible);
         let number = |n: i64| Box::new(Expr::Literal(Value::Int(n)));
         let not = |e: Expr| Expr::Unary(UnaryOperator::Not, Box::new(e));
@@ -120,51 +130,6 @@ impl Maker {
             1 if self.features.effects => not(Expr::Exists(fact)),
             _ => not(Expr::Binary(BinaryOperator::Equal, Box::new(Expr::Fact(fact)), number(1))),
         }
-    }
-
-    pub(super) fn fact(&mut self, among: &[u64], visible: &Visible) -> FactExpr {
-        let argument = match self.dice.one_of(&visible.variables).cloned() {
-            Some(variable) if self.dice.percent(40) => Some(Expr::Variable(variable)),
-            _ if self.dice.percent(15) => None,
-            _ => Some(Expr::Literal(Value::Int(self.dice.below(ARGUMENTS) as i64))),
-        };
-        // Where nothing is left to read, something that nobody writes.
-        let predicate = self.dice.one_of(among).copied().unwrap_or(PREDICATES);
-        FactExpr { predicate: format!("p{predicate}"), arguments: vec![argument] }
-    }
-
-    pub(super) fn effect(&mut self, room: &Room, visible: &Visible, own_outputs: bool) -> EffectExpr {
-        if room.writable.is_empty() {
-            // Nothing to write: the effect that changes nothing.
-            return EffectExpr::Delete(fact_at(PREDICATES + 1, 0));
-        }
-        let mut fact = self.fact(&room.writable, visible);
-        if self.dice.percent(15) {
-            return EffectExpr::Delete(fact);
-        }
-        if fact.arguments[0].is_none() {
-            fact.arguments[0] = Some(Expr::Literal(Value::Int(0)));
-        }
-        if self.dice.percent(15) {
-            return EffectExpr::Increase(fact, Expr::Literal(Value::Int(1)));
-        }
-        if own_outputs && self.features.effects && self.dice.percent(15) {
-            let variable = "each".to_owned();
-            fact.arguments[0] = Some(Expr::Variable(variable.clone()));
-            let value = Expr::Literal(Value::Int(self.dice.below(3) as i64));
-            let collection = Expr::Output("list".to_owned());
-            return EffectExpr::ForEach { variable, collection, effects: vec![EffectExpr::Set(fact, value)] };
-        }
-        let value = match self.dice.below(4) {
-            0 if own_outputs => Expr::Output("x".to_owned()),
-            1 if own_outputs && !visible.ports.is_empty() => {
-                let state = visible.ports[self.dice.below(visible.ports.len() as u64) as usize];
-                Expr::Port { state, port: "x".to_owned() }
-            }
-            2 => Expr::Fact(self.fact(&room.readable, &Visible::default())),
-            _ => Expr::Literal(Value::Int(self.dice.below(3) as i64)),
-        };
-        EffectExpr::Set(fact, value)
     }
 }
 

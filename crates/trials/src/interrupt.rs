@@ -1,0 +1,109 @@
+//! Runs that somebody ends, or that run out of time, or in which the world changes at any moment.
+//!
+//! What is compared:
+//!
+//! | what happens | compared |
+//! |---|---|
+//! | the user ends the run when a PIA starts, no regions | both modes end alike: PIAs, changes, world, outcome |
+//! | the same with regions; at any moment; a deadline | of each mode: its PIAs are a closed part of those of HSM mode undisturbed, with the same goals and in its order; its changes are, predicate by predicate, the first of HSM mode's; without regions, they are its first changes in one order; the outcome is `preempted`, or `aborted` at the deadline, or the run had ended before, as ever |
+//! | the world changes at any moment | see [`super::outside`] |
+//!
+//! That nothing is left over in any of them the simulation checks by itself.
+
+use super::outside::trial_at_any_moment;
+use super::story::story;
+use super::trial::{Conditions, Verdict, closure, difference, execute_under, max_hsm_events, not_woken, same_end};
+use super::{Dice, is_preemptive};
+use ratn_executive::protocol::{Command, Event, LogEntry, Mode};
+use ratn_model::fact::Change;
+use ratn_model::program::{ABORTED, PREEMPTED, Program, StateKind};
+use ratn_simulation::run::{Run, RunError, Trigger};
+use std::sync::Arc;
+
+/// Runs the program undisturbed in HSM mode, then interrupted in both modes, and compares.
+pub fn trial_interrupted(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
+    let whole = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), Vec::new()) {
+        Ok(run) => run,
+        Err(RunError::Endless(_)) => return Verdict::LeftOut,
+        Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
+    };
+    let mut dice = Dice(conditions.seed ^ 0x1e77_0b7e);
+    let has_regions = program.states.iter().any(|state| matches!(state.kind, StateKind::Concurrency { .. }));
+    let ask = || Event::AbortRequested { reason: "that is enough".to_owned() };
+    let at = dice.below(1_000) as f64 / 1_000.0 * whole.end_s;
+    match dice.below(4) {
+        0 => {
+            let acts = story(program, &whole).acts;
+            if acts.is_empty() {
+                return Verdict::LeftOut;
+            }
+            let path = acts[dice.below(acts.len() as u64) as usize].path.clone();
+            parts(program, conditions, &whole, (&[(Trigger::Starts(path), ask())], PREEMPTED), !has_regions)
+        }
+        1 => parts(program, conditions, &whole, (&[(Trigger::At(at), ask())], PREEMPTED), false),
+        2 => {
+            let mut limited = (**program).clone();
+            limited.deadline_s = Some(at);
+            parts(&Arc::new(limited), conditions, &whole, (&[], ABORTED), false)
+        }
+        _ => trial_at_any_moment(program, conditions, &whole),
+    }
+}
+
+/// Both modes do the first of what HSM mode does undisturbed, end by this outcome, and maybe end alike.
+fn parts(
+    program: &Arc<Program>,
+    conditions: &Conditions,
+    whole: &Run,
+    (outside, outcome): (&[(Trigger, Event)], &str),
+    alike: bool,
+) -> Verdict {
+    let mut ends = Vec::new();
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let most = 60 * whole.log.len() + 10_000;
+        let part = match execute_under(program, conditions, mode, most, outside.to_vec()) {
+            Ok(run) => run,
+            Err(problem) => return Verdict::Differs(format!("{mode:?} mode, interrupted: {problem}")),
+        };
+        if let Some(problem) = is_no_part(program, whole, &part, outcome) {
+            return Verdict::Differs(format!("{mode:?} mode, interrupted: {problem}"));
+        }
+        ends.push(part);
+    }
+    let stories = (story(program, &ends[0]), story(program, &ends[1]));
+    if alike && let Some(problem) = difference(program, &ends[0], &ends[1], &stories) {
+        return Verdict::Differs(format!("interrupted at the same place: {problem}"));
+    }
+    if let Some(problem) = not_woken(program, conditions, 60 * whole.log.len() + 10_000, outside) {
+        return Verdict::Differs(problem);
+    }
+    Verdict::Same { hsm_s: ends[0].end_s, cdtn_s: ends[1].end_s, acts: stories.1.acts.len() }
+}
+
+fn is_no_part(program: &Program, whole: &Run, part: &Run, outcome: &str) -> Option<String> {
+    let (before, after) = (story(program, whole), story(program, part));
+    if let Some(problem) = closure(program, &before, &after) {
+        return Some(problem);
+    }
+    for (predicate, changes) in &after.changes {
+        let all = before.changes.get(predicate).map_or(&[][..], Vec::as_slice);
+        if !all.starts_with(changes) {
+            return Some(format!("what became real of {predicate}: {changes:?}, undisturbed {all:?}"));
+        }
+    }
+    let has_regions = program.states.iter().any(|state| matches!(state.kind, StateKind::Concurrency { .. }));
+    if !has_regions && !commits(whole).starts_with(&commits(part)) {
+        return Some("what became real is not the first of what does undisturbed".to_owned());
+    }
+    let is_cut = part.outcome == outcome && part.outputs.is_empty();
+    let races = program.states.iter().any(is_preemptive);
+    (!is_cut && !races).then(|| same_end(whole, part)).flatten()
+}
+
+fn commits(run: &Run) -> Vec<&Change> {
+    let commits = run.log.iter().filter_map(|line| match &line.entry {
+        LogEntry::Command(Command::Commit { changes, .. }) => Some(changes),
+        _ => None,
+    });
+    commits.flatten().collect()
+}

@@ -1,0 +1,56 @@
+//! Seeds keep their meaning: whatever the generator learns to make, the old features make the programs they always made.
+
+use ratn_trials::{Dice, Features, listing, program};
+
+/// FNV-1a over what the programs of the first seeds look like.
+fn fingerprint(features: &Features) -> u64 {
+    let mut sum = Dice(0);
+    for seed in 0..300 {
+        for byte in format!("{:?}", program(seed, features)).bytes() {
+            sum.0 = (sum.0 ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
+        }
+    }
+    sum.0
+}
+
+#[test]
+fn the_old_features_make_the_programs_they_always_made() {
+    let all = [Features::BASIC, Features::ALL, Features::WEAK].map(|features| fingerprint(&features));
+    assert_eq!(
+        all,
+        [10_389_196_769_696_335_920, 1_180_402_043_409_272_414, 7_919_185_597_585_669_513],
+        "a seed that was written down somewhere means another program now"
+    );
+}
+
+#[test]
+fn everything_is_made() {
+    let made: Vec<String> = (0..3_000).map(|seed| listing(&program(seed, &Features::EVERYTHING))).collect();
+    let expected = [
+        "with an ontology",
+        "$k0 = ",
+        "exists (",
+        "p20() + ",
+        "p21(?, ?)",
+        ", box)",
+        "p24(0).a",
+        "for each in list: for other in",
+        "increase p0(0) by -",
+        "by x * 0.5",
+        "if(exists p30(0), p30(0) <",
+        "tool where level",
+        "tool where has cuts",
+        "block 0.5 power",
+        "consume 0.125 battery",
+        "| duration ",
+        "| attempts 1",
+        "stopped",
+        "variables g",
+        "range(1000)",
+        "  c99 (",
+    ];
+    for text in expected {
+        let with = made.iter().filter(|listing| listing.contains(text)).count();
+        assert!(with > 0, "no program has `{text}`");
+    }
+}
