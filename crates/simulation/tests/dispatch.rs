@@ -145,6 +145,10 @@ fn what_an_undecided_condition_may_make_useless_comes_after_all_that_is_certain(
     assert!(
         ranked.iter().position(|path| path.ends_with("hard")) < ranked.iter().position(|path| path.ends_with("easy"))
     );
+    let planned = begun.executive.outlook(Timestamp::default()).tasks;
+    let speculative: Vec<f64> =
+        planned.iter().filter(|task| task.is_speculative).map(|task| task.probability).collect();
+    assert_eq!(speculative, [0.5, 0.5], "of two ways on that are alike one is planned, and what is behind");
     begun.grant(0, "look");
     begun.finish(1, "look", 1);
     assert!(begun.ranked()[0].ends_with("hard"), "once it is certain it asks again: {:?}", begun.ranked());
