@@ -22,6 +22,8 @@ const KILLS_A_TASK: u64 = 6;
 /// Between two kills.
 const PAUSE_MS: (u64, u64) = (50, 1_200);
 const MAX_RESUMPTIONS: usize = 8;
+/// So often that a run is resumed from one most of the time.
+const CHECKPOINTS: [&str; 2] = ["--checkpoint-every", "8"];
 /// Of the log of a run that did not end as it should.
 const LAST_LINES: usize = 40;
 
@@ -48,7 +50,8 @@ impl<'a> Task<'a> {
         let task = task.to_str().context("a path")?;
         let config = host.config();
         let settings = ["--set", "boxes=1", "--set", "budget=false", &config, "--mode", mode, "--log", &file];
-        let run = host.place.start_as(&format!("run-{number}"), &[["run", task].as_slice(), &settings].concat())?;
+        let arguments = [["run", task].as_slice(), &settings, &CHECKPOINTS].concat();
+        let run = host.place.start_as(&format!("run-{number}"), &arguments)?;
         Ok(Task { host, log, run, resumptions: 0 })
     }
 
@@ -75,7 +78,8 @@ impl<'a> Task<'a> {
     fn resume(&mut self) -> anyhow::Result<()> {
         self.resumptions += 1;
         let (name, file) = (format!("resumed-{}", self.resumptions), self.log.display().to_string());
-        self.run = self.host.place.start_as(&name, &["run", "--resume", &file, &self.host.config()])?;
+        let arguments = ["run", "--resume", &file, &self.host.config()];
+        self.run = self.host.place.start_as(&name, &[&arguments[..], &CHECKPOINTS].concat())?;
         Ok(())
     }
 

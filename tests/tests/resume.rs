@@ -44,7 +44,11 @@ fn a_run_whose_task_control_is_killed_goes_on_and_repeats_no_motion() -> anyhow:
     let task = task.to_str().context("a path")?;
     let log = place.path().join("log.jsonl");
     let file = log.to_str().context("a path")?;
-    let run = place.start(&["run", task, "--set", "boxes=2", "--set", "budget=false", "--log", file])?;
+    let often = ["--checkpoint-every", "5"];
+    let run = ["run", task, "--set", "boxes=2", "--set", "budget=false", "--log", file];
+    let run = place.start(&[&run[..], &often].concat())?;
+    let checkpoint = place.path().join("log.jsonl.checkpoint");
+    wait_for("a checkpoint", || Ok(checkpoint.exists().then_some(()))).with_context(|| run.said())?;
 
     // Once while the arm moves for the first time with a box before it, and once in the middle of the second part.
     wait_for_line(&log, "the arm to move to a box", |line| starts(line, "gripper")).with_context(|| run.said())?;
@@ -52,15 +56,18 @@ fn a_run_whose_task_control_is_killed_goes_on_and_repeats_no_motion() -> anyhow:
     drop(run);
     // As if it had been killed while it wrote.
     std::fs::OpenOptions::new().append(true).open(&log)?.write_all(b"{\"at\":1,\"eve")?;
-    let again = place.start_as("again", &["run", "--resume", file])?;
+    let again = place.start_as("again", &[&["run", "--resume", file][..], &often].concat())?;
     wait_for_line(&log, "a box to be delivered", |line| line["command"] == "operate").with_context(|| again.said())?;
     again.process()?.kill()?;
     let before = lines(&log).map(|lines| lines.len()).unwrap_or_default();
+    ensure!(again.said().contains("a checkpoint after"), "{}", again.said());
     drop(again);
 
     let output = place.ratn(&["run", "--resume", file, "--json"]).output()?;
     let (out, err) = texts(&output);
     ensure!(output.status.success(), "{err}");
+    // Each time from a checkpoint; a run that has ended leaves none.
+    ensure!(err.contains("a checkpoint after") && !checkpoint.exists(), "{err}");
     let result: Value = serde_json::from_str(&out)?;
     ensure!(result["outcome"] == "success" && result["outputs"]["delivered"] == 2, "{result}");
 

@@ -8,6 +8,7 @@ use ratn_model::measurement::Evidence;
 use ratn_model::program::Program;
 use ratn_model::time::Timestamp;
 use ratn_world::world::World;
+use serde::{Deserialize, Serialize};
 
 /// What every part of the executive works with.
 pub(crate) struct Context<'a> {
@@ -66,7 +67,7 @@ impl Context<'_> {
 }
 
 /// What a node has changed, and what measured which of it.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Made {
     pub(crate) changes: Vec<Change>,
     pub(crate) evidence: Evidence,

@@ -1,5 +1,9 @@
 //! One run of one task, in either mode.
 
+mod checkpoint;
+
+pub use checkpoint::RestoreError;
+
 use crate::context::Context;
 use crate::interpreter::{Interpreter, Progress};
 use crate::lookahead::Problem;
@@ -14,9 +18,10 @@ use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_world::world::World;
+use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 /// Executes one program once.
@@ -26,6 +31,8 @@ use std::time::Duration;
 pub struct Executive {
     program: Arc<Program>,
     plan: Arc<Plan>,
+    /// Of the program and its plan, where a checkpoint was made.
+    fingerprint: OnceLock<[u8; 32]>,
     tolerance: Tolerance,
     root: World,
     last_instance: u64,
@@ -35,6 +42,7 @@ pub struct Executive {
     state: State,
 }
 
+#[derive(Serialize, Deserialize)]
 enum State {
     Fresh,
     Hsm(Box<Interpreter>),
@@ -49,6 +57,7 @@ impl Executive {
         Executive {
             program,
             plan,
+            fingerprint: OnceLock::new(),
             tolerance,
             root: World::default(),
             last_instance: 0,
@@ -104,11 +113,16 @@ impl Executive {
         }
     }
 
-    /// Whether anything could go on that was not woken: everything that waits is looked at again. For tests; costs the whole window.
+    /// Whether anything could go on that was not woken: of a copy, everything that waits is looked at again. For tests; costs the
+    /// whole window.
     ///
     /// # Errors
     /// What could have gone on.
-    pub fn check_quiescence(&mut self, now: Timestamp) -> Result<(), String> {
+    pub fn check_quiescence(&self, now: Timestamp) -> Result<(), String> {
+        self.copy().map_err(|error| format!("its checkpoint: {error}"))?.look_at_all(now)
+    }
+
+    fn look_at_all(&mut self, now: Timestamp) -> Result<(), String> {
         let program = self.program.clone();
         let plan = self.plan.clone();
         let mut commands = Vec::new();

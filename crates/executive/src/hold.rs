@@ -1,7 +1,9 @@
 //! Pause and single step: whether PIAs may begin.
 
+use serde::{Deserialize, Serialize};
+
 /// What the operator lets begin.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub(crate) enum Hold {
     /// Everything.
     #[default]

@@ -22,6 +22,7 @@
 //! third each, growing the window by one, finding out that one may begin, and finishing and retiring one.
 
 mod binding;
+mod checkpoint;
 mod context;
 mod effects;
 pub mod executive;

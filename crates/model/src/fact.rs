@@ -1,12 +1,11 @@
 //! The names of facts: keys, patterns over keys, and bound changes. The facts themselves are kept in `ratn-world`.
 
 use crate::value::Value;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 
 /// An argument of a fact: an individual by name, or a whole number.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(untagged)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Term {
     /// A whole number.
     Int(i64),
@@ -69,6 +68,40 @@ pub enum Change {
 
 /// The predicates that the geometric scene is derived from; `reads: [scene]` stands for them.
 pub const SCENE_PREDICATES: [(&str, usize); 4] = [("at", 1), ("shape", 1), ("in_gripper", 1), ("on", 2)];
+
+/// As people write it, without saying which kind it is.
+#[derive(Serialize, Deserialize)]
+#[serde(remote = "Term", untagged)]
+enum WrittenTerm {
+    Int(i64),
+    Name(String),
+}
+
+/// In bytes, which do not say of themselves what they are.
+#[derive(Serialize, Deserialize)]
+#[serde(remote = "Term")]
+enum TaggedTerm {
+    Int(i64),
+    Name(String),
+}
+
+impl Serialize for Term {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match serializer.is_human_readable() {
+            true => WrittenTerm::serialize(self, serializer),
+            false => TaggedTerm::serialize(self, serializer),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Term {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Term, D::Error> {
+        match deserializer.is_human_readable() {
+            true => WrittenTerm::deserialize(deserializer),
+            false => TaggedTerm::deserialize(deserializer),
+        }
+    }
+}
 
 impl FactPattern {
     /// The pattern that matches only `key`.

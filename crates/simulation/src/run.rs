@@ -258,7 +258,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
         Trigger::At(seconds) => Some(Duration::from_secs_f64(seconds.max(0.0))),
         _ => None,
     });
-    for _ in 0..max_events {
+    for event in 1..=max_events {
         let Some(((now, _), entry)) = simulation.agenda.pop_first() else {
             return Err(RunError::Stuck { at_s: simulation.now.seconds(), waits: executive.explain() });
         };
@@ -277,6 +277,10 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
                 lookout.looks(outlook.tasks.len());
                 next = advice(&outlook, orders, setup.seed);
             }
+        }
+        if simulation.circumstances.checkpoint_every.is_some_and(|every| event % every == 0) {
+            let restored = Executive::restore(setup.program.clone(), setup.tolerance, &executive.checkpoint());
+            executive = restored.map_err(|problem| simulation.broken(format!("its checkpoint: {problem}")))?;
         }
         simulation.check(&executive)?;
         if simulation.circumstances.checks {

@@ -16,6 +16,7 @@ use ratn_model::resource::Quantity;
 use ratn_model::value::Value;
 use ratn_simulation::run::{Run, RunError};
 use std::collections::BTreeMap;
+use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use support::script::Script;
@@ -189,6 +190,37 @@ fn both_modes_end_alike() {
         }
     }
     assert!(different.is_empty(), "{} scenarios differ:\n{}", different.len(), different.join("\n"));
+}
+
+/// The first line of the log that is otherwise when the executive is made anew from a checkpoint after every so many events.
+fn otherwise_from_checkpoints(scenario: &Scenario, name: &str, plain: &Run, every: usize) -> Option<String> {
+    let mode = if name == "hsm" { Mode::Hsm } else { Mode::Cdtn };
+    let mut script = scenario.script.clone();
+    script.checkpoint_every = NonZeroUsize::new(every);
+    let again = match script.run(&scenario.program, mode) {
+        Ok(again) => again,
+        Err(problem) => return Some(problem.to_string()),
+    };
+    let differ = plain.log.iter().zip(&again.log).find(|(plain, again)| plain != again);
+    differ
+        .map(|(plain, again)| format!("{plain:?}\nis now\n{again:?}"))
+        .or_else(|| (plain != &again).then(|| "the ends".to_owned()))
+}
+
+#[test]
+fn every_scenario_goes_the_same_from_checkpoints() {
+    let mut different = Vec::new();
+    for scenario in scenarios() {
+        for (name, plain, _) in &scenario.runs {
+            let Ok(plain) = plain else { continue };
+            for every in [1, 2, 3, 7] {
+                if let Some(what) = otherwise_from_checkpoints(scenario, name, plain, every) {
+                    different.push(format!("{} in mode {name}, after every {every}:\n{what}", scenario.name()));
+                }
+            }
+        }
+    }
+    assert!(different.is_empty(), "{} runs differ:\n{}", different.len(), different.join("\n"));
 }
 
 #[test]

@@ -12,7 +12,7 @@
 
 use super::outside::trial_at_any_moment;
 use super::story::story;
-use super::trial::{Conditions, Verdict, closure, difference, execute_under, max_hsm_events, not_woken, same_end};
+use super::trial::{Conditions, Verdict, closure, difference, execute_under, max_hsm_events, same_end};
 use super::{Dice, is_preemptive};
 use ratn_executive::protocol::{Command, Event, LogEntry, Mode};
 use ratn_model::fact::Change;
@@ -73,9 +73,6 @@ fn parts(
     let stories = (story(program, &ends[0]), story(program, &ends[1]));
     if alike && let Some(problem) = difference(program, &ends[0], &ends[1], &stories) {
         return Verdict::Differs(format!("interrupted at the same place: {problem}"));
-    }
-    if let Some(problem) = not_woken(program, conditions, 60 * whole.log.len() + 10_000, outside) {
-        return Verdict::Differs(problem);
     }
     Verdict::Same { hsm_s: ends[0].end_s, cdtn_s: ends[1].end_s, acts: stories.1.acts.len() }
 }

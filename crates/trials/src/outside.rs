@@ -10,7 +10,7 @@
 //!   left over, and no PIA was undone or started twice with the same goal.
 
 use super::story::story;
-use super::trial::{Conditions, Verdict, compare, execute_under, max_hsm_events, not_woken, problem};
+use super::trial::{Conditions, Verdict, compare, execute_under, max_hsm_events, problem};
 use super::{Dice, is_preemptive, state_of};
 use super::{around, weak};
 use ratn_executive::protocol::{Command, Event, LogEntry, Mode};
@@ -60,9 +60,6 @@ pub(super) fn trial_at_any_moment(program: &Arc<Program>, conditions: &Condition
         Ok(run) => run,
         Err(problem) => return Verdict::Differs(format!("CDTN mode: {problem}")),
     };
-    if let Some(problem) = not_woken(program, conditions, most, &[(Trigger::At(at), event.clone())]) {
-        return Verdict::Differs(problem);
-    }
     let told = story(program, &cdtn);
     if let Some(path) = told.undone.first() {
         return Verdict::Differs(format!("{path} was discarded or computed again after it had started"));

@@ -15,6 +15,7 @@ use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_simulation::run::{Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
 use std::collections::{BTreeMap, BTreeSet};
+use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -144,7 +145,7 @@ pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: 
         problem(program, &hsm, &cdtn, &stories)
     };
     let problem = problem.or_else(|| against_reference(program, conditions, outside, (&hsm, &cdtn), &stories));
-    match problem.or_else(|| not_woken(program, conditions, events, outside)) {
+    match problem {
         Some(problem) => Verdict::Differs(problem),
         None => Verdict::Same { hsm_s: hsm.end_s, cdtn_s: cdtn.end_s, acts: stories.1.acts.len() },
     }
@@ -251,21 +252,6 @@ pub(super) fn execute_under(
     }
 }
 
-/// Who could have gone on in CDTN mode and was not woken, if anybody. Long programs are not examined, which would take minutes.
-pub(super) fn not_woken(
-    program: &Arc<Program>,
-    conditions: &Conditions,
-    max_events: usize,
-    outside: &[(Trigger, Event)],
-) -> Option<String> {
-    if is_long(program) {
-        return None;
-    }
-    let circumstances = Circumstances { examines: true, max_events, ..circumstances(program, conditions) };
-    let run = run_as(program, conditions, Mode::Cdtn, outside.to_vec(), circumstances);
-    run.err().map(|problem| format!("CDTN mode, examined: {problem}"))
-}
-
 fn circumstances(program: &Program, conditions: &Conditions) -> Circumstances {
     let seed = conditions.seed;
     let percent = conditions.mischief_percent;
@@ -273,7 +259,10 @@ fn circumstances(program: &Program, conditions: &Conditions) -> Circumstances {
         orders: conditions.orders,
         events: if conditions.pauses { pauses(seed) } else { Vec::new() },
         mischief: Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent },
+        // Long programs are not examined, which would take minutes.
         checks: !is_long(program),
+        examines: !is_long(program),
+        checkpoint_every: (!is_long(program)).then(|| checkpoint_every(seed)),
         refused: refused(program, conditions),
         learned: if conditions.learned { learned(program, seed) } else { Learned::default() },
         attributes: attributes(),
@@ -328,6 +317,12 @@ fn learned(program: &Program, seed: u64) -> Learned {
         }
     }
     learned
+}
+
+/// Often, seldom or in between: what is replayed from the log is never interrupted so.
+fn checkpoint_every(seed: u64) -> NonZeroUsize {
+    let some = NonZeroUsize::MIN;
+    some.saturating_add(Dice(seed ^ 0xc4ec).below(30) as usize)
 }
 
 /// A pause, a step and what ends both.

@@ -149,7 +149,7 @@ const FURTHER: u64 = 1 << 41;
 
 #[test]
 fn random_programs_of_everything_leave_the_same_world_in_both_modes() {
-    let sum = none_fails(trial, FURTHER, 600, &Features::EVERYTHING);
+    let sum = none_fails(trial, FURTHER, 400, &Features::EVERYTHING);
     assert!(sum.left_out * 10 <= sum.programs, "{} of {} programs are too long to compare", sum.left_out, sum.programs);
 }
 
@@ -171,7 +171,7 @@ fn without_the_theorem_s_assumptions_what_acts_is_still_decided_and_final() {
 /// Nothing looks at the world, imprecise motions fail: the outcomes are HSM mode's all the same.
 #[test]
 fn where_an_imprecise_motion_s_failure_leads_is_the_same_in_both_modes() {
-    none_fails(trial, FURTHER, 500, &Features::IMPRECISE);
+    none_fails(trial, FURTHER, 300, &Features::IMPRECISE);
 }
 
 #[test]

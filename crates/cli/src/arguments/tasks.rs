@@ -1,6 +1,7 @@
 //! What is said of tasks: how they are checked, run, steered, reported and simulated, and of planning problems.
 
 use super::values::{chart, makespan, padding, setting, speed};
+use crate::task_control::checkpoint::EVERY_EVENTS;
 use crate::task_control::control::Word;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
@@ -74,6 +75,9 @@ pub(crate) struct RunArguments {
     /// Robot's seconds per second; a running system's own or the config's unless given
     #[arg(long, value_name = "X", value_parser = speed)]
     pub(crate) speed: Option<f64>,
+    /// Write a checkpoint beside the event log after so many events, for a quick `--resume`; 0: none
+    #[arg(long, value_name = "EVENTS", default_value_t = EVERY_EVENTS)]
+    pub(crate) checkpoint_every: u64,
     /// Print one JSON document on standard output
     #[arg(long)]
     pub(crate) json: bool,

@@ -154,6 +154,8 @@ async fn one_run(
         learned: Default::default(),
         log: log_file.clone(),
         quiet: false,
+        // The system ends with the demo: nobody resumes it.
+        checkpoint_every: 0,
     };
     let system = starting(System::start_private(config), interrupt).await?;
     let (ended, (delivered, greatest_tilt_rad)) =

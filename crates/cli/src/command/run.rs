@@ -97,6 +97,7 @@ async fn begin(arguments: &RunArguments, task: &Path, directory: &Path, interrup
         learned,
         log: log.clone(),
         quiet: false,
+        checkpoint_every: arguments.checkpoint_every,
     };
     let ended = on_system(run, system, interrupt, async |_| Ok(())).await;
     output::progress(format_args!("event log: {}", log.display()));

@@ -5,13 +5,21 @@ use super::record::Decided;
 use ratn_executive::protocol::{Command, Event, Goal, Origin};
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
-use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
+use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+/// A checkpoint keeps so many commits and operations although the daemons have confirmed them: a daemon that was killed without
+/// durable storage may have lost the last of them, and they are then repeated.
+const KEPT: usize = 256;
+/// A checkpoint keeps so many of the last withdrawn requests. An older one was answered long ago: the resource manager lets no
+/// session wait for more at a time (`waiters_per_session`).
+const KEPT_WITHDRAWN: usize = 4096;
+
 /// The open items of a run.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Ledger {
     pub(super) origin: Origin,
     /// The root's revision when the run began.
@@ -29,24 +37,37 @@ pub(super) struct Ledger {
     pub(super) withdrawn: Vec<String>,
     /// Leases that were granted and not given back, with what they consumed beside.
     pub(super) held: BTreeSet<LeaseId>,
-    /// What acquires have used up for the rest of the run.
+    /// What acquires, and operations that were forgotten, have used up for the rest of the run.
     pub(super) consumed: Vec<Requirement>,
     /// Projections that were asked for.
     pub(super) projecting: BTreeMap<InstanceId, Projecting>,
     /// Goals under way.
     pub(super) goals: BTreeMap<InstanceId, (u32, Goal)>,
-    /// Every commit, in order.
+    /// Every commit, in order, without those that were forgotten.
     pub(super) commits: Vec<Decided>,
-    /// Everything that was created, deleted and consumed at retirements, in order, with its number.
+    /// How many commits were forgotten, all older than the others: see [`Ledger::forget`].
+    pub(super) forgotten: u64,
+    /// Everything that was created, deleted and consumed at retirements, in order, with its number, without what was forgotten.
     pub(super) operated: Vec<(u64, InstanceId, Vec<Requirement>)>,
+    /// What the forgotten operations have created that was not deleted by another of them.
+    pub(super) left: Vec<Requirement>,
     /// When the executive wants to be woken.
     pub(super) wakes: BTreeSet<Timestamp>,
     /// The run's outcome, once it has ended.
     pub(super) ended: Option<String>,
 }
 
+/// How far the daemons have confirmed what the run has decided, which they do in order.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Confirmed {
+    /// The world pool, by the revision of a commit.
+    pub(super) commit: Revision,
+    /// The resource manager, by the number of an operation.
+    pub(super) operation: u64,
+}
+
 /// An acquire.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Asked {
     /// Its request id, as sent last.
     pub(super) request: String,
@@ -56,7 +77,7 @@ pub(super) struct Asked {
 }
 
 /// A projection that is being made.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Projecting {
     pub(super) attempt: u32,
     pub(super) base: Revision,
@@ -163,17 +184,40 @@ impl Ledger {
         }
     }
 
+    /// Leaves out what was confirmed long ago, so that the ledger does not grow with the run. What operations came to is kept.
+    /// A world pool that has none of the commits left needs older ones: they are in the log.
+    pub(super) fn forget(&mut self, confirmed: Confirmed) {
+        self.forget_but(KEPT, confirmed);
+    }
+
+    fn forget_but(&mut self, kept: usize, confirmed: Confirmed) {
+        let commits = self.commits.iter().take_while(|decided| decided.revision <= confirmed.commit).count();
+        let commits = commits.saturating_sub(kept);
+        self.commits.drain(..commits);
+        self.forgotten += commits as u64;
+
+        let operated = self.operated.iter().take_while(|(number, ..)| *number <= confirmed.operation).count();
+        let mut used_up = Vec::new();
+        for (_, _, operations) in self.operated.drain(..operated.saturating_sub(kept)) {
+            for operation in operations {
+                create_or_delete(&mut self.left, &operation);
+                if operation.operation == ResourceOperation::Consume {
+                    used_up.push(operation);
+                }
+            }
+        }
+        used_up.append(&mut self.consumed);
+        used_up.into_iter().for_each(|consumption| add_up(&mut self.consumed, consumption));
+
+        self.withdrawn.drain(..self.withdrawn.len().saturating_sub(KEPT_WITHDRAWN));
+    }
+
     /// What the run has created and not deleted again, for a session that has to be made anew: with the old one it is gone.
     /// What others had created and the run has deleted stays away.
     pub(super) fn created(&self) -> Vec<Requirement> {
-        let mut left: Vec<Requirement> = Vec::new();
-        for operation in self.operated.iter().flat_map(|(_, _, operations)| operations) {
-            match operation.operation {
-                ResourceOperation::Create => left.push(operation.clone()),
-                ResourceOperation::Delete => delete(&mut left, operation),
-                _ => {}
-            }
-        }
+        let mut left = self.left.clone();
+        let operations = self.operated.iter().flat_map(|(_, _, operations)| operations);
+        operations.for_each(|operation| create_or_delete(&mut left, operation));
         left
     }
 
@@ -181,6 +225,25 @@ impl Ledger {
     pub(super) fn used_up(&self) -> impl Iterator<Item = &Requirement> {
         let retired = self.operated.iter().flat_map(|(_, _, operations)| operations);
         retired.filter(|r| r.operation == ResourceOperation::Consume).chain(&self.consumed)
+    }
+}
+
+fn create_or_delete(left: &mut Vec<Requirement>, operation: &Requirement) {
+    match operation.operation {
+        ResourceOperation::Create => left.push(operation.clone()),
+        ResourceOperation::Delete => delete(left, operation),
+        _ => {}
+    }
+}
+
+/// Using up twice is using up the sum.
+fn add_up(consumed: &mut Vec<Requirement>, consumption: Requirement) {
+    let same = |other: &&mut Requirement| **other == Requirement { count: other.count, ..consumption.clone() };
+    let sum = |other: &Requirement| other.count.thousandths().checked_add(consumption.count.thousandths());
+    let fits = |sum: &u64| *sum <= Quantity::MAX.thousandths();
+    match consumed.iter_mut().find(same) {
+        Some(other) if let Some(sum) = sum(other).filter(fits) => other.count = Quantity::from_thousandths(sum),
+        _ => consumed.push(consumption),
     }
 }
 
@@ -282,5 +345,57 @@ mod tests {
         ];
         ledger.command(&Command::Operate { instance: InstanceId(1), operations });
         assert_eq!(ledger.created(), [requirement(Create, "Box", 1)]);
+    }
+
+    #[test]
+    fn what_is_forgotten_has_come_to_the_same() {
+        use ResourceOperation::{Consume, Create, Delete};
+        let committed = |number: u64| Command::Commit {
+            instance: InstanceId(number),
+            writer: String::new(),
+            changes: Vec::new(),
+            evidence: Vec::new(),
+            revision: Revision(number),
+        };
+        let operations = |number: u64| {
+            vec![
+                requirement(Create, "Box", 2),
+                requirement(Delete, if number.is_multiple_of(3) { "Foreign" } else { "Box" }, 1),
+                requirement(Consume, "Energy", 3),
+                requirement(Consume, if number.is_multiple_of(2) { "Water" } else { "Glue" }, 1),
+            ]
+        };
+        let totals = |ledger: &Ledger| {
+            let mut totals: BTreeMap<String, u64> = BTreeMap::new();
+            for used in ledger.used_up() {
+                *totals.entry(used.kind.clone()).or_default() += used.count.thousandths();
+            }
+            totals
+        };
+        let (mut whole, mut short) = (Ledger::default(), Ledger::default());
+        for number in 1..=200 {
+            for ledger in [&mut whole, &mut short] {
+                ledger.command(&committed(number));
+                let (instance, operations) = (InstanceId(number), operations(number));
+                ledger.command(&Command::Operate { instance, operations });
+                ledger.command(&Command::Acquire {
+                    instance,
+                    requirements: vec![requirement(Consume, "Energy", 1)],
+                    priority: 0,
+                });
+                ledger.event(Timestamp(number), &Event::Granted { instance, lease: lease(number) });
+                ledger.command(&Command::Release { instance, lease: Some(LeaseId(number)), projection: None });
+            }
+            // The daemons are behind, the world pool further.
+            let confirmed = Confirmed { commit: Revision(number / 2), operation: number.saturating_sub(3) };
+            short.forget_but(4, confirmed);
+            assert_eq!(short.created(), whole.created());
+            assert_eq!(totals(&short), totals(&whole));
+            // Whatever is not confirmed is there, and a few besides.
+            let commits = (number / 2).saturating_sub(4);
+            assert_eq!((short.forgotten, &short.commits[..]), (commits, &whole.commits[commits as usize..]));
+            assert_eq!(short.operated, whole.operated[number.saturating_sub(7) as usize..]);
+        }
+        assert_eq!(short.consumed.len(), 3, "it does not grow with the run");
     }
 }

@@ -7,7 +7,7 @@
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::time::Timestamp;
 use std::fs::{File, OpenOptions, TryLockError};
-use std::io::{BufRead, BufReader, BufWriter, Read, Write};
+use std::io::{BufRead, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 /// A longer line is not written by any task; whoever wrote it is not `ratn`.
@@ -37,7 +37,9 @@ pub(crate) enum LogError {
 pub(crate) struct LogWriter {
     path: PathBuf,
     file: BufWriter<File>,
+    /// How many bytes and lines are written.
     written: u64,
+    lines: usize,
     /// It is on a disk, so that it can be made safe there.
     on_disk: bool,
     /// What was behind the last whole line is away.
@@ -61,13 +63,36 @@ impl LogWriter {
         Ok(writer)
     }
 
-    /// Goes on with a log, of which nobody else is the writer; and what it says. A torn line is cut off before the first line
-    /// is written.
-    pub(crate) fn go_on(path: &Path) -> Result<(Self, Log), LogError> {
+    /// For a log that is gone on with: from here on nobody else is its writer. [`LogWriter::go_on_behind`] says where.
+    pub(crate) fn go_on(path: &Path) -> Result<Self, LogError> {
         let mut writer = LogWriter::open(path, OpenOptions::new().append(true), "go on with")?;
-        let log = read(path)?;
-        writer.written = log.whole;
-        Ok((writer, log))
+        writer.written = writer.file.get_ref().metadata().map_err(|source| writer.io(source))?.len();
+        Ok(writer)
+    }
+
+    /// Goes on behind the whole lines of what was read. A torn line is cut off before the first line is written.
+    pub(crate) fn go_on_behind(&mut self, log: &Log) {
+        (self.written, self.lines) = (log.whole, log.before + log.lines.len());
+    }
+
+    /// Where the log is.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Whether it is a file, which can be read again.
+    pub(crate) fn is_on_disk(&self) -> bool {
+        self.on_disk
+    }
+
+    /// How many bytes it has.
+    pub(crate) fn written(&self) -> u64 {
+        self.written
+    }
+
+    /// How many lines it has.
+    pub(crate) fn lines(&self) -> usize {
+        self.lines
     }
 
     fn open(path: &Path, options: &OpenOptions, what: &'static str) -> Result<Self, LogError> {
@@ -80,7 +105,14 @@ impl LogWriter {
                 TryLockError::Error(source) => io(source),
             })?;
         }
-        Ok(LogWriter { path: path.to_owned(), file: BufWriter::new(file), written: 0, on_disk, is_cut: false })
+        Ok(LogWriter {
+            path: path.to_owned(),
+            file: BufWriter::new(file),
+            written: 0,
+            lines: 0,
+            on_disk,
+            is_cut: false,
+        })
     }
 
     fn cut(&mut self) -> Result<(), LogError> {
@@ -118,6 +150,7 @@ impl LogWriter {
         text.push(b'\n');
         self.cut()?;
         self.written += text.len() as u64;
+        self.lines += 1;
         if self.written > MAX_LOG_BYTES {
             return Err(LogError::TooLong { path: self.path.clone() });
         }
@@ -133,9 +166,11 @@ impl LogWriter {
 #[derive(Debug)]
 pub(crate) struct Log {
     pub(crate) lines: Vec<LogLine>,
+    /// How many lines are before these and were not read.
+    pub(crate) before: usize,
     /// The number of its last line if that is torn, which is not among the others.
     pub(crate) torn: Option<usize>,
-    /// How many bytes the whole lines have.
+    /// How many bytes the whole lines have, those that were not read among them.
     pub(crate) whole: u64,
 }
 
@@ -144,19 +179,47 @@ pub(crate) struct Log {
 /// # Errors
 /// [`LogError`] names the line.
 pub(crate) fn read(path: &Path) -> Result<Log, LogError> {
+    let log = read_from(path, 0, 0, usize::MAX)?;
+    if log.lines.is_empty() {
+        return Err(LogError::Empty { path: path.to_owned() });
+    }
+    Ok(log)
+}
+
+/// Reads what is behind so many bytes, which are so many lines.
+///
+/// # Errors
+/// As [`read`].
+pub(super) fn read_behind(path: &Path, bytes: u64, lines: usize) -> Result<Log, LogError> {
+    read_from(path, bytes, lines, usize::MAX)
+}
+
+/// Reads the first line.
+///
+/// # Errors
+/// As [`read`].
+pub(super) fn first(path: &Path) -> Result<LogLine, LogError> {
+    read_from(path, 0, 0, 1)?.lines.pop().ok_or_else(|| LogError::Empty { path: path.to_owned() })
+}
+
+fn read_from(path: &Path, bytes: u64, before: usize, at_most: usize) -> Result<Log, LogError> {
     let io = |source| LogError::Io { what: "read", path: path.to_owned(), source };
-    let mut reader = BufReader::new(File::open(path).map_err(io)?);
+    let mut file = File::open(path).map_err(io)?;
+    if bytes > 0 {
+        file.seek(SeekFrom::Start(bytes)).map_err(io)?;
+    }
+    let mut reader = BufReader::new(file);
     let mut lines = Vec::new();
-    let (mut torn, mut whole) = (None, 0);
+    let (mut torn, mut whole) = (None, bytes);
     let mut text = Vec::new();
-    loop {
+    while lines.len() < at_most {
         text.clear();
         let limit = MAX_LINE_BYTES as u64 + 1;
         let length = reader.by_ref().take(limit).read_until(b'\n', &mut text).map_err(io)?;
         if length == 0 {
             break;
         }
-        let line = lines.len() + 1;
+        let line = before + lines.len() + 1;
         let foreign = |reason: String| LogError::Foreign { path: path.to_owned(), line, reason };
         if text.last() != Some(&b'\n') {
             if length as u64 == limit {
@@ -166,16 +229,13 @@ pub(crate) fn read(path: &Path) -> Result<Log, LogError> {
             break;
         }
         let parsed: LogLine = serde_json::from_slice(&text).map_err(|error| foreign(explain(&text, &error)))?;
-        if lines.is_empty() && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
+        if line == 1 && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
             return Err(foreign("an event log begins with the event `started`".into()));
         }
         lines.push(parsed);
         whole += length as u64;
     }
-    if lines.is_empty() {
-        return Err(LogError::Empty { path: path.to_owned() });
-    }
-    Ok(Log { lines, torn, whole })
+    Ok(Log { lines, before, torn, whole })
 }
 
 /// serde's message for an untagged enum says nothing; this one says what the line claims to be.
@@ -267,7 +327,8 @@ mod tests {
         let log = read(file.path()).unwrap();
         assert_eq!((log.lines.len(), log.torn), (1, Some(2)));
         // Who goes on with it writes over the torn line.
-        let (mut writer, _) = LogWriter::go_on(file.path()).unwrap();
+        let mut writer = LogWriter::go_on(file.path()).unwrap();
+        writer.go_on_behind(&log);
         writer.append(Timestamp(2), &Event::Resumed, &[]).unwrap();
         writer.make_durable().unwrap();
         let log = read(file.path()).unwrap();

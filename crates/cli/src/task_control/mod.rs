@@ -1,7 +1,9 @@
 //! Task control: the shell around the executive. Performs its commands over gRPC and brings the answers back as events.
 
 mod advisor;
+pub(crate) mod checkpoint;
 pub(crate) mod control;
+pub(crate) mod history;
 pub(crate) mod learn;
 mod ledger;
 pub(crate) mod log;

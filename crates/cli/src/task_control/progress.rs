@@ -1,20 +1,27 @@
 //! What a run is doing, one line per node that starts or ends, on standard error.
 
 use crate::output;
-use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Note};
+use ratn_executive::protocol::{Command, Event, Note};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, WORLD_MODEL};
 use ratn_model::time::Timestamp;
-use std::collections::BTreeMap;
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, VecDeque};
 
 /// Of one change from outside so many facts are said.
 const MOST_FACTS: usize = 5;
+/// The paths of so many instances that have left the window are known, so that they do not grow with the run.
+const MOST_GONE: usize = 1024;
 
 /// Follows events and commands and prints.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Progress {
+    /// Of the instances that are in the window, and of those that have left it last.
     paths: BTreeMap<InstanceId, String>,
+    /// Those that have left it, the oldest first.
+    gone: VecDeque<InstanceId>,
     started: BTreeMap<InstanceId, Timestamp>,
+    #[serde(skip)]
     quiet: bool,
 }
 
@@ -24,17 +31,40 @@ impl Progress {
         Progress { quiet, ..Progress::default() }
     }
 
-    /// Knows what was said before of a run that goes on, and says nothing of it again.
-    pub(crate) fn catch_up(&mut self, lines: &[LogLine]) {
-        for line in lines {
-            match &line.entry {
-                LogEntry::Event(Event::Finished { instance, .. }) => drop(self.started.remove(instance)),
-                LogEntry::Event(_) => {}
-                LogEntry::Command(Command::Note(Note::Expanded { instance, path, .. })) => {
+    /// Knows of one step of a run that goes on, and says nothing of it again.
+    pub(crate) fn catch_up<'a>(
+        &mut self,
+        at: Timestamp,
+        event: &Event,
+        commands: impl Iterator<Item = &'a Command> + Clone,
+    ) {
+        if let Event::Finished { instance, .. } = event {
+            self.started.remove(instance);
+        }
+        for command in commands.clone() {
+            match command {
+                Command::Note(Note::Expanded { instance, path, .. }) => {
                     self.paths.insert(*instance, path.clone());
                 }
-                LogEntry::Command(Command::Start { instance, .. }) => drop(self.started.insert(*instance, line.at)),
-                LogEntry::Command(_) => {}
+                Command::Note(Note::Invalidated { instance, .. }) => drop(self.started.remove(instance)),
+                Command::Start { instance, .. } => drop(self.started.insert(*instance, at)),
+                _ => {}
+            }
+        }
+        self.forget(commands);
+    }
+
+    /// Of an instance that has left the window only a failure to make it real can still be told.
+    fn forget<'a>(&mut self, commands: impl Iterator<Item = &'a Command>) {
+        for command in commands {
+            if let Command::Note(Note::Retired { instance } | Note::Squashed { instance }) = command {
+                self.started.remove(instance);
+                self.gone.push_back(*instance);
+                if self.gone.len() > MOST_GONE
+                    && let Some(oldest) = self.gone.pop_front()
+                {
+                    self.paths.remove(&oldest);
+                }
             }
         }
     }
@@ -42,7 +72,7 @@ impl Progress {
     /// Prints what there is to say of one step.
     pub(crate) fn follow(&mut self, at: Timestamp, event: &Event, commands: &[Command]) {
         if self.quiet {
-            return;
+            return self.catch_up(at, event, commands.iter());
         }
         match event {
             Event::Finished { instance, outcome, reason, .. } => {
@@ -122,6 +152,7 @@ impl Progress {
                 _ => {}
             }
         }
+        self.forget(commands.iter());
     }
 
     /// What is known of an instance that waits for resources; `None` where nothing is printed.

@@ -1,7 +1,7 @@
 //! What must reach the world pool and the resource manager in the order in which it was decided: projections, commits,
 //! creation and deletion of task resources. One task, one request at a time.
 
-use super::ledger::operation_request;
+use super::ledger::{Confirmed, operation_request};
 use super::performer::Answer;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::{Change, Footprint};
@@ -11,6 +11,7 @@ use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_proto::types::Resource;
 use ratn_worker::client::patiently;
 use ratn_worker::client::{CallError, Commit, Projection, ResourceClient, WorldClient};
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
 use tokio::sync::{mpsc, oneshot};
@@ -48,7 +49,7 @@ pub(super) enum Record {
 }
 
 /// What an instance has changed, to become real.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Decided {
     pub(super) instance: InstanceId,
     /// By path.
@@ -76,12 +77,16 @@ impl Decided {
 /// Attempts whose projection nobody waits for any more.
 pub(super) type Cancelled = Arc<Mutex<BTreeSet<(InstanceId, u32)>>>;
 
+/// How far the recorder is.
+pub(super) type Recorded = Arc<Mutex<Confirmed>>;
+
 /// The task that does it.
 pub(super) struct Recorder {
     pub(super) run: String,
     pub(super) world: WorldClient,
     pub(super) resources: ResourceClient,
     pub(super) cancelled: Cancelled,
+    pub(super) done: Recorded,
     pub(super) events: mpsc::Sender<Answer>,
     /// The pool's root as far as it is known: what the run's own revisions come to there, and what it was told of others'.
     pub(super) root: Revision,
@@ -92,6 +97,7 @@ impl Recorder {
     pub(super) async fn work(mut self, mut records: mpsc::Receiver<Record>) {
         let mut recorded = Ok(());
         while let Some(record) = records.recv().await {
+            let confirms = confirms(&record);
             let event = match record {
                 Record::Project { instance, attempt, base, changes, writers, reads, lease } => {
                     let request = format!("{}/{instance}/{attempt}", self.run);
@@ -114,12 +120,22 @@ impl Recorder {
             if let (Some(Event::RetirementFailed { reason, .. }), Ok(())) = (&event, &recorded) {
                 recorded = Err(reason.clone());
             }
+            // Nothing behind a failure counts: what is confirmed is confirmed without a gap.
+            if recorded.is_ok() {
+                self.confirm(confirms);
+            }
             if let Some(event) = event
                 && self.events.send(event.into()).await.is_err()
             {
                 return;
             }
         }
+    }
+
+    fn confirm(&self, confirmed: Confirmed) {
+        let mut done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
+        done.commit = done.commit.max(confirmed.commit);
+        done.operation = done.operation.max(confirmed.operation);
     }
 
     async fn project(&self, instance: InstanceId, attempt: u32, wanted: Projection) -> Option<Event> {
@@ -162,6 +178,15 @@ impl Recorder {
             }
         }
         None
+    }
+}
+
+/// What is confirmed once a record is done.
+fn confirms(record: &Record) -> Confirmed {
+    match record {
+        Record::Commit(decided) => Confirmed { commit: decided.revision, ..Confirmed::default() },
+        Record::Operate { number, .. } => Confirmed { operation: *number, ..Confirmed::default() },
+        _ => Confirmed::default(),
     }
 }
 

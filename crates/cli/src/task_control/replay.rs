@@ -1,6 +1,8 @@
 //! A run's log, replayed through a new executive: the same events give the same commands, so it then stands where the one that
-//! was killed stood. A log that says otherwise is of another program and is refused. Pure.
+//! was killed stood. With a checkpoint only the lines behind it are replayed. A log that says otherwise is of another program and
+//! is refused. Pure.
 
+use super::checkpoint::{Checkpoint, Standing};
 use super::ledger::Ledger;
 use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Note};
@@ -34,45 +36,87 @@ pub(crate) enum ReplayError {
          another catalogue, or has been edited"
     )]
     Otherwise { line: usize, theirs: String, ours: String },
+    #[error("the executive's state cannot be restored: {reason}")]
+    Restore { reason: String },
 }
 
 /// Where a run stands.
 pub(super) struct Replayed {
     pub(super) executive: Executive,
-    pub(super) ledger: Ledger,
+    pub(super) standing: Standing,
     /// Commands of the last event that are not in the log: its writer was killed among them, and has performed none of them.
     /// They are to be performed.
     pub(super) missing: Vec<Command>,
-    /// Which states the instances are of.
-    pub(super) states: BTreeMap<InstanceId, StateId>,
+    /// How many events were replayed.
+    pub(super) events: u64,
 }
 
-/// Replays a log.
+/// Whether a log that begins like this is of the program and of this version, and of a run that can be resumed.
+///
+/// # Errors
+/// [`ReplayError`].
+pub(super) fn check(program: &Program, first: &LogLine) -> Result<(), ReplayError> {
+    let LogEntry::Event(Event::Started { task, digest, origin, .. }) = &first.entry else { return Ok(()) };
+    if origin.run.is_empty() {
+        return Err(ReplayError::NoRun);
+    }
+    if origin.version != VERSION {
+        return Err(ReplayError::Version { theirs: origin.version.clone() });
+    }
+    if *task != program.name {
+        return Err(ReplayError::Task { theirs: task.clone(), ours: program.name.clone() });
+    }
+    if *digest != program.digest {
+        return Err(ReplayError::Digest);
+    }
+    Ok(())
+}
+
+/// Replays a whole log.
 ///
 /// # Errors
 /// [`ReplayError`]; lines count from 1.
 pub(super) fn replay(program: &Arc<Program>, lines: &[LogLine]) -> Result<Replayed, ReplayError> {
-    if let Some(LogLine { entry: LogEntry::Event(Event::Started { task, digest, origin, .. }), .. }) = lines.first() {
-        if origin.run.is_empty() {
-            return Err(ReplayError::NoRun);
-        }
-        if origin.version != VERSION {
-            return Err(ReplayError::Version { theirs: origin.version.clone() });
-        }
-        if *task != program.name {
-            return Err(ReplayError::Task { theirs: task.clone(), ours: program.name.clone() });
-        }
-        if *digest != program.digest {
-            return Err(ReplayError::Digest);
-        }
+    if let Some(first) = lines.first() {
+        check(program, first)?;
     }
-    let mut executive = Executive::new(program.clone(), Tolerance::ROBOT);
-    let mut ledger = Ledger::default();
-    let mut states = BTreeMap::new();
+    let executive = Executive::new(program.clone(), Tolerance::ROBOT);
+    go_on(executive, Standing::default(), 0, lines)
+}
+
+/// Replays the lines of a log that are behind a checkpoint of it.
+///
+/// # Errors
+/// [`ReplayError`]; lines count from 1, from the beginning of the log.
+pub(super) fn replay_behind(
+    program: &Arc<Program>,
+    checkpoint: Checkpoint,
+    lines: &[LogLine],
+) -> Result<Replayed, ReplayError> {
+    let Checkpoint { place, standing, executive, .. } = checkpoint;
+    let executive = Executive::restore(program.clone(), Tolerance::ROBOT, &executive)
+        .map_err(|error| ReplayError::Restore { reason: error.to_string() })?;
+    go_on(executive, standing, place.lines, lines)
+}
+
+/// Hands the events of lines to an executive and compares what it says; `before` lines are before them.
+fn go_on(
+    mut executive: Executive,
+    mut standing: Standing,
+    before: usize,
+    lines: &[LogLine],
+) -> Result<Replayed, ReplayError> {
+    let Standing { ledger, states, progress } = &mut standing;
     let mut missing = Vec::new();
-    let mut next = 0;
-    while let Some(LogLine { at, entry: LogEntry::Event(event) }) = lines.get(next) {
+    let (mut next, mut events) = (0, 0);
+    while let Some(LogLine { at, entry }) = lines.get(next) {
+        let event = match entry {
+            LogEntry::Event(event) => event,
+            // Every command behind an event was compared with it.
+            LogEntry::Command(command) => return Err(otherwise(before + next + 1, Some(command), None)),
+        };
         next += 1;
+        events += 1;
         ledger.event(*at, event);
         missing = executive.handle(*at, event.clone());
         let logged = lines[next..].iter().map_while(|line| match &line.entry {
@@ -84,24 +128,25 @@ pub(super) fn replay(program: &Arc<Program>, lines: &[LogLine]) -> Result<Replay
         for (index, theirs) in logged.iter().enumerate() {
             let ours = missing.get(index);
             if ours.is_none_or(|ours| !same(ours, theirs)) {
-                return Err(otherwise(next + index + 1, Some(theirs), ours));
+                return Err(otherwise(before + next + index + 1, Some(theirs), ours));
             }
         }
         if !last && logged.len() < missing.len() {
-            return Err(otherwise(next + logged.len() + 1, None, missing.get(logged.len())));
+            return Err(otherwise(before + next + logged.len() + 1, None, missing.get(logged.len())));
         }
-        missing.iter().for_each(|command| follow(&mut states, command));
+        missing.iter().for_each(|command| follow(states, command));
         if let Some(Command::End { outcome, .. }) = logged.last() {
             return Err(ReplayError::Ended { outcome: outcome.clone() });
         }
         logged.iter().for_each(|command| ledger.command(command));
+        progress.catch_up(*at, event, missing.iter());
         missing.drain(..logged.len());
         // Nothing of these was performed, so they are no open items; what they commit is in the executive's world already.
         let commits = missing.iter().filter(|command| matches!(command, Command::Commit { .. }));
         commits.for_each(|command| ledger.command(command));
         next += logged.len();
     }
-    Ok(Replayed { executive, ledger, missing, states })
+    Ok(Replayed { executive, standing, missing, events })
 }
 
 /// Keeps in mind which state an instance is of, as long as it matters.
@@ -155,8 +200,9 @@ pub(super) fn now(ledger: &Ledger, unix_ms: u64, speed: f64) -> Timestamp {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::super::checkpoint::Place;
     use super::*;
     use crate::command::load_text;
     use crate::system::config::SystemConfig;
@@ -170,12 +216,12 @@ mod tests {
         Arc::new(load_text(text, "fetch_boxes.yaml", &catalogue).ok().unwrap())
     }
 
-    fn fetch_boxes() -> Arc<Program> {
+    pub(in crate::task_control) fn fetch_boxes() -> Arc<Program> {
         program(include_str!("../../../../examples/fetch_boxes.yaml"))
     }
 
     /// A whole run in virtual time, as task control would have logged it.
-    fn log(program: &Arc<Program>, mode: Mode) -> Vec<LogLine> {
+    pub(in crate::task_control) fn log(program: &Arc<Program>, mode: Mode) -> Vec<LogLine> {
         let resources = SystemConfig::load(None).unwrap().catalogue.resources;
         let setup = Setup {
             program: program.clone(),
@@ -200,8 +246,8 @@ mod tests {
             let lines = log(&program, mode);
             // The last line is the end.
             for length in 1..lines.len() {
-                let Replayed { mut executive, missing, ledger, .. } = replay(&program, &lines[..length]).unwrap();
-                assert_eq!(ledger.last, lines[length - 1].at);
+                let Replayed { mut executive, missing, standing, .. } = replay(&program, &lines[..length]).unwrap();
+                assert_eq!(standing.ledger.last, lines[length - 1].at);
                 // What was not written is what would have been, and so is what follows.
                 let mut commands = missing.into_iter();
                 for line in &lines[length..] {
@@ -219,13 +265,75 @@ mod tests {
         }
     }
 
+    /// A checkpoint behind so many whole events of a log, as a run that is under way makes it.
+    fn checkpoint(program: &Arc<Program>, lines: &[LogLine]) -> Checkpoint {
+        let Replayed { executive, standing, missing, .. } = replay(program, lines).unwrap();
+        assert_eq!(missing, []);
+        let log = tempfile::NamedTempFile::new().unwrap();
+        let place = Place::of(log.as_file(), 0, lines.len()).unwrap();
+        Checkpoint { digest: program.digest.clone(), place, standing, executive: executive.checkpoint() }
+    }
+
+    #[test]
+    fn with_a_checkpoint_behind_any_event_a_cut_run_stands_where_it_stands_without() {
+        let program = fetch_boxes();
+        for mode in [Mode::Hsm, Mode::Cdtn] {
+            let lines = log(&program, mode);
+            let mut newest = None;
+            for cut in 1..lines.len() {
+                let whole = replay(&program, &lines[..cut]).unwrap();
+                // Between two events: every command of the last one is there.
+                if matches!(lines[cut].entry, LogEntry::Event(_)) {
+                    newest = Some(checkpoint(&program, &lines[..cut]).encode().unwrap());
+                }
+                let Some(newest) = &newest else { continue };
+                let checkpoint = Checkpoint::decode(newest).unwrap();
+                let before = checkpoint.place.lines;
+                let behind = replay_behind(&program, checkpoint, &lines[before..cut]).unwrap();
+                assert_eq!(behind.standing, whole.standing, "cut at {cut}, checkpoint at {before}");
+                assert_eq!(behind.missing, whole.missing);
+                assert!(behind.events <= 1);
+                // And it goes on alike.
+                let (mut one, mut other) = (whole.executive, behind.executive);
+                for LogLine { at, entry } in &lines[cut..] {
+                    if let LogEntry::Event(event) = entry {
+                        assert_eq!(one.handle(*at, event.clone()), other.handle(*at, event.clone()));
+                    }
+                }
+                assert!(one.has_ended() && other.has_ended());
+            }
+        }
+    }
+
+    #[test]
+    fn the_rest_of_a_log_goes_with_a_checkpoint_behind_any_event_of_it() {
+        let program = fetch_boxes();
+        let lines = log(&program, Mode::Cdtn);
+        let cut = lines.len() - 1;
+        let whole = replay(&program, &lines[..cut]).unwrap();
+        for place in (1..cut).filter(|place| matches!(lines[*place].entry, LogEntry::Event(_))) {
+            let behind = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place..cut]).unwrap();
+            assert_eq!((&behind.standing, &behind.missing), (&whole.standing, &whole.missing));
+            // The end is found, too; and a line that does not follow is refused with its number in the whole log.
+            let ended = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place..]).err();
+            assert_eq!(ended, Some(ReplayError::Ended { outcome: "success".into() }));
+            let refused = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place - 1..]).err();
+            if matches!(lines[place - 1].entry, LogEntry::Command(_)) {
+                assert!(
+                    matches!(refused, Some(ReplayError::Otherwise { line, .. }) if line == place + 1),
+                    "{refused:?}"
+                );
+            }
+        }
+    }
+
     #[test]
     fn whatever_is_answered_after_the_cut_is_open_at_the_cut_and_nothing_else_is() {
         let program = fetch_boxes();
         let lines = log(&program, Mode::Cdtn);
         let mut checked = 0;
         for cut in (1..lines.len()).filter(|cut| matches!(lines[*cut].entry, LogEntry::Event(_))) {
-            let ledger = replay(&program, &lines[..cut]).unwrap().ledger;
+            let ledger = replay(&program, &lines[..cut]).unwrap().standing.ledger;
             let (mut goals, mut projecting, mut waiting) = (ledger.goals, ledger.projecting, ledger.waiting);
             // What is asked for after the cut is answered after the cut, too, and was not open.
             let mut asked: Vec<InstanceId> = Vec::new();

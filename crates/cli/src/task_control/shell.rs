@@ -9,7 +9,9 @@ pub(crate) use resume::{Resumption, resume};
 
 use super::Endpoints;
 use super::advisor::{self, Advisor};
+use super::checkpoint::Keeper;
 use super::control::Control;
+use super::ledger::Ledger;
 use super::log::LogWriter;
 use super::performer::{self, Performer};
 use super::progress::Progress;
@@ -54,6 +56,8 @@ pub(crate) struct Run {
     pub(crate) log: PathBuf,
     /// Whether every node that starts and ends is printed.
     pub(crate) quiet: bool,
+    /// A checkpoint after so many events; 0 is none.
+    pub(crate) checkpoint_every: u64,
 }
 
 /// The system that a run is on.
@@ -88,6 +92,7 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
     let performer = Performer::connect(place, &id, &run.program.name, events).await.context("cannot begin the run")?;
     // A run that is refused leaves no log.
     let log = LogWriter::create(&run.log)?;
+    let keeper = Keeper::start(&log, &run.program.digest, run.checkpoint_every, Ledger::default(), 0);
     let shell = Shell {
         executive: Executive::new(run.program.clone(), Tolerance::ROBOT),
         states: BTreeMap::new(),
@@ -95,6 +100,7 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
         progress: Progress::new(run.quiet),
         program: run.program.clone(),
         log,
+        keeper,
         clock: RobotClock::start(place.speed),
         control: Control::listen_if_possible(&place.directory),
         advisor: advisor_of(run.mode, run.seed),
@@ -140,6 +146,8 @@ struct Shell {
     /// When the executive wants to be woken.
     timers: BTreeSet<Timestamp>,
     log: LogWriter,
+    /// None where there shall be no checkpoints, or can be none.
+    keeper: Option<Keeper>,
     progress: Progress,
     clock: RobotClock,
     control: Option<Control>,
@@ -181,6 +189,7 @@ impl Shell {
         let mut asked_to_abort = false;
         loop {
             if let Some(ended) = ended {
+                self.keeper.take().into_iter().for_each(Keeper::end);
                 return Ok(ended);
             }
             let event = self.next(interrupt, &mut asked_to_abort).await?;
@@ -206,6 +215,9 @@ impl Shell {
         self.log.append(now, event, &commands)?;
         if replay::must_be_durable(&self.program, &self.states, &commands) {
             self.log.make_durable()?;
+        }
+        if let Some(keeper) = &mut self.keeper {
+            keeper.follow(now, event, &commands);
         }
         self.progress.follow(now, event, &commands);
         self.lookout.observe(&commands);
@@ -242,6 +254,14 @@ impl Shell {
         }
     }
 
+    /// Whoever resumes this run begins here. Between two events all that was logged has been performed.
+    fn make_checkpoint(&mut self) {
+        if let Some(keeper) = &mut self.keeper {
+            let confirmed = self.performer.confirmed();
+            keeper.make(&self.log, &self.executive, &self.states, &self.progress, confirmed);
+        }
+    }
+
     /// The next event that the executive has to know of.
     async fn next(&mut self, interrupt: &Interrupt, asked_to_abort: &mut bool) -> anyhow::Result<Event> {
         loop {
@@ -255,6 +275,13 @@ impl Shell {
             let ask_at = self.ask_at.filter(|_| self.advisor.is_some());
             let to_ask = async {
                 match ask_at {
+                    Some(at) => tokio::time::sleep_until(at.into()).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let checkpoint_at = self.keeper.as_mut().and_then(|keeper| keeper.due(&self.log));
+            let to_keep = async {
+                match checkpoint_at {
                     Some(at) => tokio::time::sleep_until(at.into()).await,
                     None => std::future::pending().await,
                 }
@@ -278,6 +305,10 @@ impl Shell {
                 event = advised => return Ok(event),
                 () = to_ask => {
                     self.ask_for_advice();
+                    continue;
+                }
+                () = to_keep => {
+                    self.make_checkpoint();
                     continue;
                 }
                 () = tokio::time::sleep_until(self.look_at.into()) => {

@@ -85,6 +85,16 @@ impl Harness {
         self.handle(ended(instance, attempt, outputs, measured));
     }
 
+    /// The executive's state.
+    pub fn checkpoint(&self) -> Vec<u8> {
+        self.executive.checkpoint()
+    }
+
+    /// Goes on with an executive that is made of a checkpoint.
+    pub fn restore(&mut self, program: Program, bytes: &[u8]) {
+        self.executive = Executive::restore(Arc::new(program), Tolerance::EXACT, bytes).unwrap();
+    }
+
     /// How many goals are under way.
     pub fn under_way(&self) -> usize {
         self.running.len()

@@ -103,6 +103,46 @@ fn a_million_iterations() {
     assert!(grown * 10 <= early.unsigned_abs(), "what is in use must not grow with the iterations");
 }
 
+/// The state of a full window is written down: so long a run that makes a checkpoint stands still. How large it is is printed.
+#[divan::bench(types = [Chain, RandomDag, NestedLoops, World], args = [100, 1_000, 10_000, 100_000], sample_count = 10, sample_size = 1)]
+fn checkpoint<S: Shape>(bencher: divan::Bencher<'_, '_>, window: usize) {
+    let Some(harness) = in_use::<S>(window) else { return };
+    println!("{} of {window}: {} bytes", type_name::<S>(), harness.checkpoint().len());
+    bencher.bench_local(|| black_box(harness.checkpoint()));
+}
+
+/// An executive is made of such a state.
+#[divan::bench(types = [Chain, RandomDag, NestedLoops, World], args = [100, 1_000, 10_000, 100_000], sample_count = 10, sample_size = 1)]
+fn restore<S: Shape>(bencher: divan::Bencher<'_, '_>, window: usize) {
+    let Some(harness) = in_use::<S>(window) else { return };
+    let (program, bytes) = (Arc::new(S::program(window)), harness.checkpoint());
+    bencher.bench_local(|| Executive::restore(program.clone(), Tolerance::EXACT, &bytes).unwrap());
+}
+
+/// A full window in which some have retired.
+fn in_use<S: Shape>(window: usize) -> Option<Harness> {
+    (window <= S::LARGEST).then(|| {
+        let mut harness = Harness::new(S::program(window), Vec::new());
+        harness.run(1_000);
+        harness
+    })
+}
+
+/// A day: a loop of a million rounds is at its end. Its checkpoint, and that it goes on from there.
+#[divan::bench(sample_count = 5, sample_size = 1)]
+fn checkpoint_and_restore_after_a_million_iterations(bencher: divan::Bencher<'_, '_>) {
+    let began = std::time::Instant::now();
+    let mut harness = Harness::new(shapes::million(), Vec::new());
+    harness.run_until(999_000);
+    println!("the run: {:?}; its checkpoint: {} bytes", began.elapsed(), harness.checkpoint().len());
+    bencher.bench_local(|| {
+        let bytes = harness.checkpoint();
+        harness.restore(shapes::million(), &bytes);
+        bytes
+    });
+    harness.run_until(999_900);
+}
+
 /// A PIA measures otherwise than predicted while nodes run that have read ten thousand facts: that one event. The fact is the last
 /// in the order of keys.
 #[divan::bench(args = [1, 10, 100], sample_count = 20, sample_size = 1, max_time = 5)]

@@ -10,6 +10,7 @@
 //! [`routine`] holds what a routine needs from its entry to its end, [`regions`] forks and joins, [`stop`] ends what is under way.
 
 mod again;
+mod checkpoint;
 mod exit;
 mod node;
 mod regions;
@@ -18,6 +19,7 @@ mod stop;
 mod walk;
 
 use crate::binding::{Bindings, Names, Outputs};
+use crate::checkpoint::leases;
 use crate::context::{Context, Made};
 use crate::hold::Hold;
 use crate::protocol::Event;
@@ -34,12 +36,15 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+pub(crate) use checkpoint::difference;
 pub(crate) use routine::Routine;
+use serde::{Deserialize, Serialize};
 
 /// How often a computing or sensing node is tried when its worker dies, unless the state says otherwise.
 pub(crate) const DEFAULT_ATTEMPTS: u32 = 3;
 
 /// Where effects go.
+#[derive(Serialize, Deserialize)]
 pub(crate) enum Target {
     /// Into the root world.
     Actual,
@@ -56,6 +61,7 @@ pub(crate) enum Target {
         /// What measured which of this one's.
         evidence: Evidence,
         /// The result.
+        #[serde(skip)]
         world: World,
     },
 }
@@ -75,6 +81,7 @@ pub(crate) enum Progress {
 }
 
 /// One activation of a list of states.
+#[derive(Serialize, Deserialize)]
 struct Frame {
     /// The state whose list it is.
     owner: StateId,
@@ -91,6 +98,7 @@ struct Frame {
 }
 
 /// What a thread does next.
+#[derive(Serialize, Deserialize)]
 enum Todo {
     /// Visit a state, under this path if it is the first.
     Enter(StateId, Option<String>),
@@ -107,9 +115,11 @@ enum Todo {
 }
 
 /// A thread of control: the state's, or a region's.
+#[derive(Serialize, Deserialize)]
 struct Thread {
     frames: Vec<Frame>,
     /// The innermost last. Regions share the values: a long list is not copied at every fork.
+    #[serde(skip)]
     variables: Vec<(String, Arc<Value>)>,
     todo: Todo,
     current: Option<Current>,
@@ -120,7 +130,7 @@ struct Thread {
 }
 
 /// How far an action is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum Phase {
     /// The operator lets nothing begin; it may have its resources already.
     Held,
@@ -134,6 +144,7 @@ enum Phase {
 }
 
 /// An action under way, or a routine that waits for what it needs.
+#[derive(Serialize, Deserialize)]
 struct Current {
     instance: InstanceId,
     state: StateId,
@@ -144,12 +155,15 @@ struct Current {
     phase: Phase,
     /// When its goal has had its time.
     timeout: Option<Timestamp>,
+    #[serde(with = "leases")]
     lease: Option<Lease>,
     projection: Option<ProjectionId>,
 }
 
 /// The interpreter of one state.
+#[derive(Serialize, Deserialize)]
 pub(crate) struct Interpreter {
+    #[serde(with = "checkpoint")]
     threads: BTreeMap<u64, Thread>,
     last_thread: u64,
     outputs: BTreeMap<StateId, Outputs>,

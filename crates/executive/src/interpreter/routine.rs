@@ -5,16 +5,21 @@
 
 use super::{Interpreter, Target};
 use crate::binding;
+use crate::checkpoint::{leases, requirements};
 use crate::context::Context;
 use crate::protocol::{Command, Note};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::resource::{Lease, Requirement};
+use serde::{Deserialize, Serialize};
 
 /// What a routine holds for everything it contains.
+#[derive(Serialize, Deserialize)]
 pub(crate) struct Routine {
     /// What it asks for.
+    #[serde(with = "requirements")]
     pub(crate) requirements: Vec<Requirement>,
     /// What it was granted; `None` while it asks again because a worker of it died.
+    #[serde(with = "leases")]
     pub(crate) lease: Option<Lease>,
     /// The thread that entered it, and its visit; `None` of a routine of the window.
     pub(crate) visit: Option<(u64, StateId, InstanceId)>,

@@ -1,6 +1,7 @@
 //! The facts that a state reads, senses, looks up and may write.
 
-use super::outcomes::{EVERYTHING, Ends};
+use super::outcomes::{EVERYTHING, Effects, Ends};
+use super::written::{self, Written};
 use super::{Names, Predicate, Subject, is_action, nature};
 use crate::effects;
 use ratn_model::expression::{EffectExpr, Expr, FactExpr};
@@ -183,4 +184,26 @@ pub(super) fn writes(
         numbered.filter(|(number, _)| ahead & (1 << number) != 0).flat_map(|(_, all)| all).copied().collect()
     };
     if writes.contains(&EVERYTHING) { BTreeSet::from([EVERYTHING]) } else { writes }
+}
+
+/// Under which keys a state writes with the outcomes that are computed ahead, and with each outcome.
+pub(super) fn written(
+    subject: &Subject<'_>,
+    ends: &Ends,
+    may_write: Option<&[EffectExpr]>,
+    names: &mut Names,
+) -> (Vec<Written>, Vec<Vec<Written>>) {
+    let declared = |effects: &'_ Effects| match effects {
+        Effects::Unknown => Vec::new(),
+        Effects::Declared(declared) => declared.clone(),
+    };
+    let each: Vec<Vec<EffectExpr>> = ends.effects.iter().map(declared).collect();
+    let all: Vec<EffectExpr> = if subject.is_routine() {
+        may_write.unwrap_or_default().to_vec()
+    } else {
+        let ahead = ends.arms.iter().fold(0, |all, arm| all | arm.outcomes);
+        let numbered = each.iter().take(super::MAX_OUTCOMES).enumerate();
+        numbered.filter(|(number, _)| ahead & (1 << number) != 0).flat_map(|(_, effects)| effects).cloned().collect()
+    };
+    (written::written(&all, names), each.iter().map(|effects| written::written(effects, names)).collect())
 }

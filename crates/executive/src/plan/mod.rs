@@ -6,6 +6,7 @@
 //! | [`resources`] | what it asks of the resource manager, and what it does to resources at its end |
 //! | [`outcomes`] | where its outcomes lead, which of them are computed ahead, what each of them changes |
 //! | [`footprint`] | the facts that it reads, senses, looks up and may write |
+//! | [`written`] | under which keys it writes |
 //! | [`flows`] | the outputs and variables that its expressions use |
 //!
 //! Hierarchies and routines are resolved here: a routine is one node, so its plan speaks of what it contains, too. Predicates and kinds of
@@ -16,9 +17,11 @@ mod footprint;
 mod nature;
 mod outcomes;
 mod resources;
+mod written;
 
 pub(crate) use nature::NodeNature;
 pub(crate) use outcomes::{ArmPlan, EVERYTHING, Effects, MAX_OUTCOMES, Outcome, Outcomes, gives_outputs};
+pub(crate) use written::{Chain, Written};
 
 use ratn_model::expression::{EffectExpr, FactExpr};
 use ratn_model::id::StateId;
@@ -36,6 +39,8 @@ pub(crate) struct Plan {
     names: Names,
     /// How many predicates there are, [`EVERYTHING`] and the kinds of task resources included.
     pub(crate) width: usize,
+    /// How many buckets there are for the keys of facts: a power of two.
+    buckets: usize,
 }
 
 /// The plan of one state.
@@ -64,6 +69,8 @@ pub(crate) struct StatePlan {
     pub(crate) effects: Vec<Effects>,
     /// The predicates that the effects of each outcome write.
     pub(crate) effect_predicates: Vec<Vec<Predicate>>,
+    /// And under which keys; nothing where they may write every fact.
+    pub(crate) effects_written: Vec<Vec<Written>>,
     /// The outcomes with which the exit of this composite state has something to do: effects, outputs, assignments, resources.
     pub(crate) exits: Outcomes,
     /// States of its lists may be visited more than once in one activation.
@@ -94,6 +101,8 @@ pub(crate) struct StatePlan {
     /// The predicates and kinds that it writes with an outcome that is computed ahead. If it may write every fact: [`EVERYTHING`]
     /// and the kinds.
     pub(crate) writes: Vec<Predicate>,
+    /// And under which keys; nothing if it may write every fact.
+    pub(crate) written: Vec<Written>,
 
     /// The states whose outputs it needs before it starts; of a routine, those outside of it.
     pub(crate) start_flows: Vec<StateId>,
@@ -118,7 +127,8 @@ impl Plan {
         let read = flows::read_anywhere(program);
         let of = |state| StatePlan::of(&Subject::of(program, state), &transitions, &operated, &read, &mut names);
         let states = program.states.iter().map(of).collect();
-        let mut plan = Plan { states, width: names.numbers.len() + 1, names };
+        let (width, buckets) = (names.numbers.len() + 1, Plan::buckets(program.horizon));
+        let mut plan = Plan { states, width, buckets, names };
         for id in &read {
             for parent in std::iter::successors(program.state(*id).parent, |id| program.state(*id).parent) {
                 plan.states[index(parent)].read_inside.push(*id);
@@ -161,6 +171,7 @@ impl StatePlan {
         let may_write = footprint::may_write(subject);
         let ends = outcomes::of(subject, transitions, nature, names);
         let mut writes = footprint::writes(subject, &ends, may_write.as_deref(), names);
+        let (written, effects_written) = footprint::written(subject, &ends, may_write.as_deref(), names);
         let resources = resources::of(subject, operated, names);
         writes.extend(&resources.operated);
         let exits = if subject.is_node { 0 } else { outcomes::exits(state, &ends, &resources.operations) };
@@ -179,6 +190,8 @@ impl StatePlan {
             outcomes: ends.names,
             targets: ends.targets,
             arms: ends.arms,
+            effects_written,
+            written,
             effects: ends.effects,
             effect_predicates: ends.predicates,
             exits,

@@ -3,9 +3,10 @@
 use super::Subject;
 use super::resources::operated;
 use ratn_model::program::{Nature, State, StateKind};
+use serde::{Deserialize, Serialize};
 
 /// What a node does to the environment. A routine computes if all that it contains computes, else it is irreversible.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) enum NodeNature {
     /// Works on a projection.
     Computes,

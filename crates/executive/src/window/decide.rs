@@ -20,12 +20,13 @@ use ratn_model::value::Value;
 
 impl Window {
     /// What a decision from these expressions waits for.
-    fn undecidable(&mut self, context: &Context<'_>, id: InstanceId, from: &[&Expr]) -> Option<Wait> {
+    pub(super) fn undecidable(&mut self, context: &Context<'_>, id: InstanceId, from: &[&Expr]) -> Option<Wait> {
         undecidable(&mut self.graph, &self.memory, context, id, from)
     }
 
     /// A node with several ways on has ended: its outcome decides once it cannot change any more.
     pub(super) fn decide_by_outcome(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        self.revise(context);
         if let Some(blocker) = unsettled(&mut self.graph, &self.memory, context, id) {
             return self.wait(id, Wait::Settling(blocker));
         }
@@ -49,6 +50,7 @@ impl Window {
 
     /// A condition, or the test of a `while`.
     pub(super) fn decide(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        self.revise(context);
         let Some(instance) = self.graph.get(id) else { return };
         let state = context.program.state(instance.state);
         let names = names_of(instance);
@@ -56,11 +58,15 @@ impl Window {
         if let Some(wait) = self.undecidable(context, id, &[predicate]) {
             return self.wait(id, wait);
         }
-        let Some(decision) = self.look(context, id, None, |_, view| predicate.holds(view)) else { return };
+        let decision = self.look(context, id, None, |_, view| {
+            predicate.holds(view).map_err(|error| (error.clone(), view.blocker().filter(|_| error.is_not_yet_known())))
+        });
+        let Some(decision) = decision else { return };
         let taken = match decision {
             Ok(true) => 0,
             Ok(false) => 1,
-            Err(error) => {
+            Err((_, Some(blocker))) => return self.wait(id, Wait::World(blocker)),
+            Err((error, None)) => {
                 let reason = BindError::at("its predicate", state)(error).reason();
                 return self.end_instance(id, Ended::aborted(reason));
             }
@@ -73,20 +79,26 @@ impl Window {
 
     /// The list of a loop.
     pub(super) fn count(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        self.revise(context);
         let Some(instance) = self.graph.get(id) else { return };
         let state = context.program.state(instance.state);
         let StateKind::ForEach { collection, .. } = &state.kind else { return };
         if let Some(wait) = self.undecidable(context, id, &[collection]) {
             return self.wait(id, wait);
         }
-        let Some(elements) = self.look(context, id, None, |_, view| collection.evaluate(view)) else { return };
+        let elements = self.look(context, id, None, |_, view| {
+            let elements = collection.evaluate(view);
+            elements.map_err(|error| (error.clone(), view.blocker().filter(|_| error.is_not_yet_known())))
+        });
+        let Some(elements) = elements else { return };
         let elements = match elements {
             Ok(Value::List(elements)) => elements,
             Ok(other) => {
                 let reason = format!("it loops over a {}, not a list", other.type_name());
                 return self.end_instance(id, Ended::aborted(reason));
             }
-            Err(error) => {
+            Err((_, Some(blocker))) => return self.wait(id, Wait::World(blocker)),
+            Err((error, None)) => {
                 let reason = BindError::at("its list", state)(error).reason();
                 return self.end_instance(id, Ended::aborted(reason));
             }
@@ -101,6 +113,7 @@ impl Window {
 
     /// The decider over the outcomes of regions.
     pub(super) fn decide_join(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        self.revise(context);
         let Some(instance) = self.graph.get(id) else { return };
         let state = context.program.state(instance.state);
         let StateKind::Concurrency { regions, decide, .. } = &state.kind else { return };
@@ -114,10 +127,13 @@ impl Window {
             for (outcome, holds) in decide {
                 match holds.holds(view) {
                     Ok(false) => {}
-                    Ok(true) => return (outcome.clone(), None),
+                    Ok(true) => return Ok((outcome.clone(), None)),
                     Err(error) => {
+                        if let Some(blocker) = view.blocker().filter(|_| error.is_not_yet_known()) {
+                            return Err(blocker);
+                        }
                         let reason = BindError::at(format_args!("`decide.{outcome}`"), state)(error).reason();
-                        return (ABORTED.to_owned(), Some(reason));
+                        return Ok((ABORTED.to_owned(), Some(reason)));
                     }
                 }
             }
@@ -129,9 +145,13 @@ impl Window {
                 .iter()
                 .filter_map(|region| view.port(*region, "outcome").as_deref().and_then(outcome))
                 .collect();
-            (default_outcome(&outcomes).to_owned(), None)
+            Ok((default_outcome(&outcomes).to_owned(), None))
         });
-        let Some((outcome, reason)) = decided else { return };
+        let (outcome, reason) = match decided {
+            None => return,
+            Some(Err(blocker)) => return self.wait(id, Wait::World(blocker)),
+            Some(Ok(decided)) => decided,
+        };
         let path = self.path(context.program, id);
         context.note(Note::Decided { instance: id, path: path.clone(), decision: outcome.clone() });
         self.end_instance(id, Ended::with(outcome.as_str(), Outputs::new()));
@@ -181,8 +201,10 @@ impl Window {
                     (!is_left_out).then(|| not_bound(view, &BindError::at(&what, state)(error)))
                 });
                 let facts = facts_of([expression], view);
-                // What is not known is waited for, or has failed.
-                let _ = view.see(facts, &mut looked);
+                // More may be looked at than was needed: it may not be known yet, and still it was looked at.
+                if view.see(facts.clone(), &mut looked).is_err() {
+                    looked.look_at(facts);
+                }
                 let is_made = !matches!(value, Err(Some(Readiness::Waits(_))));
                 if is_made {
                     // What made it fail may come out otherwise, too.

@@ -132,9 +132,10 @@ impl Window {
         self.waits.enqueue(&mut self.graph, id);
     }
 
-    /// There is a result: whoever waits for another instance that computes the same can have it.
+    /// There is a result: whoever would compute the same, or waits for another instance that does, can have it.
     pub(super) fn wake_twins(&mut self, id: InstanceId) {
         for twin in self.results.twins_of(id) {
+            self.waits.enqueue(&mut self.graph, twin);
             self.waits.wake(&mut self.graph, twin);
         }
     }

@@ -27,6 +27,7 @@
 //! flows and projections; *settled* cannot change any more and decides conditions and loops; *retired* is real.
 
 mod begin;
+mod checkpoint;
 mod decide;
 mod discard;
 mod dispatch;
@@ -47,6 +48,7 @@ use crate::hold::Hold;
 use crate::lookahead;
 use crate::plan::Plan;
 use crate::protocol::{Command, Event, Learned};
+pub(crate) use checkpoint::Beside;
 use dispatch::Dispatch;
 use graph::Graph;
 use graph::instance::{Instance, Role, Status};
@@ -59,11 +61,12 @@ use ratn_model::resource::Quantity;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use results::Results;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use waits::{Timer, Wait, Waits};
 
 /// How a run ended.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct End {
     pub(crate) outcome: String,
     pub(crate) outputs: Outputs,
@@ -71,6 +74,7 @@ pub(crate) struct End {
 }
 
 /// CDTN mode.
+#[derive(Serialize, Deserialize)]
 pub(crate) struct Window {
     graph: Graph,
     growth: Growth,
@@ -83,6 +87,7 @@ pub(crate) struct Window {
     end: Option<End>,
     is_ending: bool,
     /// So many commands of the event have been looked through for commits.
+    #[serde(skip)]
     followed: usize,
 }
 

@@ -7,7 +7,7 @@
 
 use super::Window;
 use super::decide::names_of;
-use super::graph::instance::Role;
+use super::graph::instance::{Instance, Role};
 use super::memory::facts_of;
 use crate::context::Context;
 use ratn_model::expression::Expr;
@@ -47,7 +47,7 @@ impl Window {
         }
         self.revise(context);
         for id in &all {
-            if self.decides_otherwise(context, *id, &changed) {
+            if self.may_decide_otherwise(context, *id) || self.decides_otherwise(context, *id, &changed) {
                 self.reopen(context, *id);
             }
         }
@@ -70,20 +70,21 @@ impl Window {
         })
     }
 
-    /// Whether an instance has decided and might not do so again.
+    /// Whether an instance has decided from what may still change now: an older instance may write other facts than it would have.
+    fn may_decide_otherwise(&mut self, context: &Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.graph.get(id).filter(|instance| instance.ended().is_some()) else { return false };
+        let expressions = decides_from(context.program, instance);
+        !expressions.is_empty() && self.undecidable(context, id, &expressions).is_some()
+    }
+
+    /// Whether an instance has decided and would not do so again.
     fn decides_otherwise(&self, context: &Context<'_>, id: InstanceId, changed: &Footprint) -> bool {
         let Some(instance) = self.graph.get(id) else { return false };
         let Some(ended) = instance.ended() else { return false };
-        let state = context.program.state(instance.state);
-        let expressions: Vec<&Expr> = match (&state.kind, instance.role()) {
-            (StateKind::Condition { predicate, .. }, Some(Role::Condition)) => vec![predicate],
-            (StateKind::While { predicate, .. }, Some(Role::Test)) => vec![predicate],
-            (StateKind::ForEach { collection, .. }, Some(Role::Loop)) => vec![collection],
-            (StateKind::Concurrency { decide, .. }, Some(Role::Join)) => {
-                decide.iter().map(|(_, holds)| holds).collect()
-            }
-            _ => return false,
-        };
+        let expressions = decides_from(context.program, instance);
+        if expressions.is_empty() {
+            return false;
+        }
         let decides = self.look(context, id, None, |instance, view| {
             let made_again = |id: InstanceId| self.graph.get(id).is_some_and(|producer| producer.ended().is_none());
             if view.sight.producers_of(view.instance).any(made_again) {
@@ -114,6 +115,17 @@ impl Window {
         self.growth.reopen(&mut self.graph, context, id);
         self.waits.wake(&mut self.graph, id);
         self.waits.enqueue(&mut self.graph, id);
+    }
+}
+
+/// What a condition, a test, a loop or a decider decides from.
+fn decides_from<'p>(program: &'p Program, instance: &Instance) -> Vec<&'p Expr> {
+    match (&program.state(instance.state).kind, instance.role()) {
+        (StateKind::Condition { predicate, .. }, Some(Role::Condition)) => vec![predicate],
+        (StateKind::While { predicate, .. }, Some(Role::Test)) => vec![predicate],
+        (StateKind::ForEach { collection, .. }, Some(Role::Loop)) => vec![collection],
+        (StateKind::Concurrency { decide, .. }, Some(Role::Join)) => decide.iter().map(|(_, holds)| holds).collect(),
+        _ => Vec::new(),
     }
 }
 

@@ -8,13 +8,14 @@ use super::graph::Graph;
 use super::graph::instance::Ended;
 use super::memory::Seen;
 use ratn_model::id::InstanceId;
+use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 
 /// This many results are kept.
 const MAX_RESULTS: usize = 1024;
 
 /// Results by seed, and who computes what.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Results {
     kept: BTreeMap<u64, Vec<(Seen, Ended)>>,
     order: VecDeque<u64>,

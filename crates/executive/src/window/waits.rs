@@ -6,12 +6,13 @@
 use super::graph::Graph;
 use ratn_model::id::InstanceId;
 use ratn_model::time::Timestamp;
+use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
 
 /// What an instance waits for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub(crate) enum Wait {
     /// Nothing that is known; an event of its own, or somebody, will re-examine it.
     #[default]
@@ -88,7 +89,7 @@ impl Wait {
 }
 
 /// What an instance waits for and who waits for it: part of the instance, private to this module.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct WaitCell {
     wait: Wait,
     /// To be looked at again when this ends, settles, retires or is discarded.
@@ -109,7 +110,7 @@ impl WaitCell {
 }
 
 /// What happens by itself.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) enum Timer {
     /// The pause before the next try is over.
     Retry(InstanceId),
@@ -120,7 +121,7 @@ pub(crate) enum Timer {
 }
 
 /// The queue and the timers.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Waits {
     queue: VecDeque<InstanceId>,
     /// Those that wait for the environment to look otherwise: whatever becomes real may do that.

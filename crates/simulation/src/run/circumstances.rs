@@ -8,6 +8,7 @@ use crate::dice::Hash;
 use ratn_executive::protocol::{Event, Learned};
 use ratn_model::value::Value;
 use std::collections::{BTreeMap, BTreeSet};
+use std::num::NonZeroUsize;
 
 /// More events than this is an endless run.
 pub const MAX_EVENTS: usize = 1_000_000;
@@ -25,8 +26,8 @@ pub struct Circumstances {
     pub mischief: Mischief,
     /// After every event the executive's invariants are checked. Costs the whole window each time.
     pub checks: bool,
-    /// After the last event of every moment it is checked that nobody could go on who was not woken. Everything that waits is looked at for that, which
-    /// may change who is looked at first later: such a run is not, command by command, the run without.
+    /// After the last event of every moment it is checked that nobody could go on who was not woken; on a copy of the executive, so
+    /// that the run is the same without.
     pub examines: bool,
     /// States that are refused whatever they ask for, by their paths without visits.
     pub refused: BTreeSet<String>,
@@ -36,6 +37,8 @@ pub struct Circumstances {
     pub learned: Learned,
     /// Attributes of the resources of a kind, one after the other.
     pub attributes: BTreeMap<String, Vec<BTreeMap<String, Value>>>,
+    /// After every so many events the executive's state is written down, and the run goes on with an executive that is made of it.
+    pub checkpoint_every: Option<NonZeroUsize>,
 }
 
 impl Default for Circumstances {
@@ -51,6 +54,7 @@ impl Default for Circumstances {
             resume_after: None,
             learned: Learned::default(),
             attributes: BTreeMap::new(),
+            checkpoint_every: None,
         }
     }
 }

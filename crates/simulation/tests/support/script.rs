@@ -51,6 +51,7 @@ use ratn_simulation::run::{Answer, Circumstances, Oracle, Performance, Run, RunE
 use ratn_world::world::World;
 use serde::Deserialize;
 use std::collections::BTreeMap;
+use std::num::NonZeroUsize;
 
 /// A scenario's script, and what it has seen.
 #[derive(Debug, Clone, Default, Deserialize)]
@@ -68,6 +69,9 @@ pub(crate) struct Script {
     answers: BTreeMap<String, Vec<Reply>>,
     crashes: BTreeMap<String, u32>,
     events: Vec<Outside>,
+    /// The executive is made anew from a checkpoint after every so many events.
+    #[serde(skip)]
+    pub(crate) checkpoint_every: Option<NonZeroUsize>,
     #[serde(skip)]
     tries: BTreeMap<String, usize>,
     /// The world of every goal that was given a projection, `None` for the others.
@@ -125,7 +129,9 @@ impl Script {
         };
         let events =
             self.events.iter().map(|outside| (outside.trigger(), outside.event(undisturbed.as_ref()))).collect();
-        run_under(self.setup(program, mode), self, Circumstances { events, ..Circumstances::default() })
+        let checkpoint_every = self.checkpoint_every;
+        let circumstances = Circumstances { events, checkpoint_every, ..Circumstances::default() };
+        run_under(self.setup(program, mode), self, circumstances)
     }
 
     fn setup(&self, program: &Program, mode: ratn_executive::protocol::Mode) -> Setup {

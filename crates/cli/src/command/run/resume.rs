@@ -8,10 +8,10 @@ use crate::interrupt::Interrupt;
 use crate::output;
 use crate::system::System;
 use crate::system::config::SystemConfig;
-use crate::task_control::log::{Log, LogWriter};
+use crate::task_control::history::History;
+use crate::task_control::log::LogWriter;
 use crate::task_control::shell::{self, Resumption};
-use ratn_executive::protocol::{Event, LogEntry};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Goes on with the run that `file` tells of.
 pub(super) async fn run(
@@ -28,12 +28,10 @@ pub(super) async fn run(
         output::check_writable(chart)?;
     }
     // From here on nobody else goes on with it.
-    let (writer, log) =
-        LogWriter::go_on(file).map_err(|error| refused(&format_args!("{:#}", anyhow::Error::from(error))))?;
-    if let Some(line) = log.torn {
-        output::progress(format_args!("{}:{line}: the last line is torn and is cut off", file.display()));
-    }
-    let task = task.map(Path::to_owned).or_else(|| named(&log));
+    let log = |error| refused(&format_args!("{:#}", anyhow::Error::from(error)));
+    let writer = LogWriter::go_on(file).map_err(log)?;
+    let history = History::of(&writer).map_err(log)?;
+    let task = task.map(Path::to_owned).or_else(|| history.task());
     let task = task.ok_or_else(|| refused(&"it does not name its task file: say `ratn run --resume LOG TASK`"))?;
     let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
     let Some(mut system) = System::find(directory, given).await? else {
@@ -43,7 +41,8 @@ pub(super) async fn run(
         )));
     };
     let program = check::load(&task, &system.config.catalogue)?;
-    let resumption = Resumption::new(program, writer, &log.lines).map_err(|error| refused(&error))?;
+    let resumption = Resumption::new(program, history, writer, arguments.checkpoint_every)
+        .map_err(|error| refused(&format_args!("{:#}", anyhow::Error::from(error))))?;
     output::progress(format_args!("on the system in {}", directory.display()));
     let place = system.place();
     let ended = tokio::select! {
@@ -51,13 +50,4 @@ pub(super) async fn run(
         error = system.one_ended() => Err(error.context("a part of the system ended during the run")),
     };
     conclude(&ended?, file, arguments)
-}
-
-fn named(log: &Log) -> Option<PathBuf> {
-    match log.lines.first().map(|line| &line.entry) {
-        Some(LogEntry::Event(Event::Started { origin, .. })) if !origin.file.is_empty() => {
-            Some(PathBuf::from(&origin.file))
-        }
-        _ => None,
-    }
 }

@@ -8,11 +8,11 @@ mod resume;
 mod tests;
 mod watch;
 
-pub(super) use resume::check_world;
+pub(super) use resume::{check_world, remembers};
 
-use super::ledger::acquire_request;
+use super::ledger::{Confirmed, acquire_request};
 use super::outside::Outside;
-use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorder, said};
+use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorded, Recorder, said};
 use super::shell::Place;
 use crate::aside::Aside;
 use crate::failure::Unbegun;
@@ -93,6 +93,7 @@ pub(super) struct Performer {
     /// Hears of the root's revisions.
     following: Option<AbortOnDropHandle<()>>,
     cancelled: Cancelled,
+    recorded: Recorded,
     asking: BTreeMap<InstanceId, Asking>,
     leases: Leases,
     /// Of the commands that are performed now.
@@ -144,12 +145,13 @@ impl Performer {
         only_run(&resources, task).await?;
         let world = WorldClient::new(&channels, &place.endpoints.world_pool)?;
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
-        let cancelled = Cancelled::default();
+        let (cancelled, recorded) = (Cancelled::default(), Recorded::default());
         let recorder = Recorder {
             run: run.clone(),
             world: world.clone(),
             resources: resources.clone(),
             cancelled: cancelled.clone(),
+            done: recorded.clone(),
             events: events.clone(),
             root: Revision::default(),
         };
@@ -171,6 +173,7 @@ impl Performer {
             outside: Outside::default(),
             following: None,
             cancelled,
+            recorded,
             asking: BTreeMap::new(),
             leases: Leases::default(),
             handover: None,
@@ -196,6 +199,15 @@ impl Performer {
         let following = watch::follow(self.world.clone(), after, self.events.clone());
         self.following = Some(AbortOnDropHandle::new(tokio::spawn(following)));
         Ok(())
+    }
+
+    /// How far what was decided is done.
+    pub(super) fn confirmed(&self) -> Confirmed {
+        *self.recorded.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn confirm(&self, confirmed: Confirmed) {
+        *self.recorded.lock().unwrap_or_else(PoisonError::into_inner) = confirmed;
     }
 
     /// Resolves when the session with the resource manager, and with it every lease, is lost.

@@ -7,7 +7,7 @@
 use super::Performer;
 use super::goal::Given;
 use crate::task_control::Endpoints;
-use crate::task_control::ledger::Ledger;
+use crate::task_control::ledger::{Confirmed, Ledger};
 use crate::task_control::outside;
 use crate::task_control::record::{Record, commit_next, operate_once, said};
 use anyhow::bail;
@@ -35,6 +35,42 @@ pub(in crate::task_control) async fn check_world(endpoints: &Endpoints, ledger: 
     Ok(())
 }
 
+/// Whether the world pool needs no commit that the ledger has forgotten. Where it does, the run has to be resumed from its whole log.
+pub(in crate::task_control) async fn remembers(endpoints: &Endpoints, ledger: &Ledger) -> anyhow::Result<bool> {
+    if ledger.forgotten == 0 {
+        return Ok(true);
+    }
+    let world = WorldClient::new(&Channels::new(), &endpoints.world_pool)?;
+    let (root, _) = patiently(|| world.root()).await?;
+    Ok(youngest_there(&world, ledger, root).await?.0.is_some())
+}
+
+/// How many of the ledger's commits the pool has: they were made in order, so those up to the youngest that it tells of. `None`
+/// where it tells of none; with the oldest revision that it can tell of.
+async fn youngest_there(
+    world: &WorldClient,
+    ledger: &Ledger,
+    root: Revision,
+) -> anyhow::Result<(Option<usize>, Revision)> {
+    // Any fact says how far back the pool can tell.
+    let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
+    let (_, oldest) = patiently(|| world.history(any.clone())).await?;
+    let after = oldest.max(ledger.first_revision);
+    let run = &ledger.origin.run;
+    let ids: BTreeMap<String, usize> =
+        ledger.commits.iter().enumerate().map(|(place, decided)| (decided.id(run), place + 1)).collect();
+    let mut watch = patiently(|| world.watch(Some(after), &[])).await?;
+    let (mut told, mut there) = (after, None);
+    while told < root {
+        let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
+            bail!("the world pool does not tell of its revisions up to {root}");
+        };
+        told = change.revision;
+        there = ids.get(&change.commit).copied().or(there);
+    }
+    Ok((there, oldest))
+}
+
 impl Performer {
     /// Takes up everything that is open, in the order in which it was decided; what has changed from outside meanwhile.
     ///
@@ -47,6 +83,8 @@ impl Performer {
     ) -> anyhow::Result<Option<Event>> {
         (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
         let changed = self.commit_again(&ledger, mirror).await?;
+        let commit = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
+        self.confirm(Confirmed { commit, ..Confirmed::default() });
         if self.session.state().borrow().found {
             for (number, instance, operations) in &ledger.operated {
                 let (number, instance, operations) = (*number, *instance, operations.clone());
@@ -55,6 +93,7 @@ impl Performer {
             self.sweep(&ledger).await?;
         } else {
             self.make_anew(&ledger).await?;
+            self.confirm(Confirmed { commit, operation: ledger.operations });
         }
         // What crossed with the end of task control goes back; a waiting one has left the queue with its connection.
         for request in &ledger.withdrawn {
@@ -95,29 +134,16 @@ impl Performer {
         Ok((!facts.is_empty()).then_some(Event::WorldChanged { revision, facts }))
     }
 
-    /// How many of the run's commits the pool has: they were made in order, so those up to the youngest that it tells of.
     async fn commits_there(&self, ledger: &Ledger, root: Revision) -> anyhow::Result<usize> {
-        // Any fact says how far back the pool can tell.
-        let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
-        let (_, oldest) = patiently(|| self.world.history(any.clone())).await?;
-        let after = oldest.max(ledger.first_revision);
-        let ids: BTreeMap<String, usize> =
-            ledger.commits.iter().enumerate().map(|(place, decided)| (decided.id(&self.run), place + 1)).collect();
-        let mut watch = patiently(|| self.world.watch(Some(after), &[])).await?;
-        let (mut told, mut there) = (after, None);
-        while told < root {
-            let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
-                bail!("the world pool does not tell of its revisions up to {root}");
-            };
-            told = change.revision;
-            there = ids.get(&change.commit).copied().or(there);
-        }
-        match there {
-            None if oldest > ledger.first_revision && !ids.is_empty() => bail!(
+        match youngest_there(&self.world, ledger, root).await? {
+            (None, _) if ledger.forgotten > 0 => {
+                bail!("the world pool has lost commits of the run since it was asked for them; resume the run again")
+            }
+            (None, oldest) if oldest > ledger.first_revision && !ledger.commits.is_empty() => bail!(
                 "the world pool keeps no revision of this run any more (the oldest is {oldest}): what it has of the run's commits \
                    is not known; run the task again"
             ),
-            there => Ok(there.unwrap_or(0)),
+            (there, _) => Ok(there.unwrap_or(0)),
         }
     }
 

@@ -336,3 +336,34 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     assert!(refused.is_err_and(|error| error.to_string().contains("lost its state")));
     bench.performer.close().await
 }
+
+#[tokio::test]
+async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let commit = |number: u64| Command::Commit {
+        instance: InstanceId(number),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(number),
+    };
+    let whole = ledger(&run, &[commit(1), commit(2)]);
+    // A checkpoint without the first commit, and a pool that has lost both.
+    let mut short = ledger(&run, &[commit(2)]);
+    short.forgotten = 1;
+    assert!(remembers(&bench.endpoints, &whole).await?);
+    assert!(!remembers(&bench.endpoints, &short).await?);
+    let mut mirror = World::default();
+    mirror.apply(&done())?;
+    let refused = bench.performer.take_up(short.clone(), &mirror).await;
+    assert!(refused.is_err_and(|error| error.to_string().contains("resume the run again")));
+    assert_eq!(bench.performer.root().await?.0, Revision(0));
+    // With the whole log it has both, and the checkpoint is enough from then on.
+    assert_eq!(bench.performer.take_up(whole, &mirror).await?, None);
+    assert_eq!(bench.performer.confirmed().commit, Revision(2));
+    assert!(remembers(&bench.endpoints, &short).await?);
+    assert_eq!(bench.performer.take_up(short, &mirror).await?, None);
+    assert_eq!(bench.performer.root().await?.0, Revision(2));
+    bench.performer.close().await
+}

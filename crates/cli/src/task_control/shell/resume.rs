@@ -3,15 +3,17 @@
 
 use super::{Ended, LOOK, Place, Shell, advisor_of, unix_ms};
 use crate::interrupt::Interrupt;
+use crate::output;
+use crate::task_control::checkpoint::{Keeper, Standing};
 use crate::task_control::control::Control;
-use crate::task_control::log::LogWriter;
+use crate::task_control::history::{History, HistoryError};
+use crate::task_control::log::{Log, LogWriter};
 use crate::task_control::performer::{self, Performer};
-use crate::task_control::progress::Progress;
-use crate::task_control::replay::{self, ReplayError, Replayed};
+use crate::task_control::replay::{self, Replayed};
 use crate::task_control::shell::MAX_PENDING_EVENTS;
 use anyhow::Context;
 use ratn_executive::lookahead::Lookout;
-use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Mode};
+use ratn_executive::protocol::{Command, Event};
 use ratn_model::program::Program;
 use ratn_worker::robot_clock::RobotClock;
 use std::sync::Arc;
@@ -21,11 +23,10 @@ use tokio::sync::mpsc;
 /// A run to go on with, as its log has it.
 pub(crate) struct Resumption {
     program: Arc<Program>,
-    mode: Mode,
-    seed: u64,
+    history: History,
     replayed: Replayed,
-    progress: Progress,
     log: LogWriter,
+    checkpoint_every: u64,
 }
 
 impl Resumption {
@@ -33,16 +34,36 @@ impl Resumption {
     ///
     /// # Errors
     /// Where the log is not of this program and this version, or the run has ended.
-    pub(crate) fn new(program: Program, log: LogWriter, lines: &[LogLine]) -> Result<Resumption, ReplayError> {
+    pub(crate) fn new(
+        program: Program,
+        history: History,
+        log: LogWriter,
+        checkpoint_every: u64,
+    ) -> Result<Resumption, HistoryError> {
         let program = Arc::new(program);
-        let replayed = replay::replay(&program, lines)?;
-        let mut progress = Progress::new(false);
-        progress.catch_up(lines);
-        let (mode, seed) = match lines.first().map(|line| &line.entry) {
-            Some(LogEntry::Event(Event::Started { mode, seed, .. })) => (*mode, *seed),
-            _ => (Mode::Hsm, 0),
-        };
-        Ok(Resumption { program, mode, seed, replayed, progress, log })
+        let replayed = history.replay(&program)?;
+        Ok(Resumption::of(program, history, replayed, log, checkpoint_every))
+    }
+
+    /// The same from the whole log, where its checkpoint does not know enough.
+    fn whole(self) -> Result<Resumption, HistoryError> {
+        let Resumption { program, history, log, checkpoint_every, .. } = self;
+        let replayed = history.replay_whole(&program)?;
+        Ok(Resumption::of(program, history, replayed, log, checkpoint_every))
+    }
+
+    fn of(
+        program: Arc<Program>,
+        history: History,
+        (replayed, read): (Replayed, Log),
+        mut log: LogWriter,
+        checkpoint_every: u64,
+    ) -> Resumption {
+        if let Some(line) = read.torn {
+            output::progress(format_args!("{}:{line}: the last line is torn and is cut off", log.path().display()));
+        }
+        log.go_on_behind(&read);
+        Resumption { program, history, replayed, log, checkpoint_every }
     }
 }
 
@@ -51,10 +72,22 @@ impl Resumption {
 /// # Errors
 /// As [`run`]; and where the run cannot go on: its log is of another program, its world is not there any more, another run is
 /// under way.
-pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
-    let Resumption { program, mode, seed, replayed, progress, log } = resumption;
-    let Replayed { executive, mut ledger, missing, states } = replayed;
-    performer::check_world(&place.endpoints, &ledger).await?;
+pub(crate) async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
+    let ledger = &resumption.replayed.standing.ledger;
+    performer::check_world(&place.endpoints, ledger).await?;
+    if !performer::remembers(&place.endpoints, ledger).await? {
+        resumption.history.say(&"the world pool has lost commits that are older");
+        resumption = resumption.whole()?;
+    }
+    let Resumption { program, history, replayed, log, checkpoint_every } = resumption;
+    let Replayed { executive, standing, missing, events: replayed } = replayed;
+    let Standing { mut ledger, states, progress } = standing;
+    let (mode, seed) = history.mode_and_seed();
+    // It knows of what is missing before that is written: nothing is kept until it is.
+    let mut kept = ledger.clone();
+    let others = missing.iter().filter(|command| !matches!(command, Command::Commit { .. }));
+    others.for_each(|command| kept.command(command));
+    let keeper = Keeper::start(&log, &program.digest, checkpoint_every, kept, replayed);
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
     let performer = Performer::connect(place, &ledger.origin.run, &program.name, events).await;
     let shell = Shell {
@@ -64,6 +97,7 @@ pub(crate) async fn resume(resumption: Resumption, place: &Place, interrupt: &In
         progress,
         program,
         log,
+        keeper,
         clock: RobotClock::going_on(replay::now(&ledger, unix_ms(), place.speed), place.speed),
         control: Control::listen_if_possible(&place.directory),
         advisor: advisor_of(mode, seed),

@@ -45,6 +45,7 @@ impl Bench {
             learned: Learned::default(),
             log: directory.path().join("log.jsonl"),
             quiet: true,
+            checkpoint_every: 0,
         };
         let place =
             Place { endpoints, directory: directory.path().to_owned(), catalogue: Arc::new(catalogue), speed: 10.0 };

@@ -13,6 +13,7 @@ use crate::plan::Plan;
 use ratn_model::id::InstanceId;
 use ratn_model::program::WORLD_MODEL;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
+use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// From the top: one bit that says "certain", the urgency, program order. The bits of a positive float are in its order, so
@@ -24,7 +25,7 @@ const ORDER_BITS: u32 = 31;
 const DEFAULT_DURATION_S: f32 = 1.0;
 
 /// How urgent an instance is: part of the instance, private to this module.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct DispatchCell {
     /// Estimated, in seconds.
     duration_s: Option<f32>,
@@ -34,7 +35,7 @@ pub(crate) struct DispatchCell {
 }
 
 /// Who is under way, who leaves room.
-#[derive(Debug)]
+#[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct Dispatch {
     /// How much there is of each kind of resource, where that is known.
     capacity: BTreeMap<String, Quantity>,

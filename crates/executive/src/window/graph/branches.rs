@@ -6,13 +6,14 @@
 
 use super::instance::SegmentId;
 use ratn_model::id::InstanceId;
+use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// No path counts as less likely than this: its share stays a number that can be divided and compared.
 const LEAST_PROBABILITY: f64 = 1e-30;
 
 /// One way on from a decision.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 struct Branch {
     parent: SegmentId,
     /// The instance that decides.
@@ -25,7 +26,7 @@ struct Branch {
 }
 
 /// The branches that are open.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(super) struct Branches {
     all: BTreeMap<SegmentId, Branch>,
     /// How many may be expanded.

@@ -1,6 +1,7 @@
 //! One visit of a state in the window: a node, which something is executed for, or a marker, which only stands for a place.
 
 use crate::binding::Outputs;
+use crate::checkpoint::leases;
 use crate::context::Made;
 use crate::interpreter::Interpreter;
 use crate::plan::{NodeNature, Outcome, Outcomes, gives_outputs};
@@ -15,6 +16,7 @@ use ratn_model::program::{ABORTED, SUCCESS};
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
+use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 use std::sync::Arc;
 
@@ -24,11 +26,13 @@ pub(crate) type SegmentId = u64;
 pub(crate) type LineId = u64;
 
 /// One visit of a state. Only the graph changes it; everybody may look at it.
+#[derive(Serialize, Deserialize)]
 pub(crate) struct Instance {
     pub(crate) id: InstanceId,
     pub(crate) state: StateId,
     pub(crate) visit: u32,
     pub(crate) iteration: Option<usize>,
+    #[serde(skip)]
     pub(crate) environment: Environment,
     pub(crate) producer: Option<Arc<Producer>>,
     pub(crate) line: LineId,
@@ -53,6 +57,7 @@ pub(crate) struct Instance {
 }
 
 /// What is only there of a node, or only of a marker.
+#[derive(Serialize, Deserialize)]
 pub(crate) enum Body {
     /// An action, or a routine: something is executed.
     Node(Node),
@@ -61,6 +66,7 @@ pub(crate) enum Body {
 }
 
 /// The life of an action or a routine.
+#[derive(Serialize, Deserialize)]
 pub(crate) struct Node {
     pub(crate) nature: NodeNature,
     pub(crate) status: Status,
@@ -86,6 +92,7 @@ pub(crate) struct Node {
 ///     ▲            └───────────┴── its worker died ──┘            │
 ///     └───────────── invalidated, preempted, tried again ─────────┘
 /// ```
+#[derive(Serialize, Deserialize)]
 pub(crate) enum Status {
     /// Waits for older instances.
     Expanded,
@@ -104,8 +111,9 @@ pub(crate) enum Status {
 }
 
 /// What a node has got.
-#[derive(Default)]
+#[derive(Default, Serialize, Deserialize)]
 pub(crate) struct Held {
+    #[serde(with = "leases")]
     pub(crate) lease: Option<Box<Lease>>,
     pub(crate) projection: Option<ProjectionId>,
     /// When it got its resources.
@@ -113,6 +121,7 @@ pub(crate) struct Held {
 }
 
 /// A place of the program without a provider.
+#[derive(Serialize, Deserialize)]
 pub(crate) struct Marker {
     pub(crate) role: Role,
     /// Exit, region end, end: the outcome by which the state is left.
@@ -125,7 +134,7 @@ pub(crate) struct Marker {
 }
 
 /// What a marker stands for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Role {
     /// Decides between two branches.
     Condition,
@@ -148,7 +157,7 @@ pub(crate) enum Role {
 }
 
 /// How an instance ended.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Ended {
     pub(crate) outcome: Arc<str>,
     pub(crate) outputs: Outputs,
@@ -159,7 +168,7 @@ pub(crate) struct Ended {
 }
 
 /// What an ended instance changes when it retires.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Changed {
     /// What it declares for its outcome, with what was measured, and what is known of how.
     Declared(Vec<(FactKey, Value)>, Evidence),
@@ -169,7 +178,7 @@ pub(crate) enum Changed {
 }
 
 /// One continuation.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Arm {
     pub(crate) outcomes: Outcomes,
     pub(crate) next: Option<InstanceId>,

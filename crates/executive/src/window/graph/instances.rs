@@ -2,10 +2,11 @@
 
 use super::instance::Instance;
 use ratn_model::id::InstanceId;
+use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 
 /// The table of instances. Ids grow; what has left the window leaves a hole until everything older has left, too.
-#[derive(Default)]
+#[derive(Default, Serialize, Deserialize)]
 pub(super) struct Instances {
     first: u64,
     slots: VecDeque<Option<Box<Instance>>>,

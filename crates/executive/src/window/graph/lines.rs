@@ -2,13 +2,14 @@
 
 use super::instance::LineId;
 use ratn_model::id::InstanceId;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// The task's own line.
 pub(crate) const MAIN: LineId = 0;
 
 /// One thread of control.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 struct Line {
     /// The oldest instance that has not retired.
     head: Option<InstanceId>,
@@ -25,7 +26,7 @@ struct Line {
 }
 
 /// All lines.
-#[derive(Debug)]
+#[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Lines {
     all: BTreeMap<LineId, Line>,
     last: LineId,

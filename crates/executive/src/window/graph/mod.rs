@@ -12,13 +12,14 @@
 //! | `node` | the life of one node |
 
 mod branches;
+mod checkpoint;
 pub(crate) mod instance;
 mod instances;
 mod lines;
 mod node;
 mod prune;
 
-use crate::plan::{Outcomes, Predicate};
+use crate::plan::{Chain, Outcomes};
 use crate::window::dispatch::DispatchCell;
 use crate::window::growth::environment::{Environment, Link};
 use crate::window::memory::Seen;
@@ -30,11 +31,12 @@ use lines::Lines;
 pub(crate) use lines::MAIN;
 pub(crate) use prune::Pruned;
 use ratn_model::id::InstanceId;
+use serde::{Deserialize, Serialize};
 use smallvec::smallvec;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A fork whose join has not retired.
-#[derive(Debug)]
+#[derive(Debug, Serialize, Deserialize)]
 struct Fork {
     /// Where the fork stands.
     line: LineId,
@@ -43,13 +45,14 @@ struct Fork {
 }
 
 /// The graph.
+#[derive(Serialize, Deserialize)]
 pub(crate) struct Graph {
     instances: Instances,
     lines: Lines,
     branches: Branches,
     forks: BTreeMap<InstanceId, Fork>,
-    /// Of joins whose regions wrote the same predicate: all their links.
-    joins: BTreeMap<InstanceId, Vec<(Predicate, Link)>>,
+    /// Of joins, the links of chains in which writers of several regions stand.
+    joins: BTreeMap<InstanceId, Vec<(Chain, Link)>>,
     /// Imprecise PIAs that still run although younger instances have retired.
     detached: BTreeSet<InstanceId>,
     /// To be looked at: new ones, and those that have become heads.
@@ -170,7 +173,7 @@ impl Graph {
         fork: InstanceId,
         join: InstanceId,
         environment: Environment,
-        links: Vec<(Predicate, Link)>,
+        links: Vec<(Chain, Link)>,
     ) {
         self.joins.insert(join, links);
         if let Some(instance) = self.instances.get_mut(join) {
@@ -186,7 +189,7 @@ impl Graph {
     }
 
     /// The writers of a predicate in the regions before a join, where several wrote it.
-    pub(crate) fn joined(&self, join: InstanceId) -> Option<&[(Predicate, Link)]> {
+    pub(crate) fn joined(&self, join: InstanceId) -> Option<&[(Chain, Link)]> {
         self.joins.get(&join).map(Vec::as_slice)
     }
 

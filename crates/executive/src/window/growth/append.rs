@@ -1,19 +1,23 @@
 //! One more instance behind the last one of a path, and what is seen from behind it: its outputs, what it assigns, its effects.
 
 use super::Growth;
-use super::environment::{Binding, Link, Producer};
+use super::environment::{Binding, Environment, Link, Producer};
 use crate::context::Context;
-use crate::plan::{Outcome, Predicate, gives_outputs};
+use crate::plan::{Chain, Outcome, Predicate, Written, gives_outputs};
 use crate::protocol::Note;
 use crate::window::dispatch::DispatchCell;
 use crate::window::graph::Graph;
 use crate::window::graph::instance::{Body, Instance, Marker, Node, Role, Status};
 use crate::window::memory::MemoryCell;
 use crate::window::waits::WaitCell;
+use ratn_model::expression::{Lookup, Scope};
+use ratn_model::fact::{FactKey, FactPattern};
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::State;
+use ratn_model::program::{Program, State};
 use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
 use smallvec::SmallVec;
+use std::borrow::Cow;
 use std::sync::{Arc, OnceLock};
 
 /// What is appended: a node, or a marker that leaves its state by an outcome.
@@ -106,11 +110,18 @@ impl Growth {
         index: usize,
         instance: InstanceId,
         link: Link,
-        writes: &[Predicate],
+        (writes, written): (&[Predicate], &[Written]),
     ) {
         let Some((state, producer)) = graph.get(instance).map(|i| (i.state, i.producer.clone())) else { return };
-        for predicate in writes {
-            self.cursors[index].environment.writers.set(*predicate, Some(link));
+        let plan = context.plan;
+        let environment = &mut self.cursors[index].environment;
+        let mut chains: SmallVec<[Chain; 4]> = writes.iter().map(|predicate| plan.chain_of(*predicate)).collect();
+        for one in written {
+            let known = Fixed { environment, program: context.program };
+            plan.chains_written(one, &known, &mut |chain| chains.push(chain));
+        }
+        for chain in chains {
+            environment.writers.set(chain, Some(link));
         }
         self.produce(context, index, producer, state, link.outcome);
     }
@@ -137,5 +148,37 @@ impl Growth {
                 }
             }
         }
+    }
+}
+
+/// What is known where an instance is expanded, and never changes: loop variables and constants.
+struct Fixed<'a> {
+    environment: &'a Environment,
+    program: &'a Program,
+}
+
+impl Scope for Fixed<'_> {
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
+        match self.environment.variables.get(name) {
+            Some(Binding::Known(value)) => Some(Cow::Borrowed(value)),
+            Some(Binding::Assigned(_)) => None,
+            None => self.environment.loop_variables(self.program).find(|(n, _)| *n == name).map(|(_, value)| value),
+        }
+    }
+
+    fn output(&self, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+
+    fn port(&self, _: StateId, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+
+    fn fact(&self, _: &FactPattern) -> Lookup<'_> {
+        Lookup::Unknown
+    }
+
+    fn each_fact(&self, _: &FactPattern, _: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
+        false
     }
 }

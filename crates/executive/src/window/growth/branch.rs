@@ -82,7 +82,7 @@ impl Growth {
             [arm] => {
                 graph.single_arm(instance, arm.outcomes);
                 let link = link(arm.outcome, !arm.same_effects);
-                self.come_after(graph, context, index, instance, link, &own.writes);
+                self.come_after(graph, context, index, instance, link, (&own.writes, &own.written));
                 self.cursors[index].todo = Todo::Leave(id, arm.outcome);
             }
             arms => {
@@ -91,7 +91,7 @@ impl Growth {
                 let cursors = self.branch(graph, context, index, instance, id, &ways);
                 for ((cursor, outcome), arm) in cursors.into_iter().zip(arms) {
                     let link = link(outcome, !arm.same_effects);
-                    self.come_after(graph, context, cursor, instance, link, &own.writes);
+                    self.come_after(graph, context, cursor, instance, link, (&own.writes, &own.written));
                     self.cursors[cursor].todo = Todo::Leave(id, outcome);
                 }
             }

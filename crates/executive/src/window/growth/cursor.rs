@@ -4,11 +4,13 @@ use super::environment::Environment;
 use crate::plan::Outcome;
 use crate::window::graph::instance::{LineId, SegmentId};
 use ratn_model::id::{InstanceId, StateId};
+use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 /// An open end.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct Cursor {
+    #[serde(skip)]
     pub(super) environment: Environment,
     /// The youngest instance on its path and the arm of it that it follows; may have retired since.
     pub(super) tail: Option<(InstanceId, usize)>,
@@ -36,7 +38,7 @@ impl Cursor {
 }
 
 /// What a cursor does next.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) enum Todo {
     /// Visit a state.
     Enter(StateId),

@@ -2,21 +2,26 @@
 //! variables are, which older instance wrote each port last (register renaming), and which older instances write each
 //! predicate (memory renaming). Copies share everything.
 
+mod checkpoint;
+
+pub(crate) use checkpoint::{Collector, Places, Restored};
+
 use super::table::Table;
 use crate::binding::Outputs;
-use crate::plan::{Outcome, Plan, Predicate};
+use crate::plan::{Chain, Outcome, Plan};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
+use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::sync::{Arc, OnceLock};
 
 /// A place's environment.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct Environment {
     pub(crate) frames: Option<Arc<Frame>>,
     pub(crate) variables: Variables,
-    /// By predicate, the youngest older instance that writes it.
+    /// By chain, the youngest older instance that stands in it.
     pub(crate) writers: Table<Link>,
     /// Of the test of a `while`: its iteration, which is not begun yet.
     pub(crate) test: Option<Box<(StateId, Iteration)>>,
@@ -25,7 +30,7 @@ pub(crate) struct Environment {
 }
 
 /// An instance as a writer, seen along one of its arms. Its own environment has the link to the next older one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Link {
     pub(crate) writer: InstanceId,
     /// The outcome that the path assumes.
@@ -35,9 +40,11 @@ pub(crate) struct Link {
 }
 
 /// An instance as the writer of outputs. They stand here once it has retired, for as long as somebody can name them.
-#[derive(Debug)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Producer {
+    #[serde(skip)]
     pub(crate) instance: InstanceId,
+    #[serde(skip)]
     pub(crate) real: OnceLock<Outputs>,
 }
 
@@ -125,7 +132,7 @@ impl Environment {
             frames: None,
             variables: Variables::default(),
             test: None,
-            writers: Table::new(plan.width),
+            writers: Table::new(plan.chains()),
             producers: Table::new(2 * plan.len()),
         }
     }
@@ -158,8 +165,8 @@ impl Environment {
         self.producers.get(state.0 as usize)
     }
 
-    pub(crate) fn writer(&self, predicate: Predicate) -> Option<Link> {
-        self.writers.get(predicate).copied()
+    pub(crate) fn writer(&self, chain: Chain) -> Option<Link> {
+        self.writers.get(chain).copied()
     }
 
     /// The path of a state visited here.

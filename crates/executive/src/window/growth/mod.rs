@@ -15,6 +15,7 @@
 
 mod append;
 mod branch;
+mod checkpoint;
 mod cursor;
 pub(crate) mod environment;
 mod iterate;
@@ -31,10 +32,12 @@ use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Program};
 use ratn_model::value::Value;
 use regions::Regions;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// The open ends of all paths.
+#[derive(Serialize, Deserialize)]
 pub(crate) struct Growth {
     cursors: Vec<Cursor>,
     /// By fork, what is known of the ends of its regions.

@@ -4,21 +4,24 @@
 use super::Growth;
 use super::append::What;
 use super::cursor::{Cursor, Todo};
-use super::environment::{Binding, Environment, Frame, Link, Producer};
+use super::environment::{Binding, Collector, Environment, Frame, Link, Producer, Restored};
+use crate::checkpoint::Broken;
 use crate::context::Context;
-use crate::plan::Predicate;
+use crate::plan::Chain;
 use crate::window::graph::instance::{Ended, Role};
 use crate::window::graph::{Graph, Pruned};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{SUCCESS, State, StateKind};
 use ratn_model::value::Value;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Where a path of a region ends, and what is seen from there.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 struct RegionExit {
     end: InstanceId,
+    #[serde(skip)]
     environment: Environment,
     producer: Arc<Producer>,
     /// Why the path left otherwise than by success.
@@ -26,7 +29,7 @@ struct RegionExit {
 }
 
 /// A fork that is not joined for good: its join may be lost with an end of a region, and is expanded anew.
-#[derive(Debug)]
+#[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Regions {
     /// The concurrency and its visit.
     state: StateId,
@@ -127,7 +130,7 @@ impl Growth {
         let StateKind::Concurrency { regions, .. } = &state.kind else { return };
         let states = context.plan.len();
         let before = self.cursors[index].environment.clone();
-        let mut merged: BTreeMap<Predicate, Vec<Link>> = BTreeMap::new();
+        let mut merged: BTreeMap<Chain, Vec<Link>> = BTreeMap::new();
         for (region, RegionExit { environment, producer, .. }) in regions.iter().zip(&ends) {
             for (predicate, link) in environment.writers.iter() {
                 if before.writer(predicate) != Some(*link) {
@@ -203,5 +206,24 @@ impl Growth {
     /// Forks whose join has retired need not be kept in mind.
     pub(crate) fn forget_joined(&mut self, graph: &Graph) {
         self.regions.retain(|fork, _| graph.has_fork(*fork));
+    }
+}
+
+/// Of a checkpoint: what the ends of regions share.
+impl Regions {
+    pub(super) fn collect<'a>(&'a self, places: &mut Collector<'a>) {
+        places.add(&self.waiting.environment);
+        for exit in self.ends.iter().flatten() {
+            places.add(&exit.environment);
+            places.add_producer(&exit.producer);
+        }
+    }
+
+    pub(super) fn restore(&mut self, places: &mut Restored) -> Result<(), Broken> {
+        self.waiting.environment = places.environment()?;
+        for exit in self.ends.iter_mut().flatten() {
+            (exit.environment, exit.producer) = (places.environment()?, places.producer()?);
+        }
+        Ok(())
     }
 }

@@ -3,6 +3,9 @@
 //! A radix tree over small numbers (states, predicates) with structure shared between copies: every instance keeps the
 //! tables of its place in the program, and neighbours share all but what changed between them.
 
+mod checkpoint;
+
+pub(super) use checkpoint::{NodeForm, Nodes};
 use std::sync::Arc;
 
 const BITS: usize = 3;
@@ -19,6 +22,12 @@ pub(crate) struct Table<T> {
 enum Node<T> {
     Leaf([Option<T>; WIDTH]),
     Inner([Option<Arc<Node<T>>>; WIDTH]),
+}
+
+impl<T> Default for Table<T> {
+    fn default() -> Table<T> {
+        Table { depth: 0, root: None }
+    }
 }
 
 impl<T: Clone> Table<T> {

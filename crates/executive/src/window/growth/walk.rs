@@ -204,7 +204,8 @@ impl Growth {
             let operated: &[Predicate] = if outcome == 0 { &own.operated } else { &[] };
             let writes: Vec<Predicate> = own.effect_predicates[outcome].iter().chain(operated).copied().collect();
             let link = Link { writer: instance, outcome, vague: false };
-            self.come_after(graph, context, index, instance, link, &writes);
+            let written = &own.effects_written[outcome];
+            self.come_after(graph, context, index, instance, link, (&writes, written));
         }
         let cursor = &mut self.cursors[index];
         cursor.environment.variables.truncate(kept);

@@ -18,6 +18,7 @@ use ratn_model::id::InstanceId;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_world::world::increased;
+use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 use std::sync::Arc;
 
@@ -31,7 +32,7 @@ const MAX_VERSIONS: usize = 4;
 pub(super) type Chunk = Arc<[Change]>;
 
 /// What an instance changes, along one of its arms.
-#[derive(Debug)]
+#[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Forecast {
     /// The outcome that the arm assumes.
     outcome: Outcome,
@@ -43,7 +44,7 @@ pub(super) struct Forecast {
 }
 
 /// One effect.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 enum Part {
     /// Nobody has asked.
     Open,

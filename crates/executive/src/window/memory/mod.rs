@@ -38,6 +38,7 @@ use ratn_model::id::InstanceId;
 use ratn_model::program::Program;
 use ratn_world::world::World;
 pub(crate) use seen::Seen;
+use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeSet;
@@ -45,7 +46,7 @@ pub(crate) use view::{Blocked, View, facts_of};
 pub(crate) use walk::Looked;
 
 /// What an instance's place in memory renaming is: part of the instance, private to this module.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct MemoryCell {
     /// Who has used its outputs or looked at what it changes.
     users: RefCell<SmallVec<[User; 2]>>,
@@ -54,7 +55,7 @@ pub(crate) struct MemoryCell {
 }
 
 /// Somebody whose result, or whose effects, are made of what an older instance puts out or changes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) struct User {
     pub(crate) id: InstanceId,
     pub(crate) of: Source,
@@ -62,7 +63,7 @@ pub(crate) struct User {
 }
 
 /// What is used.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) enum Source {
     /// Outputs, or values of variables.
     Outputs,
@@ -71,7 +72,7 @@ pub(crate) enum Source {
 }
 
 /// What it is used for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub(crate) enum Purpose {
     /// The user's own result.
     Result,
@@ -80,9 +81,12 @@ pub(crate) enum Purpose {
 }
 
 /// What memory renaming keeps beside the instances.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Memory {
+    #[serde(skip)]
     deep: Deep,
+    /// What anybody would find in the root: no part of a checkpoint.
+    #[serde(skip)]
     digests: RefCell<Digests>,
     /// Instances whose outputs or effects may be otherwise than their users know.
     stale: BTreeSet<InstanceId>,

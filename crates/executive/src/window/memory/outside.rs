@@ -8,13 +8,14 @@ use ratn_model::fact::{FactKey, FactPattern};
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_world::world::World;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// Of one fact, so many values that somebody may have seen are kept; then it counts as otherwise.
 const MAX_VERSIONS: usize = 8;
 
 /// What is known of changes from outside.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(super) struct Outside {
     /// What facts were that have changed within their tolerance.
     seen: BTreeMap<FactKey, Vec<Option<Value>>>,
@@ -23,7 +24,7 @@ pub(super) struct Outside {
 }
 
 /// Facts that have changed from outside.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct News {
     /// At all.
     pub(crate) changed: Vec<FactPattern>,

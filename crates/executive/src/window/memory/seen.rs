@@ -8,10 +8,11 @@ use super::walk::Looked;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::InstanceId;
 use ratn_world::digest::Digest;
+use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 
 /// What a result was made of.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct Seen {
     /// The facts that it may have looked at.
     pub(crate) read: Vec<Footprint>,
@@ -22,6 +23,11 @@ pub(crate) struct Seen {
 }
 
 impl Seen {
+    /// These facts were looked at, whatever they were: no other result is made of the same.
+    pub(crate) fn look_at(&mut self, read: Footprint) {
+        self.read.push(read);
+    }
+
     /// Whether the same is computed of it.
     pub(crate) fn is_like(&self, other: &Seen) -> bool {
         self.inputs == other.inputs && self.facts == other.facts && self.read == other.read

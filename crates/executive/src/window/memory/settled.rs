@@ -161,11 +161,17 @@ impl View<'_> {
         self.walk(looked, |writer, link| {
             let (may, after) = self.sight.may_still_write(writer, link, looked);
             if may {
-                let can_settle = after.filter(|id| {
-                    let has_ended = self.sight.graph.get(*id).is_some_and(|older| older.ended().is_some());
-                    *id != writer.id && has_ended && !blocked.contains_key(id)
+                // A key is known before its writer is real: whoever it comes from is waited for first.
+                found = Some(match after.filter(|id| *id != writer.id) {
+                    None => Step::Blocked(writer.id),
+                    Some(older) => match blocked.get(&older) {
+                        Some(on) => Step::Blocked(*on),
+                        None if self.sight.graph.get(older).is_some_and(|older| older.ended().is_none()) => {
+                            Step::Blocked(older)
+                        }
+                        None => Step::After(older),
+                    },
                 });
-                found = Some(can_settle.map_or(Step::Blocked(writer.id), Step::After));
             }
             !may
         });

@@ -1,7 +1,7 @@
 //! The chain of older writers: from an environment, youngest first, as far as somebody wants to go.
 
 use super::view::View;
-use crate::plan::{EVERYTHING, Plan, Predicate};
+use crate::plan::{Chain, EVERYTHING, Plan};
 use crate::window::graph::instance::{Instance, Role};
 use crate::window::growth::environment::Link;
 use ratn_model::fact::{FactPattern, Footprint};
@@ -43,30 +43,29 @@ impl<'p> Looked<'p> {
         }
     }
 
-    /// The predicates whose writers are to be visited.
-    fn predicates(self, plan: &Plan) -> SmallVec<[Predicate; 4]> {
-        let mut predicates = SmallVec::new();
-        predicates.push(EVERYTHING);
+    /// The chains whose writers are to be visited.
+    fn chains(self, plan: &Plan) -> SmallVec<[Chain; 4]> {
+        let mut chains: SmallVec<[Chain; 4]> = SmallVec::new();
+        chains.push(plan.chain_of(EVERYTHING));
         match self {
-            Looked::Everything => predicates.extend(plan.predicates().skip(1)),
+            Looked::Everything => chains.extend(plan.predicates().skip(1).map(|predicate| plan.chain_of(predicate))),
             Looked::Patterns(patterns) => {
-                for (place, pattern) in patterns.iter().enumerate() {
-                    // Several patterns of one predicate are one chain.
-                    if patterns[..place].iter().any(|before| before.predicate == pattern.predicate) {
-                        continue;
+                for chain in patterns.iter().flat_map(|pattern| plan.chains_of(pattern)).flatten() {
+                    // Several patterns of one predicate may be one chain.
+                    if !chains.contains(&chain) {
+                        chains.push(chain);
                     }
-                    predicates.extend(plan.predicate(&pattern.predicate));
                 }
             }
         }
-        predicates
+        chains
     }
 }
 
-/// The next writer of one predicate.
+/// The next writer of one chain.
 #[derive(Clone, Copy)]
 struct Next {
-    predicate: Predicate,
+    chain: Chain,
     link: Link,
 }
 
@@ -75,29 +74,29 @@ impl<'a> View<'a> {
     pub(super) fn walk(&self, looked: Looked<'_>, mut visit: impl FnMut(&'a Instance, Link) -> bool) {
         let graph = self.sight.graph;
         let mut open: SmallVec<[Next; 4]> = SmallVec::new();
-        let push = |open: &mut SmallVec<[Next; 4]>, predicate: Predicate, link: Option<Link>| {
+        let push = |open: &mut SmallVec<[Next; 4]>, chain: Chain, link: Option<Link>| {
             let Some(link) = link.filter(|link| graph.contains(link.writer)) else { return };
             // Several ways, over regions, may lead to the same writer.
-            if !open.iter().any(|next| next.predicate == predicate && next.link.writer == link.writer) {
-                open.push(Next { predicate, link });
+            if !open.iter().any(|next| next.chain == chain && next.link.writer == link.writer) {
+                open.push(Next { chain, link });
             }
         };
         let environment = &self.instance.environment;
-        for predicate in looked.predicates(self.sight.plan) {
-            push(&mut open, predicate, environment.writer(predicate));
+        for chain in looked.chains(self.sight.plan) {
+            push(&mut open, chain, environment.writer(chain));
         }
         let mut last: Option<InstanceId> = None;
         let mut beside: SmallVec<[InstanceId; 2]> = SmallVec::new();
         while let Some(place) = youngest(&open) {
-            let Next { predicate, link } = open.swap_remove(place);
+            let Next { chain, link } = open.swap_remove(place);
             let Some(writer) = graph.get(link.writer) else { continue };
             match graph.joined(link.writer) {
                 Some(links) if writer.role() == Some(Role::Join) => {
-                    let merged = links.iter().filter(|(of, _)| *of == predicate);
-                    merged.for_each(|(_, link)| push(&mut open, predicate, Some(*link)));
+                    let merged = links.iter().filter(|(of, _)| *of == chain);
+                    merged.for_each(|(_, link)| push(&mut open, chain, Some(*link)));
                     continue;
                 }
-                _ => push(&mut open, predicate, writer.environment.writer(predicate)),
+                _ => push(&mut open, chain, writer.environment.writer(chain)),
             }
             if last.replace(link.writer) == Some(link.writer) {
                 continue;

@@ -1,0 +1,112 @@
+//! What the forms of a checkpoint have in common: things behind an `Arc` are written once, and leases and requirements, which JSON
+//! leaves the empty parts of out, in full.
+//!
+//! What a checkpoint is, and what of the state is not in it, says [`crate::executive::Executive::checkpoint`].
+
+use ratn_model::condition::Condition;
+use ratn_model::id::{FencingToken, LeaseId};
+use ratn_model::resource::{Lease, LeasedResource, Quantity, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::value::Value;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// Bytes that are no checkpoint of this program: what is wrong with them.
+pub(crate) type Broken = &'static str;
+
+/// The forms of things that several share, each once, in the order in which they were met.
+#[derive(Debug)]
+pub(crate) struct Pool<F> {
+    /// By address. Nothing of it is written, so what is written depends on the state alone.
+    places: BTreeMap<usize, u32>,
+    forms: Vec<F>,
+}
+
+impl<F> Default for Pool<F> {
+    fn default() -> Pool<F> {
+        Pool { places: BTreeMap::new(), forms: Vec::new() }
+    }
+}
+
+impl<F> Pool<F> {
+    /// The place of something that was met before.
+    pub(crate) fn find<T>(&self, shared: &Arc<T>) -> Option<u32> {
+        self.places.get(&Arc::as_ptr(shared).addr()).copied()
+    }
+
+    /// Gives something a place.
+    pub(crate) fn add<T>(&mut self, shared: &Arc<T>, form: F) -> u32 {
+        let place = u32::try_from(self.forms.len()).unwrap_or(u32::MAX);
+        self.places.insert(Arc::as_ptr(shared).addr(), place);
+        self.forms.push(form);
+        place
+    }
+
+    pub(crate) fn into_forms(self) -> Vec<F> {
+        self.forms
+    }
+}
+
+/// What was written at a place.
+pub(crate) fn at<T: Clone>(all: &[T], place: u32, broken: Broken) -> Result<T, Broken> {
+    usize::try_from(place).ok().and_then(|place| all.get(place)).cloned().ok_or(broken)
+}
+
+type ResourceForm = (String, String, String, Vec<String>);
+type LeaseForm = (LeaseId, FencingToken, Vec<ResourceForm>);
+
+/// A lease, if there is one.
+pub(crate) mod leases {
+    use super::{Deserialize, Deserializer, Lease, LeaseForm, LeasedResource, Serialize, Serializer};
+    use std::borrow::Borrow;
+
+    pub(crate) fn serialize<L: Borrow<Lease>, S: Serializer>(lease: &Option<L>, to: S) -> Result<S::Ok, S::Error> {
+        let form = |lease: &L| -> LeaseForm {
+            let Lease { id, token, resources } = lease.borrow().clone();
+            let resource = |resource| {
+                let LeasedResource { id, kind, endpoint, superclasses } = resource;
+                (id, kind, endpoint, superclasses)
+            };
+            (id, token, resources.into_iter().map(resource).collect())
+        };
+        lease.as_ref().map(form).serialize(to)
+    }
+
+    pub(crate) fn deserialize<'d, L: From<Lease>, D: Deserializer<'d>>(from: D) -> Result<Option<L>, D::Error> {
+        let form = Option::<LeaseForm>::deserialize(from)?;
+        Ok(form.map(|(id, token, resources)| {
+            let resource = |(id, kind, endpoint, superclasses)| LeasedResource { id, kind, endpoint, superclasses };
+            Lease { id, token, resources: resources.into_iter().map(resource).collect() }.into()
+        }))
+    }
+}
+
+type RequirementForm =
+    (ResourceOperation, String, Option<ResourceClass>, BTreeMap<String, Value>, Quantity, bool, Vec<Condition>);
+
+/// What is asked of the resource manager.
+pub(crate) mod requirements {
+    use super::{Deserialize, Deserializer, Requirement, RequirementForm, Serialize, Serializer};
+
+    pub(crate) fn serialize<S: Serializer>(all: &[Requirement], to: S) -> Result<S::Ok, S::Error> {
+        let form = |requirement: &Requirement| -> RequirementForm {
+            let Requirement { operation, kind, class, attributes, count, divisible, conditions } = requirement.clone();
+            (operation, kind, class, attributes, count, divisible, conditions)
+        };
+        all.iter().map(form).collect::<Vec<_>>().serialize(to)
+    }
+
+    pub(crate) fn deserialize<'d, D: Deserializer<'d>>(from: D) -> Result<Vec<Requirement>, D::Error> {
+        let forms = Vec::<RequirementForm>::deserialize(from)?;
+        let requirement = |(operation, kind, class, attributes, count, divisible, conditions)| Requirement {
+            operation,
+            kind,
+            class,
+            attributes,
+            count,
+            divisible,
+            conditions,
+        };
+        Ok(forms.into_iter().map(requirement).collect())
+    }
+}

@@ -1,0 +1,190 @@
+//! A checkpoint: the whole state of an executive as bytes, so that a run resumes from it without its log before.
+//!
+//! An executive that is restored gives the same commands for the same further events, to the last bit. What that takes:
+//!
+//! | in it | why |
+//! |---|---|
+//! | the mirror of the root, with the revisions of its facts | what is read, and what a commit is numbered |
+//! | the instances with their places, outputs, waits and urgency | who goes on when, and is asked for with which priority |
+//! | forecasts, with what readers were shown of them before, and their users | a forecast that changed within its tolerance is not made again: who is told of what, and what is predicted, follows from what it *was* |
+//! | what facts were before somebody changed them within their tolerance | as above, of changes from outside |
+//! | estimated durations and paths | they are made when the window has grown enough, and stand until then |
+//! | results that were discarded | they serve again |
+//! | the queue, timers, cursors, branches, lines, the interpreters with their threads | where everything is |
+//!
+//! | not in it | because |
+//! |---|---|
+//! | the plan | it follows from the program. Its fingerprint is there: a checkpoint fits no other program and no other catalogue |
+//! | the sums of hashes of the root's facts | whoever asks makes them of the root, the same ones |
+//! | how deep forecasts are within each other, how far an event's commands have been looked through | nothing, between two events |
+//!
+//! What several share is written once and shared again (`window/growth/environment/checkpoint.rs`). The mirror's facts have no writers and
+//! no measurements, those of the world pool have. A world that a routine works on is written as its difference from the root.
+//!
+//! The bytes: a version, a BLAKE3 hash of the rest, and the rest in postcard, which keeps floats to the last bit. Bytes that are torn,
+//! damaged, of another version or of another program are refused before anything of them is used.
+
+use super::{Executive, State};
+use crate::plan::Plan;
+use crate::window::Beside;
+use ratn_model::fact::FactKey;
+use ratn_model::id::Revision;
+use ratn_model::program::Program;
+use ratn_model::time::Timestamp;
+use ratn_model::tolerance::Tolerance;
+use ratn_model::value::Value;
+use ratn_world::world::{Fact, World};
+use serde::{Deserialize, Serialize};
+use std::fmt::{self, Write};
+use std::sync::Arc;
+
+/// The version of the form. Any change of what is written takes a new number: no version reads another's.
+const FORMAT: u8 = 1;
+
+type Hash = [u8; blake3::OUT_LEN];
+
+/// Why a checkpoint cannot be restored.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RestoreError {
+    /// Another version of the executive wrote it.
+    #[error("it is of format {found}, and this version of ratn reads {FORMAT}")]
+    Format {
+        /// Its first byte.
+        found: u8,
+    },
+    /// Bytes are missing, too many, or otherwise than they were written.
+    #[error("it is torn or damaged")]
+    Torn,
+    /// It is whole, and of something else.
+    #[error("it is of another program, or the catalogue was another one")]
+    OtherProgram,
+    /// It was written so, and makes no sense.
+    #[error("it contradicts itself: {0}")]
+    Broken(String),
+}
+
+/// All but the root and the window's places.
+#[derive(Serialize, Deserialize)]
+struct Form<F, S, B> {
+    program: Hash,
+    revision: Revision,
+    /// The root's.
+    facts: Vec<F>,
+    last_instance: u64,
+    seed: u64,
+    deadline: Option<Timestamp>,
+    state: S,
+    beside: Option<B>,
+}
+
+impl Executive {
+    /// The whole state. An executive that is restored from it gives the same commands for the same further events.
+    pub fn checkpoint(&self) -> Vec<u8> {
+        let facts = self.root.iter().map(|(key, fact)| (key, &fact.value, fact.revision)).collect();
+        let body = self.body(facts);
+        let mut bytes = Vec::with_capacity(1 + blake3::OUT_LEN + body.len());
+        bytes.push(FORMAT);
+        bytes.extend(blake3::hash(&body).as_bytes());
+        bytes.extend(body);
+        bytes
+    }
+
+    /// An executive as it was at a [`Executive::checkpoint`].
+    ///
+    /// # Errors
+    /// Where the bytes are torn or damaged, or of another version or another program.
+    pub fn restore(program: Arc<Program>, tolerance: Tolerance, bytes: &[u8]) -> Result<Executive, RestoreError> {
+        let (format, rest) = bytes.split_first().ok_or(RestoreError::Torn)?;
+        if *format != FORMAT {
+            return Err(RestoreError::Format { found: *format });
+        }
+        let (hash, body) = rest.split_first_chunk::<{ blake3::OUT_LEN }>().ok_or(RestoreError::Torn)?;
+        if blake3::hash(body) != *hash {
+            return Err(RestoreError::Torn);
+        }
+        Executive::new(program, tolerance).with_body(body, World::of)
+    }
+
+    /// Another executive that is like this one, by way of a checkpoint, but for the root, of which it has a copy.
+    pub(super) fn copy(&self) -> Result<Executive, RestoreError> {
+        let new = Executive {
+            program: self.program.clone(),
+            plan: self.plan.clone(),
+            fingerprint: self.fingerprint.clone(),
+            tolerance: self.tolerance,
+            root: World::default(),
+            last_instance: 0,
+            seed: 0,
+            deadline: None,
+            state: State::Fresh,
+        };
+        new.with_body(&self.body(Vec::new()), |_, _| self.root.clone())
+    }
+
+    fn body(&self, facts: Vec<(&FactKey, &Value, Revision)>) -> Vec<u8> {
+        let beside = match &self.state {
+            State::Cdtn(window) => Some(window.beside(&self.root)),
+            State::Fresh | State::Hsm(_) | State::Ended => None,
+        };
+        let Executive { last_instance, seed, deadline, state, .. } = self;
+        let (program, revision) = (self.fingerprint(), self.root.revision());
+        let (last_instance, seed, deadline) = (*last_instance, *seed, *deadline);
+        let form = Form { program, revision, facts, last_instance, seed, deadline, state, beside };
+        // Everything has a form that can be written; there is no I/O.
+        postcard::to_extend(&form, Vec::new()).unwrap_or_default()
+    }
+
+    fn with_body(
+        mut self,
+        body: &[u8],
+        root: impl FnOnce(Vec<(Arc<FactKey>, Arc<Fact>)>, Revision) -> World,
+    ) -> Result<Executive, RestoreError> {
+        let broken = |reason: &str| RestoreError::Broken(reason.to_owned());
+        // Before the rest: the form of another program may be read otherwise.
+        let (program, _): (Hash, _) = postcard::take_from_bytes(body).map_err(|error| broken(&error.to_string()))?;
+        if program != self.fingerprint() {
+            return Err(RestoreError::OtherProgram);
+        }
+        let (form, rest): (Form<(FactKey, Value, Revision), State, Beside<'static>>, _) =
+            postcard::take_from_bytes(body).map_err(|error| broken(&error.to_string()))?;
+        if !rest.is_empty() {
+            return Err(broken("there are bytes behind it"));
+        }
+        let Form { revision, facts, last_instance, seed, deadline, state, beside, .. } = form;
+        let fact =
+            |(key, value, revision)| (Arc::new(key), Arc::new(Fact { value, revision, writer: None, measured: None }));
+        self.root = root(facts.into_iter().map(fact).collect(), revision);
+        (self.last_instance, self.seed, self.deadline, self.state) = (last_instance, seed, deadline, state);
+        match (&mut self.state, beside) {
+            (State::Cdtn(window), Some(beside)) => {
+                window.restore(&self.plan, &self.root, self.tolerance, beside).map_err(broken)?;
+            }
+            (State::Cdtn(_), None) => return Err(broken("a window without its places")),
+            (_, Some(_)) => return Err(broken("places without a window")),
+            (_, None) => {}
+        }
+        Ok(self)
+    }
+
+    /// Of the program and of what follows from it, with the catalogue.
+    fn fingerprint(&self) -> Hash {
+        *self.fingerprint.get_or_init(|| fingerprint(&self.program, &self.plan))
+    }
+}
+
+fn fingerprint(program: &Program, plan: &Plan) -> Hash {
+    let mut hasher = Hashing(blake3::Hasher::new());
+    // It writes into memory only.
+    let _ = write!(hasher, "{} {} {plan:?}", program.name, program.digest);
+    *hasher.0.finalize().as_bytes()
+}
+
+/// What is written is hashed.
+struct Hashing(blake3::Hasher);
+
+impl Write for Hashing {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        self.0.update(text.as_bytes());
+        Ok(())
+    }
+}

@@ -1,0 +1,21 @@
+//! The growth's part of a checkpoint: the places of its cursors and of the ends of regions.
+
+use super::Growth;
+use super::environment::{Collector, Restored};
+use crate::checkpoint::Broken;
+
+impl Growth {
+    /// What its cursors share.
+    pub(crate) fn collect<'a>(&'a self, places: &mut Collector<'a>) {
+        self.cursors.iter().for_each(|cursor| places.add(&cursor.environment));
+        self.regions.values().for_each(|regions| regions.collect(places));
+    }
+
+    /// Gives its cursors back what they shared.
+    pub(crate) fn restore(&mut self, places: &mut Restored) -> Result<(), Broken> {
+        for cursor in &mut self.cursors {
+            cursor.environment = places.environment()?;
+        }
+        self.regions.values_mut().try_for_each(|regions| regions.restore(places))
+    }
+}
