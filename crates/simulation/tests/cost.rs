@@ -27,6 +27,9 @@ use support::{NoFiles, catalogue, fact, load};
 /// Ten times the work may take so many times as long.
 const MOST: f64 = 25.0;
 
+/// How often what takes too long is measured again.
+const RUNS: usize = 6;
+
 thread_local! {
     static LIVE: Cell<isize> = const { Cell::new(0) };
 }
@@ -183,9 +186,17 @@ fn started(program: &Program) -> Event {
 fn is_linear(what: &str, sizes: [usize; 2], took: impl Fn(usize) -> Duration) {
     // The first run pays for what is loaded once.
     took(sizes[0] / 10);
-    let [small, large] = sizes.map(&took);
-    let ratio = large.as_secs_f64() / small.as_secs_f64();
-    assert!(ratio <= MOST, "{what}: {small:?} for {}, {large:?} for {}: {ratio:.1} times", sizes[0], sizes[1]);
+    let mut least = sizes.map(&took);
+    // Somebody else may have had the processor meanwhile: the least of several runs counts.
+    for _ in 0..RUNS {
+        if least[1].as_secs_f64() <= MOST * least[0].as_secs_f64() {
+            return;
+        }
+        let again = sizes.map(&took);
+        least = [least[0].min(again[0]), least[1].min(again[1])];
+    }
+    let [small, large] = least;
+    panic!("{what}: {small:?} for {}, {large:?} for {}: more than {MOST} times", sizes[0], sizes[1]);
 }
 
 /// Every iteration changes what the one before has left, and one state reads what has come of all.
