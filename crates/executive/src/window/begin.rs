@@ -256,6 +256,8 @@ impl Window {
                     seen.inputs = before.inputs;
                     if !before.saw_the_same(&seen) {
                         self.graph.forget_tries(id);
+                        // It computes something else than whoever waits for it wants.
+                        self.waits.wake(&mut self.graph, id);
                     }
                     self.graph.set_seen(id, Some(seen));
                 }
