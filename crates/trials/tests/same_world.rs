@@ -275,7 +275,7 @@ fn programs_that_once_failed_to_fail_where_motions_are_imprecise_end_alike() {
 /// A sensing node was not woken by a commit, a twin not by its twin's result.
 #[test]
 fn programs_in_which_somebody_once_slept_who_could_have_gone_on_do_not_wait_for_nothing() {
-    const SEEDS: [u64; 23] = [
+    const SEEDS: [u64; 26] = [
         302_658, 22_264, 25_816, 443, 20_091, 20_314, 20_666, 20_799, 20_994, 21_107, 21_409, 21_472, 21_737, 21_794,
         22_422, 22_496, 22_814, 22_837, 22_844, 24_804, 25_271, 25_317, 25_627, 25_651, 31_388, 31_966,
     ];

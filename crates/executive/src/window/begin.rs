@@ -138,8 +138,9 @@ impl Window {
                 true
             }
             None => {
-                if speculative {
-                    self.results.note_twin(id, seed);
+                if speculative && self.results.note_twin(id, seed) {
+                    // Its next try: whoever waits for what it computed before does that itself.
+                    self.waits.wake(&mut self.graph, id);
                 }
                 false
             }

@@ -60,17 +60,17 @@ impl Results {
         busy
     }
 
-    /// A speculative instance computes what others may want.
-    pub(crate) fn note_twin(&mut self, id: InstanceId, seed: u64) {
-        if let Some(before) = self.seeds.insert(id, seed)
-            && before != seed
-        {
+    /// A speculative instance computes what others may want. Whether it computed something else before.
+    pub(crate) fn note_twin(&mut self, id: InstanceId, seed: u64) -> bool {
+        let before = self.seeds.insert(id, seed).filter(|before| *before != seed);
+        if let Some(before) = before {
             self.remove_twin(id, before);
         }
         let twins = self.twins.entry(seed).or_default();
         if !twins.contains(&id) {
             twins.push(id);
         }
+        before.is_some()
     }
 
     /// The others that compute what this one does.

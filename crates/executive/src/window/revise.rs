@@ -96,6 +96,10 @@ impl Window {
     pub(super) fn invalidate(&mut self, context: &mut Context<'_>, id: InstanceId, reason: String) {
         let Some(instance) = self.graph.get(id) else { return };
         if !is_revisable(instance) {
+            if !instance.is_under_way() && instance.ended().is_none() {
+                // It has not begun: what it waits for may be another instance now, or none.
+                self.waits.enqueue(&mut self.graph, id);
+            }
             return;
         }
         let is_node = instance.role().is_none();
