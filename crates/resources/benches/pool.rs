@@ -102,6 +102,27 @@ fn release_to_the_next_of(bencher: divan::Bencher<'_, '_>, waiters: usize) {
     });
 }
 
+/// Whether 47,300 of a kind and 8,000 of those with an attribute can be had, of which there are 50,000: they cannot.
+#[divan::bench(sample_count = 10, sample_size = 1)]
+fn ask_for_more_than_all(bencher: divan::Bencher<'_, '_>) {
+    let mut pool = Pool::new(Limits { units_per_request: 100_000, ..Limits::default() });
+    pool.keep_alive(NOW, &session(), "bench", Duration::from_secs(1_000_000)).unwrap();
+    for i in 0..50_000 {
+        let spec = ResourceSpec::new(ResourceClass::Module, "Tool").attribute("a", Value::Bool(i % 6 == 0));
+        pool.create(NOW, None, spec).unwrap();
+    }
+    drained(&mut pool);
+    bencher.bench_local(|| {
+        let mut request = ask("Tool", 47_300);
+        let mut special = ask("Tool", 8_000).requirements.remove(0);
+        special.attributes.insert("a".to_owned(), Value::Bool(true));
+        request.requirements.push(special);
+        let waiter = pool.acquire(NOW, request).unwrap();
+        pool.cancel(NOW, waiter).unwrap();
+        drained(&mut pool);
+    });
+}
+
 /// Why the last of the waiters waits.
 #[divan::bench(args = [10, WAITERS], sample_count = 100, sample_size = 1)]
 fn explain(bencher: divan::Bencher<'_, '_>, waiters: usize) {

@@ -1,15 +1,22 @@
 //! Which resources serve which requirement: a maximum assignment, so that a request that can be served is.
 //!
-//! Requirements take greedily; where that falls short and several requirements fit the same resources (`PathPlanner` beside
-//! `PathPlanner{host: a}`), amounts are moved between them along augmenting paths (Ford and Fulkerson).
-//! A requirement of whole units takes whole units of each resource; only of divisible ones it may be less.
+//! Requirements take greedily, each from the resources that it fits, in the order in which those are given away. Where that falls
+//! short and several requirements fit the same resources (`PathPlanner` beside `PathPlanner{host: a}`), amounts are moved by a
+//! maximum flow (`flow.rs`). Its nodes are not resources but signatures: all resources that the same requirements fit are one node,
+//! with how much there is of them. What was moved is placed on the resources of those nodes anew.
+//!
+//! A requirement of whole units takes whole units of each resource; only of divisible ones it may be less. The work grows with the
+//! number of resources that the requirements select, times the number of requirements.
+
+mod flow;
 
 use crate::group::takes;
 use crate::id::Slot;
 use crate::resource::{Resource, Units};
 use crate::resources::Resources;
+use flow::Flow;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
-use std::collections::BTreeSet;
+use std::iter::Peekable;
 
 /// How far the requirements of one request can be served.
 #[derive(Debug)]
@@ -18,6 +25,8 @@ pub(crate) struct Assignment {
     pub(crate) taken: Vec<Units>,
     /// Per requirement, what is missing.
     pub(crate) missing: Vec<Quantity>,
+    /// How many resources were looked at for it.
+    pub(crate) looked_at: usize,
 }
 
 /// What counts as available.
@@ -41,132 +50,193 @@ impl Assignment {
         let mut search = Search {
             resources,
             available,
-            requirements,
+            classes: classes(requirements),
             taken: vec![Units::new(); requirements.len()],
-            used: Units::new(),
+            missing: vec![Quantity::ZERO; requirements.len()],
+            looked_at: 0,
         };
-        let mut missing = vec![Quantity::ZERO; requirements.len()];
         for (index, requirement) in requirements.iter().enumerate() {
-            missing[index] = match requirement.operation {
-                ResourceOperation::Exists => requirement.count.saturating_sub(resources.quantity(requirement)),
-                _ => search.greedy(index),
-            };
-        }
-        for (index, amount) in missing.iter_mut().enumerate() {
-            if takes(requirements[index]) && requirements.iter().filter(|other| takes(other)).count() > 1 {
-                while !amount.is_zero() {
-                    let moved = search.augment(index, *amount, grain(requirements[index]), &mut BTreeSet::new());
-                    if moved.is_zero() {
-                        break;
-                    }
-                    *amount = amount.saturating_sub(moved);
-                }
+            if requirement.operation == ResourceOperation::Exists {
+                search.missing[index] = requirement.count.saturating_sub(resources.quantity(requirement));
+                search.looked_at +=
+                    if resources.fits_every(requirement) { 1 } else { resources.count(&requirement.kind) };
             }
         }
-        Assignment { taken: search.taken, missing }
+        search.greedy(requirements);
+        search.rearrange(requirements);
+        Assignment { taken: search.taken, missing: search.missing, looked_at: search.looked_at }
     }
+}
+
+/// Requirements that select the same in the same grain: for them every resource is alike.
+struct Class<'a> {
+    selector: &'a Requirement,
+    grain: Quantity,
+    /// The requirements, by index.
+    members: Vec<usize>,
 }
 
 struct Search<'a> {
     resources: &'a Resources,
     available: Available<'a>,
-    requirements: &'a [&'a Requirement],
+    classes: Vec<Class<'a>>,
     taken: Vec<Units>,
-    used: Units,
+    missing: Vec<Quantity>,
+    looked_at: usize,
 }
 
+type Candidates<'a> = Box<dyn Iterator<Item = (Slot, &'a Resource)> + 'a>;
+
 impl<'a> Search<'a> {
-    /// What is left of a resource, in multiples of `grain`.
-    fn left(&self, slot: Slot, resource: &Resource, grain: Quantity) -> Quantity {
-        let used = self.used.get(&slot).copied().unwrap_or_default();
+    /// Each requirement takes what is there, in order.
+    fn greedy(&mut self, requirements: &[&Requirement]) {
+        let class_of = |index: usize| self.classes.iter().position(|class| class.members.contains(&index));
+        let classes: Vec<Option<usize>> = (0..requirements.len()).map(class_of).collect();
+        // What one requirement has emptied or cannot use is not looked at again by the next of its class.
+        let candidates = self.classes.iter().map(|class| self.candidates(class).peekable());
+        let mut candidates: Vec<Peekable<Candidates<'a>>> = candidates.collect();
+        let (alone, mut used, mut looked_at) = (self.classes.len() == 1, Units::new(), 0);
+        for (index, class) in classes.into_iter().enumerate() {
+            let Some(class) = class else { continue };
+            let (grain, mut wanted) = (self.classes[class].grain, requirements[index].count);
+            while !wanted.is_zero() {
+                let Some((slot, resource)) = candidates[class].peek().copied() else { break };
+                looked_at += 1;
+                let left = self.available(slot, resource);
+                let left = left.saturating_sub(used.get(&slot).copied().unwrap_or_default()).floor_to(grain);
+                let amount = left.min(wanted);
+                if !amount.is_zero() {
+                    *self.taken[index].entry(slot).or_default() += amount;
+                    wanted = wanted.saturating_sub(amount);
+                }
+                if amount == left {
+                    candidates[class].next();
+                }
+                // Nobody looks at a resource twice that nobody else can select.
+                if !amount.is_zero() && (amount < left || !alone) {
+                    *used.entry(slot).or_default() += amount;
+                }
+            }
+            self.missing[index] = wanted;
+        }
+        drop(candidates);
+        self.looked_at += looked_at;
+    }
+
+    /// Moves what others took, where a requirement lacks something that they could have elsewhere.
+    fn rearrange(&mut self, requirements: &[&Requirement]) {
+        let lacking = |class: &Class<'_>| class.members.iter().any(|index| !self.missing[*index].is_zero());
+        let family = |class: &Class<'a>| self.resources.family(&class.selector.kind);
+        let short: Vec<&str> = self.classes.iter().filter(|class| lacking(class)).map(family).collect();
+        let touched = |class: &&Class<'a>| short.contains(&family(class));
+        let classes: Vec<&Class<'a>> = self.classes.iter().filter(touched).collect();
+        if classes.len() < 2 {
+            return;
+        }
+        let mut looked_at = 0;
+        let mut flow = Flow::new(classes.iter().map(|class| class.grain).collect());
+        for (at, class) in classes.iter().enumerate() {
+            for (slot, resource) in self.candidates(class) {
+                flow.fits(at, slot, self.available(slot, resource));
+                looked_at += 1;
+            }
+        }
+        flow.seal();
+        for (at, class) in classes.iter().enumerate() {
+            for index in &class.members {
+                self.taken[*index].iter().for_each(|(slot, amount)| flow.has(at, *slot, *amount));
+                flow.wants(at, self.missing[*index]);
+            }
+        }
+        let members: Vec<Vec<usize>> = classes.iter().map(|class| class.members.clone()).collect();
+        self.looked_at += looked_at;
+        if !flow.improve() {
+            return;
+        }
+        self.place(requirements, &flow, &members);
+    }
+
+    /// What was moved is taken from the resources of its nodes; the rest stays where it was taken.
+    fn place(&mut self, requirements: &[&Requirement], flow: &Flow, members: &[Vec<usize>]) {
+        for index in members.iter().flatten() {
+            self.taken[*index].retain(|slot, _| !flow.is_changed_at(*slot));
+            let stays: Quantity = self.taken[*index].values().copied().sum();
+            self.missing[*index] = requirements[*index].count.saturating_sub(stays);
+        }
+        for node in flow.changed() {
+            let mut left = flow.members(node).to_vec();
+            for (class, amount) in flow.shares(node) {
+                self.place_share(&members[class], flow.grain(class), amount, &mut left);
+            }
+        }
+    }
+
+    /// So much for the requirements of one class, from resources of one node with what is left of each.
+    fn place_share(&mut self, members: &[usize], grain: Quantity, amount: Quantity, left: &mut [(Slot, Quantity)]) {
+        let (mut amount, mut resources) = (amount, left.iter_mut());
+        let mut at = resources.next();
+        for index in members {
+            while let Some((slot, left)) = &mut at {
+                let share = left.floor_to(grain).min(amount).min(self.missing[*index]);
+                if !share.is_zero() {
+                    *self.taken[*index].entry(*slot).or_default() += share;
+                    self.missing[*index] = self.missing[*index].saturating_sub(share);
+                    amount = amount.saturating_sub(share);
+                    *left = left.saturating_sub(share);
+                }
+                if self.missing[*index].is_zero() || amount.is_zero() {
+                    break;
+                }
+                at = resources.next();
+            }
+        }
+    }
+
+    /// What is available of a resource to the whole request.
+    fn available(&self, slot: Slot, resource: &Resource) -> Quantity {
         let of = |units: &Units| units.get(&slot).copied().unwrap_or_default();
-        let left = match self.available {
+        match self.available {
             Available::Existing => resource.quantity(),
             Available::Free(reserved) => resource.free().saturating_sub(of(reserved)),
             Available::FreeTo(reserved, own) => {
                 let of_others = own.iter().fold(of(reserved), |left, own| left.saturating_sub(of(own)));
                 resource.free().saturating_sub(of_others)
             }
+        }
+    }
+
+    fn candidates(&self, class: &Class<'a>) -> Candidates<'a> {
+        let fitting: Candidates<'a> = match self.available {
+            Available::Existing => Box::new(self.resources.fitting(class.selector)),
+            Available::Free(_) | Available::FreeTo(..) => Box::new(self.resources.free(class.selector)),
         };
-        left.saturating_sub(used).floor_to(grain)
+        if class.grain == Quantity::ONE {
+            return fitting;
+        }
+        Box::new(fitting.filter(|(_, resource)| resource.description.divisible))
     }
+}
 
-    fn take(&mut self, index: usize, slot: Slot, amount: Quantity) {
-        *self.used.entry(slot).or_default() += amount;
-        *self.taken[index].entry(slot).or_default() += amount;
-    }
-
-    fn give_back(&mut self, index: usize, slot: Slot, amount: Quantity) {
-        for units in [&mut self.used, &mut self.taken[index]] {
-            if let Some(left) = units.get_mut(&slot) {
-                *left = left.saturating_sub(amount);
-                if left.is_zero() {
-                    units.remove(&slot);
-                }
-            }
+/// The requirements that take something, by what they select.
+fn classes<'a>(requirements: &[&'a Requirement]) -> Vec<Class<'a>> {
+    let mut classes: Vec<Class<'a>> = Vec::new();
+    for (index, requirement) in requirements.iter().enumerate().filter(|(_, requirement)| takes(requirement)) {
+        let grain = grain(requirement);
+        let same = |class: &&mut Class<'a>| class.grain == grain && selects_the_same(class.selector, requirement);
+        match classes.iter_mut().find(same) {
+            Some(class) => class.members.push(index),
+            None => classes.push(Class { selector: requirement, grain, members: vec![index] }),
         }
     }
+    classes
+}
 
-    fn candidates(&self, index: usize) -> Box<dyn Iterator<Item = (Slot, &'a Resource)> + 'a> {
-        let requirements: &'a [&'a Requirement] = self.requirements;
-        match self.available {
-            Available::Existing => Box::new(self.resources.fitting(requirements[index])),
-            Available::Free(_) | Available::FreeTo(..) => Box::new(self.resources.free(requirements[index])),
-        }
-    }
-
-    /// Takes what is there; returns what is missing.
-    fn greedy(&mut self, index: usize) -> Quantity {
-        let requirement = self.requirements[index];
-        let (mut wanted, grain) = (requirement.count, grain(requirement));
-        for (slot, resource) in self.candidates(index) {
-            if wanted.is_zero() {
-                break;
-            }
-            if grain < Quantity::ONE && !resource.description.divisible {
-                continue;
-            }
-            let amount = self.left(slot, resource, grain).min(wanted);
-            if !amount.is_zero() {
-                self.take(index, slot, amount);
-                wanted = wanted.saturating_sub(amount);
-            }
-        }
-        wanted
-    }
-
-    /// Up to `wanted` more for a requirement, if need be by moving another requirement to another resource. Returns how much.
-    fn augment(&mut self, index: usize, wanted: Quantity, grain: Quantity, visited: &mut BTreeSet<Slot>) -> Quantity {
-        let fitting: Vec<(Slot, &Resource)> = self
-            .candidates(index)
-            .filter(|(_, resource)| {
-                self::grain(self.requirements[index]) == Quantity::ONE || resource.description.divisible
-            })
-            .collect();
-        for (slot, resource) in &fitting {
-            let amount = self.left(*slot, resource, grain).min(wanted).floor_to(grain);
-            if !amount.is_zero() {
-                self.take(index, *slot, amount);
-                return amount;
-            }
-        }
-        for (slot, _) in fitting {
-            if !visited.insert(slot) {
-                continue;
-            }
-            for other in 0..self.requirements.len() {
-                let Some(held) = self.taken[other].get(&slot).copied().filter(|_| other != index) else { continue };
-                let grain = grain.max(self::grain(self.requirements[other]));
-                let moved = self.augment(other, held.min(wanted).floor_to(grain), grain, visited);
-                if !moved.is_zero() {
-                    self.give_back(other, slot, moved);
-                    self.take(index, slot, moved);
-                    return moved;
-                }
-            }
-        }
-        Quantity::ZERO
-    }
+/// Whether two requirements fit the same resources.
+pub(crate) fn selects_the_same(one: &Requirement, other: &Requirement) -> bool {
+    one.kind == other.kind
+        && one.class == other.class
+        && one.attributes == other.attributes
+        && one.conditions == other.conditions
 }
 
 /// Whole units, unless a part of one is asked for.

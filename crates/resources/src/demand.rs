@@ -14,6 +14,8 @@ use std::collections::BTreeMap;
 
 /// Waiters that are looked at, the first of the queue: who is behind them comes up when they have gone.
 const LOOKED_AT: usize = 256;
+/// Resources that are looked at for them: of who is behind, it is found out when those before have gone.
+const RESOURCES_LOOKED_AT: usize = 100_000;
 /// Kinds of which one session may say that it cannot provide them.
 const SHORTAGES: usize = 64;
 /// Characters of a reason; the rest is cut off.
@@ -35,10 +37,15 @@ impl Pool {
             return None;
         }
         let mut missing = BTreeMap::<&Key, (&Requirement, Quantity)>::new();
+        let mut looked_at = 0;
         for (_, id) in self.queue.hopeless.iter().take(LOOKED_AT) {
+            if looked_at >= RESOURCES_LOOKED_AT {
+                break;
+            }
             let Some(waiter) = self.queue.get(*id) else { continue };
             let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
             let assignment = Assignment::of(&self.resources, Available::Existing, &requirements);
+            looked_at += assignment.looked_at;
             for (index, amount) in assignment.missing.into_iter().enumerate().filter(|(_, amount)| !amount.is_zero()) {
                 let (_, most) = missing.entry(&waiter.groups[index]).or_insert((requirements[index], amount));
                 *most = amount.max(*most);

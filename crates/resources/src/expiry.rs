@@ -19,8 +19,12 @@ pub(crate) enum Timer {
 }
 
 impl Pool {
-    /// The next moment at which time alone changes something: call [`Pool::advance`] then.
+    /// The next moment at which time alone changes something: call [`Pool::advance`] then. At once, where what a turn does for
+    /// those who wait was not enough.
     pub fn next_deadline(&self) -> Option<Timestamp> {
+        if self.queue.is_behind() {
+            return Some(self.now);
+        }
         self.timers.first().map(|(at, _)| *at).filter(|at| *at < Timestamp(u64::MAX))
     }
 
@@ -28,7 +32,8 @@ impl Pool {
     pub fn advance(&mut self, now: Timestamp) {
         // A clock that goes back is a clock that stands still.
         self.now = self.now.max(now);
-        let mut ended = false;
+        self.looked_at = 0;
+        let mut ended = self.queue.is_behind();
         while self.timers.first().is_some_and(|(at, _)| *at <= self.now) {
             let Some((_, timer)) = self.timers.pop_first() else { break };
             ended = true;
@@ -36,7 +41,10 @@ impl Pool {
                 Timer::Session(id) => self.end_session(&id, EndReason::SessionExpired),
                 Timer::Lease(lease) => self.commit(Effect::LeaseEnded { lease, reason: EndReason::HeldTooLong }),
                 Timer::Waiter(id) => {
-                    let waited_for = self.explain(id).map(|e| e.to_string()).unwrap_or_default();
+                    let explained = if self.has_done_enough() { None } else { self.explained(id) };
+                    let (waited_for, looked_at) =
+                        explained.map(|(e, looked_at)| (e.to_string(), looked_at)).unwrap_or_default();
+                    self.looked_at += looked_at;
                     self.refuse(id, Refusal::Deadline { waited_for });
                 }
             }

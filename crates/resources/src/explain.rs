@@ -63,6 +63,11 @@ pub enum Obstacle {
 impl Pool {
     /// What a waiter waits for; `None` if it is not in the queue.
     pub fn explain(&self, id: WaiterId) -> Option<Explanation> {
+        self.explained(id).map(|(explanation, _)| explanation)
+    }
+
+    /// The same, and how many resources and waiters were looked at for it.
+    pub(crate) fn explained(&self, id: WaiterId) -> Option<(Explanation, usize)> {
         let waiter = self.queue.get(id)?;
         let ahead = self.queue.order.range(..waiter.place(id)).count();
         let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
@@ -70,13 +75,14 @@ impl Pool {
         let available = Available::FreeTo(&self.queue.reserved, &waiter.reserved);
         let free = Assignment::of(&self.resources, available, &requirements);
         let unreserved = Assignment::of(&self.resources, Available::Free(&Units::new()), &requirements);
+        let looked_at = ahead + free.looked_at + unreserved.looked_at;
         let obstacles = requirements
             .into_iter()
             .zip(free.missing.iter().zip(unreserved.missing))
             .filter(|(_, (missing, _))| !missing.is_zero())
             .map(|(requirement, (_, without_queue))| self.obstacle(id, requirement, !without_queue.is_zero()))
             .collect();
-        Some(Explanation { waiter: id, ahead, obstacles })
+        Some((Explanation { waiter: id, ahead, obstacles }, looked_at))
     }
 
     fn obstacle(&self, id: WaiterId, requirement: &Requirement, held: bool) -> Obstacle {

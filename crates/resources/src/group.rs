@@ -83,16 +83,19 @@ impl Group {
         resources.fits(description, &self.selector)
     }
 
-    /// Whether there is nothing left of what fits, beside what is reserved.
-    pub(crate) fn exhausted(&self, resources: &Resources, reserved: &Units) -> bool {
-        let left = |slot: &Slot| {
+    /// Whether there is nothing left of what fits, beside what is reserved; and how many resources were looked at.
+    pub(crate) fn exhausted(&self, resources: &Resources, reserved: &Units) -> (bool, usize) {
+        let mut looked_at = 0;
+        let mut left = |slot: &Slot| {
+            looked_at += 1;
             let free = resources.get(*slot).map(Resource::free).unwrap_or_default();
             free > reserved.get(slot).copied().unwrap_or_default()
         };
-        match &self.free {
-            Some(free) => !free.iter().any(left),
-            None => !resources.free(&self.selector).any(|(slot, _)| left(&slot)),
-        }
+        let some = match &self.free {
+            Some(free) => free.iter().any(left),
+            None => resources.free(&self.selector).any(|(slot, _)| left(&slot)),
+        };
+        (!some, looked_at)
     }
 }
 
@@ -135,11 +138,15 @@ impl Queue {
                 let (low, high) = (was.min(group.existing), was.max(group.existing));
                 let last = (Bound::Excluded((low, LAST)), Bound::Included((high, LAST)));
                 let range = if some.description.divisible { (Bound::Unbounded, Bound::Unbounded) } else { last };
-                self.doubtful.extend(group.by_amount.range(range).map(|(_, place)| *place));
-                self.doubtful.extend(group.several.iter().copied());
+                let (waiters, more) = (&self.waiters, group.existing > was);
+                // More makes hopeful who is not, and less the other way.
+                let concerned = |place: &&Place| waiters.get(&place.1).is_some_and(|waiter| waiter.hopeful != more);
+                let by_amount = group.by_amount.range(range).map(|(_, place)| place);
+                self.doubtful.extend(by_amount.chain(&group.several).filter(concerned).copied());
             }
             if free > free_before {
                 self.changed.entry(name.clone()).or_default();
+                self.shared_until.remove(name);
             } else if free < free_before && !granted {
                 self.changed.insert(name.clone(), true);
             }
@@ -206,6 +213,7 @@ impl Pool {
                 if family.groups.is_empty() {
                     self.queue.families.remove(&group.family);
                     self.queue.changed.remove(&group.family);
+                    self.queue.shared_until.remove(&group.family);
                 }
             }
         }

@@ -61,7 +61,8 @@ impl Pool {
             })?;
             // No lost wake-up: whoever can be served has been.
             let obstacles = self.explain(id).map_or(0, |explanation| explanation.obstacles.len());
-            ensure(obstacles > 0 || self.leases.len() >= self.limits.leases, || format!("{id} waits for nothing"))?;
+            let waits = obstacles > 0 || self.leases.len() >= self.limits.leases || self.queue.is_behind();
+            ensure(waits, || format!("{id} waits for nothing"))?;
         }
         let ids: usize = self.sessions.values().map(|s| s.waiters.len()).sum();
         ensure(ids == self.queue.len(), || "a session knows a waiter that is not in the queue".to_owned())?;

@@ -27,6 +27,12 @@ pub struct Limits {
     pub requirements: usize,
     /// Units that one requirement may ask for.
     pub units: u32,
+    /// Units that the requirements of one request may ask for together: each may be another resource, and all of them are looked
+    /// up, granted, written down and told of in one turn.
+    pub units_per_request: u32,
+    /// Comparisons of an attribute with a resource that one request may take, should it have to look at every resource of its
+    /// kinds: resources of the kind times attributes and conditions, over its different selectors.
+    pub comparisons: usize,
     /// Characters of a name, a kind or a request id.
     pub name_length: usize,
     /// Attributes of a resource.
@@ -51,6 +57,8 @@ impl Default for Limits {
             leases: 100_000,
             requirements: 32,
             units: 100_000,
+            units_per_request: 4_096,
+            comparisons: 1_000_000,
             name_length: 128,
             attributes: 32,
             remembered_requests: 65_536,

@@ -45,6 +45,8 @@ pub struct Pool {
     pub(crate) shortages: BTreeMap<SessionId, BTreeMap<String, String>>,
     pub(crate) timers: BTreeSet<(Timestamp, Timer)>,
     pub(crate) next_waiter: u64,
+    /// How many resources were looked at in this turn for those who wait.
+    pub(crate) looked_at: usize,
     pub(crate) notices: Vec<Notice>,
     pub(crate) records: Vec<Record>,
 }

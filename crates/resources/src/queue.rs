@@ -8,6 +8,7 @@ use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Bound;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -62,8 +63,12 @@ pub(crate) struct Queue {
     pub(crate) ready: BTreeSet<Place>,
     /// Families in which something became free; true where what is reserved has to be shared out anew.
     pub(crate) changed: BTreeMap<Arc<str>, bool>,
+    /// Where sharing out was interrupted in a family: those behind are still to be looked at.
+    pub(crate) shared_until: BTreeMap<Arc<str>, Place>,
     /// Those of whom it is to be found out anew whether what exists would do.
     pub(crate) doubtful: BTreeSet<Place>,
+    /// The last of them that was looked at, while there are more: the one behind it is next, so that each has its turn.
+    pub(crate) doubted: Option<Place>,
     /// Those of whom it would not.
     pub(crate) hopeless: BTreeSet<Place>,
     /// What they lack may be something else.
@@ -120,15 +125,29 @@ impl Queue {
         }
     }
 
+    /// Whether something was put off to later turns.
+    pub(crate) fn is_behind(&self) -> bool {
+        !(self.changed.is_empty() && self.doubtful.is_empty())
+    }
+
+    /// The next of whom it is to be found out whether what exists would do.
+    pub(crate) fn next_doubtful(&mut self) -> Option<Place> {
+        let behind = self.doubted.map_or(Bound::Unbounded, Bound::Excluded);
+        let next = self.doubtful.range((behind, Bound::Unbounded)).next().or_else(|| self.doubtful.first()).copied()?;
+        self.doubtful.remove(&next);
+        self.doubted = (!self.doubtful.is_empty()).then_some(next);
+        Some(next)
+    }
+
     pub(crate) fn mark(&mut self, family: &Arc<str>, anew: bool) {
         *self.changed.entry(family.clone()).or_default() |= anew;
+        self.shared_until.remove(family);
     }
 
     /// Whether the indices say the same as the waiters do.
     pub(crate) fn index_agrees(&self) -> Result<(), String> {
         let ensure = |holds: bool, what: &str| if holds { Ok(()) } else { Err(what.to_owned()) };
         ensure(self.order.len() == self.waiters.len(), "the order of the queue has another length")?;
-        ensure(self.changed.is_empty() && self.doubtful.is_empty(), "the queue has something left to do")?;
         let mut reserved = Units::new();
         let mut members = 0;
         for (id, waiter) in &self.waiters {

@@ -123,6 +123,11 @@ impl Resources {
         self.kinds.subclasses(kind).any(|kind| self.by_kind.contains_key(kind))
     }
 
+    /// How many resources there are of a kind and of the kinds below it.
+    pub(crate) fn count(&self, kind: &str) -> usize {
+        self.of(kind).map(|of_kind| of_kind.all.len()).sum()
+    }
+
     /// Those that a requirement can be met with, in the order of slots; those of subclasses last.
     pub(crate) fn fitting<'a>(
         &'a self,

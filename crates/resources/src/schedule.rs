@@ -9,6 +9,9 @@
 //! Families do not touch each other, so what a waiter reserves in one is independent of the rest: when something became free,
 //! it goes to the first in its family that lacks it. Only where the order is disturbed (a more urgent one arrives, something
 //! that was reserved is gone) is a family shared out anew. The work is that for those who get something.
+//!
+//! One turn looks at no more than [`LOOKED_AT_PER_TURN`] resources (and at those of one more waiter): what is left is put off to the next
+//! turn, which [`Pool::next_deadline`] asks for at once. Until then nobody is served past the queue.
 
 use crate::assignment::{Assignment, Available};
 use crate::group::{Key, takes};
@@ -20,14 +23,26 @@ use std::collections::BTreeSet;
 use std::ops::Bound;
 use std::sync::Arc;
 
+/// Resources that are looked at in one turn for those who wait: some milliseconds.
+const LOOKED_AT_PER_TURN: usize = 100_000;
+
 impl Pool {
+    /// Whether this turn has done its share for those who wait.
+    pub(crate) fn has_done_enough(&self) -> bool {
+        self.looked_at >= LOOKED_AT_PER_TURN
+    }
+
     /// Grants whatever can be granted.
     pub(crate) fn schedule(&mut self) {
         loop {
-            while let Some(place) = self.queue.doubtful.pop_first() {
+            while !self.has_done_enough()
+                && let Some(place) = self.queue.next_doubtful()
+            {
                 self.reconsider(place);
             }
-            if let Some((family, anew)) = self.queue.changed.pop_first() {
+            if !self.has_done_enough()
+                && let Some((family, anew)) = self.queue.changed.pop_first()
+            {
                 self.share_out(&family, anew);
                 continue;
             }
@@ -43,7 +58,10 @@ impl Pool {
 
     /// What a request can have at once: all of it, or `None`. Nobody waits before it for any of it.
     pub(crate) fn at_once(&self, place: Place, requirements: &[Requirement]) -> Option<Vec<Units>> {
-        if self.leases.len() >= self.limits.leases || self.is_before_others(place, requirements) {
+        if self.leases.len() >= self.limits.leases
+            || self.queue.is_behind()
+            || self.is_before_others(place, requirements)
+        {
             return None;
         }
         let requirements: Vec<&Requirement> = requirements.iter().collect();
@@ -64,7 +82,9 @@ impl Pool {
     fn reconsider(&mut self, place: Place) {
         let Some(waiter) = self.queue.waiters.get(&place.1) else { return };
         let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
-        let hopeful = Assignment::of(&self.resources, Available::Existing, &requirements).is_complete();
+        let assignment = Assignment::of(&self.resources, Available::Existing, &requirements);
+        self.looked_at += 1 + assignment.looked_at;
+        let hopeful = assignment.is_complete();
         let known = if hopeful { self.queue.hopeless.remove(&place) } else { self.queue.hopeless.insert(place) };
         self.queue.demand_changed |= known || !hopeful;
         let Some(waiter) = self.queue.waiters.get(&place.1) else { return };
@@ -101,9 +121,10 @@ impl Pool {
         }
     }
 
-    /// Gives what is free in a family to those who lack it, in order.
+    /// Gives what is free in a family to those who lack it, in order; on from where an earlier turn stopped.
     fn share_out(&mut self, family: &Arc<str>, anew: bool) {
         let Some(known) = self.queue.families.get_mut(family) else { return };
+        let stopped_at = self.queue.shared_until.remove(family).filter(|_| !anew);
         if anew {
             for place in std::mem::take(&mut known.reserving) {
                 self.take_back(place, family);
@@ -113,12 +134,23 @@ impl Pool {
             }
         }
         let Some(known) = self.queue.families.get(family) else { return };
-        let first = |key: &Key| self.queue.groups.get(key)?.wanting.first().map(|place| (*place, key.clone()));
+        let behind = stopped_at.map_or(Bound::Unbounded, Bound::Included);
+        let first = |key: &Key| {
+            let next = self.queue.groups.get(key)?.wanting.range((behind, Bound::Unbounded)).next();
+            next.map(|place| (*place, key.clone()))
+        };
         let mut heads: BTreeSet<(Place, Key)> = known.groups.iter().filter_map(first).collect();
         let mut before = None;
         while let Some((place, key)) = heads.pop_first() {
+            if self.has_done_enough() && before != Some(place) {
+                self.queue.mark(family, false);
+                self.queue.shared_until.insert(family.clone(), place);
+                return;
+            }
             let Some(group) = self.queue.groups.get(&key) else { continue };
-            if group.exhausted(&self.resources, &self.queue.reserved) {
+            let (exhausted, looked_at) = group.exhausted(&self.resources, &self.queue.reserved);
+            self.looked_at += 1 + looked_at;
+            if exhausted {
                 continue;
             }
             let next = group.wanting.range((Bound::Excluded(place), Bound::Unbounded)).next();
@@ -168,6 +200,7 @@ impl Pool {
         let kept = self.limits.overtaken == 0 || known.strict.last().is_some_and(|last| place <= *last);
         let passes = self.passes(place, family);
         let Some((indices, assignment)) = self.assigned(place, family) else { return };
+        self.looked_at += assignment.looked_at;
         let complete = assignment.is_complete();
         if (complete && !passes) || (!complete && kept) {
             self.reserve(place, family, &indices, assignment);

@@ -1,5 +1,6 @@
 //! What every request is checked for before it is looked at: names, amounts, numbers of things.
 
+use crate::assignment::selects_the_same;
 use crate::error::{PoolError, malformed};
 use crate::pool::Pool;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
@@ -13,6 +14,11 @@ impl Pool {
         if requirements.len() > self.limits.requirements {
             let rule = format!("at most {}", self.limits.requirements);
             return Err(malformed(&format!("{} requirements", requirements.len()), &rule));
+        }
+        let units: Quantity = requirements.iter().map(|requirement| requirement.count).sum();
+        if units > Quantity::whole(self.limits.units_per_request) {
+            let rule = format!("at most {} in one request: ask in several", self.limits.units_per_request);
+            return Err(malformed(&format!("{units} units"), &rule));
         }
         for requirement in requirements {
             if !allowed.contains(&requirement.operation) {
@@ -29,6 +35,24 @@ impl Pool {
             self.check_attributes(requirement.attributes.keys())?;
             let conditions: Vec<&String> = requirement.conditions.iter().map(|c| &c.attribute).collect();
             self.check_attributes(conditions.into_iter())?;
+        }
+        self.check_work(requirements)
+    }
+
+    /// Whether it is not too much to look for what these requirements select.
+    fn check_work(&self, requirements: &[Requirement]) -> Result<(), PoolError> {
+        let mut comparisons = 0_usize;
+        for (index, requirement) in requirements.iter().enumerate() {
+            if !requirements[..index].iter().any(|before| selects_the_same(before, requirement)) {
+                let of_each = requirement.attributes.len() + requirement.conditions.len();
+                comparisons += self.resources.count(&requirement.kind) * of_each;
+            }
+        }
+        if comparisons > self.limits.comparisons {
+            let what = format!("{comparisons} comparisons of attributes with resources");
+            let rule =
+                format!("at most {} for one request: ask with fewer attributes or conditions", self.limits.comparisons);
+            return Err(malformed(&what, &rule));
         }
         Ok(())
     }
