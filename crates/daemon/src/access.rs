@@ -10,6 +10,7 @@
 use crate::config::{Check, ConfigError, rule};
 use crate::details::status;
 use ratn_model::resource::ResourceClass;
+use ratn_resources::Speaker;
 use ratn_worker::gate::Identity;
 use rustls_pki_types::CertificateDer;
 use serde::{Deserialize, Serialize};
@@ -291,6 +292,11 @@ impl Caller {
             self.roles
         );
         Err(status(Code::PermissionDenied, "ROLE_MISSING", message))
+    }
+
+    /// Who they are to the resource pool.
+    pub(crate) fn speaker(&self) -> Speaker {
+        Speaker { name: self.name.clone(), for_anybody: self.is_operator() }
     }
 
     /// Whether what belongs to others is theirs to end.

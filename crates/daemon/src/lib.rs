@@ -18,7 +18,6 @@ mod journal;
 mod link;
 pub mod metrics;
 mod outbox;
-mod owners;
 pub mod process_manager;
 pub mod reload;
 pub mod resource_manager;

@@ -11,7 +11,9 @@ use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::tls::ServerTls;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, ExtendedKeyUsagePurpose, IsCa, KeyPair};
+use std::path::Path;
 use support::{TestSystem, in_time};
+use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity};
@@ -30,15 +32,35 @@ async fn ping(client: &mut Raw, session: &str, ttl_ms: u64) -> Result<v1::KeepAl
 }
 
 async fn manager(system: &TestSystem, listen: Endpoint, service: &ServiceConfig) -> Endpoint {
+    start(system, listen, service).await.endpoint
+}
+
+/// A manager that can be ended.
+struct Started {
+    endpoint: Endpoint,
+    shutdown: CancellationToken,
+    running: JoinHandle<anyhow::Result<()>>,
+}
+
+impl Started {
+    async fn end(self) {
+        self.shutdown.cancel();
+        in_time(self.running).await.unwrap().unwrap();
+    }
+}
+
+async fn start(system: &TestSystem, listen: Endpoint, service: &ServiceConfig) -> Started {
     let config = ResourceManagerConfig { listen, ..Default::default() };
+    let shutdown = CancellationToken::new();
     let run = resource_manager::run_as(
         tokio::sync::watch::Sender::new(config).subscribe(),
         system.directory.clone(),
         service.serving(),
-        CancellationToken::new(),
+        shutdown.clone(),
     );
-    tokio::spawn(run);
-    system.directory.wait_for(resource_manager::ROLE, support::DEADLINE).await.unwrap()
+    let running = tokio::spawn(run);
+    let endpoint = system.directory.wait_for(resource_manager::ROLE, support::DEADLINE).await.unwrap();
+    Started { endpoint, shutdown, running }
 }
 
 #[tokio::test]
@@ -126,14 +148,10 @@ impl Authority {
     }
 }
 
-#[tokio::test]
-async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_anothers() {
-    let system = TestSystem::new();
-    let files = tempfile::tempdir().unwrap();
-    let authority = Authority::new();
-    let (own, first, second, stranger) = (authority.sign(), authority.sign(), authority.sign(), authority.sign());
+/// A config under which certificates of an authority are known as `first`, `second` …, each with the role of a task.
+fn known_by_certificate(authority: &Authority, own: &Signed, files: &Path, known: &[(&Signed, &str)]) -> ServiceConfig {
     let file = |name: &str, text: &str| {
-        let path = files.path().join(name);
+        let path = files.join(name);
         std::fs::write(&path, text).unwrap();
         path
     };
@@ -142,15 +160,54 @@ async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_another
         key: file("key.pem", &own.key),
         client_ca: file("ca.pem", &authority.0.pem()),
     };
-    let known = |signed: &Signed, name: &str| CertificateAccess {
+    let certificate = |(signed, name): &(&Signed, &str)| CertificateAccess {
         fingerprint: Some(signed.fingerprint.clone()),
         host: None,
-        name: Some(name.to_owned()),
+        name: Some((*name).to_owned()),
         roles: vec![Role::Task],
     };
-    let access =
-        AccessConfig { certificates: vec![known(&first, "first"), known(&second, "second")], ..Default::default() };
-    let service = ServiceConfig { tls: Some(tls), access, ..ServiceConfig::default() };
+    let access = AccessConfig { certificates: known.iter().map(certificate).collect(), ..Default::default() };
+    ServiceConfig { tls: Some(tls), access, ..ServiceConfig::default() }
+}
+
+#[tokio::test]
+async fn who_opened_a_session_is_known_after_a_restart_and_nobody_takes_it_over() {
+    let (system, files, authority) = (TestSystem::new(), tempfile::tempdir().unwrap(), Authority::new());
+    let (own, first, second) = (authority.sign(), authority.sign(), authority.sign());
+    let service = known_by_certificate(&authority, &own, files.path(), &[(&first, "first"), (&second, "second")]);
+    let listen: Endpoint = "localhost:0".parse().unwrap();
+    let before = start(&system, listen.clone(), &service).await;
+    in_time(ping(&mut authority.client(&before.endpoint, Some(&first)), "s", 60_000)).await.unwrap();
+    before.end().await;
+
+    let after = start(&system, listen, &service).await;
+    let mut stranger = authority.client(&after.endpoint, Some(&second));
+    for ttl_ms in [60_000, 0] {
+        let refused = in_time(ping(&mut stranger, "s", ttl_ms)).await.unwrap_err();
+        assert_eq!(refused.code(), Code::PermissionDenied);
+        let says = "session `s` belongs to first (certificate), not to second (certificate)";
+        assert_eq!(refused.message(), says);
+    }
+    let end = v1::EndTaskRequest { request_id: String::new(), session_id: "s".into() };
+    assert_eq!(in_time(stranger.end_task(end)).await.unwrap_err().code(), Code::PermissionDenied);
+    let mut opener = authority.client(&after.endpoint, Some(&first));
+    let kept = in_time(ping(&mut opener, "s", 60_000)).await.unwrap();
+    assert!(!kept.created, "its session went on");
+    let sessions = in_time(opener.list_sessions(v1::ListSessionsRequest {})).await.unwrap().into_inner().sessions;
+    assert_eq!(sessions[0].opened_by, "first (certificate)");
+    // When it has ended, its name is anybody's.
+    in_time(ping(&mut opener, "s", 0)).await.unwrap();
+    assert!(in_time(ping(&mut stranger, "s", 60_000)).await.unwrap().created);
+    after.end().await;
+}
+
+#[tokio::test]
+async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_anothers() {
+    let system = TestSystem::new();
+    let files = tempfile::tempdir().unwrap();
+    let authority = Authority::new();
+    let (own, first, second, stranger) = (authority.sign(), authority.sign(), authority.sign(), authority.sign());
+    let service = known_by_certificate(&authority, &own, files.path(), &[(&first, "first"), (&second, "second")]);
     let endpoint = manager(&system, "localhost:0".parse().unwrap(), &service).await;
     assert!(matches!(endpoint, Endpoint::Tls { .. }), "{endpoint}");
 
@@ -168,6 +225,19 @@ async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_another
         (authority.client(&endpoint, Some(&first)), authority.client(&endpoint, Some(&second)));
     in_time(ping(&mut first, "s", 60_000)).await.unwrap();
     in_time(first.create(create("s", v1::ResourceClass::Task))).await.unwrap();
+    // Nor delete what the first created, by what it is.
+    in_time(ping(&mut second, "t", 60_000)).await.unwrap();
+    let things = v1::Requirement {
+        operation: v1::ResourceOperation::Delete.into(),
+        kind: "Thing".into(),
+        count: 1.0,
+        ..Default::default()
+    };
+    let target = Some(v1::delete_request::Target::Requirement(things));
+    let delete = v1::DeleteRequest { session_id: "t".into(), target, ..Default::default() };
+    let refused = in_time(second.delete(delete)).await.unwrap_err();
+    assert_eq!(refused.code(), Code::PermissionDenied, "{refused}");
+    assert!(refused.message().contains("belongs to session s"), "{refused}");
     let lease = v1::BlockRequest {
         session_id: "s".into(),
         requirement: Some(v1::Requirement {
@@ -180,6 +250,8 @@ async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_another
         ..Default::default()
     };
     let lease = in_time(first.block(lease)).await.unwrap().into_inner().lease.unwrap();
+    let list = in_time(second.list(v1::ListRequest::default())).await.unwrap().into_inner();
+    assert_eq!(list.resources[0].holdings[0].opened_by, "first (certificate)");
     let release =
         v1::ResourceServiceReleaseRequest { request_id: String::new(), session_id: "s".into(), lease_id: lease.id };
     let sessionless = v1::ResourceServiceReleaseRequest { session_id: String::new(), ..release.clone() };

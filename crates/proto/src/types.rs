@@ -38,6 +38,8 @@ pub struct Holding {
     pub session: String,
     /// What the holder said it is, for people.
     pub holder: String,
+    /// Who opened that session, as the connection proved it; empty where nobody knows.
+    pub opened_by: String,
 }
 
 /// A resource. A provider fills in the first eight fields, the manager the rest.
@@ -176,6 +178,8 @@ pub struct SessionStatus {
     pub waiting: u32,
     /// The resources that it provides.
     pub resources: Vec<String>,
+    /// Who opened it, as the connection proved it: nobody else speaks for it, except an operator. Empty where nobody knows.
+    pub opened_by: String,
 }
 
 /// Which resources a list is of; the default is all of them.

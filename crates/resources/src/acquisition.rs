@@ -196,6 +196,7 @@ impl Pool {
             consumed,
             hold_for: request.hold_for,
             purpose: request.purpose.into(),
+            opened_by: Default::default(),
             expires: None,
         };
         self.commit(Effect::LeaseGranted { lease, granted });

@@ -38,7 +38,17 @@ impl Pool {
                     (known.ttl, known.expires) = (*ttl, expires);
                     known.name.clone_from(client);
                 } else {
-                    self.sessions.insert(session.clone(), Session::new(client.clone(), *ttl, expires));
+                    let new = Session::new(client.clone(), Arc::default(), *ttl, expires);
+                    self.sessions.insert(session.clone(), new);
+                }
+                self.timers.insert((expires, Timer::Session(session.clone())));
+                Ok(())
+            }
+            Effect::SessionOpened { session, client, ttl, opened_by } => {
+                let expires = self.now + *ttl;
+                let new = Session::new(client.clone(), opened_by.clone(), *ttl, expires);
+                if self.sessions.insert(session.clone(), new).is_some() {
+                    return Err(format!("{session} is there already"));
                 }
                 self.timers.insert((expires, Timer::Session(session.clone())));
                 Ok(())
@@ -182,9 +192,11 @@ impl Pool {
         if let Some(expires) = expires {
             self.timers.insert((expires, Timer::Lease(lease)));
         }
-        self.session_mut(&granted.session)?.leases.insert(lease);
+        let session = self.session_mut(&granted.session)?;
+        session.leases.insert(lease);
+        let opened_by = session.opened_by.clone();
         let slots = granted.slots();
-        self.leases.insert(lease, LeaseRecord { expires, ..granted.clone() });
+        self.leases.insert(lease, LeaseRecord { expires, opened_by, ..granted.clone() });
         let resources = self.views(&slots)?;
         let (token, session) = (granted.token, granted.session.clone());
         self.publish(Change::LeaseGranted { lease, token, session, resources });

@@ -5,7 +5,7 @@ use crate::event::EndReason;
 use crate::id::{SessionId, Slot};
 use crate::pool::Pool;
 use crate::record::Effect;
-use crate::resource::{Description, ResourceSpec, ResourceView};
+use crate::resource::{Description, Resource, ResourceSpec, ResourceView};
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use std::sync::Arc;
@@ -62,19 +62,17 @@ impl Pool {
         self.advance(now);
         let found = self.resources.find(id).and_then(|slot| Some((slot, self.resources.get(slot)?)));
         let (slot, resource) = found.ok_or_else(|| PoolError::UnknownResource { id: id.to_owned() })?;
-        if let (Some(owner), Some(caller)) = (&resource.owner, session) {
-            check_owner(|| format!("resource `{id}`"), owner, caller)?;
-        }
+        may_delete(resource, session)?;
         self.commit(Effect::ResourceDeleted { slot, reason: EndReason::Asked });
         self.schedule();
         Ok(())
     }
 
-    /// Removes so much in all of what is free and fits, for good; a resource of which nothing is left vanishes. Returns the
-    /// ids of the resources touched.
+    /// Removes so much in all of what is free, fits and may be deleted by its id ([`Pool::delete`]), for good; a resource of which
+    /// nothing is left vanishes. Returns the ids of the resources touched.
     ///
     /// # Errors
-    /// An unknown session, another operation than delete, or too little to delete.
+    /// An unknown session, another operation than delete, too little to delete, or enough only with what belongs to another session.
     pub fn delete_units(
         &mut self,
         now: Timestamp,
@@ -85,17 +83,23 @@ impl Pool {
         self.session(session)?;
         self.check_requirements(std::slice::from_ref(requirement), &[ResourceOperation::Delete])?;
         let whole = requirement.count.is_whole();
-        let amount = |resource: &crate::resource::Resource| match whole {
+        let amount = |resource: &Resource| match whole {
             true => resource.free().floor_to(Quantity::ONE),
             false if resource.description.divisible => resource.free(),
             false => Quantity::ZERO,
         };
-        let free: Vec<(Slot, Quantity)> =
-            self.resources.free(requirement).map(|(slot, resource)| (slot, amount(resource))).collect();
+        let (mut free, mut of_others) = (Vec::new(), None);
+        for (slot, resource) in self.resources.free(requirement) {
+            match may_delete(resource, Some(session)) {
+                Ok(()) => free.push((slot, amount(resource))),
+                Err(refused) if !amount(resource).is_zero() => of_others = of_others.or(Some(refused)),
+                Err(_) => {}
+            }
+        }
         let found: Quantity = free.iter().map(|(_, free)| *free).sum();
         let mut wanted = requirement.count;
         if found < wanted {
-            return Err(PoolError::NotEnough { wanted: requirement.to_string(), found });
+            return Err(of_others.unwrap_or(PoolError::NotEnough { wanted: requirement.to_string(), found }));
         }
         let mut touched = Vec::new();
         for (slot, free) in free {
@@ -152,5 +156,14 @@ impl Pool {
             return Err(malformed(&what, "what is not divisible has whole units"));
         }
         self.check_attributes(spec.attributes.keys())
+    }
+}
+
+/// Whether a session may delete a resource, by its id or by what it is: its own, and what belongs to no session. `None` may delete
+/// anything.
+fn may_delete(resource: &Resource, session: Option<&SessionId>) -> Result<(), PoolError> {
+    match (&resource.owner, session) {
+        (Some(owner), Some(caller)) => check_owner(|| format!("resource `{}`", resource.description.id), owner, caller),
+        _ => Ok(()),
     }
 }

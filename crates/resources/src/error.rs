@@ -3,6 +3,7 @@
 use crate::id::{SessionId, WaiterId};
 use ratn_model::id::LeaseId;
 use ratn_model::resource::Quantity;
+use std::sync::Arc;
 
 /// A refused request; the pool is as it was before.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -49,6 +50,16 @@ pub enum PoolError {
         /// Who asked.
         caller: SessionId,
     },
+    /// Somebody speaks for a session that another opened.
+    #[error("session `{}` belongs to {}, not to {speaker}", session.as_str(), owner_of(opened_by))]
+    SessionOfAnother {
+        /// Which.
+        session: SessionId,
+        /// Who opened it; empty where nobody knows.
+        opened_by: Arc<str>,
+        /// Who spoke.
+        speaker: Arc<str>,
+    },
     /// Fewer resources match than the operation takes.
     #[error("{wanted} wanted, but {found} units of it are free")]
     NotEnough {
@@ -79,6 +90,14 @@ pub enum PoolError {
         /// Which.
         id: String,
     },
+}
+
+fn owner_of(opened_by: &str) -> &str {
+    if opened_by.is_empty() {
+        "whom an earlier version did not write down (only an operator may speak for it)"
+    } else {
+        opened_by
+    }
 }
 
 pub(crate) fn check_owner(

@@ -4,10 +4,10 @@
 use crate::id::Slot;
 use crate::pool::Pool;
 use crate::queue::{Place, Queue, Waiter};
-use crate::record::to_bytes;
 use crate::resource::{Description, Resource, Units};
 use crate::resources::Resources;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
+use ratn_model::versioned;
 use std::collections::BTreeSet;
 use std::ops::Bound;
 use std::sync::Arc;
@@ -56,7 +56,7 @@ pub(crate) struct Seen {
 
 pub(crate) fn key(requirement: &Requirement) -> Key {
     let selector = Requirement { operation: ResourceOperation::Block, count: Quantity::ZERO, ..requirement.clone() };
-    to_bytes(&selector).into()
+    versioned::encode(0, &selector).into()
 }
 
 pub(crate) fn takes(requirement: &Requirement) -> bool {

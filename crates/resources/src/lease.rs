@@ -24,6 +24,9 @@ pub(crate) struct LeaseRecord {
     pub(crate) consumed: Vec<(Slot, Quantity)>,
     pub(crate) hold_for: Option<Duration>,
     pub(crate) purpose: Arc<str>,
+    /// Who opened its session; of the session, where it is kept.
+    #[serde(skip)]
+    pub(crate) opened_by: Arc<str>,
     /// When it ends by itself; counted anew after a restart.
     #[serde(skip)]
     pub(crate) expires: Option<Timestamp>,
@@ -56,6 +59,13 @@ impl LeaseRecord {
     }
 
     pub(crate) fn holding(&self, lease: LeaseId, units: Quantity) -> Holding {
-        Holding { lease, token: self.token, session: self.session.clone(), units, purpose: self.purpose.clone() }
+        Holding {
+            lease,
+            token: self.token,
+            session: self.session.clone(),
+            opened_by: self.opened_by.clone(),
+            units,
+            purpose: self.purpose.clone(),
+        }
     }
 }

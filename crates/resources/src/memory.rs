@@ -6,6 +6,7 @@ use crate::id::WaiterId;
 use crate::request::Request;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::time::Timestamp;
+use ratn_model::versioned;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -123,6 +124,9 @@ impl RequestMemory {
     }
 }
 
+/// The version of the form that [`fingerprint`] hashes. Fingerprints are kept: with another number no retry would be known again.
+const FINGERPRINTED: u8 = 2;
+
 /// What makes two requests the same one: everything but the deadline of an acquire, which a repeated one has later.
 /// FNV-1a over 128 bits of its record; clients are not adversaries of themselves.
 pub(crate) fn fingerprint(request: &Request) -> u128 {
@@ -131,9 +135,9 @@ pub(crate) fn fingerprint(request: &Request) -> u128 {
     let bytes = match request {
         Request::Acquire(acquire) if acquire.deadline.is_some() => {
             let acquire = crate::queue::AcquireRequest { deadline: None, ..acquire.clone() };
-            crate::record::to_bytes(&Request::Acquire(acquire))
+            versioned::encode(FINGERPRINTED, &Request::Acquire(acquire))
         }
-        request => crate::record::to_bytes(request),
+        request => versioned::encode(FINGERPRINTED, request),
     };
     bytes.iter().fold(OFFSET, |hash, byte| (hash ^ u128::from(*byte)).wrapping_mul(PRIME))
 }

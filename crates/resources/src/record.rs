@@ -17,9 +17,11 @@ use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The version that [`encode`] writes, its first byte. Variants and fields are only ever added at the end; whatever else
-/// changes takes a new number.
-pub const FORMAT: u8 = 2;
+/// The version that [`encode`] writes, its first byte. Every new variant at the end takes a new number, so that an older program
+/// refuses what it does not know by its version; records since [`OLDEST_FORMAT`] are read as they are.
+pub const FORMAT: u8 = 3;
+/// The oldest version that [`decode`] reads: it has no [`Effect::SessionOpened`].
+pub const OLDEST_FORMAT: u8 = 2;
 
 /// One durable change of a pool.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -27,7 +29,7 @@ pub struct Record(pub(crate) Effect);
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Effect {
-    /// A session is there, or lives for another time from now on.
+    /// A session lives for another time from now on. In records of [`OLDEST_FORMAT`] it may be new: who opened it is not known.
     SessionKept { session: SessionId, client: String, ttl: Duration },
     /// A session is gone; what hung on it went before.
     SessionEnded { session: SessionId },
@@ -49,6 +51,8 @@ pub(crate) enum Effect {
     Answered { request_id: String, fingerprint: u128, reply: Remembered, forget: usize },
     /// What a session consumed of a resource with a grant that was undone is there again.
     Returned { session: SessionId, slot: Slot, amount: Quantity },
+    /// A session is new.
+    SessionOpened { session: SessionId, client: String, ttl: Duration, opened_by: Arc<str> },
 }
 
 /// What its bytes are, in messages.
@@ -56,7 +60,7 @@ const RECORDS: &str = "records of a resource pool";
 
 /// The records of one call, as one entry of a log.
 pub fn encode(records: &[Record]) -> Vec<u8> {
-    to_bytes(&records)
+    versioned::encode(FORMAT, &records)
 }
 
 /// Reads what [`encode`] wrote.
@@ -64,13 +68,6 @@ pub fn encode(records: &[Record]) -> Vec<u8> {
 /// # Errors
 /// Bytes that it did not write, or another version did.
 pub fn decode(bytes: &[u8]) -> Result<Vec<Record>, DecodeError> {
-    from_bytes(bytes)
-}
-
-pub(crate) fn to_bytes<T: Serialize>(value: &T) -> Vec<u8> {
-    versioned::encode(FORMAT, value)
-}
-
-pub(crate) fn from_bytes<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<T, DecodeError> {
-    versioned::decode(FORMAT, RECORDS, bytes)
+    let version = bytes.first().copied().filter(|found| *found == OLDEST_FORMAT).unwrap_or(FORMAT);
+    versioned::decode(version, RECORDS, bytes)
 }

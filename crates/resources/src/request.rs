@@ -54,6 +54,21 @@ pub enum Request {
     },
 }
 
+impl Request {
+    /// The session that it is made for; without one it is an operator's.
+    pub fn session(&self) -> Option<&SessionId> {
+        match self {
+            Request::Create { session, .. } | Request::Delete { session, .. } | Request::Release { session, .. } => {
+                session.as_ref()
+            }
+            Request::DeleteUnits { session, .. } | Request::Consume { session, .. } | Request::EndTask { session } => {
+                Some(session)
+            }
+            Request::Acquire(request) => Some(&request.session),
+        }
+    }
+}
+
 /// The answer to a [`Request`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum Reply {

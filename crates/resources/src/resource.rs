@@ -87,6 +87,8 @@ pub struct Holding {
     pub token: FencingToken,
     /// Whose lease.
     pub session: SessionId,
+    /// Who opened that session, as its connection proved; empty where nobody knows.
+    pub opened_by: Arc<str>,
     /// How much.
     pub units: Quantity,
     /// What the lease is for.

@@ -9,6 +9,7 @@ use crate::record::Effect;
 use ratn_model::id::LeaseId;
 use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 /// A live session.
@@ -16,6 +17,8 @@ use std::time::Duration;
 pub(crate) struct Session {
     /// The client's name, for people.
     pub(crate) name: String,
+    /// Who opened it, as the connection proved: nobody else speaks for it. Empty where nobody knows.
+    pub(crate) opened_by: Arc<str>,
     /// How long it lives without a keep-alive.
     pub(crate) ttl: Duration,
     /// When it expires unless kept alive.
@@ -37,6 +40,8 @@ pub struct SessionView {
     pub id: SessionId,
     /// The client's name.
     pub name: String,
+    /// Who opened it, as the connection proved; empty where nobody knows.
+    pub opened_by: Arc<str>,
     /// How long it lives without a keep-alive.
     pub ttl: Duration,
     /// When it expires unless kept alive.
@@ -49,13 +54,30 @@ pub struct SessionView {
     pub provides: Vec<String>,
 }
 
+/// Who speaks for sessions, as the connection proves it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Speaker {
+    /// The same name is the same speaker.
+    pub name: Arc<str>,
+    /// Also for sessions that others opened: an operator.
+    pub for_anybody: bool,
+}
+
+impl Speaker {
+    /// Where nobody else is: inside a process, in a simulation.
+    pub fn trusted() -> Speaker {
+        Speaker { name: Arc::default(), for_anybody: true }
+    }
+}
+
 /// By id.
 pub(crate) type Sessions = BTreeMap<SessionId, Session>;
 
 impl Session {
-    pub(crate) fn new(name: String, ttl: Duration, expires: Timestamp) -> Session {
+    pub(crate) fn new(name: String, opened_by: Arc<str>, ttl: Duration, expires: Timestamp) -> Session {
         Session {
             name,
+            opened_by,
             ttl,
             expires,
             provides: BTreeSet::new(),
@@ -67,11 +89,10 @@ impl Session {
 }
 
 impl Pool {
-    /// The session lives for `ttl` from now. An unknown or expired one is opened (anew: nothing of an earlier one is left),
-    /// and the answer is true. `client` says who that is, for people. Only a new session or another `ttl` is written down.
+    /// As [`Pool::keep_alive_as`], by [`Speaker::trusted`].
     ///
     /// # Errors
-    /// A malformed name, no time to live, or too many sessions.
+    /// As there.
     pub fn keep_alive(
         &mut self,
         now: Timestamp,
@@ -79,11 +100,27 @@ impl Pool {
         client: &str,
         ttl: Duration,
     ) -> Result<bool, PoolError> {
-        self.advance(now);
+        self.keep_alive_as(now, &Speaker::trusted(), id, client, ttl)
+    }
+
+    /// The session lives for `ttl` from now. An unknown or expired one is opened (anew: nothing of an earlier one is left) by the
+    /// speaker, whose it is from then on, and the answer is true. `client` says who that is, for people. Only a new session or
+    /// another `ttl` is written down.
+    ///
+    /// # Errors
+    /// A session that another opened, a malformed name, no time to live, or too many sessions.
+    pub fn keep_alive_as(
+        &mut self,
+        now: Timestamp,
+        speaker: &Speaker,
+        id: &SessionId,
+        client: &str,
+        ttl: Duration,
+    ) -> Result<bool, PoolError> {
+        self.check_speaker(now, speaker, id)?;
         if ttl.is_zero() {
             return Err(malformed("session time to live 0", "a session lives for more than 0 seconds"));
         }
-        let kept = Effect::SessionKept { session: id.clone(), client: client.to_owned(), ttl };
         match self.sessions.get_mut(id) {
             Some(session) if session.ttl == ttl => {
                 self.timers.remove(&(session.expires, Timer::Session(id.clone())));
@@ -93,7 +130,7 @@ impl Pool {
             }
             Some(_) => {
                 self.check_name("client name", client)?;
-                self.commit(kept);
+                self.commit(Effect::SessionKept { session: id.clone(), client: client.to_owned(), ttl });
                 Ok(false)
             }
             None => {
@@ -102,9 +139,28 @@ impl Pool {
                 if self.sessions.len() >= self.limits.sessions {
                     return Err(PoolError::TooMany { what: "sessions", limit: self.limits.sessions });
                 }
-                self.commit(kept);
+                let (session, client, opened_by) = (id.clone(), client.to_owned(), speaker.name.clone());
+                self.commit(Effect::SessionOpened { session, client, ttl, opened_by });
                 Ok(true)
             }
+        }
+    }
+
+    /// Whether the speaker may speak for a session. One that is not there is nobody's.
+    ///
+    /// # Errors
+    /// A session that another opened.
+    pub fn check_speaker(&mut self, now: Timestamp, speaker: &Speaker, id: &SessionId) -> Result<(), PoolError> {
+        self.advance(now);
+        match self.sessions.get(id) {
+            Some(session) if !speaker.for_anybody && session.opened_by != speaker.name => {
+                Err(PoolError::SessionOfAnother {
+                    session: id.clone(),
+                    opened_by: session.opened_by.clone(),
+                    speaker: speaker.name.clone(),
+                })
+            }
+            _ => Ok(()),
         }
     }
 
@@ -130,6 +186,7 @@ impl Pool {
         let view = |(id, session): (&SessionId, &Session)| SessionView {
             id: id.clone(),
             name: session.name.clone(),
+            opened_by: session.opened_by.clone(),
             ttl: session.ttl,
             expires: session.expires,
             leases: session.leases.iter().copied().collect(),

@@ -11,14 +11,23 @@ use crate::lease::LeaseRecord;
 use crate::limits::Limits;
 use crate::memory::Remembered;
 use crate::pool::Pool;
-use crate::record::{Record, from_bytes, to_bytes};
+use crate::record::Record;
 use crate::resource::Resource;
 use crate::session::Session;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::time::Timestamp;
-use ratn_model::versioned::DecodeError;
+use ratn_model::versioned::{self, DecodeError};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
+
+/// The version that [`Snapshot::encode`] writes, its first byte. Each one is the one before with more at its end.
+const FORMAT: u8 = 3;
+/// The version without openers of sessions.
+const WITHOUT_OPENERS: u8 = 2;
+/// What it is, in messages.
+const SNAPSHOT: &str = "snapshot of a resource pool";
 
 /// Everything durable of a pool at one moment. Taking one shares the descriptions of the resources and copies the rest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -32,6 +41,8 @@ pub struct Snapshot {
     leases: Vec<(LeaseId, LeaseRecord)>,
     /// The oldest first.
     answers: Vec<(String, u128, Remembered)>,
+    /// Who opened which session; of one that is not here nobody knows.
+    openers: Vec<(SessionId, Arc<str>)>,
 }
 
 /// A snapshot or a record that does not fit: the log has a gap, or is of another pool.
@@ -60,15 +71,19 @@ pub enum RestoreError {
 impl Snapshot {
     /// For a file.
     pub fn encode(&self) -> Vec<u8> {
-        to_bytes(self)
+        versioned::encode(FORMAT, self)
     }
 
-    /// Reads what [`Snapshot::encode`] wrote.
+    /// Reads what [`Snapshot::encode`] wrote, in this version or the one before.
     ///
     /// # Errors
     /// Bytes that it did not write, or another version did.
     pub fn decode(bytes: &[u8]) -> Result<Snapshot, DecodeError> {
-        from_bytes(bytes)
+        if bytes.first() == Some(&WITHOUT_OPENERS) {
+            // An empty list, as postcard writes it.
+            return versioned::decode(WITHOUT_OPENERS, SNAPSHOT, &[bytes, &[0]].concat());
+        }
+        versioned::decode(FORMAT, SNAPSHOT, bytes)
     }
 
     /// The pool's revision in it.
@@ -90,9 +105,10 @@ impl Pool {
             leases: self
                 .leases
                 .iter()
-                .map(|(id, lease)| (*id, LeaseRecord { expires: None, ..lease.clone() }))
+                .map(|(id, lease)| (*id, LeaseRecord { expires: None, opened_by: Arc::default(), ..lease.clone() }))
                 .collect(),
             answers: self.memory.iter().map(|(id, print, reply)| (id.clone(), print, reply.clone())).collect(),
+            openers: self.sessions.iter().map(|(id, session)| (id.clone(), session.opened_by.clone())).collect(),
         }
     }
 
@@ -124,10 +140,12 @@ impl Pool {
     fn fill(&mut self, snapshot: Snapshot) -> Result<(), String> {
         (self.revision, self.last_number) = (snapshot.revision, snapshot.last_number);
         (self.last_lease, self.last_token) = (snapshot.last_lease, snapshot.last_token);
+        let mut openers: BTreeMap<SessionId, Arc<str>> = snapshot.openers.into_iter().collect();
         for (id, client, ttl) in snapshot.sessions {
+            let opened_by = openers.remove(&id).unwrap_or_default();
             let expires = self.now + ttl;
             self.timers.insert((expires, Timer::Session(id.clone())));
-            self.sessions.insert(id, Session::new(client, ttl, expires));
+            self.sessions.insert(id, Session::new(client, opened_by, ttl, expires));
         }
         for (slot, resource) in snapshot.resources {
             let consumers = resource.consumers.iter().map(|(session, _)| (session, false));
@@ -149,6 +167,7 @@ impl Pool {
             let session =
                 self.sessions.get_mut(&lease.session).ok_or_else(|| format!("{} is not there", lease.session))?;
             session.leases.insert(id);
+            lease.opened_by = session.opened_by.clone();
             self.leases.insert(id, lease);
         }
         for (id, fingerprint, reply) in snapshot.answers {

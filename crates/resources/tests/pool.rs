@@ -516,6 +516,27 @@ fn units_are_deleted_all_or_none_and_a_resource_without_units_is_gone() {
 }
 
 #[test]
+fn a_delete_by_requirement_takes_only_what_the_session_may_delete_by_id() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    let arm = bench.pool.list().remove(0).id.clone();
+    let delete = |count| Requirement { count, ..requirement(ResourceOperation::Delete, "Arm", 1) };
+    let by_id = bench.pool.delete(bench.now, Some(&session("b")), &arm).unwrap_err();
+    let by_requirement = bench.pool.delete_units(bench.now, &session("b"), &delete(1.into())).unwrap_err();
+    assert_eq!(by_requirement, by_id);
+    assert_eq!(by_id.to_string(), format!("resource `{arm}` belongs to session a, not to session b"));
+    // Its own first, and what is nobody's; what is another's stays.
+    let own = bench.create("b", ResourceSpec::new(ResourceClass::Task, "Arm"));
+    let nobodys = bench.pool.create(bench.now, None, ResourceSpec::new(ResourceClass::Task, "Arm")).unwrap().id.clone();
+    let too_many = bench.pool.delete_units(bench.now, &session("b"), &delete(3.into())).unwrap_err();
+    assert_eq!(too_many, by_id, "and nothing is deleted in part");
+    let mut touched = bench.pool.delete_units(bench.now, &session("b"), &delete(2.into())).unwrap();
+    touched.sort();
+    assert_eq!(touched, [own, nobodys]);
+    assert_eq!(bench.pool.list().len(), 1);
+    assert_eq!(bench.pool.delete_units(bench.now, &session("a"), &delete(1.into())).unwrap(), [arm]);
+}
+
+#[test]
 fn a_request_id_used_again_is_performed_once() {
     let mut bench = Bench::new();
     let create = Request::Create { session: Some(session("a")), spec: ResourceSpec::new(ResourceClass::Module, "Arm") };

@@ -9,7 +9,7 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_resources::{
     AcquireRequest, DecodeError, FORMAT, Limits, Pool, Record, Request, ResourceSpec, RestoreError, SessionId,
-    Snapshot, decode, encode,
+    Snapshot, Speaker, decode, encode,
 };
 use std::time::Duration;
 
@@ -251,4 +251,59 @@ fn bytes_of_another_version_or_cut_short_are_refused() {
     assert!(matches!(decode(&[&bytes[..], &[0]].concat()), Err(DecodeError::Broken { .. })));
     let other = [&[FORMAT + 1], &bytes[1..]].concat();
     assert!(matches!(decode(&other), Err(DecodeError::Version { found, known: FORMAT, .. }) if found == FORMAT + 1));
+}
+
+#[test]
+fn who_opened_a_session_is_known_from_records_and_from_a_snapshot_and_not_of_one_that_an_earlier_version_wrote() {
+    let (now, id) = (Timestamp(0), SessionId::from("s"));
+    let speaker = |name: &str, for_anybody| Speaker { name: name.into(), for_anybody };
+    let mut pool = Pool::new(Limits::default());
+    assert_eq!(pool.keep_alive_as(now, &speaker("a", false), &id, "s", Duration::from_secs(10)), Ok(true));
+    pool.create(now, None, ResourceSpec::new(ResourceClass::Module, "Arm").id("arm")).unwrap();
+    let acquire = AcquireRequest::new(id.clone(), vec![requirement(ResourceOperation::Block, 0, 1)]);
+    pool.handle(now, "", Request::Acquire(acquire)).unwrap();
+    let snapshot = pool.snapshot();
+    let records = decode(&encode(&pool.take_records())).unwrap();
+    let from_records = Pool::restore(Limits::default(), now, None, records).unwrap();
+    let kept = Snapshot::decode(&snapshot.encode()).unwrap();
+    let from_snapshot = Pool::restore(Limits::default(), now, Some(kept), []).unwrap();
+    for mut again in [from_records, from_snapshot] {
+        assert_eq!(&*again.sessions()[0].opened_by, "a");
+        assert_eq!(&*again.get("arm").unwrap().holdings[0].opened_by, "a");
+        let refused = again.keep_alive_as(now, &speaker("b", false), &id, "s", Duration::from_secs(10)).unwrap_err();
+        assert_eq!(refused.to_string(), "session `s` belongs to a, not to b");
+        assert_eq!(again.keep_alive_as(now, &speaker("root", true), &id, "s", Duration::from_secs(10)), Ok(false));
+        assert_eq!(&*again.sessions()[0].opened_by, "a", "an operator speaks for it and does not own it");
+    }
+    // The snapshot of the version before has no openers: it ends where their list would begin.
+    let bytes = snapshot.encode();
+    let openers = postcard_list(&[("s", "a")]);
+    let mut earlier = bytes.strip_suffix(openers.as_slice()).unwrap().to_vec();
+    earlier[0] = 2;
+    let mut again = Pool::restore(Limits::default(), now, Some(Snapshot::decode(&earlier).unwrap()), []).unwrap();
+    let refused = again.check_speaker(now, &speaker("a", false), &id).unwrap_err();
+    assert!(refused.to_string().contains("only an operator may speak for it"), "{refused}");
+    again.check_speaker(now, &speaker("root", true), &id).unwrap();
+    assert!(matches!(Snapshot::decode(&[&[4], &bytes[1..]].concat()), Err(DecodeError::Version { found: 4, .. })));
+}
+
+/// Pairs of short texts as they are kept.
+fn postcard_list(pairs: &[(&str, &str)]) -> Vec<u8> {
+    let mut bytes = vec![u8::try_from(pairs.len()).unwrap()];
+    for text in pairs.iter().flat_map(|(one, other)| [one, other]) {
+        bytes.push(u8::try_from(text.len()).unwrap());
+        bytes.extend(text.as_bytes());
+    }
+    bytes
+}
+
+#[test]
+fn records_of_the_version_before_openers_were_kept_are_read() {
+    // A session `s` of the client `c` for one second, as version 2 wrote it.
+    let entry = [2, 1, 0, 1, b's', 1, b'c', 1, 0];
+    let records = decode(&entry).unwrap();
+    let pool = Pool::restore(Limits::default(), Timestamp(0), None, records).unwrap();
+    let session = pool.sessions().remove(0);
+    assert_eq!((session.name.as_str(), session.ttl, &*session.opened_by), ("c", Duration::from_secs(1), ""));
+    assert!(matches!(decode(&[1, 0]), Err(DecodeError::Version { found: 1, known: FORMAT, .. })));
 }

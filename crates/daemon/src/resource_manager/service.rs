@@ -7,7 +7,6 @@ use crate::access::Caller;
 use crate::audit::{self, Mutation};
 use crate::details::{ending, retry_later, status};
 use crate::metrics;
-use crate::owners::Owners;
 use futures::{Stream, StreamExt};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Lease, Requirement, ResourceOperation};
@@ -28,8 +27,6 @@ use tonic::{Code, Request, Response, Status, Streaming};
 const KEEP_ALIVE_BUFFER: usize = 16;
 /// What the pool's own answer at a deadline is given to arrive.
 const GRACE: Duration = Duration::from_millis(20);
-/// No session is believed to live longer than this without a ping.
-const LONGEST_OWNED: Duration = Duration::from_secs(24 * 3_600);
 /// When a watcher that was cut off may come back.
 const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
 
@@ -37,7 +34,6 @@ const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
 #[derive(Debug, Clone)]
 pub(super) struct Service {
     pub(super) actor: Handle,
-    pub(super) owners: Owners,
     shutdown: CancellationToken,
     next_ticket: Arc<AtomicU64>,
 }
@@ -46,7 +42,7 @@ type Streamed<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 impl Service {
     pub(super) fn new(actor: Handle, shutdown: CancellationToken) -> Service {
-        Service { actor, owners: Owners::default(), shutdown, next_ticket: Arc::default() }
+        Service { actor, shutdown, next_ticket: Arc::default() }
     }
 
     async fn perform(&self, caller: &Caller, request_id: String, request: PoolRequest) -> Result<(Reply, u64), Status> {
@@ -60,27 +56,12 @@ impl Service {
             _ => "operate",
         };
         let (request_name, what) = written_down(&request_id, &request);
-        let performed = self.actor.ask(|answer| Message::Perform { request_id, request, answer }).await?;
+        let speaker = caller.speaker();
+        let performed = self.actor.ask(|answer| Message::Perform { speaker, request_id, request, answer }).await?;
         let mutation = Mutation { caller, operation, request: &request_name, what };
         mutation.ended(performed.as_ref().map(|_| None));
         let (reply, revision) = performed?;
         Ok((reply, revision.0))
-    }
-
-    /// The session of a request, which has to be the caller's.
-    fn session(&self, caller: &Caller, id: &str) -> Result<SessionId, Status> {
-        let session = session(id)?;
-        self.owners.check(caller, id, Instant::now())?;
-        Ok(session)
-    }
-
-    /// Without a session a call speaks for the operator.
-    fn optional_session(&self, caller: &Caller, id: &str) -> Result<Option<SessionId>, Status> {
-        if !id.is_empty() {
-            return self.session(caller, id).map(Some);
-        }
-        self.owners.check(caller, id, Instant::now())?;
-        Ok(None)
     }
 
     async fn wait_for_grant(
@@ -92,7 +73,7 @@ impl Service {
     ) -> Result<Lease, Status> {
         let (request_name, what) = written_down(&request_id, &request);
         let began = Instant::now();
-        let granted = self.granted(request_id, request, wait_ms).await;
+        let granted = self.granted(caller, request_id, request, wait_ms).await;
         if let (Ok(_), Some(metrics)) = (&granted, metrics::get()) {
             metrics.granted(began.elapsed());
         }
@@ -101,7 +82,13 @@ impl Service {
         granted
     }
 
-    async fn granted(&self, request_id: String, request: AcquireRequest, wait_ms: u64) -> Result<Lease, Status> {
+    async fn granted(
+        &self,
+        caller: &Caller,
+        request_id: String,
+        request: AcquireRequest,
+        wait_ms: u64,
+    ) -> Result<Lease, Status> {
         label(&request_id, "request_id")?;
         label(&request.purpose, "holder")?;
         if wait_ms == 0 {
@@ -110,7 +97,8 @@ impl Service {
         let ticket = self.next_ticket.fetch_add(1, Ordering::Relaxed);
         let (answer, answered) = oneshot::channel();
         let wait = Duration::from_millis(wait_ms);
-        self.actor.send(Message::Acquire { ticket, request_id, request, wait, answer }).await?;
+        let speaker = caller.speaker();
+        self.actor.send(Message::Acquire { speaker, ticket, request_id, request, wait, answer }).await?;
         let mut call = WaitingCall { actor: self.actor.clone(), ticket, answered: Some(answered) };
         let Some(answered) = &mut call.answered else { return Err(ending()) };
         // The pool answers at the deadline, and says what was waited for; a call that joined another of its request id has
@@ -166,7 +154,7 @@ impl v1::resource_service_server::ResourceService for Service {
             renewable: resource.renewable,
             host: resource.host,
         };
-        let session = self.optional_session(&caller, &request.session_id)?;
+        let session = optional_session(&request.session_id)?;
         let (reply, _) = self.perform(&caller, request.request_id, PoolRequest::Create { session, spec }).await?;
         let Reply::Created { id, .. } = reply else { return Err(odd_reply(&reply)) };
         let Some(view) = self.actor.ask(|answer| Message::Get { id: id.clone(), answer }).await? else {
@@ -179,7 +167,7 @@ impl v1::resource_service_server::ResourceService for Service {
     async fn consume(&self, request: Request<v1::ConsumeRequest>) -> Result<Response<v1::ConsumeResponse>, Status> {
         let (caller, request) = (Caller::of(&request), request.into_inner());
         let requirement: Requirement = required(request.requirement, "requirement")?;
-        let session = self.session(&caller, &request.session_id)?;
+        let session = session(&request.session_id)?;
         let (reply, revision) =
             self.perform(&caller, request.request_id, PoolRequest::Consume { session, requirement }).await?;
         let Reply::Touched(resource_ids) = reply else { return Err(odd_reply(&reply)) };
@@ -195,15 +183,14 @@ impl v1::resource_service_server::ResourceService for Service {
         let (resource_ids, revision) = match target {
             Target::ResourceId(id) => {
                 name(&id, "resource_id")?;
-                let session = self.optional_session(&caller, &request.session_id)?;
+                let session = optional_session(&request.session_id)?;
                 let delete = PoolRequest::Delete { session, id: id.clone() };
                 let (_, revision) = self.perform(&caller, request.request_id, delete).await?;
                 (vec![id], revision)
             }
             Target::Requirement(requirement) => {
                 let requirement = Requirement::try_from(requirement).map_err(|m| m.within("requirement"))?;
-                let delete =
-                    PoolRequest::DeleteUnits { session: self.session(&caller, &request.session_id)?, requirement };
+                let delete = PoolRequest::DeleteUnits { session: session(&request.session_id)?, requirement };
                 let (reply, revision) = self.perform(&caller, request.request_id, delete).await?;
                 let Reply::Touched(ids) = reply else { return Err(odd_reply(&reply)) };
                 (ids, revision)
@@ -222,7 +209,7 @@ impl v1::resource_service_server::ResourceService for Service {
         let acquire = AcquireRequest {
             priority: request.priority,
             purpose: request.holder,
-            ..AcquireRequest::new(self.session(&caller, &request.session_id)?, vec![requirement])
+            ..AcquireRequest::new(session(&request.session_id)?, vec![requirement])
         };
         let lease = self.wait_for_grant(&caller, request.request_id, acquire, request.deadline_ms).await?;
         Ok(Response::new(v1::BlockResponse { lease: Some(lease.into()) }))
@@ -234,7 +221,7 @@ impl v1::resource_service_server::ResourceService for Service {
         let acquire = AcquireRequest {
             priority: request.priority,
             purpose: request.holder,
-            ..AcquireRequest::new(self.session(&caller, &request.session_id)?, requirements)
+            ..AcquireRequest::new(session(&request.session_id)?, requirements)
         };
         let lease = self.wait_for_grant(&caller, request.request_id, acquire, request.deadline_ms).await?;
         Ok(Response::new(v1::AcquireResponse { lease: Some(lease.into()) }))
@@ -244,9 +231,10 @@ impl v1::resource_service_server::ResourceService for Service {
         let caller = Caller::of(&request);
         let v1::WithdrawRequest { request_id, session_id } = request.into_inner();
         name(&request_id, "request_id")?;
-        let session = self.session(&caller, &session_id)?;
+        let session = session(&session_id)?;
         let (request_name, what) = written_down(&request_id, &session);
-        let withdrawn = self.actor.ask(|answer| Message::Withdraw { session, request_id, answer }).await?;
+        let speaker = caller.speaker();
+        let withdrawn = self.actor.ask(|answer| Message::Withdraw { speaker, session, request_id, answer }).await?;
         let mutation = Mutation { caller: &caller, operation: "withdraw", request: &request_name, what };
         mutation.ended(withdrawn.as_ref().map(|_| None));
         let withdrawn = withdrawn?;
@@ -258,7 +246,7 @@ impl v1::resource_service_server::ResourceService for Service {
         request: Request<v1::ResourceServiceReleaseRequest>,
     ) -> Result<Response<v1::ResourceServiceReleaseResponse>, Status> {
         let (caller, request) = (Caller::of(&request), request.into_inner());
-        let session = self.optional_session(&caller, &request.session_id)?;
+        let session = optional_session(&request.session_id)?;
         let release = PoolRequest::Release { session, lease: LeaseId(request.lease_id) };
         let (released, revision) = match self.perform(&caller, request.request_id, release).await {
             Ok((_, revision)) => (true, revision),
@@ -307,7 +295,7 @@ impl v1::resource_service_server::ResourceService for Service {
 
     async fn end_task(&self, request: Request<v1::EndTaskRequest>) -> Result<Response<v1::EndTaskResponse>, Status> {
         let (caller, request) = (Caller::of(&request), request.into_inner());
-        let end = PoolRequest::EndTask { session: self.session(&caller, &request.session_id)? };
+        let end = PoolRequest::EndTask { session: session(&request.session_id)? };
         let (_, revision) = self.perform(&caller, request.request_id, end).await?;
         Ok(Response::new(v1::EndTaskResponse { revision }))
     }
@@ -317,7 +305,7 @@ impl v1::resource_service_server::ResourceService for Service {
         request: Request<v1::WatchDemandRequest>,
     ) -> Result<Response<Self::WatchDemandStream>, Status> {
         let (caller, request) = (Caller::of(&request), request.into_inner());
-        let session = self.session(&caller, &request.session_id)?;
+        let session = session(&request.session_id)?;
         for (index, provision) in request.provisions.iter().enumerate() {
             name(&provision.kind, &format!("provisions[{index}].kind"))?;
         }
@@ -325,7 +313,9 @@ impl v1::resource_service_server::ResourceService for Service {
             kinds: request.provisions.into_iter().map(|provision| (provision.kind, provision.most)).collect(),
             attributes: ports(request.attributes, "attributes")?,
         };
-        let mut demand = self.actor.ask(|answer| Message::WatchDemand { session, provisions, answer }).await??;
+        let speaker = caller.speaker();
+        let mut demand =
+            self.actor.ask(|answer| Message::WatchDemand { speaker, session, provisions, answer }).await??;
         demand.mark_changed();
         let stream = futures::stream::unfold(demand, async |mut demand| {
             demand.changed().await.ok()?;
@@ -343,8 +333,10 @@ impl v1::resource_service_server::ResourceService for Service {
         let v1::ReportShortageRequest { session_id, kind, reason, most } = request.into_inner();
         name(&kind, "kind")?;
         label(&reason, "reason")?;
-        let session = self.session(&caller, &session_id)?;
-        self.actor.ask(|answer| Message::ReportShortage { session, kind, most, reason, answer }).await??;
+        let session = session(&session_id)?;
+        let speaker = caller.speaker();
+        let report = |answer| Message::ReportShortage { speaker, session, kind, most, reason, answer };
+        self.actor.ask(report).await??;
         Ok(Response::new(v1::ReportShortageResponse {}))
     }
 
@@ -385,7 +377,6 @@ impl v1::resource_service_server::ResourceService for Service {
         request: Request<Streaming<v1::KeepAliveRequest>>,
     ) -> Result<Response<Self::KeepAliveStream>, Status> {
         let caller = Caller::of(&request);
-        let owners = self.owners.clone();
         let mut pings = request.into_inner();
         let (sender, answers) = mpsc::channel(KEEP_ALIVE_BUFFER);
         let actor = self.actor.clone();
@@ -397,7 +388,7 @@ impl v1::resource_service_server::ResourceService for Service {
                     () = shutdown.cancelled() => return,
                 };
                 let Ok(Some(ping)) = ping else { return };
-                let answer = kept_alive(&actor, &owners, &caller, ping).await;
+                let answer = kept_alive(&actor, &caller, ping).await;
                 let failed = answer.is_err();
                 if sender.send(answer).await.is_err() || failed {
                     return;
@@ -420,7 +411,6 @@ impl v1::resource_service_server::ResourceService for Service {
 
 pub(super) async fn kept_alive(
     actor: &Handle,
-    owners: &Owners,
     caller: &Caller,
     ping: v1::KeepAliveRequest,
 ) -> Result<v1::KeepAliveResponse, Status> {
@@ -428,8 +418,7 @@ pub(super) async fn kept_alive(
     label(&ping.client, "client")?;
     let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };
     let ttl = Duration::from_millis(ping.ttl_ms);
-    owners.ping(caller, &ping.session_id, ttl.min(LONGEST_OWNED), Instant::now())?;
-    let kept = actor.keep_alive(session, client, ttl).await?;
+    let kept = actor.keep_alive(caller.speaker(), session, client, ttl).await?;
     Ok(v1::KeepAliveResponse {
         session_id: ping.session_id,
         ttl_ms: u64::try_from(kept.ttl.as_millis()).unwrap_or(u64::MAX),
@@ -455,6 +444,11 @@ fn session(id: &str) -> Result<SessionId, Status> {
     Ok(SessionId::from(id))
 }
 
+/// Without a session a call speaks for the operator.
+fn optional_session(id: &str) -> Result<Option<SessionId>, Status> {
+    (!id.is_empty()).then(|| session(id)).transpose()
+}
+
 /// What the audit log says of a request; nothing where there is none.
 fn written_down(request_id: &str, request: &impl std::fmt::Debug) -> (String, String) {
     if audit::enabled() { (request_id.to_owned(), format!("{request:?}")) } else { Default::default() }
@@ -470,6 +464,7 @@ mod tests {
     use super::super::{ResourceManagerConfig, actor, journal};
     use super::*;
     use ratn_model::resource::ResourceClass;
+    use ratn_resources::Speaker;
     use tokio::sync::watch;
 
     #[tokio::test]
@@ -479,19 +474,21 @@ mod tests {
         let (actor, _) =
             actor::start(watch::Sender::new(config).subscribe(), kept, Default::default(), Default::default());
         let session = SessionId::from("s");
-        actor.keep_alive(session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
+        actor.keep_alive(Speaker::trusted(), session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
         let requirement = Requirement::new(ResourceOperation::Block, "Arm");
         let mut calls = Vec::new();
         for ticket in [1, 2] {
             let (answer, answered) = oneshot::channel();
             let request = AcquireRequest::new(session.clone(), vec![requirement.clone()]);
             let (request_id, wait) = ("run/i1".to_owned(), Duration::from_secs(60));
-            actor.send(Message::Acquire { ticket, request_id, request, wait, answer }).await.unwrap();
+            let speaker = Speaker::trusted();
+            actor.send(Message::Acquire { speaker, ticket, request_id, request, wait, answer }).await.unwrap();
             calls.push(WaitingCall { actor: actor.clone(), ticket, answered: Some(answered) });
         }
         let create = PoolRequest::Create { session: None, spec: ResourceSpec::new(ResourceClass::Module, "Arm") };
         let request_id = String::new();
-        actor.ask(|answer| Message::Perform { request_id, request: create, answer }).await.unwrap().unwrap();
+        let speaker = Speaker::trusted();
+        actor.ask(|answer| Message::Perform { speaker, request_id, request: create, answer }).await.unwrap().unwrap();
         for free in [0, 0, 1] {
             let (views, _) = actor.ask(|answer| Message::List { answer }).await.unwrap();
             assert_eq!(views[0].free, free);

@@ -15,7 +15,7 @@ pub(super) fn of_error(error: &PoolError) -> Status {
         PoolError::UnknownWaiter { .. } => (Code::NotFound, "WAITER_UNKNOWN"),
         PoolError::UnknownResource { .. } => (Code::NotFound, "RESOURCE_UNKNOWN"),
         PoolError::ResourceTaken { .. } => (Code::AlreadyExists, "RESOURCE_TAKEN"),
-        PoolError::NotYours { .. } => (Code::PermissionDenied, "NOT_YOURS"),
+        PoolError::NotYours { .. } | PoolError::SessionOfAnother { .. } => (Code::PermissionDenied, "NOT_YOURS"),
         PoolError::NotEnough { .. } => (Code::FailedPrecondition, "NOT_ENOUGH"),
         PoolError::Malformed { .. } => (Code::InvalidArgument, "MALFORMED"),
         PoolError::RequestIdReused { .. } => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
@@ -24,6 +24,11 @@ pub(super) fn of_error(error: &PoolError) -> Status {
         }
     };
     status(code, reason, error.to_string())
+}
+
+/// A caller that is no operator says no session.
+pub(super) fn without_session(who: &str) -> Status {
+    status(Code::PermissionDenied, "NOT_YOURS", format!("{who} says no session: only an operator may do that"))
 }
 
 pub(super) fn of_refusal(refusal: &Refusal) -> Status {

@@ -121,9 +121,7 @@ fn call(service: Service, caller: Caller, question: v1::SessionRequest) -> Call 
             return answer(id, Err(refused));
         }
         let answered = match question.kind {
-            Some(Asked::KeepAlive(ping)) => {
-                kept_alive(&service.actor, &service.owners, &caller, ping).await.map(Kind::KeepAlive)
-            }
+            Some(Asked::KeepAlive(ping)) => kept_alive(&service.actor, &caller, ping).await.map(Kind::KeepAlive),
             Some(Asked::Block(block)) => {
                 service.block(caller.request(block)).await.map(|lease| Kind::Block(lease.into_inner()))
             }

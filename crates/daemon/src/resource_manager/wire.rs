@@ -21,6 +21,7 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
         units: holding.units,
         session: holding.session.as_str().to_owned(),
         holder: holding.purpose.to_string(),
+        opened_by: holding.opened_by.to_string(),
     };
     let description = &view.description;
     Resource {
@@ -89,6 +90,7 @@ pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
         leases: view.leases,
         waiting: u32::try_from(view.waiters.len()).unwrap_or(u32::MAX),
         resources: view.provides,
+        opened_by: view.opened_by.to_string(),
     }
 }
 

@@ -224,6 +224,7 @@ impl From<Holding> for v1::Holding {
             units: holding.units.into(),
             session_id: holding.session,
             holder: holding.holder,
+            opened_by: holding.opened_by,
         }
     }
 }
@@ -234,12 +235,14 @@ impl TryFrom<v1::Holding> for Holding {
     fn try_from(holding: v1::Holding) -> Result<Holding, Malformed> {
         label(&holding.session_id, "session_id")?;
         label(&holding.holder, "holder")?;
+        label(&holding.opened_by, "opened_by")?;
         Ok(Holding {
             lease: LeaseId(holding.lease_id),
             token: FencingToken(holding.token),
             units: amount(holding.units, "units")?,
             session: holding.session_id,
             holder: holding.holder,
+            opened_by: holding.opened_by,
         })
     }
 }
@@ -419,6 +422,7 @@ impl From<SessionStatus> for v1::SessionStatus {
             lease_ids: session.leases.into_iter().map(|lease| lease.0).collect(),
             waiting: session.waiting,
             resource_ids: session.resources,
+            opened_by: session.opened_by,
         }
     }
 }
@@ -435,6 +439,7 @@ impl TryFrom<v1::SessionStatus> for SessionStatus {
             leases: session.lease_ids.into_iter().map(LeaseId).collect(),
             waiting: session.waiting,
             resources: session.resource_ids,
+            opened_by: session.opened_by,
         })
     }
 }

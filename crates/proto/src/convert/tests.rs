@@ -155,6 +155,7 @@ fn resource() -> impl Strategy<Value = Resource> {
         token: FencingToken(token),
         units,
         holder: format!("{session}/a"),
+        opened_by: format!("{session} (certificate)"),
         session,
     });
     (

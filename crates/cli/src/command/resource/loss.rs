@@ -81,6 +81,7 @@ mod tests {
             units: Quantity::ONE,
             session: "s".into(),
             holder: "h".into(),
+            opened_by: String::new(),
         }];
         tool
     }

@@ -100,21 +100,22 @@ pub(super) fn sessions(sessions: &[SessionStatus]) -> String {
         [
             session.id.clone(),
             session.client.clone(),
+            session.opened_by.clone(),
             format!("{:.1} s", Duration::from_millis(session.expires_in_ms).as_secs_f64()),
             session.leases.len().to_string(),
             session.waiting.to_string(),
             session.resources.len().to_string(),
         ]
     });
-    columns(&["SESSION", "CLIENT", "ENDS IN", "LEASES", "WAITING", "RESOURCES"], rows.collect())
+    columns(&["SESSION", "CLIENT", "OPENED BY", "ENDS IN", "LEASES", "WAITING", "RESOURCES"], rows.collect())
 }
 
 pub(super) fn session_json(session: &SessionStatus) -> serde_json::Value {
-    let SessionStatus { id, client, ttl_ms, expires_in_ms, leases, waiting, resources } = session;
+    let SessionStatus { id, client, ttl_ms, expires_in_ms, leases, waiting, resources, opened_by } = session;
     let leases: Vec<u64> = leases.iter().map(|lease| lease.0).collect();
     json!({
         "session": id, "client": client, "ttl_ms": ttl_ms, "expires_in_ms": expires_in_ms, "leases": leases,
-        "waiting": waiting, "resources": resources,
+        "waiting": waiting, "resources": resources, "opened_by": opened_by,
     })
 }
 
@@ -232,6 +233,7 @@ mod tests {
             units: Quantity::ONE,
             session: "s".to_owned(),
             holder: "fetch/approach".to_owned(),
+            opened_by: "uid 1000".to_owned(),
         }];
         arm
     }

@@ -6,7 +6,7 @@ use crate::resource_manager::Granted;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Requirement;
 use ratn_proto::types::{Demand, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition};
-use ratn_resources::{AcquireRequest, Quantity, Reply, Request, ResourceView, SessionId};
+use ratn_resources::{AcquireRequest, Quantity, Reply, Request, ResourceView, SessionId, Speaker};
 use std::cmp::Reverse;
 use std::sync::Arc;
 use std::time::Duration;
@@ -24,6 +24,7 @@ pub(in super::super) struct KeptAlive {
 /// A ping of a session.
 #[derive(Debug)]
 pub(super) struct Ping {
+    pub(super) speaker: Speaker,
     pub(super) session: SessionId,
     pub(super) client: String,
     pub(super) ttl: Duration,
@@ -34,11 +35,13 @@ pub(super) struct Ping {
 #[derive(Debug)]
 pub(in super::super) enum Message {
     Perform {
+        speaker: Speaker,
         request_id: String,
         request: Request,
         answer: Answer<(Reply, Revision)>,
     },
     Acquire {
+        speaker: Speaker,
         ticket: u64,
         request_id: String,
         request: AcquireRequest,
@@ -50,6 +53,7 @@ pub(in super::super) enum Message {
         ticket: u64,
     },
     Withdraw {
+        speaker: Speaker,
         session: SessionId,
         request_id: String,
         answer: Answer<bool>,
@@ -81,11 +85,13 @@ pub(in super::super) enum Message {
         answer: Answer<(Vec<WaitingAcquire>, usize)>,
     },
     WatchDemand {
+        speaker: Speaker,
         session: SessionId,
         provisions: Provisions,
         answer: Answer<watch::Receiver<Vec<Demand>>>,
     },
     ReportShortage {
+        speaker: Speaker,
         session: SessionId,
         kind: String,
         most: u32,
@@ -121,12 +127,13 @@ impl Handle {
 
     pub(in super::super) async fn keep_alive(
         &self,
+        speaker: Speaker,
         session: SessionId,
         client: String,
         ttl: Duration,
     ) -> Result<KeptAlive, Status> {
         let (answer, answered) = oneshot::channel();
-        let ping = Ping { session, client, ttl, answer };
+        let ping = Ping { speaker, session, client, ttl, answer };
         self.pings.send(ping).await.map_err(|_| ending())?;
         answered.await.map_err(|_| ending())?
     }

@@ -28,7 +28,7 @@ use message::{Ping, most_urgent_first};
 use ratn_model::id::LeaseId;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::ResourceUpdate;
-use ratn_resources::{Pool, PoolError, Reply, Request, SessionId, WaiterId};
+use ratn_resources::{Pool, PoolError, Reply, Request, SessionId, Speaker, WaiterId};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -197,10 +197,10 @@ impl Actor {
         Timestamp(u64::try_from(self.start.elapsed().as_nanos()).unwrap_or(u64::MAX))
     }
 
-    fn pinged(&mut self, Ping { session, client, ttl, answer }: Ping) {
+    fn pinged(&mut self, Ping { speaker, session, client, ttl, answer }: Ping) {
         let kept = match &self.stopped {
             Some(stopped) => Err(stopped.clone()),
-            None => self.keep_alive(&session, &client, ttl).map_err(|error| status::of_error(&error)),
+            None => self.keep_alive(&speaker, &session, &client, ttl).map_err(|error| status::of_error(&error)),
         };
         self.reply(answer, kept);
         self.collect();
@@ -212,13 +212,19 @@ impl Actor {
         }
         let now = self.now();
         match message {
-            Message::Perform { request_id, request, answer } => {
-                let reply = self.pool.handle(now, &request_id, request);
-                let revision = self.pool.revision();
-                self.reply(answer, reply.map(|reply| (reply, revision)).map_err(|error| status::of_error(&error)));
+            Message::Perform { speaker, request_id, request, answer } => {
+                let reply = self.may_speak(&speaker, request.session()).and_then(|()| {
+                    let reply =
+                        self.pool.handle(now, &request_id, request).map_err(|error| status::of_error(&error))?;
+                    Ok((reply, self.pool.revision()))
+                });
+                self.reply(answer, reply);
             }
             Message::Acquire { answer, .. } if self.draining => drop(answer.send(Err(ending()))),
-            Message::Acquire { ticket, request_id, mut request, wait, answer } => {
+            Message::Acquire { speaker, ticket, request_id, mut request, wait, answer } => {
+                if let Err(refused) = self.may_speak(&speaker, Some(&request.session)) {
+                    return self.reply(answer, Err(refused));
+                }
                 request.deadline = Some(now + wait.min(self.config.max_wait()));
                 match self.pool.handle(now, &request_id, Request::Acquire(request)) {
                     Ok(Reply::Queued(waiter)) => {
@@ -232,9 +238,11 @@ impl Actor {
                 }
             }
             Message::Abandon { ticket } => self.abandon(ticket),
-            Message::Withdraw { session, request_id, answer } => {
-                let withdrawn = self.pool.withdraw(now, &session, &request_id);
-                self.reply(answer, withdrawn.map_err(|error| status::of_error(&error)));
+            Message::Withdraw { speaker, session, request_id, answer } => {
+                let withdrawn = self.may_speak(&speaker, Some(&session)).and_then(|()| {
+                    self.pool.withdraw(now, &session, &request_id).map_err(|error| status::of_error(&error))
+                });
+                self.reply(answer, withdrawn);
             }
             Message::Return { lease } => self.give_back(lease),
             Message::Find { requirement, answer } => {
@@ -246,16 +254,20 @@ impl Actor {
             Message::List { answer } => self.tell(answer, (self.pool.list(), self.pool.revision())),
             Message::Revision { answer } => self.tell(answer, self.pool.revision()),
             Message::Sessions { answer } => self.tell(answer, self.sessions()),
-            Message::WatchDemand { session, provisions, answer } => {
-                let watch = self.watch_demand(session, provisions);
+            Message::WatchDemand { speaker, session, provisions, answer } => {
+                let allowed = self.may_speak(&speaker, Some(&session));
+                let watch = allowed.and_then(|()| self.watch_demand(session, provisions));
                 self.reply(answer, watch);
             }
-            Message::ReportShortage { session, kind, most, reason, answer } => {
-                let reported = self.pool.report_shortage(now, &session, &kind, &reason);
+            Message::ReportShortage { speaker, session, kind, most, reason, answer } => {
+                let reported = self.may_speak(&speaker, Some(&session)).and_then(|()| {
+                    let reported = self.pool.report_shortage(now, &session, &kind, &reason);
+                    reported.map_err(|error| status::of_error(&error))
+                });
                 if reported.is_ok() {
                     self.providers.bound(&session, &kind, (!reason.is_empty()).then_some(most));
                 }
-                self.reply(answer, reported.map_err(|error| status::of_error(&error)));
+                self.reply(answer, reported);
             }
             Message::Explain { request_id, answer } => {
                 let explained = self.explain(&request_id);
@@ -267,6 +279,18 @@ impl Actor {
             }
         }
         self.collect();
+    }
+
+    /// Whether the speaker may do something in the name of a session; without one they do it as an operator.
+    fn may_speak(&mut self, speaker: &Speaker, session: Option<&SessionId>) -> Result<(), Status> {
+        match session {
+            Some(session) => {
+                let now = self.now();
+                self.pool.check_speaker(now, speaker, session).map_err(|error| status::of_error(&error))
+            }
+            None if speaker.for_anybody => Ok(()),
+            None => Err(status::without_session(&speaker.name)),
+        }
     }
 
     /// Reads go on, of what is on the disk.
@@ -291,19 +315,26 @@ impl Actor {
         }
     }
 
-    fn keep_alive(&mut self, session: &SessionId, client: &str, ttl: Duration) -> Result<KeptAlive, PoolError> {
+    fn keep_alive(
+        &mut self,
+        speaker: &Speaker,
+        session: &SessionId,
+        client: &str,
+        ttl: Duration,
+    ) -> Result<KeptAlive, PoolError> {
         let now = self.now();
         let ttl = ttl.min(self.config.max_session_ttl());
         let created = if ttl.is_zero() {
+            self.pool.check_speaker(now, speaker, session)?;
             match self.pool.close_session(now, session) {
                 Err(PoolError::UnknownSession { .. }) | Ok(()) => false,
                 Err(error) => return Err(error),
             }
         } else {
-            self.pool.keep_alive(now, session, client, ttl.max(MIN_SESSION_TTL))?
+            self.pool.keep_alive_as(now, speaker, session, client, ttl.max(MIN_SESSION_TTL))?
         };
         if created {
-            tracing::info!(%session, client, ttl_ms = ttl.as_millis(), "session opened");
+            tracing::info!(%session, client, opened_by = %speaker.name, ttl_ms = ttl.as_millis(), "session opened");
         }
         Ok(KeptAlive { ttl, created, revision: self.pool.revision() })
     }
