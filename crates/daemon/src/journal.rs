@@ -58,12 +58,13 @@ pub(crate) enum JournalError {
 }
 
 /// A floor for what has to be above all of before, also where the end of the log was lost (no durability, a restored backup): the
-/// milliseconds since 1970.
+/// microseconds since 1970. Nothing that begins there may grow by more than one a microsecond: tokens are held back where they would
+/// ([`ratn_resources::Pool::above`]), revisions and projections take longer to make.
 pub(crate) fn floor() -> u64 {
     #[expect(clippy::disallowed_methods, reason = "a floor: where the clock was set back, what was kept is above it")]
     let now = SystemTime::now();
-    let milliseconds = now.duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis());
-    u64::try_from(milliseconds).unwrap_or(0)
+    let microseconds = now.duration_since(UNIX_EPOCH).map_or(0, |since| since.as_micros());
+    u64::try_from(microseconds).unwrap_or(0)
 }
 
 impl Journal {

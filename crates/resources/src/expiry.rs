@@ -25,7 +25,8 @@ impl Pool {
         if self.queue.is_behind() {
             return Some(self.now);
         }
-        self.timers.first().map(|(at, _)| *at).filter(|at| *at < Timestamp(u64::MAX))
+        let timer = self.timers.first().map(|(at, _)| *at).filter(|at| *at < Timestamp(u64::MAX));
+        timer.into_iter().chain(self.served_later()).min()
     }
 
     /// Ends what has run out by `now`, then grants what became free. Every other method does this first.
@@ -33,7 +34,9 @@ impl Pool {
         // A clock that goes back is a clock that stands still.
         self.now = self.now.max(now);
         self.looked_at = 0;
-        let mut ended = self.queue.is_behind();
+        let now = self.now;
+        self.pace.iter_mut().for_each(|pace| pace.heard_of(now));
+        let mut ended = self.queue.is_behind() || !self.queue.ready.is_empty();
         while self.timers.first().is_some_and(|(at, _)| *at <= self.now) {
             let Some((_, timer)) = self.timers.pop_first() else { break };
             ended = true;

@@ -61,7 +61,7 @@ impl Pool {
             })?;
             // No lost wake-up: whoever can be served has been.
             let obstacles = self.explain(id).map_or(0, |explanation| explanation.obstacles.len());
-            let waits = obstacles > 0 || self.leases.len() >= self.limits.leases || self.queue.is_behind();
+            let waits = obstacles > 0 || !self.may_grant() || self.queue.is_behind();
             ensure(waits, || format!("{id} waits for nothing"))?;
         }
         let ids: usize = self.sessions.values().map(|s| s.waiters.len()).sum();

@@ -47,6 +47,7 @@ mod kinds;
 mod lease;
 mod limits;
 mod memory;
+mod pace;
 mod pool;
 mod queue;
 mod record;

@@ -9,6 +9,7 @@ use crate::kinds::Kinds;
 use crate::lease::{LeaseView, Leases};
 use crate::limits::Limits;
 use crate::memory::{Recalled, Remembered, RequestMemory, fingerprint};
+use crate::pace::Pace;
 use crate::queue::{AcquireRequest, Queue};
 use crate::record::{Effect, Record};
 use crate::request::{Reply, Request};
@@ -45,6 +46,8 @@ pub struct Pool {
     pub(crate) shortages: BTreeMap<SessionId, BTreeMap<String, String>>,
     pub(crate) timers: BTreeSet<(Timestamp, Timer)>,
     pub(crate) next_waiter: u64,
+    /// How fast tokens may grow; as fast as they like where nobody said from where.
+    pub(crate) pace: Option<Pace>,
     /// How many resources were looked at in this turn for those who wait.
     pub(crate) looked_at: usize,
     pub(crate) notices: Vec<Notice>,
@@ -65,13 +68,15 @@ impl Pool {
         self
     }
 
-    /// The same pool; what it grants from now on has ids and tokens above `floor` too. A restarted manager passes a number that
-    /// has grown since (the time), so that its leases are not refused as old ones, whatever was lost of what it kept.
+    /// The same pool; what it grants from now on has ids and tokens above `floor` too. A restarted manager passes the microseconds
+    /// of a clock, so that its leases are not refused as old ones, whatever was lost of what it kept: tokens do not grow faster
+    /// than those (`pace.rs`).
     #[must_use]
     pub fn above(mut self, floor: u64) -> Pool {
         for last in [&mut self.last_lease, &mut self.last_token, &mut self.next_waiter] {
             *last = floor.max(*last);
         }
+        self.pace = Some(Pace::from(self.last_token.max(self.last_lease)));
         self
     }
 

@@ -46,7 +46,7 @@ impl Pool {
                 self.share_out(&family, anew);
                 continue;
             }
-            if self.leases.len() >= self.limits.leases {
+            if !self.may_grant() {
                 return;
             }
             let Some((_, id)) = self.queue.ready.first().copied() else { return };
@@ -58,10 +58,7 @@ impl Pool {
 
     /// What a request can have at once: all of it, or `None`. Nobody waits before it for any of it.
     pub(crate) fn at_once(&self, place: Place, requirements: &[Requirement]) -> Option<Vec<Units>> {
-        if self.leases.len() >= self.limits.leases
-            || self.queue.is_behind()
-            || self.is_before_others(place, requirements)
-        {
+        if !self.may_grant() || self.queue.is_behind() || self.is_before_others(place, requirements) {
             return None;
         }
         let requirements: Vec<&Requirement> = requirements.iter().collect();

@@ -700,3 +700,30 @@ fn tokens_of_a_restarted_pool_are_above_those_of_the_old_one() {
     pool.acquire(now, AcquireRequest::new(session("a"), vec![])).unwrap();
     assert!(grants(&pool.take_notices())[0].1.token.0 > 1_000);
 }
+
+#[test]
+fn tokens_do_not_grow_faster_than_the_microseconds_that_they_began_with() {
+    const FLOOR: u64 = 1_000_000;
+    const AHEAD: u64 = 1_000;
+    let mut pool = Pool::new(Limits::default()).above(FLOOR);
+    let (start, session) = (Timestamp(5_000_000_000), session("s"));
+    pool.keep_alive(start, &session, "s", Duration::from_secs(60)).unwrap();
+    pool.create(start, None, ResourceSpec::new(ResourceClass::Module, "Arm").capacity(5_000)).unwrap();
+    let arm = || vec![Requirement::new(ResourceOperation::Block, "Arm")];
+    for _ in 0..AHEAD + 300 {
+        pool.acquire(start, AcquireRequest::new(session.clone(), arm())).unwrap();
+    }
+    pool.check_invariants().unwrap();
+    assert_eq!(pool.leases().last().unwrap().token.0, FLOOR + AHEAD, "no time has passed");
+    assert_eq!(pool.waiting(), 300);
+    let mut now = start;
+    while let Some(later) = pool.next_deadline().filter(|later| *later < start + Duration::from_secs(1)) {
+        now = later;
+        pool.advance(now);
+        let passed_us = (now.0 - start.0) / 1_000;
+        assert!(pool.leases().last().unwrap().token.0 <= FLOOR + AHEAD + passed_us);
+    }
+    assert_eq!(pool.waiting(), 0, "all are served, a little later");
+    assert!(now >= start + Duration::from_micros(300) && now < start + Duration::from_micros(400));
+    pool.check_invariants().unwrap();
+}

@@ -32,14 +32,11 @@ impl Journaled for Pool {
     }
 }
 
-/// Events a millisecond that no manager makes: revisions that a start has skipped to are above all of the one before.
-const EVENTS_PER_MS: u64 = 1_000;
-
 /// Takes the place of the one writer, and restores the pool. Without durability somebody may have heard of revisions that are lost.
 pub(super) fn open(config: &StorageConfig, directory: &Path, limits: Limits) -> Result<(Pool, Journal), JournalError> {
     let (pool, journal) = Journal::open(ROLE, config, directory, |recovered| restore(recovered, limits))?;
     let may_have_lost = config.durability == Durability::None && pool.revision() > Revision(0);
-    let floor = if may_have_lost { floor().saturating_mul(EVENTS_PER_MS) } else { 0 };
+    let floor = if may_have_lost { floor() } else { 0 };
     Ok((pool.with_revisions_above(Revision(floor)), journal))
 }
 
@@ -66,9 +63,40 @@ fn restore(recovered: Recovered, limits: Limits) -> Result<Pool, NoPool> {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
-    use ratn_model::resource::ResourceClass;
+    use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
     use ratn_model::time::Timestamp;
-    use ratn_resources::ResourceSpec;
+    use ratn_resources::{AcquireRequest, ResourceSpec, SessionId};
+    use std::time::{Duration, Instant};
+
+    #[test]
+    fn when_the_state_is_lost_tokens_are_above_all_that_were_handed_out_as_fast_as_can_be() {
+        let place = tempfile::tempdir().unwrap();
+        let config = StorageConfig { durability: Durability::None, ..StorageConfig::default() };
+        let session = SessionId::from("s");
+        let mut highest = 0;
+        for life in 0..3 {
+            // Each finds nothing of what the one before had kept.
+            let (mut pool, _journal) = open(&config, &place.path().join(life.to_string()), Limits::default()).unwrap();
+            let began = Instant::now();
+            let now = || Timestamp(u64::try_from(began.elapsed().as_nanos()).unwrap());
+            pool.keep_alive(now(), &session, "s", Duration::from_secs(60)).unwrap();
+            pool.create(now(), None, ResourceSpec::new(ResourceClass::Module, "Arm")).unwrap();
+            let mut tokens = Vec::new();
+            for _ in 0..5_000 {
+                let arm = Requirement::new(ResourceOperation::Block, "Arm");
+                pool.acquire(now(), AcquireRequest::new(session.clone(), vec![arm])).unwrap();
+                while pool.leases().is_empty() {
+                    pool.advance(now());
+                }
+                let lease = pool.leases().remove(0);
+                tokens.push(lease.token.0);
+                pool.release(now(), None, lease.id).unwrap();
+                pool.take_notices();
+            }
+            assert!(tokens.iter().all(|token| *token > highest), "life {life}: {} after {highest}", tokens[0]);
+            highest = *tokens.last().unwrap();
+        }
+    }
 
     #[test]
     fn without_durability_a_revision_never_comes_again_after_a_restart() {

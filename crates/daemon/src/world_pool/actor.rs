@@ -167,8 +167,7 @@ pub(super) fn start(
     over: CancellationToken,
 ) -> (Handle, JoinHandle<()>) {
     let (inbox, messages) = mpsc::channel(INBOX);
-    // A pool that makes a projection every microsecond for as long as it lives would reach those of its successor.
-    let pool = WorldPool::new(config.clone(), ontology, history, floor().saturating_mul(1_000));
+    let pool = WorldPool::new(config.clone(), ontology, history, floor());
     let (outbox, start) = (Outbox::default(), Instant::now());
     let actor = Actor {
         config,

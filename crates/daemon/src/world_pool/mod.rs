@@ -104,15 +104,12 @@ pub async fn run_as(
     Ok(served?)
 }
 
-/// Commits a millisecond that no pool makes: revisions that a start has skipped to are above all of the one before.
-const COMMITS_PER_MS: u64 = 1_000;
-
 /// Takes the place of the one writer, and restores the history. Without durability somebody may have heard of revisions that are lost.
 fn open(config: &WorldPoolConfig, directory: &Path) -> Result<(History, Journal), JournalError> {
     let restore = |recovered| History::restore(recovered, config);
     let (history, journal) = Journal::open(ROLE, &config.storage, directory, restore)?;
     let may_have_lost = config.storage.durability == Durability::None && history.root().revision() > Revision(0);
-    let floor = if may_have_lost { floor().saturating_mul(COMMITS_PER_MS) } else { 0 };
+    let floor = if may_have_lost { floor() } else { 0 };
     Ok((history.with_revisions_above(Revision(floor)), journal))
 }
 
