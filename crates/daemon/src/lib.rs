@@ -1,5 +1,5 @@
 //! The three daemons: [`resource_manager`], [`world_pool`], [`process_manager`]. One folder each: `config.rs`, `actor.rs`
-//! (the one task that owns the state; everything else sends it messages), `service.rs` (the gRPC adapter) and `status.rs`
+//! (the one task that owns the state; everything else sends it messages; where the state is durable, a core in a `durable_actor`), `service.rs` (the gRPC adapter) and `status.rs`
 //! (errors as gRPC statuses).
 //!
 //! What all of them share: [`service`] (who may connect and do what: [`access`], [`audit`]), [`telemetry`], [`metrics`], [`config`] (where state is kept, too), [`supervisor`] and
@@ -14,10 +14,9 @@ pub mod audit;
 pub mod config;
 mod demand;
 mod details;
-mod journal;
+mod durable_actor;
 mod link;
 pub mod metrics;
-mod outbox;
 pub mod process_manager;
 pub mod reload;
 pub mod resource_manager;

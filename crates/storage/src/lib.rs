@@ -62,5 +62,5 @@ pub mod store;
 
 pub use durable::{Durable, Progress};
 pub use error::{AppendError, CompactError, CompactionFailure, CopyError, Fault, OpenError, ReadError};
-pub use log::{Copied, Durability, Log, Options, backup, restore};
-pub use store::{Epoch, MakeSnapshot, Position, Record, Recovered, Snapshot, Store, TornEnd, Writer};
+pub use log::{Copied, Disk, Durability, Files, Log, LogFile, Options, backup, restore};
+pub use store::{Epoch, MakeSnapshot, Place, Position, Record, Recovered, Snapshot, Store, TornEnd, Writer};

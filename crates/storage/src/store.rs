@@ -94,11 +94,26 @@ pub trait Writer: fmt::Debug + Send {
     /// Where a compaction is under way, the position makes no sense, or the writer has stopped. Nothing was begun then.
     fn compact(&mut self, through: Position, snapshot: MakeSnapshot) -> Result<(), CompactError>;
 
+    /// The writer's place. It is free again when the writer is dropped or closed, whoever still has this.
+    fn place(&self) -> Box<dyn Place>;
+
+    /// How many bytes wait to be written; [`AppendError::Full`] is about them.
+    fn waiting_bytes(&self) -> usize;
+
     /// Waits until what was appended is durable and the background work has ended, and gives up the place. Blocks.
     ///
     /// # Errors
     /// The reason for which the writer had stopped before.
     fn close(self: Box<Self>) -> Result<Position, Fault>;
+}
+
+/// The place of the one writer, as those see it who ask whether it is still held.
+pub trait Place: fmt::Debug + Send + Sync {
+    /// Whether it is still the writer's. Says nothing of the moment after the look. May take as long as the disk takes to answer.
+    ///
+    /// # Errors
+    /// [`Fault::Fenced`] where somebody else has it, or where that cannot be ruled out.
+    fn check(&self) -> Result<(), Fault>;
 }
 
 impl Position {

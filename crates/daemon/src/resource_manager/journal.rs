@@ -2,7 +2,7 @@
 
 use super::ROLE;
 use crate::config::{Durability, StorageConfig};
-use crate::journal::{Journal, JournalError, Journaled, floor};
+use crate::durable_actor::{Journal, JournalError, Journaled, floor};
 use bytes::Bytes;
 use ratn_model::id::Revision;
 use ratn_resources::{DecodeError, Limits, Pool, Record, RestoreError, Snapshot, decode, encode};

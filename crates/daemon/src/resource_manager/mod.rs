@@ -1,9 +1,9 @@
 //! The resource manager: owns every resource of a system, and says who has what.
 //!
 //! ```text
-//!   gRPC call ──▶ service.rs ──message──▶ actor.rs (Pool of ratn-resources, a clock) ──answer, event──▶ service.rs
+//!   gRPC call ──▶ service.rs ──message──▶ actor (Pool of ratn-resources, a clock) ──answer, event──▶ service.rs
 //!   session's stream ──▶ stream.rs, whose every message is such a call
-//!   actor.rs ──records──▶ journal.rs (ratn-storage) ──durable──▶ outbox ──▶ what tells of them leaves
+//!   durable_actor ──records──▶ journal.rs (ratn-storage) ──durable──▶ outbox ──▶ what tells of them leaves
 //! ```
 //! After a restart everything that was acknowledged is as it was: resources, leases with their tokens, what was consumed,
 //! answers by request id; sessions and leases with a time of their own have it once more. Who was in the queue asks again.
@@ -12,7 +12,6 @@ mod actor;
 mod config;
 mod handout;
 mod journal;
-mod outgoing;
 mod providers;
 mod service;
 mod status;

@@ -6,7 +6,7 @@
 use super::WorldPoolConfig;
 use super::memory::{Memory, Reused, fingerprint};
 use super::record::{CommitRecord, FactRecord, Names, PatternRecord, SnapshotRecord, decode, encode};
-use crate::journal::Journaled;
+use crate::durable_actor::Journaled;
 use bytes::Bytes;
 use ratn_model::fact::{Change, FactKey, FactPattern};
 use ratn_model::id::Revision;

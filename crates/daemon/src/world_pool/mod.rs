@@ -23,7 +23,7 @@ mod status;
 pub use config::WorldPoolConfig;
 
 use crate::config::Durability;
-use crate::journal::{Journal, JournalError, floor};
+use crate::durable_actor::{Journal, JournalError, floor};
 use crate::link::{Link, Manager};
 use anyhow::Context;
 use history::History;

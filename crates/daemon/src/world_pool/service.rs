@@ -39,7 +39,7 @@ pub(super) struct Service {
 #[tonic::async_trait]
 impl v1::world_pool_service_server::WorldPoolService for Service {
     async fn get_root(&self, _: Request<v1::GetRootRequest>) -> Result<Response<v1::GetRootResponse>, Status> {
-        let root = self.actor.ask(|answer| Message::Root { answer }).await?;
+        let root = self.actor.request(|answer| Message::Root { answer }).await?;
         let facts = root.iter().map(|(key, fact)| record((key.clone(), fact.clone())));
         Ok(Response::new(v1::GetRootResponse { revision: root.revision().0, facts: all(facts) }))
     }
@@ -55,7 +55,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             writer: Some(request.writer).filter(|writer| !writer.is_empty()),
             evidence: each(request.evidence, "evidence")?,
         };
-        let (revision, contradictions) = self.actor.ask(|answer| Message::Commit { commit, answer }).await?;
+        let (revision, contradictions) = self.actor.request(|answer| Message::Commit { commit, answer }).await?;
         Ok(Response::new(v1::CommitResponse { revision: revision.0, contradictions: all(contradictions) }))
     }
 
@@ -78,7 +78,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             // In vain for a lease that holds nothing: the actor knows what to do with that.
             let _ = tokio::time::timeout(LEASE_PATIENCE, told).await;
         }
-        let id = self.actor.ask(|answer| Message::Project { projection, answer }).await?;
+        let id = self.actor.request(|answer| Message::Project { projection, answer }).await?;
         Ok(Response::new(v1::ProjectResponse { projection_id: id.0 }))
     }
 
@@ -90,7 +90,8 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         if projection.is_some() && at.is_some() {
             return Err(Malformed::new("at_revision", "is of the root: not together with projection_id").into());
         }
-        let (facts, revision) = self.actor.ask(|answer| Message::Query { projection, at, patterns, answer }).await?;
+        let (facts, revision) =
+            self.actor.request(|answer| Message::Query { projection, at, patterns, answer }).await?;
         Ok(Response::new(v1::QueryResponse { facts: all(facts.into_iter().map(record)), revision: revision.0 }))
     }
 
@@ -103,7 +104,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let request = request.into_inner();
         let patterns: Vec<FactPattern> = each(request.patterns, "patterns")?;
         let after = request.after_revision.map(Revision);
-        let updates = self.actor.ask(|answer| Message::Watch { after, answer }).await?;
+        let updates = self.actor.request(|answer| Message::Watch { after, answer }).await?;
         let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
             .filter_map(move |update| futures::future::ready(told(&update, &patterns)))
             .map(|update| Ok(update.into()));
@@ -126,7 +127,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         request: Request<v1::WatchProjectionRequest>,
     ) -> Result<Response<Self::WatchProjectionStream>, Status> {
         let projection = ProjectionId(request.into_inner().projection_id);
-        let validity = self.actor.ask(|answer| Message::WatchProjection { projection, answer }).await?;
+        let validity = self.actor.request(|answer| Message::WatchProjection { projection, answer }).await?;
         let told = tokio_stream::wrappers::WatchStream::new(validity).map(|contradiction| {
             Ok(v1::WatchProjectionResponse { contradiction: contradiction.map(v1::Contradiction::from) })
         });
@@ -138,7 +139,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let patterns: Vec<FactPattern> = each(request.patterns, "patterns")?;
         let from = Revision(request.from_revision);
         let to = request.to_revision.map(Revision);
-        let (differences, to) = self.actor.ask(|answer| Message::Diff { from, to, answer }).await?;
+        let (differences, to) = self.actor.request(|answer| Message::Diff { from, to, answer }).await?;
         let differences = differences.into_iter().filter(|(key, ..)| wanted(key, &patterns));
         let differences = differences.map(|(key, before, after)| FactDifference {
             before: before.map(|fact| record((key.as_ref().clone(), fact.as_ref().clone()))),
@@ -155,7 +156,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let key: FactKey = required(request.into_inner().key, "key")?;
         let asked = key.clone();
         let message = |answer| Message::Versions { key: asked, limit: MOST_VERSIONS, answer };
-        let (versions, oldest) = self.actor.ask(message).await?;
+        let (versions, oldest) = self.actor.request(message).await?;
         let versions = versions.into_iter().map(|(revision, commit, fact)| FactVersion {
             revision,
             commit: commit.to_string(),
@@ -172,7 +173,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         }
         let bases: Result<Vec<Digest>, Malformed> = request.bases.iter().map(|base| digest(base, "bases")).collect();
         let bases = bases?;
-        let scene = self.actor.ask(|answer| Message::Scene { projection, bases, answer }).await?;
+        let scene = self.actor.request(|answer| Message::Scene { projection, bases, answer }).await?;
         Ok(Response::new(scene.into()))
     }
 
@@ -181,7 +182,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         request: Request<v1::WorldPoolServiceReleaseRequest>,
     ) -> Result<Response<v1::WorldPoolServiceReleaseResponse>, Status> {
         let projection = ProjectionId(request.into_inner().projection_id);
-        let released = self.actor.ask(|answer| Message::Release { projection, answer }).await?;
+        let released = self.actor.request(|answer| Message::Release { projection, answer }).await?;
         Ok(Response::new(v1::WorldPoolServiceReleaseResponse { released }))
     }
 }

@@ -28,7 +28,7 @@ pub struct Copied {
 /// # Errors
 /// Where there is no log, where it is damaged, where the target has something in it, or where the system refuses.
 pub fn backup(log: &Path, target: &Path) -> Result<Copied, CopyError> {
-    copy(log, target)
+    copy(&Disk, log, target)
 }
 
 /// Makes a log of a backup, in a directory that is empty or not there yet: a log that exists is never overwritten. Its epochs
@@ -37,22 +37,23 @@ pub fn backup(log: &Path, target: &Path) -> Result<Copied, CopyError> {
 /// # Errors
 /// As of [`backup`].
 pub fn restore(backup: &Path, target: &Path) -> Result<Copied, CopyError> {
-    copy(backup, target)
+    copy(&Disk, backup, target)
 }
 
-fn copy(source: &Path, target: &Path) -> Result<Copied, CopyError> {
+/// The same on another disk.
+pub(super) fn copy(files: &dyn Files, source: &Path, target: &Path) -> Result<Copied, CopyError> {
     let contents = contents::read(source)?;
     if contents.store.is_none() {
         return Err(CopyError::Nothing { place: source.display().to_string() });
     }
     refuse_what_is_not_empty(target)?;
     let unfinished = unfinished(target)?;
-    let written = write(&contents, &unfinished).and_then(|()| {
+    let written = write(files, &contents, &unfinished).and_then(|()| {
         let copied = contents::read(&unfinished)?;
         debug_assert_eq!(copied.recovered().records.len(), contents.recovered().records.len(), "a copy is the same");
         let parent = parent(target);
-        fs::rename(&unfinished, target).map_err(failed("rename", &unfinished))?;
-        Disk.sync_directory(parent).map_err(failed("sync", parent))
+        files.rename(&unfinished, target).map_err(failed("rename", &unfinished))?;
+        files.sync_directory(parent).map_err(failed("sync", parent))
     });
     if written.is_err() {
         let _ = fs::remove_dir_all(&unfinished);
@@ -61,15 +62,15 @@ fn copy(source: &Path, target: &Path) -> Result<Copied, CopyError> {
     Ok(Copied { through: contents.last(), snapshot: contents.through() })
 }
 
-fn write(contents: &Contents, target: &Path) -> Result<(), CopyError> {
-    make_directory(&Disk, parent(target)).map_err(failed("make", parent(target)))?;
-    fs::create_dir(target).map_err(failed("make", target))?;
+fn write(files: &dyn Files, contents: &Contents, target: &Path) -> Result<(), CopyError> {
+    make_directory(files, parent(target)).map_err(failed("make", parent(target)))?;
+    files.create_directory(target).map_err(failed("make", target))?;
     if let (Some(store), Some(taken)) = (contents.store, &contents.snapshot) {
-        snapshot::write(&Disk, target, store, taken)
+        snapshot::write(files, target, store, taken)
             .map_err(|(action, source)| failed(action, &directory::snapshot(target, taken.through))(source))?;
     }
     for segment in &contents.segments {
-        syncer::begin(&Disk, target, segment.header, &segment.frames)
+        syncer::begin(files, target, segment.header, &segment.frames)
             .map_err(|(action, path, source)| failed(action, &path)(source))?;
     }
     Ok(())

@@ -6,7 +6,7 @@
 
 use super::directory;
 use crate::error::{Fault, OpenError};
-use crate::store::Epoch;
+use crate::store::{Epoch, Place};
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{Read, Write};
 use std::os::unix::fs::MetadataExt;
@@ -19,6 +19,13 @@ const HOLDER_BYTES: u64 = 256;
 pub(super) struct Lock {
     /// Holds the lock for as long as it is open.
     file: File,
+    held: HeldPlace,
+}
+
+/// The name of the lock, and the file that it led to when it was taken. That file is open as long as the writer is there, so no other
+/// one has its inode.
+#[derive(Debug, Clone)]
+pub(super) struct HeldPlace {
     path: PathBuf,
     inode: (u64, u64),
 }
@@ -46,7 +53,7 @@ impl Lock {
             Err(TryLockError::Error(source)) => return Err(failed("lock")(source)),
         }
         let metadata = file.metadata().map_err(failed("look at"))?;
-        Ok(Lock { file, path: path.clone(), inode: (metadata.dev(), metadata.ino()) })
+        Ok(Lock { file, held: HeldPlace { path: path.clone(), inode: (metadata.dev(), metadata.ino()) } })
     }
 
     /// Says to others who holds it. Only for their messages: nothing depends on it.
@@ -57,6 +64,17 @@ impl Lock {
 
     /// Whether the place is still this one's.
     pub(super) fn check(&self) -> Result<(), Fault> {
+        self.held.check()
+    }
+
+    /// For those who ask beside the writer.
+    pub(super) fn place(&self) -> HeldPlace {
+        self.held.clone()
+    }
+}
+
+impl Place for HeldPlace {
+    fn check(&self) -> Result<(), Fault> {
         let held = fs::metadata(&self.path).is_ok_and(|metadata| (metadata.dev(), metadata.ino()) == self.inode);
         let place = || self.path.parent().unwrap_or(Path::new(".")).display().to_string();
         if held { Ok(()) } else { Err(Fault::Fenced { place: place() }) }

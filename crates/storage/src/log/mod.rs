@@ -20,17 +20,17 @@ mod tests;
 mod writer;
 
 pub use backup::{Copied, backup, restore};
+pub use files::{Disk, Files, LogFile};
 
 use crate::error::{OpenError, ReadError};
 use crate::store::{Epoch, Position, Recovered, Store, Writer};
 use contents::Contents;
-use files::{Disk, Files};
 use format::{SegmentHeader, StoreId};
 use lock::Lock;
 use serde::{Deserialize, Serialize};
 use shared::Shared;
 use std::fmt;
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -104,6 +104,12 @@ impl Log {
     #[must_use]
     pub fn new(directory: impl Into<PathBuf>, options: Options) -> Log {
         Log { directory: directory.into(), options, files: Arc::new(Disk) }
+    }
+
+    /// The same, written through another disk than the system's: one that is slow, or fails, for tests. Reading goes to the system's.
+    #[must_use]
+    pub fn on(self, files: Arc<dyn Files>) -> Log {
+        Log { files, ..self }
     }
 
     /// Where it is.
@@ -226,7 +232,7 @@ fn make_directory(files: &dyn Files, path: &Path) -> io::Result<()> {
     if let Some(parent) = parent {
         make_directory(files, parent)?;
     }
-    fs::create_dir(path).or_else(|error| if path.is_dir() { Ok(()) } else { Err(error) })?;
+    files.create_directory(path).or_else(|error| if path.is_dir() { Ok(()) } else { Err(error) })?;
     files.sync_directory(parent.unwrap_or(Path::new(".")))
 }
 

@@ -137,6 +137,12 @@ impl Shared {
         Position(self.lock().next.0 - 1)
     }
 
+    /// Bytes that the syncer has not taken yet.
+    pub(super) fn waiting_bytes(&self) -> usize {
+        let state = self.lock();
+        if state.batch.count == 0 { 0 } else { state.batch.bytes.len() }
+    }
+
     /// For the syncer: waits for records, where there is time for more of them, and says whether they go to a new segment. Nothing
     /// when all are written and the writer is closing.
     pub(super) fn take(&self, there_is_time: bool) -> Option<(Batch, bool)> {

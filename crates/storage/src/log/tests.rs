@@ -1,12 +1,12 @@
 //! With disks that fail: what is on the real one never tells.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use super::files::{Disk, Files, LogFile};
 use super::format::SEGMENT_HEADER;
 use super::*;
 use crate::error::{AppendError, Fault};
 use crate::store::Record;
 use bytes::Bytes;
+use std::fs;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -39,6 +39,10 @@ impl Files for FaultyDisk {
     fn create(&self, path: &Path) -> io::Result<Box<dyn LogFile>> {
         let concerned = path.to_string_lossy().contains(self.0.only);
         Ok(Box::new(FaultyFile { file: Disk.create(path)?, faults: self.0.clone(), concerned }))
+    }
+
+    fn create_directory(&self, path: &Path) -> io::Result<()> {
+        Disk.create_directory(path)
     }
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {

@@ -3,12 +3,13 @@
 use super::compaction::Compaction;
 use super::files::Files;
 use super::format::StoreId;
+use super::lock::HeldPlace;
 use super::shared::Shared;
 use super::syncer::Syncer;
 use super::{Durability, Options};
 use crate::durable::Durable;
 use crate::error::{AppendError, CompactError, Fault};
-use crate::store::{MakeSnapshot, Position, Writer};
+use crate::store::{MakeSnapshot, Place, Position, Writer};
 use std::io;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
@@ -19,15 +20,16 @@ pub(super) struct LogWriter {
     files: Arc<dyn Files>,
     store: StoreId,
     options: Options,
+    place: HeldPlace,
     syncer: Option<JoinHandle<()>>,
     compaction: Option<JoinHandle<()>>,
 }
 
 impl LogWriter {
     pub(super) fn start(syncer: Syncer, store: StoreId, options: Options) -> io::Result<LogWriter> {
-        let (shared, files) = (syncer.shared.clone(), syncer.files.clone());
+        let (shared, files, place) = (syncer.shared.clone(), syncer.files.clone(), syncer.lock.place());
         let syncer = thread::Builder::new().name("log-syncer".to_owned()).spawn(move || syncer.run())?;
-        Ok(LogWriter { shared, files, store, options, syncer: Some(syncer), compaction: None })
+        Ok(LogWriter { shared, files, store, options, place, syncer: Some(syncer), compaction: None })
     }
 
     /// Writes what waits, and ends both threads.
@@ -77,6 +79,14 @@ impl Writer for LogWriter {
             }
         }
         Ok(())
+    }
+
+    fn place(&self) -> Box<dyn Place> {
+        Box::new(self.place.clone())
+    }
+
+    fn waiting_bytes(&self) -> usize {
+        self.shared.waiting_bytes()
     }
 
     fn close(mut self: Box<Self>) -> Result<Position, Fault> {

@@ -1,7 +1,7 @@
 //! What is missing, for those who can provide it.
 
 use super::super::providers::Provisions;
-use super::Actor;
+use super::{ResourceCore, ResourceDesk};
 use crate::details::retry_later;
 use ratn_proto::types::Demand;
 use ratn_resources::SessionId;
@@ -9,7 +9,7 @@ use std::time::Duration;
 use tokio::sync::watch;
 use tonic::{Code, Status};
 
-impl Actor {
+impl ResourceCore {
     pub(super) fn watch_demand(
         &mut self,
         session: SessionId,
@@ -22,8 +22,8 @@ impl Actor {
     }
 
     /// Tells providers what is missing, where that may have changed.
-    pub(super) fn spread_demand(&mut self) {
-        let now = self.now();
+    pub(super) fn spread_demand(&mut self, desk: &ResourceDesk) {
+        let now = desk.now();
         let changed = self.pool.take_demand();
         if changed.is_none() && !self.providers.are_due(now) {
             return;

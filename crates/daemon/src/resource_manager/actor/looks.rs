@@ -1,6 +1,6 @@
 //! Who only looks: the sessions there are, and why an acquire waits.
 
-use super::Actor;
+use super::{ResourceCore, ResourceDesk};
 use crate::details::status as status_with;
 use crate::resource_manager::wire;
 use ratn_proto::types::{SessionStatus, WaitingAcquire};
@@ -10,9 +10,9 @@ use tonic::{Code, Status};
 /// Waiters that are explained together at the most.
 const EXPLAINED: usize = 100;
 
-impl Actor {
-    pub(super) fn sessions(&self) -> Vec<SessionStatus> {
-        let now = self.now();
+impl ResourceCore {
+    pub(super) fn sessions(&self, desk: &ResourceDesk) -> Vec<SessionStatus> {
+        let now = desk.now();
         self.pool.sessions().into_iter().map(|session| wire::session(session, now)).collect()
     }
 

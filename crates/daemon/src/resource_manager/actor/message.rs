@@ -1,7 +1,7 @@
 //! What the service asks of the actor, and how it gets there.
 
 use super::super::providers::Provisions;
-use crate::details::ending;
+use super::ResourceCore;
 use crate::resource_manager::Granted;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Requirement;
@@ -23,7 +23,7 @@ pub(in super::super) struct KeptAlive {
 
 /// A ping of a session.
 #[derive(Debug)]
-pub(super) struct Ping {
+pub(in super::super) struct Ping {
     pub(super) speaker: Speaker,
     pub(super) session: SessionId,
     pub(super) client: String,
@@ -108,23 +108,9 @@ pub(in super::super) enum Message {
 pub(in super::super) type Answer<T> = oneshot::Sender<Result<T, Status>>;
 
 /// Sends messages to the actor.
-#[derive(Debug, Clone)]
-pub(in super::super) struct Handle {
-    pub(super) inbox: mpsc::Sender<Message>,
-    pub(super) pings: mpsc::Sender<Ping>,
-}
+pub(in super::super) type Handle = crate::durable_actor::Handle<ResourceCore>;
 
 impl Handle {
-    /// Sends a message and waits for the answer that it is to be given.
-    pub(in super::super) async fn ask<T>(
-        &self,
-        message: impl FnOnce(oneshot::Sender<T>) -> Message,
-    ) -> Result<T, Status> {
-        let (answer, answered) = oneshot::channel();
-        self.send(message(answer)).await?;
-        answered.await.map_err(|_| ending())
-    }
-
     pub(in super::super) async fn keep_alive(
         &self,
         speaker: Speaker,
@@ -132,22 +118,7 @@ impl Handle {
         client: String,
         ttl: Duration,
     ) -> Result<KeptAlive, Status> {
-        let (answer, answered) = oneshot::channel();
-        let ping = Ping { speaker, session, client, ttl, answer };
-        self.pings.send(ping).await.map_err(|_| ending())?;
-        answered.await.map_err(|_| ending())?
-    }
-
-    pub(in super::super) async fn send(&self, message: Message) -> Result<(), Status> {
-        self.inbox.send(message).await.map_err(|_| ending())
-    }
-
-    /// Sends a message from where nothing can be waited for.
-    pub(in super::super) fn send_later(&self, message: Message) {
-        if let Err(mpsc::error::TrySendError::Full(message)) = self.inbox.try_send(message) {
-            let inbox = self.inbox.clone();
-            tokio::spawn(async move { inbox.send(message).await });
-        }
+        self.ask_urgently(|answer| Ping { speaker, session, client, ttl, answer }).await?
     }
 }
 

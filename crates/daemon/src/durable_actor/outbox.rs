@@ -9,13 +9,13 @@ use tokio::sync::oneshot;
 use tonic::Status;
 
 /// With so much held back an actor takes on nothing new: the disk does not keep up.
-pub(crate) const MOST_HELD: usize = 16_384;
+pub(super) const MOST_HELD: usize = 16_384;
 
 /// Sends an answer, or a status instead of it.
-pub(crate) type SendAnswer = Box<dyn FnOnce(Option<&Status>) + Send>;
+pub(super) type SendAnswer = Box<dyn FnOnce(Option<&Status>) + Send>;
 
 /// Answers that can be held back, until it is known whether what they tell of is on the disk.
-pub(crate) fn send_answer<T: Send + 'static>(
+pub(super) fn send_answer<T: Send + 'static>(
     answer: oneshot::Sender<Result<T, Status>>,
     result: Result<T, Status>,
 ) -> SendAnswer {
@@ -24,26 +24,30 @@ pub(crate) fn send_answer<T: Send + 'static>(
 
 /// What leaves, in order.
 #[derive(Debug)]
-pub(crate) struct Outbox<T> {
+pub(super) struct Outbox<T> {
     held: VecDeque<(Position, T)>,
 }
 
 impl<T> Outbox<T> {
     /// Puts it behind all others.
-    pub(crate) fn hold(&mut self, position: Position, outgoing: T) {
+    pub(super) fn hold(&mut self, position: Position, outgoing: T) {
         self.held.push_back((position, outgoing));
     }
 
     /// What the first waits for.
-    pub(crate) fn waits_for(&self) -> Option<Position> {
+    pub(super) fn waits_for(&self) -> Option<Position> {
         self.held.front().map(|(position, _)| *position)
     }
 
-    pub(crate) fn take(&mut self) -> Option<T> {
+    pub(super) fn take(&mut self) -> Option<T> {
         self.held.pop_front().map(|(_, outgoing)| outgoing)
     }
 
-    pub(crate) fn is_full(&self) -> bool {
+    pub(super) fn take_all(&mut self) -> Vec<T> {
+        std::mem::take(&mut self.held).into_iter().map(|(_, outgoing)| outgoing).collect()
+    }
+
+    pub(super) fn is_full(&self) -> bool {
         self.held.len() >= MOST_HELD
     }
 }

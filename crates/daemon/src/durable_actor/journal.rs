@@ -18,7 +18,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 /// One entry holds what one turn of an actor changed; larger than any message that asks for it.
 const RECORD_BYTES: usize = 64 << 20;
-/// What may wait for the disk. The actor takes no more on long before ([`crate::outbox::MOST_HELD`]).
+/// What may wait for the disk. The actor takes no more on long before ([`super::outbox::MOST_HELD`]).
 const BUFFERED_BYTES: usize = 256 << 20;
 
 /// A state that is kept in a [`Journal`].

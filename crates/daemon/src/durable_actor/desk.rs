@@ -1,0 +1,104 @@
+//! What a core has at hand during a turn: the time, whom to answer, who watches, and whether anything may change.
+
+use super::Core;
+use super::outbox::{SendAnswer, send_answer};
+use super::watchers::Watchers;
+use ratn_model::time::Timestamp;
+use std::time::{Duration, Instant};
+use tokio::sync::{mpsc, oneshot};
+use tonic::Status;
+
+/// Something that leaves when the records of what it tells of are on the disk.
+pub(super) enum Outgoing<C: Core> {
+    /// To one who asked.
+    Answer(SendAnswer),
+    /// From here on it sees every update.
+    Watcher(mpsc::Sender<C::Update>),
+    /// What the state has to say.
+    Said(C::Said),
+}
+
+/// Why nothing changes any more.
+#[derive(Debug)]
+pub(crate) struct Stopped {
+    /// What who asks for a change is told.
+    pub(crate) status: Status,
+    /// Nor is anything shown: it is not known what is on the disk.
+    pub(super) unreadable: bool,
+}
+
+/// See the module.
+pub(crate) struct Desk<C: Core> {
+    /// Everybody who watches.
+    pub(crate) watchers: Watchers<C::Update>,
+    outgoing: Vec<Outgoing<C>>,
+    stopped: Option<Stopped>,
+    start: Instant,
+}
+
+impl<C: Core> Desk<C> {
+    pub(super) fn new() -> Desk<C> {
+        Desk { watchers: Watchers::default(), outgoing: Vec::new(), stopped: None, start: Instant::now() }
+    }
+
+    /// The time, since the start.
+    pub(crate) fn now(&self) -> Timestamp {
+        Timestamp(u64::try_from(self.start.elapsed().as_nanos()).unwrap_or(u64::MAX))
+    }
+
+    /// Why nothing may change any more; nothing as long as it may.
+    pub(crate) fn stopped(&self) -> Option<&Stopped> {
+        self.stopped.as_ref()
+    }
+
+    /// Answers when what the answer tells of is on the disk.
+    pub(crate) fn reply<T: Send + 'static>(
+        &mut self,
+        answer: oneshot::Sender<Result<T, Status>>,
+        result: Result<T, Status>,
+    ) {
+        self.outgoing.push(Outgoing::Answer(send_answer(answer, result)));
+    }
+
+    /// As [`Desk::reply`], to one who only looks; without an answer they ask again.
+    pub(crate) fn tell<T: Send + 'static>(&mut self, answer: oneshot::Sender<T>, told: T) {
+        self.outgoing.push(Outgoing::Answer(Box::new(move |stopped| {
+            if stopped.is_none() {
+                let _ = answer.send(told);
+            }
+        })));
+    }
+
+    /// What the state has to say, behind what was to be said before.
+    pub(crate) fn say(&mut self, said: C::Said) {
+        self.outgoing.push(Outgoing::Said(said));
+    }
+
+    /// Begins a watch with what is known now. What waits for the disk is in that; what comes later follows.
+    ///
+    /// # Errors
+    /// Where so many watch already.
+    pub(crate) fn watch(&mut self, first: Vec<C::Update>) -> Result<mpsc::Receiver<C::Update>, Status> {
+        let (watcher, updates) = super::watchers::begin(first)?;
+        self.outgoing.push(Outgoing::Watcher(watcher));
+        Ok(updates)
+    }
+
+    pub(super) fn instant(&self, at: Timestamp) -> Instant {
+        self.start + Duration::from_nanos(at.0)
+    }
+
+    pub(super) fn take_outgoing(&mut self) -> Vec<Outgoing<C>> {
+        std::mem::take(&mut self.outgoing)
+    }
+
+    pub(super) fn stop(&mut self, stopped: Stopped) {
+        self.stopped = Some(stopped);
+    }
+
+    pub(super) fn set_unreadable(&mut self) {
+        if let Some(stopped) = &mut self.stopped {
+            stopped.unreadable = true;
+        }
+    }
+}

@@ -1,0 +1,97 @@
+//! The one task that owns a durable state: takes messages in order, ends what time has ended, and lets nothing out before the records
+//! of what it tells of are on the disk. The resource manager and the world pool are both a [`Core`] in it.
+//!
+//! ```text
+//!   inbox ──message──▶ Core (the state) ──records──▶ journal ──durable──▶ outbox ──▶ answers, watchers
+//! ```
+//! What came together is written down together. When records cannot be written, every change is refused from then on; what can be read
+//! is the state that is on the disk.
+
+mod actor;
+mod desk;
+mod inbox;
+mod journal;
+mod outbox;
+mod watchers;
+
+pub(crate) use desk::Desk;
+pub(crate) use inbox::Handle;
+pub(crate) use journal::{Journal, JournalError, Journaled, floor};
+
+use actor::Actor;
+use ratn_model::time::Timestamp;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+/// A state and what is done with it: everything that is not the same for every daemon.
+pub(crate) trait Core: Sized + Send + 'static {
+    /// What is kept over a restart.
+    type State: Journaled;
+    /// What the service asks.
+    type Message: Send + 'static;
+    /// What goes before every message.
+    type Urgent: Send + 'static;
+    /// What the state has to say beside answers; it waits for the disk as they do.
+    type Said: Send + 'static;
+    /// What watchers are told.
+    type Update: Clone + Send + 'static;
+    /// What is told from outside, of which only the newest counts.
+    type Signal: Send + Sync + 'static;
+
+    /// What the journal writes down.
+    fn state(&mut self) -> &mut Self::State;
+
+    /// The journal cannot be written any more: the state is what it holds.
+    ///
+    /// # Errors
+    /// Where it cannot be read either.
+    fn restore(&mut self, journal: &Journal, desk: &Desk<Self>) -> Result<(), JournalError>;
+
+    /// When [`Core::advance`] is due.
+    fn next_deadline(&self, desk: &Desk<Self>) -> Option<Timestamp>;
+
+    /// Ends what time has ended.
+    fn advance(&mut self, desk: &mut Desk<Self>);
+
+    /// One message. It also comes when nothing can be written any more ([`Desk::stopped`]): then nothing may change.
+    fn receive(&mut self, message: Self::Message, desk: &mut Desk<Self>);
+
+    /// As [`Core::receive`], of what goes before every message.
+    fn receive_urgent(&mut self, urgent: Self::Urgent, desk: &mut Desk<Self>);
+
+    /// The newest signal.
+    fn signal(&mut self, signal: &Self::Signal, desk: &mut Desk<Self>);
+
+    /// Passes on what the state has to say since the last call ([`Desk::say`]), in order.
+    fn collect(&mut self, desk: &mut Desk<Self>);
+
+    /// What was said is on the disk: it leaves.
+    fn hand_out(&mut self, said: Self::Said, desk: &mut Desk<Self>);
+
+    /// Puts messages that arrived together into another order.
+    fn order(_messages: &mut [Self::Message]) {}
+
+    /// Whether a message may change so much that it is written down on its own.
+    fn is_large(_message: &Self::Message) -> bool {
+        false
+    }
+
+    /// Nobody is made to wait any more.
+    fn drain(&mut self, _desk: &mut Desk<Self>) {}
+
+    /// A turn has ended.
+    fn turned(&mut self, _desk: &mut Desk<Self>) {}
+}
+
+/// Starts the actor. With `draining` whoever waits is told to ask the successor; with `over` it ends, when everything is on the disk.
+pub(crate) fn start<C: Core>(
+    core: C,
+    journal: Journal,
+    signals: watch::Receiver<C::Signal>,
+    draining: CancellationToken,
+    over: CancellationToken,
+) -> (Handle<C>, JoinHandle<()>) {
+    let (handle, inbox) = inbox::open();
+    (handle, tokio::spawn(Actor::new(core, journal).run(inbox, signals, draining, over)))
+}

@@ -1,0 +1,71 @@
+//! Who watches: everything as it is, then every update; one that does not keep up is cut off rather than waited for.
+
+use crate::details::{retry_later, status};
+use std::time::Duration;
+use tokio::sync::mpsc;
+use tonic::{Code, Status};
+
+/// Updates that wait for a watcher; one that has more to catch up with is cut off.
+const WATCH_BUFFER: usize = 4_096;
+/// When a watch that was refused may be asked for again.
+const WATCH_AGAIN_AFTER: Duration = Duration::from_secs(1);
+
+/// Everybody who watches.
+#[derive(Debug)]
+pub(crate) struct Watchers<U> {
+    all: Vec<mpsc::Sender<U>>,
+}
+
+/// A watcher whose channel holds what it begins with.
+pub(super) fn begin<U>(first: Vec<U>) -> Result<(mpsc::Sender<U>, mpsc::Receiver<U>), Status> {
+    let (sender, updates) = mpsc::channel(WATCH_BUFFER + first.len());
+    for update in first {
+        sender.try_send(update).map_err(|_| status(Code::Internal, "BROKEN", "a new watch took no update"))?;
+    }
+    Ok((sender, updates))
+}
+
+impl<U: Clone> Watchers<U> {
+    /// Whether one more may watch.
+    ///
+    /// # Errors
+    /// Where so many do already.
+    pub(crate) fn admit(&mut self, most: usize) -> Result<(), Status> {
+        self.all.retain(|watcher| !watcher.is_closed());
+        if self.all.len() >= most {
+            let message = format!("{} clients watch already", self.all.len());
+            return Err(retry_later(Code::ResourceExhausted, "TOO_MANY", message, WATCH_AGAIN_AFTER));
+        }
+        Ok(())
+    }
+
+    /// Tells all.
+    pub(crate) fn publish(&mut self, update: &U) {
+        self.all.retain(|watcher| match watcher.try_send(update.clone()) {
+            Ok(()) => true,
+            Err(mpsc::error::TrySendError::Closed(_)) => false,
+            Err(mpsc::error::TrySendError::Full(_)) => {
+                tracing::warn!("a watcher did not keep up and was cut off");
+                false
+            }
+        });
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.all.len()
+    }
+
+    pub(super) fn add(&mut self, watcher: mpsc::Sender<U>) {
+        self.all.push(watcher);
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.all.clear();
+    }
+}
+
+impl<U> Default for Watchers<U> {
+    fn default() -> Watchers<U> {
+        Watchers { all: Vec::new() }
+    }
+}
