@@ -125,20 +125,39 @@ async fn what_waits_on_a_stream_that_breaks_leaves_the_queue() {
 }
 
 #[tokio::test]
-async fn more_calls_than_a_stream_may_have_are_refused_and_the_others_go_on() {
-    const CALLS: u64 = 4_200;
+async fn the_last_call_that_a_stream_may_have_waits_and_one_more_is_refused_until_another_has_ended() {
+    const CALLS: u64 = 4_096;
     let system = TestSystem::new();
     let manager = system.resource_manager().await;
     let mut line = Line::open(&system, &manager, "a").await;
-    let questions = line.questions.clone();
-    tokio::spawn(async move {
-        for number in 0..CALLS {
-            let kind = acquire("a", &format!("waits {number}"));
-            let _ = questions.send(SessionRequest { id: 10 + number, kind, ..Default::default() }).await;
-        }
-    });
-    let (id, code) = line.failure().await;
-    assert!(code == Code::ResourceExhausted && id > 10, "{id}: {code:?}");
+    for id in 10..10 + CALLS {
+        line.ask(id, acquire("a", &format!("waits {id}"))).await;
+    }
+    let undo = v1::WithdrawRequest { request_id: "waits 10".to_owned(), session_id: "a".to_owned() };
+    line.ask(5_000, Some(Asked::Withdraw(undo.clone()))).await;
+    assert_eq!(line.failure().await, (5_000, Code::ResourceExhausted));
+    // Undone from elsewhere, the first one ends.
+    let mut other = ResourceServiceClient::new(system.channels.get(&manager.endpoint).unwrap());
+    assert!(other.withdraw(undo).await.unwrap().into_inner().withdrawn);
+    assert_eq!(line.failure().await.0, 10);
+    line.ask(5_001, acquire("a", "waits too")).await;
+    line.ask(5_002, None).await;
+    assert_eq!(line.failure().await, (5_002, Code::ResourceExhausted));
+    manager.end().await;
+}
+
+#[tokio::test]
+async fn the_id_of_a_call_under_way_is_refused_to_another_unless_it_is_0() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut line = Line::open(&system, &manager, "a").await;
+    line.ask(2, acquire("a", "waits")).await;
+    line.ask(2, acquire("a", "waits too")).await;
+    assert_eq!(line.failure().await, (2, Code::InvalidArgument));
+    line.ask(0, acquire("a", "waits as well")).await;
+    line.ask(0, None).await;
+    let (0, Kind::Failure(failure)) = line.hear().await else { panic!("it says nothing") };
+    assert!(failure.message.contains("kind"), "{}", failure.message);
     manager.end().await;
 }
 

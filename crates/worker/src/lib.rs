@@ -7,7 +7,7 @@
 //! - [`server`]: `bind(&endpoint) -> Bound` (port 0 and Unix sockets too), `Services::new().with(service)`,
 //!   `bound.serve(services, shutdown_token)`: adds gRPC health and reflection, drains with a hard deadline.
 //! - [`gate::Gate`] sees every call with the [`gate::Identity`] of its caller; [`tls`] says what is shown and trusted; [`trace`] carries
-//!   a W3C trace context from call to call.
+//!   a W3C trace context from call to call; [`multiplex`] carries many calls over one stream.
 //! - [`shutdown`]: `on_signals(&token)`, `exit_with_parent(&token)`.
 //!
 //! # Performing actions
@@ -32,6 +32,7 @@ pub mod adoption;
 pub mod client;
 pub mod endpoint;
 pub mod gate;
+pub mod multiplex;
 pub mod provider;
 pub mod robot_clock;
 pub mod runtime_directory;

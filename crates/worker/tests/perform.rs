@@ -131,7 +131,7 @@ async fn a_provider_that_drains_says_how_goals_end_and_then_that_it_ends() {
     assert!(provider.client.cancel(&provider.endpoint, "goal-1").await.is_err(), "nothing new is taken");
     provider.server.cancel("goal-1");
     assert_eq!(line.outcome().await, (1, "preempted".to_owned()));
-    assert!(line.heard.message().await.unwrap().is_none());
+    assert_eq!(line.heard.message().await.unwrap_err().code(), Code::Unavailable);
 }
 
 #[tokio::test]

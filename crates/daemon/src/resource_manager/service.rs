@@ -2,6 +2,7 @@
 
 use super::actor::{Handle, Message};
 use super::providers::Provisions;
+use super::stream::CallerService;
 use super::{Granted, wire};
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
@@ -14,6 +15,8 @@ use ratn_proto::convert::{all, each, label, name, names, ports, required};
 use ratn_proto::types::{Resource, ResourceFilter, ResourceUpdate, WatchPosition};
 use ratn_proto::v1;
 use ratn_resources::{AcquireRequest, Reply, Request as PoolRequest, ResourceSpec, SessionId};
+use ratn_worker::multiplex::SessionCalls;
+use ratn_worker::multiplex::server::Answers;
 use std::collections::BTreeSet;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -135,7 +138,7 @@ impl v1::resource_service_server::ResourceService for Service {
     type WatchStream = Streamed<v1::ResourceServiceWatchResponse>;
     type WatchDemandStream = Streamed<v1::WatchDemandResponse>;
     type KeepAliveStream = Streamed<v1::KeepAliveResponse>;
-    type SessionStream = super::stream::SessionStream;
+    type SessionStream = Answers<SessionCalls, CallerService>;
 
     async fn create(&self, request: Request<v1::CreateRequest>) -> Result<Response<v1::CreateResponse>, Status> {
         let (caller, request) = (Caller::of(&request), request.into_inner());
@@ -402,10 +405,8 @@ impl v1::resource_service_server::ResourceService for Service {
         &self,
         request: Request<Streaming<v1::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let caller = Caller::of(&request);
-        let stream =
-            super::stream::SessionStream::new(self.clone(), caller, request.into_inner(), self.shutdown.clone());
-        Ok(Response::new(stream))
+        let calls = CallerService { service: self.clone(), caller: Caller::of(&request) };
+        Ok(Response::new(Answers::new(calls, request.into_inner(), Some(self.shutdown.clone()))))
     }
 }
 

@@ -2,8 +2,9 @@
 
 use super::ActionServer;
 use super::goal::{Ending, GoalEntry, Listener};
-use super::stream::PerformStream;
 use crate::gate::Draining;
+use crate::multiplex::GoalCalls;
+use crate::multiplex::server::Answers;
 use futures::stream::{BoxStream, StreamExt, unfold};
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::{name, required};
@@ -38,14 +39,14 @@ impl ActionService for ActionServer {
         Ok(Response::new(self.admit(goal).await?.into_stream()))
     }
 
-    type PerformStream = PerformStream;
+    type PerformStream = Answers<GoalCalls, ActionServer>;
 
     async fn perform(
         &self,
         request: Request<Streaming<v1::PerformRequest>>,
-    ) -> Result<Response<PerformStream>, Status> {
-        let draining = request.extensions().get::<Draining>().cloned();
-        Ok(Response::new(PerformStream::new(self.clone(), request.into_inner(), draining)))
+    ) -> Result<Response<Self::PerformStream>, Status> {
+        let draining = request.extensions().get::<Draining>().map(|draining| draining.0.clone());
+        Ok(Response::new(Answers::new(self.clone(), request.into_inner(), draining)))
     }
 
     async fn cancel(&self, request: Request<v1::CancelRequest>) -> Result<Response<v1::CancelResponse>, Status> {

@@ -9,6 +9,8 @@ use ratn_proto::convert::{Malformed, ports};
 use ratn_proto::types::{Goal, GoalOutcome};
 use ratn_proto::v1;
 use ratn_proto::v1::action_service_client::ActionServiceClient;
+use ratn_proto::v1::perform_request::Kind as Asked;
+use ratn_proto::v1::perform_response::Kind as Heard;
 use std::collections::BTreeMap;
 
 /// Gives goals to providers.
@@ -93,11 +95,21 @@ impl ActionClient {
     ) -> Result<Fate, CallError> {
         let malformed = |m: Malformed| CallError::malformed(endpoint, m);
         let mut nonsense = None;
-        let heard = |progress: v1::GoalProgress| match ports(progress.values, "progress.values") {
-            Ok(values) => on_progress(progress.message, values),
-            Err(error) => nonsense = Some(error),
+        let heard = |answer| {
+            let Heard::Progress(progress) = answer else { return };
+            match ports(progress.values, "progress.values") {
+                Ok(values) => on_progress(progress.message, values),
+                Err(error) => nonsense = Some(error),
+            }
         };
-        let result = self.channels.goals.execute(&self.channels, endpoint, question, heard).await?;
+        let mut client = self.client(endpoint)?;
+        let open = |questions| async move { client.perform(questions).await };
+        let stream = self.channels.goals(endpoint);
+        let answer = stream.call_with_progress(open, Asked::Execute(question), heard).await;
+        let answer = answer.map_err(|status| CallError::from_status(endpoint, &status))?;
+        let Heard::Result(result) = answer else {
+            return Err(malformed(Malformed::new("kind", "is not that of a goal's end")));
+        };
         if let Some(nonsense) = nonsense {
             return Err(malformed(nonsense));
         }

@@ -2,9 +2,7 @@
 
 mod action;
 mod error;
-mod goals;
 mod health;
-mod line;
 mod patience;
 mod process;
 mod resource;
@@ -19,6 +17,8 @@ pub use resource::{AcquireOptions, DemandWatch, ResourceClient, ResourceWatch};
 pub use world::{Commit, Projection, ProjectionWatch, WorldClient, WorldWatch};
 
 use crate::endpoint::{Endpoint, connect_lazily};
+use crate::multiplex::GoalCalls;
+use crate::multiplex::client::Multiplexer;
 use crate::trace::Traced;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -29,12 +29,15 @@ use tonic::transport::Channel;
 /// So many channels are kept; beyond it all are forgotten and made anew as they are needed.
 const MAX_CHANNELS: usize = 256;
 
+/// So many streams of goals are kept; beyond it those that are not used are forgotten.
+const MAX_STREAMS: usize = 256;
+
 /// One channel per endpoint, and one stream of goals, shared by all clients of a process. A channel connects by itself, again if it
 /// broke.
 #[derive(Debug, Clone, Default)]
 pub struct Channels {
     kept: Arc<Mutex<BTreeMap<Endpoint, Channel>>>,
-    goals: goals::Goals,
+    goals: Arc<Mutex<BTreeMap<Endpoint, Multiplexer<GoalCalls>>>>,
 }
 
 impl Channels {
@@ -67,6 +70,15 @@ impl Channels {
     /// As [`Channels::get`].
     pub fn traced(&self, endpoint: &Endpoint) -> Result<Traced, CallError> {
         self.get(endpoint).map(Traced::new)
+    }
+
+    /// The stream of the goals that are given to the provider at `endpoint`.
+    fn goals(&self, endpoint: &Endpoint) -> Multiplexer<GoalCalls> {
+        let mut streams = self.goals.lock().unwrap_or_else(PoisonError::into_inner);
+        if streams.len() >= MAX_STREAMS {
+            streams.retain(|_, stream| stream.is_used());
+        }
+        streams.entry(endpoint.clone()).or_default().clone()
     }
 
     /// Forgets the channel to an endpoint that is gone for good.

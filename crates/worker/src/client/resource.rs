@@ -1,8 +1,9 @@
 //! The client of the resource manager. What is asked for again and again while a task runs goes over the session's stream.
 
-use super::line::Line;
 use super::{CallError, Channels, fresh_id};
 use crate::endpoint::Endpoint;
+use crate::multiplex::SessionCalls;
+use crate::multiplex::client::Multiplexer;
 use crate::trace::Traced;
 use ratn_model::id::LeaseId;
 use ratn_model::resource::{Lease, Requirement};
@@ -26,7 +27,7 @@ pub struct ResourceClient {
     endpoint: Endpoint,
     session: String,
     client: ResourceServiceClient<Traced>,
-    line: Line,
+    calls: Multiplexer<SessionCalls>,
 }
 
 /// How an acquire waits.
@@ -77,7 +78,8 @@ impl ResourceClient {
         let client = ResourceServiceClient::new(channels.traced(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
-        Ok(ResourceClient { endpoint: endpoint.clone(), session: session.to_owned(), client, line: Line::default() })
+        let (endpoint, session, calls) = (endpoint.clone(), session.to_owned(), Multiplexer::default());
+        Ok(ResourceClient { endpoint, session, client, calls })
     }
 
     /// Where the resource manager is.
@@ -348,7 +350,9 @@ impl ResourceClient {
 
     /// Over the session's stream.
     async fn ask(&self, question: Asked) -> Result<Answered, CallError> {
-        self.line.ask(&self.client, question).await.map_err(|status| self.failed(&status))
+        let mut client = self.client.clone();
+        let open = |questions| async move { client.session(questions).await };
+        self.calls.call(open, question).await.map_err(|status| self.failed(&status))
     }
 
     /// The answer is that of another call.

@@ -1,0 +1,218 @@
+//! The asking side: the calls of all tasks share one stream.
+//!
+//! The stream is opened with the first call, and again with the first one after it broke; the calls that were under way then fail
+//! as calls of their own would.
+
+use super::Protocol;
+use crate::trace;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use tokio::sync::{mpsc, oneshot};
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Response, Status, Streaming};
+
+/// Requests that wait for the connection; more make their callers wait.
+const OUTGOING: usize = 1_024;
+/// Answers before the last one that wait for a caller; one that falls further behind misses some.
+const PROGRESS: usize = 64;
+
+/// What opens a stream: a method of a generated client.
+type Opened<P> = Result<Response<Streaming<<P as Protocol>::Response>>, Status>;
+type LastAnswer<P> = oneshot::Sender<Result<<P as Protocol>::Answer, Status>>;
+
+/// A stream that is opened when it is needed. Clones share it.
+pub(crate) struct Multiplexer<P: Protocol> {
+    stream: Arc<tokio::sync::Mutex<Option<Stream<P>>>>,
+}
+
+/// An open stream.
+struct Stream<P: Protocol> {
+    requests: mpsc::Sender<P::Request>,
+    calls: Arc<Mutex<Calls<P>>>,
+}
+
+/// The calls under way.
+struct Calls<P: Protocol> {
+    last_id: u64,
+    waiting: BTreeMap<u64, Waiting<P>>,
+    /// Why no answer will come any more.
+    broken: Option<Status>,
+}
+
+/// Where the answers to a call go.
+struct Waiting<P: Protocol> {
+    progress: Option<mpsc::Sender<P::Answer>>,
+    last: LastAnswer<P>,
+}
+
+impl<P: Protocol> Multiplexer<P> {
+    /// Makes a call that has one answer; `open` is called where there is no stream.
+    pub(crate) async fn call<F>(
+        &self,
+        open: impl FnOnce(ReceiverStream<P::Request>) -> F,
+        call: P::Call,
+    ) -> Result<P::Answer, Status>
+    where
+        F: Future<Output = Opened<P>>,
+    {
+        self.open(open).await?.call(call, None).await
+    }
+
+    /// Makes a call that may have other answers before the last one.
+    pub(crate) async fn call_with_progress<F>(
+        &self,
+        open: impl FnOnce(ReceiverStream<P::Request>) -> F,
+        call: P::Call,
+        mut on_progress: impl FnMut(P::Answer),
+    ) -> Result<P::Answer, Status>
+    where
+        F: Future<Output = Opened<P>>,
+    {
+        let stream = self.open(open).await?;
+        let (progress, mut heard) = mpsc::channel(PROGRESS);
+        let listened = async {
+            while let Some(answer) = heard.recv().await {
+                on_progress(answer);
+            }
+        };
+        // The other end of the progress is dropped before the last answer is handed over.
+        let (last, ()) = tokio::join!(stream.call(call, Some(progress)), listened);
+        last
+    }
+
+    /// Whether a call is under way, or the stream is being opened.
+    pub(crate) fn is_used(&self) -> bool {
+        let Ok(stream) = self.stream.try_lock() else { return true };
+        stream.as_ref().is_some_and(|stream| !stream.calls().waiting.is_empty())
+    }
+
+    async fn open<F>(&self, open: impl FnOnce(ReceiverStream<P::Request>) -> F) -> Result<Stream<P>, Status>
+    where
+        F: Future<Output = Opened<P>>,
+    {
+        let mut kept = self.stream.lock().await;
+        if let Some(stream) = kept.as_ref().filter(|stream| stream.calls().broken.is_none()) {
+            return Ok(stream.clone());
+        }
+        let (requests, outgoing) = mpsc::channel(OUTGOING);
+        let responses = open(ReceiverStream::new(outgoing)).await?.into_inner();
+        let calls = Arc::new(Mutex::new(Calls { last_id: 0, waiting: BTreeMap::new(), broken: None }));
+        tokio::spawn(read(responses, Arc::clone(&calls)));
+        Ok(kept.insert(Stream { requests, calls }).clone())
+    }
+}
+
+impl<P: Protocol> Stream<P> {
+    async fn call(&self, call: P::Call, progress: Option<mpsc::Sender<P::Answer>>) -> Result<P::Answer, Status> {
+        let (last, answered) = oneshot::channel();
+        let id = self.calls().begin(Waiting { progress, last })?;
+        let mut under_way = UnderWay { stream: self, id, when_dropped: P::when_dropped(id, &call) };
+        let traceparent = trace::current().map_or_else(String::new, |context| context.child().to_string());
+        // Where that fails the stream has broken, and `answered` says why.
+        let _ = self.requests.send(P::request(id, call, traceparent)).await;
+        let answer = answered.await;
+        under_way.when_dropped = None;
+        answer.unwrap_or_else(|_| Err(closed()))
+    }
+
+    fn calls(&self) -> MutexGuard<'_, Calls<P>> {
+        self.calls.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<P: Protocol> Calls<P> {
+    fn begin(&mut self, waiting: Waiting<P>) -> Result<u64, Status> {
+        if let Some(broken) = &self.broken {
+            return Err(broken.clone());
+        }
+        self.last_id += 1;
+        self.waiting.insert(self.last_id, waiting);
+        Ok(self.last_id)
+    }
+
+    /// Hands an answer to its caller, unless that has dropped the call.
+    fn answered(&mut self, id: u64, answer: Result<P::Answer, Status>) {
+        match answer {
+            Ok(answer) if !P::is_last(&answer) => {
+                if let Some(progress) = self.waiting.get(&id).and_then(|waiting| waiting.progress.as_ref()) {
+                    let _ = progress.try_send(answer);
+                }
+            }
+            last => self.ended(id, last),
+        }
+    }
+
+    fn ended(&mut self, id: u64, answer: Result<P::Answer, Status>) {
+        let Some(Waiting { progress, last }) = self.waiting.remove(&id) else { return };
+        drop(progress);
+        let _ = last.send(answer);
+    }
+}
+
+/// A call under way.
+struct UnderWay<'a, P: Protocol> {
+    stream: &'a Stream<P>,
+    id: u64,
+    /// What tells the other side that nobody waits for the answer any more.
+    when_dropped: Option<(u64, P::Call)>,
+}
+
+impl<P: Protocol> Drop for UnderWay<'_, P> {
+    fn drop(&mut self) {
+        self.stream.calls().waiting.remove(&self.id);
+        let Some((id, call)) = self.when_dropped.take() else { return };
+        let told = P::request(id, call, String::new());
+        if let Err(mpsc::error::TrySendError::Full(told)) = self.stream.requests.try_send(told) {
+            let requests = self.stream.requests.clone();
+            tokio::spawn(async move { requests.send(told).await });
+        }
+    }
+}
+
+/// Hands out the answers until there are no more.
+async fn read<P: Protocol>(mut responses: Streaming<P::Response>, calls: Arc<Mutex<Calls<P>>>) {
+    let lock = || calls.lock().unwrap_or_else(PoisonError::into_inner);
+    let broken = loop {
+        match responses.message().await {
+            Ok(Some(response)) => {
+                let (id, answer) = P::answer(response);
+                lock().answered(id, answer);
+            }
+            Ok(None) => break closed(),
+            Err(status) => break status,
+        }
+    };
+    let mut calls = lock();
+    while let Some((&id, _)) = calls.waiting.first_key_value() {
+        calls.ended(id, Err(broken.clone()));
+    }
+    calls.broken = Some(broken);
+}
+
+fn closed() -> Status {
+    Status::unavailable("the stream was closed")
+}
+
+impl<P: Protocol> Clone for Multiplexer<P> {
+    fn clone(&self) -> Self {
+        Multiplexer { stream: Arc::clone(&self.stream) }
+    }
+}
+
+impl<P: Protocol> Clone for Stream<P> {
+    fn clone(&self) -> Self {
+        Stream { requests: self.requests.clone(), calls: Arc::clone(&self.calls) }
+    }
+}
+
+impl<P: Protocol> Default for Multiplexer<P> {
+    fn default() -> Self {
+        Multiplexer { stream: Arc::default() }
+    }
+}
+
+impl<P: Protocol> std::fmt::Debug for Multiplexer<P> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Multiplexer").finish_non_exhaustive()
+    }
+}

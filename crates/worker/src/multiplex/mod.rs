@@ -1,0 +1,134 @@
+//! Many calls over one bidirectional stream, by id: each is saved the cost of an HTTP/2 stream of its own.
+//!
+//! ```text
+//!   call ─▶ Multiplexer ─ id, call ──▶ Answers ─▶ Serve::begin
+//!    ▲                                                │
+//!    └────── by its id ◀── id, answer … last answer ◀─┘
+//! ```
+//! [`client::Multiplexer`] is the asking side, [`server::Answers`] the serving one. A call that is dropped tells the other side. A
+//! stream that breaks fails its calls at the client and drops them at the server. What is carried, a [`Protocol`] says; this module
+//! knows nothing of it.
+
+pub(crate) mod client;
+pub mod server;
+
+use ratn_proto::v1::{self, CallFailure, LeaveRequest, WithdrawRequest};
+use ratn_proto::v1::{perform_request, perform_response, session_request, session_response};
+use tonic::{Code, Status};
+
+/// The messages of one streaming method.
+pub trait Protocol: 'static {
+    /// A call with its id, as it is sent.
+    type Request: Send + 'static;
+    /// An answer with the id of its call, as it is sent.
+    type Response: Send + 'static;
+    /// What is asked for.
+    type Call: Send + 'static;
+    /// What is answered.
+    type Answer: Send + 'static;
+
+    /// A request of its parts; the last one is the W3C trace context, empty for none.
+    fn request(id: u64, call: Self::Call, traceparent: String) -> Self::Request;
+
+    /// The parts of a request.
+    fn parts(request: Self::Request) -> (u64, Option<Self::Call>, String);
+
+    /// A response of its parts.
+    fn response(id: u64, answer: Result<Self::Answer, Status>) -> Self::Response;
+
+    /// The parts of a response.
+    fn answer(response: Self::Response) -> (u64, Result<Self::Answer, Status>);
+
+    /// Whether no other answer of the same call follows.
+    fn is_last(_: &Self::Answer) -> bool {
+        true
+    }
+
+    /// Whether this asks for no answer, but ends the call of its id.
+    fn ends_call(_: &Self::Call) -> bool {
+        false
+    }
+
+    /// What a client sends, under which id, when it drops this call before its last answer.
+    fn when_dropped(id: u64, call: &Self::Call) -> Option<(u64, Self::Call)>;
+}
+
+/// Conversions of the messages of a method, which are all of the same shape.
+macro_rules! messages {
+    ($request:ident $call:ident, $response:ident $answer:ident) => {
+        type Request = v1::$request;
+        type Response = v1::$response;
+        type Call = $call::Kind;
+        type Answer = $answer::Kind;
+
+        fn request(id: u64, call: $call::Kind, traceparent: String) -> v1::$request {
+            v1::$request { id, kind: Some(call), traceparent }
+        }
+
+        fn parts(request: v1::$request) -> (u64, Option<$call::Kind>, String) {
+            (request.id, request.kind, request.traceparent)
+        }
+
+        fn response(id: u64, answer: Result<$answer::Kind, Status>) -> v1::$response {
+            let kind = answer.unwrap_or_else(|status| $answer::Kind::Failure(failure(&status)));
+            v1::$response { id, kind: Some(kind) }
+        }
+
+        fn answer(response: v1::$response) -> (u64, Result<$answer::Kind, Status>) {
+            let answer = match response.kind {
+                Some($answer::Kind::Failure(failure)) => Err(status(failure)),
+                Some(answer) => Ok(answer),
+                None => Err(Status::internal("an answer without a kind")),
+            };
+            (response.id, answer)
+        }
+    };
+}
+
+/// Blocks, acquires and releases of one client at the resource manager: `ResourceService.Session`.
+#[derive(Debug)]
+pub enum SessionCalls {}
+
+impl Protocol for SessionCalls {
+    messages!(SessionRequest session_request, SessionResponse session_response);
+
+    /// Only what waits in a queue has to be undone. Nobody waits for the answer to that.
+    fn when_dropped(_: u64, call: &session_request::Kind) -> Option<(u64, session_request::Kind)> {
+        use session_request::Kind;
+        let (request_id, session_id) = match call {
+            Kind::Block(block) => (&block.request_id, &block.session_id),
+            Kind::Acquire(acquire) => (&acquire.request_id, &acquire.session_id),
+            Kind::KeepAlive(_) | Kind::Release(_) | Kind::Withdraw(_) => return None,
+        };
+        let withdraw = WithdrawRequest { request_id: request_id.clone(), session_id: session_id.clone() };
+        Some((0, Kind::Withdraw(withdraw)))
+    }
+}
+
+/// The goals of one client at a provider: `ActionService.Perform`.
+#[derive(Debug)]
+pub enum GoalCalls {}
+
+impl Protocol for GoalCalls {
+    messages!(PerformRequest perform_request, PerformResponse perform_response);
+
+    fn is_last(answer: &perform_response::Kind) -> bool {
+        !matches!(answer, perform_response::Kind::Progress(_))
+    }
+
+    fn ends_call(call: &perform_request::Kind) -> bool {
+        matches!(call, perform_request::Kind::Leave(_))
+    }
+
+    fn when_dropped(id: u64, _: &perform_request::Kind) -> Option<(u64, perform_request::Kind)> {
+        Some((id, perform_request::Kind::Leave(LeaveRequest {})))
+    }
+}
+
+fn failure(status: &Status) -> CallFailure {
+    CallFailure { code: status.code().into(), message: status.message().to_owned(), details: status.details().to_vec() }
+}
+
+fn status(failure: CallFailure) -> Status {
+    Status::with_details(Code::from(failure.code), failure.message, failure.details.into())
+}

@@ -1,0 +1,158 @@
+//! The serving side: what is polled is the stream of answers. It takes requests from the connection, keeps the calls under way and
+//! hands out their answers, all in the connection's task, so that a call costs no hop between tasks of its own.
+//!
+//! Dropped, it drops the calls under way. A client that does not read its answers is not read from either. When the process drains,
+//! no more requests are taken; what is under way is answered, then the stream ends with [`ending`].
+
+use super::Protocol;
+use crate::gate::ending;
+use crate::trace::TraceContext;
+use futures::FutureExt;
+use futures::stream::{AbortHandle, Abortable, BoxStream, SelectAll, Stream, StreamExt, abortable};
+use std::collections::BTreeMap;
+use std::pin::Pin;
+use std::task::{Context, Poll};
+use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
+use tonic::{Status, Streaming};
+
+/// Requests taken in before answers get their turn.
+const AT_ONCE: usize = 64;
+
+/// The answers to one call; the last one ends it, as does an error.
+pub type CallAnswers<P> = BoxStream<'static, Result<<P as Protocol>::Answer, Status>>;
+
+/// What performs the calls of a stream.
+pub trait Serve<P: Protocol>: Send + Unpin + 'static {
+    /// Calls under way of one stream; more are refused.
+    const MAX_CALLS: usize;
+
+    /// Begins a call, in this trace. `None` is a request that says nothing.
+    fn begin(&mut self, call: Option<P::Call>, context: Option<TraceContext>) -> CallAnswers<P>;
+
+    /// What is answered to a call beyond [`Serve::MAX_CALLS`].
+    fn too_many(&self) -> Status;
+}
+
+/// The answers of one stream.
+pub struct Answers<P: Protocol, S> {
+    serve: S,
+    requests: Option<Streaming<P::Request>>,
+    calls: SelectAll<Call<P>>,
+    under_way: usize,
+    /// What ends a call early, by its id. An id of 0 is that of calls that need not be told apart.
+    by_id: BTreeMap<u64, AbortHandle>,
+    draining: Option<Pin<Box<WaitForCancellationFutureOwned>>>,
+    drained: bool,
+}
+
+/// A call under way.
+struct Call<P: Protocol> {
+    id: u64,
+    answers: Abortable<CallAnswers<P>>,
+}
+
+impl<P: Protocol, S: Serve<P>> Answers<P, S> {
+    /// Serves the requests of a client until there are no more, or the process drains.
+    pub fn new(serve: S, requests: Streaming<P::Request>, draining: Option<CancellationToken>) -> Answers<P, S> {
+        Answers {
+            serve,
+            requests: Some(requests),
+            calls: SelectAll::new(),
+            under_way: 0,
+            by_id: BTreeMap::new(),
+            draining: draining.map(|draining| Box::pin(draining.cancelled_owned())),
+            drained: false,
+        }
+    }
+
+    /// Begins what is asked for, or says why not.
+    fn take(&mut self, request: P::Request) -> Result<(), (u64, Status)> {
+        let (id, call, traceparent) = P::parts(request);
+        if call.as_ref().is_some_and(P::ends_call) {
+            if let Some(call) = self.by_id.remove(&id) {
+                call.abort();
+                self.under_way -= 1;
+            }
+            return Ok(());
+        }
+        if self.by_id.contains_key(&id) {
+            return Err((id, Status::invalid_argument(format!("id: {id} is that of a call under way"))));
+        }
+        if self.under_way >= S::MAX_CALLS {
+            return Err((id, self.serve.too_many()));
+        }
+        let context = traceparent.parse::<TraceContext>().ok().map(TraceContext::child);
+        let (answers, abort) = abortable(self.serve.begin(call, context));
+        self.calls.push(Call { id, answers });
+        self.under_way += 1;
+        if id != 0 {
+            self.by_id.insert(id, abort);
+        }
+        Ok(())
+    }
+
+    fn poll_drain(&mut self, context: &mut Context<'_>) {
+        if self.draining.as_mut().is_some_and(|draining| draining.poll_unpin(context).is_ready()) {
+            (self.draining, self.requests, self.drained) = (None, None, true);
+        }
+    }
+}
+
+impl<P: Protocol, S: Serve<P>> Stream for Answers<P, S> {
+    type Item = Result<P::Response, Status>;
+
+    fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        let this = self.get_mut();
+        this.poll_drain(context);
+        for turn in 0..=AT_ONCE {
+            let Some(requests) = &mut this.requests else { break };
+            if turn == AT_ONCE {
+                context.waker().wake_by_ref();
+                break;
+            }
+            let request = requests.poll_next_unpin(context);
+            match request {
+                Poll::Ready(Some(Ok(request))) => {
+                    if let Err((id, refused)) = this.take(request) {
+                        return Poll::Ready(Some(Ok(P::response(id, Err(refused)))));
+                    }
+                }
+                // There are no more requests; what is under way is still answered.
+                Poll::Ready(None) => this.requests = None,
+                // Nobody is there to read an answer.
+                Poll::Ready(Some(Err(_))) => return Poll::Ready(None),
+                Poll::Pending => break,
+            }
+        }
+        match this.calls.poll_next_unpin(context) {
+            Poll::Ready(Some((id, answer))) => {
+                if answer.as_ref().map_or(true, P::is_last) {
+                    this.by_id.remove(&id);
+                    this.under_way -= 1;
+                }
+                Poll::Ready(Some(Ok(P::response(id, answer))))
+            }
+            Poll::Ready(None) if this.drained => {
+                this.drained = false;
+                Poll::Ready(Some(Err(ending())))
+            }
+            Poll::Ready(None) if this.requests.is_none() => Poll::Ready(None),
+            Poll::Ready(None) | Poll::Pending => Poll::Pending,
+        }
+    }
+}
+
+impl<P: Protocol> Stream for Call<P> {
+    type Item = (u64, Result<P::Answer, Status>);
+
+    fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        let id = self.id;
+        self.answers.poll_next_unpin(context).map(|answer| answer.map(|answer| (id, answer)))
+    }
+}
+
+impl<P: Protocol, S> std::fmt::Debug for Answers<P, S> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Answers").field("under_way", &self.under_way).finish_non_exhaustive()
+    }
+}
