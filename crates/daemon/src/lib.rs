@@ -17,6 +17,7 @@ mod details;
 mod durable_actor;
 mod link;
 pub mod metrics;
+mod paging;
 pub mod process_manager;
 pub mod reload;
 pub mod resource_manager;

@@ -193,7 +193,8 @@ async fn who_opened_a_session_is_known_after_a_restart_and_nobody_takes_it_over(
     let mut opener = authority.client(&after.endpoint, Some(&first));
     let kept = in_time(ping(&mut opener, "s", 60_000)).await.unwrap();
     assert!(!kept.created, "its session went on");
-    let sessions = in_time(opener.list_sessions(v1::ListSessionsRequest {})).await.unwrap().into_inner().sessions;
+    let sessions =
+        in_time(opener.list_sessions(v1::ListSessionsRequest::default())).await.unwrap().into_inner().sessions;
     assert_eq!(sessions[0].opened_by, "first (certificate)");
     // When it has ended, its name is anybody's.
     in_time(ping(&mut opener, "s", 0)).await.unwrap();

@@ -19,3 +19,9 @@ pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "
 
 /// No message on the wire is larger than this, in bytes, both ways: a camera image with room to spare.
 pub const MAX_MESSAGE_BYTES: usize = 16 * 1024 * 1024;
+/// What an answer or a part of one has at the most: the rest of [`MAX_MESSAGE_BYTES`] is for one thing more of any size that is accepted.
+pub const MAX_PAGE_BYTES: usize = 8 * 1024 * 1024;
+/// The page that a client asks for.
+pub const PAGE_BYTES: u32 = 4 * 1024 * 1024;
+/// All inputs of a goal together, all its outputs, and all attributes that somebody asks for or offers.
+pub const MAX_PORTS_BYTES: usize = 8 * 1024 * 1024;

@@ -155,7 +155,8 @@ impl Pool {
             let what = format!("capacity {} of {}", spec.capacity, spec.kind);
             return Err(malformed(&what, "what is not divisible has whole units"));
         }
-        self.check_attributes(spec.attributes.keys())
+        self.check_attributes(spec.attributes.keys())?;
+        self.check_size(spec)
     }
 }
 

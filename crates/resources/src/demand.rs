@@ -16,6 +16,8 @@ use std::collections::BTreeMap;
 const LOOKED_AT: usize = 256;
 /// Resources that are looked at for them: of who is behind, it is found out when those before have gone.
 const RESOURCES_LOOKED_AT: usize = 100_000;
+/// Bytes of what they ask for that providers are told of.
+const DEMAND_BYTES: usize = 1 << 20;
 /// Kinds of which one session may say that it cannot provide them.
 const SHORTAGES: usize = 64;
 /// Characters of a reason; the rest is cut off.
@@ -37,13 +39,14 @@ impl Pool {
             return None;
         }
         let mut missing = BTreeMap::<&Key, (&Requirement, Quantity)>::new();
-        let mut looked_at = 0;
+        let (mut looked_at, mut bytes) = (0, 0);
         for (_, id) in self.queue.hopeless.iter().take(LOOKED_AT) {
-            if looked_at >= RESOURCES_LOOKED_AT {
+            if looked_at >= RESOURCES_LOOKED_AT || bytes >= DEMAND_BYTES {
                 break;
             }
             let Some(waiter) = self.queue.get(*id) else { continue };
             let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
+            bytes += waiter.groups.iter().map(|key| key.len()).sum::<usize>();
             let assignment = Assignment::of(&self.resources, Available::Existing, &requirements);
             looked_at += assignment.looked_at;
             for (index, amount) in assignment.missing.into_iter().enumerate().filter(|(_, amount)| !amount.is_zero()) {

@@ -37,6 +37,12 @@ pub struct Limits {
     pub name_length: usize,
     /// Attributes of a resource.
     pub attributes: usize,
+    /// Bytes of a resource: its id, kind, host and attributes with their values.
+    pub resource_bytes: usize,
+    /// Bytes of a requirement: its kind, attributes and conditions.
+    pub requirement_bytes: usize,
+    /// Leases that may hold some of one resource at the same time.
+    pub holders: usize,
     /// Answers remembered so that a repeated request id is not performed twice; the oldest is forgotten first.
     pub remembered_requests: usize,
     /// And for so long at the most, in milliseconds (forgotten when the next one is remembered).
@@ -61,6 +67,9 @@ impl Default for Limits {
             comparisons: 1_000_000,
             name_length: 128,
             attributes: 32,
+            resource_bytes: 65_536,
+            requirement_bytes: 16_384,
+            holders: 4_096,
             remembered_requests: 65_536,
             remember_for_ms: 3_600_000,
             history: 4_096,

@@ -57,7 +57,9 @@ pub struct Pool {
 impl Pool {
     /// An empty pool.
     pub fn new(limits: Limits) -> Pool {
-        Pool { limits, ..Pool::default() }
+        let mut pool = Pool::default();
+        pool.set_limits(limits);
+        pool
     }
 
     /// The same pool, in which who asks for a kind may get one of a kind below it. Nobody may wait yet.
@@ -93,6 +95,7 @@ impl Pool {
 
     /// From now on other bounds hold; what is there beyond them stays.
     pub fn set_limits(&mut self, limits: Limits) {
+        self.resources.set_max_holders(limits.holders);
         self.limits = limits;
     }
 
@@ -158,6 +161,11 @@ impl Pool {
     /// Every resource, in the order of ids.
     pub fn list(&self) -> Vec<ResourceView> {
         self.resources.iter().map(|(_, resource)| resource.view(&self.leases)).collect()
+    }
+
+    /// At most so many resources behind an id, in the order of ids; from the first one behind the empty id.
+    pub fn list_after(&self, id: &str, most: usize) -> Vec<ResourceView> {
+        self.resources.after(id).take(most).map(|resource| resource.view(&self.leases)).collect()
     }
 
     /// Every live lease, in the order of ids.

@@ -8,11 +8,14 @@ use crate::kinds::Kinds;
 use crate::resource::{Description, Resource};
 use ratn_model::resource::{Quantity, Requirement};
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Bound;
 
 /// See the module.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Resources {
     kinds: Kinds,
+    /// More leases than these do not hold some of one resource; none where nothing is said.
+    max_holders: Option<usize>,
     slots: Vec<Option<Resource>>,
     vacant: BTreeSet<Slot>,
     by_id: BTreeMap<Box<str>, Slot>,
@@ -36,6 +39,15 @@ impl Resources {
 
     pub(crate) fn set_kinds(&mut self, kinds: Kinds) {
         self.kinds = kinds;
+    }
+
+    pub(crate) fn set_max_holders(&mut self, holders: usize) {
+        self.max_holders = Some(holders);
+    }
+
+    /// Whether as many leases hold some of it as may.
+    pub(crate) fn is_crowded(&self, resource: &Resource) -> bool {
+        self.max_holders.is_some_and(|most| resource.holders.len() >= most)
     }
 
     pub(crate) fn len(&self) -> usize {
@@ -117,6 +129,12 @@ impl Resources {
     /// In the order of ids.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (Slot, &Resource)> {
         self.by_id.values().filter_map(|slot| self.get(*slot).map(|resource| (*slot, resource)))
+    }
+
+    /// Those behind an id, in the order of ids.
+    pub(crate) fn after<'a>(&'a self, id: &'a str) -> impl Iterator<Item = &'a Resource> + 'a {
+        let behind = (Bound::Excluded(id), Bound::Unbounded);
+        self.by_id.range::<str, _>(behind).filter_map(|(_, slot)| self.get(*slot))
     }
 
     pub(crate) fn has_kind(&self, kind: &str) -> bool {

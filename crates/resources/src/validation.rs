@@ -3,7 +3,14 @@
 use crate::assignment::selects_the_same;
 use crate::error::{PoolError, malformed};
 use crate::pool::Pool;
+use crate::resource::{ENDPOINT_ATTRIBUTE, ResourceSpec};
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
+use ratn_model::value::Value;
+use ratn_model::versioned;
+use serde::Serialize;
+
+/// Of an address.
+const ENDPOINT_BYTES: usize = 1_024;
 
 impl Pool {
     pub(crate) fn check_requirements(
@@ -35,6 +42,11 @@ impl Pool {
             self.check_attributes(requirement.attributes.keys())?;
             let conditions: Vec<&String> = requirement.conditions.iter().map(|c| &c.attribute).collect();
             self.check_attributes(conditions.into_iter())?;
+            let bytes = written_bytes(requirement);
+            if bytes > self.limits.requirement_bytes {
+                let what = format!("{} {}: {bytes} bytes", requirement.operation, requirement.kind);
+                return Err(malformed(&what, &format!("at most {} in a requirement", self.limits.requirement_bytes)));
+            }
         }
         self.check_work(requirements)
     }
@@ -57,6 +69,23 @@ impl Pool {
         Ok(())
     }
 
+    /// Whether what is stored of a resource is small enough to be told of.
+    pub(crate) fn check_size(&self, spec: &ResourceSpec) -> Result<(), PoolError> {
+        let name = || spec.id.as_ref().unwrap_or(&spec.kind);
+        let bytes = written_bytes(spec);
+        if bytes > self.limits.resource_bytes {
+            let rule = format!("at most {} in a resource with its attributes", self.limits.resource_bytes);
+            return Err(malformed(&format!("resource `{}`: {bytes} bytes", name()), &rule));
+        }
+        match spec.attributes.get(ENDPOINT_ATTRIBUTE) {
+            Some(Value::String(endpoint)) if endpoint.len() > ENDPOINT_BYTES => {
+                let what = format!("resource `{}`: {} bytes of `{ENDPOINT_ATTRIBUTE}`", name(), endpoint.len());
+                Err(malformed(&what, &format!("at most {ENDPOINT_BYTES}: every lease of it says where it is")))
+            }
+            _ => Ok(()),
+        }
+    }
+
     pub(crate) fn check_attributes<'a>(
         &self,
         mut names: impl ExactSizeIterator<Item = &'a String>,
@@ -76,4 +105,9 @@ impl Pool {
         }
         Ok(())
     }
+}
+
+/// As it is kept.
+fn written_bytes(value: &impl Serialize) -> usize {
+    versioned::encode(0, value).len()
 }

@@ -8,6 +8,7 @@ use crate::access::Caller;
 use crate::audit::{self, Mutation};
 use crate::details::{ending, retry_later, status};
 use crate::metrics;
+use crate::paging::{self, Filled, Page};
 use futures::{Stream, StreamExt};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Lease, Requirement, ResourceOperation};
@@ -30,6 +31,10 @@ use tonic::{Code, Request, Response, Status, Streaming};
 const KEEP_ALIVE_BUFFER: usize = 16;
 /// What the pool's own answer at a deadline is given to arrive.
 const GRACE: Duration = Duration::from_millis(20);
+/// Resources that are looked at in one turn for a list.
+const LISTED_AT_ONCE: usize = 4_096;
+/// Ids that an answer names.
+const MOST_IDS: usize = 1_000;
 /// When a watcher that was cut off may come back.
 const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
 
@@ -264,7 +269,8 @@ impl v1::resource_service_server::ResourceService for Service {
     async fn exists(&self, request: Request<v1::ExistsRequest>) -> Result<Response<v1::ExistsResponse>, Status> {
         let requirement: Requirement = required(request.into_inner().requirement, "requirement")?;
         let wanted = requirement.count;
-        let (units, resource_ids) = self.actor.ask(|answer| Message::Find { requirement, answer }).await?;
+        let (units, mut resource_ids) = self.actor.ask(|answer| Message::Find { requirement, answer }).await?;
+        resource_ids.truncate(MOST_IDS);
         Ok(Response::new(v1::ExistsResponse { exists: units >= wanted, resource_ids }))
     }
 
@@ -285,15 +291,23 @@ impl v1::resource_service_server::ResourceService for Service {
         label(&request_id, "request_id")?;
         let (waiting, total) = self.actor.ask(|answer| Message::Explain { request_id, answer }).await??;
         let total = u32::try_from(total).unwrap_or(u32::MAX);
-        Ok(Response::new(v1::ExplainResponse { waiting: all(waiting), total }))
+        Ok(Response::new(v1::ExplainResponse { waiting: paging::first(all(waiting)), total }))
     }
 
     async fn list_sessions(
         &self,
-        _: Request<v1::ListSessionsRequest>,
+        request: Request<v1::ListSessionsRequest>,
     ) -> Result<Response<v1::ListSessionsResponse>, Status> {
+        let v1::ListSessionsRequest { page_bytes, page_token } = request.into_inner();
+        label(&page_token, "page_token")?;
         let sessions = self.actor.ask(|answer| Message::Sessions { answer }).await?;
-        Ok(Response::new(v1::ListSessionsResponse { sessions: all(sessions) }))
+        // The token is the id of the last on the page before.
+        let behind = sessions.into_iter().filter(|session| session.id > page_token).map(v1::SessionStatus::from);
+        let mut filled = Filled::default();
+        let more = Page::of(page_bytes, &page_token).fill(behind, &mut filled)?;
+        let last = filled.items.last().filter(|_| more).map(|session| session.session_id.clone());
+        let next_page_token = last.unwrap_or_default();
+        Ok(Response::new(v1::ListSessionsResponse { sessions: filled.items, next_page_token }))
     }
 
     async fn end_task(&self, request: Request<v1::EndTaskRequest>) -> Result<Response<v1::EndTaskResponse>, Status> {
@@ -344,10 +358,29 @@ impl v1::resource_service_server::ResourceService for Service {
     }
 
     async fn list(&self, request: Request<v1::ListRequest>) -> Result<Response<v1::ListResponse>, Status> {
-        let filter = ResourceFilter::try_from(request.into_inner())?;
-        let (views, revision) = self.actor.ask(|answer| Message::List { answer }).await?;
-        let resources = all(views.iter().filter(|view| wire::passes(view, &filter)).map(wire::resource));
-        Ok(Response::new(v1::ListResponse { resources, revision: revision.0 }))
+        let request = request.into_inner();
+        label(&request.page_token, "page_token")?;
+        let page = Page::of(request.page_bytes, &request.page_token);
+        // The token is the id of the last on the page before.
+        let mut after = request.page_token.clone();
+        let filter = ResourceFilter::try_from(request)?;
+        let (mut filled, mut first) = (Filled::default(), None);
+        loop {
+            let from = after.clone();
+            let listed = self.actor.ask(|answer| Message::List { after: from, most: LISTED_AT_ONCE, answer });
+            let (views, revision) = listed.await?;
+            let revision = *first.get_or_insert(revision);
+            let passing = views.iter().filter(|view| wire::passes(view, &filter));
+            let more = page.fill(passing.map(|view| wire::resource(view).into()), &mut filled)?;
+            let full = filled.items.last().filter(|_| more).map(|last: &v1::Resource| last.id.clone());
+            match views.last().filter(|_| views.len() == LISTED_AT_ONCE) {
+                Some(last) if !more => after.clone_from(&last.id),
+                _ => {
+                    let (resources, next_page_token) = (filled.items, full.unwrap_or_default());
+                    return Ok(Response::new(v1::ListResponse { resources, revision: revision.0, next_page_token }));
+                }
+            }
+        }
     }
 
     async fn watch(
@@ -356,13 +389,18 @@ impl v1::resource_service_server::ResourceService for Service {
     ) -> Result<Response<Self::WatchStream>, Status> {
         let request = request.into_inner();
         names(&request.kinds, "kinds")?;
-        let part = request.after_part;
+        let (part, in_parts) = (request.after_part, request.in_parts);
         let after = request.after_revision.map(|revision| WatchPosition { revision: Revision(revision), part });
         let kinds: BTreeSet<String> = request.kinds.into_iter().collect();
         let updates = self.actor.ask(|answer| Message::Watch { after, answer }).await??;
         let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
             .filter_map(move |update| futures::future::ready(filtered(&update, &kinds)))
-            .map(|update| Ok(update.into()));
+            .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)))
+            // After a snapshot that does not fit nothing follows.
+            .scan(false, |over, message| {
+                let before = std::mem::replace(over, message.is_err());
+                futures::future::ready((!before).then_some(message))
+            });
         let shutdown = self.shutdown.clone();
         let last = futures::stream::once(async move {
             if shutdown.is_cancelled() {
@@ -440,6 +478,30 @@ fn filtered(update: &ResourceUpdate, kinds: &BTreeSet<String>) -> Option<Resourc
     }
 }
 
+/// A snapshot in messages that are not too large; anything else as it is.
+fn messages(
+    message: v1::ResourceServiceWatchResponse,
+    in_parts: bool,
+) -> Vec<Result<v1::ResourceServiceWatchResponse, Status>> {
+    use v1::resource_service_watch_response::Kind;
+    let Some(Kind::Snapshot(mut snapshot)) = message.kind else { return vec![Ok(message)] };
+    let mut parts = paging::parts(std::mem::take(&mut snapshot.resources));
+    if parts.len() > 1 && !in_parts {
+        // What is no more than a message is sent as one.
+        let mut filled = Filled::default();
+        if let Err(too_large) = Page::of(0, "").fill(parts.into_iter().flatten(), &mut filled) {
+            return vec![Err(too_large)];
+        }
+        parts = vec![filled.items];
+    }
+    let last = parts.len() - 1;
+    let part = |(index, resources)| {
+        let snapshot = v1::ResourceSnapshot { resources, more: index < last, ..snapshot.clone() };
+        Ok(v1::ResourceServiceWatchResponse { kind: Some(Kind::Snapshot(snapshot)) })
+    };
+    parts.into_iter().enumerate().map(part).collect()
+}
+
 fn session(id: &str) -> Result<SessionId, Status> {
     name(id, "session_id")?;
     Ok(SessionId::from(id))
@@ -491,7 +553,8 @@ mod tests {
         let speaker = Speaker::trusted();
         actor.ask(|answer| Message::Perform { speaker, request_id, request: create, answer }).await.unwrap().unwrap();
         for free in [0, 0, 1] {
-            let (views, _) = actor.ask(|answer| Message::List { answer }).await.unwrap();
+            let list = |answer| Message::List { after: String::new(), most: 1, answer };
+            let (views, _) = actor.ask(list).await.unwrap();
             assert_eq!(views[0].free, free);
             calls.pop();
         }

@@ -80,6 +80,9 @@ pub(super) fn passes(view: &ResourceView, filter: &ResourceFilter) -> bool {
         && filter.conditions.iter().all(|condition| view.meets(condition))
 }
 
+/// Leases and resources of a session that are named.
+const NAMED: usize = 1_000;
+
 pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
     let milliseconds = |time: Duration| u64::try_from(time.as_millis()).unwrap_or(u64::MAX);
     SessionStatus {
@@ -87,9 +90,9 @@ pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
         client: view.name,
         ttl_ms: milliseconds(view.ttl),
         expires_in_ms: milliseconds(Duration::from_nanos(view.expires.0.saturating_sub(now.0))),
-        leases: view.leases,
+        leases: view.leases.into_iter().take(NAMED).collect(),
         waiting: u32::try_from(view.waiters.len()).unwrap_or(u32::MAX),
-        resources: view.provides,
+        resources: view.provides.into_iter().take(NAMED).collect(),
         opened_by: view.opened_by.to_string(),
     }
 }

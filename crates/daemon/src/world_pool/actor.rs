@@ -37,9 +37,6 @@ pub(super) type Facts = (Vec<(FactKey, Fact)>, Revision);
 /// What the service asks of the actor.
 #[derive(Debug)]
 pub(super) enum Message {
-    Root {
-        answer: Answer<World>,
-    },
     Commit {
         commit: Commit,
         answer: Answer<(Revision, Vec<Contradiction>)>,
@@ -194,7 +191,6 @@ impl Core for WorldCore {
     // An answer that nobody waits for any more is of no consequence: commits and projections are idempotent by id.
     fn receive(&mut self, message: Message, desk: &mut WorldDesk) {
         match message {
-            Message::Root { answer } => desk.reply(answer, Ok(self.pool.root().clone())),
             Message::Commit { commit, answer } => {
                 let committed = match desk.stopped() {
                     Some(stopped) => Err(stopped.status.clone()),

@@ -1,6 +1,7 @@
 //! The world pool's config.
 
 use crate::config::{Check, ConfigError, StorageConfig, rule};
+use ratn_proto::MAX_PAGE_BYTES;
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -36,6 +37,10 @@ pub struct WorldPoolConfig {
     pub unbound_ttl_s: f64,
     /// Clients that watch at the same time.
     pub max_watchers: usize,
+    /// Bytes of one fact with its evidence, as it is written on the wire.
+    pub fact_bytes: usize,
+    /// Bytes of all changes of one commit or projection, at most 8 MiB.
+    pub commit_bytes: usize,
     /// A file in Turtle: what does not fit it is not committed, and facts live as long as it declares.
     pub ontology: Option<PathBuf>,
     /// Seconds by predicate, instead of what the ontology declares: a fact that is not written again within them is gone.
@@ -60,6 +65,8 @@ impl Default for WorldPoolConfig {
             max_projections: 4_096,
             unbound_ttl_s: 600.0,
             max_watchers: 1_024,
+            fact_bytes: 1 << 20,
+            commit_bytes: MAX_PAGE_BYTES,
             ontology: None,
             ttl_s: BTreeMap::new(),
             remembered_requests: 65_536,
@@ -79,6 +86,8 @@ impl Check for WorldPoolConfig {
         rule("max_projections", self.max_projections >= 1, "at least 1")?;
         rule("unbound_ttl_s", (1.0..=86_400.0).contains(&self.unbound_ttl_s), "from 1 s to a day")?;
         rule("max_watchers", self.max_watchers >= 1, "at least 1")?;
+        rule("fact_bytes", (64..=self.commit_bytes).contains(&self.fact_bytes), "from 64 bytes to commit_bytes")?;
+        rule("commit_bytes", self.commit_bytes <= MAX_PAGE_BYTES, "at most 8 MiB: a message has to have room for it")?;
         let lasting = self.ttl_s.values().all(|ttl_s| TTLS_S.contains(ttl_s));
         rule("ttl_s", lasting, "from 0.001 s to 1,000,000,000 s each")?;
         rule("remembered_requests", self.remembered_requests >= 1, "at least 1")?;

@@ -89,8 +89,9 @@ pub async fn run_as(
     let linked = tokio::spawn(link.keep(over.clone()));
     let (live, leases) = watch::channel(leases::LiveLeases::default());
     tokio::spawn(over.clone().run_until_cancelled_owned(leases::follow(manager, live)));
+    let sizes = service::Sizes { fact: config.fact_bytes, commit: config.commit_bytes };
     let (actor, ended) = actor::start(config, ontology, kept, leases.clone(), over.clone());
-    let service = WorldPoolServiceServer::new(service::Service { actor, leases, shutdown: shutdown.clone() })
+    let service = WorldPoolServiceServer::new(service::Service { actor, leases, shutdown: shutdown.clone(), sizes })
         .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;

@@ -3,11 +3,14 @@
 use super::actor::{Handle, Message, NewProjection, Update, WATCH_AGAIN_AFTER};
 use super::history::Commit;
 use super::leases::{Known, LiveLeases};
-use crate::details::{ending, retry_later};
+use crate::details::{ending, retry_later, status};
+use crate::paging::{self, Filled, Page};
 use futures::StreamExt;
 use futures::stream::BoxStream;
+use prost::Message as _;
 use ratn_model::fact::{FactKey, FactPattern};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
+use ratn_proto::MAX_PAGE_BYTES;
 use ratn_proto::convert::{Malformed, all, digest, each, label, name, required};
 use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
 use ratn_proto::v1;
@@ -34,20 +37,52 @@ pub(super) struct Service {
     pub(super) actor: Handle,
     pub(super) leases: watch::Receiver<LiveLeases>,
     pub(super) shutdown: CancellationToken,
+    pub(super) sizes: Sizes,
+}
+
+/// What is accepted at the most, in bytes.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sizes {
+    /// Of one change, or one piece of evidence.
+    pub(super) fact: usize,
+    /// Of all of them together.
+    pub(super) commit: usize,
+}
+
+impl Sizes {
+    fn check(self, field: &str, changes: &[impl prost::Message]) -> Result<usize, Status> {
+        for (index, change) in changes.iter().enumerate() {
+            let (bytes, most) = (change.encoded_len(), self.fact);
+            if bytes > most {
+                let rule = format!("has {bytes} bytes: at most {most} are accepted (fact_bytes)");
+                return Err(Malformed::new(format!("{field}[{index}]"), rule).into());
+            }
+        }
+        let (bytes, most): (usize, usize) = (changes.iter().map(prost::Message::encoded_len).sum(), self.commit);
+        if bytes > most {
+            let rule = format!("have {bytes} bytes: at most {most} are accepted at once (commit_bytes)");
+            return Err(Malformed::new(field, rule).into());
+        }
+        Ok(bytes)
+    }
 }
 
 #[tonic::async_trait]
 impl v1::world_pool_service_server::WorldPoolService for Service {
-    async fn get_root(&self, _: Request<v1::GetRootRequest>) -> Result<Response<v1::GetRootResponse>, Status> {
-        let root = self.actor.request(|answer| Message::Root { answer }).await?;
-        let facts = root.iter().map(|(key, fact)| record((key.clone(), fact.clone())));
-        Ok(Response::new(v1::GetRootResponse { revision: root.revision().0, facts: all(facts) }))
+    async fn get_root(&self, request: Request<v1::GetRootRequest>) -> Result<Response<v1::GetRootResponse>, Status> {
+        let v1::GetRootRequest { page_bytes, page_token } = request.into_inner();
+        let query = v1::QueryRequest { page_bytes, page_token, ..Default::default() };
+        let v1::QueryResponse { facts, revision, next_page_token } =
+            self.query(Request::new(query)).await?.into_inner();
+        Ok(Response::new(v1::GetRootResponse { revision, facts, next_page_token }))
     }
 
     async fn commit(&self, request: Request<v1::CommitRequest>) -> Result<Response<v1::CommitResponse>, Status> {
         let request = request.into_inner();
         name(&request.commit_id, "commit_id")?;
         label(&request.writer, "writer")?;
+        self.sizes.check("changes", &request.changes)?;
+        self.sizes.check("evidence", &request.evidence)?;
         let commit = Commit {
             id: request.commit_id,
             changes: each(request.changes, "changes")?,
@@ -56,12 +91,14 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             evidence: each(request.evidence, "evidence")?,
         };
         let (revision, contradictions) = self.actor.request(|answer| Message::Commit { commit, answer }).await?;
-        Ok(Response::new(v1::CommitResponse { revision: revision.0, contradictions: all(contradictions) }))
+        let contradictions = paging::first(all(contradictions));
+        Ok(Response::new(v1::CommitResponse { revision: revision.0, contradictions }))
     }
 
     async fn project(&self, request: Request<v1::ProjectRequest>) -> Result<Response<v1::ProjectResponse>, Status> {
         let request = request.into_inner();
         label(&request.request_id, "request_id")?;
+        self.sizes.check("changes", &request.changes)?;
         request.writers.iter().try_for_each(|writer| label(writer, "writers"))?;
         let lease = (request.lease_id != 0).then_some(LeaseId(request.lease_id));
         let projection = NewProjection {
@@ -86,13 +123,24 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let request = request.into_inner();
         let projection = request.projection_id.map(ProjectionId);
         let patterns = each(request.patterns, "patterns")?;
-        let at = request.at_revision.map(Revision);
+        let place = paging::place(&request.page_token)?;
+        let page = Page::of(request.page_bytes, &request.page_token);
+        let at = match place {
+            // The next page is of the same revision; a projection has only one.
+            Some((revision, _)) => Some(Revision(revision)).filter(|_| projection.is_none()),
+            None => request.at_revision.map(Revision),
+        };
         if projection.is_some() && at.is_some() {
             return Err(Malformed::new("at_revision", "is of the root: not together with projection_id").into());
         }
         let (facts, revision) =
             self.actor.request(|answer| Message::Query { projection, at, patterns, answer }).await?;
-        Ok(Response::new(v1::QueryResponse { facts: all(facts.into_iter().map(record)), revision: revision.0 }))
+        let seen = place.map_or(0, |(_, seen)| seen);
+        let mut filled = Filled::default();
+        let rest = facts.into_iter().skip(seen).map(|fact| v1::Fact::from(record(fact)));
+        let more = page.fill(rest, &mut filled)?;
+        let next_page_token = paging::token(more, revision.0, seen + filled.items.len());
+        Ok(Response::new(v1::QueryResponse { facts: filled.items, revision: revision.0, next_page_token }))
     }
 
     type WatchStream = BoxStream<'static, Result<v1::WorldPoolServiceWatchResponse, Status>>;
@@ -103,11 +151,16 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     ) -> Result<Response<Self::WatchStream>, Status> {
         let request = request.into_inner();
         let patterns: Vec<FactPattern> = each(request.patterns, "patterns")?;
-        let after = request.after_revision.map(Revision);
+        let (after, in_parts) = (request.after_revision.map(Revision), request.in_parts);
         let updates = self.actor.request(|answer| Message::Watch { after, answer }).await?;
         let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
             .filter_map(move |update| futures::future::ready(told(&update, &patterns)))
-            .map(|update| Ok(update.into()));
+            .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)))
+            // After what does not fit nothing follows: the client would miss it.
+            .scan(false, |over, message| {
+                let before = std::mem::replace(over, message.is_err());
+                futures::future::ready((!before).then_some(message))
+            });
         let shutdown = self.shutdown.clone();
         let last = futures::stream::once(async move {
             if shutdown.is_cancelled() {
@@ -138,7 +191,9 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let request = request.into_inner();
         let patterns: Vec<FactPattern> = each(request.patterns, "patterns")?;
         let from = Revision(request.from_revision);
-        let to = request.to_revision.map(Revision);
+        let place = paging::place(&request.page_token)?;
+        let page = Page::of(request.page_bytes, &request.page_token);
+        let to = place.map(|(to, _)| Revision(to)).or(request.to_revision.map(Revision));
         let (differences, to) = self.actor.request(|answer| Message::Diff { from, to, answer }).await?;
         let differences = differences.into_iter().filter(|(key, ..)| wanted(key, &patterns));
         let differences = differences.map(|(key, before, after)| FactDifference {
@@ -146,7 +201,11 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             after: after.map(|fact| record((key.as_ref().clone(), fact.as_ref().clone()))),
             key: key.as_ref().clone(),
         });
-        Ok(Response::new(v1::DiffResponse { differences: all(differences), to_revision: to.0 }))
+        let seen = place.map_or(0, |(_, seen)| seen);
+        let mut filled = Filled::default();
+        let more = page.fill(differences.skip(seen).map(v1::FactDifference::from), &mut filled)?;
+        let next_page_token = paging::token(more, to.0, seen + filled.items.len());
+        Ok(Response::new(v1::DiffResponse { differences: filled.items, to_revision: to.0, next_page_token }))
     }
 
     async fn get_fact_history(
@@ -162,7 +221,10 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             commit: commit.to_string(),
             fact: fact.map(|fact| record((key.clone(), fact.as_ref().clone()))),
         });
-        Ok(Response::new(v1::GetFactHistoryResponse { versions: all(versions), oldest_revision: oldest.0 }))
+        Ok(Response::new(v1::GetFactHistoryResponse {
+            versions: paging::first(all(versions)),
+            oldest_revision: oldest.0,
+        }))
     }
 
     async fn get_scene(&self, request: Request<v1::GetSceneRequest>) -> Result<Response<v1::GetSceneResponse>, Status> {
@@ -208,6 +270,36 @@ fn told(update: &Update, patterns: &[FactPattern]) -> Option<WorldUpdate> {
             (!nothing).then_some(WorldUpdate::Changed(WorldChange { revision, commit, written, gone }))
         }
     }
+}
+
+/// A snapshot in messages that are not too large; a revision that is too large as that, so that the client begins anew.
+fn messages(
+    message: v1::WorldPoolServiceWatchResponse,
+    in_parts: bool,
+) -> Vec<Result<v1::WorldPoolServiceWatchResponse, Status>> {
+    use v1::world_pool_service_watch_response::Kind;
+    let mut snapshot = match message.kind {
+        Some(Kind::Snapshot(snapshot)) => snapshot,
+        Some(Kind::Change(ref change)) if change.encoded_len() > MAX_PAGE_BYTES + MAX_PAGE_BYTES / 2 => {
+            let message = "the revision changed more than a message has room for: watch again without a revision";
+            return vec![Err(status(Code::OutOfRange, "REVISION_TOO_LARGE", message))];
+        }
+        _ => return vec![Ok(message)],
+    };
+    let mut parts = paging::parts(std::mem::take(&mut snapshot.facts));
+    if parts.len() > 1 && !in_parts {
+        let mut filled = Filled::default();
+        if let Err(too_large) = Page::of(0, "").fill(parts.into_iter().flatten(), &mut filled) {
+            return vec![Err(too_large)];
+        }
+        parts = vec![filled.items];
+    }
+    let last = parts.len() - 1;
+    let part = |(index, facts)| {
+        let snapshot = v1::WorldSnapshot { facts, more: index < last, revision: snapshot.revision };
+        Ok(v1::WorldPoolServiceWatchResponse { kind: Some(Kind::Snapshot(snapshot)) })
+    };
+    parts.into_iter().enumerate().map(part).collect()
 }
 
 fn wanted(key: &FactKey, patterns: &[FactPattern]) -> bool {

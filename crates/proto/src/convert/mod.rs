@@ -11,6 +11,8 @@ mod scene;
 mod value;
 mod world;
 
+use crate::MAX_PORTS_BYTES;
+use prost::Message as _;
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -85,11 +87,28 @@ pub fn all<T, W: From<T>>(items: impl IntoIterator<Item = T>) -> Vec<W> {
     items.into_iter().map(W::from).collect()
 }
 
+/// The bytes that a value has on the wire.
+pub fn value_bytes(value: &v1::Value) -> usize {
+    value.encoded_len()
+}
+
+/// The bytes that ports have on the wire, nearly.
+pub fn ports_bytes(fields: &BTreeMap<String, v1::Value>) -> usize {
+    fields.iter().map(|(name, value)| name.len() + value.encoded_len()).sum()
+}
+
 /// Ports or attributes.
 ///
 /// # Errors
-/// [`Malformed`] of the first that is none.
+/// [`Malformed`] of the first that is none, and where all together have more than [`MAX_PORTS_BYTES`].
 pub fn ports(fields: BTreeMap<String, v1::Value>, field: &str) -> Result<BTreeMap<String, Value>, Malformed> {
+    let bytes = ports_bytes(&fields);
+    if bytes > MAX_PORTS_BYTES {
+        let largest = fields.iter().max_by_key(|(_, value)| value.encoded_len()).map_or("", |(name, _)| name);
+        let largest: String = largest.chars().filter(|c| !c.is_control()).take(MAX_NAME_BYTES).collect();
+        let rule = format!("have {bytes} bytes, most of them `{largest}`: at most {MAX_PORTS_BYTES} are allowed");
+        return Err(Malformed::new(field, rule));
+    }
     let convert = |(port, value): (String, v1::Value)| {
         name(&port, "name").map_err(|m| m.within(field))?;
         let value = Value::try_from(value).map_err(|m| m.within(format!("{field}[{port}]")))?;

@@ -359,6 +359,7 @@ impl From<ResourceUpdate> for v1::ResourceServiceWatchResponse {
                 revision: revision.0,
                 resources: all(resources),
                 youngest_lease_id: youngest.0,
+                more: false,
             }),
             ResourceUpdate::Event(event) => Kind::Event(event.into()),
         };
@@ -453,6 +454,8 @@ impl From<ResourceFilter> for v1::ListRequest {
             attributes: wire_ports(filter.attributes),
             session_id: filter.session,
             conditions: all(filter.conditions),
+            page_bytes: 0,
+            page_token: String::new(),
         }
     }
 }

@@ -11,7 +11,7 @@ impl From<WorldUpdate> for v1::WorldPoolServiceWatchResponse {
     fn from(update: WorldUpdate) -> v1::WorldPoolServiceWatchResponse {
         let kind = match update {
             WorldUpdate::Snapshot { revision, facts } => {
-                Kind::Snapshot(v1::WorldSnapshot { revision: revision.0, facts: all(facts) })
+                Kind::Snapshot(v1::WorldSnapshot { revision: revision.0, facts: all(facts), more: false })
             }
             WorldUpdate::Changed(change) => Kind::Change(v1::WorldChange {
                 revision: change.revision.0,

@@ -8,6 +8,8 @@ use crate::client::Channels;
 use crate::safety::{Safety, SafetyState};
 use crate::trace;
 use ratn_model::id::{FencingToken, LeaseId};
+use ratn_proto::MAX_PORTS_BYTES;
+use ratn_proto::convert::{ports_bytes, value_bytes, wire_ports};
 use ratn_proto::types::{Goal, GoalOutcome};
 use std::collections::{BTreeMap, VecDeque};
 use std::convert::Infallible;
@@ -317,7 +319,7 @@ async fn run(
         never = stopped => match never {},
     };
     let lost = result.as_ref().is_err_and(|failure| matches!(failure, ActionFailure::Lost(_)));
-    let outcome = result.unwrap_or_else(GoalOutcome::from);
+    let outcome = bounded(result.unwrap_or_else(GoalOutcome::from));
     let outcome = match entry.cause() {
         // Whatever the action makes of being stopped.
         Some(cause @ StopCause::EmergencyStop(_)) if !outcome.is_success() => cause.failure().into(),
@@ -335,6 +337,20 @@ async fn run(
         }
     };
     entry.result.send_replace(Some(ending));
+}
+
+/// An outcome whose outputs fit into a message; a failure that says what does not, otherwise.
+fn bounded(outcome: GoalOutcome) -> GoalOutcome {
+    let outputs = wire_ports(outcome.outputs.clone());
+    let bytes = ports_bytes(&outputs);
+    if bytes <= MAX_PORTS_BYTES {
+        return outcome;
+    }
+    let largest = outcome.outputs.iter().max_by_key(|(name, _)| value_bytes(&outputs[*name]));
+    let largest = largest.map_or("", |(name, _)| name.as_str());
+    let reason =
+        format!("the outputs have {bytes} bytes, most of them `{largest}`: at most {MAX_PORTS_BYTES} are sent");
+    ActionFailure::Aborted(reason).into()
 }
 
 fn result_of(performed: Result<ActionResult, JoinError>) -> ActionResult {

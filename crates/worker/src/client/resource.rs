@@ -8,15 +8,16 @@ use crate::trace::Traced;
 use ratn_model::id::LeaseId;
 use ratn_model::resource::{Lease, Requirement};
 use ratn_model::value::Value;
-use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::{Malformed, all, each, required, wire_ports};
 use ratn_proto::types::{
     Demand, Resource, ResourceFilter, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition,
 };
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
+use ratn_proto::v1::resource_service_watch_response::Kind as Part;
 use ratn_proto::v1::session_request::Kind as Asked;
 use ratn_proto::v1::session_response::Kind as Answered;
+use ratn_proto::{MAX_MESSAGE_BYTES, PAGE_BYTES};
 use std::collections::BTreeMap;
 use std::time::Duration;
 use tonic::Streaming;
@@ -250,9 +251,17 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn list_where(&self, filter: ResourceFilter) -> Result<Vec<Resource>, CallError> {
-        let question = v1::ListRequest::from(filter);
-        let answer = self.client.clone().list(question).await.map_err(|status| self.failed(&status))?;
-        each(answer.into_inner().resources, "resources").map_err(|m| self.malformed(m))
+        let mut question = v1::ListRequest { page_bytes: PAGE_BYTES, ..filter.into() };
+        let mut resources = Vec::new();
+        loop {
+            let answer = self.client.clone().list(question.clone()).await.map_err(|status| self.failed(&status))?;
+            let answer = answer.into_inner();
+            resources.extend(answer.resources);
+            if answer.next_page_token.is_empty() {
+                return each(resources, "resources").map_err(|m| self.malformed(m));
+            }
+            question.page_token = answer.next_page_token;
+        }
     }
 
     /// One resource.
@@ -280,9 +289,17 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn sessions(&self) -> Result<Vec<SessionStatus>, CallError> {
-        let question = v1::ListSessionsRequest {};
-        let answer = self.client.clone().list_sessions(question).await.map_err(|status| self.failed(&status))?;
-        each(answer.into_inner().sessions, "sessions").map_err(|m| self.malformed(m))
+        let mut question = v1::ListSessionsRequest { page_bytes: PAGE_BYTES, ..Default::default() };
+        let mut sessions = Vec::new();
+        loop {
+            let answer = self.client.clone().list_sessions(question.clone()).await;
+            let answer = answer.map_err(|status| self.failed(&status))?.into_inner();
+            sessions.extend(answer.sessions);
+            if answer.next_page_token.is_empty() {
+                return each(sessions, "sessions").map_err(|m| self.malformed(m));
+            }
+            question.page_token = answer.next_page_token;
+        }
     }
 
     /// The session's task is over: what it consumed of what is renewable returns.
@@ -311,7 +328,8 @@ impl ResourceClient {
     pub async fn watch_from(&self, kinds: &[&str], after: Option<WatchPosition>) -> Result<ResourceWatch, CallError> {
         let after_revision = after.map(|after| after.revision.0);
         let after_part = after.and_then(|after| after.part);
-        let question = v1::ResourceServiceWatchRequest { kinds: owned(kinds), after_revision, after_part };
+        let question =
+            v1::ResourceServiceWatchRequest { kinds: owned(kinds), after_revision, after_part, in_parts: true };
         let answer = self.client.clone().watch(question).await.map_err(|status| self.failed(&status))?;
         Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
@@ -397,9 +415,25 @@ impl ResourceWatch {
     /// # Errors
     /// [`CallError`] when it broke.
     pub async fn next(&mut self) -> Result<Option<ResourceUpdate>, CallError> {
-        let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
+        let mut message = self.read().await?;
+        if let Some(Part::Snapshot(whole)) = message.as_mut().and_then(|message| message.kind.as_mut()) {
+            while std::mem::take(&mut whole.more) {
+                let Some(Part::Snapshot(part)) = self.read().await?.and_then(|message| message.kind) else {
+                    let cut = Malformed::new("snapshot.more", "is set, and no further part follows");
+                    return Err(CallError::malformed(&self.endpoint, cut));
+                };
+                whole.resources.extend(part.resources);
+                whole.more = part.more;
+            }
+        }
         let update = message.map(ResourceUpdate::try_from).transpose();
         update.map_err(|m| CallError::malformed(&self.endpoint, m))
+    }
+}
+
+impl ResourceWatch {
+    async fn read(&mut self) -> Result<Option<v1::ResourceServiceWatchResponse>, CallError> {
+        self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))
     }
 }
 

@@ -6,11 +6,12 @@ use crate::trace::Traced;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::Evidence;
-use ratn_proto::MAX_MESSAGE_BYTES;
-use ratn_proto::convert::{all, each};
+use ratn_proto::convert::{Malformed, all, each};
 use ratn_proto::types::{Contradiction, FactDifference, FactRecord, FactVersion, WorldUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::world_pool_service_client::WorldPoolServiceClient;
+use ratn_proto::v1::world_pool_service_watch_response::Kind as Part;
+use ratn_proto::{MAX_MESSAGE_BYTES, PAGE_BYTES};
 use ratn_world::digest::Digest;
 use ratn_world::scene::delta::SceneDelta;
 use std::sync::Arc;
@@ -88,9 +89,23 @@ impl WorldWatch {
     /// # Errors
     /// [`CallError`] when it broke.
     pub async fn next(&mut self) -> Result<Option<WorldUpdate>, CallError> {
-        let message = self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))?;
+        let mut message = self.read().await?;
+        if let Some(Part::Snapshot(whole)) = message.as_mut().and_then(|message| message.kind.as_mut()) {
+            while std::mem::take(&mut whole.more) {
+                let Some(Part::Snapshot(part)) = self.read().await?.and_then(|message| message.kind) else {
+                    let cut = Malformed::new("snapshot.more", "is set, and no further part follows");
+                    return Err(CallError::malformed(&self.endpoint, cut));
+                };
+                whole.facts.extend(part.facts);
+                whole.more = part.more;
+            }
+        }
         let update = message.map(WorldUpdate::try_from).transpose();
         update.map_err(|m| CallError::malformed(&self.endpoint, m))
+    }
+
+    async fn read(&mut self) -> Result<Option<v1::WorldPoolServiceWatchResponse>, CallError> {
+        self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))
     }
 }
 
@@ -116,9 +131,7 @@ impl WorldClient {
     /// # Errors
     /// [`CallError`].
     pub async fn root(&self) -> Result<(Revision, Vec<FactRecord>), CallError> {
-        let answer = self.client.clone().get_root(v1::GetRootRequest {}).await;
-        let answer = answer.map_err(|status| self.failed(&status))?.into_inner();
-        Ok((Revision(answer.revision), self.records(answer.facts)?))
+        self.all_pages(v1::QueryRequest::default()).await
     }
 
     /// Makes changes real; the root's revision with them. `commit` is unique to what is committed, `run/instance`;
@@ -183,9 +196,9 @@ impl WorldClient {
         patterns: &[FactPattern],
     ) -> Result<Vec<FactRecord>, CallError> {
         let projection_id = projection.map(|p| p.0);
-        let question = v1::QueryRequest { projection_id, at_revision: None, patterns: all(patterns.iter().cloned()) };
-        let answer = self.client.clone().query(question).await.map_err(|status| self.failed(&status))?;
-        self.records(answer.into_inner().facts)
+        let question =
+            v1::QueryRequest { projection_id, patterns: all(patterns.iter().cloned()), ..Default::default() };
+        self.all_pages(question).await.map(|(_, facts)| facts)
     }
 
     /// The facts of the root as it was at a revision (as it is, where none is given) that match any of the patterns, all without
@@ -199,9 +212,8 @@ impl WorldClient {
         patterns: &[FactPattern],
     ) -> Result<(Revision, Vec<FactRecord>), CallError> {
         let at_revision = revision.map(|revision| revision.0);
-        let question = v1::QueryRequest { projection_id: None, at_revision, patterns: all(patterns.iter().cloned()) };
-        let answer = self.client.clone().query(question).await.map_err(|status| self.failed(&status))?.into_inner();
-        Ok((Revision(answer.revision), self.records(answer.facts)?))
+        let patterns = all(patterns.iter().cloned());
+        self.all_pages(v1::QueryRequest { at_revision, patterns, ..Default::default() }).await
     }
 
     /// Tells of every revision of the root, a snapshot first; with a revision, of every one after it and without a snapshot. With
@@ -212,7 +224,7 @@ impl WorldClient {
     pub async fn watch(&self, after: Option<Revision>, patterns: &[FactPattern]) -> Result<WorldWatch, CallError> {
         let after_revision = after.map(|after| after.0);
         let patterns = all(patterns.iter().cloned());
-        let question = v1::WorldPoolServiceWatchRequest { patterns, after_revision };
+        let question = v1::WorldPoolServiceWatchRequest { patterns, after_revision, in_parts: true };
         let answer = self.client.clone().watch(question).await.map_err(|status| self.failed(&status))?;
         Ok(WorldWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
@@ -228,11 +240,20 @@ impl WorldClient {
         patterns: &[FactPattern],
     ) -> Result<(Vec<FactDifference>, Revision), CallError> {
         let (from_revision, to_revision) = (from.0, to.map(|to| to.0));
-        let question = v1::DiffRequest { from_revision, to_revision, patterns: all(patterns.iter().cloned()) };
-        let answer = self.client.clone().diff(question).await.map_err(|status| self.failed(&status))?.into_inner();
-        let differences =
-            each(answer.differences, "differences").map_err(|m| CallError::malformed(&self.endpoint, m))?;
-        Ok((differences, Revision(answer.to_revision)))
+        let (patterns, page_token) = (all(patterns.iter().cloned()), String::new());
+        let mut question = v1::DiffRequest { from_revision, to_revision, patterns, page_bytes: PAGE_BYTES, page_token };
+        let mut differences = Vec::new();
+        loop {
+            let answer = self.client.clone().diff(question.clone()).await;
+            let answer = answer.map_err(|status| self.failed(&status))?.into_inner();
+            differences.extend(answer.differences);
+            if answer.next_page_token.is_empty() {
+                let differences = each(differences, "differences");
+                let differences = differences.map_err(|m| CallError::malformed(&self.endpoint, m))?;
+                return Ok((differences, Revision(answer.to_revision)));
+            }
+            question.page_token = answer.next_page_token;
+        }
     }
 
     /// What a fact was, the newest first, and the oldest revision that is kept: what was before that is not known.
@@ -277,6 +298,21 @@ impl WorldClient {
         let question = v1::WorldPoolServiceReleaseRequest { projection_id: projection.0 };
         let answer = self.client.clone().release(question).await.map_err(|status| self.failed(&status))?;
         Ok(answer.into_inner().released)
+    }
+
+    /// All pages of an answer, which are of one revision.
+    async fn all_pages(&self, mut question: v1::QueryRequest) -> Result<(Revision, Vec<FactRecord>), CallError> {
+        question.page_bytes = PAGE_BYTES;
+        let mut facts = Vec::new();
+        loop {
+            let answer = self.client.clone().query(question.clone()).await;
+            let answer = answer.map_err(|status| self.failed(&status))?.into_inner();
+            facts.extend(answer.facts);
+            if answer.next_page_token.is_empty() {
+                return Ok((Revision(answer.revision), self.records(facts)?));
+            }
+            question.page_token = answer.next_page_token;
+        }
     }
 
     fn records(&self, facts: Vec<v1::Fact>) -> Result<Vec<FactRecord>, CallError> {

@@ -70,7 +70,10 @@ pub(in super::super) enum Message {
         id: String,
         answer: oneshot::Sender<Option<ResourceView>>,
     },
+    /// At most so many of those behind an id.
     List {
+        after: String,
+        most: usize,
         answer: oneshot::Sender<(Vec<ResourceView>, Revision)>,
     },
     Revision {

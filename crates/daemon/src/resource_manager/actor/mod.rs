@@ -162,7 +162,10 @@ impl Core for ResourceCore {
                 desk.tell(answer, found);
             }
             Message::Get { id, answer } => desk.tell(answer, self.pool.get(&id)),
-            Message::List { answer } => desk.tell(answer, (self.pool.list(), self.pool.revision())),
+            Message::List { after, most, answer } => {
+                let listed = (self.pool.list_after(&after, most), self.pool.revision());
+                desk.tell(answer, listed);
+            }
             Message::Revision { answer } => desk.tell(answer, self.pool.revision()),
             Message::Sessions { answer } => desk.tell(answer, self.sessions(desk)),
             Message::WatchDemand { speaker, session, provisions, answer } => {
@@ -260,7 +263,10 @@ impl ResourceCore {
                 desk.tell(answer, found);
             }
             Message::Get { id, answer } => desk.tell(answer, self.pool.get(&id)),
-            Message::List { answer } => desk.tell(answer, (self.pool.list(), self.pool.revision())),
+            Message::List { after, most, answer } => {
+                let listed = (self.pool.list_after(&after, most), self.pool.revision());
+                desk.tell(answer, listed);
+            }
             Message::Revision { answer } => desk.tell(answer, self.pool.revision()),
             Message::Sessions { answer } => desk.tell(answer, self.sessions(desk)),
             Message::WatchDemand { answer, .. } => desk.reply(answer, Err(stopped)),

@@ -1,0 +1,166 @@
+//! Answers in pages: whatever can be stored can be told of, however much there is of it.
+//!
+//! ```text
+//!   page_bytes = 0: all at once, or RESOURCE_EXHAUSTED (TOO_LARGE) that says to ask in pages
+//!   page_bytes > 0: as many as fit, at least one, and a token of where the next page begins
+//! ```
+
+use crate::details::status;
+use prost::Message;
+use ratn_proto::convert::label;
+use ratn_proto::{MAX_MESSAGE_BYTES, MAX_PAGE_BYTES};
+use tonic::{Code, Status};
+
+/// Room that a message needs beside what it repeats.
+const ENVELOPE_BYTES: usize = 64 * 1024;
+
+/// How much of an answer is wanted at once.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Page {
+    /// Nothing where all of it is.
+    bytes: Option<usize>,
+}
+
+impl Page {
+    /// Of what a request says.
+    pub(crate) fn of(bytes: u32, token: &str) -> Page {
+        let asked = usize::try_from(bytes).unwrap_or(MAX_PAGE_BYTES).min(MAX_PAGE_BYTES);
+        let asked = if asked == 0 { MAX_PAGE_BYTES } else { asked };
+        Page { bytes: (bytes > 0 || !token.is_empty()).then_some(asked) }
+    }
+
+    /// Takes from what there is until the page is full. Whether something is left.
+    pub(crate) fn fill<T: Message>(
+        self,
+        items: impl IntoIterator<Item = T>,
+        filled: &mut Filled<T>,
+    ) -> Result<bool, Status> {
+        for item in items {
+            let bytes = item.encoded_len() + ITEM_BYTES;
+            match self.bytes {
+                Some(most) if filled.bytes + bytes > most && !filled.items.is_empty() => return Ok(true),
+                None if filled.bytes + bytes > MAX_MESSAGE_BYTES - ENVELOPE_BYTES => return Err(too_large()),
+                _ => {}
+            }
+            filled.bytes += bytes;
+            filled.items.push(item);
+        }
+        Ok(false)
+    }
+}
+
+/// What is on a page.
+#[derive(Debug)]
+pub(crate) struct Filled<T> {
+    pub(crate) items: Vec<T>,
+    bytes: usize,
+}
+
+impl<T> Default for Filled<T> {
+    fn default() -> Filled<T> {
+        Filled { items: Vec::new(), bytes: 0 }
+    }
+}
+
+/// What a field takes beside its message.
+const ITEM_BYTES: usize = 8;
+
+/// Cut into parts of at most a page each; at least one, which may be empty.
+pub(crate) fn parts<T: Message>(items: Vec<T>) -> Vec<Vec<T>> {
+    let (mut parts, mut bytes) = (vec![Vec::new()], 0);
+    for item in items {
+        let more = item.encoded_len() + ITEM_BYTES;
+        if bytes + more > MAX_PAGE_BYTES
+            && let Some(last) = parts.last()
+            && !last.is_empty()
+        {
+            parts.push(Vec::new());
+            bytes = 0;
+        }
+        bytes += more;
+        if let Some(last) = parts.last_mut() {
+            last.push(item);
+        }
+    }
+    parts
+}
+
+/// As many from the first on as a page has room for.
+pub(crate) fn first<T: Message>(items: Vec<T>) -> Vec<T> {
+    parts(items).swap_remove(0)
+}
+
+/// What a token says: a revision, and how many were on the pages before.
+pub(crate) fn place(token: &str) -> Result<Option<(u64, usize)>, Status> {
+    label(token, "page_token")?;
+    if token.is_empty() {
+        return Ok(None);
+    }
+    let read = || token.split_once(':').and_then(|(at, seen)| Some((at.parse().ok()?, seen.parse().ok()?)));
+    let message = "page_token: is none of a page of this answer: begin with an empty one";
+    read().map(Some).ok_or_else(|| status(Code::InvalidArgument, "MALFORMED", message))
+}
+
+/// The token of the page behind, where there is one.
+pub(crate) fn token(more: bool, revision: u64, seen: usize) -> String {
+    if more { format!("{revision}:{seen}") } else { String::new() }
+}
+
+/// An answer that does not fit into one message.
+pub(crate) fn too_large() -> Status {
+    let message = format!(
+        "the answer has more than the {MAX_MESSAGE_BYTES} bytes of a message: ask for it in pages (page_bytes, for a watch \
+         in_parts), as clients of this version do"
+    );
+    status(Code::ResourceExhausted, "TOO_LARGE", message)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    fn texts(sizes: &[usize]) -> Vec<String> {
+        sizes.iter().map(|size| "x".repeat(*size)).collect()
+    }
+
+    #[test]
+    fn a_page_has_as_many_as_fit_and_at_least_one() {
+        let page = Page::of(1_000, "");
+        let mut filled = Filled::default();
+        assert!(page.fill(texts(&[400, 400, 400]), &mut filled).unwrap());
+        assert_eq!(filled.items.len(), 2);
+        let mut filled = Filled::default();
+        assert!(page.fill(texts(&[5_000, 1]), &mut filled).unwrap());
+        assert_eq!(filled.items.len(), 1);
+        let mut filled = Filled::default();
+        assert!(!page.fill(texts(&[1, 1]), &mut filled).unwrap());
+    }
+
+    #[test]
+    fn an_answer_without_pages_is_refused_where_it_is_more_than_a_message() {
+        let whole = Page::of(0, "");
+        let edge = MAX_MESSAGE_BYTES - ENVELOPE_BYTES - ITEM_BYTES;
+        // A text has a tag and its length beside its letters.
+        let at_edge = |more: usize| "x".repeat(edge - 5 + more);
+        assert_eq!(at_edge(0).encoded_len(), edge);
+        assert!(!whole.fill([at_edge(0)], &mut Filled::default()).unwrap());
+        let refused = whole.fill([at_edge(1)], &mut Filled::default()).unwrap_err();
+        assert!(refused.code() == Code::ResourceExhausted && refused.message().contains("page_bytes"), "{refused}");
+    }
+
+    #[test]
+    fn parts_hold_everything_in_order() {
+        let half = MAX_PAGE_BYTES / 2;
+        let sizes: Vec<usize> = parts(texts(&[half, half, 1, half])).iter().map(Vec::len).collect();
+        assert_eq!(sizes, [1, 2, 1]);
+        assert_eq!(parts(texts(&[])).len(), 1);
+    }
+
+    #[test]
+    fn a_token_is_read_as_it_was_written() {
+        assert_eq!(place(&token(true, 7, 12)).unwrap(), Some((7, 12)));
+        assert_eq!(place(&token(false, 7, 12)).unwrap(), None);
+        assert!(place("7").is_err() && place("a:b").is_err());
+    }
+}
