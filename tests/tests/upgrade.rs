@@ -14,6 +14,7 @@ use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::resource::{Lease, Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::value::Value;
 use ratn_proto::types::Resource;
+use ratn_storage::{Log, Options, Store};
 use ratn_worker::client::{AcquireOptions, Channels, Commit, ResourceClient, WorldClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::Session;
@@ -358,6 +359,25 @@ fn event_logs_of_earlier_versions_are_reported_as_they_were_then() -> anyhow::Re
         let report = System::new()?.json(&["report", &fixture.join("run.jsonl").display().to_string()])?;
         let then = expected(&fixture)?["report"].clone();
         ensure!(same(&then, &report), "{}:\nthen {then}\nnow  {report}", fixture.display());
+    }
+    Ok(())
+}
+
+#[test]
+fn what_a_newer_version_wrote_is_refused_with_both_versions_and_stays_as_it_is() -> anyhow::Result<()> {
+    let fixture = fixtures()?.pop().context("a fixture")?;
+    for role in ROLES {
+        let system = left_by(&fixture)?;
+        let state = system.place.path().join("state").join(role);
+        let (_, mut writer) = Log::new(&state, Options::default()).open()?;
+        writer.append(&[250, 0])?;
+        writer.close()?;
+        let (code, _, said) = system.launch(role)?.finish()?;
+        ensure!(code == Some(1), "{role}: {code:?} {said}");
+        let named = said.contains("format 250 of the records of a") && said.contains("this program reads up to ");
+        ensure!(named, "{role}: {said}");
+        let left = Log::new(&state, Options::default()).read()?;
+        ensure!(left.records.last().is_some_and(|record| record.payload[..] == [250, 0]), "{role}");
     }
     Ok(())
 }

@@ -3,6 +3,7 @@
 use crate::error::{PoolError, check_owner, malformed};
 use crate::event::{EndReason, Notice, Refusal};
 use crate::expiry::Timer;
+use crate::fingerprint::Fingerprint;
 use crate::group::{Key, key};
 use crate::id::{SessionId, WaiterId};
 use crate::lease::LeaseRecord;
@@ -23,7 +24,7 @@ impl Pool {
     /// An unknown session, other operations than block, consume and exists, a passed deadline, a full queue.
     pub fn acquire(&mut self, now: Timestamp, request: AcquireRequest) -> Result<WaiterId, PoolError> {
         self.advance(now);
-        self.enqueue(request, "", 0)
+        self.enqueue(request, "", Fingerprint::UNKNOWN)
     }
 
     /// Takes a waiter out of the queue.
@@ -98,7 +99,7 @@ impl Pool {
         &mut self,
         request: AcquireRequest,
         request_id: &str,
-        fingerprint: u128,
+        fingerprint: Fingerprint,
     ) -> Result<WaiterId, PoolError> {
         use ResourceOperation::{Block, Consume, Exists};
         let full = self.no_room(&request.session)?;
@@ -173,7 +174,7 @@ impl Pool {
         id: WaiterId,
         request: AcquireRequest,
         request_id: String,
-        fingerprint: u128,
+        fingerprint: Fingerprint,
         taken: Vec<Units>,
     ) {
         self.overtake((Reverse(request.priority), id), &taken);
@@ -237,7 +238,7 @@ impl Pool {
     }
 
     /// Takes a waiter from everywhere; with the fingerprint of its request.
-    fn leave(&mut self, id: WaiterId) -> Option<(Waiter, u128)> {
+    fn leave(&mut self, id: WaiterId) -> Option<(Waiter, Fingerprint)> {
         let waiter = self.part(id)?;
         if let Some(deadline) = waiter.request.deadline {
             self.timers.remove(&(deadline, Timer::Waiter(id)));

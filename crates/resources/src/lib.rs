@@ -39,6 +39,7 @@ mod error;
 mod event;
 mod expiry;
 mod explain;
+mod fingerprint;
 mod group;
 mod history;
 mod id;

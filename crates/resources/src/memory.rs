@@ -2,11 +2,10 @@
 //! forgotten first. An answer is durable together with its effect; who is still in the queue is not.
 
 use crate::error::PoolError;
+use crate::fingerprint::Fingerprint;
 use crate::id::WaiterId;
-use crate::request::Request;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::time::Timestamp;
-use ratn_model::versioned;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -30,7 +29,7 @@ pub(crate) enum Recalled {
 #[derive(Debug, Clone)]
 struct Answer {
     number: u64,
-    fingerprint: u128,
+    fingerprint: Fingerprint,
     reply: Remembered,
 }
 
@@ -41,18 +40,18 @@ pub(crate) struct RequestMemory {
     /// When each was given, the oldest first.
     order: BTreeMap<u64, (Timestamp, String)>,
     next: u64,
-    waiting: BTreeMap<String, (u128, WaiterId)>,
+    waiting: BTreeMap<String, (Fingerprint, WaiterId)>,
 }
 
 impl RequestMemory {
     /// What this request led to before.
-    pub(crate) fn recall(&self, id: &str, fingerprint: u128) -> Result<Option<Recalled>, PoolError> {
+    pub(crate) fn recall(&self, id: &str, fingerprint: Fingerprint) -> Result<Option<Recalled>, PoolError> {
         let known = self.waiting.get(id).map(|(print, waiter)| (*print, Recalled::Waiting(*waiter)));
         let known = known.or_else(|| {
             self.answers.get(id).map(|answer| (answer.fingerprint, Recalled::Answered(answer.reply.clone())))
         });
         match known {
-            Some((print, _)) if print != fingerprint => Err(PoolError::RequestIdReused { id: id.to_owned() }),
+            Some((print, _)) if !print.may_be(fingerprint) => Err(PoolError::RequestIdReused { id: id.to_owned() }),
             known => Ok(known.map(|(_, recalled)| recalled)),
         }
     }
@@ -63,12 +62,12 @@ impl RequestMemory {
         waiting.or_else(|| self.answers.get(id).map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
-    pub(crate) fn wait(&mut self, id: &str, fingerprint: u128, waiter: WaiterId) {
+    pub(crate) fn wait(&mut self, id: &str, fingerprint: Fingerprint, waiter: WaiterId) {
         self.waiting.insert(id.to_owned(), (fingerprint, waiter));
     }
 
     /// Who waited under this id waits no longer.
-    pub(crate) fn waited(&mut self, id: &str) -> Option<u128> {
+    pub(crate) fn waited(&mut self, id: &str) -> Option<Fingerprint> {
         self.waiting.remove(id).map(|(fingerprint, _)| fingerprint)
     }
 
@@ -79,7 +78,14 @@ impl RequestMemory {
         self.order.values().enumerate().take_while(|(i, (at, _))| *i < by_number || old(*at)).count()
     }
 
-    pub(crate) fn remember(&mut self, id: String, fingerprint: u128, reply: Remembered, forget: usize, now: Timestamp) {
+    pub(crate) fn remember(
+        &mut self,
+        id: String,
+        fingerprint: Fingerprint,
+        reply: Remembered,
+        forget: usize,
+        now: Timestamp,
+    ) {
         for _ in 0..forget {
             if let Some((_, (_, oldest))) = self.order.pop_first() {
                 self.answers.remove(&oldest);
@@ -104,7 +110,7 @@ impl RequestMemory {
     }
 
     /// The answers, the oldest first.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (&String, u128, &Remembered)> {
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (&String, Fingerprint, &Remembered)> {
         self.order
             .values()
             .filter_map(|(_, id)| self.answers.get(id).map(|answer| (id, answer.fingerprint, &answer.reply)))
@@ -122,22 +128,4 @@ impl RequestMemory {
         self.order.len() == self.answers.len()
             && self.order.iter().all(|(number, (_, id))| self.answers.get(id).is_some_and(|a| a.number == *number))
     }
-}
-
-/// The version of the form that [`fingerprint`] hashes. Fingerprints are kept: with another number no retry would be known again.
-const FINGERPRINTED: u8 = 2;
-
-/// What makes two requests the same one: everything but the deadline of an acquire, which a repeated one has later.
-/// FNV-1a over 128 bits of its record; clients are not adversaries of themselves.
-pub(crate) fn fingerprint(request: &Request) -> u128 {
-    const OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
-    const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
-    let bytes = match request {
-        Request::Acquire(acquire) if acquire.deadline.is_some() => {
-            let acquire = crate::queue::AcquireRequest { deadline: None, ..acquire.clone() };
-            versioned::encode(FINGERPRINTED, &Request::Acquire(acquire))
-        }
-        request => versioned::encode(FINGERPRINTED, request),
-    };
-    bytes.iter().fold(OFFSET, |hash, byte| (hash ^ u128::from(*byte)).wrapping_mul(PRIME))
 }

@@ -3,12 +3,13 @@
 use crate::error::PoolError;
 use crate::event::{Notice, WatchEvent};
 use crate::expiry::Timer;
+use crate::fingerprint::Fingerprint;
 use crate::history::{Compacted, History};
 use crate::id::{SessionId, Slot, WaiterId};
 use crate::kinds::Kinds;
 use crate::lease::{LeaseView, Leases};
 use crate::limits::Limits;
-use crate::memory::{Recalled, Remembered, RequestMemory, fingerprint};
+use crate::memory::{Recalled, Remembered, RequestMemory};
 use crate::pace::Pace;
 use crate::queue::{AcquireRequest, Queue};
 use crate::record::{Effect, Record};
@@ -112,10 +113,10 @@ impl Pool {
     pub fn handle(&mut self, now: Timestamp, request_id: &str, request: Request) -> Result<Reply, PoolError> {
         self.advance(now);
         if request_id.is_empty() {
-            return self.perform(now, "", 0, request);
+            return self.perform(now, "", Fingerprint::UNKNOWN, request);
         }
         self.check_name("request id", request_id)?;
-        let fingerprint = fingerprint(&request);
+        let fingerprint = Fingerprint::of(&request);
         match self.memory.recall(request_id, fingerprint)? {
             Some(Recalled::Waiting(waiter)) => Ok(Reply::Queued(waiter)),
             Some(Recalled::Answered(Remembered::Granted(lease))) => {
@@ -243,7 +244,7 @@ impl Pool {
     }
 
     /// Keeps the answer to a request id, together with its effect.
-    pub(crate) fn remember(&mut self, request_id: String, fingerprint: u128, reply: Remembered) {
+    pub(crate) fn remember(&mut self, request_id: String, fingerprint: Fingerprint, reply: Remembered) {
         if !request_id.is_empty() {
             let for_at_most = Duration::from_millis(self.limits.remember_for_ms);
             let forget = self.memory.too_many(self.now, self.limits.remembered_requests, for_at_most);
@@ -251,7 +252,7 @@ impl Pool {
         }
     }
 
-    fn perform(&mut self, now: Timestamp, id: &str, print: u128, request: Request) -> Result<Reply, PoolError> {
+    fn perform(&mut self, now: Timestamp, id: &str, print: Fingerprint, request: Request) -> Result<Reply, PoolError> {
         Ok(match request {
             Request::Create { session, spec } => {
                 let ResourceView { description, revision, .. } = self.create(now, session.as_ref(), spec)?;

@@ -6,6 +6,7 @@
 //! [`encode`] makes them one entry of a log. Waiters are not in them; their clients ask again with the same request id.
 
 use crate::event::EndReason;
+use crate::fingerprint::Fingerprint;
 use crate::id::{SessionId, Slot};
 use crate::lease::LeaseRecord;
 use crate::memory::Remembered;
@@ -19,9 +20,11 @@ use std::time::Duration;
 
 /// The version that [`encode`] writes, its first byte. Every new variant at the end takes a new number, so that an older program
 /// refuses what it does not know by its version; records since [`OLDEST_FORMAT`] are read as they are.
-pub const FORMAT: u8 = 3;
+pub const FORMAT: u8 = 4;
 /// The oldest version that [`decode`] reads: it has no [`Effect::SessionOpened`].
 pub const OLDEST_FORMAT: u8 = 2;
+/// The newest version whose fingerprints are of how requests were written then, which says nothing to a later one.
+const BYTE_FINGERPRINTS: u8 = 3;
 
 /// One durable change of a pool.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -48,7 +51,7 @@ pub(crate) enum Effect {
     /// A lease ended.
     LeaseEnded { lease: LeaseId, reason: EndReason },
     /// A request id has its answer; the oldest `forget` answers were forgotten for it.
-    Answered { request_id: String, fingerprint: u128, reply: Remembered, forget: usize },
+    Answered { request_id: String, fingerprint: Fingerprint, reply: Remembered, forget: usize },
     /// What a session consumed of a resource with a grant that was undone is there again.
     Returned { session: SessionId, slot: Slot, amount: Quantity },
     /// A session is new.
@@ -68,6 +71,19 @@ pub fn encode(records: &[Record]) -> Vec<u8> {
 /// # Errors
 /// Bytes that it did not write, or another version did.
 pub fn decode(bytes: &[u8]) -> Result<Vec<Record>, DecodeError> {
-    let version = bytes.first().copied().filter(|found| *found == OLDEST_FORMAT).unwrap_or(FORMAT);
-    versioned::decode(version, RECORDS, bytes)
+    let version = versioned::version(OLDEST_FORMAT, FORMAT, RECORDS, bytes)?;
+    let mut records: Vec<Record> = versioned::decode(version, RECORDS, bytes)?;
+    if !knows_fingerprints(version) {
+        for record in &mut records {
+            if let Effect::Answered { fingerprint, .. } = &mut record.0 {
+                *fingerprint = Fingerprint::UNKNOWN;
+            }
+        }
+    }
+    Ok(records)
+}
+
+/// Whether the fingerprints in bytes of this version are those of this program.
+pub(crate) fn knows_fingerprints(version: u8) -> bool {
+    version > BYTE_FINGERPRINTS
 }

@@ -6,12 +6,13 @@
 //! ```
 
 use crate::expiry::Timer;
+use crate::fingerprint::Fingerprint;
 use crate::id::{SessionId, Slot};
 use crate::lease::LeaseRecord;
 use crate::limits::Limits;
 use crate::memory::Remembered;
 use crate::pool::Pool;
-use crate::record::Record;
+use crate::record::{FORMAT, OLDEST_FORMAT, Record, knows_fingerprints};
 use crate::resource::Resource;
 use crate::session::Session;
 use ratn_model::id::{LeaseId, Revision};
@@ -22,8 +23,6 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The version that [`Snapshot::encode`] writes, its first byte. Each one is the one before with more at its end.
-const FORMAT: u8 = 3;
 /// The version without openers of sessions.
 const WITHOUT_OPENERS: u8 = 2;
 /// What it is, in messages.
@@ -40,7 +39,7 @@ pub struct Snapshot {
     resources: Vec<(Slot, Resource)>,
     leases: Vec<(LeaseId, LeaseRecord)>,
     /// The oldest first.
-    answers: Vec<(String, u128, Remembered)>,
+    answers: Vec<(String, Fingerprint, Remembered)>,
     /// Who opened which session; of one that is not here nobody knows.
     openers: Vec<(SessionId, Arc<str>)>,
 }
@@ -74,16 +73,21 @@ impl Snapshot {
         versioned::encode(FORMAT, self)
     }
 
-    /// Reads what [`Snapshot::encode`] wrote, in this version or the one before.
+    /// Reads what [`Snapshot::encode`] wrote, in this version or an earlier one: each is the one before with more at its end.
     ///
     /// # Errors
     /// Bytes that it did not write, or another version did.
     pub fn decode(bytes: &[u8]) -> Result<Snapshot, DecodeError> {
-        if bytes.first() == Some(&WITHOUT_OPENERS) {
+        let version = versioned::version(OLDEST_FORMAT, FORMAT, SNAPSHOT, bytes)?;
+        let mut snapshot: Snapshot = match version {
             // An empty list, as postcard writes it.
-            return versioned::decode(WITHOUT_OPENERS, SNAPSHOT, &[bytes, &[0]].concat());
+            WITHOUT_OPENERS => versioned::decode(version, SNAPSHOT, &[bytes, &[0]].concat())?,
+            _ => versioned::decode(version, SNAPSHOT, bytes)?,
+        };
+        if !knows_fingerprints(version) {
+            snapshot.answers.iter_mut().for_each(|(_, fingerprint, _)| *fingerprint = Fingerprint::UNKNOWN);
         }
-        versioned::decode(FORMAT, SNAPSHOT, bytes)
+        Ok(snapshot)
     }
 
     /// The pool's revision in it.

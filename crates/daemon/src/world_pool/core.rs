@@ -6,8 +6,9 @@
 
 use super::WorldPoolConfig;
 use super::expiry::Expiry;
+use super::fingerprint::Fingerprint;
 use super::history::{Commit, CommitError, History, RevisionError};
-use super::memory::{Memory, Reused, fingerprint};
+use super::memory::{Memory, Reused};
 use super::scenes::{Scenes, moves};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
@@ -256,7 +257,7 @@ impl WorldPool {
 
     /// The world at a revision with changes applied. A request made before gets its answer again, as long as it lives.
     pub(super) fn project(&mut self, request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
-        let fingerprint = fingerprint(&(request.base, &request.changes, &request.reads, &request.writers));
+        let fingerprint = Fingerprint::of_projection(request.base, &request.changes, &request.reads, &request.writers);
         if let Some(id) = self.projected.recall(&request.request_id, fingerprint)? {
             let ended = || ProjectError::Ended { request_id: request.request_id.clone() };
             return self.projections.contains_key(&id).then_some(id).ok_or_else(ended);

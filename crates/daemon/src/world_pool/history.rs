@@ -4,8 +4,9 @@
 //! is put down as a record, which the journal takes; a snapshot and the records after it make the same history again.
 
 use super::WorldPoolConfig;
-use super::memory::{Memory, Reused, fingerprint};
-use super::record::{CommitRecord, FactRecord, Names, PatternRecord, SnapshotRecord, decode, encode};
+use super::fingerprint::Fingerprint;
+use super::memory::{Memory, Reused};
+use super::record::{CommitRecord, FactRecord, Names, PatternRecord, SnapshotRecord, decode_commits, encode};
 use crate::durable_actor::Journaled;
 use bytes::Bytes;
 use ratn_model::fact::{Change, FactKey, FactPattern};
@@ -123,7 +124,7 @@ impl History {
         let mut names = Names::default();
         let mut history = History::new(config);
         if let Some(snapshot) = recovered.snapshot {
-            let snapshot: SnapshotRecord = decode(&snapshot.payload).map_err(RestoreError::Snapshot)?;
+            let snapshot = SnapshotRecord::decode(&snapshot.payload).map_err(RestoreError::Snapshot)?;
             let facts = snapshot.facts.into_iter().map(|fact| fact.into_fact(&mut names));
             history = History::of(World::of(facts, Revision(snapshot.revision)), config);
             for commit in snapshot.commits {
@@ -134,8 +135,8 @@ impl History {
             }
         }
         for entry in recovered.records {
-            let commits: Vec<CommitRecord> =
-                decode(&entry.payload).map_err(|source| RestoreError::Entry { position: entry.position, source })?;
+            let commits = decode_commits(&entry.payload)
+                .map_err(|source| RestoreError::Entry { position: entry.position, source })?;
             for commit in commits {
                 let (id, fingerprint, revision) = (commit.id.clone(), commit.fingerprint, Revision(commit.revision));
                 let is_leap = commit.is_leap();
@@ -172,7 +173,7 @@ impl History {
     /// All changes as the next revision, or none. An id committed before gets its answer again.
     pub(super) fn commit(&mut self, commit: &Commit, ontology: Option<&Ontology>) -> Result<Revision, CommitError> {
         let Commit { id, changes, expected, writer, evidence } = commit;
-        let fingerprint = fingerprint(changes);
+        let fingerprint = Fingerprint::of_commit(changes);
         if let Some(revision) = self.commits.recall(id, fingerprint)? {
             return Ok(revision);
         }
@@ -337,7 +338,7 @@ impl Kept {
         CommitRecord {
             revision: self.world.revision().0,
             id: self.commit.to_string(),
-            fingerprint: 0,
+            fingerprint: Fingerprint::UNKNOWN,
             deleted: gone.map(|(key, _)| PatternRecord::new(&FactPattern::of(key))).collect(),
             written: facts_of(&self.written),
         }

@@ -1,7 +1,7 @@
 //! The answers given, by request id: the same id twice is performed once. Bounded; the oldest is forgotten first.
 
+use super::fingerprint::Fingerprint;
 use std::collections::{BTreeMap, VecDeque};
-use std::fmt::{self, Debug, Write};
 use std::sync::Arc;
 
 /// See the module.
@@ -15,7 +15,7 @@ pub(super) struct Memory<T> {
 
 #[derive(Debug, Clone)]
 struct Answer<T> {
-    fingerprint: u128,
+    fingerprint: Fingerprint,
     value: T,
 }
 
@@ -32,15 +32,15 @@ impl<T: Copy> Memory<T> {
     }
 
     /// What this request led to before; an empty id is never known.
-    pub(super) fn recall(&self, id: &str, fingerprint: u128) -> Result<Option<T>, Reused> {
+    pub(super) fn recall(&self, id: &str, fingerprint: Fingerprint) -> Result<Option<T>, Reused> {
         match self.answers.get(id) {
-            Some(answer) if answer.fingerprint == fingerprint => Ok(Some(answer.value)),
+            Some(answer) if answer.fingerprint.may_be(fingerprint) => Ok(Some(answer.value)),
             Some(_) => Err(Reused { id: id.to_owned() }),
             None => Ok(None),
         }
     }
 
-    pub(super) fn insert(&mut self, id: &str, fingerprint: u128, value: T) {
+    pub(super) fn insert(&mut self, id: &str, fingerprint: Fingerprint, value: T) {
         let id: Arc<str> = Arc::from(id);
         if id.is_empty() || self.answers.insert(Arc::clone(&id), Answer { fingerprint, value }).is_some() {
             return;
@@ -54,24 +54,8 @@ impl<T: Copy> Memory<T> {
     }
 
     /// The answers, the oldest first.
-    pub(super) fn iter(&self) -> impl Iterator<Item = (&Arc<str>, u128, T)> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = (&Arc<str>, Fingerprint, T)> {
         let known = |id| self.answers.get(id).map(|answer| (id, answer.fingerprint, answer.value));
         self.order.iter().filter_map(known)
     }
-}
-
-/// What makes two requests the same one: FNV-1a over 128 bits of what they print; clients are not adversaries of themselves.
-pub(super) fn fingerprint(request: &impl Debug) -> u128 {
-    struct Fnv(u128);
-    impl Write for Fnv {
-        fn write_str(&mut self, text: &str) -> fmt::Result {
-            const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
-            self.0 = text.bytes().fold(self.0, |hash, byte| (hash ^ u128::from(byte)).wrapping_mul(PRIME));
-            Ok(())
-        }
-    }
-    let mut hash = Fnv(0x6c62_272e_07bb_0142_62b8_2175_6295_c58d);
-    // Nothing that is printed into a hash can fail.
-    let _ = write!(hash, "{request:?}");
-    hash.0
 }

@@ -12,6 +12,7 @@ mod actor;
 mod config;
 mod core;
 mod expiry;
+mod fingerprint;
 mod history;
 mod leases;
 mod memory;

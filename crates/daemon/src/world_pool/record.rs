@@ -3,6 +3,7 @@
 //! A commit is written down as what it came to (which facts hold which values, which are gone), never as what was asked: nothing is
 //! computed again when it is read.
 
+use super::fingerprint::Fingerprint;
 use ratn_model::fact::{FactKey, FactPattern, Term};
 use ratn_model::id::Revision;
 use ratn_model::measurement::Measurement;
@@ -13,16 +14,20 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// The version that is written, the first byte. Variants and fields are only ever added at the end; whatever else changes takes a
-/// new number.
-const FORMAT: u8 = 1;
+/// The version that is written, the first byte. Only variants of enums are ever added to one, at their end; whatever else changes takes
+/// a new number, and the older ones are still read.
+const FORMAT: u8 = 2;
+/// The fingerprints are of the debug text of changes, which says nothing to a later version.
+const DEBUG_FINGERPRINTS: u8 = 1;
+/// What its bytes are, in messages.
+const RECORDS: &str = "records of a world pool";
 
 /// One commit. Without an id and without changes: the revisions before it are lost, and go on from it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct CommitRecord {
     pub(super) revision: u64,
     pub(super) id: String,
-    pub(super) fingerprint: u128,
+    pub(super) fingerprint: Fingerprint,
     /// What matches is gone, unless it is among the facts below.
     pub(super) deleted: Vec<PatternRecord>,
     pub(super) written: Vec<FactRecord>,
@@ -34,7 +39,7 @@ pub(super) struct SnapshotRecord {
     pub(super) revision: u64,
     pub(super) facts: Vec<FactRecord>,
     pub(super) commits: Vec<CommitRecord>,
-    pub(super) remembered: Vec<(String, u128, u64)>,
+    pub(super) remembered: Vec<(String, Fingerprint, u64)>,
 }
 
 /// A fact with who wrote it when.
@@ -66,8 +71,28 @@ pub(super) fn encode<T: Serialize>(value: &T) -> Vec<u8> {
     versioned::encode(FORMAT, value)
 }
 
-pub(super) fn decode<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<T, DecodeError> {
-    versioned::decode(FORMAT, "records of a world pool", bytes)
+/// The commits of one entry.
+pub(super) fn decode_commits(bytes: &[u8]) -> Result<Vec<CommitRecord>, DecodeError> {
+    let (mut commits, version): (Vec<CommitRecord>, u8) = decode(bytes)?;
+    if version == DEBUG_FINGERPRINTS {
+        commits.iter_mut().for_each(|commit| commit.fingerprint = Fingerprint::UNKNOWN);
+    }
+    Ok(commits)
+}
+
+fn decode<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<(T, u8), DecodeError> {
+    let version = versioned::version(DEBUG_FINGERPRINTS, FORMAT, RECORDS, bytes)?;
+    Ok((versioned::decode(version, RECORDS, bytes)?, version))
+}
+
+impl SnapshotRecord {
+    pub(super) fn decode(bytes: &[u8]) -> Result<SnapshotRecord, DecodeError> {
+        let (mut snapshot, version): (SnapshotRecord, u8) = decode(bytes)?;
+        if version == DEBUG_FINGERPRINTS {
+            snapshot.remembered.iter_mut().for_each(|(_, fingerprint, _)| *fingerprint = Fingerprint::UNKNOWN);
+        }
+        Ok(snapshot)
+    }
 }
 
 impl CommitRecord {
