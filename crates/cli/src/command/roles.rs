@@ -74,6 +74,7 @@ pub(super) fn process_manager(arguments: &RoleArguments) -> Result<(), Failure> 
     }
     daemon(arguments, process_manager::ROLE, async |system, host| {
         let mut config = system.process_manager_config();
+        config.owns_process = true;
         config.listen = host.listen.unwrap_or(config.listen);
         process_manager::run_as(config, host.directory, host.serving, host.shutdown).await
     })

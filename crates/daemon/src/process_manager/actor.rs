@@ -9,6 +9,7 @@ use super::predecessor::Adopted;
 use super::processes::{Processes, Told};
 use super::roster::Roster;
 use super::spawner::Outcome;
+use super::tracking::Tracker;
 use super::usage::Usage;
 use crate::demand::{Shortages, Use};
 use crate::link::{Offering, Wanted};
@@ -60,6 +61,8 @@ pub(super) struct Parts {
     pub(super) config: ProcessManagerConfig,
     pub(super) directory: RuntimeDirectory,
     pub(super) roster: Roster,
+    /// Which processes are whose.
+    pub(super) tracker: Tracker,
     /// The ids of the workers that a process manager before this one left.
     pub(super) before: Vec<String>,
     /// Those of them that were taken over.
@@ -97,9 +100,23 @@ struct Actor {
 /// Starts the actor; it ends with the token, once every worker has.
 pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Result<(Handle, JoinHandle<()>)> {
     let (inbox, messages) = mpsc::channel(INBOX);
-    let Parts { config, directory, roster, before, adopted, wanted, leaves, there, uses, demand, short, looks } = parts;
+    let Parts {
+        config,
+        directory,
+        roster,
+        tracker,
+        before,
+        adopted,
+        wanted,
+        leaves,
+        there,
+        uses,
+        demand,
+        short,
+        looks,
+    } = parts;
     let drained = Drained::of(&directory);
-    let (processes, told) = Processes::start(&config, directory, roster)?;
+    let (processes, told) = Processes::start(&config, directory, roster, tracker)?;
     let mut pools = Pools::new(&config.host, config.templates).with_labels(config.labels.clone());
     pools.go_on_after(&before);
     let actor = Actor {
@@ -202,7 +219,7 @@ impl Actor {
                 () = tokio::time::sleep_until(last.into()) => {}
             }
         }
-        self.processes.kill_all();
+        self.processes.end_all().await;
     }
 
     fn now(&self) -> Timestamp {

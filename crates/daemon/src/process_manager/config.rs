@@ -4,6 +4,7 @@ use super::limits::GroupsV1;
 use super::machine::MachineConfig;
 use super::order;
 use super::template::Template;
+use super::tracking::Tracking;
 use crate::config::{Check, ConfigError, rule};
 use ratn_model::value::Value;
 use ratn_worker::endpoint::Endpoint;
@@ -60,6 +61,12 @@ pub struct ProcessManagerConfig {
     /// A directory of cgroup v2 that is the process manager's to divide, `/sys/fs/cgroup/ratn`: then `limits` are kept by a group for
     /// each worker, and with all that it starts.
     pub cgroup: Option<PathBuf>,
+    /// How the processes of workers are kept track of, so that all of a worker ends with it.
+    pub tracking: Tracking,
+    /// This process is a process manager and nothing else: what workers leave behind becomes its children, and ends with it. Said by
+    /// the program, not by its config.
+    #[serde(skip)]
+    pub owns_process: bool,
     /// Directories of cgroup v1 that are the process manager's to divide, one for each controller; where `cgroup` is not given.
     pub cgroup_v1: GroupsV1,
     /// What else is to be said of this host and its workers, for tasks that choose by it: `gpu = true`.
@@ -81,6 +88,8 @@ impl Default for ProcessManagerConfig {
             resource_manager: None,
             session_ttl_ms: 3_000,
             cgroup: None,
+            tracking: Tracking::default(),
+            owns_process: false,
             cgroup_v1: GroupsV1::default(),
             labels: Labels::new(),
             machine: MachineConfig::default(),

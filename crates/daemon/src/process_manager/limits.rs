@@ -9,10 +9,15 @@ use rustix::process::{Pid, Resource, Rlimit, prlimit};
 use serde::{Deserialize, Serialize};
 use std::io;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 /// What the time of `cpus` is counted over, in microseconds.
 const PERIOD_US: u64 = 100_000;
 const MIB: u64 = 1 << 20;
+/// Who is killed is gone from a group within this; longer where it has much memory to give back.
+const EMPTY_PATIENCE: Duration = Duration::from_millis(200);
+/// The pause between two tries.
+const EMPTY_AGAIN: Duration = Duration::from_millis(1);
 
 /// All keys are optional; without one there is no limit.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -43,8 +48,11 @@ pub struct GroupsV1 {
 /// Where groups are made.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Groups {
+    /// Of the config: for limits, and for all that a worker starts.
     pub(super) v2: Option<PathBuf>,
     pub(super) v1: GroupsV1,
+    /// Without one of the config: for all that a worker starts, and for no limits.
+    pub(super) tracking: Option<PathBuf>,
 }
 
 /// What is in force for a worker; its groups go with this.
@@ -71,9 +79,8 @@ impl Limits {
     /// Puts them on a process that has just been started.
     pub(super) fn enforce(&self, id: &str, pid: u32, groups: &Groups) -> InForce {
         let mut force = InForce::default();
-        let needed = self.memory_mib.or(self.processes).is_some() || self.cpus.is_some();
         let mut missing = *self;
-        if let Some(v2) = groups.v2.as_deref().filter(|_| needed) {
+        if let Some(v2) = groups.v2.as_deref() {
             match self.group(v2, id, pid) {
                 Ok(group) => {
                     force.say("cgroup", self);
@@ -81,6 +88,12 @@ impl Limits {
                     missing = Limits { open_files: None, ..Limits::default() };
                 }
                 Err(error) => tracing::warn!(id, %error, "no group for a worker"),
+            }
+        }
+        if let (None, Some(tracking)) = (&groups.v2, groups.tracking.as_deref()) {
+            match Limits::default().group(tracking, id, pid) {
+                Ok(group) => force.groups.push(group),
+                Err(error) => tracing::warn!(id, %error, "no group for a worker: it is tracked by its environment"),
             }
         }
         for (place, alone) in missing.by_controller(&groups.v1) {
@@ -223,8 +236,13 @@ pub(super) fn end_group(path: &Path) {
             let _ = rustix::process::kill_process(pid, rustix::process::Signal::KILL);
         }
     }
-    if let Err(error) = std::fs::remove_dir(path) {
-        tracing::debug!(group = %path.display(), %error, "a group of a worker stays");
+    let begin = Instant::now();
+    while let Err(error) = std::fs::remove_dir(path) {
+        // Those that are killed are in it until they are gone.
+        if error.kind() != io::ErrorKind::ResourceBusy || begin.elapsed() > EMPTY_PATIENCE {
+            return tracing::debug!(group = %path.display(), %error, "a group of a worker stays");
+        }
+        std::thread::sleep(EMPTY_AGAIN);
     }
 }
 
@@ -236,14 +254,15 @@ mod tests {
     const ALL: Limits = Limits { memory_mib: Some(64), cpus: Some(1.5), processes: Some(8), open_files: Some(100) };
 
     fn v2(place: &Path) -> Groups {
-        Groups { v2: Some(place.to_owned()), v1: GroupsV1::default() }
+        Groups { v2: Some(place.to_owned()), ..Groups::default() }
     }
 
     #[test]
     fn of_cgroup_v1_each_controller_has_a_group_and_what_has_none_is_limited_otherwise_or_said() {
         let places = tempfile::tempdir().unwrap();
         let place = |name: &str| Some(places.path().join(name));
-        let groups = Groups { v2: None, v1: GroupsV1 { memory: place("memory"), cpu: place("cpu"), pids: None } };
+        let v1 = GroupsV1 { memory: place("memory"), cpu: place("cpu"), pids: None };
+        let groups = Groups { v1, ..Groups::default() };
         let mut child = child();
         let force = ALL.enforce("planner-1@compute", child.id(), &groups);
         let of = |file: &str| std::fs::read_to_string(places.path().join(file)).unwrap();
@@ -266,7 +285,8 @@ mod tests {
             eprintln!("skipped: no cgroup v1 that may be divided here");
             return;
         }
-        let groups = Groups { v2: None, v1: GroupsV1 { pids: Some(place.clone()), ..GroupsV1::default() } };
+        let v1 = GroupsV1 { pids: Some(place.clone()), ..GroupsV1::default() };
+        let groups = Groups { v1, ..Groups::default() };
         let mut child = child();
         let force =
             Limits { processes: Some(3), ..Limits::default() }.enforce("planner-1@compute", child.id(), &groups);

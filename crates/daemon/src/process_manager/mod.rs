@@ -31,6 +31,7 @@ mod service;
 mod spawner;
 mod status;
 mod template;
+pub mod tracking;
 mod usage;
 
 pub use config::{Label, Labels, ProcessManagerConfig};
@@ -40,6 +41,7 @@ pub use parameter::Parameter;
 pub use readiness::Readiness;
 pub use roster::RosterError;
 pub use template::{Liveness, Needs, Template};
+pub use tracking::Tracking;
 
 use crate::demand::{DemandLink, Shortages};
 use crate::link::{Link, Manager, Turnover, Wanted};
@@ -55,11 +57,14 @@ use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
+use tracking::Tracker;
 
 /// The role's name: of its endpoint file, its command and its section of a config.
 pub const ROLE: &str = "process-manager";
 /// What became of resources which the actor was not told of yet.
 const THERE: usize = 1_024;
+/// A child that was being started when its process manager was killed holds the place until its program begins.
+const TAKE_PATIENCE: Duration = Duration::from_millis(500);
 /// States of the demand that the actor was not told of yet.
 const DEMANDS: usize = 16;
 
@@ -94,12 +99,14 @@ pub async fn run_as(
     for obstacle in config.obstacles() {
         tracing::warn!("{obstacle}: its workers cannot be started");
     }
-    let (mut roster, left) = Roster::take(&directory)?;
+    let (mut roster, left, unknown) = Roster::take_within(&directory, TAKE_PATIENCE).await?;
+    let tracker = Tracker::start(&config, &directory).context("cannot keep track of workers")?;
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     // Before anything is offered: what the last process manager offered goes where it is not wanted any more.
-    let before: Vec<String> = left.iter().map(|entry| entry.id.clone()).collect();
-    let adopted = predecessor::settle(left, &config.templates, &directory).await;
+    let before: Vec<String> =
+        left.iter().map(|entry| &entry.id).chain(unknown.iter().map(|intent| &intent.id)).cloned().collect();
+    let adopted = predecessor::settle(left, unknown, &config.templates, &directory, &tracker).await;
     roster.keep_only(&adopted.iter().map(|one| one.entry.id.as_str()).collect());
     let (wanted, to_offer) = watch::channel(Wanted::new());
     let workers = adopted
@@ -137,6 +144,7 @@ pub async fn run_as(
         config,
         directory: directory.clone(),
         roster,
+        tracker,
         before,
         adopted,
         wanted,

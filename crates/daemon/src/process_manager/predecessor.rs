@@ -4,13 +4,15 @@
 //! ```text
 //!   its process is gone ──▶ forgotten            it serves, its template says `adopt`, and it listens for a successor ──▶ adopted
 //!   everybody else ──▶ SIGTERM, after `stop_timeout_s` SIGKILL, and with it all that it started
+//!   it was about to be started ──▶ its group is ended, and whatever carries its marker
 //! ```
 
 use super::account;
 use super::limits::end_group;
-use super::roster::Entry;
+use super::roster::{Entry, Intent};
 use super::spawner;
 use super::template::Template;
+use super::tracking::Tracker;
 use nix::sys::signal::Signal;
 use ratn_proto::types::{WorkerState, WorkerStatus};
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -90,8 +92,14 @@ pub(super) fn adopt_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
     directory.path().join(format!("{id}.adopt"))
 }
 
-/// Adopts or ends all of them; those that were adopted. Returns when the others are gone.
-pub(super) async fn settle(left: Vec<Entry>, templates: &[Template], directory: &RuntimeDirectory) -> Vec<Adopted> {
+/// Adopts or ends all of them; those that were adopted. Returns when the others are gone, and so is what was being started.
+pub(super) async fn settle(
+    left: Vec<Entry>,
+    unknown: Vec<Intent>,
+    templates: &[Template],
+    directory: &RuntimeDirectory,
+    tracker: &Tracker,
+) -> Vec<Adopted> {
     let settled = left.into_iter().map(async |entry| {
         let adopted = match Exit::of(&entry) {
             Some(exit) => match greet(&entry, exit, templates, directory).await {
@@ -120,7 +128,18 @@ pub(super) async fn settle(left: Vec<Entry>, templates: &[Template], directory: 
         }
         adopted
     });
-    futures::future::join_all(settled).await.into_iter().flatten().collect()
+    let adopted: Vec<Adopted> = futures::future::join_all(settled).await.into_iter().flatten().collect();
+    for intent in &unknown {
+        tracing::info!(id = intent.id, "the last process manager was killed while it started this worker");
+        intent.group.iter().filter(|group| group.exists()).for_each(|group| end_group(group));
+        remove_files(&intent.id, &intent.template, directory);
+    }
+    let (tracker, kept) = (tracker.clone(), adopted.iter().map(|one| one.entry.id.clone()).collect::<Vec<_>>());
+    let ended = tokio::task::spawn_blocking(move || tracker.end_all_but(&kept.iter().map(String::as_str).collect()));
+    if let Err(error) = ended.await {
+        tracing::error!(%error, "what nobody knows is not ended");
+    }
+    adopted
 }
 
 async fn greet(
@@ -163,8 +182,12 @@ async fn end(entry: &Entry, exit: &Exit) {
 
 fn clear_up(entry: &Entry, directory: &RuntimeDirectory) {
     entry.groups.iter().for_each(|group| end_group(group));
-    let directory = &account::directory_of(directory, &entry.template);
-    let files = [directory.endpoint_file(&entry.id), adopt_socket(directory, &entry.id)];
+    remove_files(&entry.id, &entry.template, directory);
+}
+
+fn remove_files(id: &str, template: &Template, directory: &RuntimeDirectory) {
+    let directory = &account::directory_of(directory, template);
+    let files = [directory.endpoint_file(id), adopt_socket(directory, id)];
     for file in files {
         let _ = std::fs::remove_file(file);
     }

@@ -9,9 +9,10 @@ use super::log_file::log_file;
 use super::parameter;
 use super::predecessor::{self, Adopted, adopt_socket};
 use super::readiness::{Pulse, Readiness, Signs};
-use super::roster::{Entry, Roster};
+use super::roster::{Entry, Intent, Roster};
 use super::spawner::{self, Job, Outcome};
 use super::template::Template;
+use super::tracking::{Children, Tracker};
 use nix::sys::signal::Signal;
 use ratn_worker::adoption;
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -21,9 +22,13 @@ use std::path::PathBuf;
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
+use tokio_util::task::AbortOnDropHandle;
 
 /// What became of processes that waits for the actor.
 const OUTCOMES: usize = 1_024;
+
+/// The pause between two looks for orphans that have ended.
+const REAP_INTERVAL: Duration = Duration::from_secs(5);
 
 /// What is told of them.
 pub(super) struct Told {
@@ -64,9 +69,12 @@ pub(super) struct Processes {
     jobs: mpsc::Sender<Job>,
     outcomes: mpsc::Sender<Outcome>,
     roster: Roster,
+    tracker: Tracker,
     tell: Tell,
     by_id: BTreeMap<String, Process>,
     ended_logs: EndedLogs,
+    /// Takes leave of orphans.
+    reaping: Option<AbortOnDropHandle<()>>,
 }
 
 #[derive(Debug, Clone)]
@@ -93,6 +101,7 @@ impl Processes {
         config: &ProcessManagerConfig,
         directory: RuntimeDirectory,
         roster: Roster,
+        tracker: Tracker,
     ) -> io::Result<(Processes, Told)> {
         let (told, outcomes) = mpsc::channel(OUTCOMES);
         let (serving, served) = mpsc::channel(OUTCOMES);
@@ -100,12 +109,14 @@ impl Processes {
         let processes = Processes {
             host: config.host.clone(),
             max_log_bytes: config.max_log_bytes,
-            groups: Groups { v2: config.cgroup.clone(), v1: config.cgroup_v1.clone() },
+            groups: Groups { v2: config.cgroup.clone(), v1: config.cgroup_v1.clone(), tracking: tracker.groups() },
             directory,
             this_program: std::env::current_exe()?,
-            jobs: spawner::start(told.clone())?,
+            jobs: spawner::start(told.clone(), tracker.clone())?,
             outcomes: told,
             roster,
+            reaping: tracker.children().map(|children| AbortOnDropHandle::new(tokio::spawn(reap(children)))),
+            tracker,
             tell: Tell { serving, health },
             by_id: BTreeMap::new(),
             ended_logs: EndedLogs::default(),
@@ -141,6 +152,8 @@ impl Processes {
         });
         let signs = signs.map_err(|error| BeginError::Socket { socket: socket.clone(), reason: error.to_string() })?;
         let mut env = environment::passed(std::env::vars_os(), &template.pass_env);
+        // Not a template's to say.
+        let marker = self.tracker.environment(id);
         env.extend(account.iter().flat_map(Account::environment));
         env.extend(template.env.iter().map(|(name, value)| (name.into(), fill(value).into())));
         if template.adopt {
@@ -152,6 +165,7 @@ impl Processes {
             let patience_us = template.liveness.timeout().as_micros().to_string();
             env.extend(watchdog.then(|| ("WATCHDOG_USEC".into(), patience_us.into())));
         }
+        env.extend([marker]);
         let awaited = match (&signs, &template.readiness) {
             (Signs::Line(seen), Readiness::Line { contains }) => Some(Awaited::new(contains, seen.clone())),
             _ => None,
@@ -170,7 +184,11 @@ impl Processes {
             outlives: template.adopt,
             program: template.program.clone().unwrap_or_else(|| self.this_program.clone()),
         };
-        self.jobs.try_send(job).map_err(|_| BeginError::Busy)?;
+        let place = self.jobs.try_reserve().map_err(|_| BeginError::Busy)?;
+        // Before there is a process that only this one knows of.
+        let group = self.tracker.group_of(id);
+        self.roster.starts(Intent { id: id.to_owned(), group, template: template.clone() });
+        place.send(job);
         let (ask, questions) = mpsc::channel(1);
         let within = template.start_timeout();
         let (known, is_known) = oneshot::channel();
@@ -219,7 +237,8 @@ impl Processes {
         let process = Process { directory, pid: entry.pid, template: None, known: None, attended };
         self.by_id.insert(id.clone(), process);
         self.roster.began(entry);
-        spawner::watch_adopted(adopted, &self.log_file(&id), self.max_log_bytes, self.outcomes.clone());
+        let tracker = self.tracker.clone();
+        spawner::watch_adopted(adopted, &self.log_file(&id), self.max_log_bytes, tracker, self.outcomes.clone());
     }
 
     /// Its process is gone.
@@ -253,13 +272,27 @@ impl Processes {
         }
     }
 
-    /// Whatever it takes.
-    pub(super) fn kill_all(&self) {
+    /// Whatever it takes: the workers, and all that they started.
+    pub(super) async fn end_all(&mut self) {
         self.by_id.values().for_each(|process| spawner::signal(process.pid, Signal::SIGKILL));
+        drop(self.reaping.take());
+        let tracker = self.tracker.clone();
+        if let Err(error) = tokio::task::spawn_blocking(move || tracker.end()).await {
+            tracing::error!(%error, "what workers left is not ended");
+        }
     }
 
     fn log_file(&self, id: &str) -> PathBuf {
         log_file(&self.directory, id)
+    }
+}
+
+/// Orphans that have ended are zombies until somebody looks.
+async fn reap(children: Children) {
+    let mut looks = tokio::time::interval(REAP_INTERVAL);
+    loop {
+        looks.tick().await;
+        children.reap();
     }
 }
 

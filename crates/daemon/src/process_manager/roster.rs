@@ -8,7 +8,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
+/// The pause between two tries to take a place.
+const TAKE_AGAIN: Duration = Duration::from_millis(10);
 /// Lines beyond those of the workers there are; then the file is written anew.
 const MOST_OLD_LINES: usize = 1_000;
 
@@ -29,10 +32,20 @@ pub(super) struct Entry {
     pub(super) template: Template,
 }
 
+/// A worker that is about to be started: written before its process is there, so that somebody knows of it however this ends.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Intent {
+    pub(super) id: String,
+    /// The group of cgroups that it is put into, if any.
+    pub(super) group: Option<PathBuf>,
+    pub(super) template: Template,
+}
+
 /// What happened to a worker.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Line {
+    Starts(Box<Intent>),
     Began(Box<Entry>),
     Serves { id: String, endpoint: String },
     Gone { id: String },
@@ -64,12 +77,27 @@ pub(super) struct Roster {
     file: File,
     lines: usize,
     there: BTreeMap<String, Entry>,
+    starting: BTreeMap<String, Intent>,
     _lock: File,
 }
 
 impl Roster {
-    /// Takes the place of the one process manager of a runtime directory; whom the last one left behind.
-    pub(super) fn take(directory: &RuntimeDirectory) -> Result<(Roster, Vec<Entry>), RosterError> {
+    /// As [`Roster::take`], asked again for so long where another one has the place.
+    pub(super) async fn take_within(
+        directory: &RuntimeDirectory,
+        patience: Duration,
+    ) -> Result<(Roster, Vec<Entry>, Vec<Intent>), RosterError> {
+        let until = Instant::now() + patience;
+        loop {
+            match Roster::take(directory) {
+                Err(RosterError::Taken { .. }) if Instant::now() < until => tokio::time::sleep(TAKE_AGAIN).await,
+                taken => return taken,
+            }
+        }
+    }
+
+    /// Takes the place of the one process manager of a runtime directory; whom the last one left behind, and whom it was starting.
+    pub(super) fn take(directory: &RuntimeDirectory) -> Result<(Roster, Vec<Entry>, Vec<Intent>), RosterError> {
         let directory = directory.path();
         let path = directory.join("workers");
         let failed = |source| RosterError::Io { file: path.clone(), source };
@@ -81,20 +109,29 @@ impl Roster {
             Err(TryLockError::WouldBlock) => return Err(RosterError::Taken { directory: directory.to_owned() }),
             Err(TryLockError::Error(source)) => return Err(failed(source)),
         }
-        let left = read(&path).map_err(failed)?;
+        let (left, starting) = read(&path).map_err(failed)?;
         let file = File::options().append(true).create(true).open(&path).map_err(failed)?;
-        let mut roster = Roster { path: path.clone(), file, lines: 0, there: left.clone(), _lock: lock };
+        let mut roster =
+            Roster { path: path.clone(), file, lines: 0, there: left.clone(), starting: starting.clone(), _lock: lock };
         roster.write_anew().map_err(failed)?;
-        Ok((roster, left.into_values().collect()))
+        Ok((roster, left.into_values().collect(), starting.into_values().collect()))
     }
 
     /// All others are gone.
     pub(super) fn keep_only(&mut self, kept: &BTreeSet<&str>) {
-        let gone: Vec<String> = self.there.keys().filter(|id| !kept.contains(id.as_str())).cloned().collect();
+        let known = self.there.keys().chain(self.starting.keys());
+        let gone: Vec<String> = known.filter(|id| !kept.contains(id.as_str())).cloned().collect();
         gone.iter().for_each(|id| self.gone(id));
     }
 
+    /// Before its process is started.
+    pub(super) fn starts(&mut self, intent: Intent) {
+        self.starting.insert(intent.id.clone(), intent.clone());
+        self.append(&Line::Starts(Box::new(intent)));
+    }
+
     pub(super) fn began(&mut self, entry: Entry) {
+        self.starting.remove(&entry.id);
         self.there.insert(entry.id.clone(), entry.clone());
         self.append(&Line::Began(Box::new(entry)));
     }
@@ -107,7 +144,8 @@ impl Roster {
     }
 
     pub(super) fn gone(&mut self, id: &str) {
-        if self.there.remove(id).is_some() {
+        let started = self.starting.remove(id).is_some();
+        if self.there.remove(id).is_some() || started {
             self.append(&Line::Gone { id: id.to_owned() });
         }
     }
@@ -115,7 +153,7 @@ impl Roster {
     /// The workers go on where it cannot be written: only a successor would not know of them.
     fn append(&mut self, line: &Line) {
         self.lines += 1;
-        let written = if self.lines > self.there.len() * 2 + MOST_OLD_LINES {
+        let written = if self.lines > (self.there.len() + self.starting.len()) * 2 + MOST_OLD_LINES {
             self.write_anew()
         } else {
             write(&mut self.file, line)
@@ -132,8 +170,11 @@ impl Roster {
         for entry in self.there.values() {
             write(&mut file, &Line::Began(Box::new(entry.clone())))?;
         }
+        for intent in self.starting.values() {
+            write(&mut file, &Line::Starts(Box::new(intent.clone())))?;
+        }
         std::fs::rename(&next, &self.path)?;
-        (self.file, self.lines) = (file, self.there.len());
+        (self.file, self.lines) = (file, self.there.len() + self.starting.len());
         Ok(())
     }
 }
@@ -145,24 +186,32 @@ fn write(file: &mut File, line: &Line) -> io::Result<()> {
 }
 
 /// A line that was cut off by the end of its writer says nothing.
-fn read(path: &Path) -> io::Result<BTreeMap<String, Entry>> {
+fn read(path: &Path) -> io::Result<(BTreeMap<String, Entry>, BTreeMap<String, Intent>)> {
     let text = match std::fs::read_to_string(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => String::new(),
         read => read?,
     };
     let mut there: BTreeMap<String, Entry> = BTreeMap::new();
+    let mut starting = BTreeMap::new();
     for line in text.lines().filter_map(|line| serde_json::from_str(line).ok()) {
         match line {
-            Line::Began(entry) => drop(there.insert(entry.id.clone(), *entry)),
+            Line::Starts(intent) => drop(starting.insert(intent.id.clone(), *intent)),
+            Line::Began(entry) => {
+                starting.remove(&entry.id);
+                there.insert(entry.id.clone(), *entry);
+            }
             Line::Serves { id, endpoint } => {
                 if let Some(entry) = there.get_mut(&id) {
                     entry.endpoint = Some(endpoint);
                 }
             }
-            Line::Gone { id } => drop(there.remove(&id)),
+            Line::Gone { id } => {
+                starting.remove(&id);
+                there.remove(&id);
+            }
         }
     }
-    Ok(there)
+    Ok((there, starting))
 }
 
 #[cfg(test)]
@@ -186,8 +235,8 @@ mod tests {
     fn a_successor_knows_whom_the_last_one_left_and_two_at_a_time_there_are_not() {
         let parent = tempfile::tempdir().unwrap();
         let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
-        let (mut roster, left) = Roster::take(&directory).unwrap();
-        assert!(left.is_empty());
+        let (mut roster, left, starting) = Roster::take(&directory).unwrap();
+        assert!(left.is_empty() && starting.is_empty());
         assert!(matches!(Roster::take(&directory), Err(RosterError::Taken { .. })));
         for id in ["a", "b", "c"] {
             roster.began(entry(id));
@@ -196,7 +245,7 @@ mod tests {
         roster.gone("a");
         roster.file.write_all(b"{\"gone\":{\"id\":\"b").unwrap();
         drop(roster);
-        let (mut roster, left) = Roster::take(&directory).unwrap();
+        let (mut roster, left, _) = Roster::take(&directory).unwrap();
         let served = Entry { endpoint: Some("unix:/b".to_owned()), ..entry("b") };
         assert_eq!(left, [served.clone(), entry("c")]);
         roster.keep_only(&["b"].into());
@@ -205,10 +254,32 @@ mod tests {
     }
 
     #[test]
+    fn a_successor_knows_whom_the_last_one_was_starting() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
+        let intent = |id: &str| Intent { id: id.to_owned(), group: Some("/g".into()), template: entry(id).template };
+        let (mut roster, ..) = Roster::take(&directory).unwrap();
+        for id in ["began", "failed", "unknown"] {
+            roster.starts(intent(id));
+        }
+        roster.began(entry("began"));
+        roster.gone("failed");
+        drop(roster);
+        for _ in 0..2 {
+            let (_, left, starting) = Roster::take(&directory).unwrap();
+            assert_eq!((left, starting), (vec![entry("began")], vec![intent("unknown")]));
+        }
+        let (mut roster, ..) = Roster::take(&directory).unwrap();
+        roster.keep_only(&["began"].into());
+        drop(roster);
+        assert!(Roster::take(&directory).unwrap().2.is_empty());
+    }
+
+    #[test]
     fn it_does_not_grow_with_those_that_are_gone() {
         let parent = tempfile::tempdir().unwrap();
         let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
-        let (mut roster, _) = Roster::take(&directory).unwrap();
+        let (mut roster, ..) = Roster::take(&directory).unwrap();
         roster.began(entry("stays"));
         for i in 0..MOST_OLD_LINES {
             roster.began(entry(&format!("w-{i}")));

@@ -1,12 +1,14 @@
 //! Starts processes, all from one thread that lives as long as the process manager, and watches each until its end.
 //!
-//! Each worker leads a process group of its own, so that it can be ended with all that it started. Its standard input is a
+//! Each worker leads a process group of its own, so that it can be ended with all that it started; what leaves that group is found by
+//! [`super::tracking`]. Its standard input is a
 //! pipe that nobody writes to: it ends with the process manager, however that ends. Nothing runs in the child before exec.
 
 use super::account::Account;
 use super::limits::{Groups, InForce, Limits};
 use super::log::{Awaited, BOUND_INTERVAL, Log};
 use super::predecessor::Adopted;
+use super::tracking::Tracker;
 use crate::supervisor::command_of;
 use nix::errno::Errno;
 use nix::sys::signal::{Signal, killpg};
@@ -67,14 +69,23 @@ pub(super) enum Outcome {
 }
 
 /// Starts the thread; it ends when the sender is dropped. Needs a tokio runtime.
-pub(super) fn start(outcomes: mpsc::Sender<Outcome>) -> io::Result<mpsc::Sender<Job>> {
+pub(super) fn start(outcomes: mpsc::Sender<Outcome>, tracker: Tracker) -> io::Result<mpsc::Sender<Job>> {
     let (sender, mut jobs) = mpsc::channel::<Job>(QUEUE);
     let runtime = Handle::current();
     std::thread::Builder::new().name("spawner".to_owned()).spawn(move || {
         let _entered = runtime.enter();
         while let Some(mut job) = jobs.blocking_recv() {
             let id = job.id.clone();
-            match spawn(&job) {
+            let spawned = match tracker.children() {
+                Some(children) => children.starting(|| {
+                    spawn(&job).map(|(child, log)| {
+                        let pid = child.id().unwrap_or(0);
+                        ((child, log), pid)
+                    })
+                }),
+                None => spawn(&job),
+            };
+            match spawned {
                 Ok((child, log)) => {
                     let pid = child.id().unwrap_or(0);
                     let force = job.limits.enforce(&id, pid, &job.groups);
@@ -85,7 +96,7 @@ pub(super) fn start(outcomes: mpsc::Sender<Outcome>) -> io::Result<mpsc::Sender<
                     }
                     let worker =
                         Watched { id, pid, child, log, awaited: job.awaited.take(), force, bounds: job.outlives };
-                    runtime.spawn(watch(worker, outcomes.clone()));
+                    runtime.spawn(watch(worker, tracker.clone(), outcomes.clone()));
                 }
                 Err(error) => {
                     let reason = format!("cannot start {}: {error}", job.program.display());
@@ -150,7 +161,7 @@ struct Watched {
     bounds: bool,
 }
 
-async fn watch(worker: Watched, outcomes: mpsc::Sender<Outcome>) {
+async fn watch(worker: Watched, tracker: Tracker, outcomes: mpsc::Sender<Outcome>) {
     let Watched { id, pid, mut child, log, awaited, force, bounds } = worker;
     let bounding = bounds.then(|| AbortOnDropHandle::new(tokio::spawn(log.clone().keep_bounded(BOUND_INTERVAL))));
     let out = child.stdout.take().map(|out| tokio::spawn(log.clone().capture(out, awaited)));
@@ -162,8 +173,11 @@ async fn watch(worker: Watched, outcomes: mpsc::Sender<Outcome>) {
         Err(error) => format!("cannot be waited for: {error}"),
     };
     drop((parent_lives, bounding));
+    if let Some(children) = tracker.children() {
+        children.ended(pid);
+    }
     signal(pid, Signal::SIGKILL);
-    drop(force);
+    end_rest(&id, force, tracker).await;
     let captured = async {
         for capture in [out, err].into_iter().flatten() {
             let _ = capture.await;
@@ -174,7 +188,13 @@ async fn watch(worker: Watched, outcomes: mpsc::Sender<Outcome>) {
 }
 
 /// Watches one that was taken over until its end; how that was nobody says who is not its parent.
-pub(super) fn watch_adopted(adopted: Adopted, log: &Path, max_log_bytes: u64, outcomes: mpsc::Sender<Outcome>) {
+pub(super) fn watch_adopted(
+    adopted: Adopted,
+    log: &Path,
+    max_log_bytes: u64,
+    tracker: Tracker,
+    outcomes: mpsc::Sender<Outcome>,
+) {
     let Adopted { entry, parent_lives, exit, .. } = adopted;
     let log = Log::of_another(log, max_log_bytes).inspect_err(|error| tracing::warn!(id = entry.id, %error, "no log"));
     tokio::spawn(async move {
@@ -184,11 +204,23 @@ pub(super) fn watch_adopted(adopted: Adopted, log: &Path, max_log_bytes: u64, ou
         exit.wait().await;
         drop((parent_lives, bounding));
         signal(entry.pid, Signal::SIGKILL);
-        drop(force);
+        end_rest(&entry.id, force, tracker).await;
         let reason = "ended, how is not known: it was adopted".to_owned();
         let last_words = log.map(|log| log.last_words()).unwrap_or_default();
         let _ = outcomes.send(Outcome::Exited { id: entry.id, reason, last_words }).await;
     });
+}
+
+/// Its groups, and what it had started outside of them.
+async fn end_rest(id: &str, force: InForce, tracker: Tracker) {
+    let of = id.to_owned();
+    let ended = tokio::task::spawn_blocking(move || {
+        drop(force);
+        tracker.end_worker(&of);
+    });
+    if let Err(error) = ended.await {
+        tracing::error!(id, %error, "what a worker started is not ended");
+    }
 }
 
 fn describe(status: ExitStatus) -> String {

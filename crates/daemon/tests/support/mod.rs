@@ -38,6 +38,33 @@ impl Daemon {
     }
 }
 
+/// This process's group of cgroup v2, where there is one.
+pub(crate) fn own_cgroup() -> Option<PathBuf> {
+    let mounts = std::fs::read_to_string("/proc/self/mounts").unwrap_or_default();
+    let mount = mounts.lines().find_map(|line| {
+        let fields: Vec<&str> = line.split(' ').collect();
+        (fields.get(2) == Some(&"cgroup2")).then(|| fields[1].to_owned())
+    })?;
+    let own = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+    let own = own.lines().find_map(|line| line.strip_prefix("0::"))?.trim_start_matches('/').to_owned();
+    Some(Path::new(&mount).join(own))
+}
+
+impl Drop for TestSystem {
+    /// A process manager that was killed could not take back its groups.
+    fn drop(&mut self) {
+        let instance = std::fs::read_to_string(self.directory.path().join("process-manager.instance"));
+        let Some(groups) = own_cgroup().zip(instance.ok()).map(|(own, name)| own.join(format!("ratn-{name}"))) else {
+            return;
+        };
+        for group in std::fs::read_dir(&groups).into_iter().flatten().flatten() {
+            let _ = std::fs::write(group.path().join("cgroup.kill"), "1");
+            let _ = std::fs::remove_dir(group.path());
+        }
+        let _ = std::fs::remove_dir(groups);
+    }
+}
+
 impl TestSystem {
     pub(crate) fn new() -> TestSystem {
         let parent = tempfile::tempdir().unwrap();

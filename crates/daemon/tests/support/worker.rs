@@ -2,12 +2,14 @@
 //!
 //! `ratn-test-worker serve ID KIND ENDPOINT_FILE` serves until its parent ends; `ratn-test-worker manage DIRECTORY` is a
 //! process manager of one such worker, with `adopt GRACE_S` of one that is to be adopted, `adopt-other` of one that differs, `sleep` of one that
-//! does not look at its standard input; `ratn-test-worker notify` says to systemd's socket that it is ready, `ratn-test-worker watchdog N` besides N times
+//! does not look at its standard input, `none WAY` of no worker, `many WAY NUMBER` of four that start more, `session WAY NUMBER` and
+//! `clean-session WAY NUMBER` of one that sends a process away into another session; `ratn-test-worker notify` says to systemd's socket that it is ready, `ratn-test-worker watchdog N` besides N times
 //! that it lives, `ratn-test-worker port N`
 //! listens on a port of loopback, both until their standard input ends; `ratn-test-worker fail` says why and exits.
 
-use ratn_daemon::process_manager::{self, ProcessManagerConfig, Readiness, Template};
+use ratn_daemon::process_manager::{self, ProcessManagerConfig, Readiness, Template, Tracking};
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::shutdown;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::process::ExitCode;
 use tokio_util::sync::CancellationToken;
@@ -24,11 +26,20 @@ async fn main() -> ExitCode {
             let env = [("COLOUR".to_owned(), "blue".to_owned())].into();
             manage(directory, Template { env, ..adoptable(grace_s) }).await
         }
-        ["manage", directory, "sleep"] => {
-            let program = Some("/bin/sh".into());
-            let args = ["-c", "echo ready; sleep 1000 & wait"].map(str::to_owned).to_vec();
-            let readiness = Readiness::Line { contains: "ready".to_owned() };
-            manage(directory, Template { program, args, readiness, ..Template::new("planner", "PathPlanner") }).await
+        ["manage", directory, "sleep"] => manage(directory, shell("echo ready; sleep 1000 & wait")).await,
+        ["manage", directory, "none", way] => manage_as(directory, way, Vec::new()).await,
+        ["manage", directory, "many", way, number] => {
+            let script = format!("sleep {number} & setsid sleep {number} & exec sleep {number}");
+            let many = Template { min: 4, max: Some(4), ..shell(&script) };
+            manage_as(directory, way, vec![many]).await
+        }
+        ["manage", directory, "session", way, number] => {
+            let script = format!("setsid sleep {number} & echo ready; exec sleep {number}");
+            manage_as(directory, way, vec![shell(&script)]).await
+        }
+        ["manage", directory, "clean-session", way, number] => {
+            let script = format!("env -i setsid sleep {number} & echo ready; exec sleep {number}");
+            manage_as(directory, way, vec![shell(&script)]).await
         }
         ["notify"] => notify().await,
         ["watchdog", times] => watchdog(times).await,
@@ -73,13 +84,37 @@ fn adoptable(grace_s: &str) -> Template {
     Template { adopt: true, adopt_grace_s, ..Template::new("planner", "PathPlanner") }
 }
 
+/// A worker that does not look at its standard input.
+fn shell(script: &str) -> Template {
+    let program = Some("/bin/sh".into());
+    let args = ["-c", script].map(str::to_owned).to_vec();
+    let readiness = Readiness::Line { contains: "ready".to_owned() };
+    Template { program, args, readiness, ..Template::new("planner", "PathPlanner") }
+}
+
+/// In a process of its own, until a signal; `way` is how the processes of workers are kept track of.
+async fn manage_as(directory: &str, way: &str, templates: Vec<Template>) -> ExitCode {
+    let tracking = match way {
+        "cgroup" => Tracking::Cgroup,
+        _ => Tracking::Environment,
+    };
+    let config =
+        ProcessManagerConfig { session_ttl_ms: 300, templates, tracking, owns_process: true, ..Default::default() };
+    let shutdown = CancellationToken::new();
+    shutdown::on_signals(&shutdown).expect("signals can be caught");
+    exit_code(process_manager::run(config, RuntimeDirectory::at(directory), shutdown).await)
+}
+
 async fn manage(directory: &str, template: Template) -> ExitCode {
     let args = ["serve", "{id}", "{kind}", "{endpoint_file}"].map(str::to_owned).to_vec();
     let template = if template.args.is_empty() { Template { args, ..template } } else { template };
     let session_ttl_ms = if template.adopt { 5_000 } else { 300 };
     let config = ProcessManagerConfig { session_ttl_ms, templates: vec![template], ..Default::default() };
-    let run = process_manager::run(config, RuntimeDirectory::at(directory), CancellationToken::new());
-    match run.await {
+    exit_code(process_manager::run(config, RuntimeDirectory::at(directory), CancellationToken::new()).await)
+}
+
+fn exit_code(ended: anyhow::Result<()>) -> ExitCode {
+    match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("{error:#}");

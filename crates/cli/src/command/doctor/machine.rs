@@ -6,7 +6,7 @@ use crate::system::variable;
 use nix::sys::resource::{Resource, getrlimit};
 use nix::sys::statvfs::statvfs;
 use nix::unistd::{AccessFlags, access, geteuid};
-use ratn_daemon::process_manager::{GroupsV1, ProcessManagerConfig};
+use ratn_daemon::process_manager::{GroupsV1, ProcessManagerConfig, tracking};
 use ratn_daemon::{resource_manager, world_pool};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -153,7 +153,14 @@ fn groups(findings: &mut Findings, config: &ProcessManagerConfig) {
             return;
         }
         match limited.as_slice() {
-            [] => findings.ok(about, "none is named, and no template needs one"),
+            [] => match tracking::here(config) {
+                Ok(place) => findings.ok(about, format!("none is named; started from here, workers are tracked by groups below {place}")),
+                Err(why) => findings.warning(
+                    about,
+                    format!("started from here, workers are tracked by their environment alone: {why}"),
+                    "Delegate=yes in the process manager's unit, or name a directory of cgroup v2 in [process-manager] `cgroup`",
+                ),
+            },
             names => findings.warning(
                 about,
                 format!("none is named: `cpus` and `processes` of {} are not in force", names.join(", ")),
