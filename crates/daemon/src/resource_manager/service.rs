@@ -559,4 +559,72 @@ mod tests {
             calls.pop();
         }
     }
+
+    /// An actor with one arm that is free, and a session.
+    async fn with_an_arm() -> (Handle, SessionId, tempfile::TempDir) {
+        let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
+        let kept = journal::open(&config.storage, directory.path(), config.limits.clone()).unwrap();
+        let (actor, _) =
+            actor::start(watch::Sender::new(config).subscribe(), kept, Default::default(), Default::default());
+        let session = SessionId::from("s");
+        actor.keep_alive(Speaker::trusted(), session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
+        let create = PoolRequest::Create { session: None, spec: ResourceSpec::new(ResourceClass::Module, "Arm") };
+        let request_id = String::new();
+        actor
+            .ask(|answer| Message::Perform { speaker: Speaker::trusted(), request_id, request: create, answer })
+            .await
+            .unwrap()
+            .unwrap();
+        (actor, session, directory)
+    }
+
+    /// Always the same request. One that does not wait is dropped before it is answered.
+    async fn call(actor: &Handle, session: &SessionId, ticket: u64, waits: bool) -> WaitingCall {
+        let (answer, answered) = oneshot::channel();
+        let answered = waits.then_some(answered);
+        let requirement = Requirement::new(ResourceOperation::Block, "Arm");
+        let request = AcquireRequest::new(session.clone(), vec![requirement]);
+        let (request_id, wait) = ("run/i1".to_owned(), Duration::from_secs(60));
+        actor
+            .send(Message::Acquire { speaker: Speaker::trusted(), ticket, request_id, request, wait, answer })
+            .await
+            .unwrap();
+        WaitingCall { actor: actor.clone(), ticket, answered }
+    }
+
+    async fn is_free(actor: &Handle) -> bool {
+        let (views, _) = actor.ask(|answer| Message::List { answer }).await.unwrap();
+        views[0].free == 1
+    }
+
+    #[tokio::test]
+    async fn a_lease_that_a_repeated_request_was_told_stays_when_the_first_call_of_it_is_dropped() {
+        let (actor, session, _directory) = with_an_arm().await;
+        let first = call(&actor, &session, 1, true).await;
+        let mut second = call(&actor, &session, 2, true).await;
+        let third = call(&actor, &session, 3, true).await;
+        // Read by its client, as the service does it.
+        second.answered.take().unwrap().await.unwrap().unwrap();
+        for unread in [first, third] {
+            drop(unread);
+            assert!(!is_free(&actor).await, "the client of the second call holds it");
+        }
+        call(&actor, &session, 4, false).await;
+        assert!(!is_free(&actor).await, "the client of the second call holds it");
+    }
+
+    #[tokio::test]
+    async fn a_lease_goes_back_when_the_first_call_and_those_that_repeated_it_are_all_dropped() {
+        let (actor, session, _directory) = with_an_arm().await;
+        let mut calls = Vec::new();
+        for (ticket, waits) in [(1, true), (2, true), (3, false)] {
+            calls.push(call(&actor, &session, ticket, waits).await);
+            assert!(!is_free(&actor).await);
+        }
+        calls.pop();
+        calls.pop();
+        assert!(!is_free(&actor).await);
+        calls.pop();
+        assert!(is_free(&actor).await);
+    }
 }

@@ -1,9 +1,11 @@
 //! The calls that wait in the queue, and what is undone where one was dropped.
 
-use super::{ResourceCore, ResourceDesk};
+use super::{ResourceCore, ResourceDesk, Said};
 use crate::resource_manager::Granted;
 use ratn_model::id::LeaseId;
+use ratn_model::resource::Lease;
 use ratn_resources::WaiterId;
+use tokio::sync::oneshot;
 
 impl ResourceCore {
     pub(super) fn abandon(&mut self, ticket: u64, desk: &ResourceDesk) {
@@ -25,6 +27,28 @@ impl ResourceCore {
         tracing::debug!(%lease, "granted to a call that was dropped: taken back");
         // Unknown when it has ended meanwhile.
         let _ = self.pool.undo_grant(desk.now(), lease);
+    }
+
+    /// A repeated request is told the lease that it was granted before. Its first call may be dropped without having been read: the
+    /// lease stays for whoever reads this answer.
+    pub(super) fn grant_again(
+        &mut self,
+        ticket: u64,
+        lease: Lease,
+        call: oneshot::Sender<Granted>,
+        desk: &mut ResourceDesk,
+    ) {
+        *self.shared.entry(lease.id).or_insert(1) += 1;
+        self.repeated.insert(ticket, (lease, call));
+        desk.say(Said::GrantedAgain { ticket });
+    }
+
+    pub(super) fn answer_again(&mut self, ticket: u64, desk: &ResourceDesk) {
+        let Some((lease, call)) = self.repeated.remove(&ticket) else { return };
+        let id = lease.id;
+        if call.send(Ok(lease)).is_err() {
+            self.give_back(id, desk);
+        }
     }
 
     /// How many calls took it.

@@ -20,7 +20,8 @@ impl ResourceCore {
                 match self.answer(waiter, Ok(lease)) {
                     0 => self.give_back(id, desk),
                     1 => {}
-                    calls => drop(self.shared.insert(id, calls)),
+                    // Repeated since, perhaps.
+                    calls => *self.shared.entry(id).or_insert(1) += calls - 1,
                 }
             }
             Notice::Refused { waiter, refusal } => {

@@ -19,6 +19,7 @@ use crate::durable_actor::{self, Core, Desk, Journal, JournalError};
 use crate::metrics::{self, Amounts};
 use message::{Ping, most_urgent_first};
 use ratn_model::id::LeaseId;
+use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::ResourceUpdate;
 use ratn_resources::{Notice, Pool, PoolError, Reply, Request, SessionId, Speaker, WaiterId};
@@ -44,8 +45,10 @@ pub(super) struct ResourceCore {
     /// Who waits for the answer of which waiter; a repeated request joins.
     calls: BTreeMap<WaiterId, Vec<(u64, oneshot::Sender<Granted>)>>,
     tickets: BTreeMap<u64, WaiterId>,
-    /// How many calls got a lease, where a repeated request had joined: as many have to be dropped before it goes back.
+    /// How many calls got a lease, where its request was repeated: as many have to be dropped before it goes back.
     shared: BTreeMap<LeaseId, usize>,
+    /// Calls that repeat a request that was granted, until they are answered; by ticket.
+    repeated: BTreeMap<u64, (Lease, oneshot::Sender<Granted>)>,
     /// What waits for more than exists.
     demand: Vec<ratn_resources::Demand>,
     /// What of it is asked of whom.
@@ -66,17 +69,27 @@ pub(super) fn start(
         calls: BTreeMap::new(),
         tickets: BTreeMap::new(),
         shared: BTreeMap::new(),
+        repeated: BTreeMap::new(),
         demand: Vec::new(),
         providers: Providers::new(live.borrow().provider_patience()),
     };
     durable_actor::start(core, journal, live, draining, over)
 }
 
+/// What leaves when its records are on the disk, besides direct answers.
+#[derive(Debug)]
+pub(super) enum Said {
+    /// Of the pool.
+    Notice(Notice),
+    /// To a call that repeated its request after that was granted.
+    GrantedAgain { ticket: u64 },
+}
+
 impl Core for ResourceCore {
     type State = Pool;
     type Message = Message;
     type Urgent = Ping;
-    type Said = Notice;
+    type Said = Said;
     type Update = Arc<ResourceUpdate>;
     type Signal = ResourceManagerConfig;
 
@@ -87,6 +100,9 @@ impl Core for ResourceCore {
     fn restore(&mut self, journal: &Journal, desk: &ResourceDesk) -> Result<(), JournalError> {
         let stopped = desk.stopped().map_or_else(ending, |stopped| stopped.status.clone());
         for (_, call) in std::mem::take(&mut self.calls).into_values().flatten() {
+            let _ = call.send(Err(stopped.clone()));
+        }
+        for (_, call) in std::mem::take(&mut self.repeated).into_values() {
             let _ = call.send(Err(stopped.clone()));
         }
         self.tickets.clear();
@@ -142,8 +158,7 @@ impl Core for ResourceCore {
                         self.tickets.insert(ticket, waiter);
                         self.calls.entry(waiter).or_default().push((ticket, answer));
                     }
-                    // Repeated after the grant: whoever asks again has it already, so a dropped call keeps it.
-                    Ok(Reply::Granted(lease)) => desk.reply(answer, Ok(lease)),
+                    Ok(Reply::Granted(lease)) => self.grant_again(ticket, lease, answer, desk),
                     Ok(reply) => debug_assert!(false, "an acquire is queued or granted, not {reply:?}"),
                     Err(error) => desk.reply(answer, Err(status::of_error(&error))),
                 }
@@ -204,12 +219,15 @@ impl Core for ResourceCore {
 
     fn collect(&mut self, desk: &mut ResourceDesk) {
         for notice in self.pool.take_notices() {
-            desk.say(notice);
+            desk.say(Said::Notice(notice));
         }
     }
 
-    fn hand_out(&mut self, notice: Notice, desk: &mut ResourceDesk) {
-        self.notify(notice, desk);
+    fn hand_out(&mut self, said: Said, desk: &mut ResourceDesk) {
+        match said {
+            Said::Notice(notice) => self.notify(notice, desk),
+            Said::GrantedAgain { ticket } => self.answer_again(ticket, desk),
+        }
     }
 
     fn order(messages: &mut [Message]) {
