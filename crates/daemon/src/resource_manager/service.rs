@@ -593,8 +593,8 @@ mod tests {
     }
 
     async fn is_free(actor: &Handle) -> bool {
-        let (views, _) = actor.ask(|answer| Message::List { answer }).await.unwrap();
-        views[0].free == 1
+        let id = "Arm-1".to_owned();
+        actor.ask(|answer| Message::Get { id, answer }).await.unwrap().unwrap().free == 1
     }
 
     #[tokio::test]
