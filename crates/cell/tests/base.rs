@@ -7,7 +7,6 @@ mod bench;
 use bench::{Bench, grasp};
 use ratn_cell::config::CellConfig;
 use ratn_cell::core::protocol::{Command, Ending, Event, Module, Product, Request};
-use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
 use ratn_motion::aimm;
@@ -117,7 +116,7 @@ fn nothing_else_begins_while_the_base_drives_and_it_does_not_drive_while_anythin
     let mut bench = Bench::new(1, 7);
     stow(&mut bench);
     let request = drive(&bench, [-1.5, 0.0, 0.0]);
-    bench.start(None, request.clone());
+    bench.start(request.clone());
     bench.pass(1.0);
     for other in [
         Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 },
@@ -125,7 +124,7 @@ fn nothing_else_begins_while_the_base_drives_and_it_does_not_drive_while_anythin
         Request::LookAt { target: aimm::TABLE_CENTRE },
         Request::Capture { frames: 1 },
     ] {
-        let (_, refused) = bench.start(None, other);
+        let (_, refused) = bench.start(other);
         assert!(
             matches!(&refused[..], [Command::Ended { ending: Ending::Aborted(r), .. }] if r.contains("block `Base`")),
             "{refused:?}"
@@ -133,27 +132,27 @@ fn nothing_else_begins_while_the_base_drives_and_it_does_not_drive_while_anythin
     }
     bench.pass(60.0);
     let back = drive(&bench, [0.0; 3]);
-    bench.start(None, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
-    let (_, refused) = bench.start(None, back);
+    bench.start(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+    let (_, refused) = bench.start(back);
     assert!(matches!(&refused[..], [Command::Ended { ending: Ending::Aborted(r), .. }] if r.contains("Arm")));
 }
 
 #[test]
-fn a_base_whose_lease_ends_holds_where_it_is_as_at_an_emergency_stop() {
-    for by_lease in [true, false] {
+fn a_base_that_is_to_stop_holds_where_it_is_as_at_an_emergency_stop() {
+    for by_goal in [true, false] {
         let mut bench = Bench::new(1, 7);
         stow(&mut bench);
         let request = drive(&bench, [-2.0, 0.0, FRAC_PI_2]);
-        let (ticket, none) = bench.start(Some(LeaseId(5)), request);
+        let (ticket, none) = bench.start(request);
         assert_eq!(none, vec![]);
         bench.pass(2.0);
-        let event = match by_lease {
-            true => Event::LeaseEnded { lease: LeaseId(5), reason: "session expired".to_owned() },
+        let event = match by_goal {
+            true => Event::Stop { ticket, reason: "session expired".to_owned() },
             false => Event::Safety { state: SafetyState::Stopped { reason: "a person".to_owned() } },
         };
         let commands = bench.cell.handle(bench.now, event);
-        let ended = |ending: &Ending| match by_lease {
-            true => matches!(ending, Ending::Aborted(r) if r.contains("session expired")),
+        let ended = |ending: &Ending| match by_goal {
+            true => matches!(ending, Ending::Preempted(r) if r.contains("session expired")),
             false => matches!(ending, Ending::Stopped(r) if r == "a person"),
         };
         assert!(
@@ -173,7 +172,7 @@ fn a_hold_pauses_a_drive_and_it_goes_on_to_its_end_afterwards() {
     let mut bench = Bench::new(1, 7);
     stow(&mut bench);
     let request = drive(&bench, [-1.0, 0.0, 0.0]);
-    bench.start(None, request);
+    bench.start(request);
     bench.pass(1.0);
     bench.cell.handle(bench.now, Event::Safety { state: SafetyState::Held { reason: "a door".to_owned() } });
     let held = bench.cell.base_pose();

@@ -6,7 +6,6 @@ use ratn_cell::config::{CellConfig, ControllersConfig, Goods};
 use ratn_cell::core::picture::develop;
 use ratn_cell::core::protocol::{Command, Ending, Event, Module, Product, Request, Ticket};
 use ratn_cell::core::recording::Line;
-use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::value::{Trajectory, TrajectoryPoint};
 use ratn_motion::aimm;
@@ -108,17 +107,17 @@ fn a_trajectory_that_collides_or_starts_elsewhere_is_refused_with_the_reason() {
 }
 
 #[test]
-fn an_arm_whose_lease_ends_in_mid_motion_is_held_where_it_was() {
+fn an_arm_that_is_to_stop_in_mid_motion_is_held_where_it_was() {
     let mut bench = Bench::new(1, 7);
-    let (ticket, none) = bench.start(Some(LeaseId(5)), Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+    let (ticket, none) = bench.start(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
     assert_eq!(none, vec![]);
     assert_eq!(bench.pass(1.5), vec![]);
-    let other = Event::LeaseEnded { lease: LeaseId(4), reason: "released".to_owned() };
+    let other = Event::Stop { ticket: Ticket(99), reason: "released".to_owned() };
     assert_eq!(bench.cell.handle(bench.now, other), vec![]);
-    let ended = Event::LeaseEnded { lease: LeaseId(5), reason: "session expired".to_owned() };
+    let ended = Event::Stop { ticket, reason: "session expired".to_owned() };
     let commands = bench.cell.handle(bench.now, ended);
     assert!(
-        matches!(&commands[..], [Command::Ended { ticket: t, ending: Ending::Aborted(reason), .. }]
+        matches!(&commands[..], [Command::Ended { ticket: t, ending: Ending::Preempted(reason), .. }]
             if *t == ticket && reason.contains("session expired")),
         "{commands:?}"
     );
@@ -133,11 +132,11 @@ fn an_arm_whose_lease_ends_in_mid_motion_is_held_where_it_was() {
 #[test]
 fn a_stopped_motion_is_preempted_and_a_second_goal_for_a_busy_module_refused() {
     let mut bench = Bench::new(1, 7);
-    let (ticket, _) = bench.start(None, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+    let (ticket, _) = bench.start(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
     bench.pass(1.0);
-    let (second, refused) = bench.start(None, Request::MoveTo { joints: aimm::HOME, speed: 0.3 });
+    let (second, refused) = bench.start(Request::MoveTo { joints: aimm::HOME, speed: 0.3 });
     assert!(matches!(&refused[..], [Command::Ended { ticket, ending: Ending::Aborted(_), .. }] if *ticket == second));
-    let (_, refused) = bench.start(None, grasp());
+    let (_, refused) = bench.start(grasp());
     assert!(matches!(&refused[..], [Command::Ended { ending: Ending::Aborted(r), .. }] if r.contains("Arm")));
     let stopped = bench.cell.handle(bench.now, Event::Stop { ticket, reason: "cancelled".to_owned() });
     let [Command::Ended { ticket: ended, ending: Ending::Preempted(reason), tracking: Some(_) }] = &stopped[..] else {
@@ -177,8 +176,8 @@ fn a_picture_takes_its_time_and_one_of_a_moving_arm_has_several_exposures() {
     assert!((bench.now.since(before).as_secs_f64() - 3.0).abs() < 1e-6);
     assert_eq!(exposures.iter().map(|e| e.frames).collect::<Vec<_>>(), vec![30]);
 
-    bench.start(None, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
-    let (_, none) = bench.start(None, Request::Capture { frames: 5 });
+    bench.start(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+    let (_, none) = bench.start(Request::Capture { frames: 5 });
     assert_eq!(none, vec![]);
     let commands = bench.pass(0.5);
     let [Command::Ended { ending: Ending::Done(Product::Captured { exposures, .. }), .. }] = &commands[..] else {
@@ -291,33 +290,6 @@ fn a_motion_that_takes_hours_is_refused_and_not_checked_posture_by_posture() {
     assert!(matches!(bench.perform(crawling), Ending::Aborted(reason) if reason.contains("speed")));
 }
 
-#[test]
-fn nothing_begins_under_a_lease_that_has_ended_or_may_have() {
-    let mut bench = Bench::new(1, 1);
-    let refused = |bench: &mut Bench, lease| {
-        let (_, commands) = bench.start(Some(LeaseId(lease)), Request::Release);
-        match &commands[..] {
-            [] => {
-                bench.pass(60.0);
-                false
-            }
-            [Command::Ended { ending: Ending::Aborted(reason), .. }] => reason.contains("lease"),
-            other => panic!("{other:?}"),
-        }
-    };
-    assert!(!refused(&mut bench, 5), "nothing is known yet");
-    bench.cell.handle(bench.now, Event::LeasesAre { living: [LeaseId(4)].into(), youngest: LeaseId(6) });
-    assert_eq!([4, 5, 6, 7].map(|lease| refused(&mut bench, lease)), [false, true, true, false]);
-    bench.cell.handle(bench.now, Event::LeaseBegan { lease: LeaseId(8) });
-    assert_eq!([7, 8].map(|lease| refused(&mut bench, lease)), [true, false]);
-    bench.cell.handle(bench.now, Event::LeaseEnded { lease: LeaseId(8), reason: "released".to_owned() });
-    assert!(refused(&mut bench, 8));
-    bench.cell.handle(bench.now, Event::LeasesLost { reason: "silence".to_owned() });
-    assert!(refused(&mut bench, 4));
-    bench.cell.handle(bench.now, Event::LeasesAre { living: [LeaseId(4)].into(), youngest: LeaseId(8) });
-    assert!(!refused(&mut bench, 4));
-}
-
 fn safety(bench: &mut Bench, state: SafetyState) -> Vec<Command> {
     bench.cell.handle(bench.now, Event::Safety { state })
 }
@@ -331,7 +303,7 @@ fn a_held_motion_stands_still_and_then_takes_the_rest_of_its_time() {
         bench.now.seconds()
     };
     let mut bench = Bench::new(1, 1);
-    let (ticket, none) = bench.start(None, observation());
+    let (ticket, none) = bench.start(observation());
     assert!(none.is_empty() && bench.pass(whole_s / 2.0).is_empty());
     assert!(safety(&mut bench, SafetyState::Held { reason: "a look".to_owned() }).is_empty());
     let here = bench.arm();
@@ -339,7 +311,7 @@ fn a_held_motion_stands_still_and_then_takes_the_rest_of_its_time() {
     assert!(bench.pass(3600.0).is_empty());
     assert_eq!(bench.arm(), here);
     // What is begun meanwhile does not move either.
-    let (head, none) = bench.start(None, Request::LookAt { target: [0.8, 0.0, 0.7] });
+    let (head, none) = bench.start(Request::LookAt { target: [0.8, 0.0, 0.7] });
     let looks = bench.cell.configuration().pan;
     assert!(none.is_empty() && bench.pass(60.0).is_empty() && bench.cell.configuration().pan == looks);
 
@@ -367,8 +339,8 @@ fn a_held_motion_stands_still_and_then_takes_the_rest_of_its_time() {
 #[test]
 fn an_emergency_stop_ends_whatever_moves_and_whatever_is_begun_until_it_is_cleared() {
     let mut bench = Bench::new(1, 1);
-    let (arm, _) = bench.start(None, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 });
-    let (head, _) = bench.start(None, Request::LookAt { target: [0.8, 0.0, 0.7] });
+    let (arm, _) = bench.start(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 });
+    let (head, _) = bench.start(Request::LookAt { target: [0.8, 0.0, 0.7] });
     bench.pass(0.2);
     let stop = SafetyState::Stopped { reason: "a hand".to_owned() };
     let stopped = |commands: &[Command]| -> Vec<Ticket> {
@@ -382,7 +354,7 @@ fn an_emergency_stop_ends_whatever_moves_and_whatever_is_begun_until_it_is_clear
     let here = bench.arm();
     assert!(bench.pass(60.0).is_empty() && bench.arm() == here);
     assert!(safety(&mut bench, stop).is_empty());
-    let (late, refused) = bench.start(None, Request::Release);
+    let (late, refused) = bench.start(Request::Release);
     assert_eq!(stopped(&refused), [late]);
 
     // What was stopped does not go on by itself.
@@ -411,7 +383,7 @@ fn a_motion_lags_a_little_and_settles_and_a_weak_controller_gives_up_with_the_re
 
     let controllers = ControllersConfig { arm_stiffness: 4.0, ..ControllersConfig::default() };
     let mut weak = Bench::of(CellConfig { boxes: 1, seed: 7, controllers, ..CellConfig::default() });
-    let (ticket, _) = weak.start(None, request);
+    let (ticket, _) = weak.start(request);
     let commands = weak.pass(60.0);
     let [Command::Ended { ticket: ended, ending: Ending::Aborted(reason), tracking: Some(tracking) }] = &commands[..]
     else {

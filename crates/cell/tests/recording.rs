@@ -26,7 +26,7 @@ fn eventful() -> Vec<String> {
         bench.perform(Request::Capture { frames: 2 });
     }
     bench.pass(10.0);
-    bench.start(None, Request::SenseArm);
+    bench.start(Request::SenseArm);
     bench.lines.iter().map(|line| serde_json::to_string(line).unwrap()).collect()
 }
 
@@ -106,7 +106,7 @@ fn a_cell_put_back_goes_on_as_it_did_with_the_box_still_in_its_fingers() {
 fn a_goal_under_way_ends_when_the_cell_is_put_back() {
     let mut bench = Bench::new(1, 4);
     let snapshot = saved(&mut bench);
-    bench.start(None, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
+    bench.start(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
     bench.pass(1.0);
     let commands = bench.cell.handle(bench.now, Event::PutBack { snapshot });
     assert!(

@@ -4,8 +4,9 @@
 
 use ratn_cell::config::CellConfig;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
+use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::pose::Pose;
-use ratn_model::resource::{Lease, Requirement, ResourceOperation};
+use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceOperation};
 use ratn_model::value::Value;
 use ratn_motion::aimm;
 use ratn_motion::collision::distance;
@@ -425,5 +426,47 @@ async fn a_motion_is_held_and_goes_on_and_an_emergency_stop_ends_it_also_for_a_c
     let driver = SafetyClient::new(&system.channels, &cell).unwrap();
     assert_eq!(driver.state().await.unwrap(), SafetyState::Stopped { reason: "a hand".to_owned() });
     assert_eq!(driver.clear().await.unwrap(), SafetyState::Ready);
+    system.end.cancel();
+}
+
+/// As [`System::execute`], with a lease that may be anything; refusals are statuses.
+async fn claim(system: &System, lease: Lease) -> Result<GoalOutcome, CallError> {
+    let inputs = to_observation().map(|(port, value)| (port.to_owned(), value)).into();
+    let goal = Goal { id: fresh_id("goal"), action: "move_to".to_owned(), inputs, lease: Some(lease), ..goal() };
+    ActionClient::new(system.channels.clone()).execute(&system.cell, goal, |_, _| {}).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_forged_lease_neither_moves_the_arm_nor_keeps_its_next_holder_from_it() {
+    let system = system(20.0, 1).await;
+    let camera = system.acquire(&["Camera"]).await;
+    let released = system.acquire(&["Arm"]).await;
+    system.resources.release(released.id).await.unwrap();
+    let arm = LeasedResource {
+        id: "arm@sim".to_owned(),
+        kind: "Arm".to_owned(),
+        endpoint: system.cell.to_string(),
+        superclasses: Vec::new(),
+    };
+    let forged = |id: LeaseId, token: FencingToken| Lease { id, token, resources: vec![arm.clone()] };
+    let most = FencingToken(u64::MAX);
+    for (what, lease) in [
+        ("made up", forged(LeaseId(u64::MAX), most)),
+        ("made up, small", forged(LeaseId(1), most)),
+        ("of another resource", forged(camera.id, camera.token)),
+        ("released a moment ago", released.clone()),
+        ("released, with another token", forged(released.id, most)),
+    ] {
+        let refused = claim(&system, lease).await.unwrap_err();
+        assert!(!refused.is_crash() && refused.code() == Some(tonic::Code::FailedPrecondition), "{what}: {refused}");
+    }
+    assert_eq!(system.arm().await, aimm::HOME);
+
+    let holder = system.acquire(&["Arm"]).await;
+    let copied = forged(holder.id, most);
+    assert!(claim(&system, copied).await.is_err_and(|error| error.to_string().contains("token")));
+    assert_eq!(system.arm().await, aimm::HOME);
+    let moved = claim(&system, holder).await.unwrap();
+    assert!(moved.is_success(), "{moved:?}");
     system.end.cancel();
 }

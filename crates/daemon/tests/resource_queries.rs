@@ -8,7 +8,7 @@ use ratn_model::condition::{Comparison, Condition};
 use ratn_model::id::Revision;
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_model::value::Value;
-use ratn_proto::types::{Resource, ResourceEvent, ResourceFilter, ResourceUpdate};
+use ratn_proto::types::{Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_resources::Limits;
@@ -148,6 +148,51 @@ async fn a_watch_goes_on_from_a_revision_without_a_gap_or_is_told_that_it_cannot
     let mut watch = a.resources.watch_from(&[], Some(Revision(18).into())).await.unwrap();
     let ids = [next_event(&mut watch).await, next_event(&mut watch).await, next_event(&mut watch).await];
     assert_eq!(ids.map(|event| event.resource.id), ["gripper-18", "gripper-19", "last"]);
+}
+
+#[tokio::test]
+async fn a_watch_of_some_resources_hears_of_no_others() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    for id in ["a", "b"] {
+        a.resources.create(gripper(id, 1.0)).await.unwrap();
+    }
+    let mut watch = a.resources.watch_resources(["b".to_owned()]).await.unwrap();
+    let Some(ResourceUpdate::Snapshot { resources, .. }) = in_time(watch.next()).await.unwrap() else { panic!() };
+    assert_eq!(resources.iter().map(|resource| resource.id.as_str()).collect::<Vec<_>>(), ["b"]);
+    let both = Requirement { count: 2.into(), ..block("Gripper") };
+    let lease = a.resources.acquire(vec![both], AcquireOptions::default()).await.unwrap();
+    a.resources.release(lease.id).await.unwrap();
+    for kind in [ResourceEventKind::Leased, ResourceEventKind::Released] {
+        let event = next_event(&mut watch).await;
+        assert_eq!((event.kind, event.resource.id.as_str(), event.lease.unwrap().0), (kind, "b", lease.id));
+    }
+
+    let mut raw = ResourceServiceClient::new(system.channels.get(&manager.endpoint).unwrap());
+    for (many, refused) in [(1_024, false), (1_025, true)] {
+        let resource_ids = (0..many).map(|i| format!("r-{i}")).collect();
+        let request = v1::ResourceServiceWatchRequest { resource_ids, ..Default::default() };
+        let watch = in_time(raw.watch(request)).await;
+        assert_eq!(watch.as_ref().is_err_and(|status| status.message().contains("at most 1024")), refused, "{watch:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_grant_says_whose_it_is() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(gripper("a", 1.0)).await.unwrap();
+    let mut raw = ResourceServiceClient::new(system.channels.get(&manager.endpoint).unwrap());
+    let request = v1::BlockRequest {
+        session_id: a.session.id().to_owned(),
+        requirement: Some(block("Gripper").into()),
+        deadline_ms: 1_000,
+        ..Default::default()
+    };
+    let granted = in_time(raw.block(request)).await.unwrap().into_inner();
+    assert_eq!(granted.lease.unwrap().session_id, a.session.id());
 }
 
 #[tokio::test]

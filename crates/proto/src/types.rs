@@ -459,6 +459,8 @@ pub struct Goal {
     pub seed: u64,
     /// What the action may use; the provider is in it.
     pub lease: Option<Lease>,
+    /// The session that holds the lease; empty where that is not said.
+    pub session: String,
     /// The world that it works on.
     pub projection: Option<ProjectionId>,
     /// Where the world pool is; empty where the action needs none.

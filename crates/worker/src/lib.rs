@@ -13,8 +13,8 @@
 //! # Performing actions
 //! - [`action::Action`]: the trait; [`action::GoalContext`]: inputs by type (`goal.input_joints("start")?`), `seed`, `lease`,
 //!   `cancelled`, `progress("…")`, `world(&patterns)`, `call("Camera", "capture", inputs)`.
-//! - [`action::ActionServer`]: fencing, idempotent goals, one at a time where asked, cancel, bounded results; for leases that
-//!   end: `end_lease(id, reason)`.
+//! - [`action::ActionServer`]: fencing, idempotent goals, one at a time where asked, cancel, bounded results.
+//! - [`lease_watch::LeaseWatch`]: who holds this provider's resources, by the resource manager's word; goals end with their lease.
 //! - [`worker::Worker`]: all of it in one builder, for `ratn worker …`.
 //! - [`safety::Safety`]: emergency stop and hold, for drivers of what moves; [`safety::SafetyClient`] asks for them.
 //!
@@ -32,6 +32,7 @@ pub mod adoption;
 pub mod client;
 pub mod endpoint;
 pub mod gate;
+pub mod lease_watch;
 pub mod multiplex;
 pub mod provider;
 pub mod robot_clock;

@@ -2,11 +2,13 @@
 //!
 //! A pooled worker only serves: its process manager makes its resource once gRPC health says SERVING, and knows where it
 //! is by the socket that it named (`listen unix:…`) or by the endpoint file that the worker writes. A worker that stands
-//! alone is given the resource manager and offers its resource itself.
+//! alone is given the resource manager and offers its resource itself. Either performs goals only under leases that the resource
+//! manager confirms; a pooled one is told where that is by `RATN_RESOURCE_MANAGER`.
 
 use crate::action::{Action, ActionServer, ActionServerBuilder};
 use crate::client::{CallError, Channels};
-use crate::endpoint::Endpoint;
+use crate::endpoint::{Endpoint, EndpointError};
+use crate::lease_watch::{LeaseWatch, ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use crate::provider::Provider;
 use crate::runtime_directory::publish_file;
 use crate::safety::Safety;
@@ -18,11 +20,12 @@ use ratn_proto::types::Resource;
 use std::io;
 use std::path::PathBuf;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
 
 /// What a worker is told by whoever starts it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorkerOptions {
-    /// Its resource's id, by which leases are checked; empty asks for no lease.
+    /// Its resource's id: goals need a lease of it, which the resource manager confirms; empty asks for no lease.
     pub id: String,
     /// Its resource's kind, `PathPlanner`.
     pub kind: String,
@@ -32,7 +35,7 @@ pub struct WorkerOptions {
     pub endpoint_file: Option<PathBuf>,
     /// Ends when its standard input does.
     pub exit_with_parent: bool,
-    /// Offers its resource there by itself. Not for pooled workers.
+    /// Offers its resource there by itself. Not for pooled workers, which `RATN_RESOURCE_MANAGER` tells where to have leases confirmed.
     pub resource_manager: Option<Endpoint>,
     /// The host that it says it is on, when it offers its resource.
     pub host: String,
@@ -64,6 +67,18 @@ pub enum WorkerError {
     /// It cannot serve.
     #[error("the worker cannot serve")]
     Serve(#[from] ServeError),
+    /// Nobody says where the resource manager is.
+    #[error(
+        "goals of worker `{id}` need a lease, and nobody says which resource manager confirms it: set {RESOURCE_MANAGER_VARIABLE} to its \
+         endpoint, or to file:PATH where PATH holds that, or give the worker no id"
+    )]
+    NoManager {
+        /// The worker's resource.
+        id: String,
+    },
+    /// What the environment says of the resource manager is no location.
+    #[error("{RESOURCE_MANAGER_VARIABLE}")]
+    Location(#[source] EndpointError),
     /// The resource manager does not want it.
     #[error("the worker's resource is refused")]
     Resource(#[from] CallError),
@@ -84,6 +99,7 @@ pub struct Worker {
     options: WorkerOptions,
     actions: ActionServerBuilder,
     safety: Option<Safety>,
+    believes: bool,
     shutdown: CancellationToken,
 }
 
@@ -91,7 +107,7 @@ impl Worker {
     /// A worker without actions that takes one goal at a time.
     pub fn new(options: WorkerOptions) -> Worker {
         let actions = ActionServer::builder(options.id.clone()).one_at_a_time();
-        Worker { options, actions, safety: None, shutdown: CancellationToken::new() }
+        Worker { options, actions, safety: None, believes: false, shutdown: CancellationToken::new() }
     }
 
     /// With an action.
@@ -108,6 +124,13 @@ impl Worker {
         self
     }
 
+    /// **For tests only.** Believes whatever a goal says of its lease: whoever reaches the worker has it do what it does.
+    #[must_use]
+    pub fn dangerously_believe_every_lease(mut self) -> Worker {
+        self.believes = true;
+        self
+    }
+
     /// Ends when `shutdown` is cancelled, too.
     #[must_use]
     pub fn shutdown(mut self, shutdown: CancellationToken) -> Worker {
@@ -120,7 +143,7 @@ impl Worker {
     /// # Errors
     /// [`WorkerError`].
     pub async fn run(self) -> Result<(), WorkerError> {
-        let Worker { options, mut actions, safety, shutdown } = self;
+        let Worker { options, mut actions, safety, believes, shutdown } = self;
         let system = |what: &str| {
             let what = what.to_owned();
             move |source| WorkerError::System { what, source }
@@ -130,6 +153,20 @@ impl Worker {
             shutdown::exit_with_parent(&shutdown).map_err(system("watch its parent"))?;
         }
         let channels = Channels::new();
+        let leases = LeaseWatch::of([options.id.clone()]);
+        let location = match options.id.is_empty() || believes || options.resource_manager.is_some() {
+            true => None,
+            false => match ManagerLocation::from_environment().map_err(WorkerError::Location)? {
+                Some(location) => Some(location),
+                None => return Err(WorkerError::NoManager { id: options.id }),
+            },
+        };
+        actions = if believes { actions.dangerously_believe_every_lease() } else { actions.leases(&leases) };
+        let watching = location.map(|location| {
+            let (leases, channels) = (leases.clone(), channels.clone());
+            let watch = async move { leases.follow_location(&channels, location, DEFAULT_TTL).await };
+            AbortOnDropHandle::new(tokio::spawn(watch))
+        });
         if let Some(safety) = &safety {
             actions = actions.safety(safety.clone());
         }
@@ -154,18 +191,19 @@ impl Worker {
             None => None,
         };
         let offered = match &options.resource_manager {
-            Some(manager) => Some(offer(&channels, manager, &options, &endpoint).await?),
+            Some(manager) => Some(offer(&channels, manager, &options, &endpoint, &leases).await?),
             None => None,
         };
         tracing::info!(id = %options.id, %endpoint, "serving");
 
         shutdown.cancelled().await;
         drop(published);
-        if let Some((session, provider)) = offered {
-            drop(provider);
+        if let Some(Offered { session, provider, watching }) = offered {
+            drop((provider, watching));
             session.close().await;
         }
         let stopping = server.shut_down();
+        drop(watching);
         let (served, ()) = tokio::join!(serving, async {
             let _ = tokio::time::timeout(crate::server::DRAIN_DEADLINE, stopping).await;
         });
@@ -176,17 +214,27 @@ impl Worker {
     }
 }
 
+/// What a worker offers by itself.
+struct Offered {
+    session: Session,
+    provider: Provider,
+    watching: AbortOnDropHandle<()>,
+}
+
 async fn offer(
     channels: &Channels,
     manager: &Endpoint,
     options: &WorkerOptions,
     endpoint: &Endpoint,
-) -> Result<(Session, Provider), CallError> {
+    leases: &LeaseWatch,
+) -> Result<Offered, CallError> {
     let session = Session::open(channels, manager, &options.id, DEFAULT_TTL);
+    let watch = leases.follow_session(channels, manager, &session, DEFAULT_TTL)?;
+    let watching = AbortOnDropHandle::new(tokio::spawn(watch));
     let provider = Provider::start(channels, manager, &session)?;
     let resource = Resource::new(&options.id, ResourceClass::Process, &options.kind)
         .with_endpoint(endpoint)
         .on_host(&options.host);
     provider.offer(resource).await?;
-    Ok((session, provider))
+    Ok(Offered { session, provider, watching })
 }

@@ -4,7 +4,6 @@
 mod common;
 
 use common::{Provider, RESOURCE, begin, goal, lease, provider};
-use ratn_model::id::LeaseId;
 use ratn_model::value::Value;
 use ratn_proto::types::{Goal, GoalOutcome};
 use ratn_worker::client::CallError;
@@ -79,15 +78,6 @@ async fn a_newer_lease_takes_over_and_the_older_goal_ends_aborted() {
 }
 
 #[tokio::test]
-async fn a_lease_that_ends_aborts_the_goal_under_way() {
-    let provider = provider(None).await;
-    let waiting = begin(&provider, goal("a", "wait", 3)).await;
-    assert_eq!(provider.server.end_lease(LeaseId(4), "expired"), 0);
-    assert_eq!(provider.server.end_lease(LeaseId(3), "expired"), 1);
-    assert_eq!(waiting.await.unwrap().unwrap(), GoalOutcome::aborted("the lease ended: expired"));
-}
-
-#[tokio::test]
 async fn a_goal_goes_on_for_its_grace_when_its_client_leaves() {
     let provider = provider(None).await;
     let patient = |id, grace_ms| Goal { grace_ms, ..goal(id, "wait", 1) };
@@ -130,17 +120,6 @@ async fn the_same_goal_twice_runs_once() {
     assert!(provider.server.cancel("b"));
     assert_eq!(one.await.unwrap().unwrap(), other.await.unwrap().unwrap());
     assert_eq!(provider.server.running(), 0);
-}
-
-#[tokio::test]
-async fn a_result_is_forgotten_when_enough_newer_ones_are_kept() {
-    let provider = provider(None).await;
-    for id in ["a", "b", "c", "a"] {
-        run(&provider, goal(id, "double", 1)).await.unwrap();
-    }
-    assert_eq!(provider.runs.load(Ordering::SeqCst), 4);
-    run(&provider, goal("c", "double", 1)).await.unwrap();
-    assert_eq!(provider.runs.load(Ordering::SeqCst), 4);
 }
 
 #[tokio::test]

@@ -158,7 +158,8 @@ async fn a_worker_serves_from_its_options_and_leaves_nothing_behind() {
         ..WorkerOptions::default()
     };
     let shutdown = CancellationToken::new();
-    let worker = Worker::new(options).action(Double { runs: Default::default() }).shutdown(shutdown.clone());
+    let worker = Worker::new(options).dangerously_believe_every_lease();
+    let worker = worker.action(Double { runs: Default::default() }).shutdown(shutdown.clone());
     let running = tokio::spawn(worker.run());
     let endpoint = wait_for_file(&file, "worker", LONG).await.unwrap();
     wait_until_serving(&endpoint, LONG).await.unwrap();

@@ -57,12 +57,7 @@ async fn system() -> System {
     tokio::spawn(world_pool::run(WorldPoolConfig::default(), directory.clone(), CancellationToken::new()));
     let file = temporary.path().join("planner");
     let listen = Endpoint::Unix(temporary.path().join("planner.sock"));
-    let options = WorkerOptions {
-        id: RESOURCE.to_owned(),
-        listen,
-        endpoint_file: Some(file.clone()),
-        ..WorkerOptions::default()
-    };
+    let options = WorkerOptions { listen, endpoint_file: Some(file.clone()), ..WorkerOptions::default() };
     tokio::spawn(ratn_workers::path_planner::run(options, SPEED));
     let world_pool = directory.wait_for(world_pool::ROLE, DEADLINE).await.unwrap();
     let planner = wait_for_file(&file, "planner", DEADLINE).await.unwrap();

@@ -29,7 +29,9 @@ pub(crate) async fn serve() {
 }
 
 fn granted(request: &BlockRequest) -> BlockResponse {
-    BlockResponse { lease: Some(Lease { id: request.deadline_ms, token: 1, resources: Vec::new() }) }
+    BlockResponse {
+        lease: Some(Lease { id: request.deadline_ms, token: 1, resources: Vec::new(), session_id: String::new() }),
+    }
 }
 
 #[derive(Clone)]

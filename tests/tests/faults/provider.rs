@@ -6,21 +6,19 @@
 use crate::support::Place;
 use anyhow::Context;
 use nix::sys::signal::Signal;
-use ratn_model::id::LeaseId;
 use ratn_model::resource::ResourceClass;
-use ratn_proto::types::{GoalOutcome, Resource, ResourceEventKind, ResourceUpdate};
+use ratn_proto::types::{GoalOutcome, Resource};
 use ratn_worker::action::{Action, ActionFailure, ActionResult, ActionServer, GoalContext};
-use ratn_worker::client::{CallError, Channels, ResourceClient};
+use ratn_worker::client::Channels;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::provider::Provider;
 use ratn_worker::server::{Services, bind};
 use ratn_worker::session::Session;
-use std::collections::BTreeSet;
 use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
@@ -137,98 +135,30 @@ pub(crate) fn serve() -> anyhow::Result<()> {
 }
 
 async fn provide(socket: PathBuf, manager: Endpoint, file: File) -> anyhow::Result<()> {
-    let leases = Arc::new(Mutex::new(Leases::default()));
-    let action = Move { file, leases: leases.clone() };
-    let server = ActionServer::builder(TOOL).action(action).one_at_a_time().build();
+    let leases = LeaseWatch::of([TOOL]);
+    let server = ActionServer::builder(TOOL).action(Move { file }).one_at_a_time().leases(&leases).build();
     let bound = bind(&Endpoint::Unix(socket)).await?;
     let endpoint = bound.endpoint().clone();
-    let services = Services::new().with(server.clone().into_service());
-    tokio::spawn(bound.serve(services, CancellationToken::new()));
+    tokio::spawn(bound.serve(Services::new().with(server.into_service()), CancellationToken::new()));
 
     let channels = Channels::new();
     let session = Session::open_as(&channels, &manager, KIND.to_owned(), KIND, TTL);
     let provider = Provider::start(&channels, &manager, &session)?;
-    let client = ResourceClient::new(&channels, &manager, "")?;
-    let mut state = session.state();
-    loop {
-        state.wait_for(|state| state.alive).await?;
-        let generation = state.borrow().generation;
-        let resource = Resource::new(TOOL, ResourceClass::Module, KIND).with_endpoint(&endpoint);
-        let watching = async {
-            let watched = follow(&client, &provider, resource, &leases, &server).await;
-            eprintln!("the watch of leases ended: {watched:?}");
+    let watching = leases.follow_session(&channels, &manager, &session, TTL)?;
+    let resource = Resource::new(TOOL, ResourceClass::Module, KIND).with_endpoint(&endpoint);
+    let offering = async {
+        while let Err(error) = provider.offer(resource.clone()).await {
+            eprintln!("not offered: {error}");
             tokio::time::sleep(AGAIN).await;
-        };
-        let gone = async {
-            let _ = state.wait_for(|state| !state.alive || state.generation != generation).await;
-        };
-        tokio::select! {
-            biased;
-            () = gone => {
-                leases.lock().unwrap_or_else(PoisonError::into_inner).known = false;
-                server.shut_down().await;
-            }
-            () = watching => {}
         }
-    }
-}
-
-/// Which leases live, as the manager says.
-#[derive(Debug, Default)]
-struct Leases {
-    living: BTreeSet<LeaseId>,
-    youngest: LeaseId,
-    /// The manager was heard, and the session lives.
-    known: bool,
-}
-
-async fn follow(
-    client: &ResourceClient,
-    provider: &Provider,
-    resource: Resource,
-    leases: &Mutex<Leases>,
-    server: &ActionServer,
-) -> Result<(), CallError> {
-    let mut watch = client.watch(&[KIND]).await?;
-    let open = || leases.lock().unwrap_or_else(PoisonError::into_inner);
-    let ended = |lease: LeaseId, reason: &str| {
-        server.lease_has_ended(lease, reason);
-        open().living.remove(&lease);
-        server.end_lease(lease, reason);
     };
-    let mut offered = false;
-    while let Some(update) = watch.next().await? {
-        match update {
-            ResourceUpdate::Snapshot { resources, youngest, .. } => {
-                let living: BTreeSet<LeaseId> =
-                    resources.iter().flat_map(|one| one.holdings.iter().map(|holding| holding.lease)).collect();
-                let before = std::mem::replace(&mut *open(), Leases { living: living.clone(), youngest, known: true });
-                before.living.difference(&living).for_each(|lease| ended(*lease, "it is gone"));
-                if !std::mem::replace(&mut offered, true) {
-                    provider.offer(resource.clone()).await?;
-                }
-            }
-            ResourceUpdate::Event(event) => match (event.kind, event.lease) {
-                (ResourceEventKind::Leased, Some((lease, _))) => {
-                    let mut leases = open();
-                    leases.living.insert(lease);
-                    leases.youngest = leases.youngest.max(lease);
-                }
-                (ResourceEventKind::Released, Some((lease, _))) => ended(lease, "it was released"),
-                (ResourceEventKind::Deleted, _) => {
-                    event.resource.holdings.iter().for_each(|holding| ended(holding.lease, "the tool is gone"));
-                }
-                _ => {}
-            },
-        }
-    }
+    tokio::join!(watching, offering);
     Ok(())
 }
 
 /// Moves for some milliseconds.
 struct Move {
     file: File,
-    leases: Arc<Mutex<Leases>>,
 }
 
 #[tonic::async_trait]
@@ -242,19 +172,10 @@ impl Action for Move {
         let lease = goal.lease.clone().ok_or_else(|| ActionFailure::aborted("no lease"))?;
         for _ in 0..steps {
             goal.checkpoint()?;
-            self.check(lease.id)?;
             let line = format!("{} {} {} {}\n", goal.id, lease.id.0, lease.token.0, super::history::now());
             (&self.file).write_all(line.as_bytes())?;
             tokio::time::sleep(STEP).await;
         }
         Ok(GoalOutcome::success())
-    }
-}
-
-impl Move {
-    fn check(&self, lease: LeaseId) -> Result<(), ActionFailure> {
-        let leases = self.leases.lock().unwrap_or_else(PoisonError::into_inner);
-        let ended = lease <= leases.youngest && !leases.living.contains(&lease);
-        if leases.known && !ended { Ok(()) } else { Err(ActionFailure::aborted("its lease has ended, or may have")) }
     }
 }

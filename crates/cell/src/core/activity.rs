@@ -2,7 +2,6 @@
 
 use super::motion::{Motion, Tracking};
 use super::picture::Exposure;
-use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::robot::Joints;
@@ -33,7 +32,6 @@ pub enum Module {
 #[derive(Debug, Clone)]
 pub(crate) struct Activity {
     pub(crate) ticket: Ticket,
-    pub(crate) lease: Option<LeaseId>,
     pub(crate) started: Timestamp,
     pub(crate) ends: Timestamp,
     pub(crate) kind: Kind,

@@ -3,7 +3,6 @@
 //! ```text
 //! module:  idle ──Start──▶ active ──its time is over──▶ idle      (Ended: done, or aborted with the reason)
 //!                            ├──Stop──▶ idle, holds where it is   (Ended: preempted)
-//!                            ├──LeaseEnded──▶ idle, holds         (Ended: aborted)
 //!                            └──emergency stop──▶ idle, holds     (Ended: stopped)
 //! ```
 //! Time is the robot's and comes in with every event; what should have happened since the last one happens first, in its
@@ -16,7 +15,6 @@ use super::environment::Environment;
 use super::faults::Faults;
 use super::grasping::Pads;
 use super::holding::Held;
-use super::leases::Leases;
 use super::objects::{Placed, TrueObject};
 use super::picture::{Exposure, Scenery};
 use super::placement::{self, PlacementError, TABLE};
@@ -43,7 +41,6 @@ pub struct Cell {
     pub(super) safety: SafetyState,
     pub(super) resting: Configuration,
     pub(super) activities: BTreeMap<Module, Activity>,
-    pub(super) leases: Leases,
     pub(super) environment: Environment,
     /// The objects' names.
     pub(super) ids: Vec<String>,
@@ -86,7 +83,6 @@ impl Cell {
             safety: SafetyState::Ready,
             resting,
             activities: BTreeMap::new(),
-            leases: Leases::default(),
             environment,
             tilts: vec![0.0; ids.len()],
             ids,
@@ -107,31 +103,15 @@ impl Cell {
         let mut out = Vec::new();
         self.advance(now, &mut out);
         match event {
-            Event::Start { ticket, lease, request } => {
+            Event::Start { ticket, request } => {
                 let refused = match &self.safety {
                     SafetyState::Stopped { reason } => Some(Ending::Stopped(reason.clone())),
-                    _ => self.start(ticket, lease, request).err().map(Ending::Aborted),
+                    _ => self.start(ticket, request).err().map(Ending::Aborted),
                 };
                 out.extend(refused.map(|ending| Command::Ended { ticket, ending, tracking: None }));
             }
             Event::Stop { ticket, reason } => {
                 self.hold(|a| a.ticket == ticket, |_| Ending::Preempted(reason.clone()), &mut out);
-            }
-            Event::LeaseBegan { lease } => self.leases.began(lease),
-            Event::LeaseEnded { lease, reason } => {
-                self.leases.ended(lease);
-                let ending = |_: &Activity| Ending::Aborted(format!("its lease {lease} ended: {reason}; it holds"));
-                self.hold(|a| a.lease == Some(lease), ending, &mut out);
-            }
-            Event::LeasesLost { reason } => {
-                let ending = |_: &Activity| Ending::Aborted(format!("its lease may have ended: {reason}; it holds"));
-                self.hold(|a| a.lease.is_some(), ending, &mut out);
-                self.leases.lost(reason);
-            }
-            Event::LeasesAre { living, youngest } => {
-                let ending = |_: &Activity| Ending::Aborted("its lease has ended; it holds".to_owned());
-                self.hold(|a| a.lease.is_some_and(|lease| !living.contains(&lease)), ending, &mut out);
-                self.leases.are(living, youngest);
             }
             Event::Safety { state } => {
                 if let SafetyState::Stopped { reason } = &state {

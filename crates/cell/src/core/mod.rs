@@ -16,7 +16,6 @@ mod activity;
 mod battery;
 mod deviations;
 mod holding;
-mod leases;
 mod motion;
 mod passing;
 mod starting;

@@ -6,14 +6,12 @@ pub use super::motion::Tracking;
 use super::picture::Exposure;
 use super::snapshot::Snapshot;
 use crate::config::Goods;
-use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
 use ratn_motion::robot::Joints;
 use ratn_perception::camera::Camera;
 use ratn_worker::safety::SafetyState;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeSet;
 
 /// What happens to the cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -23,41 +21,15 @@ pub enum Event {
     Start {
         /// How the goal will be called.
         ticket: Ticket,
-        /// Under which lease.
-        lease: Option<LeaseId>,
         /// What to do.
         request: Request,
     },
-    /// A goal's giver wants it to stop, or is gone.
+    /// A goal is to stop: its giver wants that or is gone, or its lease has ended.
     Stop {
         /// Which goal.
         ticket: Ticket,
         /// Why.
         reason: String,
-    },
-    /// A lease was given.
-    LeaseBegan {
-        /// Which.
-        lease: LeaseId,
-    },
-    /// A lease is over.
-    LeaseEnded {
-        /// Which.
-        lease: LeaseId,
-        /// Why.
-        reason: String,
-    },
-    /// Nobody knows any more which leases live, until [`Event::LeasesAre`].
-    LeasesLost {
-        /// Why.
-        reason: String,
-    },
-    /// Only these leases live.
-    LeasesAre {
-        /// All of them.
-        living: BTreeSet<LeaseId>,
-        /// The last that was given, living or not.
-        youngest: LeaseId,
     },
     /// An emergency stop or a hold is in force from now on, or neither.
     Safety {

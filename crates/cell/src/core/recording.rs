@@ -1,7 +1,7 @@
 //! What happened to a cell, line by line, and the same cell made to go through it again.
 //!
 //! ```text
-//! {"form":1,"config":{…}}                                  first: how the cell was made
+//! {"form":2,"config":{…}}                                  first: how the cell was made
 //! {"at":…,"event":{…}}                                     what came in, in the robot's nanoseconds
 //! {"at":…,"ended":…,"how":"done"}                          what a goal came to
 //! {"at":…,"world":"…"}                                     after each event: the digest of the environment
@@ -19,7 +19,7 @@ use std::collections::VecDeque;
 use std::io;
 
 /// The form of what is written.
-const FORM: u32 = 1;
+const FORM: u32 = 2;
 
 /// One line.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,7 +1,7 @@
 //! The cell's state as a value: what it can be put back to, or made of in another process.
 //!
 //! No goal is part of it: who gave one is not there any more when it is restored, so every joint is where it had come to and holds.
-//! Leases and the emergency stop are not part of it either: they are about the world outside.
+//! The emergency stop is not part of it either: it is about the world outside.
 
 use super::battery::Battery;
 use super::cell::Cell;

@@ -6,7 +6,6 @@ use super::deviations::LOST;
 use super::motion::{Controller, Motion};
 use super::protocol::Request;
 use super::trajectory;
-use ratn_model::id::LeaseId;
 use ratn_motion::drive::wrapped;
 use ratn_motion::robot::Configuration;
 use ratn_motion::trajectory::{ArmTrajectory, BaseTrajectory};
@@ -17,8 +16,7 @@ use ratn_perception::noise::MAX_FRAMES;
 const MAX_LOOK_ERROR_RAD: f64 = 0.02;
 
 impl Cell {
-    pub(super) fn start(&mut self, ticket: Ticket, lease: Option<LeaseId>, request: Request) -> Result<(), String> {
-        lease.map_or(Ok(()), |lease| self.leases.check(lease))?;
+    pub(super) fn start(&mut self, ticket: Ticket, request: Request) -> Result<(), String> {
         let module = request.module();
         if let Some(other) = self.activities.get(&module) {
             return Err(format!("the {} is busy with goal {}", module.kind(), other.ticket.0));
@@ -93,7 +91,7 @@ impl Cell {
             }
         };
         let (started, ends) = (self.motion_time, self.motion_time + seconds(lasts_s));
-        self.activities.insert(module, Activity { ticket, lease, started, ends, kind });
+        self.activities.insert(module, Activity { ticket, started, ends, kind });
         Ok(())
     }
 

@@ -9,6 +9,7 @@ use ratn_motion::robot::Configuration;
 use ratn_perception::noise::MAX_FRAMES;
 use ratn_worker::action::{Action, ActionFailure, ActionResult, ActionServer, GoalContext, GoalOutcome};
 use ratn_worker::client::Channels;
+use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::safety::Safety;
 
 /// How fast `move_to` goes unless told otherwise, as a fraction of the limits: a line that nobody planned is taken with care.
@@ -26,9 +27,20 @@ pub(crate) fn resource_id(module: Module, host: &str) -> String {
     format!("{name}@{host}")
 }
 
+/// The watch of who holds the modules.
+pub(crate) fn leases(config: &CellConfig) -> LeaseWatch {
+    LeaseWatch::of(Module::ALL.map(|module| resource_id(module, &config.host)))
+}
+
 /// The server of all modules. Each takes one goal at a time, under a lease of its own resource.
-pub(crate) fn server(keeper: &Keeper, config: &CellConfig, channels: Channels, safety: Safety) -> ActionServer {
-    let mut builder = ActionServer::builder("").one_at_a_time().channels(channels).safety(safety);
+pub(crate) fn server(
+    keeper: &Keeper,
+    config: &CellConfig,
+    channels: Channels,
+    safety: Safety,
+    leases: &LeaseWatch,
+) -> ActionServer {
+    let mut builder = ActionServer::builder("").one_at_a_time().channels(channels).safety(safety).leases(leases);
     for (module, name, description, read) in ACTIONS {
         builder = builder.action(ModuleAction {
             name,
@@ -108,7 +120,7 @@ impl Action for ModuleAction {
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let request = (self.read)(&goal)?;
         goal.while_held().await?;
-        let mut motion = self.keeper.perform(goal.lease.as_ref().map(|lease| lease.id), request)?;
+        let mut motion = self.keeper.perform(request)?;
         let ending = tokio::select! {
             biased;
             ending = motion.ended() => ending,

@@ -10,7 +10,6 @@ use crate::core::picture::{Exposure, develop};
 use crate::core::protocol::{Command, Ending, Event, Request, Ticket};
 use crate::core::recording::Line;
 use crate::core::snapshot::Snapshot;
-use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::robot::{Joints, Robot};
@@ -86,7 +85,7 @@ struct Letter {
 }
 
 enum Message {
-    Start { ticket: Ticket, lease: Option<LeaseId>, request: Request, ended: oneshot::Sender<Ending> },
+    Start { ticket: Ticket, request: Request, ended: oneshot::Sender<Ending> },
     Happened(Event),
     Safety { state: SafetyState, applied: oneshot::Sender<()> },
     Reset { seed: u64, goods: Goods, state: oneshot::Sender<State> },
@@ -112,10 +111,10 @@ fn keeper_of(cell: &Cell) -> (Keeper, Receiver<Letter>) {
 
 impl Keeper {
     /// Starts a goal.
-    pub(crate) fn perform(&self, lease: Option<LeaseId>, request: Request) -> Result<Motion, KeeperError> {
+    pub(crate) fn perform(&self, request: Request) -> Result<Motion, KeeperError> {
         let ticket = Ticket(self.tickets.fetch_add(1, Ordering::Relaxed) + 1);
         let (ended, ending) = oneshot::channel();
-        self.ask(Message::Start { ticket, lease, request, ended })?;
+        self.ask(Message::Start { ticket, request, ended })?;
         Ok(Motion { ticket, ending, messages: self.messages.clone(), over: false })
     }
 
@@ -228,9 +227,9 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
                 safety = Some(applied);
                 (Event::Safety { state }, None)
             }
-            Some(Message::Start { ticket, lease, request, ended }) => {
+            Some(Message::Start { ticket, request, ended }) => {
                 waiting.insert(ticket, ended);
-                (Event::Start { ticket, lease, request }, None)
+                (Event::Start { ticket, request }, None)
             }
             Some(Message::Happened(event)) => (event, None),
             Some(Message::Reset { seed, goods, state }) => (Event::Reset { seed, goods }, Some(state)),
@@ -293,8 +292,7 @@ mod tests {
     #[tokio::test]
     async fn a_stop_arrives_however_many_questions_wait_also_of_a_goal_that_nobody_waits_for() {
         let (keeper, inbox) = keeper_of(&Cell::new(CellConfig::default()).unwrap());
-        let (stopped, dropped) =
-            (keeper.perform(None, Request::Release).unwrap(), keeper.perform(None, Request::Release).unwrap());
+        let (stopped, dropped) = (keeper.perform(Request::Release).unwrap(), keeper.perform(Request::Release).unwrap());
         let tickets = [stopped.ticket, dropped.ticket];
         while keeper.ask(Message::Happened(Event::Tick)).is_ok() {}
         assert_eq!(keeper.state().await, Err(KeeperError::Overloaded));

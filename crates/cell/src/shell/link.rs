@@ -3,20 +3,18 @@
 
 use super::actions::resource_id;
 use super::keeper::Keeper;
-use super::leases::LeaseWatch;
 use crate::config::CellConfig;
 use crate::core::protocol::Module;
 use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
 use ratn_proto::types::Resource;
-use ratn_worker::action::ActionServer;
-use ratn_worker::client::{CallError, Channels, ResourceClient};
+use ratn_worker::client::{CallError, Channels};
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::provider::Provider;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
 use std::time::Duration;
-use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 /// The role of the resource manager in the runtime directory.
@@ -35,7 +33,8 @@ pub(crate) struct Link {
     /// Where the modules' actions are served.
     pub(crate) endpoint: Endpoint,
     pub(crate) keeper: Keeper,
-    pub(crate) server: ActionServer,
+    /// Who holds the modules.
+    pub(crate) leases: LeaseWatch,
 }
 
 impl Link {
@@ -49,6 +48,8 @@ impl Link {
             if let Some(Err(error)) = linked {
                 tracing::warn!(%manager, %error, "the resource manager does not want the cell's resources");
             }
+            // The modules, and every lease of them, end with the session.
+            self.leases.lost("the cell's session with the resource manager has ended");
             session.close().await;
             // Gives a manager that refuses time to come to its senses.
             let _ = shutdown.run_until_cancelled(tokio::time::sleep(LOOK_INTERVAL)).await;
@@ -68,19 +69,9 @@ impl Link {
     /// Offers everything and keeps the battery's level up to date, until the manager is somewhere else.
     async fn offer(&self, manager: &Endpoint, session: &Session) -> Result<(), CallError> {
         let provider = Provider::start(&self.channels, manager, session)?;
-        let listening = Notify::new();
-        let watch = LeaseWatch {
-            client: ResourceClient::new(&self.channels, manager, "")?,
-            keeper: self.keeper.clone(),
-            server: self.server.clone(),
-            session,
-            patience: Duration::from_millis(self.config.session_ttl_ms),
-            listening: &listening,
-        };
-        let watching = watch.keep();
+        let patience = Duration::from_millis(self.config.session_ttl_ms);
+        let watching = self.leases.follow_session(&self.channels, manager, session, patience)?;
         let offering = async {
-            // No lease of a module is given before its end can be heard.
-            listening.notified().await;
             for module in Module::ALL {
                 let id = resource_id(module, &self.config.host);
                 let resource = Resource::new(id, ResourceClass::Module, module.kind()).with_endpoint(&self.endpoint);

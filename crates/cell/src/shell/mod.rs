@@ -1,15 +1,14 @@
 //! The process around the cell's core.
 //!
 //! ```text
-//!   action service ─┐                                      ┌─▶ outcome of the goal
-//!   lease watch ────┼─event─▶ keeper.rs (Cell, a clock) ───┤
-//!   cell service ───┘         wakes when the core says     └─▶ ground truth
+//!   lease watch ─▶ action service ─┐                                      ┌─▶ outcome of the goal
+//!                                  ├─event─▶ keeper.rs (Cell, a clock) ───┤
+//!   cell service ──────────────────┘         wakes when the core says     └─▶ ground truth
 //! ```
 //! The keeper's thread owns the core; everything else sends it messages.
 
 mod actions;
 mod keeper;
-mod leases;
 mod link;
 #[cfg(test)]
 mod pace;
@@ -67,13 +66,14 @@ pub async fn run_as(
     let stopped = directory.path().join(STOPPED_FILE);
     let safety = Safety::kept_in(stopped.clone(), keeper.clone()).await;
     let safety = safety.with_context(|| format!("cannot tell from {} whether it is stopped", stopped.display()))?;
-    let server = actions::server(&keeper, &config, channels.clone(), safety.clone());
+    let leases = actions::leases(&config);
+    let server = actions::server(&keeper, &config, channels.clone(), safety.clone(), &leases);
     let services = Services::new()
-        .with(server.clone().into_service())
+        .with(server.into_service())
         .with(safety.into_service())
         .with(CellServiceServer::new(service::Service::new(keeper.clone(), config.scene)));
     let link =
-        link::Link { config, directory: directory.clone(), channels, endpoint: endpoint.clone(), keeper, server };
+        link::Link { config, directory: directory.clone(), channels, endpoint: endpoint.clone(), keeper, leases };
     // Motions under way have their leases until the last has ended.
     let over = CancellationToken::new();
     let _over = over.clone().drop_guard();

@@ -33,7 +33,7 @@ fn live(cell: Cell, recorder: Recorder, speed: f64) -> Keeper {
 }
 
 async fn perform(keeper: &Keeper, request: Request) -> Ending {
-    keeper.perform(None, request).unwrap().ended().await.unwrap()
+    keeper.perform(request).unwrap().ended().await.unwrap()
 }
 
 fn saved(cell: &mut Cell, now: Timestamp) -> Box<Snapshot> {
@@ -54,7 +54,7 @@ async fn a_cell_at_fifty_times_and_one_as_fast_as_possible_come_to_the_same_to_t
         assert!(matches!(perform(&keeper, Request::MoveTo { joints, speed: 0.5 }).await, Ending::Done(_)));
         perform(&keeper, Request::Capture { frames: 2 }).await;
     }
-    let way = keeper.perform(None, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.2 }).unwrap();
+    let way = keeper.perform(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.2 }).unwrap();
     way.stop().await.unwrap();
     let at_fifty = keeper.save().await.unwrap().to_json();
 
@@ -141,7 +141,7 @@ async fn how_well_the_cell_keeps_pace_with_nine_boxes() {
         for (i, request) in requests.iter().cycle().take(20).enumerate() {
             let started = now;
             let ticket = Ticket(i as u64);
-            let mut commands = cell.handle(now, Event::Start { ticket, lease: None, request: request.clone() });
+            let mut commands = cell.handle(now, Event::Start { ticket, request: request.clone() });
             while commands.is_empty() {
                 now = cell.next_wake().unwrap();
                 commands = cell.handle(now, Event::Tick);

@@ -81,7 +81,7 @@ mod tests {
             assert!(Recorder::begin(&file, &CellConfig::default())?.is_on());
         }
         for name in ["cell.jsonl", "cell.jsonl.2", "cell.jsonl.3"] {
-            assert!(std::fs::read_to_string(place.path().join(name))?.starts_with("{\"form\":1"), "{name}");
+            assert!(std::fs::read_to_string(place.path().join(name))?.starts_with("{\"form\":2"), "{name}");
         }
         let nowhere = Recorder::begin(&place.path().join("no/cell.jsonl"), &CellConfig::default());
         assert!(nowhere.is_err_and(|error| error.to_string().starts_with("cannot record to")));

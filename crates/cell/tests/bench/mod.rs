@@ -6,7 +6,6 @@ use ratn_cell::config::CellConfig;
 use ratn_cell::core::cell::Cell;
 use ratn_cell::core::protocol::{Command, Ending, Event, Product, Request, Ticket};
 use ratn_cell::core::recording::Line;
-use ratn_model::id::LeaseId;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Trajectory;
@@ -36,10 +35,10 @@ impl Bench {
         Bench { cell, now: Timestamp::default(), tickets: 0, lines: Vec::new() }
     }
 
-    pub(crate) fn start(&mut self, lease: Option<LeaseId>, request: Request) -> (Ticket, Vec<Command>) {
+    pub(crate) fn start(&mut self, request: Request) -> (Ticket, Vec<Command>) {
         self.tickets += 1;
         let ticket = Ticket(self.tickets);
-        (ticket, self.handle(Event::Start { ticket, lease, request }))
+        (ticket, self.handle(Event::Start { ticket, request }))
     }
 
     pub(crate) fn pass(&mut self, seconds: f64) -> Vec<Command> {
@@ -55,7 +54,7 @@ impl Bench {
 
     /// Performs a request to its end.
     pub(crate) fn perform(&mut self, request: Request) -> Ending {
-        let (ticket, mut commands) = self.start(None, request);
+        let (ticket, mut commands) = self.start(request);
         while commands.is_empty() {
             self.now = self.cell.next_wake().expect("the goal is under way");
             commands = self.handle(Event::Tick);

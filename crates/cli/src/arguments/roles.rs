@@ -82,7 +82,8 @@ pub(crate) struct WorkerArguments {
     /// What it does
     #[arg(value_enum)]
     pub(crate) worker: WorkerKind,
-    /// Its resource's id, `path-planner-1@compute`, by which leases are checked; without it no lease is asked for
+    /// Its resource's id, `path-planner-1@compute`; goals need a lease of it, which the resource manager of --resource-manager or
+    /// $RATN_RESOURCE_MANAGER confirms. Without it no lease is asked for
     #[arg(long, value_name = "ID", default_value = "")]
     pub(crate) id: String,
     /// Its resource's kind

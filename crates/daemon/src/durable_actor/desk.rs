@@ -2,7 +2,7 @@
 
 use super::Core;
 use super::outbox::{SendAnswer, send_answer};
-use super::watchers::Watchers;
+use super::watchers::{Watcher, Watchers};
 use ratn_model::time::Timestamp;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
@@ -12,8 +12,8 @@ use tonic::Status;
 pub(super) enum Outgoing<C: Core> {
     /// To one who asked.
     Answer(SendAnswer),
-    /// From here on it sees every update.
-    Watcher(mpsc::Sender<C::Update>),
+    /// From here on it sees every update that it wants.
+    Watcher(Watcher<C::Update>),
     /// What the state has to say.
     Said(C::Said),
 }
@@ -79,7 +79,19 @@ impl<C: Core> Desk<C> {
     /// # Errors
     /// Where so many watch already.
     pub(crate) fn watch(&mut self, first: Vec<C::Update>) -> Result<mpsc::Receiver<C::Update>, Status> {
-        let (watcher, updates) = super::watchers::begin(first)?;
+        self.watch_where(first, |_| true)
+    }
+
+    /// As [`Desk::watch`], of the updates that are wanted.
+    ///
+    /// # Errors
+    /// As [`Desk::watch`].
+    pub(crate) fn watch_where(
+        &mut self,
+        first: Vec<C::Update>,
+        wants: impl Fn(&C::Update) -> bool + Send + 'static,
+    ) -> Result<mpsc::Receiver<C::Update>, Status> {
+        let (watcher, updates) = Watcher::begin(first, wants)?;
         self.outgoing.push(Outgoing::Watcher(watcher));
         Ok(updates)
     }

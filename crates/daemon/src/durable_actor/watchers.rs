@@ -1,6 +1,7 @@
 //! Who watches: everything as it is, then every update; one that does not keep up is cut off rather than waited for.
 
 use crate::details::{retry_later, status};
+use std::fmt;
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tonic::{Code, Status};
@@ -13,16 +14,33 @@ const WATCH_AGAIN_AFTER: Duration = Duration::from_secs(1);
 /// Everybody who watches.
 #[derive(Debug)]
 pub(crate) struct Watchers<U> {
-    all: Vec<mpsc::Sender<U>>,
+    all: Vec<Watcher<U>>,
 }
 
-/// A watcher whose channel holds what it begins with.
-pub(super) fn begin<U>(first: Vec<U>) -> Result<(mpsc::Sender<U>, mpsc::Receiver<U>), Status> {
-    let (sender, updates) = mpsc::channel(WATCH_BUFFER + first.len());
-    for update in first {
-        sender.try_send(update).map_err(|_| status(Code::Internal, "BROKEN", "a new watch took no update"))?;
+/// One who watches.
+pub(super) struct Watcher<U> {
+    updates: mpsc::Sender<U>,
+    wants: Box<dyn Fn(&U) -> bool + Send>,
+}
+
+impl<U> Watcher<U> {
+    /// One whose channel holds what it begins with.
+    pub(super) fn begin(
+        first: Vec<U>,
+        wants: impl Fn(&U) -> bool + Send + 'static,
+    ) -> Result<(Watcher<U>, mpsc::Receiver<U>), Status> {
+        let (sender, updates) = mpsc::channel(WATCH_BUFFER + first.len());
+        for update in first {
+            sender.try_send(update).map_err(|_| status(Code::Internal, "BROKEN", "a new watch took no update"))?;
+        }
+        Ok((Watcher { updates: sender, wants: Box::new(wants) }, updates))
     }
-    Ok((sender, updates))
+}
+
+impl<U> fmt::Debug for Watcher<U> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Watcher").finish_non_exhaustive()
+    }
 }
 
 impl<U: Clone> Watchers<U> {
@@ -31,7 +49,7 @@ impl<U: Clone> Watchers<U> {
     /// # Errors
     /// Where so many do already.
     pub(crate) fn admit(&mut self, most: usize) -> Result<(), Status> {
-        self.all.retain(|watcher| !watcher.is_closed());
+        self.all.retain(|watcher| !watcher.updates.is_closed());
         if self.all.len() >= most {
             let message = format!("{} clients watch already", self.all.len());
             return Err(retry_later(Code::ResourceExhausted, "TOO_MANY", message, WATCH_AGAIN_AFTER));
@@ -39,14 +57,19 @@ impl<U: Clone> Watchers<U> {
         Ok(())
     }
 
-    /// Tells all.
+    /// Tells all who want it.
     pub(crate) fn publish(&mut self, update: &U) {
-        self.all.retain(|watcher| match watcher.try_send(update.clone()) {
-            Ok(()) => true,
-            Err(mpsc::error::TrySendError::Closed(_)) => false,
-            Err(mpsc::error::TrySendError::Full(_)) => {
-                tracing::warn!("a watcher did not keep up and was cut off");
-                false
+        self.all.retain(|watcher| {
+            if !(watcher.wants)(update) {
+                return !watcher.updates.is_closed();
+            }
+            match watcher.updates.try_send(update.clone()) {
+                Ok(()) => true,
+                Err(mpsc::error::TrySendError::Closed(_)) => false,
+                Err(mpsc::error::TrySendError::Full(_)) => {
+                    tracing::warn!("a watcher did not keep up and was cut off");
+                    false
+                }
             }
         });
     }
@@ -55,7 +78,7 @@ impl<U: Clone> Watchers<U> {
         self.all.len()
     }
 
-    pub(super) fn add(&mut self, watcher: mpsc::Sender<U>) {
+    pub(super) fn add(&mut self, watcher: Watcher<U>) {
         self.all.push(watcher);
     }
 

@@ -13,8 +13,10 @@ use super::roster::{Entry, Intent, Roster};
 use super::spawner::{self, Job, Outcome};
 use super::template::Template;
 use super::tracking::{Children, Tracker};
+use crate::resource_manager;
 use nix::sys::signal::Signal;
 use ratn_worker::adoption;
+use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::collections::BTreeMap;
 use std::io;
@@ -60,6 +62,8 @@ pub(super) enum BeginError {
 
 pub(super) struct Processes {
     host: String,
+    /// Where workers find the resource manager, which confirms the leases of their goals.
+    manager: ManagerLocation,
     max_log_bytes: u64,
     /// Where groups of processes are made.
     groups: Groups,
@@ -108,6 +112,10 @@ impl Processes {
         let (health, answered) = mpsc::channel(OUTCOMES);
         let processes = Processes {
             host: config.host.clone(),
+            manager: match &config.resource_manager {
+                Some(endpoint) => ManagerLocation::At(endpoint.clone()),
+                None => ManagerLocation::File(directory.endpoint_file(resource_manager::ROLE)),
+            },
             max_log_bytes: config.max_log_bytes,
             groups: Groups { v2: config.cgroup.clone(), v1: config.cgroup_v1.clone(), tracking: tracker.groups() },
             directory,
@@ -154,6 +162,7 @@ impl Processes {
         let mut env = environment::passed(std::env::vars_os(), &template.pass_env);
         // Not a template's to say.
         let marker = self.tracker.environment(id);
+        env.insert(RESOURCE_MANAGER_VARIABLE.into(), self.manager.to_string().into());
         env.extend(account.iter().flat_map(Account::environment));
         env.extend(template.env.iter().map(|(name, value)| (name.into(), fill(value).into())));
         if template.adopt {

@@ -16,6 +16,7 @@ mod providers;
 mod service;
 mod status;
 mod stream;
+mod watch_filter;
 mod wire;
 
 pub use config::ResourceManagerConfig;

@@ -3,6 +3,7 @@
 use super::actor::{Handle, Message};
 use super::providers::Provisions;
 use super::stream::CallerService;
+use super::watch_filter::WatchFilter;
 use super::{Granted, wire};
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
@@ -18,7 +19,6 @@ use ratn_proto::v1;
 use ratn_resources::{AcquireRequest, Reply, Request as PoolRequest, ResourceSpec, SessionId};
 use ratn_worker::multiplex::SessionCalls;
 use ratn_worker::multiplex::server::Answers;
-use std::collections::BTreeSet;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -35,6 +35,8 @@ const GRACE: Duration = Duration::from_millis(20);
 const LISTED_AT_ONCE: usize = 4_096;
 /// Ids that an answer names.
 const MOST_IDS: usize = 1_000;
+/// Resources that one watch may name.
+const MAX_WATCHED: usize = 1_024;
 /// When a watcher that was cut off may come back.
 const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
 
@@ -220,7 +222,7 @@ impl v1::resource_service_server::ResourceService for Service {
             ..AcquireRequest::new(session(&request.session_id)?, vec![requirement])
         };
         let lease = self.wait_for_grant(&caller, request.request_id, acquire, request.deadline_ms).await?;
-        Ok(Response::new(v1::BlockResponse { lease: Some(lease.into()) }))
+        Ok(Response::new(v1::BlockResponse { lease: Some(wire::lease(lease, request.session_id)) }))
     }
 
     async fn acquire(&self, request: Request<v1::AcquireRequest>) -> Result<Response<v1::AcquireResponse>, Status> {
@@ -232,7 +234,7 @@ impl v1::resource_service_server::ResourceService for Service {
             ..AcquireRequest::new(session(&request.session_id)?, requirements)
         };
         let lease = self.wait_for_grant(&caller, request.request_id, acquire, request.deadline_ms).await?;
-        Ok(Response::new(v1::AcquireResponse { lease: Some(lease.into()) }))
+        Ok(Response::new(v1::AcquireResponse { lease: Some(wire::lease(lease, request.session_id)) }))
     }
 
     async fn withdraw(&self, request: Request<v1::WithdrawRequest>) -> Result<Response<v1::WithdrawResponse>, Status> {
@@ -389,13 +391,21 @@ impl v1::resource_service_server::ResourceService for Service {
     ) -> Result<Response<Self::WatchStream>, Status> {
         let request = request.into_inner();
         names(&request.kinds, "kinds")?;
+        names(&request.resource_ids, "resource_ids")?;
+        if request.resource_ids.len() > MAX_WATCHED {
+            let there = request.resource_ids.len();
+            let message = format!("resource_ids: has {there} ids, at most {MAX_WATCHED}: watch without any, or twice");
+            return Err(status(Code::InvalidArgument, "MALFORMED", message));
+        }
         let (part, in_parts) = (request.after_part, request.in_parts);
         let after = request.after_revision.map(|revision| WatchPosition { revision: Revision(revision), part });
-        let kinds: BTreeSet<String> = request.kinds.into_iter().collect();
-        let updates = self.actor.ask(|answer| Message::Watch { after, answer }).await??;
+        let filter = WatchFilter {
+            kinds: request.kinds.into_iter().collect(),
+            resources: request.resource_ids.into_iter().collect(),
+        };
+        let updates = self.actor.ask(|answer| Message::Watch { after, filter, answer }).await??;
         let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
-            .filter_map(move |update| futures::future::ready(filtered(&update, &kinds)))
-            .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)))
+            .flat_map(move |update| futures::stream::iter(messages(ResourceUpdate::clone(&update).into(), in_parts)))
             // After a snapshot that does not fit nothing follows.
             .scan(false, |over, message| {
                 let before = std::mem::replace(over, message.is_err());
@@ -464,18 +474,6 @@ pub(super) async fn kept_alive(
         created: kept.created,
         revision: kept.revision.0,
     })
-}
-
-fn filtered(update: &ResourceUpdate, kinds: &BTreeSet<String>) -> Option<ResourceUpdate> {
-    match update {
-        _ if kinds.is_empty() => Some(update.clone()),
-        ResourceUpdate::Event(event) => kinds.contains(&event.resource.kind).then(|| update.clone()),
-        ResourceUpdate::Snapshot { revision, resources, youngest } => Some(ResourceUpdate::Snapshot {
-            revision: *revision,
-            youngest: *youngest,
-            resources: resources.iter().filter(|resource| kinds.contains(&resource.kind)).cloned().collect(),
-        }),
-    }
 }
 
 /// A snapshot in messages that are not too large; anything else as it is.

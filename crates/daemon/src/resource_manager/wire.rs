@@ -1,9 +1,11 @@
 //! The pool's views and events as the wire's.
 
+use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{
     Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState, SessionStatus, WaitingAcquire,
 };
+use ratn_proto::v1;
 use ratn_resources::{AcquireRequest, Change, Explanation, ResourceView, SessionView, WatchEvent};
 use std::time::Duration;
 
@@ -39,6 +41,11 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
         free: view.free,
         holdings: view.holdings.iter().cloned().map(holding).collect(),
     }
+}
+
+/// A lease as its holder gets it.
+pub(super) fn lease(lease: Lease, session_id: String) -> v1::Lease {
+    v1::Lease { session_id, ..lease.into() }
 }
 
 /// One event of the pool may touch several resources: one event each, all of one revision.

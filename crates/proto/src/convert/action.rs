@@ -14,7 +14,7 @@ impl From<Goal> for v1::Goal {
             action: goal.action,
             inputs: wire_ports(goal.inputs),
             seed: goal.seed,
-            lease: goal.lease.map(v1::Lease::from),
+            lease: goal.lease.map(|lease| v1::Lease { session_id: goal.session, ..v1::Lease::from(lease) }),
             projection_id: goal.projection.map(|projection| projection.0),
             world_pool_endpoint: goal.world_pool,
             deadline_ms: goal.deadline_ms,
@@ -30,12 +30,15 @@ impl TryFrom<v1::Goal> for Goal {
         name(&goal.goal_id, "goal_id")?;
         name(&goal.action, "action")?;
         label(&goal.world_pool_endpoint, "world_pool_endpoint")?;
+        let session = goal.lease.as_ref().map_or_else(String::new, |lease| lease.session_id.clone());
+        label(&session, "lease.session_id")?;
         Ok(Goal {
             id: goal.goal_id,
             action: goal.action,
             inputs: ports(goal.inputs, "inputs")?,
             seed: goal.seed,
             lease: goal.lease.map(Lease::try_from).transpose().map_err(|m| m.within("lease"))?,
+            session,
             projection: goal.projection_id.map(ProjectionId),
             world_pool: goal.world_pool_endpoint,
             deadline_ms: goal.deadline_ms,

@@ -172,7 +172,8 @@ impl TryFrom<v1::Demand> for Demand {
 
 impl From<Lease> for v1::Lease {
     fn from(lease: Lease) -> v1::Lease {
-        v1::Lease { id: lease.id.0, token: lease.token.0, resources: all(lease.resources) }
+        let session_id = String::new();
+        v1::Lease { id: lease.id.0, token: lease.token.0, resources: all(lease.resources), session_id }
     }
 }
 

@@ -227,6 +227,7 @@ fn goal() -> impl Strategy<Value = Goal> {
             action,
             inputs,
             seed,
+            session: lease.as_ref().map_or_else(String::new, |_| "run-1".to_owned()),
             lease,
             projection: projection.map(ProjectionId),
             world_pool: "unix:/world.sock".to_owned(),

@@ -39,6 +39,8 @@ pub struct GoalContext {
     pub projection: Option<ProjectionId>,
     /// Fires when the goal shall stop; [`GoalContext::stopped`] then says with what outcome.
     pub cancelled: CancellationToken,
+    /// Who holds the lease, as the goal says.
+    session: String,
     world_pool: String,
     channels: Channels,
     pub(super) safety: Safety,
@@ -141,6 +143,7 @@ impl GoalContext {
             seed: goal.seed,
             lease: goal.lease,
             projection: goal.projection,
+            session: goal.session,
             cancelled: entry.cancelled.clone(),
             world_pool: goal.world_pool,
             channels,
@@ -316,6 +319,7 @@ impl GoalContext {
             inputs,
             seed: self.seed,
             lease: self.lease.clone(),
+            session: self.session.clone(),
             projection: self.projection,
             world_pool: self.world_pool.clone(),
             deadline_ms: 0,

@@ -29,6 +29,8 @@ pub(crate) enum StopCause {
     Fenced(FencingToken),
     /// Its lease has ended.
     LeaseEnded(String),
+    /// Its lease may have ended.
+    LeaseUnheard(String),
     /// The provider ends.
     ShuttingDown,
     /// An emergency stop, and why.
@@ -49,7 +51,10 @@ pub(crate) enum Ending {
 impl StopCause {
     /// Whether it has nothing to do with what the goal was about.
     pub(crate) fn is_orphaning(&self) -> bool {
-        matches!(self, StopCause::Abandoned | StopCause::Fenced(_) | StopCause::LeaseEnded(_))
+        matches!(
+            self,
+            StopCause::Abandoned | StopCause::Fenced(_) | StopCause::LeaseEnded(_) | StopCause::LeaseUnheard(_)
+        )
     }
 
     /// What the goal comes to: who asked for the stop gets `preempted`, who lost the right to go on `aborted`.
@@ -62,6 +67,7 @@ impl StopCause {
                 ActionFailure::Aborted(format!("a newer lease ({token}) took the resource over"))
             }
             StopCause::LeaseEnded(reason) => ActionFailure::Aborted(format!("the lease ended: {reason}")),
+            StopCause::LeaseUnheard(reason) => ActionFailure::Aborted(format!("the lease may have ended: {reason}")),
             StopCause::ShuttingDown => ActionFailure::Aborted("the provider shuts down".to_owned()),
             StopCause::EmergencyStop(reason) => ActionFailure::emergency_stop(reason),
         }

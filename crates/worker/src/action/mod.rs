@@ -1,23 +1,27 @@
 //! Performing actions: what a driver or a worker implements, and the service around it.
 //!
 //! ```text
-//! execute ─ unknown action, stale token, busy ──────────────→ refused (a gRPC status)
+//! execute ─ unknown action, no such lease, busy ──────────────→ refused (a gRPC status)
 //!    └→ accepted → progress* → result: success | the action's own | aborted | preempted | stopped
 //!                      └─ cancel, deadline, lease over, nobody listens, emergency stop: `cancelled` fires, the action ends itself
 //! ```
 //!
 //! An [`Action`] gets a [`GoalContext`] and returns an outcome; `?` on anything that is an error makes it `aborted` with
-//! that error as reason. The [`ActionServer`] owns what is common to all: fencing, idempotence, exclusion, panics.
+//! that error as reason. The [`ActionServer`] owns what is common to all: leases as the resource manager confirms them, fencing,
+//! idempotence, exclusion, panics.
 
+mod authority;
 mod context;
 mod fence;
 mod goal;
+mod memory;
 mod port;
 mod scene;
 mod server;
 mod service;
 mod stream;
 
+pub(crate) use authority::MANAGER_UNHEARD;
 pub use context::{CallFailure, GoalContext, WorldFailure};
 pub use port::{InputError, Port};
 pub use ratn_proto::types::{Goal, GoalOutcome};

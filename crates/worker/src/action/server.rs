@@ -1,27 +1,37 @@
 //! The goals of one server: who may start, what runs, what is remembered.
 
+use super::authority::{Authority, Confirmation, refusal};
 use super::fence::Fence;
 use super::goal::{Ending, GoalEntry, StopCause};
+use super::memory::{Known, Memory};
 use super::service::Messages;
 use super::{Action, ActionFailure, ActionResult, GoalContext};
 use crate::client::Channels;
+use crate::lease_watch::{EndedHolding, GRANT_WAIT, LeaseListener, LeaseWatch};
 use crate::safety::{Safety, SafetyState};
 use crate::trace;
 use ratn_model::id::{FencingToken, LeaseId};
+use ratn_model::resource::Lease;
 use ratn_proto::MAX_PORTS_BYTES;
 use ratn_proto::convert::{ports_bytes, value_bytes, wire_ports};
 use ratn_proto::types::{Goal, GoalOutcome};
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
+use tokio::sync::Semaphore;
 use tokio::task::JoinError;
-use tonic::Status;
+use tokio::time::{Instant, timeout_at};
+use tonic::{Code, Status};
 use tracing::Instrument;
 
-/// So many results are remembered unless said otherwise.
+/// Of each resource so many results are remembered unless said otherwise.
 const RESULTS_KEPT: usize = 64;
+/// Under one lease so many goals are begun on a resource at the most, unless said otherwise: the id of each is remembered.
+const GOALS_PER_LEASE: usize = 65_536;
+/// At most so many goals wait for a word of their lease.
+const MAX_AWAITED: usize = 256;
 /// At most so many goals run at once.
 const MAX_RUNNING: usize = 64;
 /// A goal that was told to stop and does not is ended hard after this long.
@@ -40,8 +50,10 @@ pub struct ActionServerBuilder {
     actions: BTreeMap<String, Arc<dyn Action>>,
     one_at_a_time: bool,
     results_kept: Option<usize>,
+    goals_per_lease: Option<usize>,
     channels: Channels,
     safety: Safety,
+    authority: Authority,
 }
 
 pub(super) struct Inner {
@@ -49,19 +61,20 @@ pub(super) struct Inner {
     pub(super) actions: BTreeMap<String, Arc<dyn Action>>,
     one_at_a_time: bool,
     results_kept: usize,
+    goals_per_lease: usize,
     channels: Channels,
     safety: Safety,
+    authority: Authority,
+    /// Room for goals that wait for a word of their lease.
+    awaited: Semaphore,
     state: Mutex<State>,
 }
 
 #[derive(Debug, Default)]
 struct State {
     fence: Fence,
-    /// Running and remembered, by id.
-    goals: BTreeMap<String, Arc<GoalEntry>>,
+    memory: Memory,
     running: Vec<Arc<GoalEntry>>,
-    /// The remembered ones, oldest first.
-    ended: VecDeque<String>,
 }
 
 /// What became of a request for a goal.
@@ -72,6 +85,8 @@ pub(super) enum Admission {
     Joined(Arc<GoalEntry>),
     /// It has to wait until this one, told to stop, has ended.
     After(Arc<GoalEntry>),
+    /// It has to wait for what the resource manager says of its lease; this is the refusal if that takes too long.
+    Awaiting(Status),
 }
 
 impl ActionServerBuilder {
@@ -89,10 +104,32 @@ impl ActionServerBuilder {
         self
     }
 
-    /// Remembers this many results.
+    /// Remembers this many results of each resource.
     #[must_use]
     pub fn results_kept(mut self, results: usize) -> ActionServerBuilder {
         self.results_kept = Some(results);
+        self
+    }
+
+    /// Begins at the most this many goals on a resource under one lease.
+    #[must_use]
+    pub fn goals_per_lease(mut self, goals: usize) -> ActionServerBuilder {
+        self.goals_per_lease = Some(goals);
+        self
+    }
+
+    /// Goals are performed under leases that the resource manager confirms, and end with them. Without this every goal that needs a
+    /// lease is refused.
+    #[must_use]
+    pub fn leases(mut self, watch: &LeaseWatch) -> ActionServerBuilder {
+        self.authority = Authority::Watch(watch.clone());
+        self
+    }
+
+    /// **For tests only.** Believes whatever a goal says of its lease: whoever reaches the server moves what it moves.
+    #[must_use]
+    pub fn dangerously_believe_every_lease(mut self) -> ActionServerBuilder {
+        self.authority = Authority::Claimant;
         self
     }
 
@@ -112,44 +149,37 @@ impl ActionServerBuilder {
 
     /// The server.
     pub fn build(self) -> ActionServer {
-        ActionServer {
-            inner: Arc::new(Inner {
-                resource: self.resource,
-                actions: self.actions,
-                one_at_a_time: self.one_at_a_time,
-                results_kept: self.results_kept.unwrap_or(RESULTS_KEPT),
-                channels: self.channels,
-                safety: self.safety,
-                state: Mutex::default(),
-            }),
+        let inner = Arc::new(Inner {
+            resource: self.resource,
+            actions: self.actions,
+            one_at_a_time: self.one_at_a_time,
+            results_kept: self.results_kept.unwrap_or(RESULTS_KEPT),
+            goals_per_lease: self.goals_per_lease.unwrap_or(GOALS_PER_LEASE),
+            channels: self.channels,
+            safety: self.safety,
+            authority: self.authority,
+            awaited: Semaphore::new(MAX_AWAITED),
+            state: Mutex::default(),
+        });
+        if let Some(watch) = inner.authority.watch() {
+            let listener: Weak<Inner> = Arc::downgrade(&inner);
+            watch.listen(listener);
         }
+        ActionServer { inner }
     }
 }
 
 impl ActionServer {
-    /// A server that is `resource`: a goal needs a lease of it. With an empty name no lease is asked for, except by actions
-    /// that name a resource of their own.
+    /// A server that is `resource`: a goal needs a lease of it, which [`ActionServerBuilder::leases`] confirms. With an empty name
+    /// no lease is asked for, except by actions that name a resource of their own.
     pub fn builder(resource: impl Into<String>) -> ActionServerBuilder {
         ActionServerBuilder { resource: resource.into(), ..ActionServerBuilder::default() }
-    }
-
-    /// Stops every goal that runs under a lease: it ends `aborted` with the reason. How many there were.
-    pub fn end_lease(&self, lease: LeaseId, reason: &str) -> usize {
-        self.stop_where(|goal| goal.lease == Some(lease), &StopCause::LeaseEnded(reason.to_owned()))
-    }
-
-    /// A lease has ended, and whoever moves may find that out before [`ActionServer::end_lease`] says so: the goals under it that
-    /// fail from now on fail because of that.
-    pub fn lease_has_ended(&self, lease: LeaseId, reason: &str) {
-        let state = self.inner.state();
-        let cause = StopCause::LeaseEnded(reason.to_owned());
-        state.running.iter().filter(|goal| goal.lease == Some(lease)).for_each(|goal| goal.blame(cause.clone()));
     }
 
     /// Ends with the process: tells every goal to stop, and returns when all have ended. Their clients hear what they would
     /// hear if the process had been killed, unless a goal made it in time: a crash of the attempt, not an outcome.
     pub async fn shut_down(&self) {
-        self.stop_where(|_| true, &StopCause::ShuttingDown);
+        self.inner.stop_where(|_| true, &StopCause::ShuttingDown);
         let running = self.inner.state().running.clone();
         for goal in running {
             goal.over().await;
@@ -158,7 +188,7 @@ impl ActionServer {
 
     /// Tells a goal to stop; whether it was under way.
     pub fn cancel(&self, goal: &str) -> bool {
-        self.stop_where(|entry| entry.id == goal, &StopCause::Cancelled) > 0
+        self.inner.stop_where(|entry| entry.id == goal, &StopCause::Cancelled) > 0
     }
 
     /// How many goals run.
@@ -166,19 +196,23 @@ impl ActionServer {
         self.inner.state().running.len()
     }
 
-    fn stop_where(&self, which: impl Fn(&GoalEntry) -> bool, cause: &StopCause) -> usize {
-        let state = self.inner.state();
-        state.running.iter().filter(|goal| which(goal)).map(|goal| goal.stop(cause.clone())).count()
+    /// How many goals wait for a word of their lease.
+    pub fn awaiting(&self) -> usize {
+        MAX_AWAITED - self.inner.awaited.available_permits()
     }
 
     /// Finds a goal that was given before; what is to be heard of it.
     ///
     /// # Errors
-    /// NOT_FOUND where it was never given, or has been forgotten.
+    /// NOT_FOUND where it was never given under a lease that lives; FAILED_PRECONDITION where only its result has been forgotten.
     pub(super) fn join(&self, goal: &str) -> Result<Messages, Status> {
-        let known = self.inner.state().goals.get(goal).map(|entry| Messages::of(entry, true));
-        known
-            .ok_or_else(|| Status::not_found(format!("goal {goal} is not known here: never given, or forgotten since")))
+        match self.inner.state().memory.find(goal) {
+            Known::Entry(entry) => Ok(Messages::of(&entry, true)),
+            Known::ResultForgotten(lease) => Err(forgotten(goal, lease, self.inner.results_kept)),
+            Known::Never => Err(Status::not_found(format!(
+                "goal {goal} is not known here: never given, or forgotten with its lease"
+            ))),
+        }
     }
 
     /// Starts a goal, or finds the one of the same id; what is to be heard of it.
@@ -186,7 +220,11 @@ impl ActionServer {
     /// # Errors
     /// A status that says why not.
     pub(super) async fn admit(&self, goal: Goal) -> Result<Messages, Status> {
+        let heard_by = Instant::now() + GRANT_WAIT;
+        let mut room = None;
         loop {
+            // What is heard from here on is not missed.
+            let heard = self.inner.authority.watch().map(LeaseWatch::heard);
             let admission = self.inner.state().admit(&self.inner, &goal)?;
             match admission {
                 Admission::Joined(entry) => return Ok(Messages::of(&entry, true)),
@@ -202,14 +240,38 @@ impl ActionServer {
                 }
                 // Ends within the grace: the runner sees to it.
                 Admission::After(entry) => entry.over().await,
+                Admission::Awaiting(refused) => {
+                    if room.is_none() {
+                        room = Some(self.inner.awaited.try_acquire().map_err(|_| too_many_awaited())?);
+                    }
+                    let Some(mut heard) = heard else { return Err(refused) };
+                    // The sender is in the watch, which is in the server.
+                    let Ok(_) = timeout_at(heard_by, heard.changed()).await else { return Err(refused) };
+                }
             }
         }
     }
 }
 
 impl Inner {
+    fn stop_where(&self, which: impl Fn(&GoalEntry) -> bool, cause: &StopCause) -> usize {
+        let state = self.state();
+        state.running.iter().filter(|goal| which(goal)).map(|goal| goal.stop(cause.clone())).count()
+    }
+
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl LeaseListener for Inner {
+    fn lease_ended(&self, ended: &EndedHolding) {
+        let is_under = |goal: &GoalEntry| goal.lease == Some(ended.lease) && goal.resource == ended.resource;
+        self.stop_where(is_under, &StopCause::LeaseEnded(ended.reason.clone()));
+    }
+
+    fn leases_lost(&self, reason: &str) {
+        self.stop_where(|goal| !goal.resource.is_empty(), &StopCause::LeaseUnheard(reason.to_owned()));
     }
 }
 
@@ -220,12 +282,23 @@ impl State {
             let message = format!("no action `{}`: there are {}", goal.action, known.join(", "));
             return Err(Status::invalid_argument(message));
         };
-        if let Some(entry) = self.goals.get(&goal.id) {
-            return Ok(Admission::Joined(Arc::clone(entry)));
+        match self.memory.find(&goal.id) {
+            Known::Entry(entry) => return Ok(Admission::Joined(entry)),
+            Known::ResultForgotten(lease) => return Err(forgotten(&goal.id, lease, server.results_kept)),
+            Known::Never => {}
         }
         let resource = action.resource().unwrap_or(&server.resource);
         if !resource.is_empty() {
-            self.fence(goal, resource)?;
+            let lease = leased(goal, resource)?;
+            if let Confirmation::Awaited(refused) = server.authority.confirm(goal, lease, resource)? {
+                return Ok(Admission::Awaiting(refused));
+            }
+            self.fence(lease, resource)?;
+            if self.memory.begun_under(resource, lease.id) >= server.goals_per_lease {
+                let (most, lease) = (server.goals_per_lease, lease.id);
+                let message = format!("{most} goals of {resource} were begun under {lease}: no more; acquire it anew");
+                return Err(refusal(Code::ResourceExhausted, "TOO_MANY_GOALS", message));
+            }
         }
         if server.one_at_a_time
             && let Some(other) = self.running.iter().find(|other| other.resource == resource)
@@ -241,22 +314,17 @@ impl State {
             return Err(Status::resource_exhausted(message));
         }
         let entry = GoalEntry::new(goal, resource.to_owned(), action.cancel_when_abandoned());
-        self.goals.insert(goal.id.clone(), Arc::clone(&entry));
+        self.memory.begin(&entry);
         self.running.push(Arc::clone(&entry));
         Ok(Admission::New(entry, Arc::clone(action)))
     }
 
-    /// Refuses a goal without a current lease of `resource`; stops goals of older leases.
-    fn fence(&mut self, goal: &Goal, resource: &str) -> Result<(), Status> {
-        let lease = goal.lease.as_ref().filter(|lease| lease.resources.iter().any(|r| r.id == resource));
-        let Some(lease) = lease else {
-            let message = format!("the goal has no lease of {resource}: acquire it and send the lease along");
-            return Err(Status::failed_precondition(message));
-        };
+    /// Refuses an older lease than one seen; stops goals of older ones. Only what is confirmed gets here.
+    fn fence(&mut self, lease: &Lease, resource: &str) -> Result<(), Status> {
         self.fence.admit(resource, lease.token).map_err(|highest: FencingToken| {
             let (id, token) = (lease.id, lease.token);
             let message = format!("{id} ({token}) of {resource} is over: {highest} was seen since; acquire it anew");
-            Status::failed_precondition(message)
+            refusal(Code::FailedPrecondition, "LEASE_FENCED", message)
         })?;
         for other in self.running.iter().filter(|other| other.resource == resource && other.token < lease.token) {
             other.stop(StopCause::Fenced(lease.token));
@@ -266,13 +334,30 @@ impl State {
 
     fn end(&mut self, entry: &GoalEntry, results_kept: usize) {
         self.running.retain(|other| other.id != entry.id);
-        self.ended.push_back(entry.id.clone());
-        while self.ended.len() > results_kept {
-            if let Some(forgotten) = self.ended.pop_front() {
-                self.goals.remove(&forgotten);
-            }
-        }
+        self.memory.end(entry, results_kept);
     }
+}
+
+/// The goal's lease, which has to name `resource`.
+fn leased<'a>(goal: &'a Goal, resource: &str) -> Result<&'a Lease, Status> {
+    let names = |lease: &&Lease| lease.resources.iter().any(|leased| leased.id == resource);
+    goal.lease.as_ref().filter(names).ok_or_else(|| {
+        let message = format!("the goal has no lease of {resource}: acquire it and send the lease along");
+        refusal(Code::FailedPrecondition, "NO_LEASE", message)
+    })
+}
+
+fn forgotten(goal: &str, lease: LeaseId, results_kept: usize) -> Status {
+    let message = format!(
+        "goal {goal} was begun under {lease} and has ended; its result is not among the last {results_kept} of its resource, which \
+         are remembered, and it is not begun again"
+    );
+    refusal(Code::FailedPrecondition, "RESULT_FORGOTTEN", message)
+}
+
+fn too_many_awaited() -> Status {
+    let message = format!("{MAX_AWAITED} goals wait here for a word of their leases: try again in a moment");
+    refusal(Code::ResourceExhausted, "TOO_MANY", message)
 }
 
 /// Runs a goal to its end, whatever its action does.

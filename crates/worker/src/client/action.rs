@@ -1,5 +1,6 @@
 //! The client of action services: workers, and the modules of the robot.
 
+use super::patience::{PAUSE, TRIES};
 use super::{CallError, Channels};
 use crate::endpoint::Endpoint;
 use crate::trace::Traced;
@@ -62,14 +63,22 @@ impl ActionClient {
     /// Has a goal performed. Dropping the future stops listening: what that means to the goal is the action's to say.
     ///
     /// # Errors
-    /// [`CallError::Refused`] when the provider did not take the goal; otherwise what became of the goal is not known.
+    /// [`CallError::Refused`] when the provider did not take the goal; otherwise what became of the goal is not known. A provider that
+    /// does not hear the resource manager is given the goal again for a while.
     pub async fn execute(
         &self,
         endpoint: &Endpoint,
         goal: Goal,
-        on_progress: impl FnMut(String, BTreeMap<String, Value>),
+        mut on_progress: impl FnMut(String, BTreeMap<String, Value>),
     ) -> Result<GoalOutcome, CallError> {
         let question = v1::ExecuteRequest { goal: Some(goal.into()), known_only: false };
+        for _ in 1..TRIES {
+            match self.listen(endpoint, question.clone(), &mut on_progress).await {
+                // It has begun nothing.
+                Err(error) if error.is_unconfirmed() => tokio::time::sleep(PAUSE).await,
+                ended => return ended.map(|fate| fate.outcome),
+            }
+        }
         self.listen(endpoint, question, on_progress).await.map(|fate| fate.outcome)
     }
 

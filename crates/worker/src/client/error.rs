@@ -1,10 +1,12 @@
 //! How a call fails: refused by the one who was asked, or broken on the way.
 
 use super::chain;
+use crate::action::MANAGER_UNHEARD;
 use crate::endpoint::Endpoint;
 use ratn_proto::convert::Malformed;
 use std::error::Error;
 use tonic::{Code, Status};
+use tonic_types::StatusExt;
 
 /// A call without an answer.
 #[derive(Debug, Clone, thiserror::Error)]
@@ -56,6 +58,8 @@ impl CallError {
     pub fn from_status(endpoint: &Endpoint, status: &Status) -> CallError {
         let endpoint = endpoint.clone();
         let refused = match status.code() {
+            // A provider that does not hear the resource manager: it has begun nothing.
+            Code::Unavailable if is_unheard(status) => true,
             // The servers of this system use none of these to say no: they come from the connection.
             Code::Unavailable | Code::Unknown | Code::Internal | Code::Cancelled | Code::DataLoss => false,
             // With a source, the status was made on this side.
@@ -72,9 +76,18 @@ impl CallError {
         CallError::Broken { endpoint, reason }
     }
 
+    /// Whether a provider refused a goal because it does not hear the resource manager, which confirms leases: it may be given again.
+    pub fn is_unconfirmed(&self) -> bool {
+        self.code() == Some(Code::Unavailable)
+    }
+
     pub(crate) fn malformed(endpoint: &Endpoint, source: Malformed) -> CallError {
         CallError::Malformed { endpoint: endpoint.clone(), source }
     }
+}
+
+fn is_unheard(status: &Status) -> bool {
+    status.get_details_error_info().is_some_and(|info| info.reason == MANAGER_UNHEARD)
 }
 
 /// What to do where a connection failed for TLS, as far as its error tells (those of rustls and h2).

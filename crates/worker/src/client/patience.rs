@@ -4,7 +4,7 @@ use super::CallError;
 use std::time::Duration;
 
 /// How often: for longer than a session lives ([`crate::session::DEFAULT_TTL`]), so that a daemon that comes back in time is met.
-const TRIES: u32 = 16;
+pub(crate) const TRIES: u32 = 16;
 /// Between two of them.
 pub const PAUSE: Duration = Duration::from_millis(250);
 

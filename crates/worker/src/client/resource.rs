@@ -328,8 +328,22 @@ impl ResourceClient {
     pub async fn watch_from(&self, kinds: &[&str], after: Option<WatchPosition>) -> Result<ResourceWatch, CallError> {
         let after_revision = after.map(|after| after.revision.0);
         let after_part = after.and_then(|after| after.part);
-        let question =
-            v1::ResourceServiceWatchRequest { kinds: owned(kinds), after_revision, after_part, in_parts: true };
+        let kinds = owned(kinds);
+        let question = v1::ResourceServiceWatchRequest { kinds, after_revision, after_part, ..Default::default() };
+        self.watched(question).await
+    }
+
+    /// Tells of the resources of these ids, of which there is at least one, and of every change of them.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn watch_resources(&self, ids: impl IntoIterator<Item = String>) -> Result<ResourceWatch, CallError> {
+        let resource_ids = ids.into_iter().collect();
+        self.watched(v1::ResourceServiceWatchRequest { resource_ids, ..Default::default() }).await
+    }
+
+    async fn watched(&self, question: v1::ResourceServiceWatchRequest) -> Result<ResourceWatch, CallError> {
+        let question = v1::ResourceServiceWatchRequest { in_parts: true, ..question };
         let answer = self.client.clone().watch(question).await.map_err(|status| self.failed(&status))?;
         Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }

@@ -5,7 +5,9 @@ use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::{Lease, LeasedResource};
 use ratn_model::value::Value;
 use ratn_proto::types::Goal;
-use ratn_worker::action::{Action, ActionResult, ActionServer, CallFailure, GoalContext, GoalOutcome};
+use ratn_worker::action::{
+    Action, ActionResult, ActionServer, ActionServerBuilder, CallFailure, GoalContext, GoalOutcome,
+};
 use ratn_worker::client::{ActionClient, Channels};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::server::{DRAIN_DEADLINE, Services, Serving, bind};
@@ -164,12 +166,21 @@ pub async fn provider(listen: Option<Endpoint>) -> Provider {
 
 /// As [`provider`], with a drain of its own.
 pub async fn provider_with(listen: Option<Endpoint>, drain: Duration) -> Provider {
+    let believing = |builder: ActionServerBuilder| builder.dangerously_believe_every_lease().results_kept(2);
+    provider_built(listen, drain, believing).await
+}
+
+/// As [`provider`], built as it is said.
+pub async fn provider_built(
+    listen: Option<Endpoint>,
+    drain: Duration,
+    build: impl FnOnce(ActionServerBuilder) -> ActionServerBuilder,
+) -> Provider {
     let directory = tempfile::tempdir().unwrap();
     let listen = listen.unwrap_or_else(|| Endpoint::Unix(directory.path().join("workers/one.sock")));
     let (runs, ended) = (Arc::new(AtomicUsize::new(0)), Arc::new(Notify::new()));
-    let server = ActionServer::builder(RESOURCE)
+    let server = build(ActionServer::builder(RESOURCE))
         .one_at_a_time()
-        .results_kept(2)
         .action(Double { runs: Arc::clone(&runs) })
         .action(Wait { name: "wait", abandon: true, ended: Arc::clone(&ended) })
         .action(Wait { name: "stay", abandon: false, ended: Arc::clone(&ended) })

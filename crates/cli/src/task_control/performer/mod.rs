@@ -427,6 +427,7 @@ impl Performer {
                 inputs: goal.inputs,
                 seed: goal.seed,
                 lease: goal.lease,
+                session: self.run.clone(),
                 projection: goal.projection,
                 world_pool: self.world.endpoint().to_string(),
                 deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),

@@ -1,6 +1,7 @@
 //! What the service asks of the actor, and how it gets there.
 
 use super::super::providers::Provisions;
+use super::super::watch_filter::WatchFilter;
 use super::ResourceCore;
 use crate::resource_manager::Granted;
 use ratn_model::id::{LeaseId, Revision};
@@ -104,6 +105,7 @@ pub(in super::super) enum Message {
     Watch {
         /// Without a snapshot: what happened after this.
         after: Option<WatchPosition>,
+        filter: WatchFilter,
         answer: Answer<mpsc::Receiver<Arc<ResourceUpdate>>>,
     },
 }

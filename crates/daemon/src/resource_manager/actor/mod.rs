@@ -202,8 +202,8 @@ impl Core for ResourceCore {
                 let explained = self.explain(&request_id);
                 desk.reply(answer, explained);
             }
-            Message::Watch { after, answer } => {
-                let watch = self.watch(after, desk);
+            Message::Watch { after, filter, answer } => {
+                let watch = self.watch(after, filter, desk);
                 desk.reply(answer, watch);
             }
         }
@@ -290,8 +290,8 @@ impl ResourceCore {
             Message::WatchDemand { answer, .. } => desk.reply(answer, Err(stopped)),
             Message::ReportShortage { answer, .. } => desk.reply(answer, Err(stopped)),
             Message::Explain { request_id, answer } => desk.reply(answer, self.explain(&request_id)),
-            Message::Watch { after, answer } => {
-                let watch = self.watch(after, desk);
+            Message::Watch { after, filter, answer } => {
+                let watch = self.watch(after, filter, desk);
                 desk.reply(answer, watch);
             }
         }

@@ -1,0 +1,91 @@
+//! Whether a goal's lease is one: what the resource manager says of it, and the statuses of those that are refused.
+
+use crate::lease_watch::{Claim, GRANT_WAIT, LeaseWatch, Standing};
+use ratn_model::resource::Lease;
+use ratn_proto::types::Goal;
+use std::time::Duration;
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
+
+/// When a goal that was refused because the manager is not heard may be given again.
+const UNHEARD_RETRY: Duration = Duration::from_millis(250);
+/// The word for programs of such a refusal.
+pub(crate) const MANAGER_UNHEARD: &str = "MANAGER_UNHEARD";
+
+/// Who says whether a lease is one.
+#[derive(Debug, Default)]
+pub(super) enum Authority {
+    /// Nobody: goals that need a lease are refused.
+    #[default]
+    Nobody,
+    /// The resource manager.
+    Watch(LeaseWatch),
+    /// Whoever gives the goal.
+    Claimant,
+}
+
+/// A goal's lease, as far as it can be said now.
+#[derive(Debug)]
+pub(super) enum Confirmation {
+    /// The manager says so.
+    Confirmed,
+    /// It may be said in a moment; else this is the refusal.
+    Awaited(Status),
+}
+
+impl Authority {
+    /// Whether the goal's lease holds `resource`.
+    ///
+    /// # Errors
+    /// FAILED_PRECONDITION where it does not.
+    pub(super) fn confirm(&self, goal: &Goal, lease: &Lease, resource: &str) -> Result<Confirmation, Status> {
+        let watch = match self {
+            Authority::Claimant => return Ok(Confirmation::Confirmed),
+            Authority::Nobody => {
+                let message =
+                    format!("{resource} watches no leases, so none is confirmed: give its ActionServer a LeaseWatch");
+                return Err(refusal(Code::FailedPrecondition, "NO_LEASE_WATCH", message));
+            }
+            Authority::Watch(watch) => watch,
+        };
+        let claim = Claim { resource, lease: lease.id, token: lease.token, session: &goal.session };
+        let unheard = |why: &str| {
+            let message =
+                format!("{} of {resource} cannot be confirmed: {why}; nothing was begun, try again", lease.id);
+            let mut details = ErrorDetails::with_error_info(MANAGER_UNHEARD, "ratn", []);
+            details.set_retry_info(Some(UNHEARD_RETRY));
+            Status::with_error_details(Code::Unavailable, message, details)
+        };
+        Ok(match watch.check(&claim) {
+            Standing::Confirmed => Confirmation::Confirmed,
+            Standing::Refuted(why) => return Err(refusal(Code::FailedPrecondition, "LEASE_REFUTED", why)),
+            Standing::NotHeardOf { listening: true } => {
+                let message = format!(
+                    "{} ({}) of {resource} is unknown: the resource manager told of no such grant within {} s; acquire it, and send \
+                     the lease as it was granted",
+                    lease.id,
+                    lease.token,
+                    GRANT_WAIT.as_secs_f64()
+                );
+                Confirmation::Awaited(refusal(Code::FailedPrecondition, "LEASE_UNKNOWN", message))
+            }
+            Standing::NotHeardOf { listening: false } => {
+                Confirmation::Awaited(unheard("the resource manager is not heard just now"))
+            }
+            Standing::Unheard(why) => Confirmation::Awaited(unheard(&why)),
+        })
+    }
+
+    /// The watch, where there is one.
+    pub(super) fn watch(&self) -> Option<&LeaseWatch> {
+        match self {
+            Authority::Watch(watch) => Some(watch),
+            Authority::Nobody | Authority::Claimant => None,
+        }
+    }
+}
+
+/// A status that says why in one word for programs and in a sentence for people.
+pub(super) fn refusal(code: Code, reason: &str, message: String) -> Status {
+    Status::with_error_details(code, message, ErrorDetails::with_error_info(reason, "ratn", []))
+}

@@ -1,0 +1,323 @@
+//! Who holds the resources of one provider, as the resource manager says. Pure: takes what a watch tells, answers for claims.
+//!
+//! ```text
+//! unheard ─ snapshot ─→ heard ─ watch breaks ─→ interrupted ─ too long ─→ unheard
+//!                         └──────── snapshot ────────┘
+//! ```
+//! While the watch is interrupted what was heard last still counts, and nothing new is confirmed. Lease ids grow with the grants: an id
+//! beyond every one heard of may have been granted a moment ago, any other that holds nothing has ended or never was.
+
+use ratn_model::id::{FencingToken, LeaseId};
+use ratn_proto::types::{Resource, ResourceEvent, ResourceEventKind, ResourceUpdate};
+use std::collections::BTreeMap;
+
+/// Why nothing is confirmed before the first word of the manager.
+const NEVER_HEARD: &str = "the resource manager has not been heard yet";
+
+/// What a goal says of its lease.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Claim<'a> {
+    /// The resource that is to perform it.
+    pub resource: &'a str,
+    /// The lease.
+    pub lease: LeaseId,
+    /// Its fencing token.
+    pub token: FencingToken,
+    /// The session that holds the lease; empty where the goal does not say it.
+    pub session: &'a str,
+}
+
+/// What the resource manager says of a claim.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Standing {
+    /// It is so.
+    Confirmed,
+    /// It has not been heard of: it may have been granted a moment ago.
+    NotHeardOf {
+        /// The watch goes on, so that it will be heard of if it is true.
+        listening: bool,
+    },
+    /// It is not so, and why.
+    Refuted(String),
+    /// The manager is not heard, and why: nothing is known.
+    Unheard(String),
+}
+
+/// A resource that a lease does not hold any more.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EndedHolding {
+    /// The resource.
+    pub resource: String,
+    /// The lease.
+    pub lease: LeaseId,
+    /// Why, for people.
+    pub reason: String,
+}
+
+/// Who holds what.
+#[derive(Debug)]
+pub struct Holdings {
+    by_resource: BTreeMap<String, BTreeMap<LeaseId, Holder>>,
+    /// The largest id heard of.
+    youngest: LeaseId,
+    /// The session that provides the resources, where that is known: what another one provides under their ids is not this provider.
+    owner: Option<String>,
+    contact: Contact,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Holder {
+    token: FencingToken,
+    session: String,
+}
+
+#[derive(Debug, PartialEq, Eq)]
+enum Contact {
+    Heard,
+    Interrupted,
+    Unheard(String),
+}
+
+impl Default for Holdings {
+    fn default() -> Holdings {
+        Holdings {
+            by_resource: BTreeMap::new(),
+            youngest: LeaseId(0),
+            owner: None,
+            contact: Contact::Unheard(NEVER_HEARD.to_owned()),
+        }
+    }
+}
+
+impl Holdings {
+    /// What the manager says of a claim.
+    pub fn check(&self, claim: &Claim<'_>) -> Standing {
+        if let Contact::Unheard(reason) = &self.contact {
+            return Standing::Unheard(reason.clone());
+        }
+        let Claim { resource, lease, token, session } = *claim;
+        let holders = self.by_resource.get(resource);
+        match holders.and_then(|holders| holders.get(&lease)) {
+            Some(holder) if holder.token != token => Standing::Refuted(format!(
+                "{lease} of {resource} has {}, and the goal says {token}: send the lease as it was granted",
+                holder.token
+            )),
+            Some(holder) if !session.is_empty() && holder.session != session => Standing::Refuted(format!(
+                "{lease} of {resource} is held by session `{}`, and the goal says `{session}`: acquire a lease of your own",
+                holder.session
+            )),
+            Some(_) => Standing::Confirmed,
+            None if lease > self.youngest => Standing::NotHeardOf { listening: self.contact == Contact::Heard },
+            None => Standing::Refuted(self.not_held(claim)),
+        }
+    }
+
+    /// Why a lease that does not hold the resource is not good for it.
+    pub fn not_held(&self, claim: &Claim<'_>) -> String {
+        let Claim { resource, lease, token, .. } = claim;
+        let holders = self.by_resource.get(*resource).into_iter().flatten();
+        let held = match holders.map(|(lease, holder)| format!("{lease} ({})", holder.token)).next_back() {
+            Some(holder) => format!("{holder} holds it"),
+            None => "no lease holds it".to_owned(),
+        };
+        format!(
+            "{lease} ({token}) of {resource} is over, or never was one: {held}, says the resource manager; acquire it anew"
+        )
+    }
+
+    /// A new watch begins, of resources that `owner` provides where that is known.
+    pub fn begin(&mut self, owner: Option<&str>) {
+        self.owner = owner.map(str::to_owned);
+    }
+
+    /// The watch tells something; what has ended with it.
+    pub fn tell(&mut self, update: &ResourceUpdate) -> Vec<EndedHolding> {
+        match update {
+            ResourceUpdate::Snapshot { resources, youngest, .. } => {
+                let gone: Vec<String> = self.by_resource.keys().cloned().collect();
+                let gone = gone.iter().filter(|id| resources.iter().all(|resource| resource.id != **id));
+                let reason = "it ended while the resource manager was not heard";
+                let mut ended: Vec<EndedHolding> = gone.flat_map(|id| self.set(id, BTreeMap::new(), reason)).collect();
+                for resource in resources {
+                    let holders = self.holders(resource);
+                    ended.extend(self.set(&resource.id, holders, reason));
+                }
+                self.youngest = *youngest;
+                self.contact = Contact::Heard;
+                ended
+            }
+            ResourceUpdate::Event(event) => self.happened(event),
+        }
+    }
+
+    fn happened(&mut self, event: &ResourceEvent) -> Vec<EndedHolding> {
+        let or = |reason: &'static str| if event.reason.is_empty() { reason } else { event.reason.as_str() };
+        if let Some((lease, _)) = event.lease {
+            self.youngest = self.youngest.max(lease);
+        }
+        match event.kind {
+            ResourceEventKind::Deleted => self.set(&event.resource.id, BTreeMap::new(), or("its resource is gone")),
+            _ => {
+                let holders = self.holders(&event.resource);
+                self.set(&event.resource.id, holders, or("it was released"))
+            }
+        }
+    }
+
+    /// The watch broke: what was heard last counts for now.
+    pub fn interrupted(&mut self) {
+        if self.contact == Contact::Heard {
+            self.contact = Contact::Interrupted;
+        }
+    }
+
+    /// Nothing is known any more: every lease may have ended.
+    pub fn lost(&mut self, reason: &str) {
+        self.by_resource.clear();
+        self.contact = Contact::Unheard(reason.to_owned());
+    }
+
+    /// Whether the manager has been heard, and not lost since.
+    pub fn is_heard(&self) -> bool {
+        !matches!(self.contact, Contact::Unheard(_))
+    }
+
+    fn holders(&self, resource: &Resource) -> BTreeMap<LeaseId, Holder> {
+        if self.owner.as_ref().is_some_and(|owner| *owner != resource.session) {
+            return BTreeMap::new();
+        }
+        let holder = |holding: &ratn_proto::types::Holding| {
+            (holding.lease, Holder { token: holding.token, session: holding.session.clone() })
+        };
+        resource.holdings.iter().map(holder).collect()
+    }
+
+    fn set(&mut self, resource: &str, holders: BTreeMap<LeaseId, Holder>, reason: &str) -> Vec<EndedHolding> {
+        let before = self.by_resource.insert(resource.to_owned(), holders).unwrap_or_default();
+        let now = &self.by_resource[resource];
+        let ended = before.into_keys().filter(|lease| !now.contains_key(lease));
+        let ended = ended.map(|lease| EndedHolding { resource: resource.to_owned(), lease, reason: reason.to_owned() });
+        let ended = ended.collect();
+        if now.is_empty() {
+            self.by_resource.remove(resource);
+        }
+        ended
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_model::id::Revision;
+    use ratn_model::resource::{Quantity, ResourceClass};
+    use ratn_proto::types::Holding;
+
+    fn arm(leases: &[u64]) -> Resource {
+        let holding = |&lease: &u64| Holding {
+            lease: LeaseId(lease),
+            token: FencingToken(10 * lease),
+            units: Quantity::ONE,
+            session: format!("s{lease}"),
+            holder: String::new(),
+            opened_by: String::new(),
+        };
+        let mut arm = Resource::new("arm", ResourceClass::Module, "Arm");
+        (arm.session, arm.holdings) = ("cell".to_owned(), leases.iter().map(holding).collect());
+        arm
+    }
+
+    fn snapshot(resources: &[Resource], youngest: u64) -> ResourceUpdate {
+        let (revision, youngest) = (Revision(1), LeaseId(youngest));
+        ResourceUpdate::Snapshot { revision, resources: resources.to_vec(), youngest }
+    }
+
+    fn event(kind: ResourceEventKind, resource: Resource, lease: u64) -> ResourceUpdate {
+        ResourceUpdate::Event(ResourceEvent {
+            revision: Revision(2),
+            kind,
+            resource,
+            lease: (lease > 0).then_some((LeaseId(lease), FencingToken(10 * lease))),
+            reason: String::new(),
+            part: 0,
+        })
+    }
+
+    fn claim(lease: u64) -> Claim<'static> {
+        Claim { resource: "arm", lease: LeaseId(lease), token: FencingToken(10 * lease), session: "" }
+    }
+
+    fn heard(leases: &[u64], youngest: u64) -> Holdings {
+        let mut holdings = Holdings::default();
+        assert_eq!(holdings.tell(&snapshot(&[arm(leases)], youngest)), []);
+        holdings
+    }
+
+    fn refuted(holdings: &Holdings, claim: Claim<'_>, why: &str) {
+        let standing = holdings.check(&claim);
+        assert!(matches!(&standing, Standing::Refuted(reason) if reason.contains(why)), "{standing:?}");
+    }
+
+    #[test]
+    fn only_what_the_manager_says_is_confirmed() {
+        let holdings = heard(&[7], 9);
+        assert_eq!(holdings.check(&claim(7)), Standing::Confirmed);
+        assert_eq!(holdings.check(&Claim { session: "s7", ..claim(7) }), Standing::Confirmed);
+        refuted(&holdings, Claim { token: FencingToken(u64::MAX), ..claim(7) }, "has token-70, and the goal says");
+        refuted(&holdings, Claim { session: "s8", ..claim(7) }, "is held by session `s7`, and the goal says `s8`");
+        refuted(&holdings, Claim { resource: "camera", ..claim(7) }, "no lease holds it");
+        for over in [0, 6, 8, 9] {
+            refuted(&holdings, claim(over), "lease-7 (token-70) holds it");
+        }
+        assert_eq!(holdings.check(&claim(10)), Standing::NotHeardOf { listening: true });
+    }
+
+    #[test]
+    fn a_lease_is_confirmed_from_its_grant_to_its_end() {
+        let mut holdings = heard(&[], 9);
+        assert_eq!(holdings.tell(&event(ResourceEventKind::Leased, arm(&[12]), 12)), []);
+        assert_eq!(holdings.check(&claim(12)), Standing::Confirmed);
+        refuted(&holdings, claim(11), "is over");
+        let ended = holdings.tell(&event(ResourceEventKind::Released, arm(&[]), 12));
+        let reason = "it was released".to_owned();
+        assert_eq!(ended, [EndedHolding { resource: "arm".to_owned(), lease: LeaseId(12), reason }]);
+        refuted(&holdings, claim(12), "no lease holds it");
+    }
+
+    #[test]
+    fn what_ended_unheard_ends_with_the_next_snapshot_and_a_resource_that_is_gone_ends_its_leases() {
+        let mut holdings = heard(&[7], 7);
+        let leases = |ended: Vec<EndedHolding>| ended.iter().map(|ended| ended.lease.0).collect::<Vec<_>>();
+        assert_eq!(leases(holdings.tell(&snapshot(&[arm(&[8])], 8))), [7]);
+        assert_eq!(leases(holdings.tell(&event(ResourceEventKind::Deleted, arm(&[8]), 0))), [8]);
+        assert_eq!(leases(holdings.tell(&event(ResourceEventKind::Created, arm(&[]), 0))), [0; 0]);
+        holdings.tell(&event(ResourceEventKind::Leased, arm(&[9]), 9));
+        assert_eq!(leases(holdings.tell(&snapshot(&[], 9))), [9]);
+    }
+
+    #[test]
+    fn while_the_watch_is_interrupted_what_was_heard_counts_and_nothing_does_when_it_is_lost() {
+        let mut holdings = Holdings::default();
+        assert_eq!(holdings.check(&claim(7)), Standing::Unheard(NEVER_HEARD.to_owned()));
+        holdings.interrupted();
+        assert!(!holdings.is_heard());
+        holdings.tell(&snapshot(&[arm(&[7])], 7));
+        holdings.interrupted();
+        assert_eq!(holdings.check(&claim(7)), Standing::Confirmed);
+        assert_eq!(holdings.check(&claim(8)), Standing::NotHeardOf { listening: false });
+        holdings.lost("silence");
+        assert_eq!(holdings.check(&claim(7)), Standing::Unheard("silence".to_owned()));
+        holdings.tell(&snapshot(&[arm(&[7])], 7));
+        assert_eq!(holdings.check(&claim(7)), Standing::Confirmed);
+    }
+
+    #[test]
+    fn a_resource_that_another_session_provides_under_the_same_id_is_not_this_provider() {
+        let mut holdings = Holdings::default();
+        holdings.begin(Some("another cell"));
+        holdings.tell(&snapshot(&[arm(&[7])], 7));
+        refuted(&holdings, claim(7), "no lease holds it");
+        holdings.begin(Some("cell"));
+        holdings.tell(&snapshot(&[arm(&[8])], 8));
+        assert_eq!(holdings.check(&claim(8)), Standing::Confirmed);
+    }
+}

@@ -1,0 +1,257 @@
+//! Who holds the resources of this provider: the resource manager's word, not that of a goal.
+//!
+//! ```text
+//!   resource manager ──watch──▶ follow (a task) ──▶ Holdings (pure) ◀── check ── ActionServer::admit
+//!                                       └── what ended ──▶ ActionServer: its goals end
+//! ```
+//! A provider makes one [`LeaseWatch`] for its resources, gives it to its [`crate::action::ActionServer`], and has it follow the
+//! manager. While the manager cannot be heard, what it said last is trusted as long as the provider's own session lives (without
+//! a session: for a time after the watch broke); then every goal under a lease ends and none begins. What the manager
+//! says first after that is compared with what is under way.
+
+mod holdings;
+mod location;
+
+pub use holdings::{Claim, EndedHolding, Holdings, Standing};
+pub use location::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
+
+use crate::client::{CallError, Channels, ResourceClient, ResourceWatch};
+use crate::endpoint::Endpoint;
+use crate::session::{Session, SessionState};
+
+use std::future::pending;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::Duration;
+use tokio::sync::watch;
+use tokio::time::{sleep, timeout};
+
+/// A lease that has not been heard of is waited for so long: its grant reaches its holder and this provider at about the same time.
+pub const GRANT_WAIT: Duration = Duration::from_secs(1);
+
+/// The pause before the manager is asked again.
+const RETRY_INTERVAL: Duration = Duration::from_millis(100);
+
+/// Hears what ends.
+pub(crate) trait LeaseListener: Send + Sync {
+    /// A lease does not hold a resource any more.
+    fn lease_ended(&self, ended: &EndedHolding);
+
+    /// Every lease may have ended.
+    fn leases_lost(&self, reason: &str);
+}
+
+/// What is known of the leases of a provider's resources. A handle: clones share everything.
+#[derive(Clone)]
+pub struct LeaseWatch {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    /// Their ids.
+    resources: Vec<String>,
+    holdings: Mutex<Holdings>,
+    /// Grows with everything heard.
+    heard: watch::Sender<u64>,
+    listeners: Mutex<Vec<Weak<dyn LeaseListener>>>,
+}
+
+/// Where to listen.
+enum Source {
+    /// To one manager, in which a session provides the resources.
+    Session { client: Box<ResourceClient>, state: watch::Receiver<SessionState>, id: String },
+    /// To the manager of this location, wherever it is now.
+    Location { channels: Channels, location: ManagerLocation },
+}
+
+/// What is followed now.
+struct Following {
+    stream: ResourceWatch,
+    /// Of the session that was alive when it began.
+    generation: u64,
+    endpoint: Endpoint,
+}
+
+impl LeaseWatch {
+    /// Of the resources of these ids; nothing is known of them before it follows a manager.
+    pub fn of(resources: impl IntoIterator<Item = impl Into<String>>) -> LeaseWatch {
+        let shared = Shared {
+            resources: resources.into_iter().map(Into::into).collect(),
+            holdings: Mutex::default(),
+            heard: watch::channel(0).0,
+            listeners: Mutex::default(),
+        };
+        LeaseWatch { shared: Arc::new(shared) }
+    }
+
+    /// What the resource manager says of a claim, as of now.
+    pub fn check(&self, claim: &Claim<'_>) -> Standing {
+        self.shared.holdings().check(claim)
+    }
+
+    /// Whether the manager is heard, or was a moment ago.
+    pub fn is_heard(&self) -> bool {
+        self.shared.holdings().is_heard()
+    }
+
+    /// Follows the manager of a session that provides the resources, for as long as the future is polled; leases are trusted as long
+    /// as the session lives, and for `patience` after the watch broke. Drop the future before the session is closed.
+    ///
+    /// # Errors
+    /// As [`Channels::get`].
+    pub fn follow_session(
+        &self,
+        channels: &Channels,
+        manager: &Endpoint,
+        session: &Session,
+        patience: Duration,
+    ) -> Result<impl Future<Output = ()> + Send + use<>, CallError> {
+        let client = Box::new(ResourceClient::new(channels, manager, "")?);
+        let source = Source::Session { client, state: session.state(), id: session.id().to_owned() };
+        Ok(self.clone().follow(source, patience))
+    }
+
+    /// Follows the manager of a location, wherever it is, for as long as the future is polled; for a provider whose resources another
+    /// process offers. Leases are trusted for `patience` after the watch broke.
+    pub fn follow_location(
+        &self,
+        channels: &Channels,
+        location: ManagerLocation,
+        patience: Duration,
+    ) -> impl Future<Output = ()> + Send + use<> {
+        self.clone().follow(Source::Location { channels: channels.clone(), location }, patience)
+    }
+
+    /// Nothing is known any more: what is under way ends, and nothing begins until a manager is heard.
+    pub fn lost(&self, reason: &str) {
+        self.shared.holdings().lost(reason);
+        self.shared.tell(|listener| listener.leases_lost(reason));
+        self.shared.heard.send_modify(|heard| *heard += 1);
+    }
+
+    pub(crate) fn listen(&self, listener: Weak<dyn LeaseListener>) {
+        self.shared.listeners.lock().unwrap_or_else(PoisonError::into_inner).push(listener);
+    }
+
+    /// Changes with everything that is heard from now on.
+    pub(crate) fn heard(&self) -> watch::Receiver<u64> {
+        self.shared.heard.subscribe()
+    }
+
+    /// Takes what the manager tells. For tests of providers without a manager; else [`LeaseWatch::follow_session`] does it.
+    pub fn tell(&self, update: &ratn_proto::types::ResourceUpdate) {
+        let ended = self.shared.holdings().tell(update);
+        // Whoever waits for the next lease finds the goals of the last one told to stop.
+        self.shared.tell(|listener| ended.iter().for_each(|ended| listener.lease_ended(ended)));
+        self.shared.heard.send_modify(|heard| *heard += 1);
+    }
+
+    async fn follow(self, source: Source, patience: Duration) {
+        let mut following = self.begin(&source).await;
+        loop {
+            let trusted = tokio::select! {
+                biased;
+                // Known before a connection that hangs breaks.
+                () = source.is_over(following.generation) => Duration::ZERO,
+                () = self.read(&mut following.stream) => patience,
+                () = source.has_moved(&following.endpoint) => patience,
+            };
+            self.shared.holdings().interrupted();
+            let again = async {
+                sleep(RETRY_INTERVAL).await;
+                self.begin(&source).await
+            };
+            following = match timeout(trusted, again).await {
+                Ok(begun) => begun,
+                Err(_) => {
+                    let reason = "the resource manager is not heard";
+                    tracing::warn!("{reason}: goals under a lease end, and none begins");
+                    self.lost(reason);
+                    self.begin(&source).await
+                }
+            };
+        }
+    }
+
+    /// A watch that has told which leases live.
+    async fn begin(&self, source: &Source) -> Following {
+        loop {
+            match self.try_begin(source).await {
+                Ok(following) => return following,
+                Err(error) => tracing::debug!(%error, "no watch of leases"),
+            }
+            sleep(RETRY_INTERVAL).await;
+        }
+    }
+
+    async fn try_begin(&self, source: &Source) -> Result<Following, CallError> {
+        let (client, owner, generation) = match source {
+            Source::Session { client, state, id } => {
+                // A session that is closed tells nothing more, and this watch ends with it.
+                let mut state = state.clone();
+                let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { pending().await };
+                (ResourceClient::clone(client), Some(id.as_str()), generation)
+            }
+            Source::Location { channels, location } => {
+                let manager = location.find().await;
+                (ResourceClient::new(channels, &manager, "")?, None, 0)
+            }
+        };
+        let mut stream = client.watch_resources(self.shared.resources.iter().cloned()).await?;
+        let first = stream.next().await?;
+        self.shared.holdings().begin(owner);
+        if let Some(snapshot) = first {
+            self.tell(&snapshot);
+        }
+        Ok(Following { stream, generation, endpoint: client.endpoint().clone() })
+    }
+
+    /// Returns when the watch has ended.
+    async fn read(&self, stream: &mut ResourceWatch) {
+        loop {
+            match stream.next().await {
+                Ok(Some(update)) => self.tell(&update),
+                Ok(None) => return tracing::debug!("the watch of leases ended"),
+                Err(error) => return tracing::debug!(%error, "the watch of leases broke"),
+            }
+        }
+    }
+}
+
+impl Source {
+    /// Returns when the session of then is not alive, also when that was so before.
+    async fn is_over(&self, generation: u64) {
+        match self {
+            Source::Session { state, .. } => {
+                let _ = state.clone().wait_for(|s| !s.alive || s.generation != generation).await;
+            }
+            Source::Location { .. } => pending().await,
+        }
+    }
+
+    async fn has_moved(&self, endpoint: &Endpoint) {
+        match self {
+            Source::Session { .. } => pending().await,
+            Source::Location { location, .. } => location.moved_from(endpoint).await,
+        }
+    }
+}
+
+impl Shared {
+    fn holdings(&self) -> MutexGuard<'_, Holdings> {
+        self.holdings.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn tell(&self, say: impl Fn(&dyn LeaseListener)) {
+        let mut listeners = self.listeners.lock().unwrap_or_else(PoisonError::into_inner);
+        listeners.retain(|listener| listener.strong_count() > 0);
+        let there: Vec<Arc<dyn LeaseListener>> = listeners.iter().filter_map(Weak::upgrade).collect();
+        drop(listeners);
+        there.iter().for_each(|listener| say(&**listener));
+    }
+}
+
+impl std::fmt::Debug for LeaseWatch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("LeaseWatch").field("holdings", &self.shared.holdings).finish_non_exhaustive()
+    }
+}
