@@ -4,9 +4,10 @@
 //! ```text
 //!   starting ─▶ READY ─ SIGHUP ─▶ RELOADING ─▶ READY ─ drain ─▶ STOPPING          WATCHDOG, twice per time that systemd waits
 //! ```
-//! The watchdog's pings come from the runtime that serves: one that hangs is silent, and systemd ends the process.
+//! The watchdog's pings tell of the turns of the daemon's core: one that hangs, or has ended, is silent, and systemd ends the process.
 
 use ratn_worker::server::Phase;
+use ratn_worker::vitals::Vitals;
 use sd_notify::NotifyState;
 use std::io;
 use std::path::Path;
@@ -46,7 +47,9 @@ impl Supervisor {
     }
 
     /// Says how far the process is, and calls `reload` at every SIGHUP while it serves. Returns when it has ended.
-    pub async fn follow(mut self, mut phase: watch::Receiver<Phase>, mut reload: impl FnMut()) {
+    pub async fn follow(mut self, mut phase: watch::Receiver<Phase>, vitals: Vitals, mut reload: impl FnMut()) {
+        let mut condition = vitals.condition();
+        let mut beats = None;
         let mut pings = self.watchdog.map(|pause| {
             let mut pings = tokio::time::interval(pause);
             pings.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -55,7 +58,7 @@ impl Supervisor {
         loop {
             let ping = async {
                 match &mut pings {
-                    Some(pings) => pings.tick().await,
+                    Some(pings) => drop(pings.tick().await),
                     None => std::future::pending().await,
                 }
             };
@@ -79,10 +82,25 @@ impl Supervisor {
                     reload();
                     say(&[NotifyState::Ready]);
                 }
-                _ = ping => say(&[NotifyState::Watchdog]),
+                Ok(()) = condition.changed() => {
+                    let unwell = condition.borrow_and_update().unwell.clone();
+                    if *phase.borrow() == Phase::Serving {
+                        say(&[NotifyState::Status(unwell.as_deref().unwrap_or("serving"))]);
+                    }
+                }
+                () = ping => if has_moved(&mut beats, vitals.beats()) {
+                    say(&[NotifyState::Watchdog]);
+                },
             }
         }
     }
+}
+
+/// Whether the core took a turn since the last look. Without one whose turns are known, the runtime's being here is enough.
+fn has_moved(last: &mut Option<u64>, beats: Option<u64>) -> bool {
+    let moved = beats.is_none() || beats != *last;
+    *last = beats;
+    moved
 }
 
 /// A process without a server of its own is ready.
@@ -98,5 +116,21 @@ pub fn stopping() {
 fn say(states: &[NotifyState]) {
     if let Err(error) = sd_notify::notify(states) {
         tracing::warn!(%error, "the service manager does not listen");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_core_that_takes_no_turn_is_silent() {
+        let (vitals, mut last) = (Vitals::default(), None);
+        assert!(has_moved(&mut last, vitals.beats()), "there is no core that beats");
+        vitals.beat();
+        assert!(has_moved(&mut last, vitals.beats()));
+        assert!(!has_moved(&mut last, vitals.beats()));
+        vitals.beat();
+        assert!(has_moved(&mut last, vitals.beats()));
     }
 }

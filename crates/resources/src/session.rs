@@ -164,6 +164,23 @@ impl Pool {
         }
     }
 
+    /// The same pool, in which every session expires so much later, unless it is pinged before: what a predecessor of this pool's owner
+    /// may have promised meanwhile is kept.
+    #[must_use]
+    pub fn with_session_grace(mut self, grace: Duration) -> Pool {
+        for (id, session) in &mut self.sessions {
+            self.timers.remove(&(session.expires, Timer::Session(id.clone())));
+            session.expires = session.expires + grace;
+            self.timers.insert((session.expires, Timer::Session(id.clone())));
+        }
+        self
+    }
+
+    /// How long a session lives without a keep-alive; nothing where it is unknown.
+    pub fn session_ttl(&self, id: &SessionId) -> Option<Duration> {
+        self.sessions.get(id).map(|session| session.ttl)
+    }
+
     /// Ends a session and everything that hangs on it.
     ///
     /// # Errors

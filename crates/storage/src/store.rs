@@ -112,7 +112,7 @@ pub trait Place: fmt::Debug + Send + Sync {
     /// Whether it is still the writer's. Says nothing of the moment after the look. May take as long as the disk takes to answer.
     ///
     /// # Errors
-    /// [`Fault::Fenced`] where somebody else has it, or where that cannot be ruled out.
+    /// [`Fault::Fenced`] where somebody else has it or may have; another one where it cannot be seen.
     fn check(&self) -> Result<(), Fault>;
 }
 

@@ -43,4 +43,5 @@ pub mod session;
 pub mod shutdown;
 pub mod tls;
 pub mod trace;
+pub mod vitals;
 pub mod worker;

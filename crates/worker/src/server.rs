@@ -8,6 +8,7 @@
 use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
 use crate::gate::{Calls, Gate, Gated, Open};
 use crate::tls::{ServerTls, TlsError};
+use crate::vitals::{CoreFailure, Vitals};
 use std::convert::Infallible;
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt};
@@ -44,6 +45,8 @@ pub struct Serving {
     pub drain: Duration,
     /// Says how far it is.
     pub phase: watch::Sender<Phase>,
+    /// How what is served is, as it says itself.
+    pub vitals: Vitals,
 }
 
 /// How far a server is.
@@ -132,6 +135,9 @@ pub enum ServeError {
         #[source]
         source: tonic::transport::Error,
     },
+    /// What is served has ended before its time.
+    #[error(transparent)]
+    Core(#[from] CoreFailure),
     /// The descriptors do not make a reflection service.
     #[error("no reflection for the services")]
     Reflection(#[source] tonic_reflection::server::Error),
@@ -219,6 +225,7 @@ impl Default for Serving {
             gate: Arc::new(Open),
             drain: DRAIN_DEADLINE,
             phase: watch::Sender::new(Phase::Starting),
+            vitals: Vitals::default(),
         }
     }
 }
@@ -231,7 +238,7 @@ impl Bound {
 
     /// Serves until `shutdown` is cancelled, then lets calls under way end within [`DRAIN_DEADLINE`] and refuses new ones with
     /// [`crate::gate::ending`]. Health is SERVING from the first answer on, for the server (the empty name) and for each service,
-    /// and NOT_SERVING once it drains. Services must end endless streams, and calls that wait for something, on the same token.
+    /// and NOT_SERVING while what is served says that it cannot do what it is for ([`Vitals`]), and once it drains. Services must end endless streams, and calls that wait for something, on the same token.
     ///
     /// # Errors
     /// [`ServeError`] where the transport fails.
@@ -242,7 +249,8 @@ impl Bound {
     /// As [`Bound::serve`], through a gate and with a drain of one's own.
     ///
     /// # Errors
-    /// [`ServeError`] where the transport fails, or the TLS files hold nothing usable.
+    /// [`ServeError`] where the transport fails, the TLS files hold nothing usable, or what is served has ended before its time: then
+    /// nothing more is answered, and nothing drains.
     pub async fn serve_as(
         self,
         services: Services,
@@ -250,9 +258,16 @@ impl Bound {
         shutdown: CancellationToken,
     ) -> Result<(), ServeError> {
         let (health, health_service) = tonic_health::server::health_reporter();
-        for name in services.names.iter().chain(&[""]) {
-            health.set_service_status(name, ServingStatus::Serving).await;
-        }
+        let names: Vec<&'static str> = services.names.iter().copied().chain([""]).collect();
+        let say = async |status| {
+            for name in &names {
+                health.set_service_status(name, status).await;
+            }
+        };
+        let mut condition = serving.vitals.condition();
+        let status_of = |unwell: bool| if unwell { ServingStatus::NotServing } else { ServingStatus::Serving };
+        let unwell = condition.borrow_and_update().unwell.is_some();
+        say(status_of(unwell)).await;
         let reflection = tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(ratn_proto::FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
@@ -294,11 +309,18 @@ impl Bound {
         };
         serving.phase.send_replace(Phase::Serving);
         let drained = async {
-            shutdown.cancelled().await;
-            serving.phase.send_replace(Phase::Draining);
-            for name in services.names.iter().chain(&[""]) {
-                health.set_service_status(name, ServingStatus::NotServing).await;
+            loop {
+                tokio::select! {
+                    biased;
+                    () = shutdown.cancelled() => break,
+                    Ok(()) = condition.changed() => {
+                        let unwell = condition.borrow_and_update().unwell.is_some();
+                        say(status_of(unwell)).await;
+                    }
+                }
             }
+            serving.phase.send_replace(Phase::Draining);
+            say(ServingStatus::NotServing).await;
             if tokio::time::timeout(serving.drain, calls.ended()).await.is_err() {
                 let drain_ms = u64::try_from(serving.drain.as_millis()).unwrap_or(u64::MAX);
                 tracing::warn!(drain_ms, "calls were still under way at the end of the drain: they are dropped");
@@ -309,6 +331,8 @@ impl Bound {
         };
         let endpoint = self.endpoint;
         tokio::select! {
+            biased;
+            failure = serving.vitals.failed() => Err(failure.into()),
             served = served => served.map_err(|source| ServeError::Transport { endpoint, source }),
             () = drained => Ok(()),
         }

@@ -4,6 +4,7 @@
 //! ```text
 //! open ─→ not alive ─ ping answered ─→ alive ─ no answer for a TTL ─→ not alive
 //!                                      └─ answer says `created` ─→ alive, next generation
+//! not alive ─ answer says that it is known ─→ alive, the same generation: a manager that was suspended, or away, has kept it
 //! ```
 
 use crate::client::{Channels, fresh_id};
@@ -21,6 +22,8 @@ use tonic::transport::Channel;
 /// How long a session lives without a ping unless said otherwise.
 pub const DEFAULT_TTL: Duration = Duration::from_secs(3);
 
+/// A manager that is not heard for so many times to live, after the first, is not waited for any more.
+pub const GIVEN_UP_AFTER: u32 = 3;
 /// A session is pinged this many times per time to live.
 const PINGS_PER_TTL: u32 = 4;
 /// The pause before a reconnect; grows from the first to the second.
@@ -33,6 +36,7 @@ const FAREWELL: Duration = Duration::from_millis(200);
 pub struct Session {
     id: String,
     endpoint: Endpoint,
+    ttl: Duration,
     state: watch::Receiver<SessionState>,
     end: CancellationToken,
     task: Option<JoinHandle<()>>,
@@ -45,6 +49,8 @@ pub struct SessionState {
     pub alive: bool,
     /// How often the manager made it; when it grows beyond 1, what the session owned and held is gone.
     pub generation: u64,
+    /// When it ran out here, if it was alive before and is not now.
+    pub unheard_since: Option<Instant>,
     /// The manager knew it from before when it was pinged for the first time: it goes on with what it has there.
     pub found: bool,
 }
@@ -81,7 +87,7 @@ impl Session {
             end: end.clone(),
         };
         let task = Some(tokio::spawn(keeper.keep()));
-        Session { id, endpoint: endpoint.clone(), state, end, task }
+        Session { id, endpoint: endpoint.clone(), ttl, state, end, task }
     }
 
     /// Its id.
@@ -107,12 +113,40 @@ impl Session {
         Err(SessionError { endpoint: self.endpoint.clone(), waited_s: deadline.as_secs_f64() })
     }
 
-    /// Returns once what the session owned or held is gone: it was not answered for its time to live, or the manager made
-    /// it anew. Counts from the call on; a session that is not alive yet is waited for first.
+    /// Returns once what the session owned or held may be another's: it was not answered for its time to live, or the manager made
+    /// it anew since the call. A session that was never alive is waited for first. For those who have to stop then; the
+    /// manager may still know it ([`Session::gone`]).
     pub async fn lost(&self) {
         let mut state = self.state.clone();
+        if state.borrow().unheard_since.is_some() {
+            return;
+        }
         let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { return };
         let _ = state.wait_for(|s| !s.alive || s.generation != generation).await;
+    }
+
+    /// Returns once what the session owned or held is gone for good: the manager made it anew, or was not heard for [`GIVEN_UP_AFTER`]
+    /// times to live after the session had run out here. Counts from the session's beginning.
+    pub async fn gone(&self) {
+        let mut state = self.state.clone();
+        loop {
+            let now = *state.borrow_and_update();
+            if now.generation > 1 {
+                return;
+            }
+            let given_up = async {
+                match now.unheard_since {
+                    Some(since) => tokio::time::sleep_until(since + self.ttl * GIVEN_UP_AFTER).await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                changed = state.changed() => if changed.is_err() {
+                    return;
+                },
+                () = given_up => return,
+            }
+        }
     }
 
     /// Ends it with the manager, so that what it holds is free at once.
@@ -157,7 +191,14 @@ impl Keeper {
                 backoff = BACKOFF.0;
             }
             if Instant::now() >= self.expires {
-                self.tell.send_if_modified(|state| std::mem::take(&mut state.alive));
+                let expires = self.expires;
+                self.tell.send_if_modified(|state| {
+                    let ran_out = std::mem::take(&mut state.alive);
+                    if ran_out {
+                        state.unheard_since = Some(expires);
+                    }
+                    ran_out
+                });
             }
             tokio::select! {
                 biased;
@@ -194,8 +235,9 @@ impl Keeper {
                 let before = *state;
                 // One that was not alive here was not there: the answer that said so may have been lost with its stream.
                 state.found |= before.generation == 0 && !answer.created;
-                state.generation += u64::from(answer.created || !before.alive);
+                state.generation += u64::from(answer.created || before.generation == 0);
                 state.alive = true;
+                state.unheard_since = None;
                 *state != before
             });
             tokio::select! {

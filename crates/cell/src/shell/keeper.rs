@@ -17,6 +17,7 @@ use ratn_perception::camera::{Camera, DepthImage};
 use ratn_perception::noise::Noise;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::safety::{Brakes, SafetyState};
+use ratn_worker::vitals::Vitals;
 use std::collections::BTreeMap;
 use std::io;
 use std::sync::Arc;
@@ -95,9 +96,11 @@ enum Message {
 }
 
 /// Starts the thread.
-pub(crate) fn start(cell: Cell, recorder: Recorder, clock: RobotClock) -> io::Result<Keeper> {
+pub(crate) fn start(cell: Cell, recorder: Recorder, clock: RobotClock, vitals: Vitals) -> io::Result<Keeper> {
     let (keeper, inbox) = keeper_of(&cell);
-    let keep = move || keep(cell, recorder, clock, &inbox);
+    let keep = move || {
+        let _ = vitals.guard_blocking("the cell's core", || keep(cell, recorder, clock, &inbox, &vitals));
+    };
     std::thread::Builder::new().name("cell".to_owned()).spawn(keep)?;
     Ok(keeper)
 }
@@ -209,9 +212,10 @@ impl Drop for Motion {
     }
 }
 
-fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Receiver<Letter>) {
+fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Receiver<Letter>, vitals: &Vitals) {
     let mut waiting: BTreeMap<Ticket, oneshot::Sender<Ending>> = BTreeMap::new();
     loop {
+        vitals.beat();
         let most = if cell.is_restless() { RESTLESS_SLEEP } else { MAX_SLEEP };
         let sleep = cell.next_wake().map_or(most, |moment| clock.until(moment).min(most));
         let message = match inbox.recv_timeout(sleep) {

@@ -58,7 +58,8 @@ pub async fn run_as(
         Some(file) => Recorder::begin(file, &config)?,
         None => Recorder::none(),
     };
-    let keeper = keeper::start(cell, recorder, RobotClock::start(config.speed)).context("cannot start the cell")?;
+    let keeper = keeper::start(cell, recorder, RobotClock::start(config.speed), serving.vitals.clone())
+        .context("cannot start the cell")?;
 
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();

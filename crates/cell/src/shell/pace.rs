@@ -29,7 +29,7 @@ fn config(boxes: usize, faults: &[&str]) -> CellConfig {
 }
 
 fn live(cell: Cell, recorder: Recorder, speed: f64) -> Keeper {
-    keeper::start(cell, recorder, RobotClock::start(speed)).unwrap()
+    keeper::start(cell, recorder, RobotClock::start(speed), Default::default()).unwrap()
 }
 
 async fn perform(keeper: &Keeper, request: Request) -> Ending {

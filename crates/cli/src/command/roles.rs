@@ -17,7 +17,8 @@ use ratn_daemon::{metrics, process_manager, resource_manager, telemetry, world_p
 use ratn_storage::OpenError;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::server::{BindError, Exposure, Serving};
+use ratn_worker::server::{BindError, Exposure, ServeError, Serving};
+use ratn_worker::vitals::CoreFailure;
 use ratn_worker::worker::WorkerOptions;
 use ratn_worker::{shutdown, tls};
 use std::fs::File;
@@ -210,12 +211,29 @@ fn daemon_on(
         let serving = service.serving_with(&access);
         let host = Host { listen: arguments.listen.clone(), directory, shutdown, bounds: bounds.subscribe(), serving };
         let reloading = Reloading { file: arguments.config.clone(), running, role, logs, access, bounds };
-        let followed = supervisor.follow(host.serving.phase.subscribe(), move || reloading.reload());
+        let followed =
+            supervisor.follow(host.serving.phase.subscribe(), host.serving.vitals.clone(), move || reloading.reload());
         let followed = tokio::spawn(followed);
         let ended = run(system, host).await;
+        if let Some(failure) = ended.as_ref().err().and_then(core_failure) {
+            core_ended(failure);
+        }
         let _ = followed.await;
         ended.map_err(unbegun)
     })
+}
+
+fn core_failure(error: &anyhow::Error) -> Option<&CoreFailure> {
+    error.chain().find_map(|cause| match cause.downcast_ref::<ServeError>() {
+        Some(ServeError::Core(failure)) => Some(failure),
+        _ => cause.downcast_ref(),
+    })
+}
+
+/// The core has ended before its time: so does the process, whatever else of it still runs.
+fn core_ended(failure: &CoreFailure) -> ! {
+    output::progress(format_args!("ratn: {failure}"));
+    std::process::exit(failure.exit_code().into())
 }
 
 /// Refused where it could not listen, or another one has its state or its place: it has not begun then. Failed otherwise.

@@ -1,12 +1,15 @@
 //! The actor's turns.
 
+use super::clock::TICK;
 use super::desk::{Desk, Outgoing, Stopped};
 use super::inbox::Inbox;
+use super::may_speak::{MaySpeak, Speech};
 use super::outbox::Outbox;
 use super::{Core, Journal};
 use crate::details::of_fault;
 use crate::metrics;
-use ratn_storage::{Fault, Progress};
+use ratn_storage::{AppendError, Fault, Position, Progress};
+use ratn_worker::vitals::{CoreFailure, Vitals};
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -22,11 +25,12 @@ pub(super) struct Actor<C: Core> {
     desk: Desk<C>,
     outbox: Outbox<Outgoing<C>>,
     drained: bool,
+    vitals: Vitals,
 }
 
 impl<C: Core> Actor<C> {
-    pub(super) fn new(core: C, journal: Journal) -> Actor<C> {
-        Actor { core, journal, desk: Desk::new(), outbox: Outbox::default(), drained: false }
+    pub(super) fn new(core: C, journal: Journal, may_speak: MaySpeak, vitals: Vitals) -> Actor<C> {
+        Actor { core, journal, desk: Desk::new(may_speak), outbox: Outbox::default(), drained: false, vitals }
     }
 
     pub(super) async fn run(
@@ -37,9 +41,16 @@ impl<C: Core> Actor<C> {
         over: CancellationToken,
     ) {
         let mut arrived = Vec::new();
+        let mut tick = tokio::time::interval(TICK);
+        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
+            self.desk.begin_turn();
+            self.vitals.beat();
+            if let Speech::Over(fault) = self.desk.speech().now() {
+                return self.fenced(&fault);
+            }
             let deadline = self.core.next_deadline(&self.desk).map(|at| self.desk.instant(at));
-            let (running, room) = (self.desk.stopped().is_none(), !self.outbox.is_full());
+            let (running, room) = (self.desk.stopped().is_none(), !self.outbox.is_full() && !self.desk.is_full());
             tokio::select! {
                 biased;
                 () = over.cancelled() => return self.end(),
@@ -47,6 +58,8 @@ impl<C: Core> Actor<C> {
                 Some(urgent) = inbox.urgent.recv() => self.receive_urgent(urgent),
                 Ok(()) = signals.changed() => self.core.signal(&signals.borrow_and_update(), &mut self.desk),
                 progress = self.journal.changed(), if running => self.written(progress),
+                _ = tick.tick() => {}
+                () = self.desk.speech().changed() => {}
                 () = sleep_until(deadline) => self.core.advance(&mut self.desk),
                 count = inbox.messages.recv_many(&mut arrived, AT_ONCE), if room => {
                     if count == 0 {
@@ -59,8 +72,7 @@ impl<C: Core> Actor<C> {
                             self.receive_urgent(urgent);
                         }
                         let alone = C::is_large(&message);
-                        self.core.receive(message, &mut self.desk);
-                        self.collect();
+                        self.receive(message);
                         if alone {
                             self.deliver();
                         }
@@ -81,6 +93,18 @@ impl<C: Core> Actor<C> {
     fn receive_urgent(&mut self, urgent: C::Urgent) {
         self.core.receive_urgent(urgent, &mut self.desk);
         self.collect();
+    }
+
+    fn receive(&mut self, message: C::Message) {
+        let behind = if self.desk.stopped().is_none() { self.journal.behind() } else { None };
+        let message = match behind {
+            Some(behind) => C::refuse(message, &behind),
+            None => Some(message),
+        };
+        if let Some(message) = message {
+            self.core.receive(message, &mut self.desk);
+            self.collect();
+        }
     }
 
     fn drain(&mut self) {
@@ -107,19 +131,27 @@ impl<C: Core> Actor<C> {
 
     /// Writes down what has changed, and hands out what is on the disk, including what that in turn leads to.
     fn deliver(&mut self) {
-        while self.desk.stopped().is_none() {
+        loop {
             self.collect();
-            if let Err(error) = self.journal.write(self.core.state()) {
-                return self.stop(&error);
+            let written = match self.desk.stopped() {
+                // What is told when nothing can be written any more is on the disk.
+                Some(_) => Ok(Position(0)),
+                None => self.journal.write(self.core.state()),
+            };
+            match written {
+                Ok(position) => {
+                    for outgoing in self.desk.take_outgoing() {
+                        self.outbox.hold(position, outgoing);
+                    }
+                }
+                // It has no position yet.
+                Err(AppendError::Full { .. }) => {}
+                Err(error) => self.stop(&error),
             }
-            let position = self.journal.last();
-            for outgoing in self.desk.take_outgoing() {
-                self.outbox.hold(position, outgoing);
+            if !self.desk.may_speak() {
+                return;
             }
             let Some(outgoing) = self.take_durable() else { return };
-            self.hand_out(outgoing);
-        }
-        for outgoing in self.desk.take_outgoing() {
             self.hand_out(outgoing);
         }
     }
@@ -153,14 +185,33 @@ impl<C: Core> Actor<C> {
         }
     }
 
+    /// Another process has the state: nothing is said any more, and this one ends.
+    fn fenced(&mut self, fault: &Fault) {
+        self.outbox.take_all();
+        self.desk.take_outgoing();
+        self.desk.watchers.clear();
+        self.vitals.fail(CoreFailure::Fenced { what: fault.to_string() });
+    }
+
     /// Nothing changes any more. What was not on the disk has not happened.
-    fn stop(&mut self, fault: &dyn std::error::Error) {
+    fn stop(&mut self, fault: &(dyn std::error::Error + 'static)) {
         let status = of_fault(fault);
+        match fault_of(fault) {
+            Some(Fault::Ended { .. }) => {
+                self.vitals.fail(CoreFailure::Panicked { part: "the log".to_owned(), what: fault.to_string() });
+            }
+            Some(fenced @ Fault::Fenced { .. }) => {
+                self.desk.stop(Stopped { status, unreadable: true });
+                return self.fenced(fenced);
+            }
+            _ => {}
+        }
+        self.vitals.unwell(format!("storage failed: {}", status.message()));
         tracing::error!(fault = status.message(), "changes are refused from now on");
         if let Some(metrics) = metrics::get() {
             metrics.journal.failed.set(1);
         }
-        while let Some(outgoing) = self.take_durable() {
+        while let Some(outgoing) = self.take_durable().filter(|_| self.desk.may_speak()) {
             self.hand_out(outgoing);
         }
         let mut refused = self.outbox.take_all();
@@ -178,6 +229,13 @@ impl<C: Core> Actor<C> {
             tracing::error!(error = format!("{error:#}"), "what is on the disk cannot be read either");
             self.desk.set_unreadable();
         }
+    }
+}
+
+fn fault_of<'a>(error: &'a (dyn std::error::Error + 'static)) -> Option<&'a Fault> {
+    match error.downcast_ref::<AppendError>() {
+        Some(AppendError::Stopped(fault)) => Some(fault),
+        _ => error.downcast_ref(),
     }
 }
 

@@ -1,10 +1,12 @@
 //! What a core has at hand during a turn: the time, whom to answer, who watches, and whether anything may change.
 
 use super::Core;
-use super::outbox::{SendAnswer, send_answer};
+use super::clock::Clock;
+use super::may_speak::{MaySpeak, Speech};
+use super::outbox::{MOST_HELD, SendAnswer, send_answer};
 use super::watchers::{Watcher, Watchers};
 use ratn_model::time::Timestamp;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};
 use tonic::Status;
 
@@ -33,17 +35,24 @@ pub(crate) struct Desk<C: Core> {
     pub(crate) watchers: Watchers<C::Update>,
     outgoing: Vec<Outgoing<C>>,
     stopped: Option<Stopped>,
-    start: Instant,
+    clock: Clock,
+    may_speak: MaySpeak,
 }
 
 impl<C: Core> Desk<C> {
-    pub(super) fn new() -> Desk<C> {
-        Desk { watchers: Watchers::default(), outgoing: Vec::new(), stopped: None, start: Instant::now() }
+    pub(super) fn new(may_speak: MaySpeak) -> Desk<C> {
+        let clock = Clock::start(Instant::now());
+        Desk { watchers: Watchers::default(), outgoing: Vec::new(), stopped: None, clock, may_speak }
     }
 
-    /// The time, since the start.
+    /// The time since the start, without pauses of the process.
     pub(crate) fn now(&self) -> Timestamp {
-        Timestamp(u64::try_from(self.start.elapsed().as_nanos()).unwrap_or(u64::MAX))
+        self.clock.at(Instant::now())
+    }
+
+    /// Whether anything may be said at all ([`super::may_speak`]).
+    pub(crate) fn may_speak(&self) -> bool {
+        matches!(self.may_speak.now(), Speech::Allowed)
     }
 
     /// Why nothing may change any more; nothing as long as it may.
@@ -58,6 +67,19 @@ impl<C: Core> Desk<C> {
         result: Result<T, Status>,
     ) {
         self.outgoing.push(Outgoing::Answer(send_answer(answer, result)));
+    }
+
+    /// As [`Desk::reply`], of what has been on the disk for long: it leaves at once, past what waits.
+    pub(crate) fn reply_now<T: Send + 'static>(
+        &mut self,
+        answer: oneshot::Sender<Result<T, Status>>,
+        result: Result<T, Status>,
+    ) {
+        if self.may_speak() {
+            let _ = answer.send(result);
+        } else {
+            self.reply(answer, result);
+        }
     }
 
     /// As [`Desk::reply`], to one who only looks; without an answer they ask again.
@@ -97,7 +119,19 @@ impl<C: Core> Desk<C> {
     }
 
     pub(super) fn instant(&self, at: Timestamp) -> Instant {
-        self.start + Duration::from_nanos(at.0)
+        self.clock.instant(at)
+    }
+
+    pub(super) fn is_full(&self) -> bool {
+        self.outgoing.len() >= MOST_HELD
+    }
+
+    pub(super) fn begin_turn(&mut self) {
+        self.clock.look(Instant::now());
+    }
+
+    pub(super) fn speech(&mut self) -> &mut MaySpeak {
+        &mut self.may_speak
     }
 
     pub(super) fn take_outgoing(&mut self) -> Vec<Outgoing<C>> {

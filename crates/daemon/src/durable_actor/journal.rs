@@ -6,20 +6,29 @@
 //! ```
 //! What an entry and a snapshot mean is the state's: [`Journaled`] makes them, a `restore` function reads them back.
 
+use super::may_speak::MaySpeak;
 use crate::config::StorageConfig;
+use crate::details::retry_later;
 use crate::metrics;
 use ratn_storage::{
     AppendError, CompactError, Durable, Fault, Log, MakeSnapshot, OpenError, Options, Position, Progress, ReadError,
     Recovered, Store, Writer,
 };
+use ratn_worker::vitals::Vitals;
 use std::error::Error;
 use std::path::Path;
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use tonic::{Code, Status};
 
 /// One entry holds what one turn of an actor changed; larger than any message that asks for it.
 const RECORD_BYTES: usize = 64 << 20;
 /// What may wait for the disk. The actor takes no more on long before ([`super::outbox::MOST_HELD`]).
 const BUFFERED_BYTES: usize = 256 << 20;
+/// With more than this waiting for the disk nothing new is taken on. The rest of [`BUFFERED_BYTES`] is for what cannot be refused: what
+/// time ends, and what is given back.
+pub(super) const MOST_WAITING_BYTES: usize = 64 << 20;
+/// Who was refused for that asks again after so long.
+const BEHIND_RETRY: Duration = Duration::from_millis(500);
 
 /// A state that is kept in a [`Journal`].
 pub(crate) trait Journaled {
@@ -40,6 +49,8 @@ pub(crate) struct Journal {
     durable: Durable,
     /// The last entry.
     last: Position,
+    /// An entry for which there was no room yet; the next one in its place.
+    unwritten: Option<Vec<u8>>,
     compact_bytes: u64,
     /// Bytes of entries since the last snapshot.
     since_snapshot: u64,
@@ -53,6 +64,10 @@ pub(crate) enum JournalError {
     Open { role: &'static str, source: OpenError },
     #[error("cannot read the state of the {role}")]
     Read { role: &'static str, source: ReadError },
+    #[error("the journal of the {role} is closed")]
+    Closed { role: &'static str },
+    #[error("cannot start a thread for the journal of the {role}")]
+    Thread { role: &'static str, source: std::io::Error },
     #[error("the state of the {role} means nothing to this program")]
     Restore { role: &'static str, source: Box<dyn Error + Send + Sync> },
 }
@@ -75,14 +90,30 @@ impl Journal {
         directory: &Path,
         restore: impl FnOnce(Recovered) -> Result<T, E>,
     ) -> Result<(T, Journal), JournalError> {
-        let begin = Instant::now();
+        Journal::open_log(role, config, Journal::log(config, directory), restore)
+    }
+
+    /// The log of a journal.
+    pub(crate) fn log(config: &StorageConfig, directory: &Path) -> Log {
         let options = Options {
             durability: config.durability,
             record_bytes: RECORD_BYTES,
             buffered_bytes: BUFFERED_BYTES,
             ..Options::default()
         };
-        let store = Box::new(Log::new(directory, options));
+        Log::new(directory, options)
+    }
+
+    /// As [`Journal::open`], of a log that may be on another disk.
+    pub(crate) fn open_log<T, E: Error + Send + Sync + 'static>(
+        role: &'static str,
+        config: &StorageConfig,
+        log: Log,
+        restore: impl FnOnce(Recovered) -> Result<T, E>,
+    ) -> Result<(T, Journal), JournalError> {
+        let begin = Instant::now();
+        let directory = log.directory().to_owned();
+        let store = Box::new(log);
         let (recovered, writer) = store.open().map_err(|source| JournalError::Open { role, source })?;
         if let Some(torn) = &recovered.torn {
             tracing::warn!(
@@ -98,6 +129,7 @@ impl Journal {
             durable: writer.durable(),
             writer: Some(writer),
             last: recovered.last(),
+            unwritten: None,
             compact_bytes: config.compact_bytes,
             since_snapshot: recovered.records.iter().map(|record| record.payload.len() as u64).sum(),
             snapshot_bytes: recovered.snapshot.as_ref().map_or(0, |snapshot| snapshot.payload.len() as u64),
@@ -120,25 +152,57 @@ impl Journal {
         restore(recovered).map_err(|error| JournalError::Restore { role, source: error.into() })
     }
 
-    /// Writes down what has changed since the last call. Does not wait for the disk.
-    pub(crate) fn write(&mut self, state: &mut impl Journaled) -> Result<(), AppendError> {
-        let Some(entry) = state.take_entry() else { return Ok(()) };
+    /// Writes down what has changed since the last call, and says where the last entry stands. Does not wait for the disk.
+    ///
+    /// Where there is no room ([`AppendError::Full`]) the entry is kept, and written at a later call.
+    pub(crate) fn write(&mut self, state: &mut impl Journaled) -> Result<Position, AppendError> {
+        loop {
+            let Some(entry) = self.unwritten.take().or_else(|| state.take_entry()) else { break };
+            match self.append(&entry) {
+                Ok(()) => {}
+                Err(full @ AppendError::Full { .. }) => {
+                    self.unwritten = Some(entry);
+                    return Err(full);
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        if self.since_snapshot >= self.compact_bytes.max(2 * self.snapshot_bytes) {
+            self.compact(state)?;
+        }
+        Ok(self.last)
+    }
+
+    fn append(&mut self, entry: &[u8]) -> Result<(), AppendError> {
         let Some(writer) = &mut self.writer else { return Err(Fault::Closed.into()) };
-        self.last = writer.append(&entry)?;
+        self.last = writer.append(entry)?;
         self.since_snapshot += entry.len() as u64;
         if let Some(metrics) = metrics::get() {
             metrics.journal.entries.inc();
             metrics.journal.bytes.inc_by(entry.len() as u64);
         }
-        if self.since_snapshot >= self.compact_bytes.max(2 * self.snapshot_bytes) {
-            self.compact(state)?;
-        }
         Ok(())
     }
 
-    /// The last entry, durable or not.
-    pub(crate) fn last(&self) -> Position {
-        self.last
+    /// Why nothing more is taken on for now: the disk is behind.
+    pub(crate) fn behind(&self) -> Option<Status> {
+        let waiting = self.writer.as_ref()?.waiting_bytes() + self.unwritten.as_ref().map_or(0, Vec::len);
+        if waiting <= MOST_WAITING_BYTES && self.unwritten.is_none() {
+            return None;
+        }
+        let message = format!(
+            "the disk of the {} does not keep up: {waiting} bytes wait to be written, and nothing is taken on while more than \
+             {MOST_WAITING_BYTES} do; ask again, and see what slows that disk down",
+            self.role
+        );
+        Some(retry_later(Code::ResourceExhausted, "STORAGE_BEHIND", message, BEHIND_RETRY))
+    }
+
+    /// Begins to look whether the place is still this writer's.
+    pub(super) fn may_speak(&self, vitals: Vitals) -> Result<MaySpeak, JournalError> {
+        let role = self.role;
+        let Some(writer) = &self.writer else { return Err(JournalError::Closed { role }) };
+        MaySpeak::begin(writer.place(), vitals).map_err(|source| JournalError::Thread { role, source })
     }
 
     /// Whether everything through this entry is on the disk.

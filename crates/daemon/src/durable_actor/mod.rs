@@ -5,24 +5,34 @@
 //!   inbox ──message──▶ Core (the state) ──records──▶ journal ──durable──▶ outbox ──▶ answers, watchers
 //! ```
 //! What came together is written down together. When records cannot be written, every change is refused from then on; what can be read
-//! is the state that is on the disk.
+//! is the state that is on the disk. Nothing at all is said unless this is known to be the one writer ([`may_speak`]), and no deadline
+//! counts the time in which the process was not running ([`clock`]).
 
 mod actor;
+mod clock;
 mod desk;
 mod inbox;
 mod journal;
+mod may_speak;
 mod outbox;
+#[cfg(test)]
+pub(crate) mod slow_disk;
+#[cfg(test)]
+mod tests;
 mod watchers;
 
 pub(crate) use desk::Desk;
 pub(crate) use inbox::Handle;
 pub(crate) use journal::{Journal, JournalError, Journaled, floor};
+pub(crate) use may_speak::CONFIRMED_FOR;
 
 use actor::Actor;
 use ratn_model::time::Timestamp;
+use ratn_worker::vitals::Vitals;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
+use tonic::Status;
 
 /// A state and what is done with it: everything that is not the same for every daemon.
 pub(crate) trait Core: Sized + Send + 'static {
@@ -69,6 +79,9 @@ pub(crate) trait Core: Sized + Send + 'static {
     /// What was said is on the disk: it leaves.
     fn hand_out(&mut self, said: Self::Said, desk: &mut Desk<Self>);
 
+    /// The disk is behind. A message that would add to it is answered with `status`; one that would not comes back.
+    fn refuse(message: Self::Message, status: &Status) -> Option<Self::Message>;
+
     /// Puts messages that arrived together into another order.
     fn order(_messages: &mut [Self::Message]) {}
 
@@ -85,13 +98,23 @@ pub(crate) trait Core: Sized + Send + 'static {
 }
 
 /// Starts the actor. With `draining` whoever waits is told to ask the successor; with `over` it ends, when everything is on the disk.
+/// How it is, also that it has panicked, is in the `vitals`.
+///
+/// # Errors
+/// Where the thread cannot be started that watches the writer's place.
 pub(crate) fn start<C: Core>(
     core: C,
     journal: Journal,
     signals: watch::Receiver<C::Signal>,
+    vitals: Vitals,
     draining: CancellationToken,
     over: CancellationToken,
-) -> (Handle<C>, JoinHandle<()>) {
+) -> Result<(Handle<C>, JoinHandle<()>), JournalError> {
+    let may_speak = journal.may_speak(vitals.clone())?;
     let (handle, inbox) = inbox::open();
-    (handle, tokio::spawn(Actor::new(core, journal).run(inbox, signals, draining, over)))
+    let actor = Actor::new(core, journal, may_speak, vitals.clone());
+    let running = async move {
+        let _ = vitals.guard("the actor", actor.run(inbox, signals, draining, over)).await;
+    };
+    Ok((handle, tokio::spawn(running)))
 }

@@ -28,7 +28,7 @@ const WAIT_SECONDS: [f64; 11] = [1e-4, 1e-3, 1e-2, 0.1, 0.5, 1.0, 5.0, 10.0, 60.
 
 static METRICS: OnceLock<Metrics> = OnceLock::new();
 
-/// All of them. Daemons other than the resource manager have only the calls.
+/// All of them. Daemons other than the resource manager have only the calls, and the world pool its journal.
 #[derive(Debug)]
 pub struct Metrics {
     registry: Registry,
@@ -86,6 +86,18 @@ pub(crate) fn get() -> Option<&'static Metrics> {
     METRICS.get()
 }
 
+impl JournalMetrics {
+    fn register(&self, registry: &mut Registry) {
+        let JournalMetrics { entries, bytes, commits, failed } = self;
+        registry.register("journal_entries", "Entries appended to the journal", entries.clone());
+        registry.register_with_unit("journal_appended", "Bytes appended to the journal", Unit::Bytes, bytes.clone());
+        let help = "Times that more of the journal was seen to be on the disk; many entries may share one";
+        registry.register("journal_commits", help, commits.clone());
+        let help = "1 when the journal cannot be written and every change is refused";
+        registry.register("journal_failed", help, failed.clone());
+    }
+}
+
 impl Metrics {
     fn new(role: &str) -> Metrics {
         let metrics = Metrics {
@@ -110,9 +122,14 @@ impl Metrics {
         registry.register("build", "What runs", build);
         let help = "Time from a call's arrival to its answer, or to the beginning of a stream of answers";
         registry.register_with_unit("rpc_duration", help, Unit::Seconds, self.calls.clone());
-        if role != crate::resource_manager::ROLE {
+        let (resource_manager, world_pool) = (crate::resource_manager::ROLE, crate::world_pool::ROLE);
+        if role == resource_manager || role == world_pool {
+            self.journal.register(&mut self.registry);
+        }
+        if role != resource_manager {
             return self;
         }
+        let registry = &mut self.registry;
         registry.register("refusals", "Changes that were asked for and refused", self.refusals.clone());
         registry.register("grants", "Leases that were granted", self.grants.clone());
         let help = "Time from an acquire's arrival to its grant";
@@ -122,13 +139,6 @@ impl Metrics {
         registry.register("leases", "Leases that are held", self.leases.clone());
         registry.register("waiters", "Acquires in the queue", self.waiters.clone());
         registry.register("watchers", "Clients that watch", self.watchers.clone());
-        let JournalMetrics { entries, bytes, commits, failed } = &self.journal;
-        registry.register("journal_entries", "Entries appended to the journal", entries.clone());
-        registry.register_with_unit("journal_appended", "Bytes appended to the journal", Unit::Bytes, bytes.clone());
-        let help = "Times that more of the journal was seen to be on the disk; many entries may share one";
-        registry.register("journal_commits", help, commits.clone());
-        let help = "1 when the journal cannot be written and every change is refused";
-        registry.register("journal_failed", help, failed.clone());
         self
     }
 

@@ -17,6 +17,7 @@ use nix::sys::signal::Signal;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{Demand, HostPools, PoolStatus, Scale, WorkerStatus};
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::vitals::Vitals;
 use std::collections::{BTreeSet, VecDeque};
 use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::{mpsc, oneshot, watch};
@@ -28,6 +29,8 @@ use tonic::Status;
 const INBOX: usize = 256;
 /// Answers that are taken in before anything else gets its turn.
 const AT_ONCE: usize = 256;
+/// The actor takes a turn at least so often.
+const TICK: Duration = Duration::from_secs(1);
 /// Changes that wait for a watcher; one that has more to catch up with is cut off.
 const WATCH_BUFFER: usize = 4_096;
 /// Clients that watch at the same time.
@@ -98,7 +101,11 @@ struct Actor {
 }
 
 /// Starts the actor; it ends with the token, once every worker has.
-pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Result<(Handle, JoinHandle<()>)> {
+pub(super) fn start(
+    parts: Parts,
+    vitals: Vitals,
+    shutdown: CancellationToken,
+) -> std::io::Result<(Handle, JoinHandle<()>)> {
     let (inbox, messages) = mpsc::channel(INBOX);
     let Parts {
         config,
@@ -133,7 +140,10 @@ pub(super) fn start(parts: Parts, shutdown: CancellationToken) -> std::io::Resul
         drained,
     };
     let inputs = Inputs { messages, told, there, uses, demand, looks };
-    Ok((Handle { inbox }, tokio::spawn(actor.run(adopted, inputs, shutdown))))
+    let running = async move {
+        let _ = vitals.guard("the actor of the pools", actor.run(adopted, inputs, &vitals, shutdown)).await;
+    };
+    Ok((Handle { inbox }, tokio::spawn(running)))
 }
 
 impl Handle {
@@ -154,7 +164,7 @@ struct Inputs {
 }
 
 impl Actor {
-    async fn run(mut self, adopted: Vec<Adopted>, mut inputs: Inputs, shutdown: CancellationToken) {
+    async fn run(mut self, adopted: Vec<Adopted>, mut inputs: Inputs, vitals: &Vitals, shutdown: CancellationToken) {
         for worker in adopted {
             self.adopt(worker);
         }
@@ -164,7 +174,9 @@ impl Actor {
             self.perform(commands);
         }
         self.handle(Event::Time);
+        let mut tick = tokio::time::interval(TICK);
         loop {
+            vitals.beat();
             let deadline = self.pools.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
             tokio::select! {
                 Some(outcome) = inputs.told.outcomes.recv() => self.became(outcome),
@@ -191,6 +203,7 @@ impl Actor {
                 Some(demand) = inputs.demand.recv() => self.handle(Event::Demanded(demand)),
                 Some(sample) = inputs.looks.recv() => self.handle(Event::Looked(sample)),
                 Some(message) = inputs.messages.recv() => self.receive(message),
+                _ = tick.tick() => {}
                 () = sleep_until(deadline) => self.handle(Event::Time),
                 () = shutdown.cancelled() => break,
             }

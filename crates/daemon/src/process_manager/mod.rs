@@ -155,7 +155,8 @@ pub async fn run_as(
         short,
         looks,
     };
-    let (actor, ended) = actor::start(parts, shutdown.clone()).context("cannot start workers")?;
+    let (actor, ended) =
+        actor::start(parts, serving.vitals.clone(), shutdown.clone()).context("cannot start workers")?;
     let service = ProcessServiceServer::new(service::Service::new(actor, directory.clone(), shutdown.clone()));
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");

@@ -2,11 +2,11 @@
 
 use super::ROLE;
 use crate::config::{Durability, StorageConfig};
-use crate::durable_actor::{Journal, JournalError, Journaled, floor};
+use crate::durable_actor::{CONFIRMED_FOR, Journal, JournalError, Journaled, floor};
 use bytes::Bytes;
 use ratn_model::id::Revision;
 use ratn_resources::{DecodeError, Limits, Pool, Record, RestoreError, Snapshot, decode, encode};
-use ratn_storage::{MakeSnapshot, Position, Recovered};
+use ratn_storage::{Log, MakeSnapshot, Position, Recovered};
 use std::path::Path;
 
 /// Why a log is none of a pool.
@@ -34,10 +34,16 @@ impl Journaled for Pool {
 
 /// Takes the place of the one writer, and restores the pool. Without durability somebody may have heard of revisions that are lost.
 pub(super) fn open(config: &StorageConfig, directory: &Path, limits: Limits) -> Result<(Pool, Journal), JournalError> {
-    let (pool, journal) = Journal::open(ROLE, config, directory, |recovered| restore(recovered, limits))?;
+    open_log(config, Journal::log(config, directory), limits)
+}
+
+/// The same of a log that may be on another disk.
+pub(super) fn open_log(config: &StorageConfig, log: Log, limits: Limits) -> Result<(Pool, Journal), JournalError> {
+    let (pool, journal) = Journal::open_log(ROLE, config, log, |recovered| restore(recovered, limits))?;
     let may_have_lost = config.durability == Durability::None && pool.revision() > Revision(0);
     let floor = if may_have_lost { floor() } else { 0 };
-    Ok((pool.with_revisions_above(Revision(floor)), journal))
+    // A predecessor that was got past may have promised more than it wrote down.
+    Ok((pool.with_revisions_above(Revision(floor)).with_session_grace(CONFIRMED_FOR), journal))
 }
 
 /// The pool as the log has it.

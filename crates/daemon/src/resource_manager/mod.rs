@@ -65,7 +65,7 @@ pub async fn run_as(
     let endpoint = bound.endpoint().clone();
     let over = CancellationToken::new();
     let _over = over.clone().drop_guard();
-    let (actor, ended) = actor::start(live, kept, shutdown.clone(), over.clone());
+    let (actor, ended) = actor::start(live, kept, shutdown.clone(), serving.vitals.clone(), over.clone())?;
     let service = ResourceServiceServer::new(service::Service::new(actor, shutdown.clone()))
         .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);

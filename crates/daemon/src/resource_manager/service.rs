@@ -524,6 +524,8 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::super::{ResourceManagerConfig, actor, journal};
     use super::*;
+    use crate::durable_actor::Journal;
+    use crate::durable_actor::slow_disk::SlowDisk;
     use ratn_model::resource::ResourceClass;
     use ratn_resources::Speaker;
     use tokio::sync::watch;
@@ -532,8 +534,14 @@ mod tests {
     async fn a_lease_that_two_calls_of_one_request_got_goes_back_when_both_are_dropped() {
         let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
         let kept = journal::open(&config.storage, directory.path(), config.limits.clone()).unwrap();
-        let (actor, _) =
-            actor::start(watch::Sender::new(config).subscribe(), kept, Default::default(), Default::default());
+        let (actor, _) = actor::start(
+            watch::Sender::new(config).subscribe(),
+            kept,
+            Default::default(),
+            Default::default(),
+            Default::default(),
+        )
+        .unwrap();
         let session = SessionId::from("s");
         actor.keep_alive(Speaker::trusted(), session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
         let requirement = Requirement::new(ResourceOperation::Block, "Arm");
@@ -562,8 +570,9 @@ mod tests {
     async fn with_an_arm() -> (Handle, SessionId, tempfile::TempDir) {
         let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
         let kept = journal::open(&config.storage, directory.path(), config.limits.clone()).unwrap();
+        let signals = watch::Sender::new(config).subscribe();
         let (actor, _) =
-            actor::start(watch::Sender::new(config).subscribe(), kept, Default::default(), Default::default());
+            actor::start(signals, kept, Default::default(), Default::default(), Default::default()).unwrap();
         let session = SessionId::from("s");
         actor.keep_alive(Speaker::trusted(), session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
         let create = PoolRequest::Create { session: None, spec: ResourceSpec::new(ResourceClass::Module, "Arm") };
@@ -624,5 +633,40 @@ mod tests {
         assert!(!is_free(&actor).await);
         calls.pop();
         assert!(is_free(&actor).await);
+    }
+
+    #[tokio::test]
+    async fn a_ping_that_changes_nothing_is_answered_while_the_disk_hangs() {
+        let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
+        let disk = SlowDisk::default();
+        let log = Journal::log(&config.storage, directory.path()).on(disk.files());
+        let kept = journal::open_log(&config.storage, log, config.limits.clone()).unwrap();
+        let signals = watch::Sender::new(config).subscribe();
+        let (actor, _) =
+            actor::start(signals, kept, Default::default(), Default::default(), Default::default()).unwrap();
+        let speaker = || Speaker::trusted();
+        let ping = async |session: &str, ttl_s| {
+            let ttl = Duration::from_secs(ttl_s);
+            actor.keep_alive(speaker(), SessionId::from(session), "a".to_owned(), ttl).await.unwrap()
+        };
+        assert!(ping("a", 60).await.created && ping("c", 60).await.created);
+        let hangs = disk.hang();
+        let answered = ping("a", 60).await;
+        assert!(!answered.created, "at once, however long the disk takes");
+        let mut opened = Box::pin(ping("b", 60));
+        let mut changed = Box::pin(ping("a", 30));
+        for waits in [&mut opened, &mut changed] {
+            assert!(futures::poll!(&mut *waits).is_pending());
+        }
+        // Behind the two: it waits for the disk as they do, for the session is not on it as it is now.
+        let mut behind = Box::pin(ping("a", 30));
+        assert!(futures::poll!(&mut behind).is_pending());
+        assert!(!ping("c", 60).await.created, "the actor has taken all of them by now");
+        for waits in [&mut opened, &mut changed, &mut behind] {
+            assert!(futures::poll!(&mut *waits).is_pending());
+        }
+        drop(hangs);
+        assert!(opened.await.created);
+        assert!(!changed.await.created && !behind.await.created);
     }
 }

@@ -13,6 +13,7 @@ use ratn_model::id::{LeaseId, ProjectionId, Revision};
 use ratn_model::ontology::Ontology;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::Contradiction;
+use ratn_worker::vitals::Vitals;
 use ratn_world::digest::Digest;
 use ratn_world::scene::delta::SceneDelta;
 use ratn_world::world::{Fact, World};
@@ -136,8 +137,9 @@ pub(super) fn start(
     ontology: Option<Ontology>,
     (history, journal): (History, Journal),
     leases: watch::Receiver<LiveLeases>,
+    vitals: Vitals,
     over: CancellationToken,
-) -> (Handle, JoinHandle<()>) {
+) -> Result<(Handle, JoinHandle<()>), JournalError> {
     let pool = WorldPool::new(config.clone(), ontology, history, floor());
     let core = WorldCore {
         config,
@@ -147,7 +149,7 @@ pub(super) fn start(
         leases: leases.clone(),
         next_look: Timestamp(0),
     };
-    durable_actor::start(core, journal, leases, CancellationToken::new(), over)
+    durable_actor::start(core, journal, leases, vitals, CancellationToken::new(), over)
 }
 
 impl Core for WorldCore {
@@ -275,6 +277,16 @@ impl Core for WorldCore {
                     });
                 }
             }
+        }
+    }
+
+    fn refuse(message: Message, behind: &Status) -> Option<Message> {
+        match message {
+            Message::Commit { answer, .. } => {
+                let _ = answer.send(Err(behind.clone()));
+                None
+            }
+            message => Some(message),
         }
     }
 

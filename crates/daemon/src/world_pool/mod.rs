@@ -91,7 +91,7 @@ pub async fn run_as(
     let (live, leases) = watch::channel(leases::LiveLeases::default());
     tokio::spawn(over.clone().run_until_cancelled_owned(leases::follow(manager, live)));
     let sizes = service::Sizes { fact: config.fact_bytes, commit: config.commit_bytes };
-    let (actor, ended) = actor::start(config, ontology, kept, leases.clone(), over.clone());
+    let (actor, ended) = actor::start(config, ontology, kept, leases.clone(), serving.vitals.clone(), over.clone())?;
     let service = WorldPoolServiceServer::new(service::Service { actor, leases, shutdown: shutdown.clone(), sizes })
         .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);

@@ -3,11 +3,12 @@
 //! `ratn-test-worker serve ID KIND ENDPOINT_FILE` serves until its parent ends; `ratn-test-worker manage DIRECTORY` is a
 //! process manager of one such worker, with `adopt GRACE_S` of one that is to be adopted, `adopt-other` of one that differs, `sleep` of one that
 //! does not look at its standard input, `none WAY` of no worker, `many WAY NUMBER` of four that start more, `session WAY NUMBER` and
-//! `clean-session WAY NUMBER` of one that sends a process away into another session; `ratn-test-worker notify` says to systemd's socket that it is ready, `ratn-test-worker watchdog N` besides N times
+//! `clean-session WAY NUMBER` of one that sends a process away into another session; `ratn-test-worker resource-manager DIRECTORY` is a resource manager; `ratn-test-worker notify` says to systemd's socket that it is ready, `ratn-test-worker watchdog N` besides N times
 //! that it lives, `ratn-test-worker port N`
 //! listens on a port of loopback, both until their standard input ends; `ratn-test-worker fail` says why and exits.
 
 use ratn_daemon::process_manager::{self, ProcessManagerConfig, Readiness, Template, Tracking};
+use ratn_daemon::resource_manager;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::shutdown;
 use ratn_worker::worker::{Worker, WorkerOptions};
@@ -41,6 +42,7 @@ async fn main() -> ExitCode {
             let script = format!("env -i setsid sleep {number} & echo ready; exec sleep {number}");
             manage_as(directory, way, vec![shell(&script)]).await
         }
+        ["resource-manager", directory] => manage_resources(directory).await,
         ["notify"] => notify().await,
         ["watchdog", times] => watchdog(times).await,
         ["port", port] => listen(port).await,
@@ -49,6 +51,18 @@ async fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+async fn manage_resources(directory: &str) -> ExitCode {
+    let directory = RuntimeDirectory::create(directory).expect("a runtime directory");
+    let shutdown = tokio_util::sync::CancellationToken::new();
+    let running = resource_manager::run(Default::default(), directory, shutdown.clone());
+    tokio::spawn(async move {
+        until_input_ends().await;
+        shutdown.cancel();
+    });
+    running.await.expect("a resource manager");
+    ExitCode::SUCCESS
 }
 
 async fn notify() -> ExitCode {

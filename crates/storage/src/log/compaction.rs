@@ -9,7 +9,7 @@ use super::shared::Shared;
 use super::syncer::Failed;
 use super::{directory, snapshot};
 use crate::durable::Durable;
-use crate::error::CompactionFailure;
+use crate::error::{CompactionFailure, Fault};
 use crate::store::{MakeSnapshot, Position, Snapshot};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -27,6 +27,9 @@ struct Ended<'a>(&'a Shared, Option<Result<Position, Option<CompactionFailure>>>
 
 impl Drop for Ended<'_> {
     fn drop(&mut self) {
+        if std::thread::panicking() {
+            self.0.stop(&Fault::Ended { place: self.0.directory.display().to_string() });
+        }
         self.0.end_compaction(self.1.take().unwrap_or(Err(None)));
     }
 }

@@ -8,9 +8,10 @@ use super::directory;
 use crate::error::{Fault, OpenError};
 use crate::store::{Epoch, Place};
 use std::fs::{self, File, OpenOptions, TryLockError};
-use std::io::{Read, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// At most so much of what a holder wrote about itself is read.
 const HOLDER_BYTES: u64 = 256;
@@ -75,8 +76,15 @@ impl Lock {
 
 impl Place for HeldPlace {
     fn check(&self) -> Result<(), Fault> {
-        let held = fs::metadata(&self.path).is_ok_and(|metadata| (metadata.dev(), metadata.ino()) == self.inode);
-        let place = || self.path.parent().unwrap_or(Path::new(".")).display().to_string();
-        if held { Ok(()) } else { Err(Fault::Fenced { place: place() }) }
+        let fenced = || Fault::Fenced { place: self.path.parent().unwrap_or(Path::new(".")).display().to_string() };
+        match fs::metadata(&self.path) {
+            Ok(found) if (found.dev(), found.ino()) == self.inode => Ok(()),
+            Ok(_) => Err(fenced()),
+            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Err(fenced()),
+            Err(error) => {
+                let place = self.path.display().to_string();
+                Err(Fault::Io { action: "look at", place, source: Arc::new(error) })
+            }
+        }
     }
 }

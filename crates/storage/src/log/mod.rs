@@ -11,6 +11,8 @@ mod directory;
 mod files;
 mod format;
 mod lock;
+#[cfg(test)]
+mod power_loss;
 mod segment;
 mod shared;
 mod snapshot;

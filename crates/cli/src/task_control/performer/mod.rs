@@ -120,6 +120,8 @@ struct Job {
     attempt: u32,
     /// What it works under; a routine's serves several jobs.
     lease: Option<LeaseId>,
+    /// It does not work on a projection.
+    in_environment: bool,
     stop: CancellationToken,
     ended: JoinHandle<()>,
 }
@@ -210,9 +212,15 @@ impl Performer {
         *self.recorded.lock().unwrap_or_else(PoisonError::into_inner) = confirmed;
     }
 
-    /// Resolves when the session with the resource manager, and with it every lease, is lost.
+    /// Resolves when the session with the resource manager, and with it every lease, is gone: with something under way in the
+    /// environment as soon as the manager is not heard for a time to live, for that stops then. Otherwise the run waits for it for
+    /// longer: a manager that was suspended still knows what the run holds.
     pub(super) async fn lost(&self) {
-        self.session.lost().await;
+        if self.jobs.values().any(|job| job.in_environment) {
+            self.session.lost().await;
+        } else {
+            self.session.gone().await;
+        }
     }
 
     /// What the executive made of an event is performed next, all of it.
@@ -402,6 +410,7 @@ impl Performer {
     fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal, given: Given) {
         let stop = CancellationToken::new();
         let lease = goal.lease.as_ref().map(|lease| lease.id);
+        let in_environment = goal.projection.is_none();
         let provider = self.provider_of(&goal);
         let (source, endpoint) = match provider {
             Ok(resource) => (
@@ -435,7 +444,7 @@ impl Performer {
             },
         };
         let ended = tokio::spawn(trace::within(self.trace.child(), performing.perform(given)));
-        self.jobs.insert(instance, Job { attempt, lease, stop, ended });
+        self.jobs.insert(instance, Job { attempt, lease, in_environment, stop, ended });
     }
 
     /// The provider of a goal: the leased resource of its kind.

@@ -10,6 +10,7 @@ impl ResourceCore {
     pub(super) fn notify(&mut self, notice: Notice, desk: &mut ResourceDesk) {
         match notice {
             Notice::Event(event) => {
+                self.told = self.told.max(event.revision);
                 if let Change::LeaseEnded { lease, .. } = &event.change {
                     self.shared.remove(lease);
                 }

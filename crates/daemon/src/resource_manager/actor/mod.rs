@@ -18,11 +18,12 @@ use crate::details::ending;
 use crate::durable_actor::{self, Core, Desk, Journal, JournalError};
 use crate::metrics::{self, Amounts};
 use message::{Ping, most_urgent_first};
-use ratn_model::id::LeaseId;
+use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::ResourceUpdate;
 use ratn_resources::{Notice, Pool, PoolError, Reply, Request, SessionId, Speaker, WaiterId};
+use ratn_worker::vitals::Vitals;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -53,6 +54,10 @@ pub(super) struct ResourceCore {
     demand: Vec<ratn_resources::Demand>,
     /// What of it is asked of whom.
     providers: Providers,
+    /// Sessions whose last record may not be on the disk yet, and how many records that are.
+    opening: BTreeMap<SessionId, usize>,
+    /// What everybody may know of.
+    told: Revision,
 }
 
 /// Starts the actor on what was kept. With `draining` everybody who waits is told to ask the successor; with `over` it ends.
@@ -60,9 +65,11 @@ pub(super) fn start(
     live: watch::Receiver<ResourceManagerConfig>,
     (pool, journal): (Pool, Journal),
     draining: CancellationToken,
+    vitals: Vitals,
     over: CancellationToken,
-) -> (Handle, JoinHandle<()>) {
+) -> Result<(Handle, JoinHandle<()>), JournalError> {
     let core = ResourceCore {
+        told: pool.revision(),
         pool,
         draining: false,
         config: live.borrow().clone(),
@@ -72,8 +79,9 @@ pub(super) fn start(
         repeated: BTreeMap::new(),
         demand: Vec::new(),
         providers: Providers::new(live.borrow().provider_patience()),
+        opening: BTreeMap::new(),
     };
-    durable_actor::start(core, journal, live, draining, over)
+    durable_actor::start(core, journal, live, vitals, draining, over)
 }
 
 /// What leaves when its records are on the disk, besides direct answers.
@@ -83,6 +91,8 @@ pub(super) enum Said {
     Notice(Notice),
     /// To a call that repeated its request after that was granted.
     GrantedAgain { ticket: u64 },
+    /// What a ping has changed of a session is on the disk.
+    SessionKept(SessionId),
 }
 
 impl Core for ResourceCore {
@@ -107,9 +117,11 @@ impl Core for ResourceCore {
         }
         self.tickets.clear();
         self.shared.clear();
+        self.opening.clear();
         self.pool = Pool::new(self.config.limits.clone());
         let pool = super::journal::read(journal, self.config.limits.clone())?;
         self.pool = pool.with_kinds(self.config.hierarchy());
+        self.told = self.pool.revision();
         Ok(())
     }
 
@@ -123,13 +135,29 @@ impl Core for ResourceCore {
     }
 
     fn receive_urgent(&mut self, Ping { speaker, session, client, ttl, answer }: Ping, desk: &mut ResourceDesk) {
+        let before = self.pool.session_ttl(&session);
         let kept = match desk.stopped() {
             Some(stopped) => Err(stopped.status.clone()),
             None => {
                 self.keep_alive(desk.now(), &speaker, &session, &client, ttl).map_err(|error| status::of_error(&error))
             }
         };
-        desk.reply(answer, kept);
+        match kept {
+            // Nothing has changed that would have to be on the disk: however slow that is, it ends no session.
+            Ok(kept)
+                if before == Some(kept.ttl.max(MIN_SESSION_TTL))
+                    && !kept.created
+                    && !self.opening.contains_key(&session) =>
+            {
+                desk.reply_now(answer, Ok(KeptAlive { revision: self.told, ..kept }));
+            }
+            Ok(kept) => {
+                *self.opening.entry(session.clone()).or_default() += 1;
+                desk.reply(answer, Ok(kept));
+                desk.say(Said::SessionKept(session));
+            }
+            Err(refused) => desk.reply(answer, Err(refused)),
+        }
     }
 
     fn receive(&mut self, message: Message, desk: &mut ResourceDesk) {
@@ -227,7 +255,35 @@ impl Core for ResourceCore {
         match said {
             Said::Notice(notice) => self.notify(notice, desk),
             Said::GrantedAgain { ticket } => self.answer_again(ticket, desk),
+            Said::SessionKept(session) => {
+                if let Some(records) = self.opening.get_mut(&session) {
+                    *records -= 1;
+                    if *records == 0 {
+                        self.opening.remove(&session);
+                    }
+                }
+            }
         }
+    }
+
+    /// What takes or makes is refused; what gives back is not.
+    fn refuse(message: Message, behind: &Status) -> Option<Message> {
+        match message {
+            Message::Perform { request: Request::Create { .. } | Request::Consume { .. }, answer, .. } => {
+                let _ = answer.send(Err(behind.clone()));
+                None
+            }
+            Message::Acquire { answer, .. } => {
+                let _ = answer.send(Err(behind.clone()));
+                None
+            }
+            message => Some(message),
+        }
+    }
+
+    /// A resource may have as many attributes as a message holds.
+    fn is_large(message: &Message) -> bool {
+        matches!(message, Message::Perform { request: Request::Create { .. }, .. })
     }
 
     fn order(messages: &mut [Message]) {
@@ -251,7 +307,9 @@ impl Core for ResourceCore {
     }
 
     fn turned(&mut self, desk: &mut ResourceDesk) {
-        self.spread_demand(desk);
+        if desk.may_speak() {
+            self.spread_demand(desk);
+        }
         let Some(metrics) = metrics::get() else { return };
         let [resources, sessions, leases, waiters] = self.pool.amounts();
         metrics.set(Amounts { resources, sessions, leases, waiters, watchers: desk.watchers.len() });

@@ -1,0 +1,78 @@
+//! A disk whose syncs hang for as long as a test wants.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_storage::{Disk, Files, LogFile};
+use std::io;
+use std::path::Path;
+use std::sync::{Arc, Condvar, Mutex};
+
+/// Clones are the same.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct SlowDisk(Arc<(Mutex<bool>, Condvar)>);
+
+/// Dropped, the disk goes on.
+pub(crate) struct Hanging(SlowDisk);
+
+#[derive(Debug)]
+struct SlowFile(SlowDisk, Box<dyn LogFile>);
+
+impl SlowDisk {
+    pub(crate) fn files(&self) -> Arc<dyn Files> {
+        Arc::new(self.clone())
+    }
+
+    /// From now on no sync of a file ends.
+    pub(crate) fn hang(&self) -> Hanging {
+        *self.0.0.lock().unwrap() = true;
+        Hanging(self.clone())
+    }
+}
+
+impl Drop for Hanging {
+    fn drop(&mut self) {
+        *self.0.0.0.lock().unwrap() = false;
+        self.0.0.1.notify_all();
+    }
+}
+
+impl Files for SlowDisk {
+    fn create(&self, path: &Path) -> io::Result<Box<dyn LogFile>> {
+        Ok(Box::new(SlowFile(self.clone(), Disk.create(path)?)))
+    }
+
+    fn create_directory(&self, path: &Path) -> io::Result<()> {
+        Disk.create_directory(path)
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        Disk.rename(from, to)
+    }
+
+    fn remove(&self, path: &Path) -> io::Result<()> {
+        Disk.remove(path)
+    }
+
+    fn sync_directory(&self, path: &Path) -> io::Result<()> {
+        Disk.sync_directory(path)
+    }
+}
+
+impl LogFile for SlowFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.1.write(bytes)
+    }
+
+    fn reserve(&mut self, bytes: usize) -> io::Result<()> {
+        self.1.reserve(bytes)
+    }
+
+    fn cut(&mut self) -> io::Result<()> {
+        self.1.cut()
+    }
+
+    fn sync(&mut self) -> io::Result<()> {
+        let (hangs, goes_on) = &*self.0.0;
+        drop(goes_on.wait_while(hangs.lock().unwrap(), |hangs| *hangs).unwrap());
+        self.1.sync()
+    }
+}

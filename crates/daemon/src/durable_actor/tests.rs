@@ -1,0 +1,194 @@
+//! The actor with a state that is a list of blobs: what it does when it panics, is got past, or has a slow disk.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use super::journal::MOST_WAITING_BYTES;
+use super::slow_disk::SlowDisk;
+use super::{Core, Desk, Handle, Journal, JournalError, Journaled, start};
+use crate::config::StorageConfig;
+use bytes::Bytes;
+use ratn_model::time::Timestamp;
+use ratn_storage::{MakeSnapshot, Recovered};
+use ratn_worker::vitals::{CoreFailure, EXIT_CODE_FENCED, EXIT_CODE_PANICKED, Vitals};
+use std::convert::Infallible;
+use std::future::Future;
+use std::path::Path;
+use std::time::Duration;
+use tokio::sync::{oneshot, watch};
+use tokio_util::sync::CancellationToken;
+use tonic::{Code, Status};
+
+const DEADLINE: Duration = Duration::from_secs(20);
+
+/// How long its blobs are.
+#[derive(Debug, Default)]
+struct Blobs {
+    lengths: Vec<usize>,
+    entry: Option<Vec<u8>>,
+}
+
+type Answer<T> = oneshot::Sender<Result<T, Status>>;
+
+enum Message {
+    Add(usize, Answer<usize>),
+    Count(Answer<usize>),
+    /// Answered when it is taken, whatever the disk does.
+    Taken(oneshot::Sender<()>),
+    Panic,
+}
+
+struct BlobCore(Blobs);
+
+impl Journaled for Blobs {
+    fn take_entry(&mut self) -> Option<Vec<u8>> {
+        self.entry.take()
+    }
+
+    fn snapshot(&self) -> MakeSnapshot {
+        let lengths = format!("{:?}", self.lengths);
+        Box::new(move || Bytes::from(lengths))
+    }
+}
+
+impl Core for BlobCore {
+    type State = Blobs;
+    type Message = Message;
+    type Urgent = Infallible;
+    type Said = Infallible;
+    type Update = ();
+    type Signal = ();
+
+    fn state(&mut self) -> &mut Blobs {
+        &mut self.0
+    }
+
+    fn restore(&mut self, _: &Journal, _: &Desk<Self>) -> Result<(), JournalError> {
+        Ok(())
+    }
+
+    fn next_deadline(&self, _: &Desk<Self>) -> Option<Timestamp> {
+        None
+    }
+
+    fn advance(&mut self, _: &mut Desk<Self>) {}
+
+    fn receive(&mut self, message: Message, desk: &mut Desk<Self>) {
+        match message {
+            Message::Add(length, answer) => {
+                self.0.lengths.push(length);
+                self.0.entry = Some(vec![7; length]);
+                desk.reply(answer, Ok(self.0.lengths.len()));
+            }
+            Message::Count(answer) => desk.reply(answer, Ok(self.0.lengths.len())),
+            Message::Taken(answer) => drop(answer.send(())),
+            Message::Panic => panic!("a defect"),
+        }
+    }
+
+    fn receive_urgent(&mut self, urgent: Infallible, _: &mut Desk<Self>) {
+        match urgent {}
+    }
+
+    fn signal(&mut self, (): &(), _: &mut Desk<Self>) {}
+
+    fn collect(&mut self, _: &mut Desk<Self>) {}
+
+    fn hand_out(&mut self, said: Infallible, _: &mut Desk<Self>) {
+        match said {}
+    }
+
+    fn refuse(message: Message, status: &Status) -> Option<Message> {
+        match message {
+            Message::Add(_, answer) => {
+                let _ = answer.send(Err(status.clone()));
+                None
+            }
+            message => Some(message),
+        }
+    }
+
+    fn is_large(_: &Message) -> bool {
+        true
+    }
+}
+
+fn begin(place: &Path, disk: &SlowDisk) -> (Handle<BlobCore>, Vitals) {
+    let config = StorageConfig { compact_bytes: u64::MAX / 2, ..StorageConfig::default() };
+    let log = Journal::log(&config, place).on(disk.files());
+    let restore = |recovered: Recovered| -> Result<Blobs, std::fmt::Error> {
+        let lengths = recovered.records.iter().map(|record| record.payload.len()).collect();
+        Ok(Blobs { lengths, entry: None })
+    };
+    let (blobs, journal) = Journal::open_log("blobs", &config, log, restore).unwrap();
+    let vitals = Vitals::default();
+    let signals = watch::Sender::new(()).subscribe();
+    let (never, over) = (CancellationToken::new(), CancellationToken::new());
+    let (handle, _) = start(BlobCore(blobs), journal, signals, vitals.clone(), never, over).unwrap();
+    (handle, vitals)
+}
+
+async fn in_time<T>(future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(DEADLINE, future).await.expect("in time")
+}
+
+#[tokio::test]
+async fn an_actor_that_panics_is_the_end_of_its_process() {
+    let place = tempfile::tempdir().unwrap();
+    let (handle, vitals) = begin(place.path(), &SlowDisk::default());
+    assert_eq!(in_time(handle.request(Message::Count)).await.unwrap(), 0);
+    handle.send(Message::Panic).await.unwrap();
+    let failure = in_time(vitals.failed()).await;
+    assert_eq!(failure, CoreFailure::Panicked { part: "the actor".to_owned(), what: "a defect".to_owned() });
+    assert_eq!(failure.exit_code(), EXIT_CODE_PANICKED);
+    let beats = vitals.beats();
+    assert!(handle.request(Message::Count).await.is_err());
+    assert_eq!(vitals.beats(), beats, "the watchdog hears nothing more");
+}
+
+#[tokio::test]
+async fn whoever_was_got_past_says_nothing_more_and_ends() {
+    let place = tempfile::tempdir().unwrap();
+    let (handle, vitals) = begin(place.path(), &SlowDisk::default());
+    assert_eq!(in_time(handle.request(|answer| Message::Add(1, answer))).await.unwrap(), 1);
+    std::fs::remove_file(place.path().join("writer.lock")).unwrap();
+    let (successor, _) = begin(place.path(), &SlowDisk::default());
+    assert_eq!(in_time(successor.request(Message::Count)).await.unwrap(), 1);
+    let failure = in_time(vitals.failed()).await;
+    assert!(matches!(failure, CoreFailure::Fenced { .. }), "{failure}");
+    assert_eq!(failure.exit_code(), EXIT_CODE_FENCED);
+    assert!(in_time(handle.request(Message::Count)).await.is_err(), "also what is only read");
+    assert_eq!(in_time(successor.request(Message::Count)).await.unwrap(), 1);
+}
+
+#[tokio::test]
+async fn a_disk_that_is_behind_refuses_what_is_new_and_takes_it_again_when_it_has_caught_up() {
+    let place = tempfile::tempdir().unwrap();
+    let disk = SlowDisk::default();
+    let (handle, vitals) = begin(place.path(), &disk);
+    assert_eq!(in_time(handle.request(|answer| Message::Add(1, answer))).await.unwrap(), 1);
+    let hangs = disk.hang();
+    let mut waiting = Vec::new();
+    let refused = loop {
+        let (answer, mut answered) = oneshot::channel();
+        let (later, taken) = oneshot::channel();
+        handle.send(Message::Add(14 << 20, answer)).await.unwrap();
+        handle.send(Message::Taken(later)).await.unwrap();
+        in_time(taken).await.unwrap();
+        match answered.try_recv() {
+            Ok(refused) => break refused.unwrap_err(),
+            Err(_) => waiting.push(answered),
+        }
+        assert!(waiting.len() < 30, "it is never refused");
+    };
+    assert_eq!(refused.code(), Code::ResourceExhausted);
+    assert!(refused.message().contains(&MOST_WAITING_BYTES.to_string()), "{}", refused.message());
+    assert!(waiting.len() > MOST_WAITING_BYTES / (14 << 20), "as many as are allowed: {}", waiting.len());
+    assert!(vitals.condition().borrow().unwell.is_none(), "a slow disk is not a dead one");
+    drop(hangs);
+    let count = waiting.len();
+    for (index, answered) in waiting.into_iter().enumerate() {
+        assert_eq!(in_time(answered).await.unwrap().unwrap(), index + 2, "nothing that was taken on is lost");
+    }
+    let added = in_time(handle.request(|answer| Message::Add(1, answer))).await.unwrap();
+    assert_eq!(added, count + 2, "what was refused has changed nothing");
+    assert_eq!(vitals.condition().borrow().unwell, None);
+}
