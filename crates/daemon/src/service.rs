@@ -7,6 +7,7 @@
 use crate::access::{AccessConfig, Operation};
 use crate::config::{Check, ConfigError, rule};
 use crate::metrics;
+use crate::quota::{QuotaConfig, Quotas};
 use crate::telemetry::{self, LogConfig};
 use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::server::{Exposure, Serving};
@@ -16,7 +17,7 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, PoisonError, RwLock};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tonic::codegen::http;
 use tonic::{Code, Status};
 
@@ -38,6 +39,8 @@ pub struct ServiceConfig {
     pub tls: Option<ServerTls>,
     /// Who may do what.
     pub access: AccessConfig,
+    /// How much of it one caller may do at the same time.
+    pub quotas: QuotaConfig,
 }
 
 impl Default for ServiceConfig {
@@ -50,6 +53,7 @@ impl Default for ServiceConfig {
             metrics: BTreeMap::new(),
             tls: None,
             access: AccessConfig::default(),
+            quotas: QuotaConfig::default(),
         }
     }
 }
@@ -58,6 +62,7 @@ impl Check for ServiceConfig {
     fn check(&self) -> Result<(), ConfigError> {
         rule("drain_ms", (1..=600_000).contains(&self.drain_ms), "from 1 ms to 10 minutes")?;
         rule("log.filter", telemetry::is_filter(&self.log.filter), "a filter, as `info,ratn_daemon=debug`")?;
+        self.quotas.check()?;
         self.access.check()
     }
 }
@@ -84,7 +89,12 @@ impl ServiceConfig {
     pub fn serving_with(&self, access: &LiveAccess) -> Serving {
         Serving {
             exposure: Exposure { tls: self.tls.clone(), insecure: self.insecure },
-            gate: Arc::new(RoleGate { access: access.clone(), own_uid: nix::unistd::geteuid().as_raw() }),
+            gate: Arc::new(RoleGate {
+                access: access.clone(),
+                own_uid: nix::unistd::geteuid().as_raw(),
+                quotas: Quotas::new(self.quotas.clone()),
+            }),
+            connections: self.quotas.connections(),
             drain: Duration::from_millis(self.drain_ms),
             ..Serving::default()
         }
@@ -111,6 +121,7 @@ impl LiveAccess {
 struct RoleGate {
     access: LiveAccess,
     own_uid: u32,
+    quotas: Quotas,
 }
 
 impl Gate for RoleGate {
@@ -119,6 +130,11 @@ impl Gate for RoleGate {
         let caller = access.caller(identity, self.own_uid);
         drop(access);
         caller.admit(Operation::of_path(path))?;
+        if let Some(permit) = self.quotas.admit(&caller, path, Instant::now())? {
+            extensions.insert(permit);
+        }
+        // For the calls on a stream.
+        extensions.insert(self.quotas.clone());
         extensions.insert(caller);
         Ok(())
     }

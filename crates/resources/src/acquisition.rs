@@ -132,6 +132,7 @@ impl Pool {
         }
         if let Some(session) = self.sessions.get_mut(&request.session) {
             session.waiters.insert(id);
+            self.callers.waits(&session.opened_by);
         }
         if !request_id.is_empty() {
             self.memory.wait(request_id, fingerprint, id);
@@ -153,8 +154,12 @@ impl Pool {
 
     /// Why one more of a session could not wait, if it could not.
     fn no_room(&self, session: &SessionId) -> Result<Option<PoolError>, PoolError> {
-        let (of_session, limits) = (self.session(session)?.waiters.len(), &self.limits);
-        Ok(if of_session >= limits.waiters_per_session {
+        let (known, limits) = (self.session(session)?, &self.limits);
+        let (of_session, caller) = (known.waiters.len(), &known.opened_by);
+        Ok(if !caller.is_empty() && self.callers.waiters(caller) >= limits.waiters_per_caller {
+            let (what, quota) = ("waiters", "waiters_per_caller");
+            Some(PoolError::Quota { what, whose: caller.clone(), quota, limit: limits.waiters_per_caller })
+        } else if of_session >= limits.waiters_per_session {
             Some(PoolError::TooMany { what: "waiters of one session", limit: limits.waiters_per_session })
         } else if self.queue.len() >= limits.waiters {
             Some(PoolError::TooMany { what: "waiters", limit: limits.waiters })
@@ -245,6 +250,7 @@ impl Pool {
         }
         if let Some(session) = self.sessions.get_mut(&waiter.request.session) {
             session.waiters.remove(&id);
+            self.callers.waits_no_more(&session.opened_by);
         }
         let fingerprint = self.memory.waited(&waiter.request_id).unwrap_or_default();
         Some((waiter, fingerprint))

@@ -39,6 +39,7 @@ impl Pool {
                     known.name.clone_from(client);
                 } else {
                     let new = Session::new(client.clone(), Arc::default(), *ttl, expires);
+                    self.callers.opened(&new.opened_by);
                     self.sessions.insert(session.clone(), new);
                 }
                 self.timers.insert((expires, Timer::Session(session.clone())));
@@ -50,12 +51,14 @@ impl Pool {
                 if self.sessions.insert(session.clone(), new).is_some() {
                     return Err(format!("{session} is there already"));
                 }
+                self.callers.opened(opened_by);
                 self.timers.insert((expires, Timer::Session(session.clone())));
                 Ok(())
             }
             Effect::SessionEnded { session } => {
                 let known = self.sessions.remove(session).ok_or_else(|| format!("{session} is not there"))?;
                 self.timers.remove(&(known.expires, Timer::Session(session.clone())));
+                self.callers.closed(&known.opened_by);
                 Ok(())
             }
             Effect::ResourceCreated { slot, description, owner, numbered } => {

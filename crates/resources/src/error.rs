@@ -84,6 +84,18 @@ pub enum PoolError {
         /// The bound.
         limit: usize,
     },
+    /// What one caller may have is reached.
+    #[error("{what} of {whose}: the quota of {limit} is reached (limits.{quota}): end some first")]
+    Quota {
+        /// Of what.
+        what: &'static str,
+        /// Whose.
+        whose: Arc<str>,
+        /// Which, of [`crate::Limits`].
+        quota: &'static str,
+        /// The bound.
+        limit: usize,
+    },
     /// A request id that was used for something else before.
     #[error("request id `{id}` was used for another request before")]
     RequestIdReused {

@@ -1,5 +1,6 @@
 //! What always holds between two calls; checked after every step of simulated runs and property tests.
 
+use crate::caller::Callers;
 use crate::expiry::Timer;
 use crate::pool::Pool;
 use ratn_model::time::Timestamp;
@@ -66,6 +67,7 @@ impl Pool {
         }
         let ids: usize = self.sessions.values().map(|s| s.waiters.len()).sum();
         ensure(ids == self.queue.len(), || "a session knows a waiter that is not in the queue".to_owned())?;
+        ensure(self.callers == Callers::of(&self.sessions), || "what callers have is miscounted".to_owned())?;
         let leases: usize = self.sessions.values().map(|s| s.leases.len()).sum();
         ensure(leases == self.leases.len(), || "a session knows a lease that has ended".to_owned())?;
         let provided: usize = self.sessions.values().map(|s| s.provides.len()).sum();

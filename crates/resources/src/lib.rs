@@ -32,6 +32,7 @@
 mod acquisition;
 mod apply;
 mod assignment;
+mod caller;
 mod consumption;
 mod creation;
 mod demand;

@@ -11,8 +11,14 @@ pub struct Limits {
     pub resources: usize,
     /// Sessions in all.
     pub sessions: usize,
+    /// Sessions of one caller that is no operator.
+    pub sessions_per_caller: usize,
+    /// Of all sessions, so many are only for operators.
+    pub sessions_for_operators: usize,
     /// Queued acquires in all. Who can be served at once does not queue, and is not refused for this.
     pub waiters: usize,
+    /// Queued acquires of all sessions that one caller opened.
+    pub waiters_per_caller: usize,
     /// Queued acquires of one session.
     pub waiters_per_session: usize,
     /// Different selectors (kind, class, attributes) that are waited for.
@@ -56,7 +62,10 @@ impl Default for Limits {
         Limits {
             resources: 100_000,
             sessions: 10_000,
+            sessions_per_caller: 2_500,
+            sessions_for_operators: 500,
             waiters: 10_000,
+            waiters_per_caller: 6_000,
             waiters_per_session: 4_096,
             selectors: 10_000,
             overtaken: 0,

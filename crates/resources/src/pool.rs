@@ -1,5 +1,6 @@
 //! The pool: its state, requests with their ids, and what can be seen of it.
 
+use crate::caller::Callers;
 use crate::error::PoolError;
 use crate::event::{Notice, WatchEvent};
 use crate::expiry::Timer;
@@ -47,6 +48,8 @@ pub struct Pool {
     pub(crate) shortages: BTreeMap<SessionId, BTreeMap<String, String>>,
     pub(crate) timers: BTreeSet<(Timestamp, Timer)>,
     pub(crate) next_waiter: u64,
+    /// What each caller has.
+    pub(crate) callers: Callers,
     /// How fast tokens may grow; as fast as they like where nobody said from where.
     pub(crate) pace: Option<Pace>,
     /// How many resources were looked at in this turn for those who wait.

@@ -4,6 +4,7 @@ use crate::error::{PoolError, malformed};
 use crate::event::{EndReason, Refusal};
 use crate::expiry::Timer;
 use crate::id::{SessionId, Slot, WaiterId};
+use crate::limits::Limits;
 use crate::pool::Pool;
 use crate::record::Effect;
 use ratn_model::id::LeaseId;
@@ -136,14 +137,32 @@ impl Pool {
             None => {
                 self.check_name("session id", id.as_str())?;
                 self.check_name("client name", client)?;
-                if self.sessions.len() >= self.limits.sessions {
-                    return Err(PoolError::TooMany { what: "sessions", limit: self.limits.sessions });
-                }
+                self.check_sessions(speaker)?;
                 let (session, client, opened_by) = (id.clone(), client.to_owned(), speaker.name.clone());
                 self.commit(Effect::SessionOpened { session, client, ttl, opened_by });
                 Ok(true)
             }
         }
+    }
+
+    /// Whether the speaker may open one more.
+    fn check_sessions(&self, speaker: &Speaker) -> Result<(), PoolError> {
+        let Limits { sessions, sessions_per_caller, sessions_for_operators, .. } = self.limits;
+        if self.sessions.len() >= sessions {
+            return Err(PoolError::TooMany { what: "sessions", limit: sessions });
+        }
+        if speaker.for_anybody {
+            return Ok(());
+        }
+        if self.callers.sessions(&speaker.name) >= sessions_per_caller {
+            let (whose, quota) = (speaker.name.clone(), "sessions_per_caller");
+            return Err(PoolError::Quota { what: "sessions", whose, quota, limit: sessions_per_caller });
+        }
+        let for_all = sessions.saturating_sub(sessions_for_operators);
+        if self.sessions.len() >= for_all {
+            return Err(PoolError::TooMany { what: "sessions (the rest is kept for operators)", limit: for_all });
+        }
+        Ok(())
     }
 
     /// Whether the speaker may speak for a session. One that is not there is nobody's.

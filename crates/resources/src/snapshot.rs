@@ -149,6 +149,7 @@ impl Pool {
             let opened_by = openers.remove(&id).unwrap_or_default();
             let expires = self.now + ttl;
             self.timers.insert((expires, Timer::Session(id.clone())));
+            self.callers.opened(&opened_by);
             self.sessions.insert(id, Session::new(client, opened_by, ttl, expires));
         }
         for (slot, resource) in snapshot.resources {

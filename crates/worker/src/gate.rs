@@ -10,8 +10,11 @@
 //! A server that drains refuses what is new ([`ending`]), and knows what is still under way: a call is over when its last byte of
 //! answer is. Health and reflection are answered to the end, and nobody waits for them.
 
+use crate::connections::{InUse, Link, LinkInfo};
 use crate::trace::{self, TraceContext};
 use http_body::{Frame, SizeHint};
+use std::any::Any;
+use std::fmt;
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -62,6 +65,26 @@ pub trait Gate: Send + Sync + 'static {
     fn answered(&self, path: &str, code: Code, took: Duration);
 }
 
+/// What a gate leaves in the extensions of a call that it admits: dropped when the last byte of the answer has been sent, or nobody
+/// wants it any more.
+#[derive(Clone)]
+pub struct Permit {
+    _held: Arc<dyn Any + Send + Sync>,
+}
+
+impl fmt::Debug for Permit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Permit")
+    }
+}
+
+impl Permit {
+    /// Holds something for as long as the call is under way.
+    pub fn new(held: impl Send + Sync + 'static) -> Permit {
+        Permit { _held: Arc::new(held) }
+    }
+}
+
 /// Lets everybody do everything.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Open;
@@ -76,17 +99,24 @@ impl Gate for Open {
 
 /// Who made a request.
 pub fn identity_of(extensions: &http::Extensions) -> Identity {
-    if let Some(info) = extensions.get::<UdsConnectInfo>() {
+    if let Some(LinkInfo { info, .. }) = extensions.get::<LinkInfo<UdsConnectInfo>>() {
         return match info.peer_cred {
             Some(peer) => Identity::User { uid: peer.uid(), pid: peer.pid() },
             None => Identity::Anonymous,
         };
     }
-    let shown = extensions.get::<TlsConnectInfo<TcpConnectInfo>>().and_then(TlsConnectInfo::peer_certs);
+    let shown = extensions.get::<TlsConnectInfo<LinkInfo<TcpConnectInfo>>>();
+    let shown = shown.and_then(TlsConnectInfo::peer_certs);
     match shown.as_deref().and_then(|chain| chain.first()) {
         Some(certificate) => Identity::Certificate { der: certificate.as_ref().into() },
         None => Identity::Anonymous,
     }
+}
+
+/// Which connection a request came over.
+fn link_of(extensions: &http::Extensions) -> Option<&Link> {
+    let over_unix = extensions.get::<LinkInfo<UdsConnectInfo>>().map(|known| &known.link);
+    over_unix.or_else(|| extensions.get::<LinkInfo<TcpConnectInfo>>().map(|known| &known.link))
 }
 
 /// What a process that ends says to whoever asks it for something new.
@@ -140,7 +170,14 @@ fn is_counted(path: &str) -> bool {
 /// The body of an answer whose call is under way until it has been sent, or nobody wants it any more.
 struct Answer {
     body: Body,
-    _call: TaskTrackerToken,
+    _held: Held,
+}
+
+/// What lasts as long as a call is under way.
+struct Held {
+    _call: Option<TaskTrackerToken>,
+    _permit: Option<Permit>,
+    _in_use: Option<InUse>,
 }
 
 impl http_body::Body for Answer {
@@ -202,9 +239,14 @@ where
         let path = request.uri().clone();
         let identity = identity_of(request.extensions());
         let Gated { gate, calls } = self.gated.clone();
-        let admitted = gate.admit(&identity, path.path(), request.extensions_mut());
-        let call = match admitted.and_then(|()| calls.begin(is_counted(path.path()))) {
-            Ok(call) => call,
+        let in_use = link_of(request.extensions()).map(|link| link.begin(&identity)).transpose();
+        let admitted = in_use.and_then(|in_use| {
+            gate.admit(&identity, path.path(), request.extensions_mut())?;
+            let permit = request.extensions_mut().remove::<Permit>();
+            Ok(Held { _call: calls.begin(is_counted(path.path()))?, _permit: permit, _in_use: in_use })
+        });
+        let held = match admitted {
+            Ok(held) => held,
             Err(status) => {
                 gate.answered(path.path(), status.code(), began.elapsed());
                 return Box::pin(std::future::ready(Ok(status.into_http())));
@@ -218,10 +260,7 @@ where
             if let Ok(answer) = &answer {
                 gate.answered(path.path(), code_of(answer), began.elapsed());
             }
-            match (answer, call) {
-                (Ok(answer), Some(call)) => Ok(answer.map(|body| Body::new(Answer { body, _call: call }))),
-                (answer, _) => answer,
-            }
+            answer.map(|answer| answer.map(|body| Body::new(Answer { body, _held: held })))
         };
         match context {
             None => Box::pin(answered),

@@ -30,6 +30,7 @@
 pub mod action;
 pub mod adoption;
 pub mod client;
+pub mod connections;
 pub mod endpoint;
 pub mod gate;
 pub mod lease_watch;

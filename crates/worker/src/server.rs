@@ -5,6 +5,7 @@
 //!                                NOT_SERVING, new calls: UNAVAILABLE, when to come back
 //! ```
 
+use crate::connections::{ConnectionLimits, Connections};
 use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
 use crate::gate::{Calls, Gate, Gated, Open};
 use crate::tls::{ServerTls, TlsError};
@@ -17,6 +18,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpListener, UnixListener, UnixStream};
 use tokio::sync::watch;
+use tokio_stream::StreamExt;
 use tokio_stream::wrappers::UnixListenerStream;
 use tokio_util::sync::CancellationToken;
 use tonic::body::Body;
@@ -41,6 +43,8 @@ pub struct Serving {
     pub exposure: Exposure,
     /// Every call passes it.
     pub gate: Arc<dyn Gate>,
+    /// How many connections, and how long one may say nothing.
+    pub connections: ConnectionLimits,
     /// Instead of [`DRAIN_DEADLINE`].
     pub drain: Duration,
     /// Says how far it is.
@@ -223,6 +227,7 @@ impl Default for Serving {
         Serving {
             exposure: Exposure::default(),
             gate: Arc::new(Open),
+            connections: ConnectionLimits::default(),
             drain: DRAIN_DEADLINE,
             phase: watch::Sender::new(Phase::Starting),
             vitals: Vitals::default(),
@@ -278,6 +283,7 @@ impl Bound {
         let mut server = tonic::transport::Server::builder();
         if let Some(tls) = self.tls {
             let failed = |source| ServeError::Transport { endpoint: self.endpoint.clone(), source };
+            let tls = tls.timeout(serving.connections.first_call);
             server = server.tls_config(tls).map_err(failed)?;
         }
         let router = server
@@ -287,16 +293,20 @@ impl Bound {
             .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
             .add_routes(services.routes.add_service(health_service).add_service(reflection));
 
+        let connections = Connections::new(serving.connections);
+        let accepting = connections.clone();
         let served = {
             let stop = closing.clone().cancelled_owned();
             async move {
                 match self.listener {
                     Listener::Tcp(listener) => {
                         let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+                        let incoming = incoming.filter_map(move |stream| accepting.admit(stream));
                         router.serve_with_incoming_shutdown(incoming, stop).await
                     }
                     Listener::Unix(listener, file) => {
                         let incoming = UnixListenerStream::new(listener);
+                        let incoming = incoming.filter_map(move |stream| accepting.admit(stream));
                         // Removed while it is still listened on: afterwards the file may be a successor's.
                         let stop = async {
                             stop.await;
@@ -335,6 +345,7 @@ impl Bound {
             failure = serving.vitals.failed() => Err(failure.into()),
             served = served => served.map_err(|source| ServeError::Transport { endpoint, source }),
             () = drained => Ok(()),
+            never = connections.sweep() => match never {},
         }
     }
 }

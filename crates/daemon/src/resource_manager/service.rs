@@ -10,6 +10,7 @@ use crate::audit::{self, Mutation};
 use crate::details::{ending, retry_later, status};
 use crate::metrics;
 use crate::paging::{self, Filled, Page};
+use crate::quota::Quotas;
 use futures::{Stream, StreamExt};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Lease, Requirement, ResourceOperation};
@@ -37,6 +38,8 @@ const LISTED_AT_ONCE: usize = 4_096;
 const MOST_IDS: usize = 1_000;
 /// Resources that one watch may name.
 const MAX_WATCHED: usize = 1_024;
+/// What a ping on a stream counts as.
+const PING: &str = "/ratn.v1.ResourceService/KeepAlive";
 /// When a watcher that was cut off may come back.
 const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
 
@@ -427,7 +430,7 @@ impl v1::resource_service_server::ResourceService for Service {
         &self,
         request: Request<Streaming<v1::KeepAliveRequest>>,
     ) -> Result<Response<Self::KeepAliveStream>, Status> {
-        let caller = Caller::of(&request);
+        let (caller, quotas) = (Caller::of(&request), request.extensions().get::<Quotas>().cloned());
         let mut pings = request.into_inner();
         let (sender, answers) = mpsc::channel(KEEP_ALIVE_BUFFER);
         let actor = self.actor.clone();
@@ -439,7 +442,11 @@ impl v1::resource_service_server::ResourceService for Service {
                     () = shutdown.cancelled() => return,
                 };
                 let Ok(Some(ping)) = ping else { return };
-                let answer = kept_alive(&actor, &caller, ping).await;
+                let permit = quotas.as_ref().map(|quotas| quotas.admit(&caller, PING, Instant::now())).transpose();
+                let answer = match permit {
+                    Ok(_permit) => kept_alive(&actor, &caller, ping).await,
+                    Err(refused) => Err(refused),
+                };
                 let failed = answer.is_err();
                 if sender.send(answer).await.is_err() || failed {
                     return;
@@ -453,7 +460,8 @@ impl v1::resource_service_server::ResourceService for Service {
         &self,
         request: Request<Streaming<v1::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let calls = CallerService { service: self.clone(), caller: Caller::of(&request) };
+        let quotas = request.extensions().get::<Quotas>().cloned();
+        let calls = CallerService { service: self.clone(), caller: Caller::of(&request), quotas };
         Ok(Response::new(Answers::new(calls, request.into_inner(), Some(self.shutdown.clone()))))
     }
 }

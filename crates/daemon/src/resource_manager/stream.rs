@@ -5,6 +5,7 @@ use super::service::{Service, kept_alive};
 use crate::access::{Caller, Operation};
 use crate::details::{retry_later, status};
 use crate::metrics;
+use crate::quota::Quotas;
 use futures::StreamExt;
 use futures::stream::once;
 use ratn_proto::v1::resource_service_server::ResourceService;
@@ -25,13 +26,15 @@ const RETRY_DELAY: Duration = Duration::from_millis(10);
 pub(super) struct CallerService {
     pub(super) service: Service,
     pub(super) caller: Caller,
+    /// What its calls count for.
+    pub(super) quotas: Option<Quotas>,
 }
 
 impl Serve<SessionCalls> for CallerService {
     const MAX_CALLS: usize = 4_096;
 
     fn begin(&mut self, call: Option<Asked>, context: Option<TraceContext>) -> CallAnswers<SessionCalls> {
-        let performed = measured(self.service.clone(), self.caller.clone(), call);
+        let performed = measured(self.service.clone(), self.caller.clone(), self.quotas.clone(), call);
         match context {
             None => once(performed).boxed(),
             Some(context) => once(trace::within(context, performed).instrument(context.entered())).boxed(),
@@ -44,7 +47,12 @@ impl Serve<SessionCalls> for CallerService {
     }
 }
 
-async fn measured(service: Service, caller: Caller, call: Option<Asked>) -> Result<Kind, Status> {
+async fn measured(
+    service: Service,
+    caller: Caller,
+    quotas: Option<Quotas>,
+    call: Option<Asked>,
+) -> Result<Kind, Status> {
     let began = Instant::now();
     let path = match &call {
         Some(Asked::Block(_)) => "/ratn.v1.ResourceService/Block",
@@ -54,6 +62,7 @@ async fn measured(service: Service, caller: Caller, call: Option<Asked>) -> Resu
         Some(Asked::KeepAlive(_)) | None => "/ratn.v1.ResourceService/KeepAlive",
     };
     caller.admit(Operation::of_path(path))?;
+    let _permit = quotas.map(|quotas| quotas.admit(&caller, path, began)).transpose()?;
     let answered = performed(service, caller, call).await;
     if let Some(metrics) = metrics::get() {
         let code = answered.as_ref().map_or_else(Status::code, |_| Code::Ok);

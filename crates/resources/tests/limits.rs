@@ -1,0 +1,286 @@
+//! Every bound of [`Limits`], at its edge and one past it.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_model::condition::{Comparison, Condition};
+use ratn_model::id::Revision;
+use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
+use ratn_resources::{AcquireRequest, Limits, Pool, Reply, Request, ResourceSpec, SessionId, Speaker};
+use std::time::Duration;
+
+const NOW: Timestamp = Timestamp(0);
+const TTL: Duration = Duration::from_secs(1_000);
+/// What each bound is set to, beside what is there already.
+const EDGE: usize = 3;
+
+fn session() -> SessionId {
+    SessionId::from("s")
+}
+
+fn adam() -> Speaker {
+    Speaker { name: "adam".into(), for_anybody: false }
+}
+
+fn block(kind: &str, count: usize) -> Requirement {
+    let count = Quantity::whole(u32::try_from(count).unwrap());
+    Requirement { count, ..Requirement::new(ResourceOperation::Block, kind) }
+}
+
+fn acquire(pool: &mut Pool, session: &str, requirements: Vec<Requirement>) -> Result<(), String> {
+    let request = AcquireRequest::new(SessionId::from(session), requirements);
+    pool.acquire(NOW, request).map(drop).map_err(|error| error.to_string())
+}
+
+/// Acquires one more of something of which there is enough; whoever has to wait for it all the same was stopped by a bound.
+fn one_more_lease(pool: &mut Pool) -> Result<(), String> {
+    let before = pool.leases().len();
+    acquire(pool, "s", vec![block("Tool", 1)])?;
+    if pool.leases().len() > before { Ok(()) } else { Err("waits".to_owned()) }
+}
+
+fn create(pool: &mut Pool, spec: ResourceSpec) -> Result<(), String> {
+    pool.create(NOW, None, spec).map(drop).map_err(|error| error.to_string())
+}
+
+fn tool() -> ResourceSpec {
+    ResourceSpec::new(ResourceClass::Module, "Tool").capacity(100)
+}
+
+fn open(pool: &mut Pool, speaker: &Speaker, name: &str) -> Result<(), String> {
+    let opened = pool.keep_alive_as(NOW, speaker, &SessionId::from(name), "test", TTL);
+    opened.map(drop).map_err(|error| error.to_string())
+}
+
+fn with_attributes(count: usize) -> ResourceSpec {
+    (0..count).fold(tool(), |spec, number| spec.attribute(format!("a{number}"), Value::Int(0)))
+}
+
+/// Does something for the nth time.
+type Act = fn(&mut Pool, usize) -> Result<(), String>;
+
+/// A bound, what comes up to it, and how what is beyond it is refused. There is a session, and a tool of 100 units.
+fn rows() -> Vec<(&'static str, Limits, Act, &'static str)> {
+    let all = Limits::default;
+    vec![
+        (
+            "resources",
+            Limits { resources: EDGE + 1, ..all() },
+            |pool, _| create(pool, tool()),
+            "resources: the limit of 4 is reached",
+        ),
+        (
+            "sessions",
+            Limits { sessions: EDGE + 1, ..all() },
+            |pool, n| open(pool, &Speaker::trusted(), &format!("s{n}")),
+            "sessions: the limit of 4 is reached",
+        ),
+        (
+            "sessions_per_caller",
+            Limits { sessions_per_caller: EDGE, ..all() },
+            |pool, n| open(pool, &adam(), &format!("s{n}")),
+            "sessions of adam: the quota of 3 is reached (limits.sessions_per_caller)",
+        ),
+        (
+            "sessions_for_operators",
+            Limits { sessions: EDGE + 2, sessions_for_operators: 1, ..all() },
+            |pool, n| open(pool, &adam(), &format!("s{n}")),
+            "the rest is kept for operators",
+        ),
+        (
+            "waiters",
+            Limits { waiters: EDGE, ..all() },
+            |pool, _| acquire(pool, "s", vec![block("Nothing", 1)]),
+            "waiters: the limit of 3 is reached",
+        ),
+        (
+            "waiters_per_session",
+            Limits { waiters_per_session: EDGE, ..all() },
+            |pool, _| acquire(pool, "s", vec![block("Nothing", 1)]),
+            "waiters of one session: the limit of 3 is reached",
+        ),
+        (
+            "waiters_per_caller",
+            Limits { waiters_per_caller: EDGE, ..all() },
+            |pool, n| {
+                open(pool, &adam(), &format!("s{n}"))?;
+                acquire(pool, &format!("s{n}"), vec![block("Nothing", 1)])
+            },
+            "waiters of adam: the quota of 3 is reached (limits.waiters_per_caller)",
+        ),
+        (
+            "selectors",
+            Limits { selectors: EDGE, ..all() },
+            |pool, n| acquire(pool, "s", vec![block(&format!("Nothing{n}"), 1)]),
+            "different selectors waited for: the limit of 3 is reached",
+        ),
+        ("leases", Limits { leases: EDGE, ..all() }, |pool, _| one_more_lease(pool), "waits"),
+        ("holders", Limits { holders: EDGE, ..all() }, |pool, _| one_more_lease(pool), "waits"),
+        (
+            "requirements",
+            Limits { requirements: EDGE, ..all() },
+            |pool, n| acquire(pool, "s", vec![block("Tool", 1); n]),
+            "4 requirements: at most 3",
+        ),
+        (
+            "units",
+            Limits { units: u32::try_from(EDGE).unwrap(), ..all() },
+            |pool, n| acquire(pool, "s", vec![block("Tool", n)]),
+            "at most 3 units",
+        ),
+        (
+            "units_per_request",
+            Limits { units_per_request: u32::try_from(EDGE).unwrap(), ..all() },
+            |pool, n| acquire(pool, "s", vec![block("Tool", 1); n]),
+            "4 units: at most 3 in one request",
+        ),
+        (
+            "comparisons",
+            Limits { comparisons: EDGE, ..all() },
+            |pool, n| {
+                let has = |number| Condition {
+                    attribute: format!("a{number}"),
+                    comparison: Comparison::Has,
+                    value: Value::Null,
+                };
+                let requirement = Requirement { conditions: (0..n).map(has).collect(), ..block("Tool", 1) };
+                acquire(pool, "s", vec![requirement])
+            },
+            "4 comparisons of attributes with resources: at most 3",
+        ),
+        (
+            "name_length",
+            Limits { name_length: EDGE + 1, ..all() },
+            |pool, n| create(pool, ResourceSpec::new(ResourceClass::Module, "K".repeat(n + 1))),
+            "1 to 4 characters",
+        ),
+        (
+            "attributes",
+            Limits { attributes: EDGE, ..all() },
+            |pool, n| create(pool, with_attributes(n)),
+            "4 attributes: at most 3",
+        ),
+        (
+            "remembered_requests",
+            Limits { remembered_requests: EDGE, ..all() },
+            |pool, n| {
+                let ask = |pool: &mut Pool, n: usize| {
+                    let create = Request::Create { session: None, spec: tool() };
+                    pool.handle(NOW, &format!("r{n}"), create).unwrap()
+                };
+                let id = |reply| if let Reply::Created { id, .. } = reply { id } else { String::new() };
+                ask(pool, n);
+                // The first is number 2: there is a tool.
+                if id(ask(pool, 1)) == "Tool-2" { Ok(()) } else { Err("performed twice".to_owned()) }
+            },
+            "performed twice",
+        ),
+        (
+            "remember_for_ms",
+            Limits { remember_for_ms: EDGE as u64, ..all() },
+            |pool, n| {
+                let create = || Request::Create { session: None, spec: tool() };
+                let at = |ms: u64| Timestamp(ms * 1_000_000);
+                let first = pool.handle(at(0), "first", create()).unwrap();
+                pool.handle(at(n as u64 - 1), &format!("r{n}"), create()).unwrap();
+                let again = pool.handle(at(n as u64 - 1), "first", create()).unwrap();
+                if again == first { Ok(()) } else { Err("performed twice".to_owned()) }
+            },
+            "performed twice",
+        ),
+        (
+            "history",
+            Limits { history: EDGE + 1, ..all() },
+            |pool, _| {
+                create(pool, tool())?;
+                pool.changes_after(Revision(0)).map(drop).map_err(|error| error.to_string())
+            },
+            "",
+        ),
+    ]
+}
+
+#[test]
+fn every_bound_at_its_edge_and_one_past_it() {
+    // A new bound belongs into the table (those of bytes are below, `overtaken` is measured by `against_model.rs`).
+    let Limits {
+        resources: _,
+        sessions: _,
+        sessions_per_caller: _,
+        sessions_for_operators: _,
+        waiters: _,
+        waiters_per_caller: _,
+        waiters_per_session: _,
+        selectors: _,
+        overtaken: _,
+        leases: _,
+        requirements: _,
+        units: _,
+        units_per_request: _,
+        comparisons: _,
+        name_length: _,
+        attributes: _,
+        resource_bytes: _,
+        requirement_bytes: _,
+        holders: _,
+        remembered_requests: _,
+        remember_for_ms: _,
+        history: _,
+    } = Limits::default();
+    for (bound, limits, act, says) in rows() {
+        let mut pool = Pool::new(Limits { name_length: limits.name_length.max(4), ..limits });
+        pool.keep_alive(NOW, &session(), "test", TTL).unwrap();
+        create(&mut pool, tool()).unwrap();
+        for n in 1..=EDGE {
+            act(&mut pool, n).unwrap_or_else(|error| panic!("{bound}: {n} of {EDGE} is refused: {error}"));
+        }
+        let refused = act(&mut pool, EDGE + 1).expect_err(bound);
+        assert!(refused.contains(says), "{bound}: {refused}");
+        pool.check_invariants().unwrap_or_else(|error| panic!("{bound}: {error}"));
+    }
+}
+
+#[test]
+fn what_is_kept_for_operators_is_theirs() {
+    let mut pool = Pool::new(Limits { sessions: 2, sessions_for_operators: 1, ..Limits::default() });
+    open(&mut pool, &adam(), "a").unwrap();
+    open(&mut pool, &adam(), "b").unwrap_err();
+    let operator = Speaker { name: "root".into(), for_anybody: true };
+    open(&mut pool, &operator, "b").unwrap();
+}
+
+#[test]
+fn a_crowded_resource_has_room_again_when_a_lease_of_it_ends() {
+    let mut pool = Pool::new(Limits { holders: 1, ..Limits::default() });
+    pool.keep_alive(NOW, &session(), "test", TTL).unwrap();
+    create(&mut pool, tool()).unwrap();
+    one_more_lease(&mut pool).unwrap();
+    one_more_lease(&mut pool).unwrap_err();
+    let first = pool.leases()[0].id;
+    pool.release(NOW, None, first).unwrap();
+    assert_eq!((pool.leases().len(), pool.waiting()), (1, 0));
+    pool.check_invariants().unwrap();
+}
+
+/// The largest text that is accepted, and the refusal of one letter more.
+fn largest(mut act: impl FnMut(String) -> Result<(), String>) -> String {
+    (1..1_000).find_map(|bytes| act("x".repeat(bytes)).err()).expect("some are too large")
+}
+
+#[test]
+fn resources_and_requirements_have_bounds_in_bytes() {
+    let mut pool = Pool::new(Limits { resource_bytes: 200, requirement_bytes: 300, ..Limits::default() });
+    pool.keep_alive(NOW, &session(), "test", TTL).unwrap();
+    let refused = largest(|text| create(&mut pool, tool().id("t").attribute("map", Value::String(text))));
+    assert_eq!(refused, "resource `t`: 201 bytes: at most 200 in a resource with its attributes");
+    let refused = largest(|text| {
+        let attributes = [("map".to_owned(), Value::String(text))].into();
+        acquire(&mut pool, "s", vec![Requirement { attributes, ..block("Tool", 1) }])
+    });
+    assert_eq!(refused, "block Tool: 301 bytes: at most 300 in a requirement");
+    let endpoint = |bytes: usize| tool().attribute("endpoint", Value::String("x".repeat(bytes)));
+    let mut pool = Pool::new(Limits::default());
+    create(&mut pool, endpoint(1_024)).unwrap();
+    let refused = create(&mut pool, endpoint(1_025)).unwrap_err();
+    assert!(refused.contains("1025 bytes of `endpoint`: at most 1024"), "{refused}");
+}
