@@ -176,3 +176,25 @@ async fn a_lease_has_room_for_so_many_goals_and_says_so() {
     watched.happened(ResourceEventKind::Leased, 8, &[8]);
     watched.run(goal("b", "double", 8)).await.unwrap();
 }
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "a measurement: cargo test --release -p ratn-worker --test leases -- --ignored --nocapture"]
+async fn what_the_confirmation_of_a_lease_adds_to_a_goal() {
+    const GOALS: usize = 2_000;
+    let watched = watched(|builder| builder).await;
+    watched.holds(&[7], 7);
+    let believing = common::provider(None).await;
+    let mut took = [Vec::new(), Vec::new()];
+    for i in 0..GOALS {
+        // In turns, so that whatever else the machine does happens to both.
+        for (provider, took) in [&watched.provider, &believing].into_iter().zip(&mut took) {
+            let began = Instant::now();
+            let goal = goal(&format!("run/{i}/1"), "double", 7);
+            provider.client.execute(&provider.endpoint, goal, |_, _| {}).await.unwrap();
+            took.push(began.elapsed());
+        }
+    }
+    took.iter_mut().for_each(|took| took.sort());
+    let [confirmed, believed] = took.map(|took| took[GOALS / 2]);
+    println!("median of a goal: confirmed {confirmed:?}, believed {believed:?}");
+}
