@@ -4,7 +4,7 @@
 //!   [service] of the config ──▶ ServiceConfig ──serving(role)──▶ ratn_worker::server::Serving (exposure, gate, drain)
 //! ```
 
-use crate::access::{AccessConfig, Operation};
+use crate::access::{ACCESS_VARIABLE, AccessConfig, Caller, LiveAccess, RoleGate};
 use crate::config::{Check, ConfigError, rule};
 use crate::metrics;
 use crate::quota::{QuotaConfig, Quotas};
@@ -15,8 +15,8 @@ use ratn_worker::tls::{self, ClientTls, ServerTls, TlsError};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::path::PathBuf;
-use std::sync::{Arc, PoisonError, RwLock};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tonic::codegen::http;
 use tonic::{Code, Status};
@@ -80,6 +80,21 @@ impl ServiceConfig {
         Ok(())
     }
 
+    /// What processes that a daemon starts have in their environment, so that they let in whom the daemon does and show what it shows:
+    /// `file` is the system's config. What the environment of this process says of TLS stays.
+    pub fn for_workers(&self, file: Option<&Path>) -> BTreeMap<&'static str, PathBuf> {
+        let mut environment = BTreeMap::new();
+        if let Some(file) = file.and_then(|file| std::path::absolute(file).ok()) {
+            environment.insert(ACCESS_VARIABLE, file);
+        }
+        if let Some(files) = self.tls.as_ref().filter(|_| std::env::var_os(tls::CA_VARIABLE).is_none()) {
+            environment.insert(tls::CA_VARIABLE, files.client_ca.clone());
+            environment.insert(tls::CERT_VARIABLE, files.cert.clone());
+            environment.insert(tls::KEY_VARIABLE, files.key.clone());
+        }
+        environment
+    }
+
     /// How a daemon serves.
     pub fn serving(&self) -> Serving {
         self.serving_with(&LiveAccess::new(self.access.clone()))
@@ -89,9 +104,8 @@ impl ServiceConfig {
     pub fn serving_with(&self, access: &LiveAccess) -> Serving {
         Serving {
             exposure: Exposure { tls: self.tls.clone(), insecure: self.insecure },
-            gate: Arc::new(RoleGate {
-                access: access.clone(),
-                own_uid: nix::unistd::geteuid().as_raw(),
+            gate: Arc::new(QuotaGate {
+                roles: RoleGate::new(access.clone()),
                 quotas: Quotas::new(self.quotas.clone()),
             }),
             connections: self.quotas.connections(),
@@ -101,41 +115,23 @@ impl ServiceConfig {
     }
 }
 
-/// Who has which roles, as of now.
-#[derive(Debug, Clone)]
-pub struct LiveAccess(Arc<RwLock<AccessConfig>>);
-
-impl LiveAccess {
-    /// As a config says.
-    pub fn new(access: AccessConfig) -> LiveAccess {
-        LiveAccess(Arc::new(RwLock::new(access)))
-    }
-
-    /// From the next call on, and the next stream of calls.
-    pub fn replace(&self, access: AccessConfig) {
-        *self.0.write().unwrap_or_else(PoisonError::into_inner) = access;
-    }
-}
-
-/// Admits by the table of [`crate::access`], and leaves the [`Caller`] in the request.
-struct RoleGate {
-    access: LiveAccess,
-    own_uid: u32,
+/// The gate of every server, with quotas for each caller; it also counts calls.
+struct QuotaGate {
+    roles: RoleGate,
     quotas: Quotas,
 }
 
-impl Gate for RoleGate {
+impl Gate for QuotaGate {
     fn admit(&self, identity: &Identity, path: &str, extensions: &mut http::Extensions) -> Result<(), Status> {
-        let access = self.access.0.read().unwrap_or_else(PoisonError::into_inner);
-        let caller = access.caller(identity, self.own_uid);
-        drop(access);
-        caller.admit(Operation::of_path(path))?;
-        if let Some(permit) = self.quotas.admit(&caller, path, Instant::now())? {
+        self.roles.admit(identity, path, extensions)?;
+        let caller = extensions.get::<Caller>().cloned();
+        if let Some(caller) = caller
+            && let Some(permit) = self.quotas.admit(&caller, path, Instant::now())?
+        {
             extensions.insert(permit);
         }
         // For the calls on a stream.
         extensions.insert(self.quotas.clone());
-        extensions.insert(caller);
         Ok(())
     }
 

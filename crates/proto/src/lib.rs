@@ -1,10 +1,11 @@
 //! The wire: code generated from `proto/` and conversions to the cores' types.
 //!
-//! [`v1`] is what prost and tonic make of `proto/ratn/v1`; [`convert`] turns it into types that cannot be wrong and back;
+//! [`access`] says what each method does. [`v1`] is what prost and tonic make of `proto/ratn/v1`; [`convert`] turns it into types that cannot be wrong and back;
 //! [`types`] holds those of them that no core owns. Wire types stop here: cores never see one. The conversion out of the
 //! wire checks what the schema cannot say (a missing choice, a number that is none, nesting without end) and answers with
 //! the field's path; the conversion onto the wire cannot fail.
 
+pub mod access;
 pub mod convert;
 pub mod types;
 

@@ -85,18 +85,6 @@ impl Permit {
     }
 }
 
-/// Lets everybody do everything.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Open;
-
-impl Gate for Open {
-    fn admit(&self, _: &Identity, _: &str, _: &mut http::Extensions) -> Result<(), Status> {
-        Ok(())
-    }
-
-    fn answered(&self, _: &str, _: Code, _: Duration) {}
-}
-
 /// Who made a request.
 pub fn identity_of(extensions: &http::Extensions) -> Identity {
     if let Some(LinkInfo { info, .. }) = extensions.get::<LinkInfo<UdsConnectInfo>>() {

@@ -6,7 +6,8 @@
 //!   `wait_for(role, deadline)`.
 //! - [`server`]: `bind(&endpoint) -> Bound` (port 0 and Unix sockets too), `Services::new().with(service)`,
 //!   `bound.serve(services, shutdown_token)`: adds gRPC health and reflection, drains with a hard deadline.
-//! - [`gate::Gate`] sees every call with the [`gate::Identity`] of its caller; [`tls`] says what is shown and trusted; [`trace`] carries
+//! - [`gate::Gate`] sees every call with the [`gate::Identity`] of its caller; [`access::RoleGate`] is the one of every server unless it
+//!   brings its own: who may what is [`access`]. [`tls`] says what is shown and trusted; [`trace`] carries
 //!   a W3C trace context from call to call; [`multiplex`] carries many calls over one stream.
 //! - [`shutdown`]: `on_signals(&token)`, `exit_with_parent(&token)`.
 //!
@@ -27,6 +28,7 @@
 //!
 //! What it deliberately does not do: decide anything. No retries of goals, no choice of resources.
 
+pub mod access;
 pub mod action;
 pub mod adoption;
 pub mod client;

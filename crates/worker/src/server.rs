@@ -5,9 +5,10 @@
 //!                                NOT_SERVING, new calls: UNAVAILABLE, when to come back
 //! ```
 
+use crate::access::RoleGate;
 use crate::connections::{ConnectionLimits, Connections};
 use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
-use crate::gate::{Calls, Gate, Gated, Open};
+use crate::gate::{Calls, Gate, Gated};
 use crate::tls::{ServerTls, TlsError};
 use crate::vitals::{CoreFailure, Vitals};
 use std::convert::Infallible;
@@ -41,7 +42,7 @@ const MAX_METADATA_BYTES: u32 = 16 * 1024;
 pub struct Serving {
     /// What may be listened on.
     pub exposure: Exposure,
-    /// Every call passes it.
+    /// Every call passes it; unless said otherwise by roles, of which those of [`crate::access::AccessConfig::default`].
     pub gate: Arc<dyn Gate>,
     /// How many connections, and how long one may say nothing.
     pub connections: ConnectionLimits,
@@ -226,7 +227,7 @@ impl Default for Serving {
     fn default() -> Serving {
         Serving {
             exposure: Exposure::default(),
-            gate: Arc::new(Open),
+            gate: Arc::new(RoleGate::default()),
             connections: ConnectionLimits::default(),
             drain: DRAIN_DEADLINE,
             phase: watch::Sender::new(Phase::Starting),

@@ -5,6 +5,7 @@
 //! alone is given the resource manager and offers its resource itself. Either performs goals only under leases that the resource
 //! manager confirms; a pooled one is told where that is by `RATN_RESOURCE_MANAGER`.
 
+use crate::access::{AccessError, LiveAccess, RoleGate};
 use crate::action::{Action, ActionServer, ActionServerBuilder};
 use crate::client::{CallError, Channels};
 use crate::endpoint::{Endpoint, EndpointError};
@@ -12,13 +13,14 @@ use crate::lease_watch::{LeaseWatch, ManagerLocation, RESOURCE_MANAGER_VARIABLE}
 use crate::provider::Provider;
 use crate::runtime_directory::publish_file;
 use crate::safety::Safety;
-use crate::server::{BindError, Exposure, ServeError, Services, bind_as};
+use crate::server::{BindError, Exposure, ServeError, Services, Serving, bind_as};
 use crate::session::{DEFAULT_TTL, Session};
 use crate::shutdown;
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
 use std::io;
 use std::path::PathBuf;
+use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 
@@ -41,6 +43,9 @@ pub struct WorkerOptions {
     pub host: String,
     /// What it may listen on.
     pub exposure: Exposure,
+    /// The system's config, of whose `[service.access]` callers have their roles; that which the environment names unless given
+    /// ([`crate::access::ACCESS_VARIABLE`]). Without any who runs the worker, and root, are operators, and others as by default.
+    pub access: Option<PathBuf>,
 }
 
 impl Default for WorkerOptions {
@@ -54,6 +59,7 @@ impl Default for WorkerOptions {
             resource_manager: None,
             host: String::new(),
             exposure: Exposure::default(),
+            access: None,
         }
     }
 }
@@ -64,6 +70,9 @@ pub enum WorkerError {
     /// It cannot listen.
     #[error("the worker cannot start")]
     Bind(#[from] BindError),
+    /// Nobody knows who may call it.
+    #[error("the worker cannot start")]
+    Access(#[from] AccessError),
     /// It cannot serve.
     #[error("the worker cannot serve")]
     Serve(#[from] ServeError),
@@ -171,6 +180,11 @@ impl Worker {
             actions = actions.safety(safety.clone());
         }
         let server = actions.channels(channels.clone()).build();
+        let access = match &options.access {
+            Some(file) => LiveAccess::of_file(file)?,
+            None => LiveAccess::from_environment()?,
+        };
+        let serving = Serving { gate: Arc::new(RoleGate::new(access)), ..Serving::default() };
         let bound = bind_as(&options.listen, &options.exposure).await?;
         let endpoint = bound.endpoint().clone();
         let mut services = Services::new().with(server.clone().into_service());
@@ -179,7 +193,7 @@ impl Worker {
         }
         let ends = shutdown.clone();
         let serving = tokio::spawn(async move {
-            let served = bound.serve(services, ends.clone()).await;
+            let served = bound.serve_as(services, serving, ends.clone()).await;
             ends.cancel();
             served
         });

@@ -89,6 +89,9 @@ pub(crate) struct WorkerArguments {
     /// Its resource's kind
     #[arg(long, value_name = "KIND", default_value = "")]
     pub(crate) kind: String,
+    /// The system's config, of whose `[service.access]` callers have their roles; $RATN_ACCESS unless given
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
     /// The host that it is on
     #[arg(long, value_name = "NAME", default_value = "")]
     pub(crate) host: String,

@@ -2,9 +2,9 @@
 
 use crate::system::config::SystemConfig;
 use anyhow::Context;
+use ratn_daemon::access::LiveAccess;
 use ratn_daemon::reload;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
-use ratn_daemon::service::LiveAccess;
 use ratn_daemon::telemetry::Logs;
 use std::path::PathBuf;
 use tokio::sync::watch;

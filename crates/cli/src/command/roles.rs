@@ -9,9 +9,9 @@ use crate::system::config::SystemConfig;
 use crate::system::{public_directory, variable};
 use anyhow::Context;
 use ratn_cell::core::recording::{self, Replayed};
+use ratn_daemon::access::LiveAccess;
 use ratn_daemon::config::StorageConfig;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
-use ratn_daemon::service::LiveAccess;
 use ratn_daemon::supervisor::Supervisor;
 use ratn_daemon::{metrics, process_manager, resource_manager, telemetry, world_pool};
 use ratn_storage::OpenError;
@@ -76,6 +76,7 @@ pub(super) fn process_manager(arguments: &RoleArguments) -> Result<(), Failure> 
     daemon(arguments, process_manager::ROLE, async |system, host| {
         let mut config = system.process_manager_config();
         config.owns_process = true;
+        config.worker_environment = system.service.for_workers(arguments.config.as_deref());
         config.listen = host.listen.unwrap_or(config.listen);
         process_manager::run_as(config, host.directory, host.serving, host.shutdown).await
     })
@@ -139,6 +140,7 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
         resource_manager: arguments.resource_manager.clone(),
         host: arguments.host.clone(),
         exposure: Exposure { tls: tls::server_from_environment(), insecure: arguments.insecure },
+        access: arguments.config.clone(),
     };
     let speed = arguments.speed;
     blocking(async {

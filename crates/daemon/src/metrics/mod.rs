@@ -7,7 +7,6 @@ mod listener;
 
 pub use listener::{ListenError, listen};
 
-use crate::access;
 use prometheus_client::encoding::EncodeLabelSet;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
@@ -16,6 +15,7 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
+use ratn_proto::access::method_of;
 use std::sync::OnceLock;
 use std::time::Duration;
 use tonic::Code;
@@ -144,7 +144,8 @@ impl Metrics {
 
     /// A call by its path was answered. Those of services that are not of this system are not counted.
     pub(crate) fn call(&self, path: &str, code: Code, took: Duration) {
-        if let Some((service, method)) = access::method_of(path) {
+        if let Some(method) = method_of(path) {
+            let (service, method) = (method.service, method.name);
             self.calls.get_or_create(&Call { service, method, code: name_of(code) }).observe(took.as_secs_f64());
         }
     }

@@ -75,6 +75,10 @@ pub struct ProcessManagerConfig {
     pub machine: MachineConfig,
     /// A worker's log file is begun anew beyond this size, in bytes (the one before is kept as `.log.1`).
     pub max_log_bytes: u64,
+    /// What every worker has in its environment besides, as where the roles of its callers are ([`ratn_worker::access::ACCESS_VARIABLE`]).
+    /// Not of the file: of who starts the process manager.
+    #[serde(skip)]
+    pub worker_environment: BTreeMap<&'static str, PathBuf>,
     /// The pools.
     #[serde(rename = "template")]
     pub templates: Vec<Template>,
@@ -94,6 +98,7 @@ impl Default for ProcessManagerConfig {
             labels: Labels::new(),
             machine: MachineConfig::default(),
             max_log_bytes: 16 * 1024 * 1024,
+            worker_environment: BTreeMap::new(),
             templates: Vec::new(),
         }
     }

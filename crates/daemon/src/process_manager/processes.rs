@@ -64,6 +64,8 @@ pub(super) struct Processes {
     host: String,
     /// Where workers find the resource manager, which confirms the leases of their goals.
     manager: ManagerLocation,
+    /// What every worker has in its environment besides.
+    worker_environment: BTreeMap<&'static str, PathBuf>,
     max_log_bytes: u64,
     /// Where groups of processes are made.
     groups: Groups,
@@ -116,6 +118,7 @@ impl Processes {
                 Some(endpoint) => ManagerLocation::At(endpoint.clone()),
                 None => ManagerLocation::File(directory.endpoint_file(resource_manager::ROLE)),
             },
+            worker_environment: config.worker_environment.clone(),
             max_log_bytes: config.max_log_bytes,
             groups: Groups { v2: config.cgroup.clone(), v1: config.cgroup_v1.clone(), tracking: tracker.groups() },
             directory,
@@ -163,6 +166,7 @@ impl Processes {
         // Not a template's to say.
         let marker = self.tracker.environment(id);
         env.insert(RESOURCE_MANAGER_VARIABLE.into(), self.manager.to_string().into());
+        env.extend(self.worker_environment.iter().map(|(name, file)| ((*name).into(), file.into())));
         env.extend(account.iter().flat_map(Account::environment));
         env.extend(template.env.iter().map(|(name, value)| (name.into(), fill(value).into())));
         if template.adopt {

@@ -5,7 +5,7 @@ use super::providers::Provisions;
 use super::stream::CallerService;
 use super::watch_filter::WatchFilter;
 use super::{Granted, wire};
-use crate::access::Caller;
+use crate::access::{Caller, speaker};
 use crate::audit::{self, Mutation};
 use crate::details::{ending, retry_later, status};
 use crate::metrics;
@@ -69,7 +69,7 @@ impl Service {
             _ => "operate",
         };
         let (request_name, what) = written_down(&request_id, &request);
-        let speaker = caller.speaker();
+        let speaker = speaker(caller);
         let performed = self.actor.ask(|answer| Message::Perform { speaker, request_id, request, answer }).await?;
         let mutation = Mutation { caller, operation, request: &request_name, what };
         mutation.ended(performed.as_ref().map(|_| None));
@@ -110,7 +110,7 @@ impl Service {
         let ticket = self.next_ticket.fetch_add(1, Ordering::Relaxed);
         let (answer, answered) = oneshot::channel();
         let wait = Duration::from_millis(wait_ms);
-        let speaker = caller.speaker();
+        let speaker = speaker(caller);
         self.actor.send(Message::Acquire { speaker, ticket, request_id, request, wait, answer }).await?;
         let mut call = WaitingCall { actor: self.actor.clone(), ticket, answered: Some(answered) };
         let Some(answered) = &mut call.answered else { return Err(ending()) };
@@ -246,7 +246,7 @@ impl v1::resource_service_server::ResourceService for Service {
         name(&request_id, "request_id")?;
         let session = session(&session_id)?;
         let (request_name, what) = written_down(&request_id, &session);
-        let speaker = caller.speaker();
+        let speaker = speaker(&caller);
         let withdrawn = self.actor.ask(|answer| Message::Withdraw { speaker, session, request_id, answer }).await?;
         let mutation = Mutation { caller: &caller, operation: "withdraw", request: &request_name, what };
         mutation.ended(withdrawn.as_ref().map(|_| None));
@@ -335,7 +335,7 @@ impl v1::resource_service_server::ResourceService for Service {
             kinds: request.provisions.into_iter().map(|provision| (provision.kind, provision.most)).collect(),
             attributes: ports(request.attributes, "attributes")?,
         };
-        let speaker = caller.speaker();
+        let speaker = speaker(&caller);
         let mut demand =
             self.actor.ask(|answer| Message::WatchDemand { speaker, session, provisions, answer }).await??;
         demand.mark_changed();
@@ -356,7 +356,7 @@ impl v1::resource_service_server::ResourceService for Service {
         name(&kind, "kind")?;
         label(&reason, "reason")?;
         let session = session(&session_id)?;
-        let speaker = caller.speaker();
+        let speaker = speaker(&caller);
         let report = |answer| Message::ReportShortage { speaker, session, kind, most, reason, answer };
         self.actor.ask(report).await??;
         Ok(Response::new(v1::ReportShortageResponse {}))
@@ -475,7 +475,7 @@ pub(super) async fn kept_alive(
     label(&ping.client, "client")?;
     let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };
     let ttl = Duration::from_millis(ping.ttl_ms);
-    let kept = actor.keep_alive(caller.speaker(), session, client, ttl).await?;
+    let kept = actor.keep_alive(speaker(caller), session, client, ttl).await?;
     Ok(v1::KeepAliveResponse {
         session_id: ping.session_id,
         ttl_ms: u64::try_from(kept.ttl.as_millis()).unwrap_or(u64::MAX),

@@ -2,7 +2,7 @@
 //! unary calls do.
 
 use super::service::{Service, kept_alive};
-use crate::access::{Caller, Operation};
+use crate::access::Caller;
 use crate::details::{retry_later, status};
 use crate::metrics;
 use crate::quota::Quotas;
@@ -61,7 +61,7 @@ async fn measured(
         Some(Asked::Release(_)) => "/ratn.v1.ResourceService/Release",
         Some(Asked::KeepAlive(_)) | None => "/ratn.v1.ResourceService/KeepAlive",
     };
-    caller.admit(Operation::of_path(path))?;
+    caller.admit(path)?;
     let _permit = quotas.map(|quotas| quotas.admit(&caller, path, began)).transpose()?;
     let answered = performed(service, caller, call).await;
     if let Some(metrics) = metrics::get() {

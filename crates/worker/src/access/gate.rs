@@ -1,0 +1,196 @@
+//! The gate of every server: who is at the other end, and whether their roles may call the method.
+//!
+//! The roles are a config's that a process was given ([`LiveAccess::new`], [`LiveAccess::replace`]), or those of a file that is read
+//! again when it changes: so the workers of a process manager, which names the file in [`ACCESS_VARIABLE`].
+
+use super::{AccessConfig, Caller};
+use crate::gate::{Gate, Identity};
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::time::{Duration, Instant, SystemTime};
+use tonic::codegen::http;
+use tonic::{Code, Status};
+
+/// The environment variable with the system's config, of whose `[service.access]` a worker has the roles of its callers.
+pub const ACCESS_VARIABLE: &str = "RATN_ACCESS";
+
+/// A file is looked at again at the first call after this.
+const LOOK_AGAIN: Duration = Duration::from_secs(1);
+
+/// Roles that cannot be had from a file.
+#[derive(Debug, thiserror::Error)]
+#[error("no roles of callers from {}: {problem}", file.display())]
+pub struct AccessError {
+    /// Which.
+    pub file: PathBuf,
+    /// Why.
+    pub problem: String,
+}
+
+/// Who has which roles, as of now. A handle: clones share it.
+#[derive(Debug, Clone, Default)]
+pub struct LiveAccess {
+    access: Arc<RwLock<AccessConfig>>,
+    file: Option<Arc<Followed>>,
+}
+
+/// A file of which the roles are.
+#[derive(Debug)]
+struct Followed {
+    path: PathBuf,
+    /// When it was looked at last, and as which version.
+    seen: Mutex<(Instant, Option<SystemTime>)>,
+}
+
+/// What of a system's config is read here.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct SystemFile {
+    service: ServiceSection,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct ServiceSection {
+    access: AccessConfig,
+}
+
+impl LiveAccess {
+    /// As a config says.
+    pub fn new(access: AccessConfig) -> LiveAccess {
+        LiveAccess { access: Arc::new(RwLock::new(access)), file: None }
+    }
+
+    /// As `[service.access]` of a system's config says, now and whenever that changes.
+    ///
+    /// # Errors
+    /// A file that cannot be read, or says something else. One that is spoilt later changes nothing.
+    pub fn of_file(path: &Path) -> Result<LiveAccess, AccessError> {
+        let access = read(path)?;
+        let seen = Mutex::new((Instant::now(), version(path)));
+        let file = Some(Arc::new(Followed { path: path.to_owned(), seen }));
+        Ok(LiveAccess { file, ..LiveAccess::new(access) })
+    }
+
+    /// Of the file that [`ACCESS_VARIABLE`] names; without one the default.
+    ///
+    /// # Errors
+    /// As [`LiveAccess::of_file`].
+    pub fn from_environment() -> Result<LiveAccess, AccessError> {
+        match std::env::var_os(ACCESS_VARIABLE).filter(|value| !value.is_empty()) {
+            Some(path) => LiveAccess::of_file(Path::new(&path)),
+            None => Ok(LiveAccess::default()),
+        }
+    }
+
+    /// From the next call on, and the next stream of calls.
+    pub fn replace(&self, access: AccessConfig) {
+        *self.access.write().unwrap_or_else(PoisonError::into_inner) = access;
+    }
+
+    /// Who a connection's other end is to a server that runs as `own_uid`.
+    pub fn caller(&self, identity: &Identity, own_uid: u32) -> Caller {
+        if let Some(file) = &self.file {
+            self.look_again(file);
+        }
+        self.access.read().unwrap_or_else(PoisonError::into_inner).caller(identity, own_uid)
+    }
+
+    fn look_again(&self, file: &Followed) {
+        let mut seen = file.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        if seen.0.elapsed() < LOOK_AGAIN {
+            return;
+        }
+        seen.0 = Instant::now();
+        let version = version(&file.path);
+        if std::mem::replace(&mut seen.1, version) == version {
+            return;
+        }
+        match read(&file.path) {
+            Ok(access) => self.replace(access),
+            Err(error) => tracing::warn!(%error, "callers keep the roles of before"),
+        }
+    }
+}
+
+fn version(path: &Path) -> Option<SystemTime> {
+    std::fs::metadata(path).and_then(|file| file.modified()).ok()
+}
+
+fn read(path: &Path) -> Result<AccessConfig, AccessError> {
+    let failed = |problem: String| AccessError { file: path.to_owned(), problem };
+    let text = std::fs::read_to_string(path).map_err(|error| failed(error.to_string()))?;
+    let file: SystemFile = toml::from_str(&text).map_err(|error| failed(error.to_string()))?;
+    match file.service.access.fault() {
+        Some((key, rule)) => Err(failed(format!("`{key}`: {rule}"))),
+        None => Ok(file.service.access),
+    }
+}
+
+/// Admits by the table of [`super::TABLE`], and leaves the [`Caller`] in the request. Who runs the process, and root, are operators over
+/// its Unix socket.
+#[derive(Debug, Clone)]
+pub struct RoleGate {
+    access: LiveAccess,
+    own_uid: u32,
+}
+
+impl RoleGate {
+    /// With these roles.
+    pub fn new(access: LiveAccess) -> RoleGate {
+        RoleGate { access, own_uid: nix::unistd::geteuid().as_raw() }
+    }
+}
+
+impl Default for RoleGate {
+    fn default() -> RoleGate {
+        RoleGate::new(LiveAccess::default())
+    }
+}
+
+impl Gate for RoleGate {
+    fn admit(&self, identity: &Identity, path: &str, extensions: &mut http::Extensions) -> Result<(), Status> {
+        let caller = self.access.caller(identity, self.own_uid);
+        caller.admit(path)?;
+        extensions.insert(caller);
+        Ok(())
+    }
+
+    fn answered(&self, _: &str, _: Code, _: Duration) {}
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::super::Role;
+    use super::*;
+
+    #[test]
+    fn roles_of_a_file_are_read_again_when_it_changes_and_kept_where_it_is_spoilt() {
+        let place = tempfile::tempdir().unwrap();
+        let file = place.path().join("ratn.toml");
+        let write = |text: &str, seconds: u64| {
+            std::fs::write(&file, text).unwrap();
+            let at = SystemTime::UNIX_EPOCH + Duration::from_secs(seconds);
+            std::fs::File::options().write(true).open(&file).unwrap().set_modified(at).unwrap();
+        };
+        let seven = Identity::User { uid: 7, pid: None };
+        write("speed = 2.0\n[service.access]\nothers = [\"task\"]\n", 1);
+        let live = LiveAccess::of_file(&file).unwrap();
+        // As if it had been looked at long ago.
+        let roles = || {
+            live.file.as_ref().unwrap().seen.lock().unwrap().0 = Instant::now() - LOOK_AGAIN;
+            live.caller(&seven, 1).roles.to_vec()
+        };
+        assert_eq!(roles(), [Role::Task]);
+        write("[service.access]\nothers = [\"viewer\"]\n", 2);
+        assert_eq!(roles(), [Role::Viewer]);
+        write("[service.access]\nothers = [\"king\"]\n", 3);
+        assert_eq!(roles(), [Role::Viewer]);
+        assert!(LiveAccess::of_file(&file).unwrap_err().to_string().contains("king"));
+        assert!(LiveAccess::of_file(&place.path().join("none")).is_err());
+        write("", 4);
+        assert_eq!(roles(), AccessConfig::default().others);
+    }
+}

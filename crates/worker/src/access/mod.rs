@@ -1,0 +1,194 @@
+//! Who may do what: a table of operations and roles, which roles a caller has, and the gate of every server that compares the two.
+//!
+//! ```text
+//!   uid, certificate ──AccessConfig──▶ Caller { name, roles } ──allowed(operation, roles)──▶ yes or no
+//!   /ratn.v1.ResourceService/Delete ──option (access) of the proto──▶ Operation::Delete
+//! ```
+//! A method without the option, and a service that is not of this system, is refused to everybody. What belongs to whom (leases,
+//! resources) is decided where that is known; what the table allows may still be refused there.
+
+mod config;
+mod gate;
+
+pub use config::{AccessConfig, CertificateAccess, UserAccess};
+pub use gate::{ACCESS_VARIABLE, AccessError, LiveAccess, RoleGate};
+pub use ratn_proto::access::Operation;
+
+use ratn_model::resource::ResourceClass;
+use ratn_proto::access::method_of;
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::sync::Arc;
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
+
+/// What a caller is in a system. One may have several.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Role {
+    /// Looks.
+    Viewer,
+    /// Runs tasks: takes resources, gives goals, changes the world.
+    Task,
+    /// Provides resources: process managers, the world pool, cells and drivers.
+    Agent,
+    /// Everything, also with what belongs to others.
+    Operator,
+}
+
+use Operation::{Acquire, Administer, Ask, Commit, Consume, Create, Delete, Look, Perform, Project, Release, Session};
+use Role::{Agent, Operator, Task, Viewer};
+
+/// Every operation, and who may. Whoever may move a robot may stop it; that it moves again is an operator's.
+pub const TABLE: [(Operation, &[Role]); 12] = [
+    (Ask, &[Viewer, Task, Agent, Operator]),
+    (Look, &[Viewer, Task, Agent, Operator]),
+    (Session, &[Task, Agent, Operator]),
+    (Create, &[Task, Agent, Operator]),
+    (Consume, &[Task, Operator]),
+    (Delete, &[Task, Agent, Operator]),
+    (Acquire, &[Task, Operator]),
+    (Release, &[Task, Agent, Operator]),
+    (Project, &[Task, Operator]),
+    (Commit, &[Task, Operator]),
+    (Perform, &[Task, Agent, Operator]),
+    (Administer, &[Operator]),
+];
+
+/// The methods of gRPC's own that every server has.
+const OF_GRPC: [&str; 4] = [
+    "/grpc.health.v1.Health/Check",
+    "/grpc.health.v1.Health/List",
+    "/grpc.health.v1.Health/Watch",
+    "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo",
+];
+
+/// What the method of a request's path does, `/ratn.v1.ResourceService/Create`. Nothing of one that is not known, or of which the proto
+/// does not say it: nobody may call that.
+pub fn operation_of(path: &str) -> Option<Operation> {
+    if OF_GRPC.contains(&path) { Some(Ask) } else { method_of(path)?.operation }
+}
+
+/// Whether one of these roles may.
+pub fn allowed(operation: Operation, roles: &[Role]) -> bool {
+    TABLE.iter().any(|(row, may)| *row == operation && roles.iter().any(|role| may.contains(role)))
+}
+
+/// Somebody who was let in.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Caller {
+    /// Proven by the connection: `uid 1000`, `control (certificate)`, `anonymous`. The same name is the same caller.
+    pub name: Arc<str>,
+    /// What they are.
+    pub roles: Arc<[Role]>,
+}
+
+impl Caller {
+    /// Who made a request: whom the gate let in. A request that passed none is nobody's, who may nothing.
+    pub fn of<T>(request: &tonic::Request<T>) -> Caller {
+        let nobody = || Caller { name: "nobody".into(), roles: [].as_slice().into() };
+        request.extensions().get::<Caller>().cloned().unwrap_or_else(nobody)
+    }
+
+    /// A request of theirs, made inside the process.
+    pub fn request<T>(&self, message: T) -> tonic::Request<T> {
+        let mut request = tonic::Request::new(message);
+        request.extensions_mut().insert(self.clone());
+        request
+    }
+
+    /// Whether they may call a method, by what it does.
+    ///
+    /// # Errors
+    /// `PERMISSION_DENIED`, which says what they are, or that nobody may.
+    pub fn admit(&self, path: &str) -> Result<(), Status> {
+        let Some(operation) = operation_of(path) else {
+            tracing::warn!(who = %self, path, "refused: the method says no access");
+            let message = format!("nobody may call {path}: no method of this version, or its proto says no `(access)`");
+            return Err(denied("METHOD_CLOSED", message));
+        };
+        if allowed(operation, &self.roles) {
+            return Ok(());
+        }
+        tracing::warn!(who = %self, ?operation, "refused");
+        let message = format!(
+            "{self} may not {operation:?}: has the roles {:?}; an operator grants them in [service.access]",
+            self.roles
+        );
+        Err(denied("ROLE_MISSING", message))
+    }
+
+    /// Whether what belongs to others is theirs to end.
+    pub fn is_operator(&self) -> bool {
+        self.roles.contains(&Operator)
+    }
+
+    /// Whether they may add resources of a class: a task its own, agents what the system consists of (the paper's Section V-B).
+    pub fn may_create(&self, class: ResourceClass) -> bool {
+        let creator = if class == ResourceClass::Task { Task } else { Agent };
+        self.is_operator() || self.roles.contains(&creator)
+    }
+}
+
+impl fmt::Display for Caller {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.name)
+    }
+}
+
+fn denied(reason: &str, message: String) -> Status {
+    Status::with_error_details(Code::PermissionDenied, message, ErrorDetails::with_error_info(reason, "ratn", []))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    fn may(role: Role) -> Vec<Operation> {
+        TABLE.iter().map(|(operation, _)| *operation).filter(|operation| allowed(*operation, &[role])).collect()
+    }
+
+    fn one(role: Role) -> Caller {
+        Caller { name: "x".into(), roles: [role].as_slice().into() }
+    }
+
+    #[test]
+    fn a_viewer_changes_nothing_and_an_operator_may_everything() {
+        assert_eq!(may(Viewer), [Ask, Look]);
+        assert_eq!(may(Operator).len(), TABLE.len());
+        assert_eq!(may(Agent), [Ask, Look, Session, Create, Delete, Release, Perform]);
+        assert!(!may(Task).contains(&Administer));
+        assert!(!allowed(Ask, &[]));
+    }
+
+    #[test]
+    fn what_says_no_access_is_closed_to_everybody() {
+        for path in
+            ["/ratn.v1.ResourceService/Forget", "/ratn.v2.ResourceService/List", "/my.Service/Do", "/grpc.x/Y", ""]
+        {
+            let refused = one(Operator).admit(path).unwrap_err();
+            assert_eq!(refused.code(), Code::PermissionDenied, "{path}");
+            assert!(refused.message().contains("nobody may call"), "{refused}");
+        }
+        one(Viewer).admit("/grpc.health.v1.Health/Check").unwrap();
+        let refused = one(Viewer).admit("/ratn.v1.ActionService/Execute").unwrap_err();
+        assert!(refused.message().starts_with("x may not Perform: has the roles [Viewer]"), "{refused}");
+    }
+
+    #[test]
+    fn a_request_that_passed_no_gate_is_nobodys() {
+        let caller = Caller::of(&tonic::Request::new(()));
+        assert!(caller.roles.is_empty() && !caller.is_operator());
+        assert!(caller.admit("/grpc.health.v1.Health/Check").is_err());
+    }
+
+    #[test]
+    fn a_task_creates_only_task_resources_and_an_agent_none() {
+        for class in [ResourceClass::System, ResourceClass::Process, ResourceClass::Module, ResourceClass::World] {
+            assert!(one(Agent).may_create(class) && one(Operator).may_create(class) && !one(Task).may_create(class));
+        }
+        assert!(one(Task).may_create(ResourceClass::Task) && !one(Agent).may_create(ResourceClass::Task));
+        assert!(one(Operator).may_create(ResourceClass::Task) && !one(Viewer).may_create(ResourceClass::Task));
+    }
+}

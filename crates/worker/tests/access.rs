@@ -1,0 +1,85 @@
+//! Who may call a provider: as what the methods of its services say in the proto, without its author doing anything for it.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod common;
+
+use common::{Double, RESOURCE, goal};
+use ratn_worker::access::{AccessConfig, LiveAccess, Role, RoleGate, UserAccess};
+use ratn_worker::action::ActionServer;
+use ratn_worker::client::{ActionClient, Channels};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::safety::{Safety, SafetyClient, SafetyState};
+use ratn_worker::server::{Services, Serving, bind};
+use ratn_worker::worker::{Worker, WorkerOptions};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+use tokio_util::sync::CancellationToken;
+use tonic::Code;
+
+fn only(roles: &[Role]) -> AccessConfig {
+    let user = UserAccess { uid: nix::unistd::geteuid().as_raw(), roles: roles.to_vec() };
+    AccessConfig { users: vec![user], ..AccessConfig::default() }
+}
+
+#[tokio::test]
+async fn a_viewers_goal_is_refused_before_it_touches_the_fence() {
+    let (place, runs) = (tempfile::tempdir().unwrap(), Arc::new(AtomicUsize::new(0)));
+    let server = ActionServer::builder(RESOURCE).action(Double { runs: runs.clone() }).build();
+    let bound = bind(&Endpoint::Unix(place.path().join("one.sock"))).await.unwrap();
+    let (endpoint, live) = (bound.endpoint().clone(), LiveAccess::new(only(&[Role::Viewer])));
+    let serving = Serving { gate: Arc::new(RoleGate::new(live.clone())), ..Serving::default() };
+    let shutdown = CancellationToken::new();
+    tokio::spawn(bound.serve_as(Services::new().with(server.into_service()), serving, shutdown.clone()));
+    let client = ActionClient::new(Channels::new());
+    let refused = client.execute(&endpoint, goal("g1", "double", u64::MAX), |_, _| {}).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::PermissionDenied), "{refused}");
+    assert_eq!(runs.load(Ordering::SeqCst), 0);
+    live.replace(only(&[Role::Task]));
+    // The younger token of the refused goal was not seen. Another client, as streams keep the roles that they began with.
+    let client = ActionClient::new(Channels::new());
+    client.execute(&endpoint, goal("g2", "double", 1), |_, _| {}).await.unwrap();
+    assert_eq!(runs.load(Ordering::SeqCst), 1);
+    shutdown.cancel();
+}
+
+#[tokio::test]
+async fn a_worker_asks_its_config_who_may_and_only_an_operator_lets_a_robot_move_again() {
+    let place = tempfile::tempdir().unwrap();
+    let (file, socket) = (place.path().join("ratn.toml"), place.path().join("one.sock"));
+    let uid = nix::unistd::geteuid();
+    let section = |role: &str| format!("[[service.access.user]]\nuid = {uid}\nroles = [{role:?}]\n");
+    let (listen, shutdown) = (Endpoint::Unix(socket), CancellationToken::new());
+    for (role, may_stop, may_clear) in
+        [("viewer", false, false), ("task", true, false), ("agent", true, false), ("operator", true, true)]
+    {
+        std::fs::write(&file, section(role)).unwrap();
+        let options = WorkerOptions { listen: listen.clone(), access: Some(file.clone()), ..WorkerOptions::default() };
+        let (safety, ends) = (Safety::default(), shutdown.child_token());
+        let worker = Worker::new(options).safety(safety.clone()).shutdown(ends.clone()).run();
+        let running = tokio::spawn(worker);
+        let channels = Channels::new();
+        ratn_worker::client::wait_until_serving(&listen, Duration::from_secs(10)).await.unwrap();
+        let client = SafetyClient::new(&channels, &listen).unwrap();
+        assert_eq!(client.state().await.unwrap(), SafetyState::Ready, "{role} may look");
+        assert_eq!(client.stop("a hand").await.is_ok(), may_stop, "{role}");
+        assert_eq!(matches!(safety.state(), SafetyState::Stopped { .. }), may_stop, "{role}");
+        let cleared = client.clear().await;
+        assert_eq!(cleared.is_ok(), may_clear, "{role}: {cleared:?}");
+        assert_eq!(safety.state() == SafetyState::Ready, may_clear || !may_stop, "{role}");
+        if !may_clear {
+            assert_eq!(client.go_on().await.unwrap_err().code(), Some(Code::PermissionDenied), "{role}");
+        }
+        ends.cancel();
+        running.await.unwrap().unwrap();
+    }
+}
+
+#[tokio::test]
+async fn a_worker_whose_config_is_none_does_not_start() {
+    let place = tempfile::tempdir().unwrap();
+    let options = WorkerOptions { access: Some(place.path().join("none")), ..WorkerOptions::default() };
+    let refused = Worker::new(options).run().await.unwrap_err();
+    let source = std::error::Error::source(&refused).unwrap().to_string();
+    assert!(source.starts_with("no roles of callers from "), "{source}");
+}
