@@ -1,12 +1,14 @@
 //! Offering resources under a session, again whenever the resource manager has forgotten them, and withdrawing them. What
 //! the manager cannot be told now it is told as soon as it can.
+//!
+//! A provider watches what it offers: where somebody else deleted it, it says so in the log and offers it again.
 
 use crate::client::{CallError, Channels, ResourceClient};
 use crate::endpoint::Endpoint;
 use crate::session::{Session, SessionState};
 use futures::{StreamExt, stream};
 use ratn_model::resource::{Requirement, ResourceOperation};
-use ratn_proto::types::Resource;
+use ratn_proto::types::{Resource, ResourceEventKind, ResourceUpdate};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
@@ -33,6 +35,8 @@ struct Shared {
     /// By id. Held during a call, so that an older wish never overtakes a newer one.
     wishes: Mutex<BTreeMap<String, Wish>>,
     missing: Notify,
+    /// Of what is offered: what is watched.
+    kinds: watch::Sender<BTreeSet<String>>,
 }
 
 /// What shall be so at the manager.
@@ -42,6 +46,8 @@ struct Wish {
     resource: Option<Resource>,
     /// Why it is not so yet, as told in the log.
     problem: String,
+    /// The manager has said that it is there.
+    there: bool,
 }
 
 impl Provider {
@@ -51,9 +57,15 @@ impl Provider {
     /// As [`Channels::get`].
     pub fn start(channels: &Channels, endpoint: &Endpoint, session: &Session) -> Result<Provider, CallError> {
         let client = ResourceClient::new(channels, endpoint, session.id())?;
-        let shared =
-            Arc::new(Shared { client, state: session.state(), wishes: Mutex::default(), missing: Notify::new() });
+        let shared = Arc::new(Shared {
+            client,
+            state: session.state(),
+            wishes: Mutex::default(),
+            missing: Notify::new(),
+            kinds: watch::Sender::default(),
+        });
         let end = CancellationToken::new();
+        tokio::spawn(end.clone().run_until_cancelled_owned(watch_own(Arc::clone(&shared))));
         tokio::spawn(end.clone().run_until_cancelled_owned(restore(Arc::clone(&shared))));
         Ok(Provider { shared, _end: end.drop_guard() })
     }
@@ -77,6 +89,7 @@ impl Provider {
         let mut wishes = self.shared.wishes.lock().await;
         let ids: BTreeSet<String> = resources.iter().map(|resource| resource.id.clone()).collect();
         for resource in resources {
+            self.shared.watch_for(&resource.kind);
             let wish = wishes.entry(resource.id.clone()).or_default();
             wish.resource = Some(resource);
         }
@@ -119,6 +132,9 @@ impl Provider {
 
     async fn wish(&self, id: String, resource: Option<Resource>) -> Result<bool, CallError> {
         let mut wishes = self.shared.wishes.lock().await;
+        if let Some(resource) = &resource {
+            self.shared.watch_for(&resource.kind);
+        }
         wishes.entry(id.clone()).or_default().resource = resource;
         let asked = self.shared.ask(&mut wishes, &BTreeSet::from([id])).await;
         asked.into_iter().next().map_or(Ok(true), |(_, done)| done)
@@ -131,6 +147,25 @@ impl Provider {
 }
 
 impl Shared {
+    fn watch_for(&self, kind: &str) {
+        self.kinds.send_if_modified(|kinds| !kinds.contains(kind) && kinds.insert(kind.to_owned()));
+    }
+
+    /// A resource is gone. What was to be there, and was, is offered again.
+    async fn vanished(&self, id: &str, reason: &str) {
+        let mut wishes = self.wishes.lock().await;
+        let Some(wish) = wishes.get_mut(id).filter(|wish| wish.there && wish.resource.is_some()) else { return };
+        wish.there = false;
+        if self.state.borrow().alive {
+            tracing::warn!(
+                resource = id,
+                reason,
+                "the resource manager lost a resource that is still here: it is offered again"
+            );
+        }
+        self.missing.notify_one();
+    }
+
     /// Asks for these, several at a time, if the session lives: true for what is so now, false for what will be asked for again. What
     /// is gone, or refused for good, is no wish any more.
     async fn ask(
@@ -186,6 +221,7 @@ impl Wish {
             Ok(()) => {}
         }
         self.problem.clear();
+        self.there = self.resource.is_some();
         Ok(true)
     }
 }
@@ -233,4 +269,44 @@ async fn ask_for_all(shared: &Shared) -> bool {
         }
     }
     all
+}
+
+/// Watches what is offered, as long as anything is; from the beginning again where the watch breaks or other kinds are offered.
+async fn watch_own(shared: Arc<Shared>) {
+    let mut kinds = shared.kinds.subscribe();
+    loop {
+        let now = kinds.borrow_and_update().clone();
+        if !now.is_empty() {
+            tokio::select! {
+                () = watch_kinds(&shared, &now) => tokio::time::sleep(RETRY_INTERVAL).await,
+                _ = kinds.changed() => {}
+            }
+        } else if kinds.changed().await.is_err() {
+            return;
+        }
+    }
+}
+
+async fn watch_kinds(shared: &Shared, kinds: &BTreeSet<String>) {
+    let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
+    let there = |wishes: &BTreeMap<String, Wish>| -> BTreeSet<String> {
+        wishes.iter().filter(|(_, wish)| wish.there).map(|(id, _)| id.clone()).collect()
+    };
+    // Known before the snapshot is made: what is not in it is gone.
+    let before = there(&*shared.wishes.lock().await);
+    let Ok(mut watch) = shared.client.watch(&kinds).await else { return };
+    while let Ok(Some(update)) = watch.next().await {
+        match update {
+            ResourceUpdate::Snapshot { resources, .. } => {
+                let shown: BTreeSet<String> = resources.into_iter().map(|resource| resource.id).collect();
+                for id in before.difference(&shown) {
+                    shared.vanished(id, "it went while nobody watched").await;
+                }
+            }
+            ResourceUpdate::Event(event) if event.kind == ResourceEventKind::Deleted => {
+                shared.vanished(&event.resource.id, &event.reason).await;
+            }
+            ResourceUpdate::Event(_) => {}
+        }
+    }
 }
