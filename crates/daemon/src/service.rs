@@ -12,6 +12,7 @@ use crate::telemetry::{self, LogConfig};
 use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::server::{Exposure, Serving};
 use ratn_worker::tls::{self, ClientTls, ServerTls, TlsError};
+use ratn_worker::unix_socket::SocketAccess;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -37,6 +38,8 @@ pub struct ServiceConfig {
     pub metrics: BTreeMap<String, SocketAddr>,
     /// With it every TCP address is served with TLS, and only to who shows a certificate.
     pub tls: Option<ServerTls>,
+    /// Who may connect to a Unix socket.
+    pub socket: SocketAccess,
     /// Who may do what.
     pub access: AccessConfig,
     /// How much of it one caller may do at the same time.
@@ -52,6 +55,7 @@ impl Default for ServiceConfig {
             audit_file: None,
             metrics: BTreeMap::new(),
             tls: None,
+            socket: SocketAccess::default(),
             access: AccessConfig::default(),
             quotas: QuotaConfig::default(),
         }
@@ -63,6 +67,7 @@ impl Check for ServiceConfig {
         rule("drain_ms", (1..=600_000).contains(&self.drain_ms), "from 1 ms to 10 minutes")?;
         rule("log.filter", telemetry::is_filter(&self.log.filter), "a filter, as `info,ratn_daemon=debug`")?;
         self.quotas.check()?;
+        self.socket.fault().map_or(Ok(()), |(key, broken)| rule(key, false, broken))?;
         self.access.check()
     }
 }
@@ -103,7 +108,7 @@ impl ServiceConfig {
     /// As [`ServiceConfig::serving`], with roles that may change meanwhile.
     pub fn serving_with(&self, access: &LiveAccess) -> Serving {
         Serving {
-            exposure: Exposure { tls: self.tls.clone(), insecure: self.insecure },
+            exposure: Exposure { tls: self.tls.clone(), insecure: self.insecure, socket: self.socket.clone() },
             gate: Arc::new(QuotaGate {
                 roles: RoleGate::new(access.clone()),
                 quotas: Quotas::new(self.quotas.clone()),

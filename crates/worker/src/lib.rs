@@ -46,5 +46,6 @@ pub mod session;
 pub mod shutdown;
 pub mod tls;
 pub mod trace;
+pub mod unix_socket;
 pub mod vitals;
 pub mod worker;

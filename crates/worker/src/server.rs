@@ -10,6 +10,7 @@ use crate::connections::{ConnectionLimits, Connections};
 use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
 use crate::gate::{Calls, Gate, Gated};
 use crate::tls::{ServerTls, TlsError};
+use crate::unix_socket::{self, SocketAccess};
 use crate::vitals::{CoreFailure, Vitals};
 use std::convert::Infallible;
 use std::io;
@@ -126,6 +127,8 @@ pub struct Exposure {
     pub tls: Option<ServerTls>,
     /// Without TLS, addresses beyond loopback are served all the same.
     pub insecure: bool,
+    /// Who may connect to a Unix socket.
+    pub socket: SocketAccess,
 }
 
 /// Serving ended before its time.
@@ -215,7 +218,7 @@ pub async fn bind_as(listen: &Endpoint, exposure: &Exposure) -> Result<Bound, Bi
             if is_dead_socket(path).await {
                 std::fs::remove_file(path).map_err(failed)?;
             }
-            let listener = UnixListener::bind(path).map_err(failed)?;
+            let listener = unix_socket::listen(path, &exposure.socket).map_err(failed)?;
             let file = SocketFile { path: path.clone(), identity: identity(path).map_err(failed)? };
             let listener = Listener::Unix(listener, file);
             Ok(Bound { listener, endpoint: listen.clone(), tls: None })

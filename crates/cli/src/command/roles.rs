@@ -139,7 +139,7 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
         exit_with_parent: arguments.exit_with_parent,
         resource_manager: arguments.resource_manager.clone(),
         host: arguments.host.clone(),
-        exposure: Exposure { tls: tls::server_from_environment(), insecure: arguments.insecure },
+        exposure: Exposure { tls: tls::server_from_environment(), insecure: arguments.insecure, ..Exposure::default() },
         access: arguments.config.clone(),
     };
     let speed = arguments.speed;
