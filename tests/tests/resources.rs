@@ -305,6 +305,9 @@ fn a_release_by_the_operator_and_every_other_mutation_is_in_the_audit_log() -> a
     let lines: Vec<Value> = lines.lines().map(serde_json::from_str).collect::<Result<_, _>>()?;
     let who = format!("uid {}", nix::unistd::geteuid());
     ensure!(lines.iter().all(|line| line["who"] == *who), "{lines:?}");
+    let (sessions, lines): (Vec<Value>, Vec<Value>) =
+        lines.into_iter().partition(|line| line["operation"].as_str().is_some_and(|name| name.ends_with("_session")));
+    ensure!(sessions.iter().any(|line| line["operation"] == "open_session"), "{sessions:?}");
     let told: Vec<(&str, &str)> =
         lines.iter().filter_map(|line| Some((line["operation"].as_str()?, line["code"].as_str()?))).collect();
     let expected =

@@ -28,12 +28,13 @@ async fn a_resource_that_somebody_else_deleted_is_offered_again_and_one_that_was
     // Of another kind, so that what is watched changes; what was withdrawn before does not come back with it.
     assert!(in_time(provider.offer(Resource::new("gripper@sim", ResourceClass::Module, "Gripper"))).await.unwrap());
     operator.delete("gripper@sim").await.unwrap();
-    let mut back = 0;
+    let back = std::cell::Cell::new(0);
     watch
         .event(|event| {
             assert!(event.kind != ResourceEventKind::Created || event.resource.id != "arm@sim");
-            back += usize::from(event.kind == ResourceEventKind::Created && event.resource.id == "gripper@sim");
-            back == 2
+            let created = event.kind == ResourceEventKind::Created && event.resource.id == "gripper@sim";
+            back.set(back.get() + usize::from(created));
+            back.get() == 2
         })
         .await;
     let there: Vec<String> = operator.list(&[]).await.unwrap().into_iter().map(|r| r.id).collect();

@@ -105,7 +105,7 @@ const ELSEWHERE: &str = "CellService";
 async fn channels(system: &TestSystem) -> (BTreeMap<&'static str, Channel>, Vec<support::Daemon>, CancellationToken) {
     let (manager, pool, processes) =
         (system.resource_manager().await, system.world_pool(4).await, system.process_manager(Vec::new()).await);
-    let (end, bound) = (CancellationToken::new(), bind(&Endpoint::loopback()).await.unwrap());
+    let (end, bound) = (CancellationToken::new(), bind(&system.directory.socket("provider")).await.unwrap());
     let provider = bound.endpoint().clone();
     let actions =
         Services::new().with(ActionServer::builder("").build().into_service()).with(Safety::default().into_service());

@@ -31,6 +31,7 @@
 pub mod access;
 pub mod action;
 pub mod adoption;
+pub mod audit;
 pub mod client;
 pub mod connections;
 pub mod endpoint;

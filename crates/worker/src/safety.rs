@@ -22,6 +22,8 @@ use std::sync::Arc;
 use tokio::sync::{Mutex, watch};
 use tonic::{Request, Response, Status};
 
+use crate::access::Caller;
+use crate::audit::{self, Mutation, Pending};
 use crate::client::{CallError, Channels};
 use crate::endpoint::Endpoint;
 
@@ -243,29 +245,33 @@ impl SafetyService for Safety {
         &self,
         request: Request<v1::EmergencyStopRequest>,
     ) -> Result<Response<v1::EmergencyStopResponse>, Status> {
-        let reason = request.into_inner().reason;
+        let (caller, reason) = (Caller::of(&request), request.into_inner().reason);
         label(&reason, "reason")?;
-        let state = Some(wire(self.stop(&reason).await?));
+        let pending = audit::begin(&caller, "", || Mutation::EmergencyStop { reason: reason.clone() });
+        let state = Some(audited(pending, self.stop(&reason).await)?);
         Ok(Response::new(v1::EmergencyStopResponse { state }))
     }
 
     async fn clear_emergency_stop(
         &self,
-        _: Request<v1::ClearEmergencyStopRequest>,
+        request: Request<v1::ClearEmergencyStopRequest>,
     ) -> Result<Response<v1::ClearEmergencyStopResponse>, Status> {
-        let state = Some(wire(self.clear().await?));
+        let pending = audit::begin(&Caller::of(&request), "", || Mutation::ClearEmergencyStop);
+        let state = Some(audited(pending, self.clear().await)?);
         Ok(Response::new(v1::ClearEmergencyStopResponse { state }))
     }
 
     async fn hold(&self, request: Request<v1::HoldRequest>) -> Result<Response<v1::HoldResponse>, Status> {
-        let reason = request.into_inner().reason;
+        let (caller, reason) = (Caller::of(&request), request.into_inner().reason);
         label(&reason, "reason")?;
-        let state = Some(wire(Safety::hold(self, &reason).await?));
+        let pending = audit::begin(&caller, "", || Mutation::Hold { reason: reason.clone() });
+        let state = Some(audited(pending, Safety::hold(self, &reason).await)?);
         Ok(Response::new(v1::HoldResponse { state }))
     }
 
-    async fn go_on(&self, _: Request<v1::GoOnRequest>) -> Result<Response<v1::GoOnResponse>, Status> {
-        let state = Some(wire(Safety::go_on(self).await?));
+    async fn go_on(&self, request: Request<v1::GoOnRequest>) -> Result<Response<v1::GoOnResponse>, Status> {
+        let pending = audit::begin(&Caller::of(&request), "", || Mutation::GoOn);
+        let state = Some(audited(pending, Safety::go_on(self).await)?);
         Ok(Response::new(v1::GoOnResponse { state }))
     }
 
@@ -281,6 +287,13 @@ impl From<SafetyError> for Status {
             SafetyError::Brakes(_) => Status::internal(error.to_string()),
         }
     }
+}
+
+/// What came of a change, once it is written down.
+fn audited(pending: Pending, changed: Result<SafetyState, SafetyError>) -> Result<v1::SafetyState, Status> {
+    let changed = changed.map_err(Status::from);
+    pending.ended(&changed);
+    changed.map(wire)
 }
 
 fn wire(state: SafetyState) -> v1::SafetyState {

@@ -10,6 +10,8 @@ use ratn_model::pose::Pose;
 use ratn_proto::convert::name;
 use ratn_proto::v1;
 use ratn_proto::v1::cell_service_server::CellService;
+use ratn_worker::access::Caller;
+use ratn_worker::audit::{self, Mutation};
 use tonic::{Request, Response, Status};
 
 pub(crate) struct Service {
@@ -21,27 +23,27 @@ impl Service {
     pub(crate) fn new(keeper: Keeper, setting: Setting) -> Service {
         Service { keeper, setting }
     }
-}
 
-#[tonic::async_trait]
-impl CellService for Service {
-    async fn get_ground_truth(
-        &self,
-        _: Request<v1::GetGroundTruthRequest>,
-    ) -> Result<Response<v1::GetGroundTruthResponse>, Status> {
-        let state = self.keeper.state().await.map_err(status)?;
-        Ok(Response::new(v1::GetGroundTruthResponse {
-            battery_level: state.battery,
-            base: Some(pose(&state.base)),
-            arm: Some(v1::Joints { positions: state.arm.to_vec() }),
-            time_s: state.now.seconds(),
-            seed: state.seed,
-            objects: objects(state),
-        }))
+    async fn put_back_to(&self, snapshot: &str) -> Result<Vec<v1::TrueObject>, Status> {
+        let snapshot = Snapshot::from_json(snapshot).map_err(|error| Status::invalid_argument(error.to_string()))?;
+        self.keeper.tell(Event::PutBack { snapshot: Box::new(snapshot) }).await.map_err(status)?;
+        Ok(objects(self.keeper.state().await.map_err(status)?))
     }
 
-    async fn reset(&self, request: Request<v1::ResetRequest>) -> Result<Response<v1::ResetResponse>, Status> {
-        let v1::ResetRequest { seed, boxes: count, bowls, forks, cups, plates } = request.into_inner();
+    async fn inject(&self, text: &str) -> Result<(), Status> {
+        let fault: Fault = text.parse().map_err(|error: FaultError| Status::invalid_argument(error.to_string()))?;
+        if self.keeper.inject(fault).await.map_err(status)? {
+            return Ok(());
+        }
+        Err(Status::resource_exhausted(format!("{MAX_FAULTS} faults are still to come: no more are taken")))
+    }
+
+    async fn reset_to(
+        &self,
+        seed: u64,
+        count: u32,
+        [bowls, forks, cups, plates]: [u32; 4],
+    ) -> Result<Vec<v1::TrueObject>, Status> {
         let many = |n: u32| usize::try_from(n).unwrap_or(usize::MAX);
         let goods = Goods {
             boxes: many(count),
@@ -67,7 +69,34 @@ impl CellService for Service {
                 format!("no feasible scene with {count} objects was found from seed {seed}; try another seed");
             return Err(Status::failed_precondition(message));
         }
-        Ok(Response::new(v1::ResetResponse { objects: objects(state) }))
+        Ok(objects(state))
+    }
+}
+
+#[tonic::async_trait]
+impl CellService for Service {
+    async fn get_ground_truth(
+        &self,
+        _: Request<v1::GetGroundTruthRequest>,
+    ) -> Result<Response<v1::GetGroundTruthResponse>, Status> {
+        let state = self.keeper.state().await.map_err(status)?;
+        Ok(Response::new(v1::GetGroundTruthResponse {
+            battery_level: state.battery,
+            base: Some(pose(&state.base)),
+            arm: Some(v1::Joints { positions: state.arm.to_vec() }),
+            time_s: state.now.seconds(),
+            seed: state.seed,
+            objects: objects(state),
+        }))
+    }
+
+    async fn reset(&self, request: Request<v1::ResetRequest>) -> Result<Response<v1::ResetResponse>, Status> {
+        let caller = Caller::of(&request);
+        let v1::ResetRequest { seed, boxes: count, bowls, forks, cups, plates } = request.into_inner();
+        let pending = audit::begin(&caller, "", || Mutation::Reset { seed });
+        let reset = self.reset_to(seed, count, [bowls, forks, cups, plates]).await;
+        pending.ended(&reset);
+        reset.map(|objects| Response::new(v1::ResetResponse { objects }))
     }
 
     async fn save(&self, _: Request<v1::SaveRequest>) -> Result<Response<v1::SaveResponse>, Status> {
@@ -76,25 +105,23 @@ impl CellService for Service {
     }
 
     async fn put_back(&self, request: Request<v1::PutBackRequest>) -> Result<Response<v1::PutBackResponse>, Status> {
-        let snapshot = Snapshot::from_json(&request.into_inner().snapshot)
-            .map_err(|error| Status::invalid_argument(error.to_string()))?;
-        self.keeper.tell(Event::PutBack { snapshot: Box::new(snapshot) }).await.map_err(status)?;
-        let state = self.keeper.state().await.map_err(status)?;
-        Ok(Response::new(v1::PutBackResponse { objects: objects(state) }))
+        let caller = Caller::of(&request);
+        let pending = audit::begin(&caller, "", || Mutation::PutBack);
+        let put_back = self.put_back_to(&request.into_inner().snapshot).await;
+        pending.ended(&put_back);
+        put_back.map(|objects| Response::new(v1::PutBackResponse { objects }))
     }
 
     async fn inject_fault(
         &self,
         request: Request<v1::InjectFaultRequest>,
     ) -> Result<Response<v1::InjectFaultResponse>, Status> {
-        let text = request.into_inner().fault;
+        let (caller, text) = (Caller::of(&request), request.into_inner().fault);
         name(&text, "fault")?;
-        let fault: Fault = text.parse().map_err(|error: FaultError| Status::invalid_argument(error.to_string()))?;
-        if self.keeper.inject(fault).await.map_err(status)? {
-            Ok(Response::new(v1::InjectFaultResponse {}))
-        } else {
-            Err(Status::resource_exhausted(format!("{MAX_FAULTS} faults are still to come: no more are taken")))
-        }
+        let pending = audit::begin(&caller, "", || Mutation::InjectFault { fault: text.clone() });
+        let injected = self.inject(&text).await;
+        pending.ended(&injected);
+        injected.map(|()| Response::new(v1::InjectFaultResponse {}))
     }
 }
 

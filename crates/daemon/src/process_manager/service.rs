@@ -4,6 +4,8 @@ use super::actor::{Handle, Message};
 use super::log_file::{LogReader, log_file};
 use super::pools::Restart;
 use super::{log_stream, status};
+use crate::access::Caller;
+use crate::audit::{self, Mutation};
 use crate::details::{ending, retry_later};
 use futures::{Stream, StreamExt};
 use ratn_proto::convert::name;
@@ -47,6 +49,7 @@ impl v1::process_service_server::ProcessService for Service {
     }
 
     async fn spawn(&self, request: Request<v1::SpawnRequest>) -> Result<Response<v1::SpawnResponse>, Status> {
+        let caller = Caller::of(&request);
         let v1::SpawnRequest { template, count } = request.into_inner();
         name(&template, "template")?;
         if count == 0 {
@@ -56,21 +59,28 @@ impl v1::process_service_server::ProcessService for Service {
                 "count: is 0: it must be at least 1",
             ));
         }
+        let pending = audit::begin(&caller, "", || Mutation::Spawn { template: template.clone(), count });
         let spawned = self.actor.ask(|answer| Message::Spawn { template, count, answer }).await?;
-        let worker_ids = spawned.map_err(|error| status::of_error(&error))?;
+        let spawned = spawned.map_err(|error| status::of_error(&error));
+        pending.ended(&spawned);
+        let worker_ids = spawned?;
         Ok(Response::new(v1::SpawnResponse { worker_ids }))
     }
 
     async fn stop(&self, request: Request<v1::StopRequest>) -> Result<Response<v1::StopResponse>, Status> {
-        let id = request.into_inner().worker_id;
+        let (caller, id) = (Caller::of(&request), request.into_inner().worker_id);
         name(&id, "worker_id")?;
+        let pending = audit::begin(&caller, "", || Mutation::Stop { worker: id.clone() });
         let stopped = self.actor.ask(|answer| Message::Stop { id, answer }).await?;
-        stopped.map_err(|error| status::of_error(&error))?;
+        let stopped = stopped.map_err(|error| status::of_error(&error));
+        pending.ended(&stopped);
+        stopped?;
         Ok(Response::new(v1::StopResponse {}))
     }
 
     async fn restart(&self, request: Request<v1::RestartRequest>) -> Result<Response<v1::RestartResponse>, Status> {
         use v1::restart_request::Target;
+        let caller = Caller::of(&request);
         let which = match request.into_inner().target {
             Some(Target::Template(template)) => {
                 name(&template, "template")?;
@@ -85,27 +95,43 @@ impl v1::process_service_server::ProcessService for Service {
                 return Err(crate::details::status(Code::InvalidArgument, "MALFORMED", message));
             }
         };
+        let target = |which: &Restart| match which {
+            Restart::Template(template) => template.clone(),
+            Restart::Worker(worker) => worker.clone(),
+        };
+        let pending = audit::begin(&caller, "", || Mutation::Restart { target: target(&which) });
         let restarted = self.actor.ask(|answer| Message::Restart { which, answer }).await?;
-        let worker_ids = restarted.map_err(|error| status::of_error(&error))?;
+        let restarted = restarted.map_err(|error| status::of_error(&error));
+        pending.ended(&restarted);
+        let worker_ids = restarted?;
         Ok(Response::new(v1::RestartResponse { worker_ids }))
     }
 
     async fn scale(&self, request: Request<v1::ScaleRequest>) -> Result<Response<v1::ScaleResponse>, Status> {
+        let caller = Caller::of(&request);
         let v1::ScaleRequest { template, min, max, spares } = request.into_inner();
         name(&template, "template")?;
+        let scale = || Mutation::Scale { template: template.clone(), min, max, spares };
+        let pending = audit::begin(&caller, "", scale);
         let scale = Scale { min, max, spares };
         let scaled = self.actor.ask(|answer| Message::Scale { template, scale, answer }).await?;
-        let pool = scaled.map_err(|error| status::of_error(&error))?;
+        let scaled = scaled.map_err(|error| status::of_error(&error));
+        pending.ended(&scaled);
+        let pool = scaled?;
         Ok(Response::new(v1::ScaleResponse { pool: Some(pool.into()) }))
     }
 
     async fn drain(&self, request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>, Status> {
+        let caller = Caller::of(&request);
         let draining = !request.into_inner().undo;
+        let pending = audit::begin(&caller, "", || Mutation::Drain { undo: !draining });
         let left = self.actor.ask(|answer| Message::Drain { draining, answer }).await?;
-        let worker_ids = left.map_err(|error| {
+        let left = left.map_err(|error| {
             let message = format!("nothing has changed: it cannot be written to the runtime directory: {error}");
             crate::details::status(Code::Internal, "NOT_WRITTEN", message)
-        })?;
+        });
+        pending.ended(&left);
+        let worker_ids = left?;
         Ok(Response::new(v1::DrainResponse { worker_ids }))
     }
 

@@ -7,7 +7,7 @@ use super::watch_filter::WatchFilter;
 use super::{Granted, wire};
 use crate::access::{Caller, speaker};
 use crate::audit::{self, Mutation};
-use crate::details::{ending, retry_later, status};
+use crate::details::{self, ending, retry_later, status};
 use crate::metrics;
 use crate::paging::{self, Filled, Page};
 use crate::quota::Quotas;
@@ -68,11 +68,15 @@ impl Service {
             PoolRequest::EndTask { .. } => "end_task",
             _ => "operate",
         };
-        let (request_name, what) = written_down(&request_id, &request);
+        let pending = audit::begin(caller, &request_id, || mutation_of(&request));
         let speaker = speaker(caller);
-        let performed = self.actor.ask(|answer| Message::Perform { speaker, request_id, request, answer }).await?;
-        let mutation = Mutation { caller, operation, request: &request_name, what };
-        mutation.ended(performed.as_ref().map(|_| None));
+        let performed = self
+            .actor
+            .ask(|answer| Message::Perform { speaker, request_id, request, answer })
+            .await
+            .and_then(|done| done);
+        pending.ended(&performed);
+        counted(operation, &performed);
         let (reply, revision) = performed?;
         Ok((reply, revision.0))
     }
@@ -84,14 +88,14 @@ impl Service {
         request: AcquireRequest,
         wait_ms: u64,
     ) -> Result<Lease, Status> {
-        let (request_name, what) = written_down(&request_id, &request);
+        let pending = audit::begin(caller, &request_id, || mutation_of_acquire(&request));
         let began = Instant::now();
         let granted = self.granted(caller, request_id, request, wait_ms).await;
         if let (Ok(_), Some(metrics)) = (&granted, metrics::get()) {
             metrics.granted(began.elapsed());
         }
-        let mutation = Mutation { caller, operation: "acquire", request: &request_name, what };
-        mutation.ended(granted.as_ref().map(|lease| Some(lease.token)));
+        pending.ended_with(&granted, |lease| Some(lease.token));
+        counted("acquire", &granted);
         granted
     }
 
@@ -245,11 +249,16 @@ impl v1::resource_service_server::ResourceService for Service {
         let v1::WithdrawRequest { request_id, session_id } = request.into_inner();
         name(&request_id, "request_id")?;
         let session = session(&session_id)?;
-        let (request_name, what) = written_down(&request_id, &session);
+        let withdraw = || Mutation::Withdraw { session: session_id };
+        let pending = audit::begin(&caller, &request_id, withdraw);
         let speaker = speaker(&caller);
-        let withdrawn = self.actor.ask(|answer| Message::Withdraw { speaker, session, request_id, answer }).await?;
-        let mutation = Mutation { caller: &caller, operation: "withdraw", request: &request_name, what };
-        mutation.ended(withdrawn.as_ref().map(|_| None));
+        let withdrawn = self
+            .actor
+            .ask(|answer| Message::Withdraw { speaker, session, request_id, answer })
+            .await
+            .and_then(|done| done);
+        pending.ended(&withdrawn);
+        counted("withdraw", &withdrawn);
         let withdrawn = withdrawn?;
         Ok(Response::new(v1::WithdrawResponse { withdrawn }))
     }
@@ -356,9 +365,18 @@ impl v1::resource_service_server::ResourceService for Service {
         name(&kind, "kind")?;
         label(&reason, "reason")?;
         let session = session(&session_id)?;
+        let shortage = || Mutation::ReportShortage {
+            session: session_id.clone(),
+            kind: kind.clone(),
+            most,
+            reason: reason.clone(),
+        };
+        let pending = audit::begin(&caller, "", shortage);
         let speaker = speaker(&caller);
         let report = |answer| Message::ReportShortage { speaker, session, kind, most, reason, answer };
-        self.actor.ask(report).await??;
+        let reported = self.actor.ask(report).await.and_then(|done| done);
+        pending.ended(&reported);
+        reported?;
         Ok(Response::new(v1::ReportShortageResponse {}))
     }
 
@@ -475,7 +493,16 @@ pub(super) async fn kept_alive(
     label(&ping.client, "client")?;
     let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };
     let ttl = Duration::from_millis(ping.ttl_ms);
-    let kept = actor.keep_alive(speaker(caller), session, client, ttl).await?;
+    let (named, id) = (client.clone(), ping.session_id.clone());
+    let kept = actor.keep_alive(speaker(caller), session, client, ttl).await;
+    // Pings that change nothing are not written down.
+    if ttl.is_zero() {
+        audit::begin(caller, "", || Mutation::CloseSession { session: id }).ended(&kept);
+    } else if kept.as_ref().map_or(true, |kept| kept.created) {
+        let open = || Mutation::OpenSession { session: id, client: named, ttl_ms: ping.ttl_ms };
+        audit::begin(caller, "", open).ended(&kept);
+    }
+    let kept = kept?;
     Ok(v1::KeepAliveResponse {
         session_id: ping.session_id,
         ttl_ms: u64::try_from(kept.ttl.as_millis()).unwrap_or(u64::MAX),
@@ -518,9 +545,39 @@ fn optional_session(id: &str) -> Result<Option<SessionId>, Status> {
     (!id.is_empty()).then(|| session(id)).transpose()
 }
 
-/// What the audit log says of a request; nothing where there is none.
-fn written_down(request_id: &str, request: &impl std::fmt::Debug) -> (String, String) {
-    if audit::enabled() { (request_id.to_owned(), format!("{request:?}")) } else { Default::default() }
+/// A refusal is counted by its reason.
+fn counted<T>(operation: &'static str, outcome: &Result<T, Status>) {
+    if let (Err(status), Some(metrics)) = (outcome, metrics::get()) {
+        metrics.refused(operation, details::reason(status));
+    }
+}
+
+/// What the audit log says of a request.
+fn mutation_of(request: &PoolRequest) -> Mutation {
+    let session = request.session().map(|session| session.as_str().to_owned()).unwrap_or_default();
+    match request {
+        PoolRequest::Create { spec, .. } => Mutation::Create {
+            session,
+            resource: spec.id.clone().unwrap_or_default(),
+            kind: spec.kind.clone(),
+            class: spec.class.to_string(),
+        },
+        PoolRequest::Consume { requirement, .. } => Mutation::Consume { session, requirement: requirement.to_string() },
+        PoolRequest::Delete { id, .. } => Mutation::Delete { session, target: id.clone() },
+        PoolRequest::DeleteUnits { requirement, .. } => Mutation::Delete { session, target: requirement.to_string() },
+        PoolRequest::Release { lease, .. } => Mutation::Release { session, lease: lease.0 },
+        PoolRequest::EndTask { .. } => Mutation::EndTask { session },
+        PoolRequest::Acquire(acquire) => mutation_of_acquire(acquire),
+    }
+}
+
+fn mutation_of_acquire(acquire: &AcquireRequest) -> Mutation {
+    Mutation::Acquire {
+        session: acquire.session.as_str().to_owned(),
+        requirements: acquire.requirements.iter().map(|requirement| audit::cut(&requirement.to_string())).collect(),
+        holder: acquire.purpose.clone(),
+        priority: acquire.priority,
+    }
 }
 
 fn odd_reply(reply: &Reply) -> Status {

@@ -3,6 +3,8 @@
 use super::actor::{Handle, Message, NewProjection, Update, WATCH_AGAIN_AFTER};
 use super::history::Commit;
 use super::leases::{Known, LiveLeases};
+use crate::access::Caller;
+use crate::audit::{self, Mutation};
 use crate::details::{ending, retry_later, status};
 use crate::paging::{self, Filled, Page};
 use futures::StreamExt;
@@ -78,7 +80,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     }
 
     async fn commit(&self, request: Request<v1::CommitRequest>) -> Result<Response<v1::CommitResponse>, Status> {
-        let request = request.into_inner();
+        let (caller, request) = (Caller::of(&request), request.into_inner());
         name(&request.commit_id, "commit_id")?;
         label(&request.writer, "writer")?;
         self.sizes.check("changes", &request.changes)?;
@@ -90,13 +92,20 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             writer: Some(request.writer).filter(|writer| !writer.is_empty()),
             evidence: each(request.evidence, "evidence")?,
         };
-        let (revision, contradictions) = self.actor.request(|answer| Message::Commit { commit, answer }).await?;
+        let pending = audit::begin(&caller, &commit.id, || Mutation::Commit {
+            revision: commit.expected.map_or(0, |revision| revision.0),
+            changes: commit.changes.len(),
+            writer: commit.writer.clone().unwrap_or_default(),
+        });
+        let committed = self.actor.request(|answer| Message::Commit { commit, answer }).await;
+        pending.ended(&committed);
+        let (revision, contradictions) = committed?;
         let contradictions = paging::first(all(contradictions));
         Ok(Response::new(v1::CommitResponse { revision: revision.0, contradictions }))
     }
 
     async fn project(&self, request: Request<v1::ProjectRequest>) -> Result<Response<v1::ProjectResponse>, Status> {
-        let request = request.into_inner();
+        let (caller, request) = (Caller::of(&request), request.into_inner());
         label(&request.request_id, "request_id")?;
         self.sizes.check("changes", &request.changes)?;
         request.writers.iter().try_for_each(|writer| label(writer, "writers"))?;
@@ -109,13 +118,20 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             reads: required(request.reads, "reads")?,
             lease,
         };
+        let pending = audit::begin(&caller, &projection.request_id, || Mutation::Project {
+            base_revision: projection.base.0,
+            changes: projection.changes.len(),
+            lease: request.lease_id,
+        });
         if let Some(lease) = lease {
             let mut leases = self.leases.clone();
             let told = leases.wait_for(|leases| leases.known(lease) != Known::NotYet);
             // In vain for a lease that holds nothing: the actor knows what to do with that.
             let _ = tokio::time::timeout(LEASE_PATIENCE, told).await;
         }
-        let id = self.actor.request(|answer| Message::Project { projection, answer }).await?;
+        let made = self.actor.request(|answer| Message::Project { projection, answer }).await;
+        pending.ended(&made);
+        let id = made?;
         Ok(Response::new(v1::ProjectResponse { projection_id: id.0 }))
     }
 
@@ -243,8 +259,11 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         &self,
         request: Request<v1::WorldPoolServiceReleaseRequest>,
     ) -> Result<Response<v1::WorldPoolServiceReleaseResponse>, Status> {
-        let projection = ProjectionId(request.into_inner().projection_id);
-        let released = self.actor.request(|answer| Message::Release { projection, answer }).await?;
+        let (caller, projection) = (Caller::of(&request), ProjectionId(request.into_inner().projection_id));
+        let pending = audit::begin(&caller, "", || Mutation::ReleaseProjection { projection: projection.0 });
+        let released = self.actor.request(|answer| Message::Release { projection, answer }).await;
+        pending.ended(&released);
+        let released = released?;
         Ok(Response::new(v1::WorldPoolServiceReleaseResponse { released }))
     }
 }

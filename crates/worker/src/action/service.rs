@@ -2,6 +2,9 @@
 
 use super::ActionServer;
 use super::goal::{Ending, GoalEntry, Listener};
+use super::stream::CallerGoals;
+use crate::access::Caller;
+use crate::audit::{self, Mutation};
 use crate::gate::Draining;
 use crate::multiplex::GoalCalls;
 use crate::multiplex::server::Answers;
@@ -26,33 +29,50 @@ impl ActionServer {
     }
 }
 
+impl ActionServer {
+    /// A goal that a caller gives, or asks for again.
+    pub(super) async fn given(&self, caller: &Caller, request: v1::ExecuteRequest) -> Result<Messages, Status> {
+        let known_only = request.known_only;
+        let goal: Goal = required(request.goal, "goal")?;
+        let pending = audit::begin(caller, "", || Mutation::Goal {
+            goal: goal.id.clone(),
+            action: goal.action.clone(),
+            lease: goal.lease.as_ref().map_or(0, |lease| lease.id.0),
+            known_only,
+        });
+        let token = goal.lease.as_ref().map(|lease| lease.token);
+        let admitted = if known_only { self.join(&goal.id) } else { self.admit(goal).await };
+        pending.ended_with(&admitted, |_| token);
+        admitted
+    }
+}
+
 #[tonic::async_trait]
 impl ActionService for ActionServer {
     type ExecuteStream = BoxStream<'static, Result<v1::ExecuteResponse, Status>>;
 
     async fn execute(&self, request: Request<v1::ExecuteRequest>) -> Result<Response<Self::ExecuteStream>, Status> {
-        let request = request.into_inner();
-        let goal: Goal = required(request.goal, "goal")?;
-        if request.known_only {
-            return Ok(Response::new(self.join(&goal.id)?.into_stream()));
-        }
-        Ok(Response::new(self.admit(goal).await?.into_stream()))
+        let caller = Caller::of(&request);
+        Ok(Response::new(self.given(&caller, request.into_inner()).await?.into_stream()))
     }
 
-    type PerformStream = Answers<GoalCalls, ActionServer>;
+    type PerformStream = Answers<GoalCalls, CallerGoals>;
 
     async fn perform(
         &self,
         request: Request<Streaming<v1::PerformRequest>>,
     ) -> Result<Response<Self::PerformStream>, Status> {
         let draining = request.extensions().get::<Draining>().map(|draining| draining.0.clone());
-        Ok(Response::new(Answers::new(self.clone(), request.into_inner(), draining)))
+        let goals = CallerGoals { caller: Caller::of(&request), server: self.clone() };
+        Ok(Response::new(Answers::new(goals, request.into_inner(), draining)))
     }
 
     async fn cancel(&self, request: Request<v1::CancelRequest>) -> Result<Response<v1::CancelResponse>, Status> {
-        let goal = request.into_inner().goal_id;
+        let (caller, goal) = (Caller::of(&request), request.into_inner().goal_id);
         name(&goal, "goal_id")?;
+        let pending = audit::begin(&caller, "", || Mutation::Cancel { goal: goal.clone() });
         let under_way = ActionServer::cancel(self, &goal);
+        pending.ended(&Ok(under_way));
         Ok(Response::new(v1::CancelResponse { under_way }))
     }
 

@@ -2,13 +2,12 @@
 
 use super::ActionServer;
 use super::service::Messages;
+use crate::access::Caller;
 use crate::multiplex::GoalCalls;
 use crate::multiplex::server::{CallAnswers, Serve};
 use crate::trace::{self, TraceContext};
 use futures::stream::{StreamExt, once, unfold};
 use futures::{FutureExt, TryFutureExt};
-use ratn_proto::convert::required;
-use ratn_proto::types::Goal;
 use ratn_proto::v1::ExecuteRequest;
 use ratn_proto::v1::execute_response::Kind as Heard;
 use ratn_proto::v1::perform_request::Kind as Asked;
@@ -16,7 +15,14 @@ use ratn_proto::v1::perform_response::Kind;
 use tonic::Status;
 use tracing::Instrument;
 
-impl Serve<GoalCalls> for ActionServer {
+/// What takes the goals of one caller.
+#[derive(Debug)]
+pub struct CallerGoals {
+    pub(super) server: ActionServer,
+    pub(super) caller: Caller,
+}
+
+impl Serve<GoalCalls> for CallerGoals {
     const MAX_CALLS: usize = 1_024;
 
     fn begin(&mut self, call: Option<Asked>, context: Option<TraceContext>) -> CallAnswers<GoalCalls> {
@@ -24,7 +30,7 @@ impl Serve<GoalCalls> for ActionServer {
             let refused = Status::invalid_argument("kind: is missing: set one of the questions");
             return once(std::future::ready(Err(refused))).boxed();
         };
-        let admitted = admitted(self.clone(), execute);
+        let admitted = admitted(self.server.clone(), self.caller.clone(), execute);
         let admitted = match context {
             None => admitted.left_future(),
             Some(context) => trace::within(context, admitted).instrument(context.entered()).right_future(),
@@ -34,14 +40,13 @@ impl Serve<GoalCalls> for ActionServer {
     }
 
     fn too_many(&self) -> Status {
-        let most = <ActionServer as Serve<GoalCalls>>::MAX_CALLS;
+        let most = <CallerGoals as Serve<GoalCalls>>::MAX_CALLS;
         Status::resource_exhausted(format!("{most} executes are under way on this stream: no more at once"))
     }
 }
 
-async fn admitted(server: ActionServer, execute: ExecuteRequest) -> Result<Messages, Status> {
-    let goal: Goal = required(execute.goal, "goal")?;
-    if execute.known_only { server.join(&goal.id) } else { server.admit(goal).await }
+async fn admitted(server: ActionServer, caller: Caller, execute: ExecuteRequest) -> Result<Messages, Status> {
+    server.given(&caller, execute).await
 }
 
 /// What a client hears of a goal, its end as the last.
