@@ -156,8 +156,7 @@ impl Journal {
     ///
     /// Where there is no room ([`AppendError::Full`]) the entry is kept, and written at a later call.
     pub(crate) fn write(&mut self, state: &mut impl Journaled) -> Result<Position, AppendError> {
-        loop {
-            let Some(entry) = self.unwritten.take().or_else(|| state.take_entry()) else { break };
+        while let Some(entry) = self.unwritten.take().or_else(|| state.take_entry()) {
             match self.append(&entry) {
                 Ok(()) => {}
                 Err(full @ AppendError::Full { .. }) => {
