@@ -153,7 +153,9 @@ impl Holdings {
     fn happened(&mut self, event: &ResourceEvent) -> Vec<EndedHolding> {
         let or = |reason: &'static str| if event.reason.is_empty() { reason } else { event.reason.as_str() };
         if let Some((lease, _)) = event.lease {
-            self.youngest = self.youngest.max(lease);
+            // A lease of several resources is told of one by one: of the others the word is still on its way.
+            let known = if event.kind == ResourceEventKind::Leased { lease.0.saturating_sub(1) } else { lease.0 };
+            self.youngest = self.youngest.max(LeaseId(known));
         }
         match event.kind {
             ResourceEventKind::Deleted => self.set(&event.resource.id, BTreeMap::new(), or("its resource is gone")),
@@ -281,6 +283,16 @@ mod tests {
         let reason = "it was released".to_owned();
         assert_eq!(ended, [EndedHolding { resource: "arm".to_owned(), lease: LeaseId(12), reason }]);
         refuted(&holdings, claim(12), "no lease holds it");
+    }
+
+    #[test]
+    fn a_lease_of_several_resources_is_awaited_for_those_not_told_of_yet() {
+        let mut holdings = heard(&[], 9);
+        let camera = Resource { id: "camera".to_owned(), ..arm(&[12]) };
+        holdings.tell(&event(ResourceEventKind::Leased, camera, 12));
+        assert_eq!(holdings.check(&claim(12)), Standing::NotHeardOf { listening: true });
+        holdings.tell(&event(ResourceEventKind::Leased, arm(&[12]), 12));
+        assert_eq!(holdings.check(&claim(12)), Standing::Confirmed);
     }
 
     #[test]
