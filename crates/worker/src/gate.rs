@@ -11,6 +11,7 @@
 //! answer is. Health and reflection are answered to the end, and nobody waits for them.
 
 use crate::connections::{InUse, Link, LinkInfo};
+use crate::protocol;
 use crate::trace::{self, TraceContext};
 use http_body::{Frame, SizeHint};
 use std::any::Any;
@@ -229,6 +230,9 @@ where
         let Gated { gate, calls } = self.gated.clone();
         let in_use = link_of(request.extensions()).map(|link| link.begin(&identity)).transpose();
         let admitted = in_use.and_then(|in_use| {
+            if is_counted(path.path()) {
+                protocol::check(request.headers())?;
+            }
             gate.admit(&identity, path.path(), request.extensions_mut())?;
             let permit = request.extensions_mut().remove::<Permit>();
             Ok(Held { _call: calls.begin(is_counted(path.path()))?, _permit: permit, _in_use: in_use })

@@ -6,6 +6,7 @@
 //! A task's context ([`within`]) goes into every call that it makes over [`crate::client::Channels`]. Nothing is exported: the ids
 //! are in the logs, for whoever puts them together.
 
+use crate::protocol;
 use rand::RngExt;
 use std::fmt;
 use std::future::Future;
@@ -106,7 +107,7 @@ impl fmt::Display for Hex {
     }
 }
 
-/// A channel whose calls carry the context of the task that makes them, each as a span of its own.
+/// A channel whose calls carry the context of the task that makes them, each as a span of its own, and the protocol of this program.
 #[derive(Debug, Clone)]
 pub struct Traced(Channel);
 
@@ -131,6 +132,7 @@ impl Service<http::Request<Body>> for Traced {
         if let Some(Ok(header)) = header {
             request.headers_mut().insert(HEADER, header);
         }
+        protocol::say(request.headers_mut());
         self.0.call(request)
     }
 }

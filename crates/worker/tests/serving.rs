@@ -9,6 +9,7 @@ use ratn_proto::v1::DescribeRequest;
 use ratn_proto::v1::action_service_client::ActionServiceClient;
 use ratn_worker::client::{ActionClient, Channels, wait_until_serving};
 use ratn_worker::endpoint::{Endpoint, connect};
+use ratn_worker::protocol::HEADER;
 use ratn_worker::runtime_directory::wait_for_file;
 use ratn_worker::server::bind;
 use ratn_worker::worker::{Worker, WorkerOptions};
@@ -169,4 +170,28 @@ async fn a_worker_serves_from_its_options_and_leaves_nothing_behind() {
     shutdown.cancel();
     running.await.unwrap().unwrap();
     assert!(!file.exists());
+}
+
+/// A client of another version of this program, over a real connection.
+#[tokio::test]
+async fn a_client_of_a_version_without_a_protocol_in_common_is_refused_at_its_first_call_with_both_versions() {
+    let provider = provider(None).await;
+    let channel = connect(&provider.endpoint).await.unwrap();
+    let describe = async |said: Option<&'static str>| {
+        let mut question = tonic::Request::new(DescribeRequest {});
+        if let Some(said) = said {
+            question.metadata_mut().insert(HEADER, said.parse().unwrap());
+        }
+        ActionServiceClient::new(channel.clone()).describe(question).await.map(drop)
+    };
+    describe(None).await.unwrap();
+    describe(Some("1-2 0.2.0")).await.unwrap();
+    let refused = describe(Some("2-2 0.3.0")).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    for version in ["ratn 0.3.0, which speaks versions 2 to 2", concat!("ratn ", env!("CARGO_PKG_VERSION"), ", which")]
+    {
+        assert!(refused.message().contains(version), "{version}: {refused}");
+    }
+    // A client of this one says what it speaks.
+    ActionClient::new(Channels::new()).describe(&provider.endpoint).await.unwrap();
 }
