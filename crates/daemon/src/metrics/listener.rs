@@ -1,24 +1,33 @@
-//! HTTP for one page. Bounded: few connections, little to read, little time; each is closed after its answer.
+//! HTTP for one page, by hyper. Bounded: few connections, little to read, little time; each is closed after its answer.
 
 use super::Metrics;
+use hyper::body::Incoming;
+use hyper::header::{ALLOW, CONTENT_TYPE, HeaderValue};
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper::{Method, Request, Response, StatusCode};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 
 /// Connections at the same time; more are closed at once.
 const MAX_CONNECTIONS: usize = 16;
-/// A request has at most this many bytes …
+/// The head of a request has at most this many bytes (hyper takes no fewer) …
 const MAX_REQUEST_BYTES: usize = 8 * 1024;
+/// … and this many headers …
+const MAX_HEADERS: usize = 64;
 /// … and is read and answered in this time.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// After a connection that could not be had: the process is out of descriptors.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 const PATH: &str = "/metrics";
-const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+const PLAIN: &str = "text/plain; charset=utf-8";
+const OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 /// An address at which metrics cannot be shown.
 #[derive(Debug, thiserror::Error)]
@@ -71,44 +80,48 @@ async fn serve(metrics: &'static Metrics, listener: TcpListener) {
     }
 }
 
-async fn answer(metrics: &Metrics, mut connection: TcpStream) -> io::Result<()> {
-    let mut request = Vec::new();
-    while !request.windows(4).any(|window| window == b"\r\n\r\n") {
-        if request.len() >= MAX_REQUEST_BYTES || connection.read_buf(&mut request).await? == 0 {
-            return connection.write_all(&page("400 Bad Request", "a request is expected\n")).await;
-        }
-    }
-    let line = request.split(|byte| *byte == b'\r').next().unwrap_or_default();
-    let mut words = line.split(|byte| *byte == b' ');
-    let (method, target) = (words.next().unwrap_or_default(), words.next().unwrap_or_default());
-    let path = target.split(|byte| *byte == b'?').next().unwrap_or_default();
-    let page = match (method, path == PATH.as_bytes()) {
-        (b"GET", true) => page("200 OK", &metrics.text()),
-        (b"GET", false) => page("404 Not Found", "the metrics are at /metrics\n"),
-        _ => page("405 Method Not Allowed", "only GET\n"),
-    };
-    connection.write_all(&page).await?;
-    connection.shutdown().await
+/// One request of a connection, and its answer.
+async fn answer(metrics: &'static Metrics, connection: TcpStream) -> hyper::Result<()> {
+    let page = service_fn(async |request: Request<Incoming>| Ok::<_, Infallible>(page(metrics, &request)));
+    http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(PATIENCE)
+        .max_buf_size(MAX_REQUEST_BYTES)
+        .max_headers(MAX_HEADERS)
+        .keep_alive(false)
+        .half_close(true)
+        .serve_connection(TokioIo::new(connection), page)
+        .await
 }
 
-fn page(status: &str, body: &str) -> Vec<u8> {
-    let kind = if status.starts_with("200") { CONTENT_TYPE } else { "text/plain; charset=utf-8" };
-    let length = body.len();
-    format!("HTTP/1.1 {status}\r\ncontent-type: {kind}\r\ncontent-length: {length}\r\nconnection: close\r\n\r\n{body}")
-        .into_bytes()
+fn page(metrics: &Metrics, request: &Request<Incoming>) -> Response<String> {
+    let (status, kind, body) = match (request.method(), request.uri().path()) {
+        (&Method::GET, PATH) => (StatusCode::OK, OPENMETRICS, metrics.text()),
+        (&Method::GET, _) => (StatusCode::NOT_FOUND, PLAIN, "the metrics are at /metrics\n".to_owned()),
+        _ => (StatusCode::METHOD_NOT_ALLOWED, PLAIN, "only GET\n".to_owned()),
+    };
+    let mut response = Response::new(body);
+    *response.status_mut() = status;
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(kind));
+    if status == StatusCode::METHOD_NOT_ALLOWED {
+        response.headers_mut().insert(ALLOW, HeaderValue::from_static("GET"));
+    }
+    response
 }
 
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
     async fn ask(address: SocketAddr, request: &[u8]) -> String {
         let mut connection = TcpStream::connect(address).await.unwrap();
         connection.write_all(request).await.unwrap();
         connection.shutdown().await.unwrap();
         let mut answer = String::new();
-        connection.read_to_string(&mut answer).await.unwrap();
+        // What is refused before it was read to its end may be reset.
+        let _ = connection.read_to_string(&mut answer).await;
         answer
     }
 
@@ -118,10 +131,45 @@ mod tests {
         let address = listen(metrics, "127.0.0.1:0".parse().unwrap(), false).await.unwrap();
         let shown = ask(address, b"GET /metrics HTTP/1.1\r\nHost: here\r\n\r\n").await;
         assert!(shown.starts_with("HTTP/1.1 200 OK\r\n") && shown.ends_with("# EOF\n"), "{shown}");
+        assert!(shown.contains("content-type: application/openmetrics-text"), "{shown}");
+        let ago = ask(address, b"GET /metrics?of=all HTTP/1.0\r\n\r\n").await;
+        assert!(ago.starts_with("HTTP/1.0 200 OK\r\n") && ago.ends_with("# EOF\n"), "{ago}");
         assert!(ask(address, b"GET / HTTP/1.1\r\n\r\n").await.starts_with("HTTP/1.1 404"));
         assert!(ask(address, b"POST /metrics HTTP/1.1\r\n\r\n").await.starts_with("HTTP/1.1 405"));
         assert!(ask(address, b"\xff\x00").await.starts_with("HTTP/1.1 400"));
-        assert!(ask(address, &[b'x'; MAX_REQUEST_BYTES]).await.starts_with("HTTP/1.1 400"));
+    }
+
+    #[tokio::test]
+    async fn a_head_has_so_many_headers_and_bytes_and_no_more() {
+        let metrics = super::super::install("resource-manager");
+        let address = listen(metrics, "127.0.0.1:0".parse().unwrap(), false).await.unwrap();
+        let with_headers = |count: usize| {
+            let headers: String = (0..count).map(|n| format!("x-{n}: y\r\n")).collect();
+            format!("GET /metrics HTTP/1.1\r\n{headers}\r\n")
+        };
+        assert!(ask(address, with_headers(MAX_HEADERS).as_bytes()).await.starts_with("HTTP/1.1 200"));
+        assert!(ask(address, with_headers(MAX_HEADERS + 1).as_bytes()).await.starts_with("HTTP/1.1 431"));
+        let of_bytes = |bytes: usize| {
+            let (begin, end) = ("GET /metrics HTTP/1.1\r\nx: ", "\r\n\r\n");
+            format!("{begin}{}{end}", "y".repeat(bytes - begin.len() - end.len()))
+        };
+        assert!(ask(address, of_bytes(MAX_REQUEST_BYTES - 1).as_bytes()).await.starts_with("HTTP/1.1 200"));
+        let refused = ask(address, of_bytes(2 * MAX_REQUEST_BYTES).as_bytes()).await;
+        assert!(!refused.starts_with("HTTP/1.1 200"), "{refused}");
+    }
+
+    #[tokio::test]
+    async fn more_connections_than_there_are_places_for_are_closed_at_once() {
+        let metrics = super::super::install("resource-manager");
+        let address = listen(metrics, "127.0.0.1:0".parse().unwrap(), false).await.unwrap();
+        let mut silent = Vec::new();
+        for _ in 0..MAX_CONNECTIONS {
+            silent.push(TcpStream::connect(address).await.unwrap());
+        }
+        let mut one_more = TcpStream::connect(address).await.unwrap();
+        let read = tokio::time::timeout(PATIENCE / 2, one_more.read(&mut [0; 1])).await.unwrap();
+        assert!(matches!(read, Ok(0) | Err(_)), "{read:?}");
+        drop(silent);
     }
 
     #[tokio::test]
