@@ -125,6 +125,41 @@ async fn the_end_of_a_session_ends_its_leases_and_withdraws_its_resources() {
 }
 
 #[tokio::test]
+async fn an_arm_whose_holder_is_gone_is_the_next_ones_when_its_provider_has_confirmed_standstill() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let [cell, a, b] = ["cell", "a", "b"].map(|name| system.client(&manager, name));
+    let (cell, a, b) = (cell.await, a.await, b.await);
+    let bound = std::time::Duration::from_secs(60);
+    cell.resources.create(arm().with_standstill(bound)).await.unwrap();
+    let mut watch = system.watch(&manager, &[]).await;
+    let lease = a.resources.acquire(vec![block("Arm")], AcquireOptions::default()).await.unwrap();
+    let options = AcquireOptions { request: "next".to_owned(), ..AcquireOptions::default() };
+    let next = tokio::spawn({
+        let resources = b.resources.clone();
+        async move { resources.acquire(vec![block("Arm")], options).await }
+    });
+    let waits = async || b.resources.explain("next").await.map(|waiting| waiting[0].obstacles.join(""));
+    in_time(async { while waits().await.is_err() {} }).await;
+    a.session.close().await;
+    // The provider hears at once that it has to stop.
+    let ended = watch.event(|event| event.kind == ResourceEventKind::Released).await;
+    let left = &ended.resource.ending[0];
+    assert_eq!((left.lease, left.token, left.within_ms), (lease.id, lease.token, 60_000));
+    assert!(ended.resource.holdings.is_empty() && ended.resource.free.is_zero());
+    let obstacle = waits().await.unwrap();
+    assert!(obstacle.contains("is ending: waits for session cell") && obstacle.contains("up to"), "{obstacle}");
+    let stolen = b.resources.confirm_standstill(lease.id, "arm").await.unwrap_err();
+    assert_eq!(stolen.code(), Some(Code::PermissionDenied));
+    assert!(!next.is_finished());
+    assert!(cell.resources.confirm_standstill(lease.id, "arm").await.unwrap());
+    let freed = watch.event(|event| event.kind == ResourceEventKind::Updated).await;
+    assert_eq!((freed.lease, freed.reason.as_str()), (Some((lease.id, lease.token)), "standstill confirmed"));
+    assert!(in_time(next).await.unwrap().unwrap().token > lease.token);
+    assert!(!cell.resources.confirm_standstill(lease.id, "arm").await.unwrap());
+}
+
+#[tokio::test]
 async fn a_session_whose_pings_stay_away_expires() {
     let system = TestSystem::new();
     let manager = system.resource_manager().await;

@@ -9,9 +9,13 @@ use ratn_model::resource::{Lease, Quantity, Requirement, ResourceClass};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// The attribute of a resource that says where its action service is.
 pub const ENDPOINT_ATTRIBUTE: &str = "endpoint";
+
+/// The attribute by which a provider asks for time to stop what moves when a lease of its resource has ended, in milliseconds.
+pub const STANDSTILL_ATTRIBUTE: &str = "standstill_ms";
 
 /// What a resource is doing.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -40,6 +44,21 @@ pub struct Holding {
     pub holder: String,
     /// Who opened that session, as the connection proved it; empty where nobody knows.
     pub opened_by: String,
+}
+
+/// An amount of a resource whose lease has ended, while something may still move for it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EndingUnits {
+    /// The lease that has ended.
+    pub lease: LeaseId,
+    /// Its fencing token.
+    pub token: FencingToken,
+    /// How much.
+    pub units: Quantity,
+    /// The session that the lease was of.
+    pub session: String,
+    /// They are free after this many milliseconds at the latest.
+    pub within_ms: u64,
 }
 
 /// A resource. A provider fills in the first eight fields, the manager the rest.
@@ -71,6 +90,8 @@ pub struct Resource {
     pub free: Quantity,
     /// Who has some of it.
     pub holdings: Vec<Holding>,
+    /// What leases that have ended have left, until its provider has confirmed standstill.
+    pub ending: Vec<EndingUnits>,
 }
 
 impl Resource {
@@ -90,6 +111,7 @@ impl Resource {
             state: ResourceState::Free,
             free: Quantity::ONE,
             holdings: Vec::new(),
+            ending: Vec::new(),
         }
     }
 
@@ -98,6 +120,13 @@ impl Resource {
     pub fn with_attribute(mut self, name: impl Into<String>, value: Value) -> Resource {
         self.attributes.insert(name.into(), value);
         self
+    }
+
+    /// With a provider that confirms within `bound` that nothing moves any more for a lease that has ended.
+    #[must_use]
+    pub fn with_standstill(self, bound: Duration) -> Resource {
+        let bound = i64::try_from(bound.as_millis()).unwrap_or(i64::MAX);
+        self.with_attribute(STANDSTILL_ATTRIBUTE, Value::Int(bound))
     }
 
     /// With its action service at `endpoint`.
@@ -265,6 +294,7 @@ impl From<Revision> for WatchPosition {
 }
 
 /// What a watch of resources tells: the snapshot first, once.
+#[expect(clippy::large_enum_variant, reason = "most are events, and each is handled where it arrives")]
 #[derive(Debug, Clone, PartialEq)]
 pub enum ResourceUpdate {
     /// What is there; events follow from the next revision on.

@@ -24,9 +24,10 @@ fn read<W: Message + Default, T: TryFrom<W, Error = Malformed>>(bytes: &[u8]) ->
 }
 
 /// All that can come in, by the message's name.
-const READERS: [(&str, Read); 25] = [
+const READERS: [(&str, Read); 26] = [
     ("Change", read::<v1::Change, Change>),
     ("Contradiction", read::<v1::Contradiction, types::Contradiction>),
+    ("EndingUnits", read::<v1::EndingUnits, types::EndingUnits>),
     ("Evidence", read::<v1::Evidence, (FactKey, Measurement)>),
     ("FactDifference", read::<v1::FactDifference, types::FactDifference>),
     ("FactKey", read::<v1::FactKey, FactKey>),

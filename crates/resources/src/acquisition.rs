@@ -64,7 +64,8 @@ impl Pool {
         Ok(true)
     }
 
-    /// Ends a lease. `None` as session may release anything.
+    /// Ends a lease: its holder gives it back, and says by that that nothing is to move for it any more. `None` as session may
+    /// release anything, which revokes it.
     ///
     /// # Errors
     /// An unknown or ended lease, or one of another session.
@@ -74,9 +75,40 @@ impl Pool {
         if let Some(caller) = session {
             check_owner(|| id.to_string(), &record.session, caller)?;
         }
-        self.commit(Effect::LeaseEnded { lease: id, reason: EndReason::Asked });
+        let reason = if session.is_some() { EndReason::Asked } else { EndReason::Revoked };
+        self.commit(Effect::LeaseEnded { lease: id, reason });
         self.schedule();
         Ok(())
+    }
+
+    /// The provider of a resource says that nothing moves any more for a lease that has ended: what that had left of the resource is
+    /// free. False when it had left nothing, or lives. Of what no session provides, the lease's own session says so; `None` as session
+    /// may say it of anything.
+    ///
+    /// # Errors
+    /// An unknown resource, or one that another session provides.
+    pub fn confirm_standstill(
+        &mut self,
+        now: Timestamp,
+        session: Option<&SessionId>,
+        lease: LeaseId,
+        resource: &str,
+    ) -> Result<bool, PoolError> {
+        self.advance(now);
+        let unknown = || PoolError::UnknownResource { id: resource.to_owned() };
+        let slot = self.resources.find(resource).ok_or_else(unknown)?;
+        let ending = self.ending.get(&lease).filter(|ending| ending.slots.contains_key(&slot));
+        let provider = self.resources.get(slot).and_then(|resource| resource.owner.as_ref());
+        let speaks = provider.or(ending.map(|ending| &ending.session));
+        if let (Some(speaks), Some(caller)) = (speaks, session) {
+            check_owner(|| format!("resource `{resource}`"), speaks, caller)?;
+        }
+        if ending.is_none() {
+            return Ok(false);
+        }
+        self.commit(Effect::UnitsFreed { lease, slot, confirmed: true });
+        self.schedule();
+        Ok(true)
     }
 
     /// Takes back a grant that nobody heard of, and what was consumed with it. Its request may be asked again with its id, and

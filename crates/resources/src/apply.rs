@@ -8,14 +8,16 @@ use crate::event::{Change, Notice, WatchEvent};
 use crate::expiry::Timer;
 use crate::group::Seen;
 use crate::id::{SessionId, Slot};
-use crate::lease::LeaseRecord;
+use crate::lease::{Bound, EndingLease, LeaseRecord};
 use crate::pool::Pool;
 use crate::record::{Effect, Record};
 use crate::resource::{Resource, ResourceView, add_to, remove_from, take_from};
 use crate::session::Session;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Quantity;
+use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// An effect that does not fit the pool: a record was lost, or is not of this pool.
 pub(crate) type Misfit = String;
@@ -100,6 +102,9 @@ impl Pool {
                     self.leases.values_mut().for_each(|lease| lease.consumed.retain(|(consumed, _)| consumed != slot));
                 }
                 for (lease, _) in resource.holders {
+                    if self.end_standstill(lease, *slot) {
+                        continue;
+                    }
                     let record = self.leases.get_mut(&lease).ok_or_else(|| format!("{lease} is not there"))?;
                     record.held.retain(|(held, _)| held != slot);
                     let (token, session) = (record.token, record.session.clone());
@@ -156,7 +161,9 @@ impl Pool {
                 }
                 let slots = record.slots();
                 for slot in &slots {
-                    self.change(*slot, |resource| remove_from(&mut resource.holders, lease));
+                    if !self.begin_standstill(*lease, &record, *slot, *reason) {
+                        self.change(*slot, |resource| remove_from(&mut resource.holders, lease));
+                    }
                 }
                 self.session_mut(&record.session)?.leases.remove(lease);
                 if *reason == EndReason::Undelivered {
@@ -165,6 +172,18 @@ impl Pool {
                 let resources = self.views(&slots)?;
                 let LeaseRecord { token, session, .. } = record;
                 self.publish(Change::LeaseEnded { lease: *lease, token, session, resources, reason: *reason });
+                Ok(())
+            }
+            Effect::UnitsFreed { lease, slot, confirmed } => {
+                let token = self.ending.get(lease).map(|ending| ending.token);
+                let token = token.ok_or_else(|| format!("{lease} does not end"))?;
+                if !self.end_standstill(*lease, *slot) {
+                    return Err(format!("{lease} has left nothing of {slot}"));
+                }
+                self.change(*slot, |resource| remove_from(&mut resource.holders, lease))
+                    .ok_or_else(|| missing(*slot))?;
+                let resource = self.view(*slot)?;
+                self.publish(Change::UnitsFreed { lease: *lease, token, resource, confirmed: *confirmed });
                 Ok(())
             }
             Effect::Answered { request_id, fingerprint, reply, forget } => {
@@ -206,6 +225,32 @@ impl Pool {
         Ok(())
     }
 
+    /// Keeps the units of a lease that ends taken, if the resource's provider has to confirm standstill; whether it has.
+    fn begin_standstill(&mut self, lease: LeaseId, record: &LeaseRecord, slot: Slot, reason: EndReason) -> bool {
+        let standstill = self.resources.get(slot).map_or(Duration::ZERO, |resource| resource.description.standstill());
+        if reason.is_the_holders() || standstill.is_zero() {
+            return false;
+        }
+        let until = self.now + standstill;
+        let (token, session) = (record.token, record.session.clone());
+        let ending = self.ending.entry(lease);
+        let ending = ending.or_insert_with(|| EndingLease { token, session, reason, slots: BTreeMap::new() });
+        ending.slots.insert(slot, Bound(until));
+        self.timers.insert((until, Timer::Standstill(lease, slot)));
+        true
+    }
+
+    /// Nothing is left of a lease at a resource; whether something was.
+    fn end_standstill(&mut self, lease: LeaseId, slot: Slot) -> bool {
+        let Some(ending) = self.ending.get_mut(&lease) else { return false };
+        let Some(Bound(until)) = ending.slots.remove(&slot) else { return false };
+        if ending.slots.is_empty() {
+            self.ending.remove(&lease);
+        }
+        self.timers.remove(&(until, Timer::Standstill(lease, slot)));
+        true
+    }
+
     /// Changes a resource, and tells the queue.
     fn change<T>(&mut self, slot: Slot, change: impl FnOnce(&mut Resource) -> T) -> Option<T> {
         if self.queue.families.is_empty() {
@@ -225,7 +270,8 @@ impl Pool {
     }
 
     fn view(&self, slot: Slot) -> Result<ResourceView, Misfit> {
-        self.resources.get(slot).map(|resource| resource.view(&self.leases)).ok_or_else(|| missing(slot))
+        let view = |resource: &Resource| resource.view(slot, &self.leases, &self.ending, self.now);
+        self.resources.get(slot).map(view).ok_or_else(|| missing(slot))
     }
 
     fn views(&self, slots: &[Slot]) -> Result<Vec<ResourceView>, Misfit> {

@@ -5,9 +5,10 @@ use crate::event::EndReason;
 use crate::id::{SessionId, Slot};
 use crate::pool::Pool;
 use crate::record::Effect;
-use crate::resource::{Description, Resource, ResourceSpec, ResourceView};
+use crate::resource::{Description, LONGEST_STANDSTILL_MS, Resource, ResourceSpec, ResourceView, STANDSTILL_ATTRIBUTE};
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
 use std::sync::Arc;
 
 impl Pool {
@@ -137,6 +138,16 @@ impl Pool {
         }
     }
 
+    fn check_standstill(&self, spec: &ResourceSpec) -> Result<(), PoolError> {
+        let Some(bound) = spec.attributes.get(STANDSTILL_ATTRIBUTE) else { return Ok(()) };
+        let bounded = |ms: &i64| u64::try_from(*ms).is_ok_and(|ms| ms <= LONGEST_STANDSTILL_MS);
+        if matches!(bound, Value::Int(ms) if bounded(ms)) {
+            return Ok(());
+        }
+        let what = format!("attribute {STANDSTILL_ATTRIBUTE} of {}", spec.kind);
+        Err(malformed(&what, &format!("it is a whole number of milliseconds from 0 to {LONGEST_STANDSTILL_MS}")))
+    }
+
     fn check_spec(&self, spec: &ResourceSpec) -> Result<(), PoolError> {
         self.check_name("kind", &spec.kind)?;
         if let Some(id) = &spec.id {
@@ -155,6 +166,7 @@ impl Pool {
             let what = format!("capacity {} of {}", spec.capacity, spec.kind);
             return Err(malformed(&what, "what is not divisible has whole units"));
         }
+        self.check_standstill(spec)?;
         self.check_attributes(spec.attributes.keys())?;
         self.check_size(spec)
     }

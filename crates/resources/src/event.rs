@@ -88,7 +88,7 @@ pub enum Change {
         /// Its resources, as they are with it.
         resources: Vec<ResourceView>,
     },
-    /// A lease ended; what it held is free.
+    /// A lease ended. What it held is free, but for the units of resources whose providers have to confirm standstill.
     LeaseEnded {
         /// Its id.
         lease: LeaseId,
@@ -100,6 +100,17 @@ pub enum Change {
         resources: Vec<ResourceView>,
         /// Why.
         reason: EndReason,
+    },
+    /// Units that a lease had left when it ended are free: nothing moves for it any more.
+    UnitsFreed {
+        /// The lease that has ended.
+        lease: LeaseId,
+        /// Its token.
+        token: FencingToken,
+        /// The resource, as it is now.
+        resource: ResourceView,
+        /// The provider has confirmed standstill; else the bound has passed.
+        confirmed: bool,
     },
 }
 
@@ -118,6 +129,15 @@ pub enum EndReason {
     UsedUp,
     /// Nobody heard of the grant: as if it had not been made.
     Undelivered,
+    /// Somebody else than its holder ended it.
+    Revoked,
+}
+
+impl EndReason {
+    /// Whether the holder itself has ended the lease, or never had it: it says by that that nothing is to move for it any more.
+    pub(crate) fn is_the_holders(self) -> bool {
+        matches!(self, EndReason::Asked | EndReason::Undelivered)
+    }
 }
 
 impl fmt::Display for EndReason {
@@ -129,6 +149,7 @@ impl fmt::Display for EndReason {
             EndReason::HeldTooLong => "held too long",
             EndReason::UsedUp => "used up",
             EndReason::Undelivered => "undelivered",
+            EndReason::Revoked => "revoked",
         })
     }
 }

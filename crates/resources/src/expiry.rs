@@ -1,10 +1,11 @@
-//! What time does to the pool: sessions expire, waiters reach their deadline, leases their end.
+//! What time does to the pool: sessions expire, waiters reach their deadline, leases their end,
+//! and providers the bound within which they confirm standstill.
 //!
 //! Everything that is due is ended before anything is granted, so that a waiter whose session or deadline has passed is
 //! never handed a lease, however late the pool was called.
 
 use crate::event::{EndReason, Refusal};
-use crate::id::{SessionId, WaiterId};
+use crate::id::{SessionId, Slot, WaiterId};
 use crate::pool::Pool;
 use crate::record::Effect;
 use ratn_model::id::LeaseId;
@@ -16,6 +17,8 @@ pub(crate) enum Timer {
     Session(SessionId),
     Waiter(WaiterId),
     Lease(LeaseId),
+    /// The bound within which a provider confirms standstill.
+    Standstill(LeaseId, Slot),
 }
 
 impl Pool {
@@ -43,6 +46,9 @@ impl Pool {
             match timer {
                 Timer::Session(id) => self.end_session(&id, EndReason::SessionExpired),
                 Timer::Lease(lease) => self.commit(Effect::LeaseEnded { lease, reason: EndReason::HeldTooLong }),
+                Timer::Standstill(lease, slot) => {
+                    self.commit(Effect::UnitsFreed { lease, slot, confirmed: false });
+                }
                 Timer::Waiter(id) => {
                     let explained = if self.has_done_enough() { None } else { self.explained(id) };
                     let (waited_for, looked_at) =

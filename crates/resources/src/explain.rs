@@ -8,6 +8,7 @@ use crate::resource::Units;
 use ratn_model::id::LeaseId;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use std::fmt;
+use std::time::Duration;
 
 /// How many holders and waiters ahead an obstacle names at the most.
 const MAX_NAMED: usize = 8;
@@ -50,6 +51,8 @@ pub enum Obstacle {
         requirement: String,
         /// Who: lease, session, and what it is held for.
         holders: Vec<(LeaseId, SessionId, String)>,
+        /// What a lease that has ended has left: lease, resource, the provider that is to confirm standstill, and its bound.
+        ending: Vec<(LeaseId, String, Option<SessionId>, Duration)>,
     },
     /// Enough is free, but waiters ahead need it.
     Reserved {
@@ -103,7 +106,7 @@ impl Pool {
                 })
                 .take(MAX_NAMED)
                 .collect();
-            Obstacle::Held { requirement: text, holders }
+            Obstacle::Held { requirement: text, holders, ending: self.ending_of(requirement) }
         } else {
             let wants = |waiter: &Waiter| {
                 waiter.request.requirements.iter().any(|r| {
@@ -121,6 +124,20 @@ impl Pool {
                 .collect();
             Obstacle::Reserved { requirement: text, waiters }
         }
+    }
+}
+
+impl Pool {
+    /// What leases that have ended have left of what fits.
+    fn ending_of(&self, requirement: &Requirement) -> Vec<(LeaseId, String, Option<SessionId>, Duration)> {
+        let fitting = self.resources.fitting(requirement).filter(|_| !self.ending.is_empty());
+        let left = fitting.flat_map(|(slot, resource)| {
+            resource.holders.iter().filter_map(move |(lease, units)| {
+                let ending = self.ending.get(lease)?.view(*lease, slot, *units, self.now);
+                Some((*lease, resource.description.id.clone(), resource.owner.clone(), ending.within))
+            })
+        });
+        left.take(MAX_NAMED).collect()
     }
 }
 
@@ -150,12 +167,21 @@ impl fmt::Display for Obstacle {
                 write!(f, "`{requirement}`: only {exist} units that fit exist")?;
                 reasons.iter().try_for_each(|reason| write!(f, " ({reason})"))
             }
-            Obstacle::Held { requirement, holders } => {
-                write!(f, "`{requirement}`: held by ")?;
+            Obstacle::Held { requirement, holders, ending } => {
+                write!(f, "`{requirement}`: ")?;
                 for (i, (lease, session, purpose)) in holders.iter().enumerate() {
-                    let separator = if i == 0 { "" } else { ", " };
+                    let separator = if i == 0 { "held by " } else { ", " };
                     let purpose = if purpose.is_empty() { String::new() } else { format!(" for {purpose}") };
                     write!(f, "{separator}{lease} of {session}{purpose}")?;
+                }
+                for (i, (lease, resource, provider, within)) in ending.iter().enumerate() {
+                    let separator = if i == 0 && holders.is_empty() { "" } else { ", " };
+                    let provider = provider.as_ref().map_or_else(|| "an operator".to_owned(), ToString::to_string);
+                    write!(
+                        f,
+                        "{separator}{lease} is ending: waits for {provider} to confirm that {resource} stands still, "
+                    )?;
+                    write!(f, "up to {} ms", within.as_millis())?;
                 }
                 Ok(())
             }

@@ -21,6 +21,9 @@ impl Pool {
                 format!("{id}: held {held} + consumed {consumed} + free {free} is not its capacity {capacity}")
             })?;
             for (lease, amount) in &resource.holders {
+                if self.ending.get(lease).is_some_and(|ending| ending.slots.contains_key(&slot)) {
+                    continue;
+                }
                 let listed = self.leases.get(lease).map(|record| record.held.iter().filter(|(held, _)| *held == slot));
                 let listed = listed.map(|amounts| amounts.map(|(_, amount)| *amount).sum());
                 ensure(listed == Some(*amount), || format!("{id}: {lease} holds {amount} of it and lists {listed:?}"))?;
@@ -45,6 +48,14 @@ impl Pool {
             for slot in record.slots() {
                 let holds = self.resources.get(slot).is_some_and(|r| r.holders.iter().any(|(lease, _)| lease == id));
                 ensure(holds, || format!("{id} lists {slot}, which it does not hold"))?;
+            }
+        }
+        for (id, ending) in &self.ending {
+            ensure(!self.leases.contains_key(id), || format!("{id} has ended and lives"))?;
+            ensure(!ending.slots.is_empty(), || format!("{id} has left nothing and is kept"))?;
+            for slot in ending.slots.keys() {
+                let held = self.resources.get(*slot).is_some_and(|r| r.holders.iter().any(|(lease, _)| lease == id));
+                ensure(held, || format!("{id} has left something of {slot}, which does not know it"))?;
             }
         }
         ensure(tokens <= self.last_token, || "a token is ahead of the counter".to_owned())?;
@@ -84,7 +95,11 @@ impl Pool {
         let sessions = self.sessions.iter().map(|(id, session)| (session.expires, Timer::Session(id.clone())));
         let waiters = self.queue.iter().filter_map(|(id, w)| Some((w.request.deadline?, Timer::Waiter(id))));
         let leases = self.leases.iter().filter_map(|(id, lease)| Some((lease.expires?, Timer::Lease(*id))));
-        sessions.chain(waiters).chain(leases).collect()
+        let ending = self
+            .ending
+            .iter()
+            .flat_map(|(id, ending)| ending.slots.iter().map(|(slot, bound)| (bound.0, Timer::Standstill(*id, *slot))));
+        sessions.chain(waiters).chain(leases).chain(ending).collect()
     }
 }
 

@@ -1,7 +1,8 @@
-//! Live leases.
+//! Live leases, and those that have ended while something may still move for them.
 
+use crate::event::EndReason;
 use crate::id::{SessionId, Slot};
-use crate::resource::Holding;
+use crate::resource::{EndingUnits, Holding};
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::Quantity;
 use ratn_model::time::Timestamp;
@@ -12,6 +13,36 @@ use std::time::Duration;
 
 /// By id.
 pub(crate) type Leases = BTreeMap<LeaseId, LeaseRecord>;
+
+/// By id; none of them lives.
+pub(crate) type EndingLeases = BTreeMap<LeaseId, EndingLease>;
+
+/// What is left of a lease that has ended: units whose providers have not confirmed standstill.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct EndingLease {
+    pub(crate) token: FencingToken,
+    pub(crate) session: SessionId,
+    pub(crate) reason: EndReason,
+    /// Which resources, and when their units are free at the latest; counted anew after a restart.
+    pub(crate) slots: BTreeMap<Slot, Bound>,
+}
+
+/// When units are free whatever the provider says; of no interest to another process.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Bound(#[serde(skip)] pub(crate) Timestamp);
+
+impl EndingLease {
+    pub(crate) fn without_bounds(&self) -> EndingLease {
+        let slots = self.slots.keys().map(|slot| (*slot, Bound::default())).collect();
+        EndingLease { slots, ..self.clone() }
+    }
+
+    pub(crate) fn view(&self, lease: LeaseId, slot: Slot, units: Quantity, now: Timestamp) -> EndingUnits {
+        let until = self.slots.get(&slot).map_or(now, |bound| bound.0);
+        let within = Duration::from_nanos(until.0.saturating_sub(now.0));
+        EndingUnits { lease, token: self.token, session: self.session.clone(), units, within }
+    }
+}
 
 /// A live lease. The resources know it too (as a holder), so that what is free is found without looking at every lease.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -7,6 +7,9 @@
 //!      │ no keep alive for its TTL                      └─────▶ refused (deadline, cancelled, session gone)
 //!      └▶ its resources vanish, its leases end, its waiters leave, its consumption returns
 //!
+//!   a lease that ends otherwise than by its holder's release leaves units whose provider has to stop something:
+//!   leased ──▶ ending ──▶ free (its provider confirmed standstill, or its bound has passed)
+//!
 //!   call ──▶ Pool decides ──▶ Record ──▶ apply (the only thing that changes what is durable) ──▶ events
 //!                                └──▶ log ──▶ restore: the same apply
 //! ```
@@ -76,6 +79,9 @@ pub use ratn_model::resource::Quantity;
 pub use ratn_model::versioned::DecodeError;
 pub use record::{FORMAT, OLDEST_FORMAT, Record, decode, encode};
 pub use request::{Reply, Request};
-pub use resource::{Attributes, Description, ENDPOINT_ATTRIBUTE, Holding, ResourceSpec, ResourceView};
+pub use resource::{
+    Attributes, Description, ENDPOINT_ATTRIBUTE, EndingUnits, Holding, LONGEST_STANDSTILL_MS, ResourceSpec,
+    ResourceView, STANDSTILL_ATTRIBUTE,
+};
 pub use session::{SessionView, Speaker};
 pub use snapshot::{RestoreError, Snapshot};

@@ -27,7 +27,7 @@ pub struct Limits {
     /// (0) is the default: the most urgent request is not made later by less urgent ones, and units may be idle until the rest
     /// of what it waits for comes. A larger number uses them meanwhile.
     pub overtaken: u32,
-    /// Live leases in all.
+    /// Leases in all: those that live, and those that have ended while a provider has not confirmed standstill.
     pub leases: usize,
     /// Requirements of one acquire.
     pub requirements: usize,

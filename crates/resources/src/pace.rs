@@ -40,7 +40,7 @@ impl Pace {
 impl Pool {
     /// Whether one more lease may be granted now.
     pub(crate) fn may_grant(&self) -> bool {
-        self.leases.len() < self.limits.leases && !self.is_ahead_of_time()
+        self.leases.len() + self.ending.len() < self.limits.leases && !self.is_ahead_of_time()
     }
 
     /// Whether the next token would be ahead of the time.

@@ -8,14 +8,14 @@ use crate::fingerprint::Fingerprint;
 use crate::history::{Compacted, History};
 use crate::id::{SessionId, Slot, WaiterId};
 use crate::kinds::Kinds;
-use crate::lease::{LeaseView, Leases};
+use crate::lease::{EndingLeases, LeaseView, Leases};
 use crate::limits::Limits;
 use crate::memory::{Recalled, Remembered, RequestMemory};
 use crate::pace::Pace;
 use crate::queue::{AcquireRequest, Queue};
 use crate::record::{Effect, Record};
 use crate::request::{Reply, Request};
-use crate::resource::ResourceView;
+use crate::resource::{Resource, ResourceView};
 use crate::resources::Resources;
 use crate::session::Sessions;
 use ratn_model::id::{LeaseId, Revision};
@@ -34,6 +34,8 @@ pub struct Pool {
     pub(crate) resources: Resources,
     pub(crate) sessions: Sessions,
     pub(crate) leases: Leases,
+    /// What leases that have ended have left.
+    pub(crate) ending: EndingLeases,
     pub(crate) memory: RequestMemory,
     pub(crate) revision: Revision,
     pub(crate) last_lease: u64,
@@ -159,17 +161,21 @@ impl Pool {
     /// One resource.
     pub fn get(&self, id: &str) -> Option<ResourceView> {
         let slot = self.resources.find(id)?;
-        self.resources.get(slot).map(|resource| resource.view(&self.leases))
+        self.resources.get(slot).map(|resource| resource.view(slot, &self.leases, &self.ending, self.now))
     }
 
     /// Every resource, in the order of ids.
     pub fn list(&self) -> Vec<ResourceView> {
-        self.resources.iter().map(|(_, resource)| resource.view(&self.leases)).collect()
+        self.resources.iter().map(|one| self.view_of(one)).collect()
     }
 
     /// At most so many resources behind an id, in the order of ids; from the first one behind the empty id.
     pub fn list_after(&self, id: &str, most: usize) -> Vec<ResourceView> {
-        self.resources.after(id).take(most).map(|resource| resource.view(&self.leases)).collect()
+        self.resources.after(id).take(most).map(|one| self.view_of(one)).collect()
+    }
+
+    fn view_of(&self, (slot, resource): (Slot, &Resource)) -> ResourceView {
+        resource.view(slot, &self.leases, &self.ending, self.now)
     }
 
     /// Every live lease, in the order of ids.
@@ -268,6 +274,10 @@ impl Pool {
             Request::Consume { session, requirement } => Reply::Touched(self.consume(now, &session, &requirement)?),
             Request::Acquire(request) => Reply::Queued(self.enqueue(request, id, print)?),
             Request::Release { session, lease } => self.release(now, session.as_ref(), lease).map(|()| Reply::Done)?,
+            Request::ConfirmStandstill { session, lease, resource } => {
+                let freed = self.confirm_standstill(now, session.as_ref(), lease, &resource)?;
+                Reply::Touched(freed.then_some(resource).into_iter().collect())
+            }
             Request::EndTask { session } => self.end_task(now, &session).map(|()| Reply::Done)?,
         })
     }

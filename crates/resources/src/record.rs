@@ -20,8 +20,8 @@ use std::time::Duration;
 
 /// The version that [`encode`] writes, its first byte. Every new variant at the end takes a new number, so that an older program
 /// refuses what it does not know by its version; records since [`OLDEST_FORMAT`] are read as they are.
-pub const FORMAT: u8 = 4;
-/// The oldest version that [`decode`] reads: it has no [`Effect::SessionOpened`].
+pub const FORMAT: u8 = 5;
+/// The oldest version that [`decode`] reads: it has no [`Effect::SessionOpened`], as none before this one has [`Effect::UnitsFreed`].
 pub const OLDEST_FORMAT: u8 = 2;
 /// The newest version whose fingerprints are of how requests were written then, which says nothing to a later one.
 const BYTE_FINGERPRINTS: u8 = 3;
@@ -56,6 +56,8 @@ pub(crate) enum Effect {
     Returned { session: SessionId, slot: Slot, amount: Quantity },
     /// A session is new.
     SessionOpened { session: SessionId, client: String, ttl: Duration, opened_by: Arc<str> },
+    /// What a lease that has ended had left of a resource is free: standstill was confirmed, or its bound has passed.
+    UnitsFreed { lease: LeaseId, slot: Slot, confirmed: bool },
 }
 
 /// What its bytes are, in messages.

@@ -52,15 +52,25 @@ pub enum Request {
         /// Whose.
         session: SessionId,
     },
+    /// See [`crate::Pool::confirm_standstill`].
+    ConfirmStandstill {
+        /// Whose resource it is; `None` may confirm for any provider.
+        session: Option<SessionId>,
+        /// The lease that has ended.
+        lease: LeaseId,
+        /// The resource's id.
+        resource: String,
+    },
 }
 
 impl Request {
     /// The session that it is made for; without one it is an operator's.
     pub fn session(&self) -> Option<&SessionId> {
         match self {
-            Request::Create { session, .. } | Request::Delete { session, .. } | Request::Release { session, .. } => {
-                session.as_ref()
-            }
+            Request::Create { session, .. }
+            | Request::Delete { session, .. }
+            | Request::Release { session, .. }
+            | Request::ConfirmStandstill { session, .. } => session.as_ref(),
             Request::DeleteUnits { session, .. } | Request::Consume { session, .. } | Request::EndTask { session } => {
                 Some(session)
             }
@@ -84,7 +94,8 @@ pub enum Reply {
     Queued(WaiterId),
     /// To an acquire repeated after it was granted.
     Granted(Lease),
-    /// To a consume or a delete of units: the ids of the resources touched.
+    /// To a consume or a delete of units: the ids of the resources touched. To a confirmation of standstill: the resource, if units
+    /// of it became free by it.
     Touched(Vec<String>),
     /// To the rest.
     Done,

@@ -1,19 +1,29 @@
 //! A resource: its description, who has how much of it, and therefore what is free.
 
 use crate::id::{SessionId, Slot};
-use crate::lease::Leases;
+use crate::lease::{EndingLeases, Leases};
 use ratn_model::condition::Condition;
 use ratn_model::id::{FencingToken, LeaseId, Revision};
 use ratn_model::resource::{LeasedResource, Quantity, Requirement, ResourceClass};
+use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::ops::Deref;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// The attribute that says where a resource's action service is.
 pub const ENDPOINT_ATTRIBUTE: &str = "endpoint";
+
+/// The attribute by which a provider asks for time to stop what moves, in whole milliseconds: when a lease of the resource ends
+/// otherwise than by its holder's release, its units stay taken until the provider has confirmed standstill
+/// ([`crate::Pool::confirm_standstill`]), and no longer than this. Without it, or with 0, they are free at once.
+pub const STANDSTILL_ATTRIBUTE: &str = "standstill_ms";
+
+/// The longest [`STANDSTILL_ATTRIBUTE`], in milliseconds.
+pub const LONGEST_STANDSTILL_MS: u64 = 60_000;
 
 /// What a create asks for.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -74,6 +84,8 @@ pub struct ResourceView {
     pub owner: Option<SessionId>,
     /// Who holds some of it now, in the order of leases.
     pub holdings: Vec<Holding>,
+    /// What is neither held nor free yet, in the order of leases.
+    pub ending: Vec<EndingUnits>,
     /// The pool's revision when it was created or updated.
     pub revision: Revision,
 }
@@ -95,13 +107,29 @@ pub struct Holding {
     pub purpose: Arc<str>,
 }
 
-/// A resource in the pool. `holders` is what the live leases hold of it, and there is no other count of what is taken.
+/// An amount of a resource whose lease has ended, while something may still move for it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EndingUnits {
+    /// The lease that has ended.
+    pub lease: LeaseId,
+    /// Its fencing token.
+    pub token: FencingToken,
+    /// Whose lease it was.
+    pub session: SessionId,
+    /// How much.
+    pub units: Quantity,
+    /// They are free after this time, whatever the provider says until then.
+    pub within: Duration,
+}
+
+/// A resource in the pool. `holders` is what the live leases hold of it and what leases that end have left, and there is no other
+/// count of what is taken.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Resource {
     pub(crate) description: Arc<Description>,
     pub(crate) owner: Option<SessionId>,
     pub(crate) revision: Revision,
-    /// In the order of leases.
+    /// In the order of leases, those that end included.
     pub(crate) holders: Vec<(LeaseId, Quantity)>,
     /// What sessions have consumed of it until their task ends, in the order of sessions.
     pub(crate) consumers: Vec<(SessionId, Quantity)>,
@@ -136,6 +164,13 @@ impl ResourceSpec {
     pub fn capacity(mut self, capacity: impl Into<Quantity>) -> ResourceSpec {
         self.capacity = capacity.into();
         self
+    }
+
+    /// Whose provider needs up to this time to stop what moves, in whole milliseconds.
+    #[must_use]
+    pub fn standstill(self, bound: Duration) -> ResourceSpec {
+        let bound = i64::try_from(bound.as_millis()).unwrap_or(i64::MAX);
+        self.attribute(STANDSTILL_ATTRIBUTE, Value::Int(bound))
     }
 
     /// Of which parts of a unit can be had.
@@ -218,6 +253,14 @@ impl Description {
         self.attributes.get(name).map(Cow::Borrowed).or_else(host)
     }
 
+    /// How long its units stay taken after a lease has ended, unless its provider confirms standstill.
+    pub(crate) fn standstill(&self) -> Duration {
+        match self.attributes.get(STANDSTILL_ATTRIBUTE) {
+            Some(Value::Int(bound)) => Duration::from_millis(u64::try_from(*bound).unwrap_or_default()),
+            _ => Duration::ZERO,
+        }
+    }
+
     pub(crate) fn leased(&self, superclasses: &[String]) -> LeasedResource {
         let endpoint = match self.attributes.get(ENDPOINT_ATTRIBUTE) {
             Some(Value::String(endpoint)) => endpoint.clone(),
@@ -251,7 +294,7 @@ impl Resource {
         self.quantity().saturating_sub(self.held())
     }
 
-    pub(crate) fn view(&self, leases: &Leases) -> ResourceView {
+    pub(crate) fn view(&self, slot: Slot, leases: &Leases, ending: &EndingLeases, now: Timestamp) -> ResourceView {
         ResourceView {
             description: self.description.clone(),
             free: self.free(),
@@ -261,6 +304,11 @@ impl Resource {
                 .holders
                 .iter()
                 .filter_map(|(id, units)| leases.get(id).map(|lease| lease.holding(*id, *units)))
+                .collect(),
+            ending: self
+                .holders
+                .iter()
+                .filter_map(|(id, units)| ending.get(id).map(|lease| lease.view(*id, slot, *units, now)))
                 .collect(),
             revision: self.revision,
         }

@@ -132,9 +132,9 @@ impl Resources {
     }
 
     /// Those behind an id, in the order of ids.
-    pub(crate) fn after<'a>(&'a self, id: &'a str) -> impl Iterator<Item = &'a Resource> + 'a {
+    pub(crate) fn after<'a>(&'a self, id: &'a str) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
         let behind = (Bound::Excluded(id), Bound::Unbounded);
-        self.by_id.range::<str, _>(behind).filter_map(|(_, slot)| self.get(*slot))
+        self.by_id.range::<str, _>(behind).filter_map(|(_, slot)| self.get(*slot).map(|resource| (*slot, resource)))
     }
 
     pub(crate) fn has_kind(&self, kind: &str) -> bool {

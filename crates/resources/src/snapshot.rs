@@ -8,7 +8,7 @@
 use crate::expiry::Timer;
 use crate::fingerprint::Fingerprint;
 use crate::id::{SessionId, Slot};
-use crate::lease::LeaseRecord;
+use crate::lease::{Bound, EndingLease, LeaseRecord};
 use crate::limits::Limits;
 use crate::memory::Remembered;
 use crate::pool::Pool;
@@ -23,7 +23,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The version without openers of sessions.
+/// The last version without leases that end, and the one without openers of sessions.
+const WITHOUT_ENDING: u8 = 4;
 const WITHOUT_OPENERS: u8 = 2;
 /// What it is, in messages.
 const SNAPSHOT: &str = "snapshot of a resource pool";
@@ -42,6 +43,8 @@ pub struct Snapshot {
     answers: Vec<(String, Fingerprint, Remembered)>,
     /// Who opened which session; of one that is not here nobody knows.
     openers: Vec<(SessionId, Arc<str>)>,
+    /// What leases that have ended have left.
+    ending: Vec<(LeaseId, EndingLease)>,
 }
 
 /// A snapshot or a record that does not fit: the log has a gap, or is of another pool.
@@ -80,8 +83,9 @@ impl Snapshot {
     pub fn decode(bytes: &[u8]) -> Result<Snapshot, DecodeError> {
         let version = versioned::version(OLDEST_FORMAT, FORMAT, SNAPSHOT, bytes)?;
         let mut snapshot: Snapshot = match version {
-            // An empty list, as postcard writes it.
-            WITHOUT_OPENERS => versioned::decode(version, SNAPSHOT, &[bytes, &[0]].concat())?,
+            // An empty list for each that is missing, as postcard writes it.
+            WITHOUT_OPENERS => versioned::decode(version, SNAPSHOT, &[bytes, &[0, 0]].concat())?,
+            ..=WITHOUT_ENDING => versioned::decode(version, SNAPSHOT, &[bytes, &[0]].concat())?,
             _ => versioned::decode(version, SNAPSHOT, bytes)?,
         };
         if !knows_fingerprints(version) {
@@ -113,11 +117,13 @@ impl Pool {
                 .collect(),
             answers: self.memory.iter().map(|(id, print, reply)| (id.clone(), print, reply.clone())).collect(),
             openers: self.sessions.iter().map(|(id, session)| (id.clone(), session.opened_by.clone())).collect(),
+            ending: self.ending.iter().map(|(id, ending)| (*id, ending.without_bounds())).collect(),
         }
     }
 
     /// The pool of a snapshot (`None`: an empty one) and the records since, at `now` of a clock that need not be that of
-    /// before. Every session and every lease with a time of its own has that time once more; the queue is empty.
+    /// before. Every session and every lease with a time of its own has that time once more, as has every provider that is to confirm standstill; the queue is
+    /// empty.
     ///
     /// # Errors
     /// A snapshot or a record that does not fit.
@@ -174,6 +180,14 @@ impl Pool {
             session.leases.insert(id);
             lease.opened_by = session.opened_by.clone();
             self.leases.insert(id, lease);
+        }
+        for (id, mut ending) in snapshot.ending {
+            for (slot, bound) in &mut ending.slots {
+                let resource = self.resources.get(*slot).ok_or_else(|| format!("{slot} is empty"))?;
+                *bound = Bound(self.now + resource.description.standstill());
+                self.timers.insert((bound.0, Timer::Standstill(id, *slot)));
+            }
+            self.ending.insert(id, ending);
         }
         for (id, fingerprint, reply) in snapshot.answers {
             self.memory.remember(id, fingerprint, reply, 0, self.now);

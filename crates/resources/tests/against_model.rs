@@ -1,6 +1,7 @@
 //! Random histories: the pool does what a tiny obvious model does, grant by grant, and keeps its invariants, also over crashes
 //! after which it is restored from what it wrote down.
 //!
+//! What a lease of an arm has left when it was lost is nobody's until its provider confirms standstill or the bound has passed.
 //! What is held, free and there is compared from outside besides: no unit has two holders, what there is is what was created
 //! without what was consumed and deleted, a lease has all that was asked for, tokens grow, nobody who can be served waits, and a
 //! large request is overtaken as often as allowed and no more.
@@ -22,6 +23,9 @@ const KINDS: [&str; 4] = ["Arm", "Camera", "PathPlanner", "Charge"];
 const CHARGE: usize = 3;
 const SESSIONS: usize = 3;
 const TTL: u64 = 20;
+/// The provider of arms confirms standstill within this.
+const STANDSTILL: u64 = 6;
+const ARM: usize = 0;
 /// So many may wait, in all and of one session; who need not wait is not refused for it.
 const WAITERS: usize = 5;
 const WAITERS_OF_ONE: usize = 3;
@@ -40,6 +44,8 @@ enum Step {
         patience: Option<u64>,
     },
     Release(usize),
+    Revoke(usize),
+    ConfirmStandstill(usize),
     Cancel(usize),
     EndTask(usize),
     /// Restored from the snapshot of an earlier moment and the records since; the records of the last step may be lost.
@@ -63,11 +69,18 @@ fn step() -> impl Strategy<Value = Step> {
         1 => (0..KINDS.len()).prop_map(Step::DeleteUnit),
         8 => acquire,
         5 => (0..16usize).prop_map(Step::Release),
+        1 => (0..16usize).prop_map(Step::Revoke),
+        1 => (0..16usize).prop_map(Step::ConfirmStandstill),
         1 => (0..16usize).prop_map(Step::Cancel),
         1 => (0..SESSIONS).prop_map(Step::EndTask),
         2 => (any::<prop::sample::Index>(), any::<bool>())
             .prop_map(|(snapshot, last_is_lost)| Step::Crash { snapshot, last_is_lost }),
     ]
+}
+
+/// Times of the model are milliseconds.
+fn moment(time: u64) -> Timestamp {
+    Timestamp(time * 1_000_000)
 }
 
 /// Thousandths of a unit.
@@ -97,6 +110,8 @@ struct Model {
     capacity: Units,
     expires: [Option<u64>; SESSIONS],
     leases: BTreeMap<LeaseId, (usize, Units)>,
+    /// How many arms leases have left when they ended, and until when those are not free.
+    ending: BTreeMap<LeaseId, (u64, u64)>,
     consumed: [Units; SESSIONS],
     spent: Units,
     queue: Vec<ModelWaiter>,
@@ -108,18 +123,35 @@ impl Model {
     fn restart(&mut self, now: u64) {
         self.queue.clear();
         self.expires.iter_mut().flatten().for_each(|expires| *expires = now + TTL);
+        self.ending.values_mut().for_each(|(_, until)| *until = now + STANDSTILL);
     }
 
     fn advance(&mut self, now: u64) {
         self.queue.retain(|waiter| waiter.deadline.is_none_or(|deadline| deadline > now));
+        self.ending.retain(|_, (_, until)| *until > now);
         for session in 0..SESSIONS {
             if self.expires[session].is_some_and(|at| at <= now) {
                 self.expires[session] = None;
                 self.consumed[session] = Units::default();
-                self.leases.retain(|_, (owner, _)| *owner != session);
+                let lost: Vec<LeaseId> =
+                    self.leases.iter().filter(|(_, (owner, _))| *owner == session).map(|(id, _)| *id).collect();
+                lost.into_iter().for_each(|lease| self.revoke(lease, now));
                 self.queue.retain(|waiter| waiter.session != session);
             }
         }
+    }
+
+    /// Ends a lease; its arms may still move.
+    fn revoke(&mut self, lease: LeaseId, now: u64) {
+        let arms = self.leases.remove(&lease).map_or(0, |(_, units)| units[ARM]);
+        if arms > 0 {
+            self.ending.insert(lease, (arms, now + STANDSTILL));
+        }
+    }
+
+    /// What leases that have ended have left.
+    fn ending(&self, kind: usize) -> u64 {
+        if kind == ARM { self.ending.values().map(|(arms, _)| arms).sum() } else { 0 }
     }
 
     fn quantity(&self, kind: usize) -> u64 {
@@ -127,7 +159,7 @@ impl Model {
     }
 
     fn free(&self, kind: usize) -> u64 {
-        self.quantity(kind) - self.leases.values().map(|(_, units)| units[kind]).sum::<u64>()
+        self.quantity(kind) - self.leases.values().map(|(_, units)| units[kind]).sum::<u64>() - self.ending(kind)
     }
 
     /// Who should be granted now, in order; `ids` are the lease ids that the pool gave them.
@@ -211,10 +243,10 @@ proptest! {
         let names: Vec<SessionId> = ["a", "b", "c"].map(SessionId::from).to_vec();
         let mut now = 0;
         for step in steps {
-            if let Step::Wait(seconds) = step {
-                now += seconds;
+            if let Step::Wait(time) = step {
+                now += time;
             }
-            let at = Timestamp(now);
+            let at = moment(now);
             if let Step::Crash { snapshot, last_is_lost } = step {
                 let last_is_lost = last_is_lost && !kept.entries.is_empty();
                 kept.crash(at, snapshot, last_is_lost);
@@ -241,7 +273,7 @@ proptest! {
             match step {
                 Step::Wait(_) | Step::Crash { .. } => {}
                 Step::KeepAlive(session) => {
-                    let created = pool.keep_alive(at, &names[session], "test", Duration::from_nanos(TTL)).unwrap();
+                    let created = pool.keep_alive(at, &names[session], "test", Duration::from_millis(TTL)).unwrap();
                     prop_assert_eq!(created, model.expires[session].is_none());
                     model.expires[session] = Some(now + TTL);
                 }
@@ -249,6 +281,7 @@ proptest! {
                     // Several resources of one kind count as their sum.
                     let spec = ResourceSpec::new(ResourceClass::Module, KINDS[kind]);
                     let spec = spec.capacity(Quantity::from_thousandths(capacity));
+                    let spec = if kind == ARM { spec.standstill(Duration::from_millis(STANDSTILL)) } else { spec };
                     let spec = if kind == CHARGE { spec.divisible().non_renewable() } else { spec };
                     pool.create(at, None, spec).unwrap();
                     model.capacity[kind] += capacity;
@@ -268,9 +301,9 @@ proptest! {
                         .map(|kind| requirement(operation, kind, units[kind]))
                         .collect();
                     let mut request = AcquireRequest::new(names[session].clone(), requirements).priority(priority);
-                    request.deadline = patience.map(|seconds| Timestamp(now + seconds));
+                    request.deadline = patience.map(|time| moment(now + time));
                     let result = pool.acquire(at, request);
-                    let deadline = patience.map(|seconds| now + seconds);
+                    let deadline = patience.map(|time| now + time);
                     // Behind all of its priority, as the pool numbers it.
                     let id = WaiterId(u64::MAX);
                     let waiter = ModelWaiter { id, session, units, consume, priority, deadline };
@@ -288,9 +321,29 @@ proptest! {
                     }
                 }
                 Step::Release(index) => {
+                    if let Some((lease, (session, _))) = model.leases.iter().nth(index).map(|(id, lease)| (*id, *lease)) {
+                        pool.release(at, Some(&names[session]), lease).unwrap();
+                        model.leases.remove(&lease);
+                    }
+                }
+                Step::Revoke(index) => {
                     if let Some(lease) = model.leases.keys().nth(index).copied() {
                         pool.release(at, None, lease).unwrap();
-                        model.leases.remove(&lease);
+                        model.revoke(lease, now);
+                    }
+                }
+                Step::ConfirmStandstill(index) => {
+                    // Of one that lives nothing is to be confirmed.
+                    for (lease, resource) in model.leases.keys().zip(pool.list()) {
+                        prop_assert!(!pool.confirm_standstill(at, None, *lease, &resource.id).unwrap());
+                    }
+                    if let Some(lease) = model.ending.keys().nth(index).copied() {
+                        let left = pool.list().into_iter().filter(|view| view.ending.iter().any(|ending| ending.lease == lease));
+                        for resource in left.collect::<Vec<_>>() {
+                            prop_assert!(pool.confirm_standstill(at, None, lease, &resource.id).unwrap());
+                            prop_assert!(!pool.confirm_standstill(at, None, lease, &resource.id).unwrap());
+                        }
+                        model.ending.remove(&lease);
                     }
                 }
                 Step::Cancel(index) => {
@@ -394,7 +447,8 @@ fn compare(pool: &mut Pool, model: &mut Model) -> Result<(), TestCaseError> {
         free[kind] += resource.free.thousandths();
         // No unit has two holders.
         let held: Quantity = resource.holdings.iter().map(|holding| holding.units).sum();
-        prop_assert_eq!(held + resource.consumed + resource.free, resource.capacity);
+        let ending: Quantity = resource.ending.iter().map(|ending| ending.units).sum();
+        prop_assert_eq!(held + ending + resource.consumed + resource.free, resource.capacity);
     }
     prop_assert_eq!(free, [0, 1, 2, 3].map(|kind| model.free(kind)));
     for kind in 0..4 {

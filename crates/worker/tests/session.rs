@@ -158,6 +158,13 @@ impl ResourceService for Manager {
         Err(Status::unimplemented("not under test"))
     }
 
+    async fn confirm_standstill(
+        &self,
+        _: Request<ratn_proto::v1::ConfirmStandstillRequest>,
+    ) -> Result<Response<ratn_proto::v1::ConfirmStandstillResponse>, Status> {
+        Err(Status::unimplemented("not asked for"))
+    }
+
     async fn report_shortage(
         &self,
         _: Request<ratn_proto::v1::ReportShortageRequest>,

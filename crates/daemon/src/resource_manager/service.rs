@@ -66,6 +66,7 @@ impl Service {
             PoolRequest::Delete { .. } | PoolRequest::DeleteUnits { .. } => "delete",
             PoolRequest::Release { .. } => "release",
             PoolRequest::EndTask { .. } => "end_task",
+            PoolRequest::ConfirmStandstill { .. } => "confirm_standstill",
             _ => "operate",
         };
         let pending = audit::begin(caller, &request_id, || mutation_of(&request));
@@ -278,6 +279,20 @@ impl v1::resource_service_server::ResourceService for Service {
             Err(status) => return Err(status),
         };
         Ok(Response::new(v1::ResourceServiceReleaseResponse { released, revision }))
+    }
+
+    async fn confirm_standstill(
+        &self,
+        request: Request<v1::ConfirmStandstillRequest>,
+    ) -> Result<Response<v1::ConfirmStandstillResponse>, Status> {
+        let (caller, request) = (Caller::of(&request), request.into_inner());
+        name(&request.resource_id, "resource_id")?;
+        let session = optional_session(&request.session_id)?;
+        let (lease, resource) = (LeaseId(request.lease_id), request.resource_id);
+        let confirm = PoolRequest::ConfirmStandstill { session, lease, resource };
+        let (reply, revision) = self.perform(&caller, request.request_id, confirm).await?;
+        let Reply::Touched(freed) = reply else { return Err(odd_reply(&reply)) };
+        Ok(Response::new(v1::ConfirmStandstillResponse { freed: !freed.is_empty(), revision }))
     }
 
     async fn exists(&self, request: Request<v1::ExistsRequest>) -> Result<Response<v1::ExistsResponse>, Status> {

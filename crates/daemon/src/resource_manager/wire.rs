@@ -3,7 +3,8 @@
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{
-    Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState, SessionStatus, WaitingAcquire,
+    EndingUnits, Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState, SessionStatus,
+    WaitingAcquire,
 };
 use ratn_proto::v1;
 use ratn_resources::{AcquireRequest, Change, Explanation, ResourceView, SessionView, WatchEvent};
@@ -25,6 +26,13 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
         holder: holding.purpose.to_string(),
         opened_by: holding.opened_by.to_string(),
     };
+    let ending = |ending: &ratn_resources::EndingUnits| EndingUnits {
+        lease: ending.lease,
+        token: ending.token,
+        units: ending.units,
+        session: ending.session.as_str().to_owned(),
+        within_ms: milliseconds(ending.within),
+    };
     let description = &view.description;
     Resource {
         id: description.id.clone(),
@@ -40,6 +48,7 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
         state,
         free: view.free,
         holdings: view.holdings.iter().cloned().map(holding).collect(),
+        ending: view.ending.iter().map(ending).collect(),
     }
 }
 
@@ -74,6 +83,10 @@ pub(super) fn events(event: &WatchEvent) -> Vec<ResourceEvent> {
         Change::LeaseEnded { lease, token, resources, reason, .. } => {
             each(Released, resources, Some((*lease, *token)), &reason.to_string())
         }
+        Change::UnitsFreed { lease, token, resource, confirmed } => {
+            let why = if *confirmed { "standstill confirmed" } else { "standstill not confirmed within its bound" };
+            vec![of(0, Updated, resource, Some((*lease, *token)), why.to_owned())]
+        }
     }
 }
 
@@ -91,7 +104,6 @@ pub(super) fn passes(view: &ResourceView, filter: &ResourceFilter) -> bool {
 const NAMED: usize = 1_000;
 
 pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
-    let milliseconds = |time: Duration| u64::try_from(time.as_millis()).unwrap_or(u64::MAX);
     SessionStatus {
         id: view.id.as_str().to_owned(),
         client: view.name,
@@ -102,6 +114,10 @@ pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
         resources: view.provides.into_iter().take(NAMED).collect(),
         opened_by: view.opened_by.to_string(),
     }
+}
+
+fn milliseconds(time: Duration) -> u64 {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
 pub(super) fn waiting(request_id: &str, request: &AcquireRequest, why: &Explanation) -> WaitingAcquire {

@@ -2,8 +2,8 @@
 
 use super::{Malformed, all, each, label, missing_choice, name, names, ports, required, wire_ports};
 use crate::types::{
-    Demand, Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState, ResourceUpdate,
-    SessionStatus, WaitingAcquire,
+    Demand, EndingUnits, Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState,
+    ResourceUpdate, SessionStatus, WaitingAcquire,
 };
 use crate::v1;
 use ratn_model::condition::{Comparison, Condition};
@@ -248,6 +248,33 @@ impl TryFrom<v1::Holding> for Holding {
     }
 }
 
+impl From<EndingUnits> for v1::EndingUnits {
+    fn from(ending: EndingUnits) -> v1::EndingUnits {
+        v1::EndingUnits {
+            lease_id: ending.lease.0,
+            token: ending.token.0,
+            units: ending.units.into(),
+            session_id: ending.session,
+            within_ms: ending.within_ms,
+        }
+    }
+}
+
+impl TryFrom<v1::EndingUnits> for EndingUnits {
+    type Error = Malformed;
+
+    fn try_from(ending: v1::EndingUnits) -> Result<EndingUnits, Malformed> {
+        label(&ending.session_id, "session_id")?;
+        Ok(EndingUnits {
+            lease: LeaseId(ending.lease_id),
+            token: FencingToken(ending.token),
+            units: amount(ending.units, "units")?,
+            session: ending.session_id,
+            within_ms: ending.within_ms,
+        })
+    }
+}
+
 impl From<Resource> for v1::Resource {
     fn from(resource: Resource) -> v1::Resource {
         let state = match resource.state {
@@ -269,6 +296,7 @@ impl From<Resource> for v1::Resource {
             state: state.into(),
             free: resource.free.into(),
             holdings: all(resource.holdings),
+            ending: all(resource.ending),
         }
     }
 }
@@ -301,6 +329,7 @@ impl TryFrom<v1::Resource> for Resource {
             state,
             free: amount(resource.free, "free")?,
             holdings: each(resource.holdings, "holdings")?,
+            ending: each(resource.ending, "ending")?,
         })
     }
 }
@@ -344,7 +373,7 @@ impl TryFrom<v1::ResourceEvent> for ResourceEvent {
             revision: Revision(event.revision),
             kind,
             resource: required(event.resource, "resource")?,
-            lease: matches!(kind, ResourceEventKind::Leased | ResourceEventKind::Released)
+            lease: (event.lease_id != 0 || matches!(kind, ResourceEventKind::Leased | ResourceEventKind::Released))
                 .then_some((LeaseId(event.lease_id), FencingToken(event.token))),
             reason: event.reason,
             part: event.part,

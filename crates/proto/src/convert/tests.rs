@@ -176,6 +176,13 @@ fn resource() -> impl Strategy<Value = Resource> {
             state,
             holdings,
             session: "s".to_owned(),
+            ending: vec![EndingUnits {
+                lease: LeaseId(capacity.thousandths()),
+                token: FencingToken(1),
+                units: capacity,
+                session: "t".to_owned(),
+                within_ms: 7,
+            }],
             revision: Revision(capacity.thousandths()),
             ..Resource::new(id, class, kind).on_host("here")
         })

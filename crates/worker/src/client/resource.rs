@@ -228,6 +228,23 @@ impl ResourceClient {
         }
     }
 
+    /// Says, as the provider of a resource, that nothing moves any more for a lease that has ended; false when the lease had left nothing
+    /// of it.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn confirm_standstill(&self, lease: LeaseId, resource: &str) -> Result<bool, CallError> {
+        let question = v1::ConfirmStandstillRequest {
+            // Another confirmation of the same changes nothing.
+            request_id: String::new(),
+            session_id: self.session.clone(),
+            lease_id: lease.0,
+            resource_id: resource.to_owned(),
+        };
+        let answer = self.client.clone().confirm_standstill(question).await.map_err(|status| self.failed(&status))?;
+        Ok(answer.into_inner().freed)
+    }
+
     /// Whether what is required is there, blocked or not.
     ///
     /// # Errors

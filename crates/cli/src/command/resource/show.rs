@@ -45,6 +45,11 @@ pub(super) fn in_full(resource: &Resource) -> String {
             format!("{} units, token {}, by {} ({})", holding.units, holding.token.0, holding.holder, holding.session);
         [format!("lease {}", holding.lease.0), what]
     }));
+    rows.extend(resource.ending.iter().map(|ending| {
+        let provider = if resource.session.is_empty() { "an operator" } else { &resource.session };
+        let what = format!("ending: {} units wait for {provider} up to {} ms", ending.units, ending.within_ms);
+        [format!("lease {}", ending.lease.0), what]
+    }));
     aligned(&rows).join("\n")
 }
 
@@ -140,6 +145,12 @@ pub(super) fn resource_json(resource: &Resource) -> serde_json::Value {
             "session": holding.session, "holder": holding.holder,
         })
     });
+    let ending = resource.ending.iter().map(|ending| {
+        json!({
+            "lease": ending.lease.0, "token": ending.token.0, "units": ending.units, "session": ending.session,
+            "within_ms": ending.within_ms,
+        })
+    });
     let attributes: serde_json::Map<_, _> =
         resource.attributes.iter().map(|(name, value)| (name.clone(), plain(value))).collect();
     json!({
@@ -147,7 +158,7 @@ pub(super) fn resource_json(resource: &Resource) -> serde_json::Value {
         "state": state(resource.state), "free": resource.free, "capacity": resource.capacity,
         "divisible": resource.divisible, "renewable": resource.renewable,
         "session": resource.session, "revision": resource.revision.0, "attributes": attributes,
-        "holdings": holdings.collect::<Vec<_>>(),
+        "holdings": holdings.collect::<Vec<_>>(), "ending": ending.collect::<Vec<_>>(),
     })
 }
 
@@ -188,7 +199,9 @@ fn amounts(resource: &Resource) -> String {
 
 fn holders(resource: &Resource) -> String {
     let one = |holding: &ratn_proto::types::Holding| format!("{} (lease {})", holding.holder, holding.lease.0);
+    let ending = |ending: &ratn_proto::types::EndingUnits| format!("(lease {} is ending)", ending.lease.0);
     let mut holders: Vec<String> = resource.holdings.iter().map(one).collect();
+    holders.extend(resource.ending.iter().map(ending));
     if holders.is_empty() && resource.state == ResourceState::Exhausted {
         holders.push("(consumed)".to_owned());
     }
