@@ -58,6 +58,7 @@ fn record_of(path: &str) -> (&'static str, &'static str) {
         "ResourceService/Acquire" | "ResourceService/Block" => ("acquire", r#""session":"a""#),
         "ResourceService/Withdraw" => ("withdraw", r#""session":"a""#),
         "ResourceService/Release" => ("release", r#""lease":"#),
+        "ResourceService/ConfirmStandstill" => ("confirm_standstill", r#""resource":"a""#),
         "ResourceService/EndTask" => ("end_task", r#""session":"a""#),
         "ResourceService/ReportShortage" => ("report_shortage", r#""kind":"a""#),
         "WorldPoolService/Commit" => ("commit", r#""writer":"a""#),

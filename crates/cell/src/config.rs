@@ -68,6 +68,10 @@ pub struct CellConfig {
     pub speed: f64,
     /// How long the session with the resource manager outlives the last keep-alive, in milliseconds.
     pub session_ttl_ms: u64,
+    /// Where an emergency stop is kept, so that it outlasts the process; a folder that a reboot leaves alone. `state/cell` in the runtime
+    /// directory unless given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub state_dir: Option<PathBuf>,
     /// A new file to write down in what happens, so that `ratn cell --replay` goes through it again.
     pub record: Option<PathBuf>,
     /// What goes wrong: `grasp_slips:2` at the second grasp, `object_moved@12.5` at a time, `sensor_dropout~0.05` by chance.
@@ -335,6 +339,7 @@ impl Default for CellConfig {
             seed: 1,
             speed: 1.0,
             session_ttl_ms: 3000,
+            state_dir: None,
             record: None,
             faults: Vec::new(),
             controllers: ControllersConfig::default(),

@@ -20,6 +20,7 @@ use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::{SafetyClient, SafetyState};
 use ratn_worker::session::Session;
 use ratn_worker::worker::WorkerOptions;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
@@ -427,6 +428,40 @@ async fn a_motion_is_held_and_goes_on_and_an_emergency_stop_ends_it_also_for_a_c
     assert_eq!(driver.state().await.unwrap(), SafetyState::Stopped { reason: "a hand".to_owned() });
     assert_eq!(driver.clear().await.unwrap(), SafetyState::Ready);
     system.end.cancel();
+}
+
+/// A cell that serves without a resource manager; its driver's safety, and what ends it.
+async fn cell_alone(runtime: &Path, state_dir: Option<PathBuf>) -> (SafetyClient, CancellationToken) {
+    let (directory, end) = (RuntimeDirectory::create(runtime).unwrap(), CancellationToken::new());
+    tokio::spawn(ratn_cell::run(CellConfig { state_dir, ..CellConfig::default() }, directory.clone(), end.clone()));
+    let cell = directory.wait_for(ratn_cell::ROLE, DEADLINE).await.unwrap();
+    (SafetyClient::new(&Channels::new(), &cell).unwrap(), end)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stop_outlasts_a_reboot_which_leaves_nothing_of_the_runtime_directory() {
+    let [state, before, after] = [(); 3].map(|()| tempfile::tempdir().unwrap());
+    let state_dir = Some(state.path().join("cell"));
+    let (driver, end) = cell_alone(before.path(), state_dir.clone()).await;
+    driver.stop("a hand").await.unwrap();
+    end.cancel();
+    drop(before);
+    let (driver, end) = cell_alone(after.path(), state_dir).await;
+    assert_eq!(driver.state().await.unwrap(), SafetyState::Stopped { reason: "a hand".to_owned() });
+    assert_eq!(driver.clear().await.unwrap(), SafetyState::Ready);
+    end.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stop_that_an_earlier_version_kept_in_the_runtime_directory_is_taken_over() {
+    let [state, runtime] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    let earlier = runtime.path().join("cell.stopped");
+    std::fs::write(&earlier, "a hand").unwrap();
+    let (driver, end) = cell_alone(runtime.path(), Some(state.path().to_owned())).await;
+    assert_eq!(driver.state().await.unwrap(), SafetyState::Stopped { reason: "a hand".to_owned() });
+    assert_eq!(std::fs::read_to_string(state.path().join("stopped")).unwrap(), "a hand");
+    assert!(!earlier.exists());
+    end.cancel();
 }
 
 /// As [`System::execute`], with a lease that may be anything; refusals are statuses.

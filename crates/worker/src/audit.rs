@@ -32,6 +32,7 @@ pub enum Mutation {
     Acquire { session: String, requirements: Vec<String>, holder: String, priority: i64 },
     Withdraw { session: String },
     Release { session: String, lease: u64 },
+    ConfirmStandstill { session: String, lease: u64, resource: String },
     EndTask { session: String },
     ReportShortage { session: String, kind: String, most: u32, reason: String },
     // ----- world pool -----

@@ -30,8 +30,10 @@ use tokio_util::sync::CancellationToken;
 /// The role's name: of its endpoint file, its command and its section of a config.
 pub const ROLE: &str = "cell";
 
-/// In the runtime directory while an emergency stop is in force: a cell that is started again is still stopped.
-const STOPPED_FILE: &str = "cell.stopped";
+/// In the state directory while an emergency stop is in force: a cell that is started again, also after a reboot, is still stopped.
+const STOPPED_FILE: &str = "stopped";
+/// Where earlier versions had it, in the runtime directory.
+const EARLIER_STOPPED_FILE: &str = "cell.stopped";
 
 /// Serves until `shutdown` is cancelled. The modules' resources are there as soon as the resource manager is.
 ///
@@ -64,9 +66,7 @@ pub async fn run_as(
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let channels = Channels::new();
-    let stopped = directory.path().join(STOPPED_FILE);
-    let safety = Safety::kept_in(stopped.clone(), keeper.clone()).await;
-    let safety = safety.with_context(|| format!("cannot tell from {} whether it is stopped", stopped.display()))?;
+    let safety = safety(&config, &directory, &keeper).await?;
     let leases = actions::leases(&config);
     let server = actions::server(&keeper, &config, channels.clone(), safety.clone(), &leases);
     let services = Services::new()
@@ -86,4 +86,24 @@ pub async fn run_as(
     over.cancel();
     linked.await.context("the link to the resource manager")?;
     Ok(served?)
+}
+
+/// The safety of the cell, stopped where a stop was in force when the one before ended. Nothing has moved yet.
+async fn safety(config: &CellConfig, directory: &RuntimeDirectory, keeper: &keeper::Keeper) -> anyhow::Result<Safety> {
+    let state = config.state_dir.clone().unwrap_or_else(|| directory.path().join("state").join(ROLE));
+    let stopped = state.join(STOPPED_FILE);
+    let safety = Safety::kept_in(stopped.clone(), keeper.clone()).await;
+    let safety = safety.with_context(|| format!("cannot tell from {} whether it is stopped", stopped.display()))?;
+    let earlier = directory.path().join(EARLIER_STOPPED_FILE);
+    match std::fs::read_to_string(&earlier) {
+        Ok(reason) => {
+            safety.stop(&reason).await.context("the stop that an earlier version kept is not taken over")?;
+            std::fs::remove_file(&earlier).with_context(|| format!("cannot remove {}", earlier.display()))?;
+        }
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+        Err(error) => {
+            return Err(error).with_context(|| format!("cannot tell from {} whether it is stopped", earlier.display()));
+        }
+    }
+    Ok(safety)
 }

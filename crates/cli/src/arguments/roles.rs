@@ -45,6 +45,10 @@ pub(crate) struct CellArguments {
     /// What the cell is furnished for: boxes on a table, or tableware on a rack; as its config says unless given
     #[arg(long, value_name = "SCENE", value_parser = scene)]
     pub(crate) scene: Option<Setting>,
+    /// Where an emergency stop is kept, in a folder `cell`; the config's, $RATN_STATE_DIR, $STATE_DIRECTORY or `state` in the runtime
+    /// directory unless given
+    #[arg(long, value_name = "DIR")]
+    pub(crate) state_dir: Option<PathBuf>,
     /// Write down in a new file what happens, line by line
     #[arg(long, value_name = "FILE")]
     pub(crate) record: Option<PathBuf>,

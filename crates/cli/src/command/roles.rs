@@ -62,10 +62,14 @@ impl KeptRoleArguments {
     /// What the command line and the environment say of a role's state.
     fn apply(&self, role: &str, storage: &mut StorageConfig) {
         storage.durability = self.durability.unwrap_or(storage.durability);
-        let of_this_role = |directory: PathBuf| directory.join(role);
-        let elsewhere = || STATE_VARIABLES.iter().find_map(|name| variable(name)).map(of_this_role);
-        storage.directory = self.state_dir.clone().map(of_this_role).or(storage.directory.take()).or_else(elsewhere);
+        storage.directory = state_of(role, self.state_dir.as_deref(), storage.directory.take());
     }
+}
+
+/// Where a role keeps its state, as the command line, its config and the environment say, in this order.
+fn state_of(role: &str, argument: Option<&Path>, configured: Option<PathBuf>) -> Option<PathBuf> {
+    let elsewhere = || STATE_VARIABLES.iter().find_map(|name| variable(name)).map(|place| place.join(role));
+    argument.map(|place| place.join(role)).or(configured).or_else(elsewhere)
 }
 
 /// `ratn process-manager`
@@ -108,6 +112,7 @@ pub(super) fn cell(arguments: &CellArguments) -> Result<(), Failure> {
         let mut config = system.cell;
         config.scene = arguments.scene.unwrap_or(config.scene);
         config.faults.extend(&arguments.faults.fault);
+        config.state_dir = state_of(ratn_cell::ROLE, arguments.state_dir.as_deref(), config.state_dir.take());
         config.record = arguments.record.clone().or(config.record);
         config.listen = host.listen.unwrap_or(config.listen);
         ratn_cell::run_as(config, host.directory, host.serving, host.shutdown).await

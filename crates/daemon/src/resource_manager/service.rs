@@ -581,6 +581,9 @@ fn mutation_of(request: &PoolRequest) -> Mutation {
         PoolRequest::Delete { id, .. } => Mutation::Delete { session, target: id.clone() },
         PoolRequest::DeleteUnits { requirement, .. } => Mutation::Delete { session, target: requirement.to_string() },
         PoolRequest::Release { lease, .. } => Mutation::Release { session, lease: lease.0 },
+        PoolRequest::ConfirmStandstill { lease, resource, .. } => {
+            Mutation::ConfirmStandstill { session, lease: lease.0, resource: resource.clone() }
+        }
         PoolRequest::EndTask { .. } => Mutation::EndTask { session },
         PoolRequest::Acquire(acquire) => mutation_of_acquire(acquire),
     }

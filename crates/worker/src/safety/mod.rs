@@ -6,18 +6,21 @@
 //! ```
 //! A [`Safety`] is the state of one driver. Its [`Brakes`] make it true before anybody is told that it is; an
 //! [`crate::action::ActionServer`] that is given one ends every goal `stopped` while a stop is in force, and an action pauses itself
-//! with [`crate::action::GoalContext::while_held`]. A stop that is kept in a file outlasts the process. What it does not do: stop
+//! with [`crate::action::GoalContext::while_held`]. A stop that is kept in a file
+//! outlasts the process and a reboot. What it does not do: stop
 //! motors. An emergency stop of a real robot is a circuit; this is how its software learns of one, and asks for one.
 
+mod latch;
+
+use latch::Latch;
 use ratn_proto::convert::label;
 use ratn_proto::v1;
 use ratn_proto::v1::safety_service_client::SafetyServiceClient;
 use ratn_proto::v1::safety_service_server::{SafetyService, SafetyServiceServer};
 use serde::{Deserialize, Serialize};
 use std::fmt;
-use std::fs;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use tokio::sync::{Mutex, watch};
 use tonic::{Request, Response, Status};
@@ -72,10 +75,9 @@ impl Brakes for NoBrakes {
 pub struct Safety {
     state: Arc<watch::Sender<SafetyState>>,
     brakes: Arc<dyn Brakes>,
-    /// There while a stop is in force, with its reason.
-    kept: Option<Arc<Path>>,
-    /// One change at a time.
-    changing: Arc<Mutex<()>>,
+    latch: Option<Latch>,
+    /// One change at a time; whether a stop is on the disk, as far as that is asked for.
+    changing: Arc<Mutex<bool>>,
 }
 
 /// A state that could not be made so.
@@ -90,6 +92,9 @@ pub enum SafetyError {
     /// The brakes do not confirm.
     #[error("not confirmed, go and look: {0}")]
     Brakes(String),
+    /// The stop is in force, and a restart may forget it, or find one that is not.
+    #[error("the stop is in force, but not as it is on the disk, which a restart goes by: {0}")]
+    Latch(String),
 }
 
 impl Default for Safety {
@@ -102,29 +107,25 @@ impl Safety {
     /// Ready, with brakes.
     pub fn new(brakes: impl Brakes) -> Safety {
         let state = Arc::new(watch::Sender::new(SafetyState::Ready));
-        Safety { state, brakes: Arc::new(brakes), kept: None, changing: Arc::default() }
+        Safety { state, brakes: Arc::new(brakes), latch: None, changing: Arc::default() }
     }
 
-    /// As [`Safety::new`]; a stop is kept in `file`, and one that is there already is in force from the beginning.
+    /// As [`Safety::new`]; a stop is kept in `file`, and one that is there already is in force from the beginning. The file belongs
+    /// into a state directory: what is in a runtime directory is gone after a reboot.
     ///
     /// # Errors
-    /// Where the file is there and cannot be read, or where the brakes do not confirm.
+    /// Where the file is there and cannot be read, where its folder cannot be made, or where the brakes do not confirm.
     pub async fn kept_in(file: PathBuf, brakes: impl Brakes) -> io::Result<Safety> {
-        let safety = Safety { kept: Some(file.into()), ..Safety::new(brakes) };
-        if let Some(reason) = safety.kept_reason()? {
+        let latch = Latch::at(file)?;
+        let reason = latch.read()?;
+        let safety =
+            Safety { latch: Some(latch), changing: Arc::new(Mutex::new(reason.is_some())), ..Safety::new(brakes) };
+        if let Some(reason) = reason {
             safety.brakes.apply(&SafetyState::Stopped { reason: reason.clone() }).await.map_err(io::Error::other)?;
             tracing::warn!(reason, "an emergency stop from before is in force until it is cleared");
             safety.state.send_replace(SafetyState::Stopped { reason });
         }
         Ok(safety)
-    }
-
-    fn kept_reason(&self) -> io::Result<Option<String>> {
-        match self.kept.as_ref().map(fs::read_to_string) {
-            Some(Ok(reason)) => Ok(Some(reason)),
-            Some(Err(error)) if error.kind() != io::ErrorKind::NotFound => Err(error),
-            _ => Ok(None),
-        }
     }
 
     /// What is in force, and every change of it.
@@ -137,43 +138,52 @@ impl Safety {
         self.state.borrow().clone()
     }
 
-    /// Emergency stop, from whatever state. The state is `Stopped` afterwards also where the brakes do not confirm.
+    /// Emergency stop, from whatever state. Returns when nothing moves and the stop is on the disk, where it is kept. The state is
+    /// `Stopped` afterwards also where that is not confirmed.
     ///
     /// # Errors
-    /// [`SafetyError::Brakes`].
+    /// [`SafetyError::Brakes`], and [`SafetyError::Latch`]: asked for again, the stop is written again.
     pub async fn stop(&self, reason: &str) -> Result<SafetyState, SafetyError> {
-        let _one = self.changing.lock().await;
-        if let stopped @ SafetyState::Stopped { .. } = self.state() {
-            return Ok(stopped);
+        let mut on_disk = self.changing.lock().await;
+        if let SafetyState::Stopped { reason } = self.state() {
+            self.keep(&mut on_disk, &reason).await?;
+            return Ok(SafetyState::Stopped { reason });
         }
         let state = SafetyState::Stopped { reason: reason.to_owned() };
         tracing::warn!(reason, "emergency stop");
         let confirmed = self.brakes.apply(&state).await;
         self.state.send_replace(state.clone());
-        if let Some(file) = &self.kept
-            && let Err(error) = fs::write(file, reason)
-        {
-            tracing::error!(file = %file.display(), %error, "the stop is in force, and forgotten at a restart");
-        }
+        let kept = self.keep(&mut on_disk, reason).await;
         confirmed.map_err(SafetyError::Brakes)?;
-        Ok(state)
+        kept.map(|()| state)
+    }
+
+    /// Writes down that a stop is in force, unless that is on the disk already.
+    async fn keep(&self, on_disk: &mut bool, reason: &str) -> Result<(), SafetyError> {
+        if let Some(latch) = self.latch.as_ref().filter(|_| !*on_disk) {
+            latch.set(reason).await.map_err(|error| {
+                tracing::error!(error, "the stop is in force, and forgotten at a restart");
+                SafetyError::Latch(error)
+            })?;
+            *on_disk = true;
+        }
+        Ok(())
     }
 
     /// Ends an emergency stop. What was stopped does not go on.
     ///
     /// # Errors
-    /// [`SafetyError::Brakes`], also where the file that keeps the stop cannot be removed: it stays in force then.
+    /// [`SafetyError::Brakes`], and [`SafetyError::Latch`] where the file that keeps the stop cannot be removed: it stays in force then.
     pub async fn clear(&self) -> Result<SafetyState, SafetyError> {
-        let _one = self.changing.lock().await;
+        let mut on_disk = self.changing.lock().await;
         let state = self.state();
         if !matches!(state, SafetyState::Stopped { .. }) {
             return Ok(state);
         }
-        if let Some(file) = &self.kept
-            && let Err(error) = fs::remove_file(file)
-            && error.kind() != io::ErrorKind::NotFound
-        {
-            return Err(SafetyError::Brakes(format!("cannot remove {}: {error}", file.display())));
+        if let Some(latch) = &self.latch {
+            // Removed and not synced it may be there again, or not.
+            *on_disk = false;
+            latch.clear().await.map_err(SafetyError::Latch)?;
         }
         self.become_ready().await
     }
@@ -235,7 +245,7 @@ impl Safety {
 
 impl fmt::Debug for Safety {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Safety").field("state", &self.state()).field("kept", &self.kept).finish()
+        f.debug_struct("Safety").field("state", &self.state()).field("latch", &self.latch).finish()
     }
 }
 
@@ -284,7 +294,7 @@ impl From<SafetyError> for Status {
     fn from(error: SafetyError) -> Status {
         match error {
             SafetyError::Stopped { .. } => Status::failed_precondition(error.to_string()),
-            SafetyError::Brakes(_) => Status::internal(error.to_string()),
+            SafetyError::Brakes(_) | SafetyError::Latch(_) => Status::internal(error.to_string()),
         }
     }
 }
@@ -425,6 +435,35 @@ mod tests {
         assert_eq!(after.state(), SafetyState::Stopped { reason: "a hand".into() });
         after.clear().await.unwrap();
         assert_eq!(Safety::kept_in(file, NoBrakes).await.unwrap().state(), SafetyState::Ready);
+    }
+
+    #[tokio::test]
+    async fn a_stop_that_is_not_on_the_disk_is_in_force_and_not_confirmed_until_it_is() {
+        let place = tempfile::tempdir().unwrap();
+        let file = place.path().join("cell").join("stopped");
+        let safety = Safety::kept_in(file.clone(), NoBrakes).await.unwrap();
+        // A folder in the way of the file.
+        std::fs::create_dir(file.with_extension("new")).unwrap();
+        let refused = safety.stop("a hand").await.unwrap_err();
+        assert!(matches!(&refused, SafetyError::Latch(_)) && refused.to_string().contains("stopped"), "{refused}");
+        assert_eq!(safety.state(), SafetyState::Stopped { reason: "a hand".into() });
+        assert!(matches!(safety.stop("again").await, Err(SafetyError::Latch(_))), "still not on the disk");
+        std::fs::remove_dir(file.with_extension("new")).unwrap();
+        assert_eq!(safety.stop("again").await, Ok(SafetyState::Stopped { reason: "a hand".into() }));
+        assert_eq!(Safety::kept_in(file, NoBrakes).await.unwrap().state(), safety.state());
+    }
+
+    #[tokio::test]
+    async fn a_stop_that_was_not_cleared_on_the_disk_stays_in_force() {
+        let place = tempfile::tempdir().unwrap();
+        let file = place.path().join("stopped");
+        let safety = Safety::kept_in(file.clone(), NoBrakes).await.unwrap();
+        safety.stop("a hand").await.unwrap();
+        std::fs::remove_file(&file).unwrap();
+        std::fs::create_dir(&file).unwrap();
+        assert!(matches!(safety.clear().await, Err(SafetyError::Latch(_))));
+        assert_eq!(safety.state(), SafetyState::Stopped { reason: "a hand".into() });
+        assert!(Safety::kept_in(file, NoBrakes).await.is_err(), "nobody moves before it is known");
     }
 
     #[tokio::test]
