@@ -112,7 +112,8 @@ impl Client {
                 42..50 => self.consume().await,
                 50..60 => self.make().await,
                 60..66 => self.delete().await,
-                66..80 => self.look().await,
+                66..77 => self.look().await,
+                77..80 => self.forge().await,
                 _ => self.use_tool().await,
             }
             tokio::time::sleep(Duration::from_micros(self.random.below(6_000))).await;
@@ -181,7 +182,8 @@ impl Client {
             let answer = if both { self.ask_both(&question).await } else { self.ask(&question).await };
             lost |= both || matches!(answer, Answer::Unknown);
             match answer {
-                Answer::Unknown if gives_up => break None,
+                // Its patience may be less than the deadline, time and again.
+                Answer::Unknown if gives_up || self.end.is_cancelled() => break None,
                 Answer::Unknown => tokio::time::sleep(A_MOMENT / 3).await,
                 Answer::Yes(lease) => break Some(lease),
                 Answer::No(code, message) => {
@@ -424,6 +426,20 @@ impl Client {
             }
             _ => self.given_back(held).await,
         }
+    }
+
+    /// Gives a goal under a lease that it made up: nothing may come of it, for it or for those who hold the tool.
+    async fn forge(&mut self) {
+        let (id, token) = match self.random.below(3) {
+            0 => (u64::MAX, u64::MAX),
+            1 => (1, u64::MAX),
+            _ => (1 + self.random.below(1 << 40), 1 + self.random.below(1 << 40)),
+        };
+        let tool =
+            v1::LeasedResource { id: provider::TOOL.to_owned(), kind: provider::KIND.to_owned(), ..Default::default() };
+        let session_id = [String::new(), session(self.number)][self.random.below(2) as usize].clone();
+        self.record.count("leases made up");
+        self.give_goal(&v1::Lease { id, token, resources: vec![tool], session_id }).await;
     }
 
     async fn given_back(&mut self, held: Held) {

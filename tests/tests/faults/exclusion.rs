@@ -15,8 +15,9 @@ pub(crate) struct Measured {
     pub(crate) latest: Duration,
 }
 
-/// What is wrong with the steps, in words; and what was measured.
-pub(crate) fn check(steps: &[Step], history: &History) -> (Vec<String>, Measured) {
+/// What is wrong with the steps, in words; and what was measured. It may not move for longer than `bound` under a lease after another client
+/// was told that it holds the tool.
+pub(crate) fn check(steps: &[Step], history: &History, bound: Duration) -> (Vec<String>, Measured) {
     let mut wrong = Vec::new();
     // Steps are in the order in which they were taken; two processes that move at the same time show in the times.
     for pair in steps.windows(2) {
@@ -47,6 +48,9 @@ pub(crate) fn check(steps: &[Step], history: &History) -> (Vec<String>, Measured
         next.map(|granted| last.saturating_sub(granted))
     });
     let latest = Duration::from_nanos(latest.max().unwrap_or_default());
+    if latest > bound {
+        wrong.push(format!("it moved for {latest:?} after the next one was granted it; {bound:?} is allowed"));
+    }
     (wrong, Measured { steps: steps.len(), holders: intervals.len(), latest })
 }
 

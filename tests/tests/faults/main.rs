@@ -20,6 +20,7 @@ mod search;
 #[path = "../support/mod.rs"]
 mod support;
 
+use anyhow::ensure;
 use manager::Shim;
 use round::{Outcome, play};
 use std::collections::BTreeMap;
@@ -43,6 +44,7 @@ struct Sum {
     rounds: u64,
     calls: usize,
     states: usize,
+    undecided: u64,
     steps: usize,
     holders: usize,
     latest: Duration,
@@ -53,7 +55,8 @@ impl Sum {
     fn add(&mut self, outcome: Outcome) {
         self.rounds += 1;
         self.calls += outcome.calls;
-        self.states = self.states.max(outcome.states);
+        self.states = self.states.max(outcome.states.unwrap_or_default());
+        self.undecided += u64::from(outcome.states.is_none());
         self.steps += outcome.measured.steps;
         self.holders += outcome.measured.holders;
         self.latest = self.latest.max(outcome.measured.latest);
@@ -86,10 +89,11 @@ async fn histories_under_faults_are_those_of_one_pool_and_a_provider_moves_for_o
         sum.add(played??);
     }
     println!(
-        "{} rounds in {:.0} s: {} calls, at most {} states for a history; {} steps of the tool for {} holders, at the latest {} ms \
+        "{} rounds in {:.0} s, {} of them undecided: {} calls, at most {} states for a history; {} steps of the tool for {} holders, at the latest {} ms \
          after the next one was granted it",
         sum.rounds,
         begin.elapsed().as_secs_f64(),
+        sum.undecided,
         sum.calls,
         sum.states,
         sum.steps,
@@ -97,5 +101,6 @@ async fn histories_under_faults_are_those_of_one_pool_and_a_provider_moves_for_o
         sum.latest.as_millis()
     );
     println!("{:#?}", sum.counts);
+    ensure!(sum.undecided * 10 <= sum.rounds, "{} of {} rounds are undecided", sum.undecided, sum.rounds);
     Ok(())
 }

@@ -7,8 +7,11 @@ use super::model::{Pool, STOCK};
 use super::provider::{Step, TOOL};
 use super::search::{Timed, Verdict, search};
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 const TTL: u64 = 100;
+/// How long it may move after another one was granted the tool.
+const BOUND: Duration = Duration::from_nanos(10);
 
 /// The history of two clients whose sessions live from 0 on, with these calls of each: begin, end, answer.
 fn history(calls: [Vec<(u64, u64, Done)>; 2]) -> History {
@@ -140,7 +143,7 @@ fn with_tool() -> History {
 
 #[test]
 fn steps_that_no_provider_may_take_are_found() {
-    let wrong = |steps: &[Step], history: &History| exclusion::check(steps, history).0;
+    let wrong = |steps: &[Step], history: &History| exclusion::check(steps, history, BOUND).0;
     let good = [step(2, 12), step(2, 25), step(3, 41), step(3, 50)];
     assert_eq!(wrong(&good, &with_tool()), Vec::<String>::new());
     // Back to the first holder; two that move at the same time; a token that was never granted; another client's.
@@ -148,17 +151,19 @@ fn steps_that_no_provider_may_take_are_found() {
     assert!(!wrong(&[step(2, 12), step(2, 45), step(3, 41)], &with_tool()).is_empty());
     assert!(!wrong(&[step(2, 12), step(9, 20)], &with_tool()).is_empty());
     assert!(!wrong(&[Step { goal: "client-1/goal".to_owned(), ..step(2, 12) }], &with_tool()).is_empty());
-    // Late is measured, not refused here: nobody else moved yet.
-    let (none, measured) = exclusion::check(&[step(2, 12), step(2, 45)], &with_tool());
+    // It goes on for a while after the next one was told, and nobody else moves yet.
+    let late = |at| exclusion::check(&[step(2, 12), step(2, at)], &with_tool(), BOUND);
+    let (none, measured) = late(45);
     assert_eq!((none.len(), measured.latest.as_nanos()), (0, 5));
+    assert_eq!((late(50).0.len(), late(51).0.len()), (0, 1));
 }
 
 #[test]
 fn two_that_were_both_told_that_they_hold_the_tool_are_found() {
     let mut history = with_tool();
     history.holds[0].released = NEVER;
-    assert!(!exclusion::check(&[], &history).0.is_empty());
+    assert!(!exclusion::check(&[], &history, BOUND).0.is_empty());
     // Its session may have expired by then.
     history.holds[1].granted = 3 * TTL;
-    assert_eq!(exclusion::check(&[], &history).0, Vec::<String>::new());
+    assert_eq!(exclusion::check(&[], &history, BOUND).0, Vec::<String>::new());
 }

@@ -33,7 +33,7 @@ pub(crate) enum Verdict {
     /// There is none. The most calls of each thread that could be explained.
     Impossible { furthest: Vec<usize> },
     /// The bound on states was reached.
-    Undecided { furthest: Vec<usize> },
+    Undecided,
 }
 
 /// Whether there is an order of all calls, looking at no more than `most` states.
@@ -51,7 +51,7 @@ pub(crate) fn search<M: Model>(threads: &[Vec<Timed<M::Call>>], start: M, most: 
             return Verdict::Explained { states: seen.len() };
         };
         if seen.len() >= most {
-            return Verdict::Undecided { furthest };
+            return Verdict::Undecided;
         }
         let done = |thread: usize| threads[thread][..at[thread]].last().map(|call| call.begin);
         let earliest = (0..threads.len()).filter_map(done).max().unwrap_or(0);
