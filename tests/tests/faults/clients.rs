@@ -71,6 +71,8 @@ fn thousandths(amount: f64) -> u64 {
 struct Held {
     lease: v1::Lease,
     request: String,
+    /// Of the tool; a lease that lost it before it was answered does not say so any more.
+    is_tool: bool,
 }
 
 impl Client {
@@ -155,9 +157,9 @@ impl Client {
 
     async fn give_back(&mut self, held: Held) {
         if self.random.below(4) == 0 {
-            self.withdraw(held.request, is_tool(&held.lease)).await;
+            self.withdraw(held.request, held.is_tool).await;
         } else {
-            self.release(held.lease).await;
+            self.release(held.lease, held.is_tool).await;
         }
     }
 
@@ -218,7 +220,7 @@ impl Client {
             }
             self.answered(begin, Done::Granted { request: request.clone(), token: lease.token, held });
         }
-        Some(Held { lease, request })
+        Some(Held { lease, request, is_tool: wanted[0].0 == provider::KIND })
     }
 
     fn until(&self, request: &str, until: u64) {
@@ -277,7 +279,7 @@ impl Client {
         }
     }
 
-    async fn release(&mut self, lease: v1::Lease) {
+    async fn release(&mut self, lease: v1::Lease, is_tool: bool) {
         let begin = now();
         let request_id = self.request();
         let (answer, _) = known(|| {
@@ -292,7 +294,7 @@ impl Client {
         .await;
         let done = |released| Done::Released { token: lease.token, released };
         match answer {
-            _ if is_tool(&lease) => {}
+            _ if is_tool => {}
             Answer::Yes(answer) => self.answered(begin, done(answer.released)),
             Answer::No(code, message) => {
                 self.refused("release", code, &message).await;
@@ -531,10 +533,6 @@ pub(crate) fn saw(record: &Record, resource: &v1::Resource) {
         let (session, request, lease) = (holding.session_id.clone(), holding.holder.clone(), holding.lease_id);
         record.saw(holding.token, Grant { session, request, lease, held });
     }
-}
-
-fn is_tool(lease: &v1::Lease) -> bool {
-    lease.resources.iter().any(|resource| resource.id == provider::TOOL)
 }
 
 fn block(kind: &str, amount: u64) -> v1::Requirement {
