@@ -24,3 +24,19 @@ where
     }
     call().await
 }
+
+/// As [`patiently`], for as long as it takes: for calls that somebody else ends, when the session is given up.
+///
+/// # Errors
+/// A refusal.
+pub async fn until_answered<T, F>(mut call: impl FnMut() -> F) -> Result<T, CallError>
+where
+    F: Future<Output = Result<T, CallError>>,
+{
+    loop {
+        match call().await {
+            Err(error) if error.is_crash() => tokio::time::sleep(PAUSE).await,
+            answer => return answer,
+        }
+    }
+}

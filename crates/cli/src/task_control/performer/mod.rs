@@ -29,8 +29,8 @@ use ratn_model::resource::{LeasedResource, Requirement, ResourceClass};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{self, Resource, WorldChange};
-use ratn_worker::client::patiently;
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
+use ratn_worker::client::{patiently, until_answered};
 use ratn_worker::session::{DEFAULT_TTL, Session};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
@@ -325,7 +325,8 @@ impl Performer {
             let answer = match handed {
                 Some(lease) => Ok(lease),
                 None => tokio::select! {
-                    answer = patiently(ask) => answer,
+                    // A manager that does not answer is waited for until the run gives its session up ([`Performer::lost`]).
+                    answer = until_answered(ask) => answer,
                     () = withdrawn.cancelled() => {
                         // The call is dropped; what was granted meanwhile goes back.
                         let _ = patiently(|| resources.withdraw(&options.request)).await;
