@@ -11,7 +11,8 @@ use ratn_worker::client::{ActionClient, Channels, wait_until_serving};
 use ratn_worker::endpoint::{Endpoint, connect};
 use ratn_worker::protocol::HEADER;
 use ratn_worker::runtime_directory::wait_for_file;
-use ratn_worker::server::bind;
+use ratn_worker::server::{ServeError, Services, Serving, bind};
+use ratn_worker::vitals::{CoreFailure, Vitals};
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::time::{Duration, Instant};
 use tokio_util::sync::CancellationToken;
@@ -194,4 +195,26 @@ async fn a_client_of_a_version_without_a_protocol_in_common_is_refused_at_its_fi
     }
     // A client of this one says what it speaks.
     ActionClient::new(Channels::new()).describe(&provider.endpoint).await.unwrap();
+}
+
+#[tokio::test]
+async fn health_is_what_the_core_says_and_a_core_that_has_ended_is_served_no_more() {
+    let directory = tempfile::tempdir().unwrap();
+    let bound = bind(&Endpoint::Unix(directory.path().join("socket"))).await.unwrap();
+    let (endpoint, vitals) = (bound.endpoint().clone(), Vitals::default());
+    let serving = Serving { vitals: vitals.clone(), ..Serving::default() };
+    let served = tokio::spawn(bound.serve_as(Services::new(), serving, CancellationToken::new()));
+    wait_until_serving(&endpoint, LONG).await.unwrap();
+    let mut health = HealthClient::new(connect(&endpoint).await.unwrap());
+    let mut told = health.watch(HealthCheckRequest::default()).await.unwrap().into_inner();
+    let mut next = async || told.message().await.unwrap().unwrap().status();
+    assert_eq!(next().await, ServingStatus::Serving);
+    vitals.unwell("storage failed");
+    assert_eq!(next().await, ServingStatus::NotServing);
+    vitals.well();
+    assert_eq!(next().await, ServingStatus::Serving);
+    let failure = CoreFailure::Panicked { part: "the core".to_owned(), what: "a defect".to_owned() };
+    vitals.fail(failure.clone());
+    let ended = tokio::time::timeout(LONG, served).await.unwrap().unwrap().unwrap_err();
+    assert!(matches!(ended, ServeError::Core(found) if found == failure));
 }

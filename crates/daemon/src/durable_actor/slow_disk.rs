@@ -1,14 +1,15 @@
-//! A disk whose syncs hang for as long as a test wants.
+//! A disk whose syncs hang for as long as a test wants, or fail.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use ratn_storage::{Disk, Files, LogFile};
 use std::io;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 
 /// Clones are the same.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct SlowDisk(Arc<(Mutex<bool>, Condvar)>);
+pub(crate) struct SlowDisk(Arc<(Mutex<bool>, Condvar)>, Arc<AtomicBool>);
 
 /// Dropped, the disk goes on.
 pub(crate) struct Hanging(SlowDisk);
@@ -19,6 +20,11 @@ struct SlowFile(SlowDisk, Box<dyn LogFile>);
 impl SlowDisk {
     pub(crate) fn files(&self) -> Arc<dyn Files> {
         Arc::new(self.clone())
+    }
+
+    /// From now on every sync of a file fails.
+    pub(crate) fn fail(&self) {
+        self.1.store(true, Ordering::SeqCst);
     }
 
     /// From now on no sync of a file ends.
@@ -73,6 +79,9 @@ impl LogFile for SlowFile {
     fn sync(&mut self) -> io::Result<()> {
         let (hangs, goes_on) = &*self.0.0;
         drop(goes_on.wait_while(hangs.lock().unwrap(), |hangs| *hangs).unwrap());
+        if self.0.1.load(Ordering::SeqCst) {
+            return Err(io::Error::other("the disk is gone"));
+        }
         self.1.sync()
     }
 }

@@ -192,3 +192,18 @@ async fn a_disk_that_is_behind_refuses_what_is_new_and_takes_it_again_when_it_ha
     assert_eq!(added, count + 2, "what was refused has changed nothing");
     assert_eq!(vitals.condition().borrow().unwell, None);
 }
+
+#[tokio::test]
+async fn a_disk_that_fails_makes_the_daemon_unwell_and_what_was_not_on_it_is_refused() {
+    let place = tempfile::tempdir().unwrap();
+    let disk = SlowDisk::default();
+    let (handle, vitals) = begin(place.path(), &disk);
+    assert_eq!(in_time(handle.request(|answer| Message::Add(1, answer))).await.unwrap(), 1);
+    disk.fail();
+    let refused = in_time(handle.request(|answer| Message::Add(1, answer))).await.unwrap_err();
+    assert_eq!(refused.code(), Code::Unavailable);
+    let unwell = vitals.condition().borrow().unwell.clone();
+    assert!(unwell.is_some_and(|why| why.contains("the disk is gone")), "health says so");
+    assert_eq!(vitals.condition().borrow().failure, None, "what is on the disk can still be read");
+    assert!(in_time(handle.request(Message::Count)).await.is_ok());
+}

@@ -11,6 +11,9 @@ use tonic_health::pb::health_client::HealthClient;
 /// The pause between two questions; grows up to the second.
 const POLL_INTERVALS: (Duration, Duration) = (Duration::from_millis(2), Duration::from_millis(50));
 
+/// What [`Health::serving`] says of a server that answers, and not with SERVING.
+pub const NOT_SERVING: &str = "its health is not SERVING";
+
 /// Asks one server, over one connection for as long as that holds.
 #[derive(Debug, Clone)]
 pub struct Health {
@@ -35,7 +38,7 @@ impl Health {
             loop {
                 match self.ask().await {
                     Ok(true) => return,
-                    Ok(false) => last = "its health is not SERVING".to_owned(),
+                    Ok(false) => last = NOT_SERVING.to_owned(),
                     Err(reason) => {
                         last = reason;
                         self.client = None;

@@ -10,7 +10,7 @@ mod world;
 
 pub use action::{ActionClient, ActionInfo, Fate, ProviderInfo};
 pub use error::CallError;
-pub use health::{Health, wait_until_serving};
+pub use health::{Health, NOT_SERVING, wait_until_serving};
 pub use patience::{PAUSE, patiently, until_answered};
 pub use process::{LogPieces, ProcessClient, WorkerWatch};
 pub use resource::{AcquireOptions, DemandWatch, ResourceClient, ResourceWatch};

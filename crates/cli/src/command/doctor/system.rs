@@ -7,7 +7,7 @@ use crate::system::config::SystemConfig;
 use ratn_daemon::process_manager::HOST_KIND;
 use ratn_daemon::resource_manager;
 use ratn_proto::types::{HostPools, Resource};
-use ratn_worker::client::{Channels, Health, ProcessClient, ResourceClient};
+use ratn_worker::client::{Channels, Health, NOT_SERVING, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::{FindError, RuntimeDirectory};
 use std::io::ErrorKind;
@@ -51,10 +51,20 @@ async fn role_answers(findings: &mut Findings, role: &str, endpoint: &Endpoint) 
             true
         }
         Err(error) => {
-            let help = format!(
-                "it was killed, hangs, or cannot be reached from here: start it again (`ratn {role}`), and look at its log"
-            );
-            findings.problem(role, format!("is published at {endpoint} and does not answer: {error}"), help);
+            // The last thing that it said.
+            let (found, help) = if error.to_string().contains(NOT_SERVING) {
+                let help = "its log says why; where its disk is full or failed, see to that and start it again";
+                (
+                    format!("answers at {endpoint}, and says that it cannot do what it is for (NOT_SERVING)"),
+                    help.to_owned(),
+                )
+            } else {
+                let help = format!(
+                    "it was killed, hangs, or cannot be reached from here: start it again (`ratn {role}`), and look at its log"
+                );
+                (format!("is published at {endpoint} and does not answer: {error}"), help)
+            };
+            findings.problem(role, found, help);
             false
         }
     }
