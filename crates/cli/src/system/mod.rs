@@ -46,12 +46,13 @@ impl System {
     pub(crate) async fn start_private(config: SystemConfig) -> anyhow::Result<System> {
         let private = tempfile::Builder::new().prefix("ratn-").tempdir().context("cannot make a runtime directory")?;
         let path = private.path().to_owned();
-        System::start(config, &path, Some(private)).await
+        // Boxed: it holds the config of every role.
+        Box::pin(System::start(config, &path, Some(private))).await
     }
 
     /// Starts one that others find in `directory`.
     pub(crate) async fn start_public(config: SystemConfig, directory: &Path) -> anyhow::Result<System> {
-        System::start(config, directory, None).await
+        Box::pin(System::start(config, directory, None)).await
     }
 
     async fn start(
