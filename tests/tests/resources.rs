@@ -238,6 +238,66 @@ fn whoever_holds_what_an_operator_takes_away_hears_it_and_its_program_ends() -> 
     Ok(())
 }
 
+/// Processes of a command line that are there, without those that nobody has waited for yet.
+fn alive(marker: &str) -> usize {
+    let has = |pid: &str| {
+        let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+        String::from_utf8_lossy(&line).contains(marker)
+    };
+    let processes = std::fs::read_dir("/proc").unwrap().filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+    processes.filter(|pid| pid.bytes().all(|digit| digit.is_ascii_digit()) && has(pid)).count()
+}
+
+#[test]
+fn a_program_is_ended_before_what_it_holds_can_be_anothers_also_when_the_manager_hangs_and_it_ignores_sigterm()
+-> anyhow::Result<()> {
+    let manager = Manager::start()?;
+    manager.json(&["create", "Tool", "--id", "t1"])?;
+    let marker = format!("{}-stubborn", manager.place.path().display());
+    // Neither the program nor what it starts in the background ends by itself.
+    let stubborn = format!(
+        "trap '' TERM; : {marker}; sh -c 'trap \"\" TERM; : {marker}; sleep 600' & while true; do sleep 1; done"
+    );
+    let arguments = ["resource", "block", "Tool", "--", "sh", "-c", &stubborn];
+    let mut holder = manager.place.start_as("holder", &arguments)?;
+    wait_for("the program", || Ok((alive(&marker) >= 3).then_some(())))?;
+    manager.process.signal(Signal::SIGSTOP)?;
+    let (code, _, err) = holder.finish()?;
+    ensure!(code == Some(75) && err.contains("was not heard for 7 s") && err.contains("is killed"), "{code:?} {err}");
+    // The manager has not gone on: nobody else can have it yet.
+    ensure!(alive(&marker) == 0, "something of the program is left");
+    manager.process.signal(Signal::SIGCONT)?;
+    let next = manager.place.ratn(&["resource", "block", "Tool", "--", "true"]).output()?;
+    ensure!(next.status.success(), "{:?}", texts(&next));
+    Ok(())
+}
+
+#[test]
+fn a_program_whose_lease_is_taken_away_is_ended_before_the_next_begins_where_the_resource_asks_for_it()
+-> anyhow::Result<()> {
+    let manager = Manager::start()?;
+    manager.json(&["create", "Tool", "--id", "t1", "--attribute", "standstill_ms=20000"])?;
+    let pid = manager.place.path().join("pid");
+    let stubborn = format!("trap '' TERM; echo $$ > {}; while true; do sleep 1; done", pid.display());
+    let mut holder = manager.place.start_as("holder", &["resource", "block", "Tool", "--", "sh", "-c", &stubborn])?;
+    wait_for("the program", || Ok(std::fs::read_to_string(&pid).is_ok_and(|pid| pid.ends_with('\n')).then_some(())))?;
+    let lease = manager.json(&["get", "t1"])?["holdings"][0]["lease"].as_u64().context("a lease")?;
+    // Fails where the program of the one before is still there.
+    let look = format!("kill -0 $(cat {}) && exit 9; exit 0", pid.display());
+    let mut next = manager.place.start_as("next", &["resource", "block", "Tool", "--", "sh", "-c", &look])?;
+    wait_for("the waiter", || Ok((manager.json(&["explain"])?[0]["request"].is_string()).then_some(())))?;
+    manager.json(&["release", &lease.to_string()])?;
+    wait_for("the end", || Ok(manager.json(&["get", "t1"])?["ending"][0]["lease"].as_u64()))?;
+    let why = manager.json(&["explain"])?.to_string();
+    ensure!(why.contains("is ending"), "{why}");
+    let (code, _, err) = holder.finish()?;
+    ensure!(code == Some(75) && err.contains("is killed"), "{code:?} {err}");
+    // Well before the bound has passed: the holder has confirmed.
+    let (code, out, err) = next.finish()?;
+    ensure!(code == Some(0), "{code:?} {out} {err}");
+    Ok(())
+}
+
 #[test]
 fn who_waits_and_who_watches_goes_on_with_the_manager_that_comes_back() -> anyhow::Result<()> {
     let place = Place::new()?;

@@ -38,6 +38,7 @@ pub struct Session {
     endpoint: Endpoint,
     ttl: Duration,
     state: watch::Receiver<SessionState>,
+    expires: watch::Receiver<Instant>,
     end: CancellationToken,
     task: Option<JoinHandle<()>>,
 }
@@ -76,18 +77,19 @@ impl Session {
     pub fn open_as(channels: &Channels, endpoint: &Endpoint, id: String, client: &str, ttl: Duration) -> Session {
         let end = CancellationToken::new();
         let (tell, state) = watch::channel(SessionState::default());
+        let (expires, known) = watch::channel(Instant::now());
         let keeper = Keeper {
             channels: channels.clone(),
             endpoint: endpoint.clone(),
             id: id.clone(),
             client: client.to_owned(),
             ttl,
-            expires: Instant::now(),
+            expires,
             tell,
             end: end.clone(),
         };
         let task = Some(tokio::spawn(keeper.keep()));
-        Session { id, endpoint: endpoint.clone(), ttl, state, end, task }
+        Session { id, endpoint: endpoint.clone(), ttl, state, expires: known, end, task }
     }
 
     /// Its id.
@@ -149,6 +151,29 @@ impl Session {
         }
     }
 
+    /// As [`Session::lost`], but returns this long before the session may be over at the manager: in time to end what only the holder of
+    /// its leases may do.
+    pub async fn nearly_lost(&self, margin: Duration) {
+        let nearly = async {
+            let (mut state, mut expires) = (self.state.clone(), self.expires.clone());
+            if state.wait_for(|state| state.alive).await.is_err() {
+                return;
+            }
+            loop {
+                let at = expires.borrow_and_update().checked_sub(margin).unwrap_or_else(Instant::now);
+                tokio::select! {
+                    biased;
+                    changed = expires.changed() => if changed.is_err() { return },
+                    () = tokio::time::sleep_until(at) => return,
+                }
+            }
+        };
+        tokio::select! {
+            () = nearly => {}
+            () = self.lost() => {}
+        }
+    }
+
     /// Ends it with the manager, so that what it holds is free at once.
     pub async fn close(mut self) {
         self.end.cancel();
@@ -171,7 +196,7 @@ struct Keeper {
     id: String,
     client: String,
     ttl: Duration,
-    expires: Instant,
+    expires: watch::Sender<Instant>,
     tell: watch::Sender<SessionState>,
     end: CancellationToken,
 }
@@ -187,11 +212,11 @@ impl Keeper {
                 () = end.cancelled() => break,
                 () = self.stream() => {}
             }
-            if self.tell.borrow().generation != before || Instant::now() < self.expires {
+            if self.tell.borrow().generation != before || Instant::now() < *self.expires.borrow() {
                 backoff = BACKOFF.0;
             }
-            if Instant::now() >= self.expires {
-                let expires = self.expires;
+            let expires = *self.expires.borrow();
+            if Instant::now() >= expires {
                 self.tell.send_if_modified(|state| {
                     let ran_out = std::mem::take(&mut state.alive);
                     if ran_out {
@@ -230,7 +255,7 @@ impl Keeper {
             let Ok(Ok(Some(answer))) = timeout(self.patience(), answers.message()).await else { return };
             let ttl = Duration::from_millis(answer.ttl_ms);
             // Counted from the question, so that it never lives longer here than there.
-            self.expires = asked + ttl;
+            self.expires.send_replace(asked + ttl);
             self.tell.send_if_modified(|state| {
                 let before = *state;
                 // One that was not alive here was not there: the answer that said so may have been lost with its stream.
@@ -271,7 +296,7 @@ impl Keeper {
 
     /// How long an answer may take: until the session is over, once it is, a time to live.
     fn patience(&self) -> Duration {
-        let left = self.expires.saturating_duration_since(Instant::now());
+        let left = self.expires.borrow().saturating_duration_since(Instant::now());
         if left.is_zero() { self.ttl } else { left }
     }
 }

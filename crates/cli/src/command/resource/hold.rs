@@ -1,4 +1,8 @@
 //! `block` and `consume`: what they take is held by a session of their own, which ends with the command however that ends.
+//!
+//! A program that is run with it is ended before another can have what it holds: when the manager is not heard, in the time that the
+//! session lives on there. A lease that somebody else ends is over at once, unless the resource has a `standstill_ms`, which then is
+//! to be more than [`STOP_MARGIN`].
 
 use super::arguments::HoldArguments;
 use super::{Asking, loss, show};
@@ -16,8 +20,14 @@ use std::os::unix::process::ExitStatusExt;
 use std::time::{Duration, Instant};
 use tokio::process::{Child, Command};
 
-/// From the loss of the lease to the end of the program that it was for.
+/// The session of a program that holds something lives so long without a word of the manager: it goes on over short pauses, and can
+/// be ended in the rest of the time.
+const PROGRAM_TTL: Duration = Duration::from_secs(10);
+/// From SIGTERM to SIGKILL.
 const STOP_PATIENCE: Duration = Duration::from_secs(2);
+/// So long before the session may be over a program is asked to end: its end, by SIGKILL where it has to be, comes before another can
+/// have what it holds.
+const STOP_MARGIN: Duration = Duration::from_secs(3);
 /// From a manager that does not answer to the next question.
 const AGAIN: Duration = Duration::from_millis(250);
 const LEASE_VARIABLE: &str = "RATN_LEASE";
@@ -27,7 +37,7 @@ const TOKEN_VARIABLE: &str = "RATN_TOKEN";
 pub(super) async fn block(asking: &Asking, held: &HoldArguments) -> Result<(), Failure> {
     let requirement = held.selector.requirement(ResourceOperation::Block)?;
     let interrupt = Interrupt::listen()?;
-    let (session, client) = asking.session("block").await?;
+    let (session, client) = asking.session("block", ttl_for(held)).await?;
     let options = AcquireOptions {
         request: fresh_id("block"),
         priority: held.priority,
@@ -48,7 +58,12 @@ pub(super) async fn block(asking: &Asking, held: &HoldArguments) -> Result<(), F
     asking.show(&show::lease_json(&lease), || show::lease(&lease))?;
     let environment = [(LEASE_VARIABLE, lease.id.0.to_string()), (TOKEN_VARIABLE, lease.token.0.to_string())];
     let lost = loss::of(&client, &lease);
-    hold(session, &interrupt, held, &environment, lost).await
+    let outcome = hold(&session, &interrupt, held, &environment, lost).await;
+    if let Err(Failure::Lost(_)) = &outcome {
+        confirm_standstill(&client, &lease).await;
+    }
+    session.close().await;
+    outcome
 }
 
 /// Asks until there is an answer or the time is over: a manager that restarts keeps who holds, not who waits, and the request id
@@ -85,7 +100,7 @@ async fn granted(
 pub(super) async fn consume(asking: &Asking, held: &HoldArguments) -> Result<(), Failure> {
     let requirement = held.selector.requirement(ResourceOperation::Consume)?;
     let interrupt = Interrupt::listen()?;
-    let (session, client) = asking.session("consume").await?;
+    let (session, client) = asking.session("consume", ttl_for(held)).await?;
     let consumed = client.consume(requirement).await;
     let consumed = match consumed {
         Ok(consumed) => consumed,
@@ -95,12 +110,36 @@ pub(super) async fn consume(asking: &Asking, held: &HoldArguments) -> Result<(),
         }
     };
     asking.show(&consumed.as_slice().into(), || consumed.join("\n"))?;
-    hold(session, &interrupt, held, &[], std::future::pending()).await
+    let outcome = hold(&session, &interrupt, held, &[], std::future::pending()).await;
+    session.close().await;
+    outcome
 }
 
-/// Until the time, the user, the program, the resource manager or an operator ends it; `lost` says what the last did.
+fn ttl_for(held: &HoldArguments) -> Duration {
+    if held.program.is_empty() { super::SESSION_TTL } else { PROGRAM_TTL }
+}
+
+/// The program has ended: what still waits for that, and has no provider to say so, is free now.
+async fn confirm_standstill(client: &ResourceClient, lease: &Lease) {
+    for held in &lease.resources {
+        let confirming = async {
+            let resource = client.get(&held.id).await?;
+            let is_ending = resource.ending.iter().any(|ending| ending.lease == lease.id);
+            if is_ending && resource.session.is_empty() {
+                client.confirm_standstill(lease.id, &held.id).await
+            } else {
+                Ok(false)
+            }
+        };
+        // A manager that does not answer frees it after its bound.
+        let _ = tokio::time::timeout(AGAIN, confirming).await;
+    }
+}
+
+/// Until the time, the user, the program, the resource manager or an operator ends it; `lost` says what the last did. No program is
+/// left then.
 async fn hold(
-    session: Session,
+    session: &Session,
     interrupt: &Interrupt,
     held: &HoldArguments,
     environment: &[(&str, String)],
@@ -116,14 +155,7 @@ async fn hold(
             if !std::io::stdin().is_terminal() {
                 command.process_group(0);
             }
-            let started = command.spawn().with_context(|| format!("cannot start `{program}`"));
-            match started {
-                Ok(child) => Some(child),
-                Err(error) => {
-                    session.close().await;
-                    return Err(error.into());
-                }
-            }
+            Some(command.spawn().with_context(|| format!("cannot start `{program}`"))?)
         }
     };
     let ended = async {
@@ -149,10 +181,7 @@ async fn hold(
         },
         () = over => Ok(()),
         () = interrupt.asked_times(1) => Ok(()),
-        () = session.lost() => Err(Failure::Lost(format!(
-            "the resource manager was not heard for {} s, others may have the resources now",
-            super::SESSION_TTL.as_secs()
-        ))),
+        unheard = unheard(session, held) => Err(Failure::Lost(unheard)),
         why = lost => Err(Failure::Lost(format!("{why}; others may have the resources now"))),
     };
     if let (Err(Failure::Lost(why)), Some(_)) = (&outcome, &program) {
@@ -161,8 +190,19 @@ async fn hold(
     if let Some(mut child) = program {
         stop(&mut child).await;
     }
-    session.close().await;
     outcome
+}
+
+/// Resolves when the session may be over; where a program has to be ended first, that much earlier. What that means.
+async fn unheard(session: &Session, held: &HoldArguments) -> String {
+    if held.program.is_empty() {
+        session.lost().await;
+        let seconds = super::SESSION_TTL.as_secs();
+        return format!("the resource manager was not heard for {seconds} s, others may have the resources now");
+    }
+    session.nearly_lost(STOP_MARGIN).await;
+    let (seconds, left) = ((PROGRAM_TTL - STOP_MARGIN).as_secs(), STOP_MARGIN.as_secs());
+    format!("the resource manager was not heard for {seconds} s, others may have the resources in {left} s")
 }
 
 /// Asks a program that still runs to end, and ends it when it does not.
@@ -174,9 +214,13 @@ async fn stop(child: &mut Child) {
         let _ = if leads { nix::sys::signal::killpg(pid, signal) } else { nix::sys::signal::kill(pid, signal) };
     };
     signal(Signal::SIGTERM);
-    if tokio::time::timeout(STOP_PATIENCE, child.wait()).await.is_err() {
+    let overdue = tokio::time::timeout(STOP_PATIENCE, child.wait()).await.is_err();
+    if overdue {
         output::progress("the program did not end in time and is killed");
-        signal(Signal::SIGKILL);
-        let _ = child.wait().await;
     }
+    // Also what the program has left in its group; the number of a process that has ended may be another's.
+    if overdue || leads {
+        signal(Signal::SIGKILL);
+    }
+    let _ = child.wait().await;
 }

@@ -49,7 +49,8 @@ fn told(update: &ResourceUpdate, lease: &Lease) -> Option<String> {
                 (ResourceEventKind::Deleted, _) => Some(format!("`{id}` was deleted")),
                 (ResourceEventKind::Released, Some((ended, _))) if ended == lease.id => {
                     Some(match event.reason.as_str() {
-                        "asked" => format!("lease {number} was released by another"),
+                        // By its session, and by an operator.
+                        "asked" | "revoked" => format!("lease {number} was released by another"),
                         "the resource is gone" => format!("`{id}` was deleted"),
                         reason => format!("lease {number} ended: {reason}"),
                     })
@@ -105,7 +106,9 @@ mod tests {
     fn a_release_a_deletion_and_an_expiry_end_a_lease_and_what_happens_to_others_does_not() {
         use ResourceEventKind::{Deleted, Leased, Released, Updated};
         let of = |update| told(&update, &lease());
-        assert_eq!(of(event(Released, "t1", Some(7), "asked")).as_deref(), Some("lease 7 was released by another"));
+        for by_whom in ["asked", "revoked"] {
+            assert_eq!(of(event(Released, "t1", Some(7), by_whom)).as_deref(), Some("lease 7 was released by another"));
+        }
         assert_eq!(
             of(event(Released, "t1", Some(7), "session expired")).as_deref(),
             Some("lease 7 ended: session expired")

@@ -73,7 +73,7 @@ impl Asking {
             ResourceCommand::Delete { kind: Some(kind), .. } => {
                 let requirement = Selector { kind: kind.clone(), count: Quantity::ONE, ..Selector::default() };
                 let requirement = requirement.requirement(ResourceOperation::Delete)?;
-                let (session, client) = self.session("delete").await?;
+                let (session, client) = self.session("delete", SESSION_TTL).await?;
                 let deleted = client.delete_matching(requirement).await;
                 session.close().await;
                 let deleted = deleted.context("not deleted")?;
@@ -166,9 +166,9 @@ impl Asking {
     }
 
     /// A session for as long as it is kept, and a client in its name.
-    async fn session(&self, what: &str) -> anyhow::Result<(Session, ResourceClient)> {
+    async fn session(&self, what: &str, ttl: Duration) -> anyhow::Result<(Session, ResourceClient)> {
         let name = format!("ratn resource {what}");
-        let session = Session::open(&self.channels, &self.endpoint, &name, SESSION_TTL);
+        let session = Session::open(&self.channels, &self.endpoint, &name, ttl);
         if let Err(error) = session.alive(SESSION_DEADLINE).await {
             // What the manager says to a plain question tells more than its silence.
             self.client.list(&["-"]).await?;
