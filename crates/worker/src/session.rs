@@ -228,7 +228,8 @@ impl Keeper {
             tokio::select! {
                 biased;
                 () = end.cancelled() => break,
-                () = tokio::time::sleep(backoff) => {}
+                // It is said in time that the session is over.
+                () = tokio::time::sleep(backoff.min(self.patience())) => {}
             }
             backoff = (backoff * 2).min(BACKOFF.1);
         }

@@ -96,7 +96,7 @@ async fn a_lease_is_good_from_the_word_of_its_grant_to_the_word_of_its_end() {
     // The goal comes before the word: it waits, and not longer.
     let began = Instant::now();
     let (outcome, ()) = tokio::join!(watched.run(goal("a", "double", 7)), async {
-        while watched.provider.server.awaiting() == 0 {
+        while watched.provider.server.waiting() == 0 {
             tokio::task::yield_now().await;
         }
         watched.happened(ResourceEventKind::Leased, 7, &[7]);
@@ -117,7 +117,7 @@ async fn without_the_manager_nothing_begins_and_what_is_under_way_ends() {
     watched.watch.lost("silence");
     assert_eq!(waiting.await.unwrap().unwrap(), GoalOutcome::aborted("the lease may have ended: silence"));
     let (outcome, ()) = tokio::join!(watched.run(goal("b", "double", 7)), async {
-        while watched.provider.server.awaiting() == 0 {
+        while watched.provider.server.waiting() == 0 {
             tokio::task::yield_now().await;
         }
         tokio::time::sleep(2 * GRANT_WAIT).await;

@@ -97,6 +97,17 @@ pub fn ports_bytes(fields: &BTreeMap<String, v1::Value>) -> usize {
     fields.iter().map(|(name, value)| name.len() + value.encoded_len()).sum()
 }
 
+/// Hands out the wire form of ports, in the order of names, for a fingerprint of them.
+pub fn wire_form(fields: &BTreeMap<String, v1::Value>, mut take: impl FnMut(&[u8])) {
+    for (name, value) in fields {
+        let value = value.encode_to_vec();
+        for part in [name.as_bytes(), &value] {
+            take(&(part.len() as u64).to_le_bytes());
+            take(part);
+        }
+    }
+}
+
 /// Ports or attributes.
 ///
 /// # Errors

@@ -1,5 +1,6 @@
 //! Whether a goal's lease is one: what the resource manager says of it, and the statuses of those that are refused.
 
+use super::goal::LeaseKey;
 use crate::lease_watch::{Claim, GRANT_WAIT, LeaseWatch, Standing};
 use ratn_model::resource::Lease;
 use ratn_proto::types::Goal;
@@ -7,8 +8,8 @@ use std::time::Duration;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-/// When a goal that was refused because the manager is not heard may be given again.
-const UNHEARD_RETRY: Duration = Duration::from_millis(250);
+/// When a goal that was refused for now may be given again.
+const RETRY_DELAY: Duration = Duration::from_millis(250);
 /// The word for programs of such a refusal.
 pub(crate) const MANAGER_UNHEARD: &str = "MANAGER_UNHEARD";
 
@@ -46,15 +47,17 @@ impl Authority {
                     format!("{resource} watches no leases, so none is confirmed: give its ActionServer a LeaseWatch");
                 return Err(refusal(Code::FailedPrecondition, "NO_LEASE_WATCH", message));
             }
+            Authority::Watch(watch) if !watch.resources().iter().any(|watched| watched == resource) => {
+                let message = format!("the leases of {resource} are not watched: name it to LeaseWatch::of");
+                return Err(refusal(Code::FailedPrecondition, "NOT_WATCHED", message));
+            }
             Authority::Watch(watch) => watch,
         };
         let claim = Claim { resource, lease: lease.id, token: lease.token, session: &goal.session };
         let unheard = |why: &str| {
             let message =
                 format!("{} of {resource} cannot be confirmed: {why}; nothing was begun, try again", lease.id);
-            let mut details = ErrorDetails::with_error_info(MANAGER_UNHEARD, "ratn", []);
-            details.set_retry_info(Some(UNHEARD_RETRY));
-            Status::with_error_details(Code::Unavailable, message, details)
+            retry_later(MANAGER_UNHEARD, message)
         };
         Ok(match watch.check(&claim) {
             Standing::Confirmed => Confirmation::Confirmed,
@@ -76,6 +79,17 @@ impl Authority {
         })
     }
 
+    /// Whether a lease that held `resource` does not any more, now that `newest` does.
+    pub(super) fn is_over(&self, resource: &str, (lease, token): LeaseKey, newest: LeaseKey) -> bool {
+        match self {
+            Authority::Watch(watch) => {
+                let claim = Claim { resource, lease, token, session: "" };
+                matches!(watch.check(&claim), Standing::Refuted(_))
+            }
+            Authority::Nobody | Authority::Claimant => token < newest.1,
+        }
+    }
+
     /// The watch, where there is one.
     pub(super) fn watch(&self) -> Option<&LeaseWatch> {
         match self {
@@ -88,4 +102,11 @@ impl Authority {
 /// A status that says why in one word for programs and in a sentence for people.
 pub(super) fn refusal(code: Code, reason: &str, message: String) -> Status {
     Status::with_error_details(code, message, ErrorDetails::with_error_info(reason, "ratn", []))
+}
+
+/// A status that says that nothing was begun, and that the same goal may be given again in a moment.
+pub(super) fn retry_later(reason: &str, message: String) -> Status {
+    let mut details = ErrorDetails::with_error_info(reason, "ratn", []);
+    details.set_retry_info(Some(RETRY_DELAY));
+    Status::with_error_details(Code::Unavailable, message, details)
 }

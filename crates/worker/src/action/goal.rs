@@ -2,6 +2,7 @@
 
 use super::ActionFailure;
 use ratn_model::id::{FencingToken, LeaseId};
+use ratn_proto::convert::wire_form;
 use ratn_proto::types::{Goal, GoalOutcome};
 use ratn_proto::v1;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -74,17 +75,42 @@ impl StopCause {
     }
 }
 
-/// A goal under way, or ended and remembered.
+/// SHA-256 of a goal's inputs as they came over the wire: a goal is not joined by one that asks for something else.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Fingerprint([u8; 32]);
+
+impl Fingerprint {
+    /// Of a goal; of one that is missing as of one without inputs.
+    pub(crate) fn of(goal: Option<&v1::Goal>) -> Fingerprint {
+        let mut digest = ring::digest::Context::new(&ring::digest::SHA256);
+        if let Some(goal) = goal {
+            wire_form(&goal.inputs, |bytes| digest.update(bytes));
+        }
+        let mut sum = [0; 32];
+        sum.copy_from_slice(digest.finish().as_ref());
+        Fingerprint(sum)
+    }
+}
+
+/// A lease as it was granted: its id, and its token.
+pub(crate) type LeaseKey = (LeaseId, FencingToken);
+
+/// A goal that waits to begin, is under way, or has ended and is remembered.
 #[derive(Debug)]
 pub(crate) struct GoalEntry {
     pub(crate) id: String,
+    pub(crate) action: String,
+    pub(crate) inputs: Fingerprint,
     /// The resource that it has to itself where the server takes one goal at a time.
     pub(crate) resource: String,
-    pub(crate) lease: Option<LeaseId>,
-    pub(crate) token: FencingToken,
+    pub(crate) lease: Option<LeaseKey>,
+    /// Whose lease that is, as the goal says; may be empty.
+    pub(crate) session: String,
     pub(crate) cancelled: CancellationToken,
     pub(crate) progress: broadcast::Sender<v1::GoalProgress>,
     pub(crate) result: watch::Sender<Option<Ending>>,
+    /// Fires when its action has returned; an action that does not stop in time does so after its result was told.
+    pub(crate) returned: CancellationToken,
     stop_when_abandoned: bool,
     /// For how long nobody may listen to it.
     grace: Duration,
@@ -99,15 +125,18 @@ pub(crate) struct GoalEntry {
 pub(crate) struct Listener(Arc<GoalEntry>);
 
 impl GoalEntry {
-    pub(crate) fn new(goal: &Goal, resource: String, stop_when_abandoned: bool) -> Arc<GoalEntry> {
+    pub(crate) fn new(goal: &Goal, inputs: Fingerprint, resource: &str, stop_when_abandoned: bool) -> Arc<GoalEntry> {
         Arc::new(GoalEntry {
             id: goal.id.clone(),
-            resource,
-            lease: goal.lease.as_ref().map(|lease| lease.id),
-            token: goal.lease.as_ref().map_or(FencingToken(0), |lease| lease.token),
+            action: goal.action.clone(),
+            inputs,
+            resource: resource.to_owned(),
+            lease: goal.lease.as_ref().map(|lease| (lease.id, lease.token)),
+            session: goal.session.clone(),
             cancelled: CancellationToken::new(),
             progress: broadcast::channel(PROGRESS_KEPT).0,
             result: watch::channel(None).0,
+            returned: CancellationToken::new(),
             stop_when_abandoned,
             grace: Duration::from_millis(goal.grace_ms).min(MAX_GRACE),
             cause: Mutex::new(None),
@@ -136,7 +165,7 @@ impl GoalEntry {
         self.result.borrow().is_some()
     }
 
-    /// Returns once it has ended.
+    /// Returns once its result is there.
     pub(crate) async fn over(&self) {
         // The sender is in `self`, so the channel is open.
         let _ = self.result.subscribe().wait_for(Option::is_some).await;

@@ -1,29 +1,44 @@
 //! Which goals a provider has begun, so that none is begun twice.
 //!
-//! Two memories with different bounds. Of the goals of the newest lease of each resource every **id** is kept: given again, such a goal is
-//! joined, gets its result, or is refused, and under any older lease nothing begins at all (the fence). So that a goal is never begun
+//! A goal is known by its id, the resource that performs it, and the lease under which it was given (id and token): nobody can take the
+//! id of another's goal. The same goal asks for the same action with the same inputs.
+//!
+//! Two memories with different bounds. Of the goals of every lease that still holds its resource every **id** is kept: given again, such
+//! a goal is joined, gets its result, or is refused, and under a lease that is over nothing begins at all. So that a goal is never begun
 //! twice does not depend on how many **results** are kept: of those the newest of each resource are.
 
-use super::goal::GoalEntry;
-use ratn_model::id::LeaseId;
+use super::goal::{Fingerprint, GoalEntry, LeaseKey};
+use ratn_model::id::{FencingToken, LeaseId};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
-/// The goals of a server, by id.
+/// The goals of a server.
 #[derive(Debug, Default)]
 pub(super) struct Memory {
     /// Under way, or with a result that is kept.
-    entries: BTreeMap<String, Arc<GoalEntry>>,
+    entries: BTreeMap<Key, Arc<GoalEntry>>,
     /// Whose results are kept, the oldest first, by resource.
-    ended: BTreeMap<String, VecDeque<String>>,
-    /// What was begun under the newest lease of each resource.
-    begun: BTreeMap<String, Begun>,
+    ended: BTreeMap<String, VecDeque<Key>>,
+    /// What was begun under each lease of each resource.
+    begun: BTreeMap<(String, LeaseKey), BTreeSet<String>>,
 }
 
-#[derive(Debug)]
-struct Begun {
-    lease: LeaseId,
-    goals: BTreeSet<String>,
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Key {
+    resource: String,
+    goal: String,
+    lease: Option<LeaseKey>,
+}
+
+/// A goal that is asked for.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Asked<'a> {
+    pub(super) goal: &'a str,
+    pub(super) resource: &'a str,
+    pub(super) action: &'a str,
+    pub(super) inputs: Fingerprint,
+    pub(super) lease: Option<LeaseKey>,
+    pub(super) session: &'a str,
 }
 
 /// What is known of a goal.
@@ -33,61 +48,116 @@ pub(super) enum Known {
     Entry(Arc<GoalEntry>),
     /// It was begun, has ended, and its result is not kept any more.
     ResultForgotten(LeaseId),
+    /// Another goal has its id, and what differs.
+    Other(String),
     /// It was not begun, as far as leases that live go.
     Never,
 }
 
-impl Memory {
-    pub(super) fn find(&self, goal: &str) -> Known {
-        if let Some(entry) = self.entries.get(goal) {
-            return Known::Entry(Arc::clone(entry));
+impl<'a> From<&'a GoalEntry> for Asked<'a> {
+    fn from(entry: &'a GoalEntry) -> Asked<'a> {
+        Asked {
+            goal: &entry.id,
+            resource: &entry.resource,
+            action: &entry.action,
+            inputs: entry.inputs,
+            lease: entry.lease,
+            session: &entry.session,
         }
-        match self.begun.values().find(|begun| begun.goals.contains(goal)) {
-            Some(begun) => Known::ResultForgotten(begun.lease),
+    }
+}
+
+impl Memory {
+    pub(super) fn find(&self, asked: &Asked<'_>) -> Known {
+        let key = |lease| Key { resource: asked.resource.to_owned(), goal: asked.goal.to_owned(), lease };
+        if let Some(entry) = self.entries.get(&key(asked.lease)) {
+            return match difference(asked, entry) {
+                None => Known::Entry(Arc::clone(entry)),
+                Some(difference) => Known::Other(difference),
+            };
+        }
+        let begun = asked.lease.and_then(|lease| self.begun.get(&(asked.resource.to_owned(), lease)).zip(Some(lease)));
+        if let Some((goals, lease)) = begun
+            && goals.contains(asked.goal)
+        {
+            return Known::ResultForgotten(lease.0);
+        }
+        // A holder gives a goal under one lease. Another holder's goals are none of its business.
+        let same_id = self.entries.range(key(None)..).map(|(_, entry)| entry);
+        let mut same_id = same_id.take_while(|entry| entry.resource == asked.resource && entry.id == asked.goal);
+        match same_id.find(|entry| entry.session == asked.session) {
+            Some(entry) => Known::Other(format!(
+                "that one was given under {}, and this one is under {}",
+                said(entry.lease),
+                said(asked.lease)
+            )),
             None => Known::Never,
         }
     }
 
-    /// How many goals were begun on a resource under a lease, if that is its newest.
-    pub(super) fn begun_under(&self, resource: &str, lease: LeaseId) -> usize {
-        self.begun.get(resource).filter(|begun| begun.lease == lease).map_or(0, |begun| begun.goals.len())
+    /// How many goals were begun on a resource under a lease.
+    pub(super) fn begun_under(&self, resource: &str, lease: LeaseKey) -> usize {
+        self.begun.get(&(resource.to_owned(), lease)).map_or(0, BTreeSet::len)
     }
 
-    /// A goal begins; where it has a lease, that is the newest of its resource.
+    /// A goal begins.
     pub(super) fn begin(&mut self, entry: &Arc<GoalEntry>) {
-        self.entries.insert(entry.id.clone(), Arc::clone(entry));
+        self.entries.insert(Key::of(entry), Arc::clone(entry));
         let Some(lease) = entry.lease.filter(|_| !entry.resource.is_empty()) else { return };
-        let fresh = || Begun { lease, goals: BTreeSet::new() };
-        let begun = self.begun.entry(entry.resource.clone()).or_insert_with(fresh);
-        if begun.lease != lease {
-            *begun = fresh();
-        }
-        begun.goals.insert(entry.id.clone());
+        self.begun.entry((entry.resource.clone(), lease)).or_default().insert(entry.id.clone());
     }
 
     /// A goal has ended; of its resource so many results are kept.
     pub(super) fn end(&mut self, entry: &GoalEntry, results_kept: usize) {
         let ended = self.ended.entry(entry.resource.clone()).or_default();
-        ended.push_back(entry.id.clone());
+        ended.push_back(Key::of(entry));
         while ended.len() > results_kept {
             if let Some(forgotten) = ended.pop_front() {
                 self.entries.remove(&forgotten);
             }
         }
     }
+
+    /// Forgets what was begun on a resource under leases that are over: under them nothing begins any more.
+    pub(super) fn forget_begun(&mut self, resource: &str, is_over: impl Fn(LeaseKey) -> bool) {
+        let least = (resource.to_owned(), (LeaseId(0), FencingToken(0)));
+        let of_resource = self.begun.range(least..).map(|(key, _)| key).take_while(|(of, _)| of == resource);
+        let over: Vec<(String, LeaseKey)> = of_resource.filter(|(_, lease)| is_over(*lease)).cloned().collect();
+        for lease in &over {
+            self.begun.remove(lease);
+        }
+    }
+}
+
+impl Key {
+    fn of(entry: &GoalEntry) -> Key {
+        Key { resource: entry.resource.clone(), goal: entry.id.clone(), lease: entry.lease }
+    }
+}
+
+fn difference(asked: &Asked<'_>, known: &GoalEntry) -> Option<String> {
+    if asked.action != known.action {
+        return Some(format!("that one's action is `{}`, and this one's `{}`", known.action, asked.action));
+    }
+    (asked.inputs != known.inputs).then(|| "it has other inputs".to_owned())
+}
+
+fn said(lease: Option<LeaseKey>) -> String {
+    lease.map_or_else(|| "no lease".to_owned(), |(id, token)| format!("{id} ({token})"))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ratn_model::id::FencingToken;
     use ratn_model::resource::Lease;
     use ratn_proto::types::Goal;
 
     fn entry(id: &str, resource: &str, lease: u64) -> Arc<GoalEntry> {
         let lease = Lease { id: LeaseId(lease), token: FencingToken(lease), resources: Vec::new() };
-        let goal = Goal { id: id.to_owned(), lease: (lease.id.0 > 0).then_some(lease), ..Goal::default() };
-        GoalEntry::new(&goal, resource.to_owned(), true)
+        let session = format!("session-{}", lease.id.0);
+        let lease = (lease.id.0 > 0).then_some(lease);
+        let goal = Goal { id: id.to_owned(), action: "move".to_owned(), session, lease, ..Goal::default() };
+        GoalEntry::new(&goal, Fingerprint::of(None), resource, true)
     }
 
     fn perform(memory: &mut Memory, id: &str, resource: &str, lease: u64) {
@@ -96,19 +166,61 @@ mod tests {
         memory.end(&entry, 2);
     }
 
+    fn find(memory: &Memory, id: &str, resource: &str, lease: u64) -> Known {
+        memory.find(&Asked::from(&*entry(id, resource, lease)))
+    }
+
+    fn key(lease: u64) -> LeaseKey {
+        (LeaseId(lease), FencingToken(lease))
+    }
+
     #[test]
-    fn of_the_newest_lease_every_goal_is_known_though_its_result_is_not() {
+    fn of_leases_that_live_every_goal_is_known_though_its_result_is_not() {
         let mut memory = Memory::default();
         for i in 0..10 {
             perform(&mut memory, &format!("a{i}"), "arm", 1);
         }
-        assert!(matches!(memory.find("a9"), Known::Entry(_)));
-        assert!(matches!(memory.find("a0"), Known::ResultForgotten(LeaseId(1))));
-        assert_eq!((memory.begun_under("arm", LeaseId(1)), memory.begun_under("arm", LeaseId(2))), (10, 0));
+        assert!(matches!(find(&memory, "a9", "arm", 1), Known::Entry(_)));
+        assert!(matches!(find(&memory, "a0", "arm", 1), Known::ResultForgotten(LeaseId(1))));
+        assert_eq!((memory.begun_under("arm", key(1)), memory.begun_under("arm", key(2))), (10, 0));
+        // Another one that holds the resource, too.
         perform(&mut memory, "b", "arm", 2);
-        assert!(matches!(memory.find("a0"), Known::Never));
-        assert!(matches!(memory.find("a9"), Known::Entry(_)), "results outlast their lease");
-        assert_eq!(memory.begun_under("arm", LeaseId(2)), 1);
+        assert!(matches!(find(&memory, "a0", "arm", 1), Known::ResultForgotten(LeaseId(1))));
+        memory.forget_begun("arm", |lease| lease == key(1));
+        assert!(matches!(find(&memory, "a0", "arm", 1), Known::Never));
+        assert!(matches!(find(&memory, "a9", "arm", 1), Known::Entry(_)), "results outlast their lease");
+        assert_eq!(memory.begun_under("arm", key(2)), 1);
+    }
+
+    #[test]
+    fn a_goal_of_another_resource_lease_or_token_is_another_goal() {
+        let mut memory = Memory::default();
+        perform(&mut memory, "a", "camera", 1);
+        assert!(matches!(find(&memory, "a", "arm", 2), Known::Never));
+        assert!(matches!(find(&memory, "a", "camera", 2), Known::Never));
+        let known = entry("a", "camera", 1);
+        let token = Asked { lease: Some((LeaseId(1), FencingToken(9))), session: "", ..Asked::from(&*known) };
+        assert!(matches!(memory.find(&token), Known::Never));
+    }
+
+    #[test]
+    fn what_differs_from_the_goal_of_an_id_is_said() {
+        let mut memory = Memory::default();
+        perform(&mut memory, "a", "arm", 1);
+        let same = entry("a", "arm", 1);
+        let differs = |asked: Asked<'_>, why: &str| {
+            let known = memory.find(&asked);
+            assert!(matches!(&known, Known::Other(said) if said.contains(why)), "{known:?}");
+        };
+        differs(
+            Asked { action: "grasp", ..Asked::from(&*same) },
+            "that one's action is `move`, and this one's `grasp`",
+        );
+        let inputs = [("x".to_owned(), ratn_model::value::Value::Int(1))].into();
+        let inputs = Fingerprint::of(Some(&Goal { inputs, ..Goal::default() }.into()));
+        differs(Asked { inputs, ..Asked::from(&*same) }, "other inputs");
+        let under_another = Asked { lease: Some(key(2)), ..Asked::from(&*same) };
+        differs(under_another, "under lease-1 (token-1), and this one is under lease-2");
     }
 
     #[test]
@@ -118,7 +230,7 @@ mod tests {
         for i in 0..10 {
             perform(&mut memory, &format!("a{i}"), "arm", 1);
         }
-        assert!(matches!(memory.find("g"), Known::Entry(_)));
+        assert!(matches!(find(&memory, "g", "gripper", 1), Known::Entry(_)));
     }
 
     #[test]
@@ -127,6 +239,7 @@ mod tests {
         for id in ["a", "b", "c"] {
             perform(&mut memory, id, "", 0);
         }
-        assert!(matches!(memory.find("a"), Known::Never) && matches!(memory.find("c"), Known::Entry(_)));
+        assert!(matches!(find(&memory, "a", "", 0), Known::Never));
+        assert!(matches!(find(&memory, "c", "", 0), Known::Entry(_)));
     }
 }

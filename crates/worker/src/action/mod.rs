@@ -10,17 +10,20 @@
 //! that error as reason. The [`ActionServer`] owns what is common to all: leases as the resource manager confirms them, fencing,
 //! idempotence, exclusion, panics.
 
+mod admission;
 mod authority;
 mod context;
 mod fence;
 mod goal;
 mod memory;
 mod port;
+mod run;
 mod scene;
 mod server;
 mod service;
 mod stream;
 
+pub(crate) use admission::TOO_MANY_WAITING;
 pub(crate) use authority::MANAGER_UNHEARD;
 pub use context::{CallFailure, GoalContext, WorldFailure};
 pub use port::{InputError, Port};
@@ -53,8 +56,8 @@ pub trait Action: Send + Sync + 'static {
         true
     }
 
-    /// Does it. Has to look at `goal.cancelled` (or `goal.checkpoint()?`) and to end soon once that fired. What blocks for
-    /// longer than a millisecond belongs into `tokio::task::spawn_blocking`.
+    /// Does it. Has to look at `goal.cancelled` (or `goal.checkpoint()?`) and to end soon once that fired: its resource is its own until
+    /// it returns, and nothing tears it down. What blocks for longer than a millisecond belongs into `tokio::task::spawn_blocking`.
     async fn execute(&self, goal: GoalContext) -> ActionResult;
 }
 

@@ -1,7 +1,7 @@
 //! The gRPC adapter of [`ActionServer`].
 
 use super::ActionServer;
-use super::goal::{Ending, GoalEntry, Listener};
+use super::goal::{Ending, Fingerprint, GoalEntry, Listener};
 use super::stream::CallerGoals;
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
@@ -33,6 +33,7 @@ impl ActionServer {
     /// A goal that a caller gives, or asks for again.
     pub(super) async fn given(&self, caller: &Caller, request: v1::ExecuteRequest) -> Result<Messages, Status> {
         let known_only = request.known_only;
+        let inputs = Fingerprint::of(request.goal.as_ref());
         let goal: Goal = required(request.goal, "goal")?;
         let pending = audit::begin(caller, "", || Mutation::Goal {
             goal: goal.id.clone(),
@@ -41,7 +42,7 @@ impl ActionServer {
             known_only,
         });
         let token = goal.lease.as_ref().map(|lease| lease.token);
-        let admitted = if known_only { self.join(&goal.id) } else { self.admit(goal).await };
+        let admitted = if known_only { self.join(&goal, inputs) } else { self.admit(caller, goal, inputs).await };
         pending.ended_with(&admitted, |_| token);
         admitted
     }

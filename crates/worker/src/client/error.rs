@@ -1,7 +1,7 @@
 //! How a call fails: refused by the one who was asked, or broken on the way.
 
 use super::chain;
-use crate::action::MANAGER_UNHEARD;
+use crate::action::{MANAGER_UNHEARD, TOO_MANY_WAITING};
 use crate::endpoint::Endpoint;
 use ratn_proto::convert::Malformed;
 use std::error::Error;
@@ -58,8 +58,8 @@ impl CallError {
     pub fn from_status(endpoint: &Endpoint, status: &Status) -> CallError {
         let endpoint = endpoint.clone();
         let refused = match status.code() {
-            // A provider that does not hear the resource manager: it has begun nothing.
-            Code::Unavailable if is_unheard(status) => true,
+            // A provider that has begun nothing, for now.
+            Code::Unavailable if begins_nothing_yet(status) => true,
             // The servers of this system use none of these to say no: they come from the connection.
             Code::Unavailable | Code::Unknown | Code::Internal | Code::Cancelled | Code::DataLoss => false,
             // With a source, the status was made on this side.
@@ -76,7 +76,8 @@ impl CallError {
         CallError::Broken { endpoint, reason }
     }
 
-    /// Whether a provider refused a goal because it does not hear the resource manager, which confirms leases: it may be given again.
+    /// Whether a provider refused a goal for now, because it does not hear the resource manager, which confirms leases, or because too
+    /// many goals wait: it has begun nothing, and the goal may be given again.
     pub fn is_unconfirmed(&self) -> bool {
         self.code() == Some(Code::Unavailable)
     }
@@ -86,8 +87,9 @@ impl CallError {
     }
 }
 
-fn is_unheard(status: &Status) -> bool {
-    status.get_details_error_info().is_some_and(|info| info.reason == MANAGER_UNHEARD)
+fn begins_nothing_yet(status: &Status) -> bool {
+    let reason = status.get_details_error_info().map(|info| info.reason);
+    reason.is_some_and(|reason| reason == MANAGER_UNHEARD || reason == TOO_MANY_WAITING)
 }
 
 /// What to do where a connection failed for TLS, as far as its error tells (those of rustls and h2).

@@ -4,7 +4,7 @@
 //! unheard ─ snapshot ─→ heard ─ watch breaks ─→ interrupted ─ too long ─→ unheard
 //!                         └──────── snapshot ────────┘
 //! ```
-//! While the watch is interrupted what was heard last still counts, and nothing new is confirmed. Lease ids grow with the grants: an id
+//! While the watch is interrupted nothing is confirmed, so that nothing begins, and nothing has ended, so that what is under way goes on. Lease ids grow with the grants: an id
 //! beyond every one heard of may have been granted a moment ago, any other that holds nothing has ended or never was.
 
 use ratn_model::id::{FencingToken, LeaseId};
@@ -13,6 +13,9 @@ use std::collections::BTreeMap;
 
 /// Why nothing is confirmed before the first word of the manager.
 const NEVER_HEARD: &str = "the resource manager has not been heard yet";
+
+/// Why nothing is confirmed while the watch is taken up again.
+const INTERRUPTED: &str = "the watch of leases was interrupted a moment ago";
 
 /// What a goal says of its lease.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -50,6 +53,8 @@ pub struct EndedHolding {
     pub resource: String,
     /// The lease.
     pub lease: LeaseId,
+    /// Its fencing token: a manager that lost its state may use an id again.
+    pub token: FencingToken,
     /// Why, for people.
     pub reason: String,
 }
@@ -106,6 +111,8 @@ impl Holdings {
                 "{lease} of {resource} is held by session `{}`, and the goal says `{session}`: acquire a lease of your own",
                 holder.session
             )),
+            // It may have ended since.
+            Some(_) if self.contact == Contact::Interrupted => Standing::Unheard(INTERRUPTED.to_owned()),
             Some(_) => Standing::Confirmed,
             None if lease > self.youngest => Standing::NotHeardOf { listening: self.contact == Contact::Heard },
             None => Standing::Refuted(self.not_held(claim)),
@@ -166,7 +173,7 @@ impl Holdings {
         }
     }
 
-    /// The watch broke: what was heard last counts for now.
+    /// The watch broke: what holds its resource counts as such until more is heard, and nothing is confirmed.
     pub fn interrupted(&mut self) {
         if self.contact == Contact::Heard {
             self.contact = Contact::Interrupted;
@@ -197,8 +204,14 @@ impl Holdings {
     fn set(&mut self, resource: &str, holders: BTreeMap<LeaseId, Holder>, reason: &str) -> Vec<EndedHolding> {
         let before = self.by_resource.insert(resource.to_owned(), holders).unwrap_or_default();
         let now = &self.by_resource[resource];
-        let ended = before.into_keys().filter(|lease| !now.contains_key(lease));
-        let ended = ended.map(|lease| EndedHolding { resource: resource.to_owned(), lease, reason: reason.to_owned() });
+        // The same id with another token, or of another session, is another lease.
+        let ended = before.into_iter().filter(|(lease, holder)| now.get(lease) != Some(holder));
+        let ended = ended.map(|(lease, Holder { token, .. })| EndedHolding {
+            resource: resource.to_owned(),
+            lease,
+            token,
+            reason: reason.to_owned(),
+        });
         let ended = ended.collect();
         if now.is_empty() {
             self.by_resource.remove(resource);
@@ -281,7 +294,8 @@ mod tests {
         refuted(&holdings, claim(11), "is over");
         let ended = holdings.tell(&event(ResourceEventKind::Released, arm(&[]), 12));
         let reason = "it was released".to_owned();
-        assert_eq!(ended, [EndedHolding { resource: "arm".to_owned(), lease: LeaseId(12), reason }]);
+        let (resource, lease, token) = ("arm".to_owned(), LeaseId(12), FencingToken(120));
+        assert_eq!(ended, [EndedHolding { resource, lease, token, reason }]);
         refuted(&holdings, claim(12), "no lease holds it");
     }
 
@@ -307,19 +321,36 @@ mod tests {
     }
 
     #[test]
-    fn while_the_watch_is_interrupted_what_was_heard_counts_and_nothing_does_when_it_is_lost() {
+    fn while_the_watch_is_interrupted_nothing_is_confirmed_and_nothing_ends() {
         let mut holdings = Holdings::default();
         assert_eq!(holdings.check(&claim(7)), Standing::Unheard(NEVER_HEARD.to_owned()));
         holdings.interrupted();
         assert!(!holdings.is_heard());
         holdings.tell(&snapshot(&[arm(&[7])], 7));
         holdings.interrupted();
-        assert_eq!(holdings.check(&claim(7)), Standing::Confirmed);
+        assert_eq!(holdings.check(&claim(7)), Standing::Unheard(INTERRUPTED.to_owned()));
         assert_eq!(holdings.check(&claim(8)), Standing::NotHeardOf { listening: false });
+        refuted(&holdings, claim(6), "is over");
+        assert_eq!(holdings.tell(&snapshot(&[arm(&[7])], 7)), []);
+        assert_eq!(holdings.check(&claim(7)), Standing::Confirmed);
         holdings.lost("silence");
         assert_eq!(holdings.check(&claim(7)), Standing::Unheard("silence".to_owned()));
         holdings.tell(&snapshot(&[arm(&[7])], 7));
         assert_eq!(holdings.check(&claim(7)), Standing::Confirmed);
+    }
+
+    #[test]
+    fn a_lease_of_the_same_id_with_another_token_or_session_is_another_one() {
+        let ended = |change: fn(&mut Holding)| {
+            let (mut holdings, mut again) = (heard(&[7], 9), arm(&[7]));
+            change(&mut again.holdings[0]);
+            let ended = holdings.tell(&snapshot(&[again], 7));
+            assert_eq!(holdings.check(&claim(8)), Standing::NotHeardOf { listening: true }, "of the new count");
+            ended.iter().map(|ended| (ended.lease.0, ended.token.0)).collect::<Vec<_>>()
+        };
+        assert_eq!(ended(|holding| holding.token = FencingToken(71)), [(7, 70)]);
+        assert_eq!(ended(|holding| holding.session = "another".to_owned()), [(7, 70)]);
+        assert_eq!(ended(|_| {}), []);
     }
 
     #[test]

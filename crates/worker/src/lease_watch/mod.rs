@@ -5,9 +5,9 @@
 //!                                       └── what ended ──▶ ActionServer: its goals end
 //! ```
 //! A provider makes one [`LeaseWatch`] for its resources, gives it to its [`crate::action::ActionServer`], and has it follow the
-//! manager. While the manager cannot be heard, what it said last is trusted as long as the provider's own session lives (without
-//! a session: for a time after the watch broke); then every goal under a lease ends and none begins. What the manager
-//! says first after that is compared with what is under way.
+//! manager. While the watch is interrupted nothing begins. What is under way goes on as long as the provider's own session lives (without
+//! a session: for a time after the manager's last answer, and it is asked often enough); then every goal under a lease ends. What the
+//! manager says first after that is compared with what is under way.
 
 mod holdings;
 mod location;
@@ -19,17 +19,21 @@ use crate::client::{CallError, Channels, ResourceClient, ResourceWatch};
 use crate::endpoint::Endpoint;
 use crate::session::{Session, SessionState};
 
-use std::future::pending;
+use std::future::{pending, ready};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 use tokio::sync::watch;
-use tokio::time::{sleep, timeout};
+use tokio::time::{Instant, sleep, sleep_until, timeout, timeout_at};
 
 /// A lease that has not been heard of is waited for so long: its grant reaches its holder and this provider at about the same time.
 pub const GRANT_WAIT: Duration = Duration::from_secs(1);
 
 /// The pause before the manager is asked again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
+/// A manager to which this provider has no session is asked something so often within the time that it is trusted without an answer.
+const QUESTIONS_PER_PATIENCE: u32 = 4;
+/// How often it is said that there is no watch.
+const WARN_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Hears what ends.
 pub(crate) trait LeaseListener: Send + Sync {
@@ -66,10 +70,14 @@ enum Source {
 /// What is followed now.
 struct Following {
     stream: ResourceWatch,
+    client: ResourceClient,
     /// Of the session that was alive when it began.
     generation: u64,
-    endpoint: Endpoint,
+    answered: Answered,
 }
+
+/// When the last question was asked that was answered.
+struct Answered(Mutex<Instant>);
 
 impl LeaseWatch {
     /// Of the resources of these ids; nothing is known of them before it follows a manager.
@@ -81,6 +89,11 @@ impl LeaseWatch {
             listeners: Mutex::default(),
         };
         LeaseWatch { shared: Arc::new(shared) }
+    }
+
+    /// The ids of the resources.
+    pub fn resources(&self) -> &[String] {
+        &self.shared.resources
     }
 
     /// What the resource manager says of a claim, as of now.
@@ -111,7 +124,7 @@ impl LeaseWatch {
     }
 
     /// Follows the manager of a location, wherever it is, for as long as the future is polled; for a provider whose resources another
-    /// process offers. Leases are trusted for `patience` after the watch broke.
+    /// process offers. Leases are trusted for `patience` after the manager has answered something; it is asked four times within that.
     pub fn follow_location(
         &self,
         channels: &Channels,
@@ -145,39 +158,85 @@ impl LeaseWatch {
         self.shared.heard.send_modify(|heard| *heard += 1);
     }
 
+    /// The watch broke: nothing begins, and what is under way goes on, until more is heard. For tests of providers without a manager.
+    pub fn interrupted(&self) {
+        self.shared.holdings().interrupted();
+    }
+
     async fn follow(self, source: Source, patience: Duration) {
-        let mut following = self.begin(&source).await;
+        let mut following = self.begin(&source, patience).await;
         loop {
-            let trusted = tokio::select! {
+            let is_lost = tokio::select! {
                 biased;
                 // Known before a connection that hangs breaks.
-                () = source.is_over(following.generation) => Duration::ZERO,
-                () = self.read(&mut following.stream) => patience,
-                () = source.has_moved(&following.endpoint) => patience,
+                () = source.is_over(following.generation) => true,
+                () = self.silence(&source, &following.client, &following.answered, patience) => true,
+                () = self.read(&mut following.stream) => false,
+                () = source.has_moved(following.client.endpoint()) => false,
             };
-            self.shared.holdings().interrupted();
+            self.interrupted();
+            let generation = following.generation;
+            let trusted_until = match source {
+                Source::Session { .. } => Instant::now() + patience,
+                Source::Location { .. } => following.answered.last() + patience,
+            };
+            drop(following);
             let again = async {
                 sleep(RETRY_INTERVAL).await;
-                self.begin(&source).await
+                self.begin(&source, patience).await
             };
-            following = match timeout(trusted, again).await {
-                Ok(begun) => begun,
-                Err(_) => {
+            let begun = tokio::select! {
+                biased;
+                () = ready(()), if is_lost => None,
+                () = source.is_over(generation) => None,
+                () = sleep_until(trusted_until) => None,
+                begun = again => Some(begun),
+            };
+            following = match begun {
+                Some(begun) => begun,
+                None => {
                     let reason = "the resource manager is not heard";
                     tracing::warn!("{reason}: goals under a lease end, and none begins");
                     self.lost(reason);
-                    self.begin(&source).await
+                    self.begin(&source, patience).await
                 }
             };
         }
     }
 
-    /// A watch that has told which leases live.
-    async fn begin(&self, source: &Source) -> Following {
+    /// Returns when the manager of a location has answered nothing for the time: one that hangs breaks no connection. That of a session
+    /// answers its pings.
+    async fn silence(&self, source: &Source, client: &ResourceClient, answered: &Answered, patience: Duration) {
+        let (Source::Location { .. }, Some(resource)) = (source, self.shared.resources.first()) else {
+            return pending().await;
+        };
         loop {
-            match self.try_begin(source).await {
-                Ok(following) => return following,
-                Err(error) => tracing::debug!(%error, "no watch of leases"),
+            sleep(patience / QUESTIONS_PER_PATIENCE).await;
+            let (asked, trusted_until) = (Instant::now(), answered.last() + patience);
+            match timeout_at(trusted_until, client.get(resource)).await {
+                Ok(Err(error)) if error.is_crash() => tracing::debug!(%error, "the resource manager does not answer"),
+                // What it says does not matter.
+                Ok(_) => answered.at(asked),
+                Err(_) => return,
+            }
+        }
+    }
+
+    /// A watch that has told which leases live.
+    async fn begin(&self, source: &Source, patience: Duration) -> Following {
+        let mut warn_at = Instant::now() + patience;
+        loop {
+            match timeout(patience, self.try_begin(source)).await {
+                Ok(Ok(following)) => return following,
+                Ok(Err(error)) if Instant::now() < warn_at => tracing::debug!(%error, "no watch of leases"),
+                failed => {
+                    let why = match failed {
+                        Ok(Err(error)) => error.to_string(),
+                        _ => "it does not answer".to_owned(),
+                    };
+                    tracing::warn!(why, resources = ?self.shared.resources, "the resource manager is not heard: no goal begins");
+                    warn_at = Instant::now() + WARN_INTERVAL;
+                }
             }
             sleep(RETRY_INTERVAL).await;
         }
@@ -196,13 +255,14 @@ impl LeaseWatch {
                 (ResourceClient::new(channels, &manager, "")?, None, 0)
             }
         };
+        let answered = Answered::new();
         let mut stream = client.watch_resources(self.shared.resources.iter().cloned()).await?;
         let first = stream.next().await?;
         self.shared.holdings().begin(owner);
         if let Some(snapshot) = first {
             self.tell(&snapshot);
         }
-        Ok(Following { stream, generation, endpoint: client.endpoint().clone() })
+        Ok(Following { stream, client, generation, answered })
     }
 
     /// Returns when the watch has ended.
@@ -214,6 +274,20 @@ impl LeaseWatch {
                 Err(error) => return tracing::debug!(%error, "the watch of leases broke"),
             }
         }
+    }
+}
+
+impl Answered {
+    fn new() -> Answered {
+        Answered(Mutex::new(Instant::now()))
+    }
+
+    fn last(&self) -> Instant {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn at(&self, asked: Instant) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = asked;
     }
 }
 

@@ -1,0 +1,248 @@
+//! Who may start: what runs, what waits and what is remembered of a server's goals, and the refusals.
+//!
+//! ```text
+//! asked ─ known ────────────────────────────→ joined, or refused: another goal has its id, or its result is forgotten
+//!   ├─ no lease, another's, one that is over ──→ refused
+//!   ├─ the manager has not told of its lease ──→ waits for that, a second at the most
+//!   ├─ one that was told to stop still moves ──→ waits for its end; refused once that one is overdue
+//!   ├─ busy, too many ────────────────────────→ refused
+//!   └→ new
+//! ```
+
+use super::authority::{Authority, Confirmation, refusal, retry_later};
+use super::fence::Fence;
+use super::goal::{GoalEntry, StopCause};
+use super::memory::{Asked, Known, Memory};
+use super::run::STOP_GRACE;
+use super::server::Inner;
+use crate::access::Caller;
+use crate::gate::ending;
+use ratn_model::id::{FencingToken, LeaseId};
+use ratn_model::resource::Lease;
+use ratn_proto::types::Goal;
+use std::sync::Arc;
+use tonic::{Code, Status};
+
+/// At most so many goals wait at once.
+const MAX_WAITING: usize = 1_024;
+/// At most so many of one caller, so that others find room.
+const MAX_WAITING_PER_CALLER: usize = 128;
+/// At most so many goals run at once on one resource.
+const MAX_RUNNING: usize = 64;
+/// The word for programs of a refusal because too many goals wait.
+pub(crate) const TOO_MANY_WAITING: &str = "TOO_MANY_WAITING";
+
+/// What a server was built with.
+#[derive(Debug)]
+pub(super) struct Limits {
+    /// A resource performs one goal at a time.
+    pub(super) one_at_a_time: bool,
+    /// Results remembered of each resource.
+    pub(super) results_kept: usize,
+    /// Goals begun on a resource under one lease.
+    pub(super) goals_per_lease: usize,
+}
+
+/// The goals of a server.
+#[derive(Debug, Default)]
+pub(super) struct State {
+    fence: Fence,
+    memory: Memory,
+    /// Until their actions have returned.
+    running: Vec<Arc<GoalEntry>>,
+    waiting: Vec<WaitingGoal>,
+    /// The provider ends: nothing begins any more.
+    closed: bool,
+}
+
+#[derive(Debug)]
+struct WaitingGoal {
+    caller: Arc<str>,
+    entry: Arc<GoalEntry>,
+}
+
+/// What became of a request for a goal.
+pub(super) enum Admission {
+    /// It starts.
+    New,
+    /// It was known.
+    Joined(Arc<GoalEntry>),
+    /// It was told to stop while it waited.
+    Stopped(StopCause),
+    /// It has to wait until this one, told to stop, has ended.
+    After(Arc<GoalEntry>),
+    /// It has to wait for what the resource manager says of its lease; this is the refusal if that takes too long.
+    Awaiting(Status),
+}
+
+impl State {
+    pub(super) fn running(&self) -> impl Iterator<Item = &GoalEntry> {
+        self.running.iter().map(|entry| &**entry)
+    }
+
+    pub(super) fn waiting(&self) -> impl Iterator<Item = &GoalEntry> {
+        self.waiting.iter().map(|waiting| &*waiting.entry)
+    }
+
+    /// Begins nothing more, and tells every goal to stop; those that run.
+    pub(super) fn close(&mut self) -> Vec<Arc<GoalEntry>> {
+        self.closed = true;
+        self.running().chain(self.waiting()).for_each(|entry| entry.stop(StopCause::ShuttingDown));
+        self.running.clone()
+    }
+
+    /// The goal of the same id, lease, action and inputs, if there is one.
+    ///
+    /// # Errors
+    /// FAILED_PRECONDITION where its result is forgotten; ALREADY_EXISTS where another goal has its id.
+    pub(super) fn known(&self, limits: &Limits, entry: &GoalEntry) -> Result<Option<Arc<GoalEntry>>, Status> {
+        match self.memory.find(&Asked::from(entry)) {
+            Known::Entry(entry) => Ok(Some(entry)),
+            Known::Never => Ok(None),
+            Known::ResultForgotten(lease) => Err(forgotten(&entry.id, lease, limits.results_kept)),
+            Known::Other(difference) => {
+                let id = &entry.id;
+                let message = format!("there is another goal {id}: {difference}; give this one an id of its own");
+                Err(refusal(Code::AlreadyExists, "ANOTHER_GOAL", message))
+            }
+        }
+    }
+
+    /// Lets a goal in, or says why not.
+    pub(super) fn admit(&mut self, server: &Inner, goal: &Goal, entry: &Arc<GoalEntry>) -> Result<Admission, Status> {
+        if let Some(cause) = entry.cause() {
+            return Ok(Admission::Stopped(cause));
+        }
+        if let Some(known) = self.known(&server.limits, entry)? {
+            return Ok(Admission::Joined(known));
+        }
+        if self.closed {
+            return Err(ending());
+        }
+        let (limits, resource) = (&server.limits, entry.resource.as_str());
+        if !resource.is_empty() {
+            let lease = leased(goal, resource)?;
+            if let Confirmation::Awaited(refused) = server.authority.confirm(goal, lease, resource)? {
+                return Ok(Admission::Awaiting(refused));
+            }
+            self.take_over(&server.authority, lease, resource)?;
+            if self.memory.begun_under(resource, (lease.id, lease.token)) >= limits.goals_per_lease {
+                let (most, lease) = (limits.goals_per_lease, lease.id);
+                let message = format!("{most} goals of {resource} were begun under {lease}: no more; acquire it anew");
+                return Err(refusal(Code::ResourceExhausted, "TOO_MANY_GOALS", message));
+            }
+        }
+        let mut others = self.running.iter().filter(|other| other.resource == resource);
+        let is_in_the_way = |other: &&Arc<GoalEntry>| {
+            let is_anothers = !resource.is_empty() && other.lease != entry.lease;
+            other.cancelled.is_cancelled() && (limits.one_at_a_time || is_anothers)
+        };
+        if let Some(other) = others.clone().find(is_in_the_way) {
+            if other.is_over() {
+                return Err(still_running(other));
+            }
+            return Ok(Admission::After(Arc::clone(other)));
+        }
+        if limits.one_at_a_time
+            && let Some(other) = others.next()
+        {
+            let message = format!("busy with goal {}: one goal at a time", other.id);
+            return Err(Status::resource_exhausted(message));
+        }
+        if others.count() >= MAX_RUNNING {
+            let of = if resource.is_empty() { "this provider" } else { resource };
+            let message = format!("{MAX_RUNNING} goals of {of} are under way: no more at once");
+            return Err(Status::resource_exhausted(message));
+        }
+        self.memory.begin(entry);
+        self.running.push(Arc::clone(entry));
+        Ok(Admission::New)
+    }
+
+    /// Stops goals of leases that are over, and forgets what was begun under them. Only what is confirmed gets here.
+    ///
+    /// # Errors
+    /// FAILED_PRECONDITION for an older lease than one seen, where no watch says who holds the resource.
+    fn take_over(&mut self, authority: &Authority, lease: &Lease, resource: &str) -> Result<(), Status> {
+        if authority.watch().is_none() {
+            self.fence.admit(resource, lease.token).map_err(|highest: FencingToken| {
+                let (id, token) = (lease.id, lease.token);
+                let message =
+                    format!("{id} ({token}) of {resource} is over: {highest} was seen since; acquire it anew");
+                refusal(Code::FailedPrecondition, "LEASE_FENCED", message)
+            })?;
+        }
+        let key = (lease.id, lease.token);
+        let is_over = |other| other != key && authority.is_over(resource, other, key);
+        for other in self.running.iter().filter(|other| other.resource == resource) {
+            if other.lease.is_some_and(is_over) {
+                other.stop(StopCause::Fenced(lease.token));
+            }
+        }
+        if self.memory.begun_under(resource, key) == 0 {
+            self.memory.forget_begun(resource, is_over);
+        }
+        Ok(())
+    }
+
+    /// A goal waits.
+    ///
+    /// # Errors
+    /// UNAVAILABLE, to be tried again, where too many do.
+    pub(super) fn wait(&mut self, caller: &Caller, entry: &Arc<GoalEntry>) -> Result<(), Status> {
+        let of_caller = self.waiting.iter().filter(|waiting| waiting.caller == caller.name).count();
+        if of_caller >= MAX_WAITING_PER_CALLER {
+            let name = &caller.name;
+            return Err(too_many_waiting(format!("{MAX_WAITING_PER_CALLER} goals of {name} wait here to begin")));
+        }
+        if self.waiting.len() >= MAX_WAITING {
+            return Err(too_many_waiting(format!("{MAX_WAITING} goals of all callers wait here to begin")));
+        }
+        if self.closed {
+            return Err(ending());
+        }
+        self.waiting.push(WaitingGoal { caller: Arc::clone(&caller.name), entry: Arc::clone(entry) });
+        Ok(())
+    }
+
+    /// A goal does not wait any more.
+    pub(super) fn leave(&mut self, entry: &Arc<GoalEntry>) {
+        self.waiting.retain(|waiting| !Arc::ptr_eq(&waiting.entry, entry));
+    }
+
+    /// A goal's action has returned.
+    pub(super) fn end(&mut self, entry: &Arc<GoalEntry>, results_kept: usize) {
+        self.running.retain(|other| !Arc::ptr_eq(other, entry));
+        self.memory.end(entry, results_kept);
+    }
+}
+
+/// The goal's lease, which has to name `resource`.
+fn leased<'a>(goal: &'a Goal, resource: &str) -> Result<&'a Lease, Status> {
+    let names = |lease: &&Lease| lease.resources.iter().any(|leased| leased.id == resource);
+    goal.lease.as_ref().filter(names).ok_or_else(|| {
+        let message = format!("the goal has no lease of {resource}: acquire it and send the lease along");
+        refusal(Code::FailedPrecondition, "NO_LEASE", message)
+    })
+}
+
+fn forgotten(goal: &str, lease: LeaseId, results_kept: usize) -> Status {
+    let message = format!(
+        "goal {goal} was begun under {lease} and has ended; its result is not among the last {results_kept} of its resource, which \
+         are remembered, and it is not begun again"
+    );
+    refusal(Code::FailedPrecondition, "RESULT_FORGOTTEN", message)
+}
+
+fn still_running(goal: &GoalEntry) -> Status {
+    let (id, resource, grace_s) = (&goal.id, &goal.resource, STOP_GRACE.as_secs());
+    let message = format!(
+        "goal {id} of {resource} was told to stop, has not within {grace_s} s, and still runs: nothing begins before it has ended; if it \
+         never does, end the provider"
+    );
+    refusal(Code::ResourceExhausted, "STILL_RUNNING", message)
+}
+
+fn too_many_waiting(who: String) -> Status {
+    retry_later(TOO_MANY_WAITING, format!("{who}, the most at once: nothing was begun, try again in a moment"))
+}

@@ -1,0 +1,136 @@
+//! One goal from its beginning to its end.
+//!
+//! ```text
+//! begun ─ the action returns ─────────────────→ result told, place free
+//!    └─ told to stop ─ it does not for a grace ─→ result told ─ the action returns ─→ place free
+//! ```
+//! A goal has its resource until its action has returned, whatever was told of it before.
+
+use super::goal::{Ending, GoalEntry, StopCause};
+use super::server::Inner;
+use super::{Action, ActionFailure, ActionResult, GoalContext};
+use crate::safety::SafetyState;
+use crate::trace;
+use ratn_proto::MAX_PORTS_BYTES;
+use ratn_proto::convert::{ports_bytes, value_bytes, wire_ports};
+use ratn_proto::types::GoalOutcome;
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::task::JoinError;
+use tracing::Instrument;
+
+/// Of a goal that was told to stop and does not the result is told after this long; it keeps its resource until it has ended.
+pub(super) const STOP_GRACE: Duration = Duration::from_secs(3);
+
+/// Runs a goal to its end, whatever its action does.
+pub(super) async fn run(
+    server: Arc<Inner>,
+    entry: Arc<GoalEntry>,
+    action: Arc<dyn Action>,
+    context: GoalContext,
+    deadline_ms: u64,
+) {
+    tracing::debug!(goal = %entry.id, action = %context.action, "begun");
+    let performing = trace::within_any(trace::current(), async move {
+        match context.safety.state() {
+            SafetyState::Stopped { reason } => Err(ActionFailure::emergency_stop(&reason)),
+            // It may have been told to stop since it was admitted.
+            _ => match context.checkpoint() {
+                Ok(()) => action.execute(context).await,
+                Err(stopped) => Err(stopped),
+            },
+        }
+    });
+    let mut performing = tokio::spawn(performing.in_current_span());
+    let deadline = async {
+        if deadline_ms > 0 {
+            tokio::time::sleep(Duration::from_millis(deadline_ms)).await;
+            entry.stop(StopCause::Deadline);
+        }
+        // It only tells the goal to stop; the goal ends by itself, or is overdue.
+        std::future::pending::<Infallible>().await
+    };
+    let stopped = async {
+        entry.stop(StopCause::EmergencyStop(server.safety.stopped().await));
+        std::future::pending::<Infallible>().await
+    };
+    let overdue = async {
+        entry.cancelled.cancelled().await;
+        tokio::time::sleep(STOP_GRACE).await;
+    };
+    let mut returned = true;
+    let result = tokio::select! {
+        biased;
+        performed = &mut performing => result_of(performed),
+        () = overdue => {
+            returned = false;
+            let cause = GoalOutcome::from(entry.stopped()).reason;
+            Err(ActionFailure::Aborted(format!("{cause}; it did not stop within {} s", STOP_GRACE.as_secs())))
+        }
+        never = deadline => match never {},
+        never = stopped => match never {},
+    };
+    let lost = result.as_ref().is_err_and(|failure| matches!(failure, ActionFailure::Lost(_)));
+    let outcome = bounded(result.unwrap_or_else(GoalOutcome::from));
+    let outcome = match entry.cause() {
+        // Whatever the action makes of being stopped.
+        Some(cause @ StopCause::EmergencyStop(_)) if !outcome.is_success() => cause.failure().into(),
+        _ => outcome,
+    };
+    tracing::debug!(goal = %entry.id, outcome = %outcome.outcome, reason = %outcome.reason, "ended");
+    if returned {
+        // No longer running before anybody hears of its end: the next goal must find its place free.
+        server.state().end(&entry, server.limits.results_kept);
+    }
+    let ending = match entry.cause() {
+        Some(StopCause::ShuttingDown) if !outcome.is_success() => Ending::Gone,
+        None if lost => Ending::Lost(outcome.reason),
+        cause => {
+            let orphaned = !outcome.is_success() && cause.is_some_and(|cause| cause.is_orphaning());
+            Ending::Outcome(outcome, orphaned)
+        }
+    };
+    entry.result.send_replace(Some(ending));
+    if !returned {
+        let (goal, action, resource) = (&entry.id, &entry.action, &entry.resource);
+        let grace_s = STOP_GRACE.as_secs();
+        tracing::error!(%goal, %action, %resource, grace_s, "a goal that was told to stop still runs: nothing begins beside it");
+        // Not torn down: what it does in threads or on a device would go on unseen.
+        let _ = performing.await;
+        tracing::warn!(%goal, %action, %resource, "the goal that was told to stop has ended after all");
+        server.state().end(&entry, server.limits.results_kept);
+    }
+    entry.returned.cancel();
+}
+
+/// An outcome whose outputs fit into a message; a failure that says what does not, otherwise.
+fn bounded(outcome: GoalOutcome) -> GoalOutcome {
+    let outputs = wire_ports(outcome.outputs.clone());
+    let bytes = ports_bytes(&outputs);
+    if bytes <= MAX_PORTS_BYTES {
+        return outcome;
+    }
+    let largest = outcome.outputs.iter().max_by_key(|(name, _)| value_bytes(&outputs[*name]));
+    let largest = largest.map_or("", |(name, _)| name.as_str());
+    let reason =
+        format!("the outputs have {bytes} bytes, most of them `{largest}`: at most {MAX_PORTS_BYTES} are sent");
+    ActionFailure::Aborted(reason).into()
+}
+
+fn result_of(performed: Result<ActionResult, JoinError>) -> ActionResult {
+    performed.unwrap_or_else(|error| {
+        Err(ActionFailure::Aborted(match error.try_into_panic() {
+            Ok(panic) => format!("the action panicked: {}", panic_message(&*panic)),
+            Err(error) => format!("the action was torn down: {error}"),
+        }))
+    })
+}
+
+fn panic_message(panic: &(dyn std::any::Any + Send)) -> &str {
+    match (panic.downcast_ref::<&str>(), panic.downcast_ref::<String>()) {
+        (Some(text), _) => text,
+        (_, Some(text)) => text,
+        _ => "no message",
+    }
+}
