@@ -16,8 +16,10 @@ use crate::safety::Safety;
 use crate::server::{BindError, Exposure, ServeError, Services, Serving, bind_as};
 use crate::session::{DEFAULT_TTL, Session};
 use crate::shutdown;
+use crate::vitals::Vitals;
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
+use std::collections::BTreeSet;
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -27,7 +29,7 @@ use tokio_util::task::AbortOnDropHandle;
 /// What a worker is told by whoever starts it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorkerOptions {
-    /// Its resource's id: goals need a lease of it, which the resource manager confirms; empty asks for no lease.
+    /// Its resource's id: goals need a lease of it, which the resource manager confirms. Only a worker [`Worker::without_leases`] has none.
     pub id: String,
     /// Its resource's kind, `PathPlanner`.
     pub kind: String,
@@ -79,12 +81,23 @@ pub enum WorkerError {
     /// Nobody says where the resource manager is.
     #[error(
         "goals of worker `{id}` need a lease, and nobody says which resource manager confirms it: set {RESOURCE_MANAGER_VARIABLE} to its \
-         endpoint, or to file:PATH where PATH holds that, or give the worker no id"
+         endpoint, or to file:PATH where PATH holds that, or build the worker `without_leases()`"
     )]
     NoManager {
         /// The worker's resource.
         id: String,
     },
+    /// It has no resource of which a lease could be asked, and nothing says that it needs none.
+    #[error(
+        "the worker has no id, so its goals would need no lease: give it the id of its resource (WorkerOptions::id), or build it \
+         `without_leases()`, so that every caller with the role `task` has it perform goals"
+    )]
+    NoId,
+    /// Whatever moves is moved under a lease.
+    #[error(
+        "the worker moves something (it has a Safety), and asks for no lease: give it the id of its resource (WorkerOptions::id)"
+    )]
+    MovesWithoutLease,
     /// What the environment says of the resource manager is no location.
     #[error("{RESOURCE_MANAGER_VARIABLE}")]
     Location(#[source] EndpointError),
@@ -108,20 +121,32 @@ pub struct Worker {
     options: WorkerOptions,
     actions: ActionServerBuilder,
     safety: Option<Safety>,
-    believes: bool,
+    /// The resources that actions name themselves.
+    resources: BTreeSet<String>,
+    leases: Leases,
     shutdown: CancellationToken,
+}
+
+/// Whether goals need leases.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Leases {
+    Confirmed,
+    Believed,
+    NotAsked,
 }
 
 impl Worker {
     /// A worker without actions that takes one goal at a time.
     pub fn new(options: WorkerOptions) -> Worker {
         let actions = ActionServer::builder(options.id.clone()).one_at_a_time();
-        Worker { options, actions, safety: None, believes: false, shutdown: CancellationToken::new() }
+        let shutdown = CancellationToken::new();
+        Worker { options, actions, safety: None, resources: BTreeSet::new(), leases: Leases::Confirmed, shutdown }
     }
 
-    /// With an action.
+    /// With an action. One that names a resource of its own needs leases of that.
     #[must_use]
     pub fn action(mut self, action: impl Action) -> Worker {
+        self.resources.extend(action.resource().map(str::to_owned));
         self.actions = self.actions.action(action);
         self
     }
@@ -136,7 +161,14 @@ impl Worker {
     /// **For tests only.** Believes whatever a goal says of its lease: whoever reaches the worker has it do what it does.
     #[must_use]
     pub fn dangerously_believe_every_lease(mut self) -> Worker {
-        self.believes = true;
+        self.leases = Leases::Believed;
+        self
+    }
+
+    /// It may have no id, and then asks for no lease: whoever may call it has it perform goals. For what only computes, and is no resource.
+    #[must_use]
+    pub fn without_leases(mut self) -> Worker {
+        self.leases = Leases::NotAsked;
         self
     }
 
@@ -152,7 +184,13 @@ impl Worker {
     /// # Errors
     /// [`WorkerError`].
     pub async fn run(self) -> Result<(), WorkerError> {
-        let Worker { options, mut actions, safety, believes, shutdown } = self;
+        let Worker { options, mut actions, safety, mut resources, leases: asked, shutdown } = self;
+        let has_resource = !options.id.is_empty() || !resources.is_empty();
+        match asked {
+            _ if safety.is_some() && !has_resource => return Err(WorkerError::MovesWithoutLease),
+            Leases::Confirmed if !has_resource => return Err(WorkerError::NoId),
+            _ => {}
+        }
         let system = |what: &str| {
             let what = what.to_owned();
             move |source| WorkerError::System { what, source }
@@ -162,15 +200,20 @@ impl Worker {
             shutdown::exit_with_parent(&shutdown).map_err(system("watch its parent"))?;
         }
         let channels = Channels::new();
-        let leases = LeaseWatch::of([options.id.clone()]);
-        let location = match options.id.is_empty() || believes || options.resource_manager.is_some() {
+        resources.extend((!options.id.is_empty()).then(|| options.id.clone()));
+        let leases = LeaseWatch::of(resources);
+        let confirms = has_resource && asked != Leases::Believed;
+        let location = match !confirms || options.resource_manager.is_some() {
             true => None,
             false => match ManagerLocation::from_environment().map_err(WorkerError::Location)? {
                 Some(location) => Some(location),
                 None => return Err(WorkerError::NoManager { id: options.id }),
             },
         };
-        actions = if believes { actions.dangerously_believe_every_lease() } else { actions.leases(&leases) };
+        actions = match asked {
+            Leases::Believed => actions.dangerously_believe_every_lease(),
+            Leases::Confirmed | Leases::NotAsked => actions.leases(&leases),
+        };
         let watching = location.map(|location| {
             let (leases, channels) = (leases.clone(), channels.clone());
             let watch = async move { leases.follow_location(&channels, location, DEFAULT_TTL).await };
@@ -184,7 +227,9 @@ impl Worker {
             Some(file) => LiveAccess::of_file(file)?,
             None => LiveAccess::from_environment()?,
         };
-        let serving = Serving { gate: Arc::new(RoleGate::new(access)), ..Serving::default() };
+        let vitals = Vitals::default();
+        let _hearing = confirms.then(|| serve_once_heard(&leases, &vitals));
+        let serving = Serving { gate: Arc::new(RoleGate::new(access)), vitals, ..Serving::default() };
         let bound = bind_as(&options.listen, &options.exposure).await?;
         let endpoint = bound.endpoint().clone();
         let mut services = Services::new().with(server.clone().into_service());
@@ -212,20 +257,37 @@ impl Worker {
 
         shutdown.cancelled().await;
         drop(published);
+        // What the goals move stays this worker's until nothing moves any more.
+        let (served, stopped) =
+            tokio::join!(serving, tokio::time::timeout(crate::server::DRAIN_DEADLINE, server.shut_down()));
+        drop(watching);
         if let Some(Offered { session, provider, watching }) = offered {
             drop((provider, watching));
-            session.close().await;
+            match stopped {
+                Ok(()) => session.close().await,
+                Err(_) => {
+                    tracing::error!(id = %options.id, "goals still run at the end: the session is left to run out by itself");
+                    // Dropped, it would be ended with the manager.
+                    std::mem::forget(session);
+                }
+            }
         }
-        let stopping = server.shut_down();
-        drop(watching);
-        let (served, ()) = tokio::join!(serving, async {
-            let _ = tokio::time::timeout(crate::server::DRAIN_DEADLINE, stopping).await;
-        });
         match served {
             Ok(served) => Ok(served?),
             Err(error) => Err(WorkerError::System { what: "serve".to_owned(), source: io::Error::other(error) }),
         }
     }
+}
+
+/// Nobody is offered a worker that refuses every goal because it has never heard the resource manager.
+fn serve_once_heard(leases: &LeaseWatch, vitals: &Vitals) -> AbortOnDropHandle<()> {
+    vitals.unwell("the resource manager has not been heard yet: every goal is refused");
+    let (mut heard, leases, vitals) = (leases.heard(), leases.clone(), vitals.clone());
+    AbortOnDropHandle::new(tokio::spawn(async move {
+        // The sender is in the watch.
+        while !leases.is_heard() && heard.changed().await.is_ok() {}
+        vitals.well();
+    }))
 }
 
 /// What a worker offers by itself.

@@ -55,9 +55,11 @@ async fn a_worker_asks_its_config_who_may_and_only_an_operator_lets_a_robot_move
         [("viewer", false, false), ("task", true, false), ("agent", true, false), ("operator", true, true)]
     {
         std::fs::write(&file, section(role)).unwrap();
-        let options = WorkerOptions { listen: listen.clone(), access: Some(file.clone()), ..WorkerOptions::default() };
+        let (id, access) = (RESOURCE.to_owned(), Some(file.clone()));
+        let options = WorkerOptions { id, listen: listen.clone(), access, ..WorkerOptions::default() };
         let (safety, ends) = (Safety::default(), shutdown.child_token());
-        let worker = Worker::new(options).safety(safety.clone()).shutdown(ends.clone()).run();
+        let worker = Worker::new(options).dangerously_believe_every_lease().safety(safety.clone());
+        let worker = worker.shutdown(ends.clone()).run();
         let running = tokio::spawn(worker);
         let channels = Channels::new();
         ratn_worker::client::wait_until_serving(&listen, Duration::from_secs(10)).await.unwrap();
@@ -80,7 +82,7 @@ async fn a_worker_asks_its_config_who_may_and_only_an_operator_lets_a_robot_move
 async fn a_worker_whose_config_is_none_does_not_start() {
     let place = tempfile::tempdir().unwrap();
     let options = WorkerOptions { access: Some(place.path().join("none")), ..WorkerOptions::default() };
-    let refused = Worker::new(options).run().await.unwrap_err();
+    let refused = Worker::new(options).without_leases().run().await.unwrap_err();
     let source = std::error::Error::source(&refused).unwrap().to_string();
     assert!(source.starts_with("no roles of callers from "), "{source}");
 }
