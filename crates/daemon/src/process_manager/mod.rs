@@ -106,7 +106,8 @@ pub async fn run_as(
     // Before anything is offered: what the last process manager offered goes where it is not wanted any more.
     let before: Vec<String> =
         left.iter().map(|entry| &entry.id).chain(unknown.iter().map(|intent| &intent.id)).cloned().collect();
-    let adopted = predecessor::settle(left, unknown, &config.templates, &directory, &tracker).await;
+    let manager = processes::manager_of(&config, &directory);
+    let adopted = predecessor::settle(left, unknown, &config.templates, &manager, &directory, &tracker).await;
     roster.keep_only(&adopted.iter().map(|one| one.entry.id.as_str()).collect());
     let (wanted, to_offer) = watch::channel(Wanted::new());
     let workers = adopted

@@ -15,6 +15,7 @@ use super::template::Template;
 use super::tracking::Tracker;
 use nix::sys::signal::Signal;
 use ratn_proto::types::{WorkerState, WorkerStatus};
+use ratn_worker::lease_watch::ManagerLocation;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
@@ -35,7 +36,7 @@ pub(super) struct Adopted {
     /// As long as this is open, it has a parent.
     pub(super) parent_lives: UnixStream,
     pub(super) exit: Exit,
-    /// Its template has changed: it is to be replaced.
+    /// Its template has changed, or the resource manager's place: it is to be replaced.
     pub(super) outdated: bool,
 }
 
@@ -97,12 +98,13 @@ pub(super) async fn settle(
     left: Vec<Entry>,
     unknown: Vec<Intent>,
     templates: &[Template],
+    manager: &ManagerLocation,
     directory: &RuntimeDirectory,
     tracker: &Tracker,
 ) -> Vec<Adopted> {
     let settled = left.into_iter().map(async |entry| {
         let adopted = match Exit::of(&entry) {
-            Some(exit) => match greet(&entry, exit, templates, directory).await {
+            Some(exit) => match greet(&entry, exit, templates, manager, directory).await {
                 Ok(adopted) => Some(adopted),
                 Err((exit, why)) => {
                     tracing::info!(
@@ -146,6 +148,7 @@ async fn greet(
     entry: &Entry,
     exit: Exit,
     templates: &[Template],
+    manager: &ManagerLocation,
     directory: &RuntimeDirectory,
 ) -> Result<Adopted, (Exit, &'static str)> {
     let Some(template) = templates.iter().find(|template| template.name == entry.template.name) else {
@@ -160,12 +163,18 @@ async fn greet(
     let socket = adopt_socket(&account::directory_of(directory, &entry.template), &entry.id);
     match timeout(GREETING_PATIENCE, UnixStream::connect(socket)).await {
         Ok(Ok(parent_lives)) => {
-            let outdated = !template.starts_the_same_as(&entry.template);
+            let outdated = is_outdated(entry, template, manager);
             tracing::info!(id = entry.id, pid = entry.pid, outdated, "a worker of the last process manager is adopted");
             Ok(Adopted { entry: entry.clone(), parent_lives, exit, outdated })
         }
         _ => Err((exit, "it does not listen for a successor")),
     }
+}
+
+/// Whether a worker of now would be another one: of another template, or told of another resource manager. One that asks a manager which
+/// is not that of the system confirms no lease of it.
+fn is_outdated(entry: &Entry, template: &Template, manager: &ManagerLocation) -> bool {
+    !template.starts_the_same_as(&entry.template) || entry.manager.as_ref() != Some(&manager.to_string())
 }
 
 async fn end(entry: &Entry, exit: &Exit) {
@@ -190,5 +199,32 @@ fn remove_files(id: &str, template: &Template, directory: &RuntimeDirectory) {
     let files = [directory.endpoint_file(id), adopt_socket(directory, id)];
     for file in files {
         let _ = std::fs::remove_file(file);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn a_worker_that_was_told_of_another_resource_manager_is_outdated() {
+        let template = Template::new("planner", "PathPlanner");
+        let outdated = |manager: Option<&str>| {
+            let entry = Entry {
+                id: "planner-1".to_owned(),
+                pid: 42,
+                began: 7,
+                endpoint: None,
+                manager: manager.map(str::to_owned),
+                limits: String::new(),
+                groups: Vec::new(),
+                template: template.clone(),
+            };
+            is_outdated(&entry, &template, &"http://127.0.0.1:2".parse().unwrap())
+        };
+        assert!(!outdated(Some("http://127.0.0.1:2")));
+        assert!(outdated(Some("http://127.0.0.1:1")));
+        assert!(outdated(None), "nobody knows");
     }
 }

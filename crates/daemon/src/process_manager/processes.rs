@@ -101,6 +101,14 @@ struct Process {
     attended: Option<(AbortHandle, mpsc::Sender<Duration>)>,
 }
 
+/// Where the workers of a process manager are told that the resource manager is.
+pub(super) fn manager_of(config: &ProcessManagerConfig, directory: &RuntimeDirectory) -> ManagerLocation {
+    match &config.resource_manager {
+        Some(endpoint) => ManagerLocation::At(endpoint.clone()),
+        None => ManagerLocation::File(directory.endpoint_file(resource_manager::ROLE)),
+    }
+}
+
 impl Processes {
     /// None yet. Needs a tokio runtime.
     pub(super) fn start(
@@ -114,10 +122,7 @@ impl Processes {
         let (health, answered) = mpsc::channel(OUTCOMES);
         let processes = Processes {
             host: config.host.clone(),
-            manager: match &config.resource_manager {
-                Some(endpoint) => ManagerLocation::At(endpoint.clone()),
-                None => ManagerLocation::File(directory.endpoint_file(resource_manager::ROLE)),
-            },
+            manager: manager_of(config, &directory),
             worker_environment: config.worker_environment.clone(),
             max_log_bytes: config.max_log_bytes,
             groups: Groups { v2: config.cgroup.clone(), v1: config.cgroup_v1.clone(), tracking: tracker.groups() },
@@ -219,8 +224,17 @@ impl Processes {
         process.pid = pid;
         drop(process.known.take());
         if let (Some(template), Some(began)) = (process.template.take(), predecessor::began(pid)) {
-            let limits = limits.to_owned();
-            self.roster.began(Entry { id: id.to_owned(), pid, began, endpoint: None, limits, groups, template });
+            let (limits, manager) = (limits.to_owned(), Some(self.manager.to_string()));
+            self.roster.began(Entry {
+                id: id.to_owned(),
+                pid,
+                began,
+                endpoint: None,
+                manager,
+                limits,
+                groups,
+                template,
+            });
         }
     }
 

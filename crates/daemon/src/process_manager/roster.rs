@@ -24,6 +24,9 @@ pub(super) struct Entry {
     pub(super) began: u64,
     /// Where it serves; `None` while it did not.
     pub(super) endpoint: Option<String>,
+    /// Where it was told that the resource manager is; nothing in what an older version wrote.
+    #[serde(default)]
+    pub(super) manager: Option<String>,
     /// What it may use of the machine, for people.
     pub(super) limits: String,
     /// Its groups of cgroups, if it has any.
@@ -225,6 +228,7 @@ mod tests {
             pid: 42,
             began: 7,
             endpoint: None,
+            manager: Some("file:/run/resource-manager.endpoint".to_owned()),
             limits: String::new(),
             groups: Vec::new(),
             template: Template::new("planner", "PathPlanner"),
