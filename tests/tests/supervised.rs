@@ -116,3 +116,49 @@ fn a_reload_takes_over_bounds_roles_and_the_log_filter_and_names_what_it_does_no
     ensure!(code == Some(1) && refused.contains("may not"), "{code:?} {refused}");
     Ok(())
 }
+
+#[test]
+fn certificates_are_read_again_at_a_reload_and_a_bad_one_changes_nothing() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let (used, first, second) = (place.path().join("used"), place.path().join("first"), place.path().join("second"));
+    std::fs::create_dir(&used)?;
+    for made in [&first, &second] {
+        // Each with an authority of its own.
+        let made = made.to_str().context("a path")?;
+        ensure!(place.ratn(&["certs", made, "localhost"]).output()?.status.success());
+    }
+    let put = |made: &PathBuf| -> anyhow::Result<()> {
+        for name in ["ca.pem", "localhost.pem", "localhost.key"] {
+            std::fs::copy(made.join(name), used.join(name))?;
+        }
+        Ok(())
+    };
+    put(&first)?;
+    let file = |name: &str| used.join(name).display().to_string();
+    let config = format!(
+        "[service.tls]\ncert = '{}'\nkey = '{}'\nclient_ca = '{}'\n[resource-manager]\nlisten = 'localhost:0'\n",
+        file("localhost.pem"),
+        file("localhost.key"),
+        file("ca.pem")
+    );
+    let manager = Supervised::start("resource-manager", &config)?;
+    let is_served = |made: &PathBuf| -> anyhow::Result<bool> {
+        let mut list = manager.place.ratn(&["resource", "list"]);
+        list.env("RATN_TLS_CA", made.join("ca.pem"));
+        list.env("RATN_TLS_CERT", made.join("localhost.pem")).env("RATN_TLS_KEY", made.join("localhost.key"));
+        Ok(list.output()?.status.success())
+    };
+    ensure!(is_served(&first)? && !is_served(&second)?, "{}", manager.process.said());
+
+    std::fs::write(used.join("localhost.pem"), "no certificate")?;
+    manager.reload(&config)?;
+    wait_for("the complaint", || Ok(manager.process.said().contains("the config stays as it was").then_some(())))?;
+    let said = manager.process.said();
+    ensure!(said.contains(&format!("cannot read the TLS file {}", file("localhost.pem"))), "{said}");
+    ensure!(is_served(&first)? && !is_served(&second)?, "{said}");
+
+    put(&second)?;
+    manager.reload(&config)?;
+    ensure!(is_served(&second)? && !is_served(&first)?, "{}", manager.process.said());
+    Ok(())
+}

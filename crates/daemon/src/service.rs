@@ -11,7 +11,7 @@ use crate::quota::{QuotaConfig, Quotas};
 use crate::telemetry::{self, LogConfig};
 use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::server::{Exposure, Serving};
-use ratn_worker::tls::{self, ClientTls, ServerTls, TlsError};
+use ratn_worker::tls::{self, ClientTls, LiveServerTls, ServerTls, TlsError};
 use ratn_worker::unix_socket::SocketAccess;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -108,7 +108,11 @@ impl ServiceConfig {
     /// As [`ServiceConfig::serving`], with roles that may change meanwhile.
     pub fn serving_with(&self, access: &LiveAccess) -> Serving {
         Serving {
-            exposure: Exposure { tls: self.tls.clone(), insecure: self.insecure, socket: self.socket.clone() },
+            exposure: Exposure {
+                tls: self.tls.clone().map(LiveServerTls::new),
+                insecure: self.insecure,
+                socket: self.socket.clone(),
+            },
             gate: Arc::new(QuotaGate {
                 roles: RoleGate::new(access.clone()),
                 quotas: Quotas::new(self.quotas.clone()),

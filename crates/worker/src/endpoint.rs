@@ -1,6 +1,7 @@
 //! Where a server is: a TCP address, with TLS or without, or a Unix socket. Written `http://host:port`, `host:port`,
 //! `https://host:port` or `unix:/path`.
 
+use crate::tls::connect::Connector;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::path::PathBuf;
@@ -150,7 +151,11 @@ impl TryFrom<String> for Endpoint {
 /// # Errors
 /// [`ConnectError`] when the endpoint makes no URI.
 pub fn connect_lazily(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
-    Ok(configured(endpoint)?.connect_lazy())
+    let configured = configured(endpoint)?;
+    Ok(match tls_of(endpoint) {
+        Some(connector) => configured.connect_with_connector_lazy(connector),
+        None => configured.connect_lazy(),
+    })
 }
 
 /// A channel that is connected.
@@ -158,8 +163,7 @@ pub fn connect_lazily(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
 /// # Errors
 /// [`ConnectError`] when nobody answers there within [`CONNECT_TIMEOUT`].
 pub async fn connect(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
-    let connected = configured(endpoint)?.connect().await;
-    connected.map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
+    connected(endpoint, configured(endpoint)?).await
 }
 
 /// As [`connect`], without pings while nothing is asked: for questions that are asked again and again, each with a deadline.
@@ -167,8 +171,23 @@ pub async fn connect(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
 /// # Errors
 /// As [`connect`].
 pub(crate) async fn connect_to_ask(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
-    let connected = unwatched(endpoint)?.connect().await;
+    connected(endpoint, unwatched(endpoint)?).await
+}
+
+async fn connected(endpoint: &Endpoint, configured: tonic::transport::Endpoint) -> Result<Channel, ConnectError> {
+    let connected = match tls_of(endpoint) {
+        Some(connector) => configured.connect_with_connector(connector).await,
+        None => configured.connect().await,
+    };
     connected.map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
+}
+
+/// TLS is the connector's: tonic's own would be as it was when the channel was made.
+fn tls_of(endpoint: &Endpoint) -> Option<Connector> {
+    match endpoint {
+        Endpoint::Tls { host, .. } => Some(Connector::to(host)),
+        Endpoint::Tcp { .. } | Endpoint::Unix(_) => None,
+    }
 }
 
 fn configured(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, ConnectError> {
@@ -180,11 +199,20 @@ fn configured(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, Connect
 
 fn unwatched(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, ConnectError> {
     let failed = |source| ConnectError { endpoint: endpoint.clone(), source };
-    let mut configured = tonic::transport::Endpoint::from_shared(endpoint.to_string()).map_err(failed)?;
-    if let Endpoint::Tls { host, .. } = endpoint {
-        configured = configured.tls_config(crate::tls::of_client(host)).map_err(failed)?;
+    let mut configured = tonic::transport::Endpoint::from_shared(address_of(endpoint)).map_err(failed)?;
+    if let Endpoint::Tls { .. } = endpoint {
+        let origin = tonic::transport::Endpoint::from_shared(endpoint.to_string()).map_err(failed)?;
+        configured = configured.origin(origin.uri().clone());
     }
     Ok(configured.connect_timeout(CONNECT_TIMEOUT).tcp_nodelay(true))
+}
+
+/// As tonic takes it: of TLS it knows nothing.
+fn address_of(endpoint: &Endpoint) -> String {
+    match endpoint {
+        Endpoint::Tls { host, port } => Endpoint::Tcp { host: host.clone(), port: *port }.to_string(),
+        Endpoint::Tcp { .. } | Endpoint::Unix(_) => endpoint.to_string(),
+    }
 }
 
 #[cfg(test)]

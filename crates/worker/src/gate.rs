@@ -105,7 +105,9 @@ pub fn identity_of(extensions: &http::Extensions) -> Identity {
 /// Which connection a request came over.
 fn link_of(extensions: &http::Extensions) -> Option<&Link> {
     let over_unix = extensions.get::<LinkInfo<UdsConnectInfo>>().map(|known| &known.link);
-    over_unix.or_else(|| extensions.get::<LinkInfo<TcpConnectInfo>>().map(|known| &known.link))
+    let over_tcp = || extensions.get::<LinkInfo<TcpConnectInfo>>();
+    let over_tls = || extensions.get::<TlsConnectInfo<LinkInfo<TcpConnectInfo>>>().map(TlsConnectInfo::get_ref);
+    over_unix.or_else(|| over_tcp().or_else(over_tls).map(|known| &known.link))
 }
 
 /// What a process that ends says to whoever asks it for something new.

@@ -9,7 +9,8 @@ use crate::access::RoleGate;
 use crate::connections::{ConnectionLimits, Connections};
 use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
 use crate::gate::{Calls, Gate, Gated};
-use crate::tls::{ServerTls, TlsError};
+use crate::tls::accept::handshakes;
+use crate::tls::{LiveServerTls, TlsError};
 use crate::unix_socket::{self, SocketAccess};
 use crate::vitals::{CoreFailure, Vitals};
 use std::convert::Infallible;
@@ -27,7 +28,6 @@ use tonic::body::Body;
 use tonic::codegen::{Service, http};
 use tonic::server::NamedService;
 use tonic::service::Routes;
-use tonic::transport::ServerTlsConfig;
 use tonic::transport::server::TcpIncoming;
 use tonic_health::ServingStatus;
 
@@ -71,7 +71,7 @@ pub enum Phase {
 pub struct Bound {
     listener: Listener,
     endpoint: Endpoint,
-    tls: Option<ServerTlsConfig>,
+    tls: Option<LiveServerTls>,
 }
 
 #[derive(Debug)]
@@ -115,16 +115,16 @@ pub enum BindError {
         /// Which.
         endpoint: Endpoint,
     },
-    /// A TLS file cannot be read.
+    /// A TLS file cannot be read, or holds nothing usable.
     #[error(transparent)]
     Tls(#[from] TlsError),
 }
 
 /// What a server may listen on.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default)]
 pub struct Exposure {
     /// With it every TCP address is served with TLS.
-    pub tls: Option<ServerTls>,
+    pub tls: Option<LiveServerTls>,
     /// Without TLS, addresses beyond loopback are served all the same.
     pub insecure: bool,
     /// Who may connect to a Unix socket.
@@ -198,7 +198,8 @@ pub async fn bind_as(listen: &Endpoint, exposure: &Exposure) -> Result<Bound, Bi
     let failed = |source| BindError::Refused { endpoint: listen.clone(), source };
     match listen {
         Endpoint::Tcp { host, port } | Endpoint::Tls { host, port } => {
-            let tls = exposure.tls.as_ref().map(ServerTls::read).transpose()?;
+            let tls = exposure.tls.clone();
+            tls.as_ref().map(LiveServerTls::load).transpose()?;
             if tls.is_none() && matches!(listen, Endpoint::Tls { .. }) {
                 return Err(BindError::NoCertificate { endpoint: listen.clone() });
             }
@@ -258,7 +259,7 @@ impl Bound {
     /// As [`Bound::serve`], through a gate and with a drain of one's own.
     ///
     /// # Errors
-    /// [`ServeError`] where the transport fails, the TLS files hold nothing usable, or what is served has ended before its time: then
+    /// [`ServeError`] where the transport fails, or what is served has ended before its time: then
     /// nothing more is answered, and nothing drains.
     pub async fn serve_as(
         self,
@@ -284,29 +285,31 @@ impl Bound {
             .map_err(ServeError::Reflection)?;
         let calls = Calls::until(shutdown.clone());
         let closing = CancellationToken::new();
-        let mut server = tonic::transport::Server::builder();
-        if let Some(tls) = self.tls {
-            let failed = |source| ServeError::Transport { endpoint: self.endpoint.clone(), source };
-            let tls = tls.timeout(serving.connections.first_call);
-            server = server.tls_config(tls).map_err(failed)?;
-        }
-        let router = server
+        let router = tonic::transport::Server::builder()
             .http2_max_header_list_size(MAX_METADATA_BYTES)
             .layer(Gated { gate: serving.gate, calls: calls.clone() })
             .http2_keepalive_interval(Some(KEEPALIVE_INTERVAL))
             .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
             .add_routes(services.routes.add_service(health_service).add_service(reflection));
 
+        let first_call = serving.connections.first_call;
         let connections = Connections::new(serving.connections);
         let accepting = connections.clone();
         let served = {
             let stop = closing.clone().cancelled_owned();
-            async move {
+            // On the heap: it is large, and within the future of every daemon.
+            Box::pin(async move {
                 match self.listener {
                     Listener::Tcp(listener) => {
                         let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
                         let incoming = incoming.filter_map(move |stream| accepting.admit(stream));
-                        router.serve_with_incoming_shutdown(incoming, stop).await
+                        match self.tls {
+                            Some(tls) => {
+                                let incoming = handshakes(incoming, tls, first_call);
+                                router.serve_with_incoming_shutdown(incoming, stop).await
+                            }
+                            None => router.serve_with_incoming_shutdown(incoming, stop).await,
+                        }
                     }
                     Listener::Unix(listener, file) => {
                         let incoming = UnixListenerStream::new(listener);
@@ -319,7 +322,7 @@ impl Bound {
                         router.serve_with_incoming_shutdown(incoming, stop).await
                     }
                 }
-            }
+            })
         };
         serving.phase.send_replace(Phase::Serving);
         let drained = async {

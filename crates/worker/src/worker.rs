@@ -27,7 +27,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 
 /// What a worker is told by whoever starts it.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct WorkerOptions {
     /// Its resource's id: goals need a lease of it, which the resource manager confirms. Only a worker [`Worker::without_leases`] has none.
     pub id: String,

@@ -157,7 +157,7 @@ async fn one_run(
         // The system ends with the demo: nobody resumes it.
         checkpoint_every: 0,
     };
-    let system = starting(System::start_private(config), interrupt).await?;
+    let system = starting(Box::pin(System::start_private(config)), interrupt).await?;
     let (ended, (delivered, greatest_tilt_rad)) =
         on_system(run, system, interrupt, async |system| system.in_place().await).await?;
     let timeline = Timeline::of(&log::read(&log_file)?.lines);

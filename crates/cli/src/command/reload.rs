@@ -6,6 +6,7 @@ use ratn_daemon::access::LiveAccess;
 use ratn_daemon::reload;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::telemetry::Logs;
+use ratn_worker::tls::{self, LiveServerTls};
 use std::path::PathBuf;
 use tokio::sync::watch;
 
@@ -14,13 +15,15 @@ const SHARED: [&str; 2] = ["service", "speed"];
 
 /// A daemon's config and what of it may change.
 pub(super) struct Reloading {
-    /// Without one only the audit log is opened again.
+    /// Without one only the audit log is opened again, and certificates are read again.
     pub(super) file: Option<PathBuf>,
     /// As the process began with it.
     pub(super) running: SystemConfig,
     /// The daemon's section.
     pub(super) role: &'static str,
     pub(super) logs: Logs,
+    /// What is served with TLS shows this.
+    pub(super) tls: Option<LiveServerTls>,
     pub(super) access: LiveAccess,
     /// Of the resource manager.
     pub(super) bounds: watch::Sender<ResourceManagerConfig>,
@@ -45,7 +48,9 @@ impl Reloading {
             None => self.running.clone(),
         };
         let (old, new) = (toml::Table::try_from(&self.running)?, toml::Table::try_from(&wanted)?);
+        let renewed = tls::read_again(self.tls.as_ref()).context("[service.tls]")?;
         self.logs.reload(&wanted.service.log).context("[service.log]")?;
+        renewed.take_over();
         self.access.replace(wanted.service.access);
         self.bounds.send_replace(wanted.resource_manager);
         let mine =

@@ -144,7 +144,11 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
         exit_with_parent: arguments.exit_with_parent,
         resource_manager: arguments.resource_manager.clone(),
         host: arguments.host.clone(),
-        exposure: Exposure { tls: tls::server_from_environment(), insecure: arguments.insecure, ..Exposure::default() },
+        exposure: Exposure {
+            tls: tls::server_from_environment().map(Into::into),
+            insecure: arguments.insecure,
+            ..Exposure::default()
+        },
         access: arguments.config.clone(),
     };
     let speed = arguments.speed;
@@ -216,8 +220,9 @@ fn daemon_on(
         let (access, bounds) =
             (LiveAccess::new(service.access.clone()), watch::Sender::new(system.resource_manager.clone()));
         let serving = service.serving_with(&access);
+        let tls = serving.exposure.tls.clone();
         let host = Host { listen: arguments.listen.clone(), directory, shutdown, bounds: bounds.subscribe(), serving };
-        let reloading = Reloading { file: arguments.config.clone(), running, role, logs, access, bounds };
+        let reloading = Reloading { file: arguments.config.clone(), running, role, logs, tls, access, bounds };
         let followed =
             supervisor.follow(host.serving.phase.subscribe(), host.serving.vitals.clone(), move || reloading.reload());
         let followed = tokio::spawn(followed);

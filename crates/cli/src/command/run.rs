@@ -83,7 +83,7 @@ async fn begin(arguments: &RunArguments, task: &Path, directory: &Path, interrup
         }
         None => {
             output::progress(format_args!("no system runs in {}: starting one for this run", directory.display()));
-            let system = starting(System::start_private(config.clone()), interrupt).await?;
+            let system = starting(Box::pin(System::start_private(config.clone())), interrupt).await?;
             output::progress(format_args!("its runtime directory: {}", system.directory().path().display()));
             system
         }

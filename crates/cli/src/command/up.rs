@@ -20,7 +20,7 @@ pub(crate) fn run(arguments: &UpArguments) -> Result<(), Failure> {
         if running(&directory).await.is_some() {
             return Err(Failure::Refused(format!("ratn: a system runs in {} already", directory.display())));
         }
-        let mut system = starting(System::start_public(config, &directory), &interrupt).await?;
+        let mut system = starting(Box::pin(System::start_public(config, &directory)), &interrupt).await?;
         output::progress(format_args!(
             "the system is ready in {}; Ctrl-C ends it",
             system.directory().path().display()

@@ -1,0 +1,168 @@
+//! Certificates that are replaced while a process runs: what its server shows, and what its clients do.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_worker::endpoint::{Endpoint, connect, connect_lazily};
+use ratn_worker::gate::{Gate, Identity};
+use ratn_worker::server::{Exposure, Services, Serving, bind_as};
+use ratn_worker::tls::{self, ClientTls, LiveServerTls, ServerTls, read_again};
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, ExtendedKeyUsagePurpose, IsCa, KeyPair};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+use tokio_util::sync::CancellationToken;
+use tonic::codegen::http;
+use tonic::transport::{Certificate, Channel, ClientTlsConfig};
+use tonic::{Code, Status};
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_client::HealthClient;
+
+/// Nothing here takes this long.
+const LONG: Duration = Duration::from_secs(20);
+
+struct Authority(CertifiedIssuer<'static, KeyPair>);
+
+struct Signed {
+    pem: String,
+    key: String,
+    der: Vec<u8>,
+}
+
+impl Authority {
+    fn new() -> Authority {
+        let mut params = CertificateParams::new([]).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        Authority(CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap())
+    }
+
+    fn sign(&self) -> Signed {
+        let key = KeyPair::generate().unwrap();
+        let mut params = CertificateParams::new(["localhost".to_owned()]).unwrap();
+        params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
+        let certificate = params.signed_by(&key, &self.0).unwrap();
+        Signed { pem: certificate.pem(), key: key.serialize_pem(), der: certificate.der().to_vec() }
+    }
+}
+
+/// Where the three files of a process are.
+struct Files(tempfile::TempDir);
+
+impl Files {
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    fn write(&self, authority: &Authority, signed: &Signed) {
+        for (name, text) in [("ca", &authority.0.pem()), ("cert", &signed.pem), ("key", &signed.key)] {
+            std::fs::write(self.path(name), text).unwrap();
+        }
+    }
+}
+
+/// Lets everybody in, and remembers the certificate of the last caller.
+#[derive(Default)]
+struct Remembering(Mutex<Option<Vec<u8>>>);
+
+impl Gate for Remembering {
+    fn admit(&self, identity: &Identity, _: &str, _: &mut http::Extensions) -> Result<(), Status> {
+        let Identity::Certificate { der } = identity else { return Err(Status::unauthenticated("no certificate")) };
+        *self.0.lock().unwrap() = Some(der.to_vec());
+        Ok(())
+    }
+
+    fn answered(&self, _: &str, _: Code, _: Duration) {}
+}
+
+async fn ask(channel: Channel) -> Result<(), Status> {
+    let check = HealthCheckRequest { service: String::new() };
+    tokio::time::timeout(LONG, HealthClient::new(channel).check(check)).await.unwrap().map(drop)
+}
+
+/// A client that has nothing of the process: it trusts `authority` and shows `shown`.
+async fn stranger(endpoint: &Endpoint, authority: &Authority, shown: &Signed) -> Result<(), Status> {
+    let tls = ClientTlsConfig::new().domain_name("localhost").ca_certificate(Certificate::from_pem(authority.0.pem()));
+    let tls = tls.identity(tonic::transport::Identity::from_pem(&shown.pem, &shown.key));
+    ask(Channel::from_shared(endpoint.to_string()).unwrap().tls_config(tls).unwrap().connect_lazy()).await
+}
+
+/// The certificate that is shown to who connects now.
+async fn shown_by(endpoint: &Endpoint, authority: &Authority) -> Vec<u8> {
+    use tokio_rustls::rustls::crypto::ring::default_provider;
+    use tokio_rustls::rustls::{ClientConfig, RootCertStore};
+    let Endpoint::Tls { host, port } = endpoint else { panic!("{endpoint}") };
+    let mut roots = RootCertStore::empty();
+    roots.add(authority.0.der().clone()).unwrap();
+    let config = ClientConfig::builder_with_provider(Arc::new(default_provider()))
+        .with_safe_default_protocol_versions()
+        .unwrap()
+        .with_root_certificates(roots)
+        .with_no_client_auth();
+    let stream = tokio::net::TcpStream::connect((host.as_str(), *port)).await.unwrap();
+    let connector = tokio_rustls::TlsConnector::from(Arc::new(config));
+    let stream = connector.connect("localhost".try_into().unwrap(), stream).await.unwrap();
+    stream.get_ref().1.peer_certificates().unwrap()[0].to_vec()
+}
+
+fn refused(server: &LiveServerTls, file: &Path) {
+    let error = read_again(Some(server)).unwrap_err();
+    assert_eq!(error.file, file, "{error}");
+}
+
+#[tokio::test]
+async fn a_connection_made_after_certificates_were_read_again_is_with_the_new_ones_and_bad_ones_change_nothing() {
+    let (files, authority) = (Files(tempfile::tempdir().unwrap()), Authority::new());
+    let (first, second) = (authority.sign(), authority.sign());
+    files.write(&authority, &first);
+    let (ca, cert, key) = (files.path("ca"), files.path("cert"), files.path("key"));
+    assert!(tls::install(ClientTls::read(&ca, Some((&cert, &key))).unwrap()));
+    let server = LiveServerTls::new(ServerTls { cert: cert.clone(), key: key.clone(), client_ca: ca.clone() });
+    let exposure = Exposure { tls: Some(server.clone()), ..Exposure::default() };
+    let bound = bind_as(&"localhost:0".parse().unwrap(), &exposure).await.unwrap();
+    let endpoint = bound.endpoint().clone();
+    let gate = Arc::new(Remembering::default());
+    let caller = || gate.0.lock().unwrap().clone().unwrap();
+    let (serving, shutdown) = (Serving { gate: gate.clone(), ..Serving::default() }, CancellationToken::new());
+    let served = tokio::spawn(bound.serve_as(Services::new(), serving, shutdown.clone()));
+
+    let (open, lazy) = (connect(&endpoint).await.unwrap(), connect_lazily(&endpoint).unwrap());
+    ask(open.clone()).await.unwrap();
+    assert_eq!((caller(), shown_by(&endpoint, &authority).await), (first.der.clone(), first.der.clone()));
+
+    // The next connection of both sides is with the new ones, also that of a channel from before; an open one goes on.
+    files.write(&authority, &second);
+    let renewed = read_again(Some(&server)).unwrap();
+    assert_eq!(shown_by(&endpoint, &authority).await, first.der, "not before it is taken over");
+    renewed.take_over();
+    assert_eq!(shown_by(&endpoint, &authority).await, second.der);
+    ask(lazy).await.unwrap();
+    assert_eq!(caller(), second.der);
+    ask(open.clone()).await.unwrap();
+    assert_eq!(caller(), first.der);
+
+    // Bad ones: the old stay, of the server and of its clients.
+    std::fs::write(&key, &first.key).unwrap();
+    refused(&server, &key);
+    std::fs::write(&cert, "no certificate").unwrap();
+    refused(&server, &cert);
+    files.write(&authority, &first);
+    std::fs::write(&ca, "").unwrap();
+    refused(&server, &ca);
+    std::fs::remove_file(&ca).unwrap();
+    refused(&server, &ca);
+    assert_eq!(shown_by(&endpoint, &authority).await, second.der);
+    ask(connect(&endpoint).await.unwrap()).await.unwrap();
+    assert_eq!(caller(), second.der);
+
+    // Another authority: who has a certificate of the old one is not let in any more.
+    let other = Authority::new();
+    let third = other.sign();
+    stranger(&endpoint, &authority, &first).await.unwrap();
+    files.write(&other, &third);
+    read_again(Some(&server)).unwrap().take_over();
+    stranger(&endpoint, &other, &first).await.unwrap_err();
+    stranger(&endpoint, &other, &third).await.unwrap();
+    ask(connect(&endpoint).await.unwrap()).await.unwrap();
+    assert_eq!(caller(), third.der);
+
+    shutdown.cancel();
+    tokio::time::timeout(LONG, served).await.unwrap().unwrap().unwrap();
+}
