@@ -15,7 +15,7 @@ use ratn_proto::types::{Goal, GoalOutcome, ResourceEventKind, ResourceUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::cell_service_client::CellServiceClient;
 use ratn_worker::client::{AcquireOptions, ActionClient, CallError, Channels, ResourceClient, fresh_id};
-use ratn_worker::endpoint::Endpoint;
+use ratn_worker::endpoint::{Endpoint, connect};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::{SafetyClient, SafetyState};
 use ratn_worker::session::Session;
@@ -301,6 +301,12 @@ async fn the_modules_vanish_when_the_cell_ends() {
     system.end.cancel();
 }
 
+/// Where the arm is.
+async fn arm(cell: &Endpoint) -> v1::Joints {
+    let mut client = CellServiceClient::new(connect(cell).await.unwrap());
+    client.get_ground_truth(v1::GetGroundTruthRequest {}).await.unwrap().into_inner().arm.unwrap()
+}
+
 /// A line to a socket that can hang: what is written waits, and no connection breaks.
 async fn line(from: &Endpoint, to: &Endpoint) -> watch::Sender<bool> {
     let (Endpoint::Unix(from), Endpoint::Unix(to)) = (from.clone(), to.clone()) else { panic!("Unix sockets only") };
@@ -351,9 +357,15 @@ async fn an_arm_stops_each_time_that_the_line_to_the_manager_hangs() {
         let inputs = slowly.map(|(port, value)| (port.to_owned(), value)).into();
         let goal =
             Goal { id: fresh_id("goal"), action: "move_to".to_owned(), inputs, lease: Some(lease.clone()), ..goal() };
-        hang.send_replace(true);
         let client = ActionClient::new(channels.clone());
+        let before = arm(&cell).await;
         let outcome = client.execute(&cell, goal, |_, _| {});
+        let hanging = async {
+            // What the manager said of the lease has come over the line.
+            while arm(&cell).await == before {}
+            hang.send_replace(true);
+        };
+        let outcome = async { tokio::join!(outcome, hanging).0 };
         let outcome = tokio::time::timeout(Duration::from_secs(5), outcome).await.expect("soon").unwrap();
         assert_eq!(outcome.outcome, "aborted", "{outcome:?}");
         hang.send_replace(false);
