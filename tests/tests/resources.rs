@@ -244,7 +244,8 @@ fn alive(marker: &str) -> usize {
         let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
         String::from_utf8_lossy(&line).contains(marker)
     };
-    let processes = std::fs::read_dir("/proc").unwrap().filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+    let processes =
+        std::fs::read_dir("/proc").into_iter().flatten().filter_map(|entry| entry.ok()?.file_name().into_string().ok());
     processes.filter(|pid| pid.bytes().all(|digit| digit.is_ascii_digit()) && has(pid)).count()
 }
 

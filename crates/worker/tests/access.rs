@@ -4,10 +4,14 @@
 mod common;
 
 use common::{Double, RESOURCE, goal};
+use ratn_model::id::{FencingToken, LeaseId, Revision};
+use ratn_model::resource::{Quantity, ResourceClass};
+use ratn_proto::types::{Holding, Resource, ResourceUpdate};
 use ratn_worker::access::{AccessConfig, LiveAccess, Role, RoleGate, UserAccess};
 use ratn_worker::action::ActionServer;
 use ratn_worker::client::{ActionClient, Channels};
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::safety::{Safety, SafetyClient, SafetyState};
 use ratn_worker::server::{Services, Serving, bind};
 use ratn_worker::worker::{Worker, WorkerOptions};
@@ -41,6 +45,43 @@ async fn a_viewers_goal_is_refused_before_it_touches_the_fence() {
     let client = ActionClient::new(Channels::new());
     client.execute(&endpoint, goal("g2", "double", 1), |_, _| {}).await.unwrap();
     assert_eq!(runs.load(Ordering::SeqCst), 1);
+    shutdown.cancel();
+}
+
+#[tokio::test]
+async fn a_lease_of_another_is_no_lease_though_everybody_can_read_it() {
+    let (place, runs) = (tempfile::tempdir().unwrap(), Arc::new(AtomicUsize::new(0)));
+    let watch = LeaseWatch::of([RESOURCE]);
+    let server = ActionServer::builder(RESOURCE).leases(&watch).action(Double { runs: runs.clone() }).build();
+    let bound = bind(&Endpoint::Unix(place.path().join("one.sock"))).await.unwrap();
+    let (endpoint, live) = (bound.endpoint().clone(), LiveAccess::new(only(&[Role::Task])));
+    let serving = Serving { gate: Arc::new(RoleGate::new(live.clone())), ..Serving::default() };
+    let shutdown = CancellationToken::new();
+    tokio::spawn(bound.serve_as(Services::new().with(server.into_service()), serving, shutdown.clone()));
+    let own = format!("uid {}", nix::unistd::geteuid());
+    let of = |opened_by: &str| {
+        let (lease, token) = (LeaseId(1), FencingToken(1));
+        let (units, session, holder) = (Quantity::ONE, "session-1".to_owned(), String::new());
+        let mut resource = Resource::new(RESOURCE, ResourceClass::Process, "Tester");
+        resource.holdings = vec![Holding { lease, token, units, session, holder, opened_by: opened_by.to_owned() }];
+        ResourceUpdate::Snapshot { revision: Revision(1), resources: vec![resource], youngest: lease }
+    };
+    let give = async |id: &str| {
+        let outcome = ActionClient::new(Channels::new()).execute(&endpoint, goal(id, "double", 1), |_, _| {}).await;
+        outcome.map_err(|error| error.code())
+    };
+    for stranger in ["uid 65533", "control (certificate)", ""] {
+        watch.tell(&of(stranger));
+        assert_eq!(give("g1").await.unwrap_err(), Some(Code::PermissionDenied), "opened by {stranger:?}");
+    }
+    assert_eq!(runs.load(Ordering::SeqCst), 0);
+    watch.tell(&of(&own));
+    give("g2").await.unwrap();
+    // One provider calls another under the lease of who called it.
+    live.replace(only(&[Role::Agent]));
+    watch.tell(&of("uid 65533"));
+    give("g3").await.unwrap();
+    assert_eq!(runs.load(Ordering::SeqCst), 2);
     shutdown.cancel();
 }
 

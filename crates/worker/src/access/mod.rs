@@ -123,6 +123,17 @@ impl Caller {
         self.roles.contains(&Operator)
     }
 
+    /// Whether they may give goals under a lease of a session that `opener` opened: their own; an agent's and an operator's word is taken for
+    /// others, for that is how one provider calls another.
+    pub(crate) fn may_act_for(&self, opener: &str) -> bool {
+        *self.name == *opener || self.is_operator() || self.roles.contains(&Agent)
+    }
+
+    /// Whether they may stop, or hear of, what `giver` asked for.
+    pub(crate) fn may_end_for(&self, giver: &str) -> bool {
+        *self.name == *giver || self.is_operator()
+    }
+
     /// Whether they may add resources of a class: a task its own, agents what the system consists of (the paper's Section V-B).
     pub fn may_create(&self, class: ResourceClass) -> bool {
         let creator = if class == ResourceClass::Task { Task } else { Agent };

@@ -84,6 +84,22 @@ impl State {
         self.waiting.iter().map(|waiting| &*waiting.entry)
     }
 
+    /// Tells a goal of this id to stop, also one that waits to begin; whether there was one.
+    ///
+    /// # Errors
+    /// PERMISSION_DENIED where only others gave goals of this id.
+    pub(super) fn cancel(&self, caller: &Caller, id: &str) -> Result<bool, Status> {
+        let found: Vec<&GoalEntry> = self.running().chain(self.waiting()).filter(|entry| entry.id == id).collect();
+        let own: Vec<&&GoalEntry> = found.iter().filter(|entry| caller.may_end_for(&entry.giver)).collect();
+        match (own.as_slice(), found.first()) {
+            ([], Some(other)) => Err(not_yours(caller, other)),
+            (own, _) => {
+                own.iter().for_each(|entry| entry.stop(StopCause::Cancelled));
+                Ok(!own.is_empty())
+            }
+        }
+    }
+
     /// Begins nothing more, and tells every goal to stop; those that run.
     pub(super) fn close(&mut self) -> Vec<Arc<GoalEntry>> {
         self.closed = true;
@@ -94,10 +110,17 @@ impl State {
     /// The goal of the same id, lease, action and inputs, if there is one.
     ///
     /// # Errors
-    /// FAILED_PRECONDITION where its result is forgotten; ALREADY_EXISTS where another goal has its id.
-    pub(super) fn known(&self, limits: &Limits, entry: &GoalEntry) -> Result<Option<Arc<GoalEntry>>, Status> {
+    /// FAILED_PRECONDITION where its result is forgotten; ALREADY_EXISTS where another goal has its id; PERMISSION_DENIED where somebody
+    /// else gave it.
+    pub(super) fn known(
+        &self,
+        limits: &Limits,
+        caller: &Caller,
+        entry: &GoalEntry,
+    ) -> Result<Option<Arc<GoalEntry>>, Status> {
         match self.memory.find(&Asked::from(entry)) {
-            Known::Entry(entry) => Ok(Some(entry)),
+            Known::Entry(known) if !caller.may_end_for(&known.giver) => Err(not_yours(caller, &known)),
+            Known::Entry(known) => Ok(Some(known)),
             Known::Never => Ok(None),
             Known::ResultForgotten(lease) => Err(forgotten(&entry.id, lease, limits.results_kept)),
             Known::Other(difference) => {
@@ -109,11 +132,17 @@ impl State {
     }
 
     /// Lets a goal in, or says why not.
-    pub(super) fn admit(&mut self, server: &Inner, goal: &Goal, entry: &Arc<GoalEntry>) -> Result<Admission, Status> {
+    pub(super) fn admit(
+        &mut self,
+        server: &Inner,
+        caller: &Caller,
+        goal: &Goal,
+        entry: &Arc<GoalEntry>,
+    ) -> Result<Admission, Status> {
         if let Some(cause) = entry.cause() {
             return Ok(Admission::Stopped(cause));
         }
-        if let Some(known) = self.known(&server.limits, entry)? {
+        if let Some(known) = self.known(&server.limits, caller, entry)? {
             return Ok(Admission::Joined(known));
         }
         if self.closed {
@@ -122,7 +151,7 @@ impl State {
         let (limits, resource) = (&server.limits, entry.resource.as_str());
         if !resource.is_empty() {
             let lease = leased(goal, resource)?;
-            if let Confirmation::Awaited(refused) = server.authority.confirm(goal, lease, resource)? {
+            if let Confirmation::Awaited(refused) = server.authority.confirm(caller, goal, lease, resource)? {
                 return Ok(Admission::Awaiting(refused));
             }
             self.take_over(&server.authority, lease, resource)?;
@@ -243,6 +272,47 @@ fn still_running(goal: &GoalEntry) -> Status {
     refusal(Code::ResourceExhausted, "STILL_RUNNING", message)
 }
 
+fn not_yours(caller: &Caller, goal: &GoalEntry) -> Status {
+    let GoalEntry { id, giver, .. } = goal;
+    let message = format!(
+        "goal {id} was given by `{giver}`, not by `{caller}`: only its giver and operators hear of it and end it"
+    );
+    refusal(Code::PermissionDenied, "NOT_YOURS", message)
+}
+
 fn too_many_waiting(who: String) -> Status {
     retry_later(TOO_MANY_WAITING, format!("{who}, the most at once: nothing was begun, try again in a moment"))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::access::Role;
+    use crate::action::goal::Fingerprint;
+
+    fn caller(name: &str, role: Role) -> Caller {
+        Caller { name: name.into(), roles: [role].as_slice().into() }
+    }
+
+    #[test]
+    fn a_goal_is_ended_and_heard_of_by_its_giver_and_operators_alone() {
+        let (giver, operator) = (caller("uid 1", Role::Task), caller("uid 0", Role::Operator));
+        let limits = Limits { one_at_a_time: true, results_kept: 1, goals_per_lease: 1 };
+        let goal = Goal { id: "g".to_owned(), ..Goal::default() };
+        let entry = GoalEntry::new(&giver, &goal, Fingerprint::of(None), "", true);
+        let mut state = State::default();
+        assert!(!state.cancel(&giver, "g").unwrap());
+        state.memory.begin(&entry);
+        state.running.push(Arc::clone(&entry));
+        for stranger in [caller("uid 2", Role::Task), caller("uid 3", Role::Agent)] {
+            assert_eq!(state.cancel(&stranger, "g").unwrap_err().code(), Code::PermissionDenied);
+            assert_eq!(state.known(&limits, &stranger, &entry).unwrap_err().code(), Code::PermissionDenied);
+        }
+        assert!(!entry.cancelled.is_cancelled());
+        assert!(state.known(&limits, &operator, &entry).unwrap().is_some());
+        assert!(state.known(&limits, &giver, &entry).unwrap().is_some());
+        assert!(state.cancel(&giver, "g").unwrap() && entry.cancelled.is_cancelled());
+        assert!(state.cancel(&operator, "g").unwrap());
+    }
 }

@@ -1,6 +1,7 @@
 //! Whether a goal's lease is one: what the resource manager says of it, and the statuses of those that are refused.
 
 use super::goal::LeaseKey;
+use crate::access::Caller;
 use crate::lease_watch::{Claim, GRANT_WAIT, LeaseWatch, Standing};
 use ratn_model::resource::Lease;
 use ratn_proto::types::Goal;
@@ -35,11 +36,18 @@ pub(super) enum Confirmation {
 }
 
 impl Authority {
-    /// Whether the goal's lease holds `resource`.
+    /// Whether the goal's lease holds `resource`, and the caller may give goals under it. What a lease is can be read by everybody who may
+    /// look, so that a goal names it proves nothing.
     ///
     /// # Errors
-    /// FAILED_PRECONDITION where it does not.
-    pub(super) fn confirm(&self, goal: &Goal, lease: &Lease, resource: &str) -> Result<Confirmation, Status> {
+    /// FAILED_PRECONDITION where it does not; PERMISSION_DENIED where the session that holds it was opened by somebody else.
+    pub(super) fn confirm(
+        &self,
+        caller: &Caller,
+        goal: &Goal,
+        lease: &Lease,
+        resource: &str,
+    ) -> Result<Confirmation, Status> {
         let watch = match self {
             Authority::Claimant => return Ok(Confirmation::Confirmed),
             Authority::Nobody => {
@@ -60,7 +68,18 @@ impl Authority {
             retry_later(MANAGER_UNHEARD, message)
         };
         Ok(match watch.check(&claim) {
-            Standing::Confirmed => Confirmation::Confirmed,
+            Standing::Confirmed => {
+                let opened_by = watch.opened_by(resource, lease.id);
+                if !caller.may_act_for(&opened_by) {
+                    let lease = lease.id;
+                    let message = format!(
+                        "{lease} of {resource} is held by a session of `{opened_by}`, and the goal is given by `{caller}`: acquire a lease \
+                         of your own; only agents and operators give goals under the leases of others"
+                    );
+                    return Err(refusal(Code::PermissionDenied, "NOT_YOURS", message));
+                }
+                Confirmation::Confirmed
+            }
             Standing::Refuted(why) => return Err(refusal(Code::FailedPrecondition, "LEASE_REFUTED", why)),
             Standing::NotHeardOf { listening: true } => {
                 let message = format!(

@@ -1,6 +1,7 @@
 //! One goal as the server keeps it: who listens, whether it was told to stop, how it ended.
 
 use super::ActionFailure;
+use crate::access::Caller;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_proto::convert::wire_form;
 use ratn_proto::types::{Goal, GoalOutcome};
@@ -99,6 +100,8 @@ pub(crate) type LeaseKey = (LeaseId, FencingToken);
 #[derive(Debug)]
 pub(crate) struct GoalEntry {
     pub(crate) id: String,
+    /// The name of the caller who gave it.
+    pub(crate) giver: Arc<str>,
     pub(crate) action: String,
     pub(crate) inputs: Fingerprint,
     /// The resource that it has to itself where the server takes one goal at a time.
@@ -125,9 +128,16 @@ pub(crate) struct GoalEntry {
 pub(crate) struct Listener(Arc<GoalEntry>);
 
 impl GoalEntry {
-    pub(crate) fn new(goal: &Goal, inputs: Fingerprint, resource: &str, stop_when_abandoned: bool) -> Arc<GoalEntry> {
+    pub(crate) fn new(
+        giver: &Caller,
+        goal: &Goal,
+        inputs: Fingerprint,
+        resource: &str,
+        stop_when_abandoned: bool,
+    ) -> Arc<GoalEntry> {
         Arc::new(GoalEntry {
             id: goal.id.clone(),
+            giver: giver.name.clone(),
             action: goal.action.clone(),
             inputs,
             resource: resource.to_owned(),

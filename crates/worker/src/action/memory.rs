@@ -149,6 +149,7 @@ fn said(lease: Option<LeaseKey>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::access::Caller;
     use ratn_model::resource::Lease;
     use ratn_proto::types::Goal;
 
@@ -157,7 +158,8 @@ mod tests {
         let session = format!("session-{}", lease.id.0);
         let lease = (lease.id.0 > 0).then_some(lease);
         let goal = Goal { id: id.to_owned(), action: "move".to_owned(), session, lease, ..Goal::default() };
-        GoalEntry::new(&goal, Fingerprint::of(None), resource, true)
+        let giver = Caller { name: "giver".into(), roles: [].as_slice().into() };
+        GoalEntry::new(&giver, &goal, Fingerprint::of(None), resource, true)
     }
 
     fn perform(memory: &mut Memory, id: &str, resource: &str, lease: u64) {

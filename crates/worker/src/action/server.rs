@@ -192,11 +192,11 @@ impl ActionServer {
     ///
     /// # Errors
     /// NOT_FOUND where it was never given under a lease that lives; FAILED_PRECONDITION where only its result has been forgotten;
-    /// ALREADY_EXISTS where another goal has its id.
-    pub(super) fn join(&self, goal: &Goal, inputs: Fingerprint) -> Result<Messages, Status> {
+    /// ALREADY_EXISTS where another goal has its id; PERMISSION_DENIED where somebody else gave it.
+    pub(super) fn join(&self, caller: &Caller, goal: &Goal, inputs: Fingerprint) -> Result<Messages, Status> {
         let (action, resource) = self.inner.performer(&goal.action)?;
-        let entry = GoalEntry::new(goal, inputs, resource, action.cancel_when_abandoned());
-        match self.inner.state().known(&self.inner.limits, &entry)? {
+        let entry = GoalEntry::new(caller, goal, inputs, resource, action.cancel_when_abandoned());
+        match self.inner.state().known(&self.inner.limits, caller, &entry)? {
             Some(entry) => Ok(Messages::of(&entry, true)),
             None => Err(Status::not_found(format!(
                 "goal {} is not known here: never given under the lease that it names, or forgotten with it",
@@ -211,13 +211,13 @@ impl ActionServer {
     /// A status that says why not.
     pub(super) async fn admit(&self, caller: &Caller, goal: Goal, inputs: Fingerprint) -> Result<Messages, Status> {
         let (action, resource) = self.inner.performer(&goal.action)?;
-        let entry = GoalEntry::new(&goal, inputs, resource, action.cancel_when_abandoned());
+        let entry = GoalEntry::new(caller, &goal, inputs, resource, action.cancel_when_abandoned());
         let heard_by = Instant::now() + GRANT_WAIT;
         let mut waiting = None;
         loop {
             // What is heard from here on is not missed.
             let heard = self.inner.authority.watch().map(LeaseWatch::heard);
-            let admission = self.inner.state().admit(&self.inner, &goal, &entry)?;
+            let admission = self.inner.state().admit(&self.inner, caller, &goal, &entry)?;
             let (predecessor, refused) = match admission {
                 Admission::Joined(entry) => return Ok(Messages::of(&entry, true)),
                 Admission::Stopped(StopCause::ShuttingDown) => return Err(ending()),

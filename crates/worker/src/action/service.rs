@@ -42,7 +42,8 @@ impl ActionServer {
             known_only,
         });
         let token = goal.lease.as_ref().map(|lease| lease.token);
-        let admitted = if known_only { self.join(&goal, inputs) } else { self.admit(caller, goal, inputs).await };
+        let admitted =
+            if known_only { self.join(caller, &goal, inputs) } else { self.admit(caller, goal, inputs).await };
         pending.ended_with(&admitted, |_| token);
         admitted
     }
@@ -72,9 +73,9 @@ impl ActionService for ActionServer {
         let (caller, goal) = (Caller::of(&request), request.into_inner().goal_id);
         name(&goal, "goal_id")?;
         let pending = audit::begin(&caller, "", || Mutation::Cancel { goal: goal.clone() });
-        let under_way = ActionServer::cancel(self, &goal);
-        pending.ended(&Ok(under_way));
-        Ok(Response::new(v1::CancelResponse { under_way }))
+        let cancelled = self.inner.state().cancel(&caller, &goal);
+        pending.ended(&cancelled);
+        Ok(Response::new(v1::CancelResponse { under_way: cancelled? }))
     }
 
     async fn describe(&self, _: Request<v1::DescribeRequest>) -> Result<Response<v1::DescribeResponse>, Status> {

@@ -74,6 +74,8 @@ pub struct Holdings {
 struct Holder {
     token: FencingToken,
     session: String,
+    /// Who opened that; empty where the manager does not know.
+    opened_by: String,
 }
 
 #[derive(Debug, PartialEq, Eq)]
@@ -117,6 +119,12 @@ impl Holdings {
             None if lease > self.youngest => Standing::NotHeardOf { listening: self.contact == Contact::Heard },
             None => Standing::Refuted(self.not_held(claim)),
         }
+    }
+
+    /// Who opened the session of a lease that holds a resource; empty where nobody knows.
+    pub fn opened_by(&self, resource: &str, lease: LeaseId) -> &str {
+        let holder = self.by_resource.get(resource).and_then(|holders| holders.get(&lease));
+        holder.map_or("", |holder| &holder.opened_by)
     }
 
     /// Why a lease that does not hold the resource is not good for it.
@@ -196,7 +204,8 @@ impl Holdings {
             return BTreeMap::new();
         }
         let holder = |holding: &ratn_proto::types::Holding| {
-            (holding.lease, Holder { token: holding.token, session: holding.session.clone() })
+            let (session, opened_by) = (holding.session.clone(), holding.opened_by.clone());
+            (holding.lease, Holder { token: holding.token, session, opened_by })
         };
         resource.holdings.iter().map(holder).collect()
     }

@@ -18,7 +18,7 @@ pub use location::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use crate::client::{CallError, Channels, ResourceClient, ResourceWatch};
 use crate::endpoint::Endpoint;
 use crate::session::{Session, SessionState};
-
+use ratn_model::id::LeaseId;
 use std::future::{pending, ready};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
@@ -99,6 +99,11 @@ impl LeaseWatch {
     /// What the resource manager says of a claim, as of now.
     pub fn check(&self, claim: &Claim<'_>) -> Standing {
         self.shared.holdings().check(claim)
+    }
+
+    /// Who opened the session of a lease that holds a resource; empty where nobody knows.
+    pub fn opened_by(&self, resource: &str, lease: LeaseId) -> String {
+        self.shared.holdings().opened_by(resource, lease).to_owned()
     }
 
     /// Whether the manager is heard, or was a moment ago.
