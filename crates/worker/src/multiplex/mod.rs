@@ -5,7 +5,7 @@
 //!    ▲                                                │
 //!    └────── by its id ◀── id, answer … last answer ◀─┘
 //! ```
-//! [`client::Multiplexer`] is the asking side, [`server::Answers`] the serving one. A call that is dropped tells the other side. A
+//! `client::Multiplexer` is the asking side, [`server::Answers`] the serving one. A call that is dropped tells the other side. A
 //! stream that breaks fails its calls at the client and drops them at the server. What is carried, a [`Protocol`] says; this module
 //! knows nothing of it.
 

@@ -6,10 +6,10 @@
 //!                             └── from its first instruction on the process and all that it starts carry the marker in their environment
 //! ```
 //! A **group** of cgroup v2 for each worker holds whatever the worker starts, and `cgroup.kill` ends all of it: in the directory that the
-//! config names, else below the process manager's own group where groups may be made there. The **marker** ([`marker`]) reaches what was
+//! config names, else below the process manager's own group where groups may be made there. The **marker** (`marker`) reaches what was
 //! started before the process was in its group, and everything where there are no groups. Only a process that leaves its session *and*
 //! clears its environment, and that without groups, is not known to be of a worker: the process manager is then its parent once the worker
-//! has ended ([`orphans`]), and ends it when it stops.
+//! has ended (`orphans`), and ends it when it stops.
 //!
 //! The lock of the roster is held by a child, too, until its program begins: a successor gets it only when every child that was being started
 //! carries its marker.
