@@ -92,6 +92,8 @@ fn open_files(pid: u32) -> [String; 2] {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_process_manager_may_open_all_files_that_it_can_and_its_worker_as_many_as_it_was_started_with() {
     let system = TestSystem::new();
+    // A worker is ready when it has heard the resource manager.
+    system.resource_manager().await;
     let (program, directory) = (env!("CARGO_BIN_EXE_ratn-test-worker"), system.directory.path());
     let script = r#"ulimit -Sn 300 && ulimit -Hn 900 && exec "$0" manage "$1""#;
     let mut command = tokio::process::Command::new("/bin/sh");
