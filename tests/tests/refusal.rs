@@ -187,7 +187,8 @@ fn a_daemon_that_may_not_listen_or_has_no_state_of_its_own_is_refused() -> anyho
     for role in ["resource-manager", "process-manager", "cell"] {
         refused(&[role, "--listen", "0.0.0.0:0"], "has no TLS")?;
     }
-    refused(&["worker", "detector", "--listen", "0.0.0.0:0"], "has no TLS")?;
+    let worker = ["worker", "detector", "--id", "d1", "--resource-manager", "http://127.0.0.1:1"];
+    refused(&[worker.as_slice(), &["--listen", "0.0.0.0:0"]].concat(), "has no TLS")?;
     let config = place.path().join("ratn.toml");
     std::fs::write(&config, "[service.tls]\ncert = \"/no/a.pem\"\nkey = \"/no/a.key\"\nclient_ca = \"/no/ca.pem\"\n")?;
     let config = config.to_str().context("a path")?;
