@@ -27,14 +27,19 @@ pub struct PlanAction {
     scenes: Arc<SceneCache>,
 }
 
-/// Runs the worker until it is told to stop; `speed` is how many of the robot's seconds pass in one of ours.
+/// The worker; `speed` is how many of the robot's seconds pass in one of ours.
+pub fn worker(options: WorkerOptions, speed: f64) -> Worker {
+    let plan = PlanAction::new(speed);
+    let drive = DriveAction::new(&plan.robot, speed, &plan.scenes);
+    Worker::new(options).action(plan).action(drive)
+}
+
+/// Runs the [`worker`] until it is told to stop.
 ///
 /// # Errors
 /// Where it cannot serve.
 pub async fn run(options: WorkerOptions, speed: f64) -> anyhow::Result<()> {
-    let plan = PlanAction::new(speed);
-    let drive = DriveAction::new(&plan.robot, speed, &plan.scenes);
-    Ok(Worker::new(options).action(plan).action(drive).run().await?)
+    Ok(worker(options, speed).run().await?)
 }
 
 impl PlanAction {
