@@ -58,6 +58,7 @@
 pub mod durable;
 mod error;
 pub mod log;
+mod pending;
 pub mod store;
 
 pub use durable::{Durable, Progress};

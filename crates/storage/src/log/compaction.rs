@@ -28,9 +28,9 @@ struct Ended<'a>(&'a Shared, Option<Result<Position, Option<CompactionFailure>>>
 impl Drop for Ended<'_> {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            self.0.stop(&Fault::Ended { place: self.0.directory.display().to_string() });
+            self.0.pending.stop(&Fault::Ended { place: self.0.directory.display().to_string() });
         }
-        self.0.end_compaction(self.1.take().unwrap_or(Err(None)));
+        self.0.pending.end_compaction(self.1.take().unwrap_or(Err(None)));
     }
 }
 
@@ -39,7 +39,7 @@ impl Compaction {
         let mut ended = Ended(&self.shared, None);
         let payload = make();
         // The snapshot must not know of records that a crash could still take away.
-        if Durable::new(self.shared.watch()).wait_blocking(self.through).is_err() {
+        if Durable::new(self.shared.pending.watch()).wait_blocking(self.through).is_err() {
             return;
         }
         let snapshot = Snapshot { through: self.through, payload };

@@ -21,8 +21,7 @@ pub(super) const SNAPSHOT_MAGIC: [u8; 8] = *b"ratn-snp";
 pub(super) const SEGMENT_HEADER: usize = 48;
 pub(super) const FRAME_HEADER: usize = 20;
 pub(super) const SNAPSHOT_HEADER: usize = 44;
-/// Before each payload.
-pub(super) const RECORD_HEADER: usize = 4;
+pub(super) use crate::pending::RECORD_HEADER;
 
 /// Which log this is: a number drawn when it was made, so that files of two logs are not taken for one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

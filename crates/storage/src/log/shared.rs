@@ -1,72 +1,18 @@
-//! What the writer, the syncer and a compaction share: the records that wait, and how far everybody is.
-//!
-//! ```text
-//!   append ──▶ batch ──take──▶ syncer: write, sync ──▶ progress.durable ──▶ whoever holds answers back
-//! ```
-//! The lock is held for copying a record and for swapping two buffers, never while something is written.
+//! What the writer, the syncer and a compaction of a log in files share: the records that wait, and which segments there are.
 
 use super::directory;
-use super::format::{FRAME_HEADER, RECORD_HEADER};
-use crate::durable::Progress;
-use crate::error::{AppendError, CompactError, Fault};
+use super::format::FRAME_HEADER;
+use crate::pending::Pending;
 use crate::store::Position;
 use std::path::PathBuf;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
-use tokio::sync::watch;
-
-/// Where nobody waits for the disk, what comes within this time is written together: waking a thread costs more than an append.
-const LINGER: Duration = Duration::from_millis(5);
-/// A buffer that was larger gives the rest back.
-const KEEP_BYTES: usize = 1 << 20;
-
-/// Records that are written together. The frame's header is filled in when they are.
-#[derive(Debug)]
-pub(super) struct Batch {
-    pub(super) bytes: Vec<u8>,
-    pub(super) first: Position,
-    pub(super) count: u32,
-}
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 #[derive(Debug)]
 pub(super) struct Shared {
     pub(super) directory: PathBuf,
-    state: Mutex<State>,
-    /// The syncer waits for it.
-    work: Condvar,
-    progress: watch::Sender<Progress>,
-}
-
-#[derive(Debug)]
-struct State {
-    batch: Batch,
-    /// The other buffer, while the syncer does not have it.
-    spare: Option<Batch>,
-    next: Position,
-    /// The syncer waits: it has to be woken.
-    idle: bool,
-    closing: bool,
-    /// The next batch goes to a new segment, so that the one before can be removed.
-    rotate: bool,
+    pub(super) pending: Pending,
     /// (number, first record) of every segment, the one that is written last.
-    segments: Vec<(u64, Position)>,
-    fault: Option<Fault>,
-}
-
-impl Batch {
-    fn new() -> Batch {
-        Batch { bytes: vec![0; FRAME_HEADER], first: Position(0), count: 0 }
-    }
-
-    pub(super) fn last(&self) -> Position {
-        Position(self.first.0 + u64::from(self.count) - 1)
-    }
-
-    fn clear(&mut self) {
-        self.bytes.truncate(FRAME_HEADER);
-        self.bytes.shrink_to(KEEP_BYTES);
-        self.count = 0;
-    }
+    segments: Mutex<Vec<(u64, Position)>>,
 }
 
 impl Shared {
@@ -76,180 +22,22 @@ impl Shared {
         compacted: Position,
         segments: Vec<(u64, Position)>,
     ) -> Shared {
-        let state = State {
-            batch: Batch::new(),
-            spare: Some(Batch::new()),
-            next: last.next(),
-            idle: false,
-            closing: false,
-            rotate: false,
-            segments,
-            fault: None,
-        };
-        let progress = Progress { durable: last, compacted, ..Progress::default() };
-        Shared { directory, state: Mutex::new(state), work: Condvar::new(), progress: watch::Sender::new(progress) }
-    }
-
-    pub(super) fn watch(&self) -> watch::Receiver<Progress> {
-        self.progress.subscribe()
-    }
-
-    /// `at_once`: it counts as durable now.
-    pub(super) fn append(&self, record: &[u8], most: usize, at_once: bool) -> Result<Position, AppendError> {
-        let mut state = self.lock();
-        if let Some(fault) = &state.fault {
-            return Err(fault.clone().into());
-        }
-        let buffered = state.batch.bytes.len();
-        if buffered + RECORD_HEADER + record.len() > most {
-            return Err(AppendError::Full { buffered, most });
-        }
-        let position = state.next;
-        state.next = position.next();
-        let batch = &mut state.batch;
-        if batch.count == 0 {
-            batch.first = position;
-        }
-        // Checked against a bound below 4 GiB.
-        let length = u32::try_from(record.len()).unwrap_or(u32::MAX);
-        batch.bytes.extend_from_slice(&length.to_le_bytes());
-        batch.bytes.extend_from_slice(record);
-        batch.count += 1;
-        let before = buffered..batch.bytes.len();
-        // Idle: there was nothing. Lingering: now there is enough.
-        let wake = std::mem::take(&mut state.idle) || (at_once && before.contains(&KEEP_BYTES));
-        drop(state);
-        if wake {
-            self.work.notify_one();
-        }
-        if at_once {
-            // Who asks finds it so; nobody has to be woken to hear it.
-            self.progress.send_if_modified(|progress| {
-                progress.durable = position;
-                false
-            });
-        }
-        Ok(position)
-    }
-
-    /// The last position that was given out.
-    pub(super) fn appended(&self) -> Position {
-        Position(self.lock().next.0 - 1)
-    }
-
-    /// Bytes that the syncer has not taken yet.
-    pub(super) fn waiting_bytes(&self) -> usize {
-        let state = self.lock();
-        if state.batch.count == 0 { 0 } else { state.batch.bytes.len() }
-    }
-
-    /// For the syncer: waits for records, where there is time for more of them, and says whether they go to a new segment. Nothing
-    /// when all are written and the writer is closing.
-    pub(super) fn take(&self, there_is_time: bool) -> Option<(Batch, bool)> {
-        let mut state = self.lock();
-        while state.batch.count == 0 {
-            if state.closing {
-                return None;
-            }
-            state.idle = true;
-            state = self.work.wait(state).unwrap_or_else(PoisonError::into_inner);
-        }
-        state.idle = false;
-        if there_is_time {
-            let waits = |state: &mut State| !state.closing && state.batch.bytes.len() < KEEP_BYTES;
-            let waited = self.work.wait_timeout_while(state, LINGER, waits);
-            state = waited.unwrap_or_else(PoisonError::into_inner).0;
-        }
-        let spare = state.spare.take().unwrap_or_else(Batch::new);
-        let batch = std::mem::replace(&mut state.batch, spare);
-        Some((batch, std::mem::take(&mut state.rotate)))
-    }
-
-    /// For the syncer: all through this position are on the disk.
-    pub(super) fn synced(&self, through: Position) {
-        self.progress.send_if_modified(|progress| {
-            let further = through > progress.durable;
-            progress.durable = progress.durable.max(through);
-            further
-        });
-    }
-
-    /// For the syncer: it has written a batch.
-    pub(super) fn give_back(&self, mut batch: Batch) {
-        batch.clear();
-        self.lock().spare = Some(batch);
+        let pending = Pending::new(directory.display().to_string(), FRAME_HEADER, last, compacted);
+        Shared { directory, pending, segments: Mutex::new(segments) }
     }
 
     pub(super) fn segment_begun(&self, number: u64, first: Position) {
-        self.lock().segments.push((number, first));
-    }
-
-    /// Nothing is accepted any more. The first fault stays.
-    pub(super) fn stop(&self, fault: &Fault) {
-        let mut state = self.lock();
-        if state.fault.is_some() {
-            return;
-        }
-        state.fault = Some(fault.clone());
-        state.batch.clear();
-        drop(state);
-        self.progress.send_modify(|progress| progress.fault = Some(fault.clone()));
-    }
-
-    pub(super) fn fault(&self) -> Option<Fault> {
-        self.lock().fault.clone()
-    }
-
-    pub(super) fn close(&self) {
-        self.lock().closing = true;
-        self.work.notify_one();
-    }
-
-    /// Books a compaction.
-    pub(super) fn begin_compaction(&self, through: Position) -> Result<(), CompactError> {
-        let mut state = self.lock();
-        if let Some(fault) = &state.fault {
-            return Err(fault.clone().into());
-        }
-        let last = Position(state.next.0 - 1);
-        if through > last {
-            return Err(CompactError::Ahead { through, last });
-        }
-        let (compacting, compacted) = {
-            let progress = self.progress.borrow();
-            (progress.compacting, progress.compacted)
-        };
-        if compacting {
-            return Err(CompactError::Busy);
-        }
-        if through <= compacted {
-            return Err(CompactError::Behind { through, compacted });
-        }
-        state.rotate = true;
-        drop(state);
-        self.progress.send_modify(|progress| progress.compacting = true);
-        Ok(())
-    }
-
-    pub(super) fn end_compaction(&self, result: Result<Position, Option<crate::error::CompactionFailure>>) {
-        self.progress.send_modify(|progress| {
-            progress.compacting = false;
-            progress.compaction_failure = None;
-            match result {
-                Ok(through) => progress.compacted = through,
-                Err(failure) => progress.compaction_failure = failure,
-            }
-        });
+        self.segments().push((number, first));
     }
 
     /// Forgets the segments that hold nothing after this position, and says which files they are, oldest first.
     pub(super) fn superfluous(&self, through: Position) -> Vec<PathBuf> {
-        let mut state = self.lock();
-        let kept = state.segments.iter().skip(1).take_while(|(_, first)| *first <= through.next()).count();
-        state.segments.drain(..kept).map(|(number, _)| directory::segment(&self.directory, number)).collect()
+        let mut segments = self.segments();
+        let kept = segments.iter().skip(1).take_while(|(_, first)| *first <= through.next()).count();
+        segments.drain(..kept).map(|(number, _)| directory::segment(&self.directory, number)).collect()
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    fn segments(&self) -> MutexGuard<'_, Vec<(u64, Position)>> {
+        self.segments.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

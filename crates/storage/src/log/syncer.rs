@@ -8,7 +8,8 @@ use super::directory;
 use super::files::{Files, LogFile};
 use super::format::{FRAME_HEADER, FrameHeader, RECORD_HEADER, SEGMENT_HEADER, SegmentHeader, u32_at};
 use super::lock::Lock;
-use super::shared::{Batch, Shared};
+use super::shared::Shared;
+use crate::pending::Batch;
 use crate::error::Fault;
 use crate::store::Position;
 use std::io;
@@ -45,7 +46,7 @@ struct Ended(Arc<Shared>);
 impl Drop for Ended {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            self.0.stop(&Fault::Ended { place: self.0.directory.display().to_string() });
+            self.0.pending.stop(&Fault::Ended { place: self.0.directory.display().to_string() });
         }
     }
 }
@@ -54,12 +55,12 @@ impl Syncer {
     pub(super) fn run(mut self) {
         let shared = self.shared.clone();
         let _ended = Ended(shared.clone());
-        while let Some((mut batch, rotate)) = shared.take(self.durability == Durability::None) {
+        while let Some((mut batch, rotate)) = shared.pending.take(self.durability == Durability::None) {
             if let Err(fault) = self.commit(&mut batch, rotate) {
-                shared.stop(&fault);
+                shared.pending.stop(&fault);
                 return;
             }
-            shared.give_back(batch);
+            shared.pending.give_back(batch);
         }
         // Everything is acknowledged. Zeros that stay are no harm.
         let _ = self.active.file.cut();
@@ -115,7 +116,7 @@ impl Syncer {
         self.reserve();
         self.active.file.sync().map_err(|error| self.fault("sync", error))?;
         self.lock.check()?;
-        self.shared.synced(through);
+        self.shared.pending.synced(through);
         Ok(())
     }
 

@@ -34,12 +34,12 @@ impl LogWriter {
 
     /// Writes what waits, and ends both threads.
     fn end(&mut self) {
-        self.shared.close();
+        self.shared.pending.close();
         for thread in [self.syncer.take(), self.compaction.take()].into_iter().flatten() {
             // Its panic has stopped the log already, with a fault.
             let _ = thread.join();
         }
-        self.shared.stop(&Fault::Closed);
+        self.shared.pending.stop(&Fault::Closed);
     }
 }
 
@@ -50,15 +50,15 @@ impl Writer for LogWriter {
             return Err(AppendError::TooLarge { bytes: record.len(), most });
         }
         let at_once = self.options.durability == Durability::None;
-        self.shared.append(record, self.options.buffered_bytes, at_once)
+        self.shared.pending.append(record, self.options.buffered_bytes, at_once)
     }
 
     fn durable(&self) -> Durable {
-        Durable::new(self.shared.watch())
+        Durable::new(self.shared.pending.watch())
     }
 
     fn compact(&mut self, through: Position, snapshot: MakeSnapshot) -> Result<(), CompactError> {
-        self.shared.begin_compaction(through)?;
+        self.shared.pending.begin_compaction(through)?;
         if let Some(ended) = self.compaction.take() {
             // It has said that it ended, so this waits for no more than its last instructions.
             let _ = ended.join();
@@ -75,7 +75,7 @@ impl Writer for LogWriter {
                     place: self.shared.directory.display().to_string(),
                     source: Arc::new(error),
                 };
-                self.shared.end_compaction(Err(Some(failure)));
+                self.shared.pending.end_compaction(Err(Some(failure)));
             }
         }
         Ok(())
@@ -86,16 +86,16 @@ impl Writer for LogWriter {
     }
 
     fn waiting_bytes(&self) -> usize {
-        self.shared.waiting_bytes()
+        self.shared.pending.waiting_bytes()
     }
 
     fn close(mut self: Box<Self>) -> Result<Position, Fault> {
-        let appended = self.shared.appended();
-        self.shared.close();
+        let appended = self.shared.pending.appended();
+        self.shared.pending.close();
         if let Some(syncer) = self.syncer.take() {
             let _ = syncer.join();
         }
-        let fault = self.shared.fault();
+        let fault = self.shared.pending.fault();
         self.end();
         fault.map_or(Ok(appended), Err)
     }

@@ -1,0 +1,241 @@
+//! What a writer shares with the thread that writes and with a compaction: the records that wait, and how far everybody is.
+//!
+//! ```text
+//!   append ──▶ batch ──take──▶ the thread that writes ──▶ progress.durable ──▶ whoever holds answers back
+//! ```
+//! The lock is held for copying a record and for swapping two buffers, never while something is written. In a batch every record is
+//! behind its length: `length u32 | payload`, little-endian.
+
+use crate::durable::Progress;
+use crate::error::{AppendError, CompactError, Fault};
+use crate::store::Position;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+use tokio::sync::watch;
+
+/// Where nobody waits for the disk, what comes within this time is written together: waking a thread costs more than an append.
+const LINGER: Duration = Duration::from_millis(5);
+/// A buffer that was larger gives the rest back.
+const KEEP_BYTES: usize = 1 << 20;
+
+/// Before each payload.
+pub(crate) const RECORD_HEADER: usize = 4;
+
+/// Records that are written together.
+#[derive(Debug)]
+pub(crate) struct Batch {
+    /// Room for a header, to be filled in by who writes them; then the records.
+    pub(crate) bytes: Vec<u8>,
+    pub(crate) first: Position,
+    pub(crate) count: u32,
+    header: usize,
+}
+
+#[derive(Debug)]
+pub(crate) struct Pending {
+    /// Which log it is, for messages.
+    pub(crate) place: String,
+    state: Mutex<State>,
+    /// The thread that writes waits for it.
+    work: Condvar,
+    progress: watch::Sender<Progress>,
+}
+
+#[derive(Debug)]
+struct State {
+    batch: Batch,
+    /// The other buffer, while it is not being written.
+    spare: Option<Batch>,
+    next: Position,
+    /// The thread that writes waits: it has to be woken.
+    idle: bool,
+    closing: bool,
+    /// A compaction has begun: what the next batch is written to is new, so that what was written before can be removed.
+    rotate: bool,
+    fault: Option<Fault>,
+}
+
+impl Batch {
+    fn new(header: usize) -> Batch {
+        Batch { bytes: vec![0; header], first: Position(0), count: 0, header }
+    }
+
+    pub(crate) fn last(&self) -> Position {
+        Position(self.first.0 + u64::from(self.count) - 1)
+    }
+
+    fn clear(&mut self) {
+        self.bytes.truncate(self.header);
+        self.bytes.shrink_to(KEEP_BYTES);
+        self.count = 0;
+    }
+}
+
+impl Pending {
+    /// Nothing waits yet. `header`: the room that a batch has in front.
+    pub(crate) fn new(place: String, header: usize, last: Position, compacted: Position) -> Pending {
+        let state = State {
+            batch: Batch::new(header),
+            spare: Some(Batch::new(header)),
+            next: last.next(),
+            idle: false,
+            closing: false,
+            rotate: false,
+            fault: None,
+        };
+        let progress = Progress { durable: last, compacted, ..Progress::default() };
+        Pending { place, state: Mutex::new(state), work: Condvar::new(), progress: watch::Sender::new(progress) }
+    }
+
+    pub(crate) fn watch(&self) -> watch::Receiver<Progress> {
+        self.progress.subscribe()
+    }
+
+    /// `at_once`: it counts as durable now.
+    pub(crate) fn append(&self, record: &[u8], most: usize, at_once: bool) -> Result<Position, AppendError> {
+        let mut state = self.lock();
+        if let Some(fault) = &state.fault {
+            return Err(fault.clone().into());
+        }
+        let buffered = state.batch.bytes.len();
+        if buffered + RECORD_HEADER + record.len() > most {
+            return Err(AppendError::Full { buffered, most });
+        }
+        let position = state.next;
+        state.next = position.next();
+        let batch = &mut state.batch;
+        if batch.count == 0 {
+            batch.first = position;
+        }
+        // Checked against a bound below 4 GiB.
+        let length = u32::try_from(record.len()).unwrap_or(u32::MAX);
+        batch.bytes.extend_from_slice(&length.to_le_bytes());
+        batch.bytes.extend_from_slice(record);
+        batch.count += 1;
+        let before = buffered..batch.bytes.len();
+        // Idle: there was nothing. Lingering: now there is enough.
+        let wake = std::mem::take(&mut state.idle) || (at_once && before.contains(&KEEP_BYTES));
+        drop(state);
+        if wake {
+            self.work.notify_one();
+        }
+        if at_once {
+            // Who asks finds it so; nobody has to be woken to hear it.
+            self.progress.send_if_modified(|progress| {
+                progress.durable = position;
+                false
+            });
+        }
+        Ok(position)
+    }
+
+    /// The last position that was given out.
+    pub(crate) fn appended(&self) -> Position {
+        Position(self.lock().next.0 - 1)
+    }
+
+    /// Bytes that are not being written yet.
+    pub(crate) fn waiting_bytes(&self) -> usize {
+        let state = self.lock();
+        if state.batch.count == 0 { 0 } else { state.batch.bytes.len() }
+    }
+
+    /// For the thread that writes: waits for records, where there is time for more of them, and says whether a compaction has begun since
+    /// the last batch. Nothing when all are written and the writer is closing.
+    pub(crate) fn take(&self, there_is_time: bool) -> Option<(Batch, bool)> {
+        let mut state = self.lock();
+        while state.batch.count == 0 {
+            if state.closing {
+                return None;
+            }
+            state.idle = true;
+            state = self.work.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+        state.idle = false;
+        if there_is_time {
+            let waits = |state: &mut State| !state.closing && state.batch.bytes.len() < KEEP_BYTES;
+            let waited = self.work.wait_timeout_while(state, LINGER, waits);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        let spare = state.spare.take().unwrap_or_else(|| Batch::new(state.batch.header));
+        let batch = std::mem::replace(&mut state.batch, spare);
+        Some((batch, std::mem::take(&mut state.rotate)))
+    }
+
+    /// For the thread that writes: all through this position are on the disk.
+    pub(crate) fn synced(&self, through: Position) {
+        self.progress.send_if_modified(|progress| {
+            let further = through > progress.durable;
+            progress.durable = progress.durable.max(through);
+            further
+        });
+    }
+
+    /// For the thread that writes: it has written a batch.
+    pub(crate) fn give_back(&self, mut batch: Batch) {
+        batch.clear();
+        self.lock().spare = Some(batch);
+    }
+
+    /// Nothing is accepted any more. The first fault stays.
+    pub(crate) fn stop(&self, fault: &Fault) {
+        let mut state = self.lock();
+        if state.fault.is_some() {
+            return;
+        }
+        state.fault = Some(fault.clone());
+        state.batch.clear();
+        drop(state);
+        self.progress.send_modify(|progress| progress.fault = Some(fault.clone()));
+    }
+
+    pub(crate) fn fault(&self) -> Option<Fault> {
+        self.lock().fault.clone()
+    }
+
+    pub(crate) fn close(&self) {
+        self.lock().closing = true;
+        self.work.notify_one();
+    }
+
+    /// Books a compaction.
+    pub(crate) fn begin_compaction(&self, through: Position) -> Result<(), CompactError> {
+        let mut state = self.lock();
+        if let Some(fault) = &state.fault {
+            return Err(fault.clone().into());
+        }
+        let last = Position(state.next.0 - 1);
+        if through > last {
+            return Err(CompactError::Ahead { through, last });
+        }
+        let (compacting, compacted) = {
+            let progress = self.progress.borrow();
+            (progress.compacting, progress.compacted)
+        };
+        if compacting {
+            return Err(CompactError::Busy);
+        }
+        if through <= compacted {
+            return Err(CompactError::Behind { through, compacted });
+        }
+        state.rotate = true;
+        drop(state);
+        self.progress.send_modify(|progress| progress.compacting = true);
+        Ok(())
+    }
+
+    pub(crate) fn end_compaction(&self, result: Result<Position, Option<crate::error::CompactionFailure>>) {
+        self.progress.send_modify(|progress| {
+            progress.compacting = false;
+            progress.compaction_failure = None;
+            match result {
+                Ok(through) => progress.compacted = through,
+                Err(failure) => progress.compaction_failure = failure,
+            }
+        });
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
