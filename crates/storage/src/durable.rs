@@ -20,6 +20,8 @@ pub struct Progress {
     pub compacting: bool,
     /// Why the last compaction came to nothing.
     pub compaction_failure: Option<CompactionFailure>,
+    /// Why nothing is being made durable for now. It goes on by itself.
+    pub stalled: Option<Arc<str>>,
     /// Why the writer has stopped. What is not durable by then never is.
     pub fault: Option<Fault>,
 }

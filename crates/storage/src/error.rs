@@ -45,6 +45,14 @@ pub enum ReadError {
         /// The newest that can be read.
         supported: u32,
     },
+    /// The service that keeps the log does not give it.
+    #[error("cannot read from {place}: {what}")]
+    Remote {
+        /// Which service.
+        place: String,
+        /// What it said, or that it said nothing.
+        what: String,
+    },
     /// Something that belongs to the log is not there.
     #[error("{place}: {what}; the directory is incomplete: put back what was removed, or restore a backup")]
     Incomplete {
@@ -80,6 +88,15 @@ pub enum OpenError {
         /// What the system said.
         source: io::Error,
     },
+    /// The service that keeps the log has another one than before.
+    #[error(
+        "the cluster of etcd that has {place} is not the one that this log was written to: an older state of etcd was restored, and what \
+         was acknowledged since then may be gone; see that no robot moves by it, then start once with `storage.accept_restored = true`"
+    )]
+    Restored {
+        /// Which log.
+        place: String,
+    },
     /// The options contradict each other.
     #[error("{what}")]
     Options {
@@ -101,6 +118,16 @@ pub enum Fault {
         place: String,
         /// What the system said.
         source: Arc<io::Error>,
+    },
+    /// The service that keeps the log refuses.
+    #[error("cannot {action} {place}, so nothing more is accepted: {what}")]
+    Remote {
+        /// What was tried.
+        action: &'static str,
+        /// On what.
+        place: String,
+        /// What the service said.
+        what: String,
     },
     /// Another writer has taken the place, past the lock.
     #[error(

@@ -55,13 +55,16 @@
 //! | 64 writers, each waits for every record | 12 400 records/s (plain: 250) | 282 000 records/s | 726 000 records/s |
 //! | 64 writers, each 64 records ahead | 686 000 records/s | 1 709 000 records/s | 2 213 000 records/s |
 
+mod draw;
 pub mod durable;
 mod error;
+pub mod etcd;
 pub mod log;
 mod pending;
 pub mod store;
 
 pub use durable::{Durable, Progress};
 pub use error::{AppendError, CompactError, CompactionFailure, CopyError, Fault, OpenError, ReadError};
+pub use etcd::{Etcd, EtcdOptions};
 pub use log::{Copied, Disk, Durability, Files, Log, LogFile, Options, backup, restore};
 pub use store::{Epoch, MakeSnapshot, Place, Position, Record, Recovered, Snapshot, Store, TornEnd, Writer};

@@ -9,7 +9,7 @@
 use crate::durable::Progress;
 use crate::error::{AppendError, CompactError, Fault};
 use crate::store::Position;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio::sync::watch;
 
@@ -187,6 +187,17 @@ impl Pending {
         state.batch.clear();
         drop(state);
         self.progress.send_modify(|progress| progress.fault = Some(fault.clone()));
+    }
+
+    /// Why nothing is being made durable for now, or that it is again.
+    pub(crate) fn stalled(&self, why: Option<String>) {
+        self.progress.send_if_modified(|progress| {
+            let changed = progress.stalled.as_deref() != why.as_deref();
+            if changed {
+                progress.stalled = why.map(Arc::from);
+            }
+            changed
+        });
     }
 
     pub(crate) fn fault(&self) -> Option<Fault> {

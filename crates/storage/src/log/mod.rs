@@ -32,8 +32,7 @@ use lock::Lock;
 use serde::{Deserialize, Serialize};
 use shared::Shared;
 use std::fmt;
-use std::fs::File;
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -128,10 +127,8 @@ impl Log {
             source,
         };
         let epoch = Epoch(contents.epoch().0 + 1);
-        let store = contents.store.map_or_else(draw_store_id, Ok).map_err(|source| OpenError::Io {
-            action: "draw a number for",
-            place: self.directory.display().to_string(),
-            source,
+        let store = contents.store.map_or_else(|| crate::draw::number().map(StoreId), Ok).map_err(|source| {
+            OpenError::Io { action: "draw a number for", place: self.directory.display().to_string(), source }
         })?;
         let fresh = SegmentHeader { store, number: 1, first: Position(1), epoch };
         let (header, frames) = match contents.segments.last() {
@@ -236,10 +233,4 @@ fn make_directory(files: &dyn Files, path: &Path) -> io::Result<()> {
     }
     files.create_directory(path).or_else(|error| if path.is_dir() { Ok(()) } else { Err(error) })?;
     files.sync_directory(parent.unwrap_or(Path::new(".")))
-}
-
-fn draw_store_id() -> io::Result<StoreId> {
-    let mut bytes = [0; 8];
-    File::open("/dev/urandom")?.read_exact(&mut bytes)?;
-    Ok(StoreId(u64::from_le_bytes(bytes)))
 }

@@ -1,0 +1,11 @@
+//! Numbers that no other process draws.
+
+use std::fs::File;
+use std::io::{self, Read};
+
+/// Of the system's generator.
+pub(crate) fn number() -> io::Result<u64> {
+    let mut bytes = [0; 8];
+    File::open("/dev/urandom")?.read_exact(&mut bytes)?;
+    Ok(u64::from_le_bytes(bytes))
+}

@@ -1,0 +1,147 @@
+//! Where what stands in etcd, and how a transaction of it is written.
+//!
+//! ```text
+//!   PREFIX/meta                       which log this is, and of which format
+//!   PREFIX/leader                     who leads; written when somebody takes the place, and when it is given up
+//!   PREFIX/alive                      written again and again by who leads
+//!   PREFIX/head                       the last record that counts
+//!   PREFIX/log/POSITION/PART          a frame of records, by the first of them
+//!   PREFIX/snapshot/current           which snapshot counts
+//!   PREFIX/snapshot/THROUGH/PART      a snapshot
+//! ```
+//! Positions and parts have as many digits as the largest, so that keys are in the order of what they stand for.
+
+use super::wire::{
+    Compare, DeleteRangeRequest, KeyValue, PutRequest, RangeRequest, RequestOp, compare, request_op, response_op,
+};
+use super::wire::{ResponseOp, TxnRequest};
+use crate::store::Position;
+use bytes::Bytes;
+
+/// The keys of one log.
+#[derive(Debug, Clone)]
+pub(super) struct Keys {
+    prefix: String,
+}
+
+/// A range of keys, its end not included.
+pub(super) type Span = (Bytes, Bytes);
+
+impl Keys {
+    pub(super) fn new(prefix: &str) -> Keys {
+        Keys { prefix: prefix.trim_end_matches('/').to_owned() }
+    }
+
+    pub(super) fn prefix(&self) -> &str {
+        &self.prefix
+    }
+
+    pub(super) fn meta(&self) -> Bytes {
+        self.key("meta")
+    }
+
+    pub(super) fn leader(&self) -> Bytes {
+        self.key("leader")
+    }
+
+    pub(super) fn alive(&self) -> Bytes {
+        self.key("alive")
+    }
+
+    pub(super) fn head(&self) -> Bytes {
+        self.key("head")
+    }
+
+    pub(super) fn current(&self) -> Bytes {
+        self.key("snapshot/current")
+    }
+
+    pub(super) fn frame(&self, first: Position, part: u32) -> Bytes {
+        self.key(&format!("log/{:020}/{part:06}", first.0))
+    }
+
+    /// Every frame whose first record is one of these.
+    pub(super) fn frames(&self, from: Position, before: Position) -> Span {
+        (self.key(&format!("log/{:020}", from.0)), self.key(&format!("log/{:020}", before.0)))
+    }
+
+    /// Every frame from this record on.
+    pub(super) fn frames_from(&self, from: Position) -> Span {
+        (self.key(&format!("log/{:020}", from.0)), self.key("log0"))
+    }
+
+    pub(super) fn snapshot_part(&self, through: Position, part: u32) -> Bytes {
+        self.key(&format!("snapshot/{:020}/{part:06}", through.0))
+    }
+
+    /// Every part of one snapshot.
+    pub(super) fn snapshot(&self, through: Position) -> Span {
+        (self.key(&format!("snapshot/{:020}/", through.0)), self.key(&format!("snapshot/{:020}0", through.0)))
+    }
+
+    /// Every part of every older snapshot.
+    pub(super) fn snapshots_before(&self, through: Position) -> Span {
+        (self.key("snapshot/0"), self.key(&format!("snapshot/{:020}", through.0)))
+    }
+
+    /// Every part of every younger snapshot; `current` is behind all of them.
+    pub(super) fn snapshots_after(&self, through: Position) -> Span {
+        (self.key(&format!("snapshot/{:020}", through.next().0)), self.key("snapshot/c"))
+    }
+
+    fn key(&self, name: &str) -> Bytes {
+        Bytes::from(format!("{}/{name}", self.prefix))
+    }
+}
+
+/// Holds if the key was last written at this revision; at 0, if it is not there.
+pub(super) fn written_at(key: Bytes, revision: i64) -> Compare {
+    Compare {
+        result: compare::CompareResult::Equal.into(),
+        target: compare::CompareTarget::Mod.into(),
+        key,
+        target_union: Some(compare::TargetUnion::ModRevision(revision)),
+    }
+}
+
+pub(super) fn put(key: Bytes, value: impl Into<Bytes>) -> RequestOp {
+    op(request_op::Request::RequestPut(PutRequest { key, value: value.into() }))
+}
+
+pub(super) fn get(key: Bytes) -> RequestOp {
+    range(RangeRequest { key, ..RangeRequest::default() })
+}
+
+pub(super) fn range(range: RangeRequest) -> RequestOp {
+    op(request_op::Request::RequestRange(range))
+}
+
+pub(super) fn delete(key: Bytes) -> RequestOp {
+    delete_span((key, Bytes::new()))
+}
+
+pub(super) fn delete_span((key, range_end): Span) -> RequestOp {
+    op(request_op::Request::RequestDeleteRange(DeleteRangeRequest { key, range_end }))
+}
+
+/// Only looks.
+pub(super) fn look(success: Vec<RequestOp>) -> TxnRequest {
+    TxnRequest { success, ..TxnRequest::default() }
+}
+
+/// What a range found; nothing where the operation was another one.
+pub(super) fn found(response: Option<ResponseOp>) -> (Vec<KeyValue>, bool) {
+    match response.and_then(|response| response.response) {
+        Some(response_op::Response::ResponseRange(range)) => (range.kvs, range.more),
+        _ => (Vec::new(), false),
+    }
+}
+
+/// The only key of a range.
+pub(super) fn found_one(response: Option<ResponseOp>) -> Option<KeyValue> {
+    found(response).0.pop()
+}
+
+fn op(request: request_op::Request) -> RequestOp {
+    RequestOp { request: Some(request) }
+}

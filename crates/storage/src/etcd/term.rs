@@ -1,0 +1,262 @@
+//! The writer's place: who has it, how it is taken, kept and given up.
+//!
+//! ```text
+//!   vacant ──take──▶ held: `alive` is written every 250 ms ──give up──▶ vacant
+//!                      │ `alive` was not written for a second
+//!                      └──take──▶ held by another: every write of the first is refused from now on
+//! ```
+//! Safety is in the guards, not in time: every write compares the revision of `leader`, which whoever takes the place changes. Time only
+//! decides when somebody else may take it. Who takes it compares `alive`, too: so the last confirmation of its predecessor was asked for
+//! before the silence began.
+
+use super::client::{CallError, Client, cluster_of};
+use super::format::{Head, Holder, Leader, Meta, VERSION, parse, text};
+use super::keys::{Keys, delete, found_one, get, look, put, written_at};
+use super::wire::{Compare, KeyValue, RequestOp, TxnRequest, TxnResponse};
+use crate::error::{Fault, OpenError, ReadError};
+use crate::store::{Epoch, Place};
+use bytes::Bytes;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// Who has the place writes `alive` so often.
+pub(super) const RENEW_INTERVAL: Duration = Duration::from_millis(250);
+/// A holder that has not written for so long has left. Longer than what a confirmation holds for those who ask [`Place::check`].
+const SILENCE: Duration = Duration::from_millis(1_050);
+/// Silence counts only while etcd answers: with a longer pause between two looks it begins anew.
+const LONGEST_LOOK_PAUSE: Duration = Duration::from_millis(500);
+/// How often somebody looks who wants the place.
+const LOOK_INTERVAL: Duration = Duration::from_millis(50);
+/// One attempt of a small transaction.
+pub(super) const PATIENCE: Duration = Duration::from_millis(400);
+/// After so long without an answer of any member there is no etcd.
+const REACH: Duration = Duration::from_secs(5);
+
+/// Everything small, as it was at one moment.
+#[derive(Debug)]
+pub(super) struct Seen {
+    pub(super) meta: Option<Meta>,
+    pub(super) leader: Option<(i64, Leader)>,
+    pub(super) head: Option<(i64, Head)>,
+    /// When `alive` was written.
+    alive: i64,
+    /// etcd's number of its cluster.
+    cluster: u64,
+    /// etcd's revision.
+    pub(super) revision: i64,
+}
+
+/// How long the same holder has said nothing, as far as was looked.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Silence {
+    leader: i64,
+    alive: i64,
+    since: Instant,
+    looked: Instant,
+}
+
+/// The place, held.
+#[derive(Debug)]
+pub(super) struct Term {
+    pub(super) client: Arc<Client>,
+    pub(super) keys: Keys,
+    pub(super) epoch: Epoch,
+    pub(super) store: u64,
+    /// The revision of `leader`: every write compares it.
+    leader: i64,
+    draw: u64,
+    lost: AtomicBool,
+}
+
+impl Seen {
+    pub(super) fn look(client: &Client, keys: &Keys) -> Result<Seen, ReadError> {
+        let request = look([keys.meta(), keys.leader(), keys.head(), keys.alive()].map(get).into());
+        let answer = client.repeat(&request, PATIENCE, Instant::now() + REACH);
+        let answer = answer.map_err(|error| unreadable(client, &error))?;
+        Seen::of(keys, answer)
+    }
+
+    fn of(keys: &Keys, answer: TxnResponse) -> Result<Seen, ReadError> {
+        let (cluster, revision) =
+            (cluster_of(answer.header.as_ref()), answer.header.as_ref().map_or(0, |header| header.revision));
+        let mut found = answer.responses.into_iter();
+        let mut next = || found_one(found.next());
+        let meta: Option<Meta> = next().map(|kv| parse(&keys.meta(), &kv.value)).transpose()?;
+        let leader = with_revision(next(), &keys.leader())?;
+        let head = with_revision(next(), &keys.head())?;
+        let alive = next().map_or(0, |kv| kv.mod_revision);
+        if let Some(newer) = meta.as_ref().filter(|meta| meta.version > VERSION) {
+            let place = keys.prefix().to_owned();
+            return Err(ReadError::Newer { place, found: newer.version, supported: VERSION });
+        }
+        Ok(Seen { meta, leader, head, alive, cluster, revision })
+    }
+
+    fn holder(&self) -> Option<&Holder> {
+        self.leader.as_ref().and_then(|(_, leader)| leader.holder.as_ref())
+    }
+
+    fn revision_of_leader(&self) -> i64 {
+        self.leader.as_ref().map_or(0, |(revision, _)| *revision)
+    }
+}
+
+fn with_revision<T: serde::de::DeserializeOwned>(
+    kv: Option<KeyValue>,
+    key: &Bytes,
+) -> Result<Option<(i64, T)>, ReadError> {
+    kv.map(|kv| parse(key, &kv.value).map(|value| (kv.mod_revision, value))).transpose()
+}
+
+/// Looks until the place can be taken, or somebody who has it says something.
+pub(super) fn await_vacancy(client: &Client, keys: &Keys, silence: &mut Option<Silence>) -> Result<Seen, OpenError> {
+    loop {
+        let seen = Seen::look(client, keys)?;
+        let Some(holder) = seen.holder() else { return Ok(seen) };
+        let now = Instant::now();
+        let (leader, alive) = (seen.revision_of_leader(), seen.alive);
+        let before = silence.filter(|before| now - before.looked <= LONGEST_LOOK_PAUSE);
+        match before {
+            Some(before) if (before.leader, before.alive) == (leader, alive) => {
+                if now - before.since >= SILENCE {
+                    return Ok(seen);
+                }
+                *silence = Some(Silence { looked: now, ..before });
+            }
+            Some(_) => {
+                *silence = Some(Silence { leader, alive, since: now, looked: now });
+                let holder = format!("{}, {}", holder.about, holder.address);
+                return Err(OpenError::Held { place: keys.prefix().to_owned(), holder });
+            }
+            None => *silence = Some(Silence { leader, alive, since: now, looked: now }),
+        }
+        std::thread::sleep(LOOK_INTERVAL);
+    }
+}
+
+/// Takes the place, if nobody has taken it or said something since it was looked at.
+pub(super) fn take(
+    client: &Arc<Client>,
+    keys: &Keys,
+    seen: &Seen,
+    holder: &Holder,
+    accept_restored: bool,
+) -> Result<Term, OpenError> {
+    let draw = || {
+        crate::draw::number().map_err(|source| OpenError::Io {
+            action: "draw a number for",
+            place: keys.prefix().to_owned(),
+            source,
+        })
+    };
+    let meta = match &seen.meta {
+        Some(meta) if meta.cluster != seen.cluster && !accept_restored => {
+            return Err(OpenError::Restored { place: keys.prefix().to_owned() });
+        }
+        Some(meta) => Meta { cluster: seen.cluster, ..meta.clone() },
+        None => Meta { version: VERSION, store: draw()?, cluster: seen.cluster },
+    };
+    let epoch = seen.leader.as_ref().map_or(0, |(_, leader)| leader.epoch) + 1;
+    let leader = Leader { epoch, holder: Some(holder.clone()), draw: draw()? };
+    let compare = vec![written_at(keys.leader(), seen.revision_of_leader()), written_at(keys.alive(), seen.alive)];
+    let success =
+        vec![put(keys.leader(), text(&leader)), put(keys.alive(), text(&epoch)), put(keys.meta(), text(&meta))];
+    let request = TxnRequest { compare, success, failure: vec![get(keys.leader())] };
+    // Repeated it finds what it wrote itself.
+    let answer = client.repeat(&request, PATIENCE, Instant::now() + REACH);
+    let answer = answer.map_err(|error| OpenError::Read(unreadable(client, &error)))?;
+    let revision = match answer.succeeded {
+        true => answer.header.as_ref().map_or(0, |header| header.revision),
+        false => {
+            let found: Option<(i64, Leader)> =
+                with_revision(found_one(answer.responses.into_iter().next()), &keys.leader())?;
+            match found {
+                Some((revision, found)) if found == leader => revision,
+                found => {
+                    let holder = found.and_then(|(_, leader)| leader.holder).unwrap_or_default();
+                    let holder = format!("{}, {}", holder.about, holder.address);
+                    return Err(OpenError::Held { place: keys.prefix().to_owned(), holder });
+                }
+            }
+        }
+    };
+    Ok(Term {
+        client: client.clone(),
+        keys: keys.clone(),
+        epoch: leader.epoch(),
+        store: meta.store,
+        leader: revision,
+        draw: leader.draw,
+        lost: AtomicBool::new(false),
+    })
+}
+
+impl Term {
+    /// Holds as long as the place is held.
+    pub(super) fn guard(&self) -> Compare {
+        written_at(self.keys.leader(), self.leader)
+    }
+
+    /// Only performed while the place is held.
+    pub(super) fn guarded(&self, success: Vec<RequestOp>) -> TxnRequest {
+        TxnRequest { compare: vec![self.guard()], success, failure: Vec::new() }
+    }
+
+    /// Whether `leader`, written at this revision, says that the place is held.
+    pub(super) fn is_since(&self, leader: i64) -> bool {
+        leader == self.leader
+    }
+
+    pub(super) fn fenced(&self) -> Fault {
+        self.lost.store(true, Ordering::SeqCst);
+        Fault::Fenced { place: self.keys.prefix().to_owned() }
+    }
+
+    /// That the place is held, said to everybody, and confirmed.
+    pub(super) fn renew(&self) -> Result<(), Fault> {
+        if self.lost.load(Ordering::SeqCst) {
+            return Err(self.fenced());
+        }
+        let alive = self.guarded(vec![put(self.keys.alive(), text(&self.epoch.0))]);
+        let until = Instant::now() + 2 * PATIENCE;
+        let answer = match self.client.repeat(&alive, PATIENCE, until) {
+            // It cannot be said, but it can be seen; nor can anybody take the place meanwhile.
+            Err(CallError::NoSpace) => {
+                self.client.repeat(&self.guarded(vec![get(self.keys.leader())]), PATIENCE, until)
+            }
+            answer => answer,
+        };
+        match answer {
+            Ok(answer) if answer.succeeded => Ok(()),
+            Ok(_) => Err(self.fenced()),
+            Err(error) => Err(self.fault("ask for", &error)),
+        }
+    }
+
+    /// The place is free for the next one at once. Whether that was heard is not known where etcd does not answer.
+    pub(super) fn give_up(&self) {
+        let vacant = Leader { epoch: self.epoch.0, holder: None, draw: self.draw };
+        let request = self.guarded(vec![put(self.keys.leader(), text(&vacant)), delete(self.keys.alive())]);
+        let _ = self.client.repeat(&request, PATIENCE, Instant::now() + REACH);
+        self.lost.store(true, Ordering::SeqCst);
+    }
+
+    pub(super) fn fault(&self, action: &'static str, error: &CallError) -> Fault {
+        Fault::Remote { action, place: self.keys.prefix().to_owned(), what: error.to_string() }
+    }
+}
+
+/// The place, for those who ask beside the writer.
+#[derive(Debug, Clone)]
+pub(super) struct HeldPlace(pub(super) Arc<Term>);
+
+impl Place for HeldPlace {
+    fn check(&self) -> Result<(), Fault> {
+        self.0.renew()
+    }
+}
+
+pub(super) fn unreadable(client: &Client, error: &CallError) -> ReadError {
+    ReadError::Remote { place: client.place(), what: error.to_string() }
+}

@@ -1,0 +1,325 @@
+//! The writer's side of a log in etcd: one thread, one transaction at a time.
+//!
+//! ```text
+//!   append ──▶ batch ──take──▶ frame: { leader and head as I know them? put frame, move head } ──▶ durable
+//!                                └── no answer: the same again; `head` says whether it was performed
+//! ```
+//! While etcd does not answer or has no space, what is appended waits, and [`Progress::stalled`](crate::Progress) says why. What waits is
+//! bounded: then appends are refused, and accepted again when etcd is back.
+
+use super::client::{CallError, Client, FIRST_PAUSE, LONGEST_PAUSE};
+use super::compaction::Compaction;
+use super::format::{Head, encode_frame, parse, text};
+use super::keys::{found_one, get, put, written_at};
+use super::term::{HeldPlace, RENEW_INTERVAL, Term};
+use super::wire::{RequestOp, TxnRequest};
+use crate::durable::Durable;
+use crate::error::{AppendError, CompactError, CompactionFailure, Fault};
+use crate::pending::{Batch, Pending, RECORD_HEADER};
+use crate::store::{MakeSnapshot, Place, Position, Writer};
+use bytes::Bytes;
+use std::collections::VecDeque;
+use std::io;
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+/// One attempt of a transaction with a whole part.
+pub(super) const PATIENCE: Duration = Duration::from_secs(1);
+/// A transaction that is not performed for so long is told of.
+const STALLED_AFTER: Duration = Duration::from_millis(500);
+/// Who closes waits so long for an etcd that does not answer.
+const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
+/// Where etcd has no space it is asked again after so long.
+const NO_SPACE_PAUSE: Duration = Duration::from_millis(500);
+
+/// The bounds of a log in etcd, in bytes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Bounds {
+    /// The largest record.
+    pub record: usize,
+    /// What may wait to be written. As much again may be being written.
+    pub buffered: usize,
+    /// What one transaction puts: below etcd's `--max-request-bytes` of 1.5 MiB.
+    pub part: usize,
+}
+
+impl Default for Bounds {
+    fn default() -> Bounds {
+        Bounds { record: 4 << 20, buffered: 64 << 20, part: 1 << 20 }
+    }
+}
+
+/// What the writer, its thread and a compaction share.
+#[derive(Debug)]
+pub(super) struct Shared {
+    pub(super) term: Arc<Term>,
+    pub(super) pending: Pending,
+    pub(super) bounds: Bounds,
+    /// (first, last) of every frame that is there.
+    frames: Mutex<VecDeque<(Position, Position)>>,
+    closing_since: Mutex<Option<Instant>>,
+}
+
+#[derive(Debug)]
+pub(super) struct EtcdWriter {
+    shared: Arc<Shared>,
+    writing: Option<JoinHandle<()>>,
+    compaction: Option<JoinHandle<()>>,
+    /// Ends the thread that renews.
+    renewing: Option<(mpsc::Sender<()>, JoinHandle<()>)>,
+}
+
+impl Shared {
+    pub(super) fn new(
+        term: Arc<Term>,
+        bounds: Bounds,
+        last: Position,
+        compacted: Position,
+        frames: Vec<(Position, Position)>,
+    ) -> Shared {
+        let pending = Pending::new(term.keys.prefix().to_owned(), 0, last, compacted);
+        Shared { term, pending, bounds, frames: Mutex::new(frames.into()), closing_since: Mutex::default() }
+    }
+
+    /// Forgets the frames that hold nothing after this position; from which to which they begin.
+    pub(super) fn superfluous(&self, through: Position) -> Option<(Position, Position)> {
+        let mut frames = self.frames.lock().unwrap_or_else(PoisonError::into_inner);
+        let (first, _) = *frames.front()?;
+        while frames.front().is_some_and(|(_, last)| *last <= through) {
+            frames.pop_front();
+        }
+        let end = frames.front().map_or(through.next(), |(kept, _)| *kept);
+        (end > first).then_some((first, end))
+    }
+
+    /// Performs what has no effect twice, until it is performed or never will be.
+    pub(super) fn perform(&self, request: &TxnRequest) -> Result<super::wire::TxnResponse, Fault> {
+        let (client, began): (&Client, _) = (&self.term.client, Instant::now());
+        let mut pause = FIRST_PAUSE;
+        loop {
+            let error = match client.attempt(request.clone(), PATIENCE) {
+                Ok(answer) => {
+                    self.pending.stalled(None);
+                    return Ok(answer);
+                }
+                Err(error) => error,
+            };
+            if let Some(fault) = self.pending.fault() {
+                return Err(fault);
+            }
+            if !matches!(error, CallError::Unknown(_) | CallError::NoSpace) || self.has_waited_to_close() {
+                return Err(self.term.fault("write to", &error));
+            }
+            if began.elapsed() >= STALLED_AFTER || matches!(error, CallError::NoSpace) {
+                self.pending.stalled(Some(error.to_string()));
+            }
+            thread::sleep(if matches!(error, CallError::NoSpace) { NO_SPACE_PAUSE } else { pause });
+            pause = (2 * pause).min(LONGEST_PAUSE);
+        }
+    }
+
+    fn has_waited_to_close(&self) -> bool {
+        let since = self.closing_since.lock().unwrap_or_else(PoisonError::into_inner);
+        since.is_some_and(|since| since.elapsed() >= CLOSE_PATIENCE)
+    }
+
+    fn close(&self) {
+        self.closing_since.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert_with(Instant::now);
+        self.pending.close();
+    }
+}
+
+/// The thread that writes.
+struct Writing {
+    shared: Arc<Shared>,
+    /// The revision of `head`.
+    head: i64,
+}
+
+/// Says that nobody writes any more, however the thread ended.
+pub(super) struct Ended(pub(super) Arc<Shared>);
+
+impl Drop for Ended {
+    fn drop(&mut self) {
+        if thread::panicking() {
+            self.0.pending.stop(&Fault::Ended { place: self.0.pending.place.clone() });
+        }
+    }
+}
+
+impl Writing {
+    fn run(mut self) {
+        let shared = self.shared.clone();
+        let _ended = Ended(shared.clone());
+        while let Some((batch, _)) = shared.pending.take(false) {
+            if let Err(fault) = self.write(&batch) {
+                shared.pending.stop(&fault);
+                return;
+            }
+            shared.pending.give_back(batch);
+        }
+    }
+
+    /// As few frames as hold it; a record that is larger than a transaction has one of its own.
+    fn write(&mut self, batch: &Batch) -> Result<(), Fault> {
+        let most = self.shared.bounds.part - super::format::FRAME_HEADER;
+        let mut rest = &batch.bytes[..];
+        let mut first = batch.first;
+        while !rest.is_empty() {
+            let (mut bytes, mut count) = (0, 0_u32);
+            while let Some(length) = rest[bytes..].first_chunk::<RECORD_HEADER>() {
+                let record = RECORD_HEADER + u32::from_le_bytes(*length) as usize;
+                if count > 0 && bytes + record > most {
+                    break;
+                }
+                (bytes, count) = (bytes + record, count + 1);
+            }
+            let (frame, behind) = rest.split_at(bytes);
+            let last = Position(first.0 + u64::from(count) - 1);
+            self.commit(first, last, frame)?;
+            self.shared.pending.synced(last);
+            (rest, first) = (behind, last.next());
+        }
+        Ok(())
+    }
+
+    fn commit(&mut self, first: Position, last: Position, records: &[u8]) -> Result<(), Fault> {
+        let (term, keys) = (&self.shared.term, &self.shared.term.keys);
+        let count = u32::try_from(last.0 - first.0 + 1).unwrap_or(u32::MAX);
+        let parts = encode_frame(term.store, first, count, records, self.shared.bounds.part);
+        let put_part = |(number, part): (u32, Bytes)| put(keys.frame(first, number), part);
+        let mut puts = (0..).zip(parts).map(put_part);
+        let begin = puts.next();
+        // What is behind the head does not count until the head has moved.
+        for part in puts {
+            let answer = self.shared.perform(&term.guarded(vec![part]))?;
+            if !answer.succeeded {
+                return Err(term.fenced());
+            }
+        }
+        let head = Head { position: last.0, epoch: term.epoch.0 };
+        let mut success: Vec<RequestOp> = begin.into_iter().collect();
+        success.push(put(keys.head(), text(&head)));
+        let request = TxnRequest {
+            compare: vec![term.guard(), written_at(keys.head(), self.head)],
+            success,
+            failure: vec![get(keys.leader()), get(keys.head())],
+        };
+        let answer = self.shared.perform(&request)?;
+        self.head = if answer.succeeded {
+            answer.header.map_or(0, |header| header.revision)
+        } else {
+            let mut found = answer.responses.into_iter();
+            let leader = found_one(found.next()).map_or(0, |kv| kv.mod_revision);
+            if !term.is_since(leader) {
+                return Err(term.fenced());
+            }
+            // An attempt without an answer may have been performed: then the head is where it was to be.
+            let kv = found_one(found.next());
+            let at = kv.as_ref().map_or(0, |kv| kv.mod_revision);
+            let found: Option<Head> = kv.and_then(|kv| parse(&keys.head(), &kv.value).ok());
+            if found != Some(head) {
+                let what = "its head was moved by somebody who is not its writer".to_owned();
+                return Err(Fault::Remote { action: "write to", place: keys.prefix().to_owned(), what });
+            }
+            at
+        };
+        self.shared.frames.lock().unwrap_or_else(PoisonError::into_inner).push_back((first, last));
+        Ok(())
+    }
+}
+
+impl EtcdWriter {
+    pub(super) fn start(shared: Arc<Shared>, head: i64) -> io::Result<EtcdWriter> {
+        let writing = Writing { shared: shared.clone(), head };
+        let (end, ended) = mpsc::channel::<()>();
+        let renewed = shared.clone();
+        let renew = move || {
+            let _ended = Ended(renewed.clone());
+            while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(RENEW_INTERVAL) {
+                if let Err(fault @ Fault::Fenced { .. }) = renewed.term.renew() {
+                    renewed.pending.stop(&fault);
+                    return;
+                }
+            }
+        };
+        let renewing = thread::Builder::new().name("etcd-renewer".to_owned()).spawn(renew)?;
+        let writing = thread::Builder::new().name("etcd-writer".to_owned()).spawn(move || writing.run())?;
+        Ok(EtcdWriter { shared, writing: Some(writing), compaction: None, renewing: Some((end, renewing)) })
+    }
+
+    /// Writes what waits, gives up the place, and ends every thread.
+    fn end(&mut self) {
+        self.shared.close();
+        for thread in [self.writing.take(), self.compaction.take()].into_iter().flatten() {
+            // Its panic has stopped the log already, with a fault.
+            let _ = thread.join();
+        }
+        if let Some((end, renewing)) = self.renewing.take() {
+            drop(end);
+            let _ = renewing.join();
+            self.shared.term.give_up();
+        }
+        self.shared.pending.stop(&Fault::Closed);
+    }
+}
+
+impl Writer for EtcdWriter {
+    fn append(&mut self, record: &[u8]) -> Result<Position, AppendError> {
+        let most = self.shared.bounds.record;
+        if record.len() > most {
+            return Err(AppendError::TooLarge { bytes: record.len(), most });
+        }
+        self.shared.pending.append(record, self.shared.bounds.buffered, false)
+    }
+
+    fn durable(&self) -> Durable {
+        Durable::new(self.shared.pending.watch())
+    }
+
+    fn compact(&mut self, through: Position, snapshot: MakeSnapshot) -> Result<(), CompactError> {
+        self.shared.pending.begin_compaction(through)?;
+        if let Some(ended) = self.compaction.take() {
+            // It has said that it ended, so this waits for no more than its last instructions.
+            let _ = ended.join();
+        }
+        let compaction = Compaction { shared: self.shared.clone(), through };
+        let started = thread::Builder::new().name("etcd-compaction".to_owned()).spawn(move || compaction.run(snapshot));
+        match started {
+            Ok(thread) => self.compaction = Some(thread),
+            Err(error) => {
+                let place = self.shared.pending.place.clone();
+                let source = Arc::new(error);
+                let failure = CompactionFailure { through, action: "start a thread for", place, source };
+                self.shared.pending.end_compaction(Err(Some(failure)));
+            }
+        }
+        Ok(())
+    }
+
+    fn place(&self) -> Box<dyn Place> {
+        Box::new(HeldPlace(self.shared.term.clone()))
+    }
+
+    fn waiting_bytes(&self) -> usize {
+        self.shared.pending.waiting_bytes()
+    }
+
+    fn close(mut self: Box<Self>) -> Result<Position, Fault> {
+        let appended = self.shared.pending.appended();
+        self.shared.close();
+        if let Some(writing) = self.writing.take() {
+            let _ = writing.join();
+        }
+        let fault = self.shared.pending.fault();
+        self.end();
+        fault.map_or(Ok(appended), Err)
+    }
+}
+
+impl Drop for EtcdWriter {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
