@@ -1,6 +1,9 @@
 //! What the tests of the log share.
 #![allow(dead_code, reason = "each test uses some of it")]
 
+pub(crate) mod etcd;
+pub(crate) mod promises;
+
 use ratn_storage::{Log, Options, Position, Progress, Record, Store, Writer};
 use std::fs;
 use std::path::{Path, PathBuf};

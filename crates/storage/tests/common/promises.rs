@@ -1,0 +1,156 @@
+//! What [`Store`] and [`Writer`] promise, for every log there is: each function is a test, given how to make a log.
+
+use super::{append_durably, compacted, payloads};
+use bytes::Bytes;
+use proptest::prelude::*;
+use proptest::test_runner::{RngAlgorithm, TestRng, TestRunner};
+use ratn_storage::{OpenError, Position, Store, Writer};
+
+/// Makes a log by its name: the same name, the same log.
+pub(crate) type Make<'a> = &'a dyn Fn(&str) -> Box<dyn Store>;
+
+pub(crate) fn a_second_writer_is_refused_until_the_first_is_gone(make: Make<'_>) {
+    let (first, mut writer) = make("second").open().unwrap();
+    append_durably(&mut *writer, b"one");
+    assert!(matches!(make("second").open(), Err(OpenError::Held { .. })));
+    append_durably(&mut *writer, b"two");
+    drop(writer);
+    let (second, _writer) = make("second").open().unwrap();
+    assert!(second.epoch > first.epoch);
+    assert_eq!(payloads(&second.records), [b"one", b"two"]);
+}
+
+pub(crate) fn many_restarts_keep_every_record(make: Make<'_>) {
+    for round in 0..20_u64 {
+        let (recovered, mut writer) = make("restarts").open().unwrap();
+        assert_eq!((recovered.last(), recovered.epoch.0), (Position(round), round + 1));
+        writer.append(&round.to_le_bytes()).unwrap();
+        drop(writer);
+    }
+}
+
+pub(crate) fn compaction_beside_appends_loses_nothing(make: Make<'_>) {
+    let log = make("compaction");
+    let (_, mut writer) = log.open().unwrap();
+    let mut sum = 0_u64;
+    for number in 1..=2_000_u64 {
+        sum += number;
+        let position = writer.append(&number.to_le_bytes()).unwrap();
+        if number.is_multiple_of(500) {
+            let state = Bytes::copy_from_slice(&sum.to_le_bytes());
+            writer.compact(position, Box::new(move || state)).unwrap();
+        }
+        if number % 500 == 250 {
+            assert!(compacted(&*writer).compaction_failure.is_none());
+            // A reader beside the writer sees a prefix.
+            assert!(log.read().unwrap().last() <= position);
+        }
+    }
+    compacted(&*writer);
+    writer.close().unwrap();
+    let read = log.read().unwrap();
+    let state = read.snapshot.as_ref().map_or(0, |state| u64::from_le_bytes(state.payload[..].try_into().unwrap()));
+    let rest: u64 = read.records.iter().map(|record| u64::from_le_bytes(record.payload[..].try_into().unwrap())).sum();
+    assert_eq!((state + rest, read.last()), (sum, Position(2_000)));
+    assert_eq!(read.snapshot.unwrap().through, Position(2_000));
+}
+
+pub(crate) fn a_waiter_hears_when_the_writer_is_gone(make: Make<'_>) {
+    let (_, mut writer) = make("waiter").open().unwrap();
+    let position = append_durably(&mut *writer, b"one");
+    let mut durable = writer.durable();
+    let waiting = std::thread::spawn({
+        let mut durable = durable.clone();
+        move || durable.wait_blocking(position.next())
+    });
+    writer.close().unwrap();
+    assert!(waiting.join().unwrap().is_err());
+    assert!(durable.reached(position).unwrap());
+    assert!(durable.wait_blocking(position).is_ok());
+}
+
+#[derive(Debug, Clone)]
+enum Step {
+    /// Bytes of the record.
+    Append(usize),
+    Wait,
+    /// Of so many thousandths of what there is.
+    Compact(u64),
+    /// Closes or drops the writer, and opens the log again.
+    Restart {
+        close: bool,
+    },
+}
+
+fn step(longest: usize) -> impl Strategy<Value = Step> {
+    prop_oneof![
+        10 => (0..longest).prop_map(Step::Append),
+        2 => Just(Step::Wait),
+        1 => (0..=1_000_u64).prop_map(Step::Compact),
+        1 => any::<bool>().prop_map(|close| Step::Restart { close }),
+    ]
+}
+
+/// Random histories of so many steps: the log does what a vector does.
+pub(crate) fn a_log_is_a_vector(make: Make<'_>, histories: u32, steps: usize, longest: usize) {
+    let config = ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(histories) };
+    let mut runner = TestRunner::new_with_rng(config, TestRng::deterministic_rng(RngAlgorithm::ChaCha));
+    let number = std::cell::Cell::new(0);
+    let history = prop::collection::vec(step(longest), 1..steps);
+    let ran = runner.run(&history, |steps| {
+        number.set(number.get() + 1);
+        run(make, &format!("vector-{}", number.get()), steps);
+        Ok(())
+    });
+    ran.unwrap();
+}
+
+fn check(log: &dyn Store, model: &[Vec<u8>], compacted: usize) -> Box<dyn Writer> {
+    let (recovered, writer) = log.open().unwrap();
+    let through = recovered.snapshot.as_ref().map_or(0, |snapshot| snapshot.through.0 as usize);
+    assert_eq!(through, compacted);
+    if let Some(snapshot) = &recovered.snapshot {
+        assert_eq!(snapshot.payload, model[..through].concat());
+    }
+    assert_eq!(payloads(&recovered.records), model[through..]);
+    assert_eq!(recovered.last(), Position(model.len() as u64));
+    writer
+}
+
+fn run(make: Make<'_>, name: &str, steps: Vec<Step>) {
+    let log = make(name);
+    let (mut model, mut through) = (Vec::new(), 0);
+    let mut writer = check(&*log, &model, through);
+    for step in steps {
+        match step {
+            Step::Append(length) => {
+                let record = vec![u8::try_from(model.len() % 251).unwrap(); length];
+                let position = writer.append(&record).unwrap();
+                model.push(record);
+                assert_eq!(position, Position(model.len() as u64));
+            }
+            Step::Wait => {
+                writer.durable().wait_blocking(Position(model.len() as u64)).unwrap();
+                assert_eq!(payloads(&log.read().unwrap().records), &model[through..]);
+            }
+            Step::Compact(share) => {
+                let to = model.len() * share as usize / 1_000;
+                let state: Bytes = model[..to].concat().into();
+                if writer.compact(Position(to as u64), Box::new(move || state)).is_ok() {
+                    through = to;
+                }
+                assert_eq!(compacted(&*writer).compacted, Position(through as u64));
+            }
+            Step::Restart { close } => {
+                if close {
+                    writer.close().unwrap();
+                } else {
+                    drop(writer);
+                }
+                writer = check(&*log, &model, through);
+            }
+        }
+    }
+    drop(writer);
+    drop(check(&*log, &model, through));
+}

@@ -1,0 +1,281 @@
+//! The log in etcd: what every log promises, and what an etcd does that a disk does not.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod common;
+
+use common::etcd::{Cluster, Proxy, is_there, options, store};
+use common::{append_durably, payloads, promises};
+use ratn_storage::etcd::Bounds;
+use ratn_storage::{Etcd, Fault, OpenError, ReadError, Store, Writer};
+use std::time::{Duration, Instant};
+
+/// A log of these bounds for each name.
+fn with_logs(bounds: Bounds, test: impl Fn(promises::Make<'_>)) {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &[]);
+    let make = |name: &str| -> Box<dyn Store> {
+        let options = options(cluster.endpoints(), &format!("/test/{name}"), "test");
+        Box::new(Etcd::new(ratn_storage::EtcdOptions { bounds: bounds.clone(), ..options }).unwrap())
+    };
+    test(&make);
+}
+
+/// So that most records need several transactions.
+fn tiny() -> Bounds {
+    Bounds { part: 100, ..Bounds::default() }
+}
+
+#[test]
+fn a_second_writer_is_refused_until_the_first_is_gone() {
+    with_logs(Bounds::default(), promises::a_second_writer_is_refused_until_the_first_is_gone);
+}
+
+#[test]
+fn many_restarts_keep_every_record() {
+    with_logs(Bounds::default(), promises::many_restarts_keep_every_record);
+}
+
+#[test]
+fn compaction_beside_appends_loses_nothing() {
+    with_logs(Bounds::default(), promises::compaction_beside_appends_loses_nothing);
+}
+
+#[test]
+fn a_waiter_hears_when_the_writer_is_gone() {
+    with_logs(Bounds::default(), promises::a_waiter_hears_when_the_writer_is_gone);
+}
+
+#[test]
+fn a_log_is_a_vector() {
+    with_logs(Bounds::default(), |make| promises::a_log_is_a_vector(make, 8, 60, 60));
+    with_logs(tiny(), |make| promises::a_log_is_a_vector(make, 8, 60, 500));
+}
+
+/// Waits until this holds.
+fn until(what: &str, holds: impl Fn() -> bool) {
+    let begin = Instant::now();
+    while !holds() {
+        assert!(begin.elapsed() < Duration::from_secs(30), "{what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn open(store: &Etcd) -> (ratn_storage::Recovered, Box<dyn Writer>) {
+    let begin = Instant::now();
+    loop {
+        match store.open() {
+            Ok(opened) => return opened,
+            Err(OpenError::Held { .. }) => assert!(begin.elapsed() < Duration::from_secs(30), "it stays held"),
+            Err(error) => panic!("{error}"),
+        }
+    }
+}
+
+#[test]
+fn a_writer_that_says_nothing_for_a_second_is_got_past_and_writes_nothing_more() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &[]);
+    let proxy = Proxy::to(&cluster.members[0].client);
+    let cut_off = store(vec![proxy.address.clone()], "/test/got-past", "first");
+    let (first, mut old) = cut_off.open().unwrap();
+    append_durably(&mut *old, b"old");
+    proxy.lose_all(true);
+    let cut = Instant::now();
+    let lost = old.append(b"lost").unwrap();
+    let next = store(cluster.endpoints(), "/test/got-past", "second");
+    let (second, mut new) = open(&next);
+    assert!(cut.elapsed() >= Duration::from_millis(750), "taken after {:?}", cut.elapsed());
+    assert!(second.epoch > first.epoch);
+    assert_eq!(payloads(&second.records), [b"old"]);
+    append_durably(&mut *new, b"new");
+    assert!(matches!(old.place().check(), Err(Fault::Remote { .. })), "nothing is known while it is cut off");
+    proxy.lose_all(false);
+    assert!(matches!(old.durable().wait_blocking(lost), Err(Fault::Fenced { .. })));
+    assert!(matches!(old.place().check(), Err(Fault::Fenced { .. })));
+    drop(old);
+    append_durably(&mut *new, b"newer");
+    drop(new);
+    assert_eq!(payloads(&next.read().unwrap().records), [&b"old"[..], b"new", b"newer"]);
+}
+
+#[test]
+fn a_transaction_whose_answer_is_lost_is_there_once() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &[]);
+    let proxy = Proxy::to(&cluster.members[0].client);
+    let lossy = store(vec![proxy.address.clone()], "/test/lost", "test");
+    let (_, mut writer) = lossy.open().unwrap();
+    for round in 0..5_u8 {
+        proxy.lose_answers(true);
+        let position = writer.append(&[round]).unwrap();
+        // Delivered, and not answered.
+        let direct = store(cluster.endpoints(), "/test/lost", "reader");
+        until("it is not delivered", || direct.read().unwrap().last() >= position);
+        assert!(!writer.durable().reached(position).unwrap(), "nobody can know that yet");
+        proxy.lose_answers(false);
+        writer.durable().wait_blocking(position).unwrap();
+    }
+    writer.close().unwrap();
+    let read = store(cluster.endpoints(), "/test/lost", "reader").read().unwrap();
+    assert_eq!(payloads(&read.records), (0..5_u8).map(|round| vec![round]).collect::<Vec<_>>());
+}
+
+#[test]
+fn records_go_on_when_etcds_own_leader_is_killed() {
+    if !is_there() {
+        return;
+    }
+    let mut cluster = Cluster::start(3, &[]);
+    let log = store(cluster.endpoints(), "/test/members", "test");
+    let (_, mut writer) = log.open().unwrap();
+    let mut longest = Duration::ZERO;
+    for round in 0..6_usize {
+        append_durably(&mut *writer, &[u8::try_from(round).unwrap()]);
+        cluster.kill(round % 3);
+        let begin = Instant::now();
+        append_durably(&mut *writer, b"without one");
+        longest = longest.max(begin.elapsed());
+        cluster.run(round % 3);
+        cluster.await_health();
+    }
+    println!("the longest append: {longest:?}");
+    writer.close().unwrap();
+    assert_eq!(log.read().unwrap().records.len(), 12);
+}
+
+#[test]
+fn without_space_appends_wait_and_say_why_and_go_on_when_there_is_space() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &["--quota-backend-bytes", "2097152"]);
+    let log = store(cluster.endpoints(), "/test/space", "test");
+    let (_, mut writer) = log.open().unwrap();
+    let durable = writer.durable();
+    append_durably(&mut *writer, b"with space");
+    // Somebody else fills it, with many versions of one key.
+    let value = "x".repeat(100 << 10);
+    let filled = (0..100).any(|_| !cluster.ctl(&["put", "/other", &value]).status.success());
+    assert!(filled);
+    let last = writer.append(b"without space").unwrap();
+    until("it does not say that it is stalled", || durable.progress().stalled.is_some());
+    let why = durable.progress().stalled.unwrap();
+    assert!(why.contains("NOSPACE") && why.contains("disarm"), "{why}");
+    assert!(!durable.reached(last).unwrap());
+    // The place is still held, and nobody else gets it.
+    writer.place().check().unwrap();
+    assert_eq!(payloads(&log.read().unwrap().records), [b"with space"]);
+    // An operator makes room, as the message says.
+    let found = cluster.ctl(&["get", "/other", "-w", "json"]);
+    let found: serde_json::Value = serde_json::from_slice(&found.stdout).unwrap();
+    assert!(cluster.ctl(&["compact", &found["header"]["revision"].to_string()]).status.success());
+    assert!(cluster.ctl(&["defrag"]).status.success());
+    assert!(cluster.ctl(&["alarm", "disarm"]).status.success());
+    writer.durable().wait_blocking(last).unwrap();
+    until("it still says that it is stalled", || durable.progress().stalled.is_none());
+    append_durably(&mut *writer, b"with space again");
+    writer.close().unwrap();
+    assert_eq!(log.read().unwrap().records.len(), 3);
+}
+
+#[test]
+fn etcds_compaction_and_a_revoked_lease_change_nothing() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &["--auto-compaction-mode", "revision", "--auto-compaction-retention", "1"]);
+    let log = store(cluster.endpoints(), "/test/compacted", "test");
+    let (_, mut writer) = log.open().unwrap();
+    let leases = String::from_utf8(cluster.ctl(&["lease", "list"]).stdout).unwrap();
+    assert!(leases.contains("found 0 leases"), "nothing depends on a lease of etcd: {leases}");
+    for round in 0..50_u8 {
+        append_durably(&mut *writer, &[round]);
+        if round % 10 == 9 {
+            let revision = cluster.ctl(&["get", "/test/compacted/head", "-w", "json"]);
+            let revision: serde_json::Value = serde_json::from_slice(&revision.stdout).unwrap();
+            assert!(cluster.ctl(&["compact", &revision["header"]["revision"].to_string()]).status.success());
+        }
+    }
+    writer.close().unwrap();
+    assert_eq!(open(&log).0.records.len(), 50);
+}
+
+#[test]
+fn an_older_state_of_etcd_is_refused_unless_told() {
+    if !is_there() {
+        return;
+    }
+    let kept = tempfile::tempdir().unwrap();
+    let file = kept.path().join("snapshot").display().to_string();
+    let mut cluster = Cluster::start(1, &[]);
+    let endpoints = cluster.endpoints();
+    let log = store(endpoints.clone(), "/test/restored", "test");
+    let (_, mut writer) = log.open().unwrap();
+    append_durably(&mut *writer, b"saved");
+    assert!(cluster.ctl(&["snapshot", "save", &file]).status.success());
+    for _ in 0..20 {
+        append_durably(&mut *writer, b"acknowledged, and gone");
+    }
+    cluster.restore(&file);
+    // The writer that was there knows more than etcd does.
+    let position = writer.append(b"more").unwrap();
+    let fault = writer.durable().wait_blocking(position).unwrap_err();
+    assert!(fault.to_string().contains("an older state of etcd") || matches!(fault, Fault::Fenced { .. }), "{fault}");
+    drop(writer);
+    // Who opens it anew, too: by the cluster that it was written to.
+    let fresh = store(endpoints.clone(), "/test/restored", "test");
+    let begin = Instant::now();
+    let error = loop {
+        match fresh.open().map(drop) {
+            Err(OpenError::Held { .. }) if begin.elapsed() < Duration::from_secs(10) => {}
+            other => break other.unwrap_err(),
+        }
+    };
+    assert!(matches!(error, OpenError::Restored { .. }), "{error}");
+    assert!(error.to_string().contains("accept_restored"), "{error}");
+    let options = options(endpoints, "/test/restored", "test");
+    let told = Etcd::new(ratn_storage::EtcdOptions { accept_restored: true, ..options }).unwrap();
+    let (recovered, writer) = open(&told);
+    assert_eq!(payloads(&recovered.records), [b"saved"]);
+    drop(writer);
+    // Once is enough.
+    assert_eq!(open(&fresh).0.records.len(), 1);
+}
+
+#[test]
+fn what_is_missing_or_wrong_in_etcd_is_refused_by_name() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &[]);
+    let log = store(cluster.endpoints(), "/test/damaged", "test");
+    let (_, mut writer) = log.open().unwrap();
+    for record in [b"1", b"2", b"3"] {
+        append_durably(&mut *writer, record);
+    }
+    drop(writer);
+    let keys = String::from_utf8(cluster.ctl(&["get", "--prefix", "/test/damaged/log", "--keys-only"]).stdout).unwrap();
+    let keys: Vec<&str> = keys.split_whitespace().collect();
+    assert_eq!(keys.len(), 3, "{keys:?}");
+    assert!(cluster.ctl(&["put", keys[1], "something else"]).status.success());
+    assert!(matches!(log.read(), Err(ReadError::Damaged { place, .. }) if place == keys[1]));
+    assert!(cluster.ctl(&["del", keys[1]]).status.success());
+    let error = log.open().map(drop).unwrap_err().to_string();
+    assert!(error.contains("records 2 to 3 are missing"), "{error}");
+    assert!(cluster.ctl(&["del", keys[2]]).status.success());
+    let error = log.read().unwrap_err().to_string();
+    assert!(error.contains("its head is record 3, and 1 is the last"), "{error}");
+}
+
+#[test]
+fn without_any_member_opening_says_whom_it_asked() {
+    let log = store(vec!["http://127.0.0.1:1".to_owned()], "/test/nobody", "test");
+    let error = log.open().map(drop).unwrap_err().to_string();
+    assert!(error.contains("cannot read from http://127.0.0.1:1"), "{error}");
+}
