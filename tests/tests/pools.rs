@@ -29,7 +29,9 @@ fn start() -> anyhow::Result<(Place, Vec<Started>)> {
     let (here, there) = (place.path().join("here.toml"), place.path().join("there.toml"));
     std::fs::write(&here, config("here", ""))?;
     let manager = place.path().join("run/resource-manager.sock");
-    std::fs::write(&there, config("there", &format!("resource_manager = \"unix:{}\"", manager.display())))?;
+    // Without cgroups also where the machine has them.
+    let settings = format!("resource_manager = \"unix:{}\"\ntracking = \"environment\"", manager.display());
+    std::fs::write(&there, config("there", &settings))?;
     let (here, there) = (here.to_str().context("a path")?, there.to_str().context("a path")?);
     let elsewhere = place.path().join("run-there");
     let elsewhere = elsewhere.to_str().context("a path")?;
@@ -68,6 +70,8 @@ fn workers_of_all_hosts_are_shown_started_scaled_and_ended_and_their_logs_are_re
     let (code, table, err) = asked(&place, &["ps"])?;
     ensure!(code == Some(0) && table.starts_with("WORKER"), "{table} {err}");
     ensure!(table.contains("there-shell-1@there  Shell  ready"), "{table}");
+    ensure!(table.contains("host here: processes are tracked by "), "{table}");
+    ensure!(table.contains("host there: processes are tracked by subreaper (no cgroups): "), "{table}");
     ensure!(asked(&place, &["pool", "start", "there-shell"])?.1 == "there-shell-2@there\n");
     wait_for_ready(&place, &["here-shell-1@here", "there-shell-1@there", "there-shell-2@there"])?;
     let (code, _, err) = asked(&place, &["pool", "start", "there-shell"])?;

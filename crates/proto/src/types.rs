@@ -461,8 +461,22 @@ pub struct HostPools {
     pub draining: bool,
     /// What the clock of the host's wall showed when it answered, in microseconds since 1970.
     pub clock_us: u64,
+    /// How the processes of workers are tracked; `None` where the process manager does not tell.
+    pub tracking: Option<TrackingMode>,
     /// In the order of templates.
     pub pools: Vec<PoolStatus>,
+}
+
+/// How a process manager knows which processes belong to which worker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TrackingMode {
+    /// Each worker has a group of cgroup v2.
+    Cgroup,
+    /// By a marker in the environment of processes; orphans become children of the process manager (`PR_SET_CHILD_SUBREAPER`), which
+    /// ends them when it stops.
+    Subreaper,
+    /// By the marker alone.
+    Marker,
 }
 
 /// How many workers a template is to have; what is `None` stays as it is.

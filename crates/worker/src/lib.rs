@@ -38,6 +38,7 @@ pub mod endpoint;
 pub mod gate;
 pub mod lease_watch;
 pub mod multiplex;
+pub mod panic;
 pub mod protocol;
 pub mod provider;
 pub mod robot_clock;

@@ -15,7 +15,7 @@ use crate::demand::{Shortages, Use};
 use crate::link::{Offering, Wanted};
 use nix::sys::signal::Signal;
 use ratn_model::time::Timestamp;
-use ratn_proto::types::{Demand, HostPools, PoolStatus, Scale, WorkerStatus};
+use ratn_proto::types::{Demand, HostPools, PoolStatus, Scale, TrackingMode, WorkerStatus};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::vitals::Vitals;
 use std::collections::{BTreeSet, VecDeque};
@@ -89,6 +89,7 @@ pub(super) struct Parts {
 struct Actor {
     host: String,
     labels: Labels,
+    tracking: TrackingMode,
     pools: Pools,
     processes: Processes,
     start: Instant,
@@ -122,7 +123,7 @@ pub(super) fn start(
         short,
         looks,
     } = parts;
-    let drained = Drained::of(&directory);
+    let (drained, tracking) = (Drained::of(&directory), tracker.mode());
     let (processes, told) = Processes::start(&config, directory, roster, tracker)?;
     let mut pools = Pools::new(&config.host, config.templates).with_labels(config.labels.clone());
     pools.go_on_after(&before);
@@ -131,6 +132,7 @@ pub(super) fn start(
         processes,
         host: config.host,
         labels: config.labels,
+        tracking,
         start: Instant::now(),
         wanted,
         leaves,
@@ -247,7 +249,8 @@ impl Actor {
                 let mut pools = self.pools.status();
                 self.usage.fill_in(&mut pools);
                 let draining = self.pools.is_draining();
-                let _ = answer.send(HostPools { host: self.host.clone(), draining, clock_us: wall_clock_us(), pools });
+                let (host, tracking) = (self.host.clone(), Some(self.tracking));
+                let _ = answer.send(HostPools { host, draining, clock_us: wall_clock_us(), tracking, pools });
             }
             Message::Lives { id, answer } => drop(answer.send(self.pools.knows(&id))),
             Message::Restart { which, answer } => {

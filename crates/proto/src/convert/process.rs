@@ -1,7 +1,7 @@
 //! Worker processes and pools.
 
 use super::{Malformed, all, each, label, name};
-use crate::types::{HostPools, PoolStatus, WorkerState, WorkerStatus};
+use crate::types::{HostPools, PoolStatus, TrackingMode, WorkerState, WorkerStatus};
 use crate::v1;
 
 impl From<WorkerStatus> for v1::WorkerStatus {
@@ -102,6 +102,7 @@ impl From<HostPools> for v1::ListPoolsResponse {
             pools: all(host.pools),
             draining: host.draining,
             clock_us: host.clock_us,
+            tracking: wire_tracking(host.tracking).into(),
         }
     }
 }
@@ -111,7 +112,22 @@ impl TryFrom<v1::ListPoolsResponse> for HostPools {
 
     fn try_from(answer: v1::ListPoolsResponse) -> Result<HostPools, Malformed> {
         name(&answer.host, "host")?;
+        let tracking = match answer.tracking() {
+            v1::TrackingMode::Unspecified => None,
+            v1::TrackingMode::Cgroup => Some(TrackingMode::Cgroup),
+            v1::TrackingMode::Subreaper => Some(TrackingMode::Subreaper),
+            v1::TrackingMode::Marker => Some(TrackingMode::Marker),
+        };
         let pools = each(answer.pools, "pools")?;
-        Ok(HostPools { host: answer.host, draining: answer.draining, clock_us: answer.clock_us, pools })
+        Ok(HostPools { host: answer.host, draining: answer.draining, clock_us: answer.clock_us, tracking, pools })
+    }
+}
+
+fn wire_tracking(mode: Option<TrackingMode>) -> v1::TrackingMode {
+    match mode {
+        None => v1::TrackingMode::Unspecified,
+        Some(TrackingMode::Cgroup) => v1::TrackingMode::Cgroup,
+        Some(TrackingMode::Subreaper) => v1::TrackingMode::Subreaper,
+        Some(TrackingMode::Marker) => v1::TrackingMode::Marker,
     }
 }

@@ -330,8 +330,12 @@ fn workers_and_pools_come_back_the_same() {
             crashes: 7,
             last_exit: "path-planner-0@compute: killed by signal 9".to_owned(),
         };
-        let host = HostPools { host: "compute".to_owned(), draining: true, clock_us: 7, pools: vec![pool] };
-        assert_eq!(HostPools::try_from(v1::ListPoolsResponse::from(host.clone())), Ok(host));
+        let modes = [TrackingMode::Cgroup, TrackingMode::Subreaper, TrackingMode::Marker].map(Some);
+        for tracking in [None].into_iter().chain(modes) {
+            let pools = vec![pool.clone()];
+            let host = HostPools { host: "compute".to_owned(), draining: true, clock_us: 7, tracking, pools };
+            assert_eq!(HostPools::try_from(v1::ListPoolsResponse::from(host.clone())), Ok(host));
+        }
     }
 }
 

@@ -2,15 +2,20 @@
 
 use super::hosts::Answered;
 use crate::columns::columns;
-use ratn_proto::types::{HostPools, PoolStatus, WorkerState, WorkerStatus};
+use ratn_proto::types::{HostPools, PoolStatus, TrackingMode, WorkerState, WorkerStatus};
 use serde_json::{Value, json};
 
-/// A line for each worker; then one for each host and each pool of which there is something to say.
+/// A line for each worker; then for each host how it tracks processes and whether it is drained, and each pool of which there is something
+/// to say.
 pub(super) fn table(hosts: &[&HostPools]) -> String {
     let pools = || hosts.iter().flat_map(|host| host.pools.iter().map(move |pool| (*host, pool)));
     let rows = pools().flat_map(|(_, pool)| pool.workers.iter().map(|worker| row(pool, worker)));
     let head = ["WORKER", "KIND", "STATE", "PID", "AGE", "MEMORY", "CPU", "LIMITS"];
     let mut lines = vec![columns(&head, rows.collect())];
+    for host in hosts {
+        let limit = tracking_limit(host.tracking).map(|limit| format!(" (no cgroups): {limit}")).unwrap_or_default();
+        lines.push(format!("host {}: processes are tracked by {}{limit}", host.host, tracking(host.tracking)));
+    }
     for host in hosts.iter().filter(|host| host.draining) {
         let left: usize = host.pools.iter().map(|pool| pool.workers.len()).sum();
         let still = if left == 0 { String::new() } else { format!("; {left} workers have not ended yet") };
@@ -29,6 +34,26 @@ pub(super) fn table(hosts: &[&HostPools]) -> String {
         }
     }
     lines.join("\n")
+}
+
+fn tracking(mode: Option<TrackingMode>) -> &'static str {
+    match mode {
+        Some(TrackingMode::Cgroup) => "cgroup",
+        Some(TrackingMode::Subreaper) => "subreaper",
+        Some(TrackingMode::Marker) => "marker",
+        None => "unknown",
+    }
+}
+
+/// What is not found of a worker that clears the environment of a process and gives it a session of its own.
+fn tracking_limit(mode: Option<TrackingMode>) -> Option<&'static str> {
+    match mode {
+        Some(TrackingMode::Cgroup) | None => None,
+        Some(TrackingMode::Subreaper) => {
+            Some("a daemon that a worker starts may outlive a process manager that is killed")
+        }
+        Some(TrackingMode::Marker) => Some("a daemon that a worker starts may outlive it"),
+    }
 }
 
 fn row(pool: &PoolStatus, worker: &WorkerStatus) -> [String; 8] {
@@ -68,6 +93,7 @@ pub(super) fn in_json(hosts: &[Answered]) -> Value {
     let host = |one: &Answered| match &one.pools {
         Ok(pools) => json!({
             "host": pools.host, "endpoint": one.host.endpoint.to_string(), "draining": pools.draining,
+            "tracking": tracking(pools.tracking),
             "pools": pools.pools.iter().map(pool_json).collect::<Vec<_>>(),
         }),
         Err(error) => {
@@ -130,17 +156,22 @@ mod tests {
             host: "compute".to_owned(),
             draining: false,
             clock_us: 0,
+            tracking: Some(TrackingMode::Cgroup),
             pools: vec![
                 pool("path-planner", workers, "", killed),
                 pool("detector", vec![], "", ""),
                 pool("script", vec![], "5 crashes", ""),
             ],
         };
-        let control = HostPools { host: "control".to_owned(), draining: true, clock_us: 0, pools: Vec::new() };
+        let tracking = Some(TrackingMode::Subreaper);
+        let control =
+            HostPools { host: "control".to_owned(), draining: true, clock_us: 0, tracking, pools: Vec::new() };
         insta::assert_snapshot!(table(&[&compute, &control]), @r"
         WORKER                  KIND         STATE  PID  AGE  MEMORY  CPU      LIMITS
         path-planner-1@compute  PathPlanner  busy   42   2 h  24 MiB  101.5 %  -
         path-planner-2@compute  PathPlanner  ready  42   2 h  24 MiB  101.5 %  -
+        host compute: processes are tracked by cgroup
+        host control: processes are tracked by subreaper (no cgroups): a daemon that a worker starts may outlive a process manager that is killed
         host control: drained; `ratn drain --undo control` ends that
         path-planner@compute: 1 crashed, the last one: path-planner-0@compute: killed by signal 9
         detector@compute: no workers now (0 to 4)

@@ -25,6 +25,7 @@ use super::config::ProcessManagerConfig;
 use super::limits::end_group;
 use crate::config::ConfigError;
 use nix::unistd::geteuid;
+use ratn_proto::types::TrackingMode;
 use ratn_worker::client::fresh_id;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use serde::{Deserialize, Serialize};
@@ -97,14 +98,23 @@ impl Tracker {
         Ok(tracker)
     }
 
-    /// How, for people.
-    pub(super) fn words(&self) -> String {
+    /// How processes are tracked.
+    pub(super) fn mode(&self) -> TrackingMode {
         match (&self.groups, &self.children) {
-            (Some(groups), _) => format!("workers are tracked by cgroups in {}", groups.display()),
-            (None, Some(_)) => "workers are tracked by their environment, without cgroups: what clears it and leaves its session ends \
+            (Some(_), _) => TrackingMode::Cgroup,
+            (None, Some(_)) => TrackingMode::Subreaper,
+            (None, None) => TrackingMode::Marker,
+        }
+    }
+
+    /// How processes are tracked, for people.
+    pub(super) fn words(&self) -> String {
+        match (self.mode(), &self.groups) {
+            (TrackingMode::Cgroup, Some(groups)) => format!("workers are tracked by cgroups in {}", groups.display()),
+            (TrackingMode::Subreaper, _) => "workers are tracked by their environment, without cgroups: what clears it and leaves its session ends \
                                 when the process manager stops, and outlives one that is killed"
                 .to_owned(),
-            (None, None) => "workers are tracked by their environment, without cgroups: what clears it and leaves its session is not \
+            _ => "workers are tracked by their environment, without cgroups: what clears it and leaves its session is not \
                              found"
                 .to_owned(),
         }
