@@ -3,6 +3,7 @@
 //! The first asks to end in order, the second to end at once, the third ends the process.
 
 use crate::aside::Aside;
+use ratn_worker::panic::exit_on_panic;
 use std::sync::Arc;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
@@ -36,7 +37,7 @@ impl Interrupt {
             tokio::select! { _ = interrupt.recv() => {}, _ = terminate.recv() => {}, _ = hangup.recv() => {} }
             std::process::exit(EXIT_CODE_INTERRUPTED);
         };
-        aside.within(|| tokio::spawn(listening));
+        aside.within(|| tokio::spawn(exit_on_panic("the watch of signals", listening)));
         Ok(Interrupt { count, _aside: Arc::new(aside) })
     }
 

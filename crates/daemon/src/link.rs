@@ -3,6 +3,7 @@
 
 use crate::demand::DemandLink;
 use crate::resource_manager;
+use ratn_panic_point::panic_point;
 use ratn_proto::types::{Resource, ResourceFilter};
 use ratn_worker::client::{CallError, Channels};
 use ratn_worker::endpoint::Endpoint;
@@ -14,6 +15,8 @@ use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
+/// A part of a daemon, for its log.
+pub(crate) const LINK: &str = "the link to the resource manager";
 /// How long is waited for a manager before that is said in the log (and waited on).
 const PATIENCE: Duration = Duration::from_secs(10);
 /// How often is looked whether the manager has moved, and whether something is still to be offered.
@@ -169,6 +172,7 @@ impl Link {
     /// has moved, or nothing is wanted ever again.
     async fn has_news(&mut self, endpoint: &Endpoint, settled: bool) -> bool {
         loop {
+            panic_point("link");
             tokio::select! {
                 changed = self.wanted.changed() => return changed.is_ok(),
                 () = more_leave(&mut self.there) => return true,

@@ -5,6 +5,7 @@
 
 use crate::client::{CallError, Channels, ResourceClient};
 use crate::endpoint::Endpoint;
+use crate::panic::exit_on_panic;
 use crate::session::{Session, SessionState};
 use futures::{StreamExt, stream};
 use ratn_model::resource::{Requirement, ResourceOperation};
@@ -18,6 +19,8 @@ use tonic::Code;
 
 /// Resources that the manager is asked for at a time.
 const AT_ONCE: usize = 16;
+/// A part of a process, for its log.
+const PART: &str = "the provider of resources";
 /// The pause before the manager is asked again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -65,8 +68,9 @@ impl Provider {
             kinds: watch::Sender::default(),
         });
         let end = CancellationToken::new();
-        tokio::spawn(end.clone().run_until_cancelled_owned(watch_own(Arc::clone(&shared))));
-        tokio::spawn(end.clone().run_until_cancelled_owned(restore(Arc::clone(&shared))));
+        let (watching, restoring) = (watch_own(Arc::clone(&shared)), restore(Arc::clone(&shared)));
+        tokio::spawn(exit_on_panic(PART, end.clone().run_until_cancelled_owned(watching)));
+        tokio::spawn(exit_on_panic(PART, end.clone().run_until_cancelled_owned(restoring)));
         Ok(Provider { shared, _end: end.drop_guard() })
     }
 

@@ -9,6 +9,8 @@
 
 use crate::client::{Channels, fresh_id};
 use crate::endpoint::Endpoint;
+use crate::panic::exit_on_panic;
+use ratn_panic_point::panic_point;
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use std::time::Duration;
@@ -88,7 +90,7 @@ impl Session {
             tell,
             end: end.clone(),
         };
-        let task = Some(tokio::spawn(keeper.keep()));
+        let task = Some(tokio::spawn(exit_on_panic("the task that keeps a session alive", keeper.keep())));
         Session { id, endpoint: endpoint.clone(), ttl, state, expires: known, end, task }
     }
 
@@ -271,6 +273,7 @@ impl Keeper {
                 // Nothing is due: the stream broke, or the manager ended it.
                 _ = answers.message() => return,
             }
+            panic_point("session");
             asked = Instant::now();
             if pings.send(self.ping(self.ttl)).await.is_err() {
                 return;

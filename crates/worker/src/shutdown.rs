@@ -2,6 +2,7 @@
 //! not drain in time is ended hard, so that nothing outlives its parent.
 
 use crate::adoption::Adoption;
+use crate::panic::{exit_on_panic, exit_on_panic_blocking};
 use std::io::{self, Read};
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
@@ -21,13 +22,14 @@ const EXIT_CODE_INTERRUPTED: i32 = 130;
 pub fn on_signals(token: &CancellationToken) -> io::Result<()> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let token = token.clone();
-    tokio::spawn(async move {
+    let watch = async move {
         let mut next = async || tokio::select! { _ = terminate.recv() => {}, _ = interrupt.recv() => {} };
         next().await;
         token.cancel();
         next().await;
         std::process::exit(EXIT_CODE_INTERRUPTED);
-    });
+    };
+    tokio::spawn(exit_on_panic("the watch of signals", watch));
     Ok(())
 }
 
@@ -55,6 +57,7 @@ pub fn on_signals_within(token: &CancellationToken, patience: Duration) -> io::R
             std::process::exit(EXIT_CODE_OVERDUE);
         });
     };
+    let watch = || exit_on_panic_blocking("the watch of signals", watch);
     std::thread::Builder::new().name("signals".to_owned()).spawn(watch)?;
     Ok(())
 }
@@ -77,6 +80,7 @@ pub fn exit_with_parent(token: &CancellationToken) -> io::Result<()> {
         std::thread::sleep(EXIT_GRACE);
         std::process::exit(EXIT_CODE_OVERDUE);
     };
+    let watch = || exit_on_panic_blocking("the watch of the parent", watch);
     std::thread::Builder::new().name("exit-with-parent".to_owned()).spawn(watch)?;
     Ok(())
 }

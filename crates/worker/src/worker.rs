@@ -10,6 +10,7 @@ use crate::action::{Action, ActionServer, ActionServerBuilder};
 use crate::client::{CallError, Channels};
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::lease_watch::{LeaseWatch, ManagerLocation, RESOURCE_MANAGER_VARIABLE};
+use crate::panic::exit_on_panic;
 use crate::provider::Provider;
 use crate::runtime_directory::publish_file;
 use crate::safety::Safety;
@@ -25,6 +26,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
+
+/// A part of the process, for its log.
+const LEASES: &str = "the watch of leases";
 
 /// What a worker is told by whoever starts it.
 #[derive(Debug, Clone)]
@@ -217,7 +221,7 @@ impl Worker {
         let watching = location.map(|location| {
             let (leases, channels) = (leases.clone(), channels.clone());
             let watch = async move { leases.follow_location(&channels, location, DEFAULT_TTL).await };
-            AbortOnDropHandle::new(tokio::spawn(watch))
+            AbortOnDropHandle::new(tokio::spawn(exit_on_panic(LEASES, watch)))
         });
         if let Some(safety) = &safety {
             actions = actions.safety(safety.clone());
@@ -237,11 +241,12 @@ impl Worker {
             services = services.with(safety.into_service());
         }
         let ends = shutdown.clone();
-        let serving = tokio::spawn(async move {
+        let serve = async move {
             let served = bound.serve_as(services, serving, ends.clone()).await;
             ends.cancel();
             served
-        });
+        };
+        let serving = tokio::spawn(exit_on_panic("the server of the worker", serve));
         // Connections are accepted from the bind on: whoever reads the file is answered.
         let published = match &options.endpoint_file {
             Some(file) => Some(
@@ -283,11 +288,12 @@ impl Worker {
 fn serve_once_heard(leases: &LeaseWatch, vitals: &Vitals) -> AbortOnDropHandle<()> {
     vitals.unwell("the resource manager has not been heard yet: every goal is refused");
     let (mut heard, leases, vitals) = (leases.heard(), leases.clone(), vitals.clone());
-    AbortOnDropHandle::new(tokio::spawn(async move {
+    let hear = async move {
         // The sender is in the watch.
         while !leases.is_heard() && heard.changed().await.is_ok() {}
         vitals.well();
-    }))
+    };
+    AbortOnDropHandle::new(tokio::spawn(exit_on_panic(LEASES, hear)))
 }
 
 /// What a worker offers by itself.
@@ -306,7 +312,7 @@ async fn offer(
 ) -> Result<Offered, CallError> {
     let session = Session::open(channels, manager, &options.id, DEFAULT_TTL);
     let watch = leases.follow_session(channels, manager, &session, DEFAULT_TTL)?;
-    let watching = AbortOnDropHandle::new(tokio::spawn(watch));
+    let watching = AbortOnDropHandle::new(tokio::spawn(exit_on_panic(LEASES, watch)));
     let provider = Provider::start(channels, manager, &session)?;
     let resource = Resource::new(&options.id, ResourceClass::Process, &options.kind)
         .with_endpoint(endpoint)

@@ -13,6 +13,7 @@ use crate::core::snapshot::Snapshot;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::robot::{Joints, Robot};
+use ratn_panic_point::panic_point;
 use ratn_perception::camera::{Camera, DepthImage};
 use ratn_perception::noise::Noise;
 use ratn_worker::robot_clock::RobotClock;
@@ -216,6 +217,7 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
     let mut waiting: BTreeMap<Ticket, oneshot::Sender<Ending>> = BTreeMap::new();
     loop {
         vitals.beat();
+        panic_point("cell-core");
         let most = if cell.is_restless() { RESTLESS_SLEEP } else { MAX_SLEEP };
         let sleep = cell.next_wake().map_or(most, |moment| clock.until(moment).min(most));
         let message = match inbox.recv_timeout(sleep) {

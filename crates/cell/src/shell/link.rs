@@ -7,6 +7,7 @@ use crate::config::CellConfig;
 use crate::core::protocol::Module;
 use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
+use ratn_panic_point::panic_point;
 use ratn_proto::types::Resource;
 use ratn_worker::client::{CallError, Channels};
 use ratn_worker::endpoint::Endpoint;
@@ -85,6 +86,7 @@ impl Link {
                     provider.offer(self.battery(level)).await?;
                 }
                 tokio::time::sleep(LOOK_INTERVAL).await;
+                panic_point("link");
                 if self.has_moved_from(manager) {
                     return Ok(());
                 }

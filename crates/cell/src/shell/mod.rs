@@ -20,6 +20,7 @@ use crate::core::cell::Cell;
 use anyhow::Context;
 use ratn_proto::v1::cell_service_server::CellServiceServer;
 use ratn_worker::client::Channels;
+use ratn_worker::panic::exit_on_panic;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::Safety;
@@ -78,7 +79,7 @@ pub async fn run_as(
     // Motions under way have their leases until the last has ended.
     let over = CancellationToken::new();
     let _over = over.clone().drop_guard();
-    let linked = tokio::spawn(link.keep(over.clone()));
+    let linked = tokio::spawn(exit_on_panic("the link to the resource manager", link.keep(over.clone())));
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
     let served = bound.serve_as(services, serving, shutdown).await;

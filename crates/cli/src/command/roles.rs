@@ -16,6 +16,7 @@ use ratn_daemon::supervisor::Supervisor;
 use ratn_daemon::{metrics, process_manager, resource_manager, telemetry, world_pool};
 use ratn_storage::OpenError;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{BindError, Exposure, ServeError, Serving};
 use ratn_worker::vitals::CoreFailure;
@@ -152,13 +153,14 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
         access: arguments.config.clone(),
     };
     let speed = arguments.speed;
-    blocking(async {
+    let run = async {
         match arguments.worker {
             WorkerKind::PathPlanner => ratn_workers::path_planner::run(options, speed).await,
             WorkerKind::Detector => ratn_workers::detector::run(options, arguments.pictures.clone()).await,
         }
         .map_err(unbegun)
-    })
+    };
+    blocking(exit_on_panic("the worker", run))
 }
 
 /// What a daemon finds where it runs.
@@ -225,8 +227,19 @@ fn daemon_on(
         let reloading = Reloading { file: arguments.config.clone(), running, role, logs, tls, access, bounds };
         let followed =
             supervisor.follow(host.serving.phase.subscribe(), host.serving.vitals.clone(), move || reloading.reload());
-        let followed = tokio::spawn(followed);
-        let ended = run(system, host).await;
+        let followed = tokio::spawn(exit_on_panic("the link to the service manager", followed));
+        let vitals = host.serving.vitals.clone();
+        // What is left to do once the core has ended may hang.
+        let overdue = async {
+            let failure = vitals.failed().await;
+            tokio::time::sleep(EXIT_PATIENCE).await;
+            failure
+        };
+        let ended = tokio::select! {
+            biased;
+            ended = exit_on_panic(role, run(system, host)) => ended,
+            failure = overdue => core_ended(&failure),
+        };
         if let Some(failure) = ended.as_ref().err().and_then(core_failure) {
             core_ended(failure);
         }

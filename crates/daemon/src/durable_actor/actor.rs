@@ -8,6 +8,7 @@ use super::outbox::Outbox;
 use super::{Core, Journal};
 use crate::details::of_fault;
 use crate::metrics;
+use ratn_panic_point::panic_point;
 use ratn_storage::{AppendError, Fault, Position, Progress};
 use ratn_worker::vitals::{CoreFailure, Vitals};
 use std::time::{Duration, Instant};
@@ -46,6 +47,7 @@ impl<C: Core> Actor<C> {
         loop {
             self.desk.begin_turn();
             self.vitals.beat();
+            panic_point("durable-actor");
             if let Speech::Over(fault) = self.desk.speech().now() {
                 return self.fenced(&fault);
             }

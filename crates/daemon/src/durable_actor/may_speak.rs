@@ -17,6 +17,7 @@
 //! - *Lists and watches* tell of what was on the disk before T. Who moves something by what the predecessor said does so for at most
 //!   G after T, under a lease that the successor has, too, and does not give to another before its session has ended.
 
+use ratn_panic_point::panic_point;
 use ratn_storage::{Fault, Place};
 use ratn_worker::vitals::Vitals;
 use std::sync::mpsc;
@@ -64,6 +65,7 @@ impl MaySpeak {
         let (end, ended) = mpsc::channel::<()>();
         let keep = move || {
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(CONFIRM_INTERVAL) {
+                panic_point("may-speak");
                 match look(&*place) {
                     Ok(found) => {
                         let over = matches!(found, Confirmed::Lost(_));

@@ -15,6 +15,7 @@ use crate::demand::{Shortages, Use};
 use crate::link::{Offering, Wanted};
 use nix::sys::signal::Signal;
 use ratn_model::time::Timestamp;
+use ratn_panic_point::panic_point;
 use ratn_proto::types::{Demand, HostPools, PoolStatus, Scale, TrackingMode, WorkerStatus};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::vitals::Vitals;
@@ -179,6 +180,7 @@ impl Actor {
         let mut tick = tokio::time::interval(TICK);
         loop {
             vitals.beat();
+            panic_point("process-manager-actor");
             let deadline = self.pools.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
             tokio::select! {
                 Some(outcome) = inputs.told.outcomes.recv() => self.became(outcome),

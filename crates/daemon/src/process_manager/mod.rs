@@ -44,11 +44,12 @@ pub use template::{Liveness, Needs, Template};
 pub use tracking::Tracking;
 
 use crate::demand::{DemandLink, Shortages};
-use crate::link::{Link, Manager, Turnover, Wanted};
+use crate::link::{LINK, Link, Manager, Turnover, Wanted};
 use anyhow::Context;
 use machine::Machine;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
 use ratn_worker::client::fresh_id;
+use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
 use roster::Roster;
@@ -136,11 +137,11 @@ pub async fn run_as(
             used,
         }),
     };
-    let linked = tokio::spawn(link.keep(shutdown.clone()));
+    let linked = tokio::spawn(exit_on_panic(LINK, link.keep(shutdown.clone())));
     let machine = Machine { config: config.machine.clone(), labels: config.labels.clone(), host };
     let (look, looks) = mpsc::channel(1);
     let watching = machine.watch(directory.clone(), wanted.clone(), look);
-    let watching = AbortOnDropHandle::new(tokio::spawn(watching));
+    let watching = AbortOnDropHandle::new(tokio::spawn(exit_on_panic("the watch of the machine", watching)));
     let parts = actor::Parts {
         config,
         directory: directory.clone(),

@@ -16,6 +16,7 @@ use super::tracking::Tracker;
 use nix::sys::signal::Signal;
 use ratn_proto::types::{WorkerState, WorkerStatus};
 use ratn_worker::lease_watch::ManagerLocation;
+use ratn_worker::panic::exit_on_panic_blocking;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
@@ -137,7 +138,9 @@ pub(super) async fn settle(
         remove_files(&intent.id, &intent.template, directory);
     }
     let (tracker, kept) = (tracker.clone(), adopted.iter().map(|one| one.entry.id.clone()).collect::<Vec<_>>());
-    let ended = tokio::task::spawn_blocking(move || tracker.end_all_but(&kept.iter().map(String::as_str).collect()));
+    let end_unknown = move || tracker.end_all_but(&kept.iter().map(String::as_str).collect());
+    let part = "the end of what the last process manager left";
+    let ended = tokio::task::spawn_blocking(move || exit_on_panic_blocking(part, end_unknown));
     if let Err(error) = ended.await {
         tracing::error!(%error, "what nobody knows is not ended");
     }

@@ -15,8 +15,10 @@ use super::template::Template;
 use super::tracking::{Children, Tracker};
 use crate::resource_manager;
 use nix::sys::signal::Signal;
+use ratn_panic_point::panic_point;
 use ratn_worker::adoption;
 use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
+use ratn_worker::panic::{exit_on_panic, exit_on_panic_blocking};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::collections::BTreeMap;
 use std::io;
@@ -31,6 +33,9 @@ const OUTCOMES: usize = 1_024;
 
 /// The pause between two looks for orphans that have ended.
 const REAP_INTERVAL: Duration = Duration::from_secs(5);
+
+/// A part of this process, for the log.
+const HEALTH_OF_WORKER: &str = "the health check of a worker";
 
 /// What is told of them.
 pub(super) struct Told {
@@ -131,7 +136,9 @@ impl Processes {
             jobs: spawner::start(told.clone(), tracker.clone())?,
             outcomes: told,
             roster,
-            reaping: tracker.children().map(|children| AbortOnDropHandle::new(tokio::spawn(reap(children)))),
+            reaping: tracker.children().map(|children| {
+                AbortOnDropHandle::new(tokio::spawn(exit_on_panic("the reaper of orphans", reap(children))))
+            }),
             tracker,
             tell: Tell { serving, health },
             by_id: BTreeMap::new(),
@@ -212,7 +219,7 @@ impl Processes {
         let (known, is_known) = oneshot::channel();
         let attended =
             attend(directory.clone(), id.to_owned(), (signs, within), is_known, questions, self.tell.clone());
-        let attended = Some((tokio::spawn(attended).abort_handle(), ask));
+        let attended = Some((tokio::spawn(exit_on_panic(HEALTH_OF_WORKER, attended)).abort_handle(), ask));
         let process = Process { directory, pid: 0, template: Some(template.clone()), known: Some(known), attended };
         self.by_id.insert(id.to_owned(), process);
         Ok(())
@@ -259,7 +266,7 @@ impl Processes {
         }
         let attended = pulse.map(|pulse| {
             let answered = answer(pulse, id.clone(), questions, self.tell.health.clone());
-            (tokio::spawn(answered).abort_handle(), ask)
+            (tokio::spawn(exit_on_panic(HEALTH_OF_WORKER, answered)).abort_handle(), ask)
         });
         let process = Process { directory, pid: entry.pid, template: None, known: None, attended };
         self.by_id.insert(id.clone(), process);
@@ -304,7 +311,8 @@ impl Processes {
         self.by_id.values().for_each(|process| spawner::signal(process.pid, Signal::SIGKILL));
         drop(self.reaping.take());
         let tracker = self.tracker.clone();
-        if let Err(error) = tokio::task::spawn_blocking(move || tracker.end()).await {
+        let end = || exit_on_panic_blocking("the end of all workers", move || tracker.end());
+        if let Err(error) = tokio::task::spawn_blocking(end).await {
             tracing::error!(%error, "what workers left is not ended");
         }
     }
@@ -319,6 +327,7 @@ async fn reap(children: Children) {
     let mut looks = tokio::time::interval(REAP_INTERVAL);
     loop {
         looks.tick().await;
+        panic_point("reaper");
         children.reap();
     }
 }

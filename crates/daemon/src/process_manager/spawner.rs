@@ -13,6 +13,8 @@ use crate::supervisor::command_of;
 use nix::errno::Errno;
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
+use ratn_panic_point::panic_point;
+use ratn_worker::panic::{exit_on_panic, exit_on_panic_blocking};
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io;
@@ -29,6 +31,8 @@ use tokio_util::task::AbortOnDropHandle;
 const QUEUE: usize = 1_024;
 /// How long the end of a dead worker's output is waited for: something that it started may hold the pipe open.
 const LAST_WORDS_PATIENCE: Duration = Duration::from_millis(20);
+/// A part of this process, for the log.
+const WATCH_OF_WORKER: &str = "the watch of a worker";
 
 /// A process to be started.
 #[derive(Debug)]
@@ -72,9 +76,10 @@ pub(super) enum Outcome {
 pub(super) fn start(outcomes: mpsc::Sender<Outcome>, tracker: Tracker) -> io::Result<mpsc::Sender<Job>> {
     let (sender, mut jobs) = mpsc::channel::<Job>(QUEUE);
     let runtime = Handle::current();
-    std::thread::Builder::new().name("spawner".to_owned()).spawn(move || {
+    let start_all = move || {
         let _entered = runtime.enter();
         while let Some(mut job) = jobs.blocking_recv() {
+            panic_point("spawner");
             let id = job.id.clone();
             let spawned = match tracker.children() {
                 Some(children) => children.starting(|| {
@@ -96,7 +101,8 @@ pub(super) fn start(outcomes: mpsc::Sender<Outcome>, tracker: Tracker) -> io::Re
                     }
                     let worker =
                         Watched { id, pid, child, log, awaited: job.awaited.take(), force, bounds: job.outlives };
-                    runtime.spawn(watch(worker, tracker.clone(), outcomes.clone()));
+                    let watching = watch(worker, tracker.clone(), outcomes.clone());
+                    runtime.spawn(exit_on_panic(WATCH_OF_WORKER, watching));
                 }
                 Err(error) => {
                     let reason = format!("cannot start {}: {error}", job.program.display());
@@ -107,7 +113,9 @@ pub(super) fn start(outcomes: mpsc::Sender<Outcome>, tracker: Tracker) -> io::Re
                 }
             }
         }
-    })?;
+    };
+    let start_all = || exit_on_panic_blocking("the thread that starts workers", start_all);
+    std::thread::Builder::new().name("spawner".to_owned()).spawn(start_all)?;
     Ok(sender)
 }
 
@@ -172,6 +180,7 @@ async fn watch(worker: Watched, tracker: Tracker, outcomes: mpsc::Sender<Outcome
         Ok(status) => describe(status),
         Err(error) => format!("cannot be waited for: {error}"),
     };
+    panic_point("worker-watch");
     drop((parent_lives, bounding));
     if let Some(children) = tracker.children() {
         children.ended(pid);
@@ -197,7 +206,7 @@ pub(super) fn watch_adopted(
 ) {
     let Adopted { entry, parent_lives, exit, .. } = adopted;
     let log = Log::of_another(log, max_log_bytes).inspect_err(|error| tracing::warn!(id = entry.id, %error, "no log"));
-    tokio::spawn(async move {
+    let watching = async move {
         let bounding =
             log.as_ref().ok().map(|log| AbortOnDropHandle::new(tokio::spawn(log.clone().keep_bounded(BOUND_INTERVAL))));
         let force = InForce::adopted(entry.groups);
@@ -208,16 +217,19 @@ pub(super) fn watch_adopted(
         let reason = "ended, how is not known: it was adopted".to_owned();
         let last_words = log.map(|log| log.last_words()).unwrap_or_default();
         let _ = outcomes.send(Outcome::Exited { id: entry.id, reason, last_words }).await;
-    });
+    };
+    tokio::spawn(exit_on_panic(WATCH_OF_WORKER, watching));
 }
 
 /// Its groups, and what it had started outside of them.
 async fn end_rest(id: &str, force: InForce, tracker: Tracker) {
     let of = id.to_owned();
-    let ended = tokio::task::spawn_blocking(move || {
+    let end_rest = move || {
+        panic_point("end-of-worker");
         drop(force);
         tracker.end_worker(&of);
-    });
+    };
+    let ended = tokio::task::spawn_blocking(|| exit_on_panic_blocking("the end of a worker's processes", end_rest));
     if let Err(error) = ended.await {
         tracing::error!(id, %error, "what a worker started is not ended");
     }

@@ -25,7 +25,7 @@ pub use config::WorldPoolConfig;
 
 use crate::config::Durability;
 use crate::durable_actor::{Journal, JournalError, floor};
-use crate::link::{Link, Manager};
+use crate::link::{LINK, Link, Manager};
 use anyhow::Context;
 use history::History;
 use ratn_model::id::Revision;
@@ -33,6 +33,7 @@ use ratn_model::ontology::{Ontology, turtle};
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
 use ratn_proto::v1::world_pool_service_server::WorldPoolServiceServer;
+use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
 use std::path::Path;
@@ -87,9 +88,10 @@ pub async fn run_as(
     // Calls under way need all of it until the last has ended.
     let over = CancellationToken::new();
     let _over = over.clone().drop_guard();
-    let linked = tokio::spawn(link.keep(over.clone()));
+    let linked = tokio::spawn(exit_on_panic(LINK, link.keep(over.clone())));
     let (live, leases) = watch::channel(leases::LiveLeases::default());
-    tokio::spawn(over.clone().run_until_cancelled_owned(leases::follow(manager, live)));
+    let following = over.clone().run_until_cancelled_owned(leases::follow(manager, live));
+    tokio::spawn(exit_on_panic("the watch of leases", following));
     let sizes = service::Sizes { fact: config.fact_bytes, commit: config.commit_bytes };
     let (actor, ended) = actor::start(config, ontology, kept, leases.clone(), serving.vitals.clone(), over.clone())?;
     let service = WorldPoolServiceServer::new(service::Service { actor, leases, shutdown: shutdown.clone(), sizes })

@@ -37,6 +37,7 @@ impl Drop for Ended<'_> {
 impl Compaction {
     pub(super) fn run(self, make: MakeSnapshot) {
         let mut ended = Ended(&self.shared, None);
+        ratn_panic_point::panic_point("log-compaction");
         let payload = make();
         // The snapshot must not know of records that a crash could still take away.
         if Durable::new(self.shared.pending.watch()).wait_blocking(self.through).is_err() {

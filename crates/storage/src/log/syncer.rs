@@ -56,6 +56,7 @@ impl Syncer {
         let shared = self.shared.clone();
         let _ended = Ended(shared.clone());
         while let Some((mut batch, rotate)) = shared.pending.take(self.durability == Durability::None) {
+            ratn_panic_point::panic_point("log-syncer");
             if let Err(fault) = self.commit(&mut batch, rotate) {
                 shared.pending.stop(&fault);
                 return;

@@ -2,6 +2,7 @@
 
 use super::ActionFailure;
 use crate::access::Caller;
+use crate::panic::exit_on_panic;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_proto::convert::wire_form;
 use ratn_proto::types::{Goal, GoalOutcome};
@@ -201,7 +202,7 @@ impl Drop for Listener {
         let left = self.0.left.fetch_add(1, Ordering::AcqRel) + 1;
         match tokio::runtime::Handle::try_current() {
             Ok(runtime) if !self.0.grace.is_zero() => {
-                runtime.spawn(abandoned(Arc::clone(&self.0), left));
+                runtime.spawn(exit_on_panic("the task of an abandoned goal", abandoned(Arc::clone(&self.0), left)));
             }
             _ => self.0.stop(StopCause::Abandoned),
         }

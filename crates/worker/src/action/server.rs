@@ -10,6 +10,7 @@ use crate::access::Caller;
 use crate::client::Channels;
 use crate::gate::ending;
 use crate::lease_watch::{EndedHolding, GRANT_WAIT, LeaseListener, LeaseWatch};
+use crate::panic::exit_on_panic;
 use crate::safety::Safety;
 use crate::trace;
 use ratn_proto::types::Goal;
@@ -233,7 +234,8 @@ impl ActionServer {
                     let context = GoalContext::new(goal, Arc::clone(&entry), channels, safety);
                     let action = Arc::clone(action);
                     let running = run(Arc::clone(&self.inner), entry, action, context, deadline_ms);
-                    tokio::spawn(trace::within_any(trace::current(), running).in_current_span());
+                    let running = trace::within_any(trace::current(), running).in_current_span();
+                    tokio::spawn(exit_on_panic("the task of a goal", running));
                     return Ok(messages);
                 }
                 Admission::After(other) => (Some(other), None),

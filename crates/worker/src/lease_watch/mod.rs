@@ -19,6 +19,7 @@ use crate::client::{CallError, Channels, ResourceClient, ResourceWatch};
 use crate::endpoint::Endpoint;
 use crate::session::{Session, SessionState};
 use ratn_model::id::LeaseId;
+use ratn_panic_point::panic_point;
 use std::future::{pending, ready};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
@@ -217,6 +218,7 @@ impl LeaseWatch {
         };
         loop {
             sleep(patience / QUESTIONS_PER_PATIENCE).await;
+            panic_point("lease-watch");
             let (asked, trusted_until) = (Instant::now(), answered.last() + patience);
             match timeout_at(trusted_until, client.get(resource)).await {
                 Ok(Err(error)) if error.is_crash() => tracing::debug!(%error, "the resource manager does not answer"),

@@ -4,6 +4,7 @@
 //! as calls of their own would.
 
 use super::Protocol;
+use crate::panic::exit_on_panic;
 use crate::trace;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -97,7 +98,7 @@ impl<P: Protocol> Multiplexer<P> {
         let (requests, outgoing) = mpsc::channel(OUTGOING);
         let responses = open(ReceiverStream::new(outgoing)).await?.into_inner();
         let calls = Arc::new(Mutex::new(Calls { last_id: 0, waiting: BTreeMap::new(), broken: None }));
-        tokio::spawn(read(responses, Arc::clone(&calls)));
+        tokio::spawn(exit_on_panic("the reader of a stream of calls", read(responses, Arc::clone(&calls))));
         Ok(kept.insert(Stream { requests, calls }).clone())
     }
 }
