@@ -96,8 +96,11 @@ async fn a_grant_that_crossed_a_dropped_call_is_given_back_by_its_request_id() {
     assert_eq!(first, again, "asked twice, granted once");
     let mut raw = ResourceServiceClient::new(system.channels.get(&manager.endpoint).unwrap());
     let mut withdraw = async || {
-        let request =
-            v1::WithdrawRequest { request_id: "run/i1/acquire".to_owned(), session_id: a.session.id().to_owned() };
+        let request = v1::WithdrawRequest {
+            request_id: "run/i1/acquire".to_owned(),
+            session_id: a.session.id().to_owned(),
+            call: 0,
+        };
         raw.withdraw(request).await.unwrap().into_inner().withdrawn
     };
     assert!(withdraw().await);

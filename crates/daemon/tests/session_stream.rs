@@ -9,6 +9,7 @@ use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_proto::v1::session_request::Kind as Asked;
 use ratn_proto::v1::session_response::Kind;
 use ratn_proto::v1::{self, SessionRequest};
+use ratn_worker::client::AcquireOptions;
 use std::collections::BTreeMap;
 use support::{TestSystem, block, in_time};
 use tokio::sync::mpsc;
@@ -99,7 +100,7 @@ async fn a_call_that_fails_leaves_the_stream_as_it_is() {
     assert_eq!(line.failure().await, (2, Code::InvalidArgument));
     line.ask(3, acquire("nobody", "x")).await;
     assert_eq!(line.failure().await, (3, Code::FailedPrecondition));
-    let undo = v1::WithdrawRequest { request_id: "never asked".to_owned(), session_id: "a".to_owned() };
+    let undo = v1::WithdrawRequest { request_id: "never asked".to_owned(), session_id: "a".to_owned(), call: 0 };
     line.ask(4, Some(Asked::Withdraw(undo))).await;
     assert!(matches!(line.hear().await, (4, Kind::Withdraw(undone)) if !undone.withdrawn));
     manager.end().await;
@@ -133,7 +134,7 @@ async fn the_last_call_that_a_stream_may_have_waits_and_one_more_is_refused_unti
     for id in 10..10 + CALLS {
         line.ask(id, acquire("a", &format!("waits {id}"))).await;
     }
-    let undo = v1::WithdrawRequest { request_id: "waits 10".to_owned(), session_id: "a".to_owned() };
+    let undo = v1::WithdrawRequest { request_id: "waits 10".to_owned(), session_id: "a".to_owned(), call: 0 };
     line.ask(5_000, Some(Asked::Withdraw(undo.clone()))).await;
     assert_eq!(line.failure().await, (5_000, Code::ResourceExhausted));
     // Undone from elsewhere, the first one ends.
@@ -202,5 +203,102 @@ async fn a_stream_that_broke_fails_its_calls_and_the_next_call_opens_another() {
         }
     });
     assert!(asked.await.is_ok());
+    manager.end().await;
+}
+
+/// The client does not wait for this call any more.
+fn dropped(call: u64, request: &str) -> Option<Asked> {
+    Some(Asked::Withdraw(v1::WithdrawRequest { request_id: request.to_owned(), session_id: "b".to_owned(), call }))
+}
+
+impl Line {
+    /// Drops a call; whether the server undoes it.
+    async fn drop_call(&mut self, call: u64) -> bool {
+        self.ask(1_000, dropped(call, "run/i1")).await;
+        let (1_000, Kind::Withdraw(undone)) = self.hear().await else { panic!("it is answered") };
+        undone.withdrawn
+    }
+}
+
+#[tokio::test]
+async fn a_lease_that_two_questions_were_answered_with_ends_when_both_are_dropped_and_is_acquired_anew_then() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let mut line = Line::open(&system, &manager, "b").await;
+    let mut tokens = Vec::new();
+    for id in [2, 3] {
+        line.ask(id, acquire("b", "run/i1")).await;
+        let (answered, Kind::Acquire(granted)) = line.hear().await else { panic!("the arm is free, or its own") };
+        tokens.push((answered, granted.lease.unwrap().token));
+    }
+    assert_eq!(tokens, [(2, tokens[0].1), (3, tokens[0].1)]);
+    assert!(line.drop_call(3).await);
+    assert!(!line.drop_call(3).await, "it is not known any more");
+    assert_eq!(a.resources.get("arm").await.unwrap().free.units(), 0, "the first question's");
+    assert!(line.drop_call(2).await);
+    assert_eq!(a.resources.get("arm").await.unwrap().free.units(), 1);
+    // Dropped and asked again at once: in this order.
+    line.ask(4, acquire("b", "run/i1")).await;
+    line.ask(0, dropped(4, "run/i1")).await;
+    line.ask(5, acquire("b", "run/i1")).await;
+    let mut answers = Vec::new();
+    while !matches!(answers.last(), Some((5, _))) {
+        match line.hear().await {
+            (0, Kind::Withdraw(undone)) => assert!(undone.withdrawn),
+            (id, Kind::Acquire(granted)) => answers.push((id, granted.lease.unwrap().token)),
+            (_, other) => panic!("{other:?}"),
+        }
+    }
+    assert!(answers.iter().all(|(_, token)| *token > tokens[0].1), "{answers:?}");
+    assert_eq!(a.resources.get("arm").await.unwrap().free.units(), 0);
+    manager.end().await;
+}
+
+#[tokio::test]
+async fn of_two_questions_of_one_request_that_wait_the_dropped_one_takes_nothing_from_the_other() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let held = a.resources.acquire(vec![block("Arm")], Default::default()).await.unwrap();
+    let mut line = Line::open(&system, &manager, "b").await;
+    line.ask(2, acquire("b", "run/i1")).await;
+    line.ask(3, acquire("b", "run/i1")).await;
+    assert!(line.drop_call(2).await);
+    assert!(a.resources.release(held.id).await.unwrap());
+    let (3, Kind::Acquire(granted)) = line.hear().await else { panic!("the other question waits on") };
+    assert!(!line.drop_call(2).await, "it has ended");
+    assert!(granted.lease.is_some_and(|lease| lease.token > held.token.0));
+    assert_eq!(a.resources.get("arm").await.unwrap().free.units(), 0);
+    manager.end().await;
+}
+
+#[tokio::test]
+async fn a_call_that_a_client_drops_leaves_another_one_of_its_request_as_it_is() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let held = a.resources.acquire(vec![block("Arm")], Default::default()).await.unwrap();
+    let options = || AcquireOptions { request: "run/i1".to_owned(), ..AcquireOptions::default() };
+    let mut first = Box::pin(b.resources.acquire(vec![block("Arm")], options()));
+    let mut second = Box::pin(b.resources.acquire(vec![block("Arm")], options()));
+    // Both are on the stream, one behind the other, when a later question of it is answered.
+    in_time(async {
+        assert!(futures::poll!(&mut first).is_pending());
+        while b.resources.explain("run/i1").await.is_err() {
+            assert!(futures::poll!(&mut first).is_pending());
+        }
+        assert!(futures::poll!(&mut second).is_pending());
+        drop(first);
+        assert!(!b.resources.release(held.id).await.unwrap_or(false), "it is another's");
+    })
+    .await;
+    assert!(a.resources.release(held.id).await.unwrap());
+    let granted = in_time(second).await.unwrap();
+    assert!(granted.token > held.token);
+    assert!(b.resources.release(granted.id).await.unwrap(), "it still holds it");
     manager.end().await;
 }

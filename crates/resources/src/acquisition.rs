@@ -7,11 +7,12 @@ use crate::fingerprint::Fingerprint;
 use crate::group::{Key, key};
 use crate::id::{SessionId, WaiterId};
 use crate::lease::LeaseRecord;
-use crate::memory::{Recalled, Remembered};
+use crate::memory::{Recalled, Remembered, RequestId};
 use crate::pool::Pool;
 use crate::queue::{AcquireRequest, Waiter};
 use crate::record::Effect;
 use crate::resource::{Resource, Units};
+use crate::session::Speaker;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::{Lease, ResourceOperation};
 use ratn_model::time::Timestamp;
@@ -24,7 +25,7 @@ impl Pool {
     /// An unknown session, other operations than block, consume and exists, a passed deadline, a full queue.
     pub fn acquire(&mut self, now: Timestamp, request: AcquireRequest) -> Result<WaiterId, PoolError> {
         self.advance(now);
-        self.enqueue(request, "", Fingerprint::UNKNOWN)
+        self.enqueue(request, RequestId::default(), Fingerprint::UNKNOWN)
     }
 
     /// Takes a waiter out of the queue.
@@ -39,14 +40,15 @@ impl Pool {
         Ok(())
     }
 
-    /// Undoes an acquire by its request id: takes it out of the queue, or ends the lease that it was granted. False when
-    /// there is nothing to undo.
+    /// Undoes an acquire by its request id: takes it out of the queue, or ends the lease that it was granted. The same request id once
+    /// more acquires anew. False when there is nothing to undo.
     ///
     /// # Errors
     /// An acquire of another session.
     pub fn withdraw(&mut self, now: Timestamp, caller: &SessionId, request_id: &str) -> Result<bool, PoolError> {
         self.advance(now);
-        match self.memory.reply(request_id) {
+        let Some(session) = self.sessions.get(caller) else { return Ok(false) };
+        match self.memory.reply(&RequestId::new(&session.opened_by, request_id)) {
             Some(Recalled::Waiting(id)) => {
                 let Some(waiter) = self.queue.get(id) else { return Ok(false) };
                 check_owner(|| id.to_string(), &waiter.request.session, caller)?;
@@ -56,7 +58,7 @@ impl Pool {
                 let Some(record) = self.leases.get(&lease) else { return Ok(false) };
                 check_owner(|| lease.to_string(), &record.session, caller)?;
                 self.return_consumed(lease);
-                self.commit(Effect::LeaseEnded { lease, reason: EndReason::Asked });
+                self.commit(Effect::LeaseEnded { lease, reason: EndReason::Undelivered });
             }
             _ => return Ok(false),
         }
@@ -81,15 +83,30 @@ impl Pool {
         Ok(())
     }
 
-    /// The provider of a resource says that nothing moves any more for a lease that has ended: what that had left of the resource is
-    /// free. False when it had left nothing, or lives. Of what no session provides, the lease's own session says so; `None` as session
-    /// may say it of anything.
+    /// As [`Pool::confirm_standstill_as`], by [`Speaker::trusted`].
     ///
     /// # Errors
-    /// An unknown resource, or one that another session provides.
+    /// As there.
     pub fn confirm_standstill(
         &mut self,
         now: Timestamp,
+        session: Option<&SessionId>,
+        lease: LeaseId,
+        resource: &str,
+    ) -> Result<bool, PoolError> {
+        self.confirm_standstill_as(now, &Speaker::trusted(), session, lease, resource)
+    }
+
+    /// The provider of a resource says that nothing moves any more for a lease that has ended: what that had left of the resource is
+    /// free. False when it had left nothing, or lives. Of what no session provides, the lease's own session says so; it may have ended
+    /// and been opened anew, but by nobody else than its opener of then. `None` as session may say it of anything.
+    ///
+    /// # Errors
+    /// An unknown resource, or one that another session provides; a lease of a session that another opened.
+    pub fn confirm_standstill_as(
+        &mut self,
+        now: Timestamp,
+        speaker: &Speaker,
         session: Option<&SessionId>,
         lease: LeaseId,
         resource: &str,
@@ -103,8 +120,10 @@ impl Pool {
         if let (Some(speaks), Some(caller)) = (speaks, session) {
             check_owner(|| format!("resource `{resource}`"), speaks, caller)?;
         }
-        if ending.is_none() {
-            return Ok(false);
+        let Some(ending) = ending else { return Ok(false) };
+        if provider.is_none() && !speaker.for_anybody && ending.opened_by != speaker.name {
+            let (session, opened_by) = (ending.session.clone(), ending.opened_by.clone());
+            return Err(PoolError::SessionOfAnother { session, opened_by, speaker: speaker.name.clone() });
         }
         self.commit(Effect::UnitsFreed { lease, slot, confirmed: true });
         self.schedule();
@@ -130,7 +149,7 @@ impl Pool {
     pub(crate) fn enqueue(
         &mut self,
         request: AcquireRequest,
-        request_id: &str,
+        request_id: RequestId,
         fingerprint: Fingerprint,
     ) -> Result<WaiterId, PoolError> {
         use ResourceOperation::{Block, Consume, Exists};
@@ -146,7 +165,7 @@ impl Pool {
         let id = WaiterId(self.next_waiter);
         let place = (Reverse(request.priority), id);
         if let Some(taken) = self.at_once(place, &request.requirements) {
-            self.give(id, request, request_id.to_owned(), fingerprint, taken);
+            self.give(id, request, request_id, fingerprint, taken);
             self.schedule();
             return Ok(id);
         }
@@ -167,10 +186,9 @@ impl Pool {
             self.callers.waits(&session.opened_by);
         }
         if !request_id.is_empty() {
-            self.memory.wait(request_id, fingerprint, id);
+            self.memory.wait(&request_id, fingerprint, id);
         }
         let reserved = vec![Units::new(); request.requirements.len()];
-        let request_id = request_id.to_owned();
         let (hopeful, lacks, overtaken) = Default::default();
         self.join(id, Waiter { request, request_id, groups, hopeful, reserved, lacks, overtaken });
         self.schedule();
@@ -210,7 +228,7 @@ impl Pool {
         &mut self,
         id: WaiterId,
         request: AcquireRequest,
-        request_id: String,
+        request_id: RequestId,
         fingerprint: Fingerprint,
         taken: Vec<Units>,
     ) {

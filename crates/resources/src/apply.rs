@@ -9,6 +9,7 @@ use crate::expiry::Timer;
 use crate::group::Seen;
 use crate::id::{SessionId, Slot};
 use crate::lease::{Bound, EndingLease, LeaseRecord};
+use crate::memory::RequestId;
 use crate::pool::Pool;
 use crate::record::{Effect, Record};
 use crate::resource::{Resource, ResourceView, add_to, remove_from, take_from};
@@ -187,7 +188,15 @@ impl Pool {
                 Ok(())
             }
             Effect::Answered { request_id, fingerprint, reply, forget } => {
-                self.memory.remember(request_id.clone(), *fingerprint, reply.clone(), *forget, self.now);
+                self.memory.forget_oldest(*forget);
+                let id = RequestId::new(&Arc::default(), request_id);
+                self.memory.remember(id, *fingerprint, reply.clone(), self.now);
+                Ok(())
+            }
+            Effect::AnsweredTo { caller, request_id, fingerprint, reply, forget } => {
+                self.memory.forget(forget);
+                let id = RequestId { id: request_id.clone(), caller: caller.clone() };
+                self.memory.remember(id, *fingerprint, reply.clone(), self.now);
                 Ok(())
             }
         }
@@ -232,9 +241,13 @@ impl Pool {
             return false;
         }
         let until = self.now + standstill;
-        let (token, session) = (record.token, record.session.clone());
-        let ending = self.ending.entry(lease);
-        let ending = ending.or_insert_with(|| EndingLease { token, session, reason, slots: BTreeMap::new() });
+        let ending = self.ending.entry(lease).or_insert_with(|| EndingLease {
+            token: record.token,
+            session: record.session.clone(),
+            reason,
+            slots: BTreeMap::new(),
+            opened_by: record.opened_by.clone(),
+        });
         ending.slots.insert(slot, Bound(until));
         self.timers.insert((until, Timer::Standstill(lease, slot)));
         true

@@ -85,8 +85,7 @@ impl Pool {
         let owned = self.resources.iter().filter(|(_, resource)| resource.owner.is_some()).count();
         ensure(provided == owned, || "a session provides a resource that is gone".to_owned())?;
         ensure(self.timers == self.expected_timers(), || "the timers do not agree with what they are for".to_owned())?;
-        ensure(self.memory.len() <= self.limits.remembered_requests, || "the request memory is too long".to_owned())?;
-        ensure(self.memory.order_agrees(), || "the order of the request memory does not agree".to_owned())?;
+        self.memory.check(&self.limits)?;
         let waiting = self.queue.iter().filter(|(_, waiter)| !waiter.request_id.is_empty()).count();
         ensure(self.memory.waiting() == waiting, || "a request id waits without a waiter".to_owned())
     }

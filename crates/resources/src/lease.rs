@@ -25,6 +25,9 @@ pub(crate) struct EndingLease {
     pub(crate) reason: EndReason,
     /// Which resources, and when their units are free at the latest; counted anew after a restart.
     pub(crate) slots: BTreeMap<Slot, Bound>,
+    /// Who opened the session; kept beside it.
+    #[serde(skip)]
+    pub(crate) opened_by: Arc<str>,
 }
 
 /// When units are free whatever the provider says; of no interest to another process.

@@ -49,8 +49,12 @@ pub struct Limits {
     pub requirement_bytes: usize,
     /// Leases that may hold some of one resource at the same time.
     pub holders: usize,
-    /// Answers remembered so that a repeated request id is not performed twice; the oldest is forgotten first.
+    /// Answers remembered so that a repeated request id is not performed twice; of the caller with the most, the oldest is forgotten first.
     pub remembered_requests: usize,
+    /// Of those, answers to one caller: the caller's own oldest is forgotten first.
+    pub remembered_per_caller: usize,
+    /// And bytes of the answers to one caller, each with about 256 bytes besides its ids; the newest is kept whatever it has.
+    pub remembered_bytes_per_caller: usize,
     /// And for so long at the most, in milliseconds (forgotten when the next one is remembered).
     pub remember_for_ms: u64,
     /// Watch events kept for those who watch from an earlier revision.
@@ -80,6 +84,8 @@ impl Default for Limits {
             requirement_bytes: 16_384,
             holders: 4_096,
             remembered_requests: 65_536,
+            remembered_per_caller: 32_768,
+            remembered_bytes_per_caller: 33_554_432,
             remember_for_ms: 3_600_000,
             history: 4_096,
         }

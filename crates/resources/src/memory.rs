@@ -1,14 +1,31 @@
-//! The answers given, by request id: the same id twice is performed once. Bounded by number and by age; the oldest is
-//! forgotten first. An answer is durable together with its effect; who is still in the queue is not.
+//! The answers given, by who asked and request id: the same id of the same caller twice is performed once.
+//!
+//! Bounded by number and by age, and for each caller by number and bytes. A caller's own oldest answers are forgotten first; where all
+//! callers together have too many, those of the caller with the most. So nobody's requests make the manager forget the answers of a caller
+//! with fewer. An answer is durable together with its effect; who is still in the queue is not.
 
 use crate::error::PoolError;
 use crate::fingerprint::Fingerprint;
 use crate::id::WaiterId;
+use crate::limits::Limits;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
+
+/// What an answer takes besides its texts, in bytes, about.
+const OVERHEAD: usize = 256;
+
+/// A request's id, in the name space of who opened the session that it is for.
+#[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct RequestId {
+    /// First, so that the requests of one id stand together.
+    pub(crate) id: Arc<str>,
+    /// Empty where nobody knows: whoever asks the same is taken for that caller.
+    pub(crate) caller: Arc<str>,
+}
 
 /// An answer as it is kept: small, with ids instead of what they name.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -26,106 +43,246 @@ pub(crate) enum Recalled {
     Answered(Remembered),
 }
 
-#[derive(Debug, Clone)]
-struct Answer {
-    number: u64,
-    fingerprint: Fingerprint,
-    reply: Remembered,
-}
+/// How many of their oldest answers these callers lose.
+pub(crate) type Forgotten = Vec<(Arc<str>, usize)>;
 
 /// See the module.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct RequestMemory {
-    answers: BTreeMap<String, Answer>,
-    /// When each was given, the oldest first.
-    order: BTreeMap<u64, (Timestamp, String)>,
+    callers: BTreeMap<Arc<str>, OfCaller>,
+    /// When each answer was given and to whom, the oldest first.
+    order: BTreeMap<u64, (Timestamp, Arc<str>)>,
+    grants: BTreeMap<LeaseId, (Arc<str>, u64)>,
     next: u64,
-    waiting: BTreeMap<String, (Fingerprint, WaiterId)>,
+    waiting: BTreeMap<RequestId, (Fingerprint, WaiterId)>,
+}
+
+/// The answers to one caller.
+#[derive(Debug, Clone, Default)]
+struct OfCaller {
+    numbers: BTreeMap<Arc<str>, u64>,
+    /// The oldest first.
+    answers: BTreeMap<u64, Answer>,
+    bytes: usize,
+}
+
+#[derive(Debug, Clone)]
+struct Answer {
+    id: Arc<str>,
+    fingerprint: Fingerprint,
+    reply: Remembered,
+}
+
+impl RequestId {
+    pub(crate) fn new(caller: &Arc<str>, id: &str) -> RequestId {
+        RequestId { id: id.into(), caller: caller.clone() }
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.id.is_empty()
+    }
+}
+
+impl Remembered {
+    fn bytes(&self) -> usize {
+        match self {
+            Remembered::Created { id, .. } => id.len(),
+            Remembered::Touched(ids) => ids.iter().map(|id| id.len() + size_of::<String>()).sum(),
+            Remembered::Granted(_) | Remembered::Done => 0,
+        }
+    }
+}
+
+impl Answer {
+    fn bytes(&self) -> usize {
+        OVERHEAD + 2 * self.id.len() + self.reply.bytes()
+    }
+}
+
+impl OfCaller {
+    fn get(&self, id: &str) -> Option<&Answer> {
+        self.answers.get(self.numbers.get(id)?)
+    }
+
+    fn remove(&mut self, number: u64) -> Option<Answer> {
+        let answer = self.answers.remove(&number)?;
+        self.numbers.remove(&answer.id);
+        self.bytes -= answer.bytes();
+        Some(answer)
+    }
+
+    fn insert(&mut self, number: u64, answer: Answer) {
+        self.bytes += answer.bytes();
+        self.numbers.insert(answer.id.clone(), number);
+        self.answers.insert(number, answer);
+    }
 }
 
 impl RequestMemory {
-    /// What this request led to before.
-    pub(crate) fn recall(&self, id: &str, fingerprint: Fingerprint) -> Result<Option<Recalled>, PoolError> {
-        let known = self.waiting.get(id).map(|(print, waiter)| (*print, Recalled::Waiting(*waiter)));
-        let known = known.or_else(|| {
-            self.answers.get(id).map(|answer| (answer.fingerprint, Recalled::Answered(answer.reply.clone())))
-        });
-        match known {
-            Some((print, _)) if !print.may_be(fingerprint) => Err(PoolError::RequestIdReused { id: id.to_owned() }),
-            known => Ok(known.map(|(_, recalled)| recalled)),
+    /// What this request led to before. An answer to nobody knows whom is that of whoever asks the same.
+    pub(crate) fn recall(&self, id: &RequestId, fingerprint: Fingerprint) -> Result<Option<Recalled>, PoolError> {
+        if let Some((print, waiter)) = self.waiting.get(id) {
+            return same(id, *print, fingerprint).map(|()| Some(Recalled::Waiting(*waiter)));
         }
+        if let Some(answer) = self.answer(id) {
+            let recalled = Recalled::Answered(answer.reply.clone());
+            return same(id, answer.fingerprint, fingerprint).map(|()| Some(recalled));
+        }
+        let unknown = self.answer(&RequestId { caller: Arc::default(), ..id.clone() });
+        let unknown = unknown.filter(|answer| answer.fingerprint.may_be(fingerprint));
+        Ok(unknown.map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
     /// The same, whatever the request was.
-    pub(crate) fn reply(&self, id: &str) -> Option<Recalled> {
+    pub(crate) fn reply(&self, id: &RequestId) -> Option<Recalled> {
         let waiting = self.waiting.get(id).map(|(_, waiter)| Recalled::Waiting(*waiter));
-        waiting.or_else(|| self.answers.get(id).map(|answer| Recalled::Answered(answer.reply.clone())))
+        waiting.or_else(|| self.answer(id).map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
-    pub(crate) fn wait(&mut self, id: &str, fingerprint: Fingerprint, waiter: WaiterId) {
-        self.waiting.insert(id.to_owned(), (fingerprint, waiter));
+    /// Who waits under this id: the caller's own waiter, else that of the first caller who has one.
+    pub(crate) fn waiter(&self, id: &RequestId) -> Option<WaiterId> {
+        let first = RequestId { caller: Arc::default(), ..id.clone() };
+        let of_all = self.waiting.range(first..).take_while(|(other, _)| other.id == id.id);
+        let own = self.waiting.get(id).or_else(|| of_all.map(|(_, waiting)| waiting).next());
+        own.map(|(_, waiter)| *waiter)
+    }
+
+    pub(crate) fn wait(&mut self, id: &RequestId, fingerprint: Fingerprint, waiter: WaiterId) {
+        self.waiting.insert(id.clone(), (fingerprint, waiter));
     }
 
     /// Who waited under this id waits no longer.
-    pub(crate) fn waited(&mut self, id: &str) -> Option<Fingerprint> {
+    pub(crate) fn waited(&mut self, id: &RequestId) -> Option<Fingerprint> {
         self.waiting.remove(id).map(|(fingerprint, _)| fingerprint)
     }
 
-    /// How many of the oldest have to go before one more is remembered.
-    pub(crate) fn too_many(&self, now: Timestamp, limit: usize, for_at_most: Duration) -> usize {
-        let by_number = (self.order.len() + 1).saturating_sub(limit.max(1));
-        let old = |at: Timestamp| at + for_at_most <= now;
-        self.order.values().enumerate().take_while(|(i, (at, _))| *i < by_number || old(*at)).count()
+    /// Which answers have to go before one more is remembered.
+    pub(crate) fn too_many(&self, now: Timestamp, limits: &Limits, id: &RequestId, reply: &Remembered) -> Forgotten {
+        let for_at_most = Duration::from_millis(limits.remember_for_ms);
+        let mut forget: BTreeMap<&Arc<str>, usize> = BTreeMap::new();
+        for (_, caller) in self.order.values().take_while(|(at, _)| *at + for_at_most <= now) {
+            *forget.entry(caller).or_default() += 1;
+        }
+        let none = OfCaller::default();
+        let own = self.callers.get(&id.caller).unwrap_or(&none);
+        let gone = forget.get(&id.caller).copied().unwrap_or_default();
+        let mut bytes = own.bytes + OVERHEAD + 2 * id.id.len() + reply.bytes();
+        bytes -= own.answers.values().take(gone).map(Answer::bytes).sum::<usize>();
+        let mut left = own.answers.len() - gone;
+        let over = own.answers.values().skip(gone).take_while(|answer| {
+            let over = left >= limits.remembered_per_caller.max(1) || bytes > limits.remembered_bytes_per_caller;
+            (bytes, left) = (bytes.saturating_sub(answer.bytes()), left.saturating_sub(1));
+            over
+        });
+        let over = over.count();
+        if over > 0 {
+            *forget.entry(&id.caller).or_default() += over;
+        }
+        let of_all = self.order.len() - forget.values().sum::<usize>();
+        for _ in limits.remembered_requests.max(1)..=of_all {
+            let left = |(caller, known): &(&Arc<str>, &OfCaller)| {
+                known.answers.len() - forget.get(caller).copied().unwrap_or_default()
+            };
+            let Some((most, _)) = self.callers.iter().max_by_key(left) else { break };
+            *forget.entry(most).or_default() += 1;
+        }
+        forget.into_iter().map(|(caller, count)| (caller.clone(), count)).collect()
     }
 
-    pub(crate) fn remember(
-        &mut self,
-        id: String,
-        fingerprint: Fingerprint,
-        reply: Remembered,
-        forget: usize,
-        now: Timestamp,
-    ) {
-        for _ in 0..forget {
-            if let Some((_, (_, oldest))) = self.order.pop_first() {
-                self.answers.remove(&oldest);
-            }
+    /// Forgets the oldest answers, whosever they are.
+    pub(crate) fn forget_oldest(&mut self, count: usize) {
+        for _ in 0..count {
+            let Some((number, (_, caller))) = self.order.pop_first() else { return };
+            self.remove(&caller, number);
+        }
+    }
+
+    /// Forgets the oldest answers of callers.
+    pub(crate) fn forget(&mut self, forgotten: &Forgotten) {
+        for (caller, count) in forgotten {
+            let oldest = self.callers.get(caller).map(|known| known.answers.keys().take(*count).copied().collect());
+            let oldest: Vec<u64> = oldest.unwrap_or_default();
+            oldest.into_iter().for_each(|number| self.remove(caller, number));
+        }
+    }
+
+    pub(crate) fn remember(&mut self, id: RequestId, fingerprint: Fingerprint, reply: Remembered, now: Timestamp) {
+        if let Some(before) = self.callers.get(&id.caller).and_then(|known| known.numbers.get(&id.id)).copied() {
+            self.remove(&id.caller, before);
         }
         let number = self.next;
         self.next += 1;
-        self.order.insert(number, (now, id.clone()));
-        let answer = Answer { number, fingerprint, reply };
-        if let Some(before) = self.answers.insert(id, answer) {
-            self.order.remove(&before.number);
+        if let Remembered::Granted(lease) = reply {
+            self.grants.insert(lease, (id.caller.clone(), number));
         }
+        self.order.insert(number, (now, id.caller.clone()));
+        self.callers.entry(id.caller).or_default().insert(number, Answer { id: id.id, fingerprint, reply });
     }
 
-    /// The request that led to this lease is as if it had never been asked. It is among the youngest.
+    /// The request that led to this lease is as if it had never been asked.
     pub(crate) fn forget_grant(&mut self, lease: LeaseId) {
-        let led_here = |id: &String| self.answers.get(id).is_some_and(|a| a.reply == Remembered::Granted(lease));
-        let found = self.order.iter().rev().find(|(_, (_, id))| led_here(id)).map(|(number, _)| *number);
-        if let Some((_, id)) = found.and_then(|number| self.order.remove(&number)) {
-            self.answers.remove(&id);
+        if let Some((caller, number)) = self.grants.get(&lease).cloned() {
+            self.remove(&caller, number);
         }
     }
 
-    /// The answers, the oldest first.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (&String, Fingerprint, &Remembered)> {
-        self.order
-            .values()
-            .filter_map(|(_, id)| self.answers.get(id).map(|answer| (id, answer.fingerprint, &answer.reply)))
+    fn remove(&mut self, caller: &Arc<str>, number: u64) {
+        self.order.remove(&number);
+        let Some(known) = self.callers.get_mut(caller) else { return };
+        if let Some(Answer { reply: Remembered::Granted(lease), .. }) = known.remove(number) {
+            self.grants.remove(&lease);
+        }
+        if known.answers.is_empty() {
+            self.callers.remove(caller);
+        }
     }
 
-    pub(crate) fn len(&self) -> usize {
-        self.order.len()
+    fn answer(&self, id: &RequestId) -> Option<&Answer> {
+        self.callers.get(&id.caller)?.get(&id.id)
+    }
+
+    /// The answers with whom they were given to, the oldest first.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (&Arc<str>, &Arc<str>, Fingerprint, &Remembered)> {
+        self.order.iter().filter_map(|(number, (_, caller))| {
+            let answer = self.callers.get(caller)?.answers.get(number)?;
+            Some((caller, &answer.id, answer.fingerprint, &answer.reply))
+        })
     }
 
     pub(crate) fn waiting(&self) -> usize {
         self.waiting.len()
     }
 
-    pub(crate) fn order_agrees(&self) -> bool {
-        self.order.len() == self.answers.len()
-            && self.order.iter().all(|(number, (_, id))| self.answers.get(id).is_some_and(|a| a.number == *number))
+    /// Whether the bounds hold, but for a single answer that is larger; and whether the indices say the same as the answers do.
+    pub(crate) fn check(&self, limits: &Limits) -> Result<(), &'static str> {
+        let ensure = |holds: bool, broken| if holds { Ok(()) } else { Err(broken) };
+        ensure(self.order.len() <= limits.remembered_requests.max(1), "the request memory is too long")?;
+        let (mut answers, mut grants) = (0, 0);
+        for (caller, known) in &self.callers {
+            answers += known.answers.len();
+            let most = limits.remembered_per_caller.max(1);
+            ensure(known.answers.len() <= most, "the request memory of a caller is too long")?;
+            let fits = known.bytes <= limits.remembered_bytes_per_caller || known.answers.len() == 1;
+            ensure(fits, "the request memory of a caller is too large")?;
+            let bytes = known.answers.values().map(Answer::bytes).sum::<usize>();
+            ensure(bytes == known.bytes, "the bytes of the request memory are miscounted")?;
+            ensure(known.numbers.len() == known.answers.len(), "a request id has two answers")?;
+            for (number, answer) in &known.answers {
+                let listed = self.order.get(number).is_some_and(|(_, listed)| listed == caller);
+                ensure(listed && known.numbers.get(&answer.id) == Some(number), "an answer is not in the order")?;
+                if let Remembered::Granted(lease) = answer.reply {
+                    grants += 1;
+                    let listed = self.grants.get(&lease).is_some_and(|(_, of)| of == number);
+                    ensure(listed, "a grant is not known by its lease")?;
+                }
+            }
+        }
+        ensure(answers == self.order.len(), "the order of the request memory does not agree")?;
+        ensure(grants == self.grants.len(), "a lease is known whose answer was forgotten")
     }
+}
+
+/// Whether both can be of the same request.
+fn same(id: &RequestId, known: Fingerprint, asked: Fingerprint) -> Result<(), PoolError> {
+    if known.may_be(asked) { Ok(()) } else { Err(PoolError::RequestIdReused { id: id.id.to_string() }) }
 }

@@ -10,20 +10,19 @@ use crate::id::{SessionId, Slot, WaiterId};
 use crate::kinds::Kinds;
 use crate::lease::{EndingLeases, LeaseView, Leases};
 use crate::limits::Limits;
-use crate::memory::{Recalled, Remembered, RequestMemory};
+use crate::memory::{Recalled, Remembered, RequestId, RequestMemory};
 use crate::pace::Pace;
 use crate::queue::{AcquireRequest, Queue};
 use crate::record::{Effect, Record};
 use crate::request::{Reply, Request};
 use crate::resource::{Resource, ResourceView};
 use crate::resources::Resources;
-use crate::session::Sessions;
+use crate::session::{Sessions, Speaker};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::time::Duration;
 
 /// Every resource, session, lease and waiter. See the crate's documentation.
 #[derive(Debug, Clone, Default)]
@@ -110,28 +109,48 @@ impl Pool {
         [self.resources.len(), self.sessions.len(), self.leases.len(), self.queue.len()]
     }
 
-    /// Performs a mutation. With a request id, an equal request of that id answered before is not performed again: its
-    /// answer is given once more.
+    /// As [`Pool::handle_as`], by [`Speaker::trusted`].
+    ///
+    /// # Errors
+    /// As there.
+    pub fn handle(&mut self, now: Timestamp, request_id: &str, request: Request) -> Result<Reply, PoolError> {
+        self.handle_as(now, &Speaker::trusted(), request_id, request)
+    }
+
+    /// Performs a mutation that a speaker asks for who may speak for its session ([`Pool::check_speaker`]). With a request id, an equal
+    /// request of that id answered before is not performed again: its answer is given once more. Request ids are of who opened the
+    /// session, or of the speaker where it is not there.
     ///
     /// # Errors
     /// As the method of the same name; nothing has changed then, and the id is not used up.
-    pub fn handle(&mut self, now: Timestamp, request_id: &str, request: Request) -> Result<Reply, PoolError> {
+    pub fn handle_as(
+        &mut self,
+        now: Timestamp,
+        speaker: &Speaker,
+        request_id: &str,
+        request: Request,
+    ) -> Result<Reply, PoolError> {
         self.advance(now);
         if request_id.is_empty() {
-            return self.perform(now, "", Fingerprint::UNKNOWN, request);
+            return self.perform(now, speaker, RequestId::default(), Fingerprint::UNKNOWN, request);
         }
         self.check_name("request id", request_id)?;
+        let id = RequestId::new(self.caller_of(request.session(), speaker), request_id);
         let fingerprint = Fingerprint::of(&request);
-        match self.memory.recall(request_id, fingerprint)? {
+        match self.memory.recall(&id, fingerprint)? {
             Some(Recalled::Waiting(waiter)) => Ok(Reply::Queued(waiter)),
             Some(Recalled::Answered(Remembered::Granted(lease))) => {
+                // Of another session: only the id is known of what an earlier version remembers.
+                if self.leases.get(&lease).is_some_and(|known| Some(&known.session) != request.session()) {
+                    return Err(PoolError::RequestIdReused { id: request_id.to_owned() });
+                }
                 self.lease(lease).map(Reply::Granted).ok_or(PoolError::UnknownLease { lease })
             }
             Some(Recalled::Answered(Remembered::Created { id, revision })) => Ok(Reply::Created { id, revision }),
             Some(Recalled::Answered(Remembered::Touched(ids))) => Ok(Reply::Touched(ids)),
             Some(Recalled::Answered(Remembered::Done)) => Ok(Reply::Done),
             None => {
-                let reply = self.perform(now, request_id, fingerprint, request)?;
+                let reply = self.perform(now, speaker, id.clone(), fingerprint, request)?;
                 let remembered = match &reply {
                     // Remembered by the grant, which may be long after this or was within it.
                     Reply::Queued(_) | Reply::Granted(_) => return Ok(reply),
@@ -139,10 +158,16 @@ impl Pool {
                     Reply::Touched(ids) => Remembered::Touched(ids.clone()),
                     Reply::Done => Remembered::Done,
                 };
-                self.remember(request_id.to_owned(), fingerprint, remembered);
+                self.remember(id, fingerprint, remembered);
                 Ok(reply)
             }
         }
+    }
+
+    /// Who is answered: the opener of the session, where that is there.
+    fn caller_of<'a>(&'a self, session: Option<&SessionId>, speaker: &'a Speaker) -> &'a Arc<str> {
+        let session = session.and_then(|session| self.sessions.get(session));
+        session.map_or(&speaker.name, |session| &session.opened_by)
     }
 
     /// How much of what fits exists and is not consumed, held or not (the paper's `exists`).
@@ -201,17 +226,14 @@ impl Pool {
         self.queue.iter().map(|(id, waiter)| (id, waiter.request.clone())).collect()
     }
 
-    /// The waiter of a request id, if it waits.
-    pub fn waiter_of(&self, request_id: &str) -> Option<WaiterId> {
-        match self.memory.reply(request_id) {
-            Some(Recalled::Waiting(waiter)) => Some(waiter),
-            _ => None,
-        }
+    /// The waiter of a request id, if it waits: the caller's own, else one of another caller.
+    pub fn waiter_of(&self, caller: &Arc<str>, request_id: &str) -> Option<WaiterId> {
+        self.memory.waiter(&RequestId::new(caller, request_id))
     }
 
     /// The request id of a waiter, empty where it has none, and what it asked for.
     pub fn waiter(&self, id: WaiterId) -> Option<(&str, &AcquireRequest)> {
-        self.queue.get(id).map(|waiter| (waiter.request_id.as_str(), &waiter.request))
+        self.queue.get(id).map(|waiter| (&*waiter.request_id.id, &waiter.request))
     }
 
     /// The first of the queue, in the order in which it is served.
@@ -253,15 +275,22 @@ impl Pool {
     }
 
     /// Keeps the answer to a request id, together with its effect.
-    pub(crate) fn remember(&mut self, request_id: String, fingerprint: Fingerprint, reply: Remembered) {
-        if !request_id.is_empty() {
-            let for_at_most = Duration::from_millis(self.limits.remember_for_ms);
-            let forget = self.memory.too_many(self.now, self.limits.remembered_requests, for_at_most);
-            self.commit(Effect::Answered { request_id, fingerprint, reply, forget });
+    pub(crate) fn remember(&mut self, id: RequestId, fingerprint: Fingerprint, reply: Remembered) {
+        if !id.is_empty() {
+            let forget = self.memory.too_many(self.now, &self.limits, &id, &reply);
+            let RequestId { id: request_id, caller } = id;
+            self.commit(Effect::AnsweredTo { caller, request_id, fingerprint, reply, forget });
         }
     }
 
-    fn perform(&mut self, now: Timestamp, id: &str, print: Fingerprint, request: Request) -> Result<Reply, PoolError> {
+    fn perform(
+        &mut self,
+        now: Timestamp,
+        speaker: &Speaker,
+        id: RequestId,
+        print: Fingerprint,
+        request: Request,
+    ) -> Result<Reply, PoolError> {
         Ok(match request {
             Request::Create { session, spec } => {
                 let ResourceView { description, revision, .. } = self.create(now, session.as_ref(), spec)?;
@@ -275,7 +304,7 @@ impl Pool {
             Request::Acquire(request) => Reply::Queued(self.enqueue(request, id, print)?),
             Request::Release { session, lease } => self.release(now, session.as_ref(), lease).map(|()| Reply::Done)?,
             Request::ConfirmStandstill { session, lease, resource } => {
-                let freed = self.confirm_standstill(now, session.as_ref(), lease, &resource)?;
+                let freed = self.confirm_standstill_as(now, speaker, session.as_ref(), lease, &resource)?;
                 Reply::Touched(freed.then_some(resource).into_iter().collect())
             }
             Request::EndTask { session } => self.end_task(now, &session).map(|()| Reply::Done)?,

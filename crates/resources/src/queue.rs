@@ -2,6 +2,7 @@
 
 use crate::group::{Family, Group, Key};
 use crate::id::{SessionId, Slot, WaiterId};
+use crate::memory::RequestId;
 use crate::resource::Units;
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
@@ -37,7 +38,7 @@ pub(crate) type Place = (Reverse<i64>, WaiterId);
 pub(crate) struct Waiter {
     pub(crate) request: AcquireRequest,
     /// Forgotten again when it leaves without a lease, so that the client can ask once more.
-    pub(crate) request_id: String,
+    pub(crate) request_id: RequestId,
     /// Per requirement, the group that it waits in.
     pub(crate) groups: Vec<Key>,
     /// Whether what exists would do if nobody held any of it. Only then it reserves.

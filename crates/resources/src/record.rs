@@ -9,7 +9,7 @@ use crate::event::EndReason;
 use crate::fingerprint::Fingerprint;
 use crate::id::{SessionId, Slot};
 use crate::lease::LeaseRecord;
-use crate::memory::Remembered;
+use crate::memory::{Forgotten, Remembered};
 use crate::resource::Description;
 use ratn_model::id::LeaseId;
 use ratn_model::resource::Quantity;
@@ -20,7 +20,7 @@ use std::time::Duration;
 
 /// The version that [`encode`] writes, its first byte. Every new variant at the end takes a new number, so that an older program
 /// refuses what it does not know by its version; records since [`OLDEST_FORMAT`] are read as they are.
-pub const FORMAT: u8 = 5;
+pub const FORMAT: u8 = 6;
 /// The oldest version that [`decode`] reads: it has no `Effect::SessionOpened`, as none before this one has `Effect::UnitsFreed`.
 pub const OLDEST_FORMAT: u8 = 2;
 /// The newest version whose fingerprints are of how requests were written then, which says nothing to a later one.
@@ -50,7 +50,7 @@ pub(crate) enum Effect {
     LeaseGranted { lease: LeaseId, granted: LeaseRecord },
     /// A lease ended.
     LeaseEnded { lease: LeaseId, reason: EndReason },
-    /// A request id has its answer; the oldest `forget` answers were forgotten for it.
+    /// In records of before: a request id has its answer, given to nobody knows whom; the oldest `forget` answers were forgotten for it.
     Answered { request_id: String, fingerprint: Fingerprint, reply: Remembered, forget: usize },
     /// What a session consumed of a resource with a grant that was undone is there again.
     Returned { session: SessionId, slot: Slot, amount: Quantity },
@@ -58,6 +58,14 @@ pub(crate) enum Effect {
     SessionOpened { session: SessionId, client: String, ttl: Duration, opened_by: Arc<str> },
     /// What a lease that has ended had left of a resource is free: standstill was confirmed, or its bound has passed.
     UnitsFreed { lease: LeaseId, slot: Slot, confirmed: bool },
+    /// A request id of a caller has its answer; so many of the oldest answers of these callers were forgotten for it.
+    AnsweredTo {
+        caller: Arc<str>,
+        request_id: Arc<str>,
+        fingerprint: Fingerprint,
+        reply: Remembered,
+        forget: Forgotten,
+    },
 }
 
 /// What its bytes are, in messages.

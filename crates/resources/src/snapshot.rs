@@ -10,7 +10,7 @@ use crate::fingerprint::Fingerprint;
 use crate::id::{SessionId, Slot};
 use crate::lease::{Bound, EndingLease, LeaseRecord};
 use crate::limits::Limits;
-use crate::memory::Remembered;
+use crate::memory::{Remembered, RequestId};
 use crate::pool::Pool;
 use crate::record::{FORMAT, OLDEST_FORMAT, Record, knows_fingerprints};
 use crate::resource::Resource;
@@ -23,7 +23,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The last version without leases that end, and the one without openers of sessions.
+/// The last versions without callers of answers and openers of leases that end, without leases that end, and without openers of sessions.
+const WITHOUT_CALLERS: u8 = 5;
 const WITHOUT_ENDING: u8 = 4;
 const WITHOUT_OPENERS: u8 = 2;
 /// What it is, in messages.
@@ -45,6 +46,10 @@ pub struct Snapshot {
     openers: Vec<(SessionId, Arc<str>)>,
     /// What leases that have ended have left.
     ending: Vec<(LeaseId, EndingLease)>,
+    /// To whom the answers were given, in their order; to nobody knows whom where they are not here.
+    answered: Vec<Arc<str>>,
+    /// Who opened the sessions of the leases that have ended, in their order; as above.
+    ended: Vec<Arc<str>>,
 }
 
 /// A snapshot or a record that does not fit: the log has a gap, or is of another pool.
@@ -84,8 +89,9 @@ impl Snapshot {
         let version = versioned::version(OLDEST_FORMAT, FORMAT, SNAPSHOT, bytes)?;
         let mut snapshot: Snapshot = match version {
             // An empty list for each that is missing, as postcard writes it.
-            WITHOUT_OPENERS => versioned::decode(version, SNAPSHOT, &[bytes, &[0, 0]].concat())?,
-            ..=WITHOUT_ENDING => versioned::decode(version, SNAPSHOT, &[bytes, &[0]].concat())?,
+            WITHOUT_OPENERS => versioned::decode(version, SNAPSHOT, &[bytes, &[0; 4]].concat())?,
+            ..=WITHOUT_ENDING => versioned::decode(version, SNAPSHOT, &[bytes, &[0; 3]].concat())?,
+            WITHOUT_CALLERS => versioned::decode(version, SNAPSHOT, &[bytes, &[0; 2]].concat())?,
             _ => versioned::decode(version, SNAPSHOT, bytes)?,
         };
         if !knows_fingerprints(version) {
@@ -115,9 +121,11 @@ impl Pool {
                 .iter()
                 .map(|(id, lease)| (*id, LeaseRecord { expires: None, opened_by: Arc::default(), ..lease.clone() }))
                 .collect(),
-            answers: self.memory.iter().map(|(id, print, reply)| (id.clone(), print, reply.clone())).collect(),
+            answers: self.memory.iter().map(|(_, id, print, reply)| (id.to_string(), print, reply.clone())).collect(),
             openers: self.sessions.iter().map(|(id, session)| (id.clone(), session.opened_by.clone())).collect(),
             ending: self.ending.iter().map(|(id, ending)| (*id, ending.without_bounds())).collect(),
+            answered: self.memory.iter().map(|(caller, ..)| caller.clone()).collect(),
+            ended: self.ending.values().map(|ending| ending.opened_by.clone()).collect(),
         }
     }
 
@@ -181,7 +189,9 @@ impl Pool {
             lease.opened_by = session.opened_by.clone();
             self.leases.insert(id, lease);
         }
+        let mut ended = snapshot.ended.into_iter();
         for (id, mut ending) in snapshot.ending {
+            ending.opened_by = ended.next().unwrap_or_default();
             for (slot, bound) in &mut ending.slots {
                 let resource = self.resources.get(*slot).ok_or_else(|| format!("{slot} is empty"))?;
                 *bound = Bound(self.now + resource.description.standstill());
@@ -189,8 +199,10 @@ impl Pool {
             }
             self.ending.insert(id, ending);
         }
+        let mut answered = snapshot.answered.into_iter();
         for (id, fingerprint, reply) in snapshot.answers {
-            self.memory.remember(id, fingerprint, reply, 0, self.now);
+            let id = RequestId::new(&answered.next().unwrap_or_default(), &id);
+            self.memory.remember(id, fingerprint, reply, self.now);
         }
         Ok(())
     }

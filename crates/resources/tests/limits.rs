@@ -56,6 +56,18 @@ fn with_attributes(count: usize) -> ResourceSpec {
     (0..count).fold(tool(), |spec, number| spec.attribute(format!("a{number}"), Value::Int(0)))
 }
 
+/// Asks something new, then what was asked first.
+fn still_remembers_the_first(pool: &mut Pool, n: usize) -> Result<(), String> {
+    let ask = |pool: &mut Pool, n: usize| {
+        let create = Request::Create { session: None, spec: tool() };
+        pool.handle(NOW, &format!("r{n}"), create).unwrap()
+    };
+    let id = |reply| if let Reply::Created { id, .. } = reply { id } else { String::new() };
+    ask(pool, n);
+    // The first is number 2: there is a tool.
+    if id(ask(pool, 1)) == "Tool-2" { Ok(()) } else { Err("performed twice".to_owned()) }
+}
+
 /// Does something for the nth time.
 type Act = fn(&mut Pool, usize) -> Result<(), String>;
 
@@ -163,16 +175,20 @@ fn rows() -> Vec<(&'static str, Limits, Act, &'static str)> {
         (
             "remembered_requests",
             Limits { remembered_requests: EDGE, ..all() },
-            |pool, n| {
-                let ask = |pool: &mut Pool, n: usize| {
-                    let create = Request::Create { session: None, spec: tool() };
-                    pool.handle(NOW, &format!("r{n}"), create).unwrap()
-                };
-                let id = |reply| if let Reply::Created { id, .. } = reply { id } else { String::new() };
-                ask(pool, n);
-                // The first is number 2: there is a tool.
-                if id(ask(pool, 1)) == "Tool-2" { Ok(()) } else { Err("performed twice".to_owned()) }
-            },
+            still_remembers_the_first,
+            "performed twice",
+        ),
+        (
+            "remembered_per_caller",
+            Limits { remembered_per_caller: EDGE, ..all() },
+            still_remembers_the_first,
+            "performed twice",
+        ),
+        (
+            "remembered_bytes_per_caller",
+            // An answer has 256 bytes, its request id twice and the id of the tool.
+            Limits { remembered_bytes_per_caller: EDGE * (256 + 2 * 2 + 6), ..all() },
+            still_remembers_the_first,
             "performed twice",
         ),
         (
@@ -224,6 +240,8 @@ fn every_bound_at_its_edge_and_one_past_it() {
         requirement_bytes: _,
         holders: _,
         remembered_requests: _,
+        remembered_per_caller: _,
+        remembered_bytes_per_caller: _,
         remember_for_ms: _,
         history: _,
     } = Limits::default();

@@ -633,6 +633,12 @@ fn a_withdrawn_acquire_leaves_the_queue_or_gives_back_what_it_got() {
     assert_eq!(bench.pool.get("Arm-1").unwrap().free, 1);
     assert_eq!(bench.pool.withdraw(bench.now, &session("b"), "first"), Ok(false));
     assert_eq!(bench.pool.withdraw(bench.now, &session("b"), "never asked"), Ok(false));
+    let undone = bench.notices();
+    for id in ["first", "second"] {
+        let again = bench.pool.handle(bench.now, id, acquire.clone());
+        assert!(matches!(again, Ok(Reply::Queued(_))), "it is acquired anew: {again:?}");
+    }
+    assert!(grants(&bench.notices())[0].1.token > grants(&undone)[0].1.token);
 }
 
 #[test]

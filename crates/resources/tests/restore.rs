@@ -295,9 +295,9 @@ fn who_opened_a_session_is_known_from_records_and_from_a_snapshot_and_not_of_one
         assert_eq!(again.keep_alive_as(now, &speaker("root", true), &id, "s", Duration::from_secs(10)), Ok(false));
         assert_eq!(&*again.sessions()[0].opened_by, "a", "an operator speaks for it and does not own it");
     }
-    // The snapshot of an earlier version has no openers: it ends where their list would begin.
+    // The snapshot of an earlier version has no openers: it ends where their list would begin. Three more lists follow that, all empty.
     let bytes = snapshot.encode();
-    let openers = [postcard_list(&[("s", "a")]), vec![0]].concat();
+    let openers = [postcard_list(&[("s", "a")]), vec![0; 3]].concat();
     let mut earlier = bytes.strip_suffix(openers.as_slice()).unwrap().to_vec();
     earlier[0] = 2;
     let mut again = Pool::restore(Limits::default(), now, Some(Snapshot::decode(&earlier).unwrap()), []).unwrap();
@@ -305,10 +305,38 @@ fn who_opened_a_session_is_known_from_records_and_from_a_snapshot_and_not_of_one
     assert!(refused.to_string().contains("only an operator may speak for it"), "{refused}");
     again.check_speaker(now, &speaker("root", true), &id).unwrap();
     // That of the version after it has no leases that end.
-    let mut without_ending = bytes.strip_suffix(&[0]).unwrap().to_vec();
+    let mut without_ending = bytes.strip_suffix(&[0; 3]).unwrap().to_vec();
     without_ending[0] = 4;
     assert_eq!(Snapshot::decode(&without_ending).unwrap(), Snapshot::decode(&bytes).unwrap());
-    assert!(matches!(Snapshot::decode(&[&[6], &bytes[1..]].concat()), Err(DecodeError::Version { found: 6, .. })));
+    let newer = Snapshot::decode(&[&[FORMAT + 1], &bytes[1..]].concat());
+    assert!(matches!(newer, Err(DecodeError::Version { found, .. }) if found == FORMAT + 1));
+}
+
+#[test]
+fn answers_that_an_earlier_version_remembers_for_nobody_knows_whom_are_given_to_whoever_asks_the_same() {
+    let (now, id) = (Timestamp(0), SessionId::from("s"));
+    let speaker = |name: &str| Speaker { name: name.into(), for_anybody: false };
+    let create = |kind: &str| Request::Create { session: None, spec: ResourceSpec::new(ResourceClass::Module, kind) };
+    let mut pool = Pool::new(Limits::default());
+    pool.keep_alive_as(now, &speaker("a"), &id, "s", Duration::from_secs(10)).unwrap();
+    let first = pool.handle_as(now, &speaker("a"), "r1", create("Arm")).unwrap();
+    let bytes = pool.snapshot().encode();
+    // It ends where the callers of the answers would follow, and the openers of leases that end, of which there are none.
+    let mut earlier = bytes.strip_suffix(&[1, 1, b'a', 0]).unwrap().to_vec();
+    earlier[0] = 5;
+    let earlier = Snapshot::decode(&earlier).unwrap();
+    let mut pool = Pool::restore(Limits::default(), now, Some(earlier), []).unwrap();
+    for name in ["a", "b"] {
+        assert_eq!(pool.handle_as(now, &speaker(name), "r1", create("Arm")).as_ref(), Ok(&first));
+    }
+    let other = pool.handle_as(now, &speaker("b"), "r1", create("Tool")).unwrap();
+    assert!(matches!(other, ratn_resources::Reply::Created { id, .. } if id == "Tool-2"), "another request of b's own");
+    pool.check_invariants().unwrap();
+    // A record of before: `r1` was done, whatever it asked, and none was forgotten for it.
+    let records = decode(&[5, 1, 9, 2, b'r', b'1', 0, 3, 0]).unwrap();
+    let mut pool = Pool::restore(Limits::default(), now, None, records).unwrap();
+    let again = pool.handle_as(now, &speaker("b"), "r1", Request::Release { session: None, lease: LeaseId(7) });
+    assert_eq!(again, Ok(ratn_resources::Reply::Done));
 }
 
 /// Pairs of short texts as they are kept.

@@ -7,7 +7,7 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_resources::{
     AcquireRequest, Change, LONGEST_STANDSTILL_MS, Limits, Notice, Pool, PoolError, Reply, Request, ResourceSpec,
-    STANDSTILL_ATTRIBUTE, SessionId, Snapshot, decode, encode,
+    STANDSTILL_ATTRIBUTE, SessionId, Snapshot, Speaker, decode, encode,
 };
 use std::time::Duration;
 
@@ -218,5 +218,47 @@ fn a_bound_is_whole_milliseconds_up_to_the_longest() {
     for value in [Value::Int(longest + 1), Value::Int(-1), Value::Float(1.0), Value::String("1".to_owned())] {
         let refused = create(value).unwrap_err().to_string();
         assert_eq!(refused, "attribute standstill_ms of Arm: it is a whole number of milliseconds from 0 to 60000");
+    }
+}
+
+#[test]
+fn standstill_of_what_no_session_provides_is_confirmed_by_the_opener_of_the_lost_session_and_by_nobody_else() {
+    let speaker = |name: &str| Speaker { name: name.into(), for_anybody: false };
+    let opened = |pool: &mut Pool, name: &str| {
+        pool.keep_alive_as(at(100), &speaker(name), &session("a"), name, Duration::from_secs(60)).unwrap();
+    };
+    let mut pool = Pool::new(Limits::default());
+    pool.keep_alive_as(at(0), &speaker("adam"), &session("a"), "a", Duration::from_millis(50)).unwrap();
+    pool.create(at(0), None, arm().standstill(BOUND)).unwrap();
+    let block = Requirement::new(ResourceOperation::Block, "Arm");
+    pool.acquire(at(0), AcquireRequest::new(session("a"), vec![block])).unwrap();
+    let lease = pool.leases()[0].id;
+    pool.advance(at(100));
+    let entry = encode(&pool.take_records());
+    let snapshot = Snapshot::decode(&pool.snapshot().encode()).unwrap();
+    let of_records = Pool::restore(Limits::default(), at(100), None, decode(&entry).unwrap()).unwrap();
+    let of_snapshot = Pool::restore(Limits::default(), at(100), Some(snapshot), []).unwrap();
+    for pool in [pool, of_records, of_snapshot] {
+        let confirm = |pool: &mut Pool, name: &str| {
+            let confirm = Request::ConfirmStandstill { session: Some(session("a")), lease, resource: "arm".to_owned() };
+            pool.handle_as(at(101), &speaker(name), "", confirm)
+        };
+        for opens in [false, true] {
+            let mut pool = pool.clone();
+            if opens {
+                opened(&mut pool, "mallory");
+            }
+            let refused = confirm(&mut pool, "mallory");
+            assert!(matches!(refused, Err(PoolError::SessionOfAnother { .. })), "{opens}: {refused:?}");
+        }
+        for opens in [false, true] {
+            let mut pool = pool.clone();
+            if opens {
+                opened(&mut pool, "adam");
+            }
+            assert_eq!(confirm(&mut pool, "adam"), Ok(Reply::Touched(vec!["arm".to_owned()])));
+        }
+        let mut pool = pool;
+        assert_eq!(pool.confirm_standstill(at(101), None, lease, "arm"), Ok(true), "an operator");
     }
 }

@@ -247,9 +247,13 @@ impl v1::resource_service_server::ResourceService for Service {
 
     async fn withdraw(&self, request: Request<v1::WithdrawRequest>) -> Result<Response<v1::WithdrawResponse>, Status> {
         let caller = Caller::of(&request);
-        let v1::WithdrawRequest { request_id, session_id } = request.into_inner();
+        let v1::WithdrawRequest { request_id, session_id, call } = request.into_inner();
         name(&request_id, "request_id")?;
         let session = session(&session_id)?;
+        if call != 0 {
+            let message = "call: is of a session's stream: a withdraw of its own names the request id alone";
+            return Err(status(Code::InvalidArgument, "MALFORMED", message));
+        }
         let withdraw = || Mutation::Withdraw { session: session_id };
         let pending = audit::begin(&caller, &request_id, withdraw);
         let speaker = speaker(&caller);
@@ -316,9 +320,9 @@ impl v1::resource_service_server::ResourceService for Service {
     }
 
     async fn explain(&self, request: Request<v1::ExplainRequest>) -> Result<Response<v1::ExplainResponse>, Status> {
-        let request_id = request.into_inner().request_id;
+        let (caller, request_id) = (Caller::of(&request).name, request.into_inner().request_id);
         label(&request_id, "request_id")?;
-        let (waiting, total) = self.actor.ask(|answer| Message::Explain { request_id, answer }).await??;
+        let (waiting, total) = self.actor.ask(|answer| Message::Explain { caller, request_id, answer }).await??;
         let total = u32::try_from(total).unwrap_or(u32::MAX);
         Ok(Response::new(v1::ExplainResponse { waiting: paging::first(all(waiting)), total }))
     }
@@ -494,7 +498,7 @@ impl v1::resource_service_server::ResourceService for Service {
         request: Request<Streaming<v1::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
         let quotas = request.extensions().get::<Quotas>().cloned();
-        let calls = CallerService { service: self.clone(), caller: Caller::of(&request), quotas };
+        let calls = CallerService::new(self.clone(), Caller::of(&request), quotas);
         Ok(Response::new(Answers::new(calls, request.into_inner(), Some(self.shutdown.clone()))))
     }
 }

@@ -1,19 +1,25 @@
 //! The calls of a session's stream, each as if it had come on its own, from the stream's caller. Dropped, they leave the queue as
-//! unary calls do.
+//! unary calls do; so does one of which the client says that it dropped it, also when its answer was under way to the client.
 
+use super::actor::Message;
 use super::service::{Service, kept_alive};
 use crate::access::Caller;
+use crate::audit::{self, Mutation};
 use crate::details::{retry_later, status};
 use crate::metrics;
 use crate::quota::Quotas;
 use futures::StreamExt;
 use futures::stream::once;
+use ratn_model::id::LeaseId;
+use ratn_proto::convert::name;
+use ratn_proto::v1;
 use ratn_proto::v1::resource_service_server::ResourceService;
 use ratn_proto::v1::session_request::Kind as Asked;
 use ratn_proto::v1::session_response::Kind;
 use ratn_worker::multiplex::SessionCalls;
 use ratn_worker::multiplex::server::{CallAnswers, Serve};
 use ratn_worker::trace::{self, TraceContext};
+use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 use tonic::{Code, Status};
 use tracing::Instrument;
@@ -21,13 +27,43 @@ use tracing::Instrument;
 /// When to ask again after a refusal for the number of calls.
 const RETRY_DELAY: Duration = Duration::from_millis(10);
 
+/// Grants of a stream that are known by the ids of their calls: more than can be under way to a client that reads.
+const GRANTS: usize = 4_096;
+
 /// What performs the calls of one caller.
 #[derive(Debug)]
 pub(super) struct CallerService {
-    pub(super) service: Service,
-    pub(super) caller: Caller,
+    service: Service,
+    caller: Caller,
     /// What its calls count for.
-    pub(super) quotas: Option<Quotas>,
+    quotas: Option<Quotas>,
+    grants: Grants,
+}
+
+/// Which call of the stream was answered with which lease: the newest ones.
+#[derive(Debug, Default)]
+struct Grants {
+    leases: BTreeMap<u64, LeaseId>,
+    /// The oldest first.
+    order: VecDeque<u64>,
+}
+
+impl Grants {
+    fn keep(&mut self, call: u64, lease: LeaseId) {
+        self.leases.insert(call, lease);
+        self.order.push_back(call);
+        while self.order.len() > GRANTS {
+            if let Some(oldest) = self.order.pop_front() {
+                self.leases.remove(&oldest);
+            }
+        }
+    }
+}
+
+impl CallerService {
+    pub(super) fn new(service: Service, caller: Caller, quotas: Option<Quotas>) -> CallerService {
+        CallerService { service, caller, quotas, grants: Grants::default() }
+    }
 }
 
 impl Serve<SessionCalls> for CallerService {
@@ -39,6 +75,32 @@ impl Serve<SessionCalls> for CallerService {
             None => once(performed).boxed(),
             Some(context) => once(trace::within(context, performed).instrument(context.entered())).boxed(),
         }
+    }
+
+    fn answered(&mut self, id: u64, answer: &Result<Kind, Status>) {
+        let lease = match answer {
+            Ok(Kind::Block(granted)) => granted.lease.as_ref(),
+            Ok(Kind::Acquire(granted)) => granted.lease.as_ref(),
+            _ => None,
+        };
+        if let Some(lease) = lease.filter(|_| id != 0) {
+            self.grants.keep(id, LeaseId(lease.id));
+        }
+    }
+
+    /// The client dropped a call. Where its answer was under way, the lease goes back as from a unary call that is dropped: unless another
+    /// call of the same request got it.
+    fn end(&mut self, ended: u64, by: Asked, end: impl FnOnce() -> bool) -> Option<Result<Kind, Status>> {
+        let Asked::Withdraw(v1::WithdrawRequest { request_id, session_id, .. }) = by else { return None };
+        if let Err(malformed) = name(&request_id, "request_id").and_then(|()| name(&session_id, "session_id")) {
+            return Some(Err(malformed.into()));
+        }
+        let late = if end() { None } else { Some(self.grants.leases.remove(&ended)) };
+        if let Some(Some(lease)) = late {
+            self.service.actor.send_later(Message::Return { lease });
+            audit::begin(&self.caller, &request_id, || Mutation::Withdraw { session: session_id }).ended(&Ok(()));
+        }
+        Some(Ok(Kind::Withdraw(v1::WithdrawResponse { withdrawn: late != Some(None) })))
     }
 
     fn too_many(&self) -> Status {

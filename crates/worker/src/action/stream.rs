@@ -39,6 +39,11 @@ impl Serve<GoalCalls> for CallerGoals {
         admitted.map_ok_or_else(refused, |messages| told(messages).right_stream()).flatten_stream().boxed()
     }
 
+    fn end(&mut self, _: u64, _: Asked, end: impl FnOnce() -> bool) -> Option<Result<Kind, Status>> {
+        end();
+        None
+    }
+
     fn too_many(&self) -> Status {
         let most = <CallerGoals as Serve<GoalCalls>>::MAX_CALLS;
         Status::resource_exhausted(format!("{most} executes are under way on this stream: no more at once"))

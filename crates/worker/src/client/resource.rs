@@ -181,8 +181,8 @@ impl ResourceClient {
         }
     }
 
-    /// Waits until all requirements can be met at once and takes them under one lease. Dropping the future leaves the queue;
-    /// a grant that crosses with that is undone by [`ResourceClient::withdraw`].
+    /// Waits until all requirements can be met at once and takes them under one lease. Dropping the future leaves the queue,
+    /// or gives back a grant that crosses with that, unless another call of the same request waits for it or got it.
     ///
     /// # Errors
     /// [`CallError`].
@@ -202,13 +202,14 @@ impl ResourceClient {
         }
     }
 
-    /// Undoes an acquire or a block by its request id, where the call was dropped and a grant may have crossed with that:
-    /// it leaves the queue, or gives back what it got. False when there was nothing to undo.
+    /// Undoes an acquire or a block by its request id, for all who asked for it: it leaves the queue, or gives back what it got. The
+    /// same request id once more acquires anew. False when there was nothing to undo.
     ///
     /// # Errors
     /// [`CallError`].
     pub async fn withdraw(&self, request: &str) -> Result<bool, CallError> {
-        let question = v1::WithdrawRequest { request_id: request.to_owned(), session_id: self.session.clone() };
+        let (request_id, session_id) = (request.to_owned(), self.session.clone());
+        let question = v1::WithdrawRequest { request_id, session_id, call: 0 };
         match self.ask(Asked::Withdraw(question)).await? {
             Answered::Withdraw(undone) => Ok(undone.withdrawn),
             _ => Err(self.another("a withdraw")),

@@ -44,10 +44,8 @@ pub trait Protocol: 'static {
         true
     }
 
-    /// Whether this asks for no answer, but ends the call of its id.
-    fn ends_call(_: &Self::Call) -> bool {
-        false
-    }
+    /// The call that this one ends; `id` is its own.
+    fn ends_call(id: u64, call: &Self::Call) -> Option<u64>;
 
     /// What a client sends, under which id, when it drops this call before its last answer.
     fn when_dropped(id: u64, call: &Self::Call) -> Option<(u64, Self::Call)>;
@@ -92,15 +90,22 @@ pub enum SessionCalls {}
 impl Protocol for SessionCalls {
     messages!(SessionRequest session_request, SessionResponse session_response);
 
-    /// Only what waits in a queue has to be undone. Nobody waits for the answer to that.
-    fn when_dropped(_: u64, call: &session_request::Kind) -> Option<(u64, session_request::Kind)> {
+    fn ends_call(_: u64, call: &session_request::Kind) -> Option<u64> {
+        match call {
+            session_request::Kind::Withdraw(withdraw) if withdraw.call != 0 => Some(withdraw.call),
+            _ => None,
+        }
+    }
+
+    /// Only what waits in a queue has to be undone. A server of before looks at the request id alone, and answers.
+    fn when_dropped(id: u64, call: &session_request::Kind) -> Option<(u64, session_request::Kind)> {
         use session_request::Kind;
         let (request_id, session_id) = match call {
             Kind::Block(block) => (&block.request_id, &block.session_id),
             Kind::Acquire(acquire) => (&acquire.request_id, &acquire.session_id),
             Kind::KeepAlive(_) | Kind::Release(_) | Kind::Withdraw(_) => return None,
         };
-        let withdraw = WithdrawRequest { request_id: request_id.clone(), session_id: session_id.clone() };
+        let withdraw = WithdrawRequest { request_id: request_id.clone(), session_id: session_id.clone(), call: id };
         Some((0, Kind::Withdraw(withdraw)))
     }
 }
@@ -116,8 +121,8 @@ impl Protocol for GoalCalls {
         !matches!(answer, perform_response::Kind::Progress(_))
     }
 
-    fn ends_call(call: &perform_request::Kind) -> bool {
-        matches!(call, perform_request::Kind::Leave(_))
+    fn ends_call(id: u64, call: &perform_request::Kind) -> Option<u64> {
+        matches!(call, perform_request::Kind::Leave(_)).then_some(id)
     }
 
     fn when_dropped(id: u64, _: &perform_request::Kind) -> Option<(u64, perform_request::Kind)> {

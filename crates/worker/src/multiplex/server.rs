@@ -29,6 +29,13 @@ pub trait Serve<P: Protocol>: Send + Unpin + 'static {
     /// Begins a call, in this trace. `None` is a request that says nothing.
     fn begin(&mut self, call: Option<P::Call>, context: Option<TraceContext>) -> CallAnswers<P>;
 
+    /// A call has its last answer, which is sent now.
+    fn answered(&mut self, _id: u64, _answer: &Result<P::Answer, Status>) {}
+
+    /// Performs a call that ends another one. `end` ends that, and says whether it was under way; its answer may not have been read
+    /// where it was not. Without an answer nothing is said.
+    fn end(&mut self, ended: u64, by: P::Call, end: impl FnOnce() -> bool) -> Option<Result<P::Answer, Status>>;
+
     /// What is answered to a call beyond [`Serve::MAX_CALLS`].
     fn too_many(&self) -> Status;
 }
@@ -65,21 +72,26 @@ impl<P: Protocol, S: Serve<P>> Answers<P, S> {
         }
     }
 
-    /// Begins what is asked for, or says why not.
-    fn take(&mut self, request: P::Request) -> Result<(), (u64, Status)> {
+    /// Begins what is asked for; or what is answered at once, under which id.
+    fn take(&mut self, request: P::Request) -> Option<(u64, Result<P::Answer, Status>)> {
         let (id, call, traceparent) = P::parts(request);
-        if call.as_ref().is_some_and(P::ends_call) {
-            if let Some(call) = self.by_id.remove(&id) {
-                call.abort();
-                self.under_way -= 1;
+        let call = match call.map(|call| (P::ends_call(id, &call), call)) {
+            Some((Some(ended), by)) => {
+                let (by_id, under_way) = (&mut self.by_id, &mut self.under_way);
+                let end = || {
+                    let call = by_id.remove(&ended);
+                    *under_way -= usize::from(call.is_some());
+                    call.map(|call| call.abort()).is_some()
+                };
+                return self.serve.end(ended, by, end).map(|answer| (id, answer));
             }
-            return Ok(());
-        }
+            other => other.map(|(_, call)| call),
+        };
         if self.by_id.contains_key(&id) {
-            return Err((id, Status::invalid_argument(format!("id: {id} is that of a call under way"))));
+            return Some((id, Err(Status::invalid_argument(format!("id: {id} is that of a call under way")))));
         }
         if self.under_way >= S::MAX_CALLS {
-            return Err((id, self.serve.too_many()));
+            return Some((id, Err(self.serve.too_many())));
         }
         let context = traceparent.parse::<TraceContext>().ok().map(TraceContext::child);
         let (answers, abort) = abortable(self.serve.begin(call, context));
@@ -88,7 +100,7 @@ impl<P: Protocol, S: Serve<P>> Answers<P, S> {
         if id != 0 {
             self.by_id.insert(id, abort);
         }
-        Ok(())
+        None
     }
 
     fn poll_drain(&mut self, context: &mut Context<'_>) {
@@ -113,8 +125,8 @@ impl<P: Protocol, S: Serve<P>> Stream for Answers<P, S> {
             let request = requests.poll_next_unpin(context);
             match request {
                 Poll::Ready(Some(Ok(request))) => {
-                    if let Err((id, refused)) = this.take(request) {
-                        return Poll::Ready(Some(Ok(P::response(id, Err(refused)))));
+                    if let Some((id, answer)) = this.take(request) {
+                        return Poll::Ready(Some(Ok(P::response(id, answer))));
                     }
                 }
                 // There are no more requests; what is under way is still answered.
@@ -129,6 +141,7 @@ impl<P: Protocol, S: Serve<P>> Stream for Answers<P, S> {
                 if answer.as_ref().map_or(true, P::is_last) {
                     this.by_id.remove(&id);
                     this.under_way -= 1;
+                    this.serve.answered(id, &answer);
                 }
                 Poll::Ready(Some(Ok(P::response(id, answer))))
             }

@@ -5,6 +5,7 @@ use crate::details::status as status_with;
 use crate::resource_manager::wire;
 use ratn_proto::types::{SessionStatus, WaitingAcquire};
 use ratn_resources::WaiterId;
+use std::sync::Arc;
 use tonic::{Code, Status};
 
 /// Waiters that are explained together at the most.
@@ -16,11 +17,11 @@ impl ResourceCore {
         self.pool.sessions().into_iter().map(|session| wire::session(session, now)).collect()
     }
 
-    pub(super) fn explain(&self, request_id: &str) -> Result<(Vec<WaitingAcquire>, usize), Status> {
+    pub(super) fn explain(&self, caller: &Arc<str>, request_id: &str) -> Result<(Vec<WaitingAcquire>, usize), Status> {
         let waiters = if request_id.is_empty() {
             self.pool.first_waiters(EXPLAINED)
         } else {
-            let waiter = self.pool.waiter_of(request_id).ok_or_else(|| {
+            let waiter = self.pool.waiter_of(caller, request_id).ok_or_else(|| {
                 let message = format!("no acquire of request id `{request_id}` waits: it was answered, or never asked");
                 status_with(Code::NotFound, "WAITER_UNKNOWN", message)
             })?;

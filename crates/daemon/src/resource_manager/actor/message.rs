@@ -83,8 +83,9 @@ pub(in super::super) enum Message {
     Sessions {
         answer: oneshot::Sender<Vec<SessionStatus>>,
     },
-    /// Why the acquire of a request id waits, or the first of the queue; and how many wait.
+    /// Why the acquire of a request id waits, the caller's own before those of others; or the first of the queue; and how many wait.
     Explain {
+        caller: Arc<str>,
         request_id: String,
         answer: Answer<(Vec<WaitingAcquire>, usize)>,
     },
@@ -128,10 +129,64 @@ impl Handle {
 }
 
 /// Calls that arrive together are handled by separate tasks, so in no order of their own: the most urgent acquire goes first,
-/// and what is given back comes after those who ask for it. The rest keeps its order.
+/// and what is given back comes after those who ask for it. The rest keeps its order, and no acquire goes past the end of a call that
+/// came before it: it may be the same request, asked again.
 pub(super) fn most_urgent_first(messages: &mut [Message]) {
-    messages.sort_by_key(|message| match message {
-        Message::Acquire { request, .. } => (0, Reverse(request.priority)),
-        _ => (1, Reverse(0)),
-    });
+    let ends_call = |message: &Message| {
+        matches!(message, Message::Withdraw { .. } | Message::Abandon { .. } | Message::Return { .. })
+    };
+    for messages in messages.split_mut(ends_call) {
+        messages.sort_by_key(|message| match message {
+            Message::Acquire { request, .. } => (0, Reverse(request.priority)),
+            _ => (1, Reverse(0)),
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn acquire(ticket: u64, priority: i64) -> Message {
+        let request = AcquireRequest::new(SessionId::from("s"), Vec::new()).priority(priority);
+        let (speaker, request_id, wait) = (Speaker::trusted(), String::new(), Duration::ZERO);
+        Message::Acquire { speaker, ticket, request_id, request, wait, answer: oneshot::channel().0 }
+    }
+
+    fn release() -> Message {
+        let (speaker, request_id) = (Speaker::trusted(), String::new());
+        let request = Request::Release { session: None, lease: LeaseId(1) };
+        Message::Perform { speaker, request_id, request, answer: oneshot::channel().0 }
+    }
+
+    fn withdraw() -> Message {
+        let (speaker, session, request_id) = (Speaker::trusted(), SessionId::from("s"), "r".to_owned());
+        Message::Withdraw { speaker, session, request_id, answer: oneshot::channel().0 }
+    }
+
+    /// By ticket; what is no acquire by a name.
+    fn sorted(mut messages: Vec<Message>) -> Vec<String> {
+        most_urgent_first(&mut messages);
+        let name = |message: &Message| match message {
+            Message::Acquire { ticket, .. } => ticket.to_string(),
+            Message::Perform { .. } => "release".to_owned(),
+            _ => "end".to_owned(),
+        };
+        messages.iter().map(name).collect()
+    }
+
+    #[test]
+    fn the_most_urgent_acquire_goes_first_and_what_is_given_back_last() {
+        let messages = vec![release(), acquire(1, 0), acquire(2, 7), acquire(3, 0)];
+        assert_eq!(sorted(messages), ["2", "1", "3", "release"]);
+    }
+
+    #[test]
+    fn no_acquire_goes_past_the_end_of_a_call_that_came_before_it() {
+        let ends = [withdraw(), Message::Abandon { ticket: 1 }, Message::Return { lease: LeaseId(1) }];
+        for end in ends {
+            let messages = vec![acquire(1, 0), release(), end, acquire(2, 7), release(), acquire(3, 8)];
+            assert_eq!(sorted(messages), ["1", "release", "end", "3", "2", "release"]);
+        }
+    }
 }

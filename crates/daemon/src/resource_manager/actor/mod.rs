@@ -169,8 +169,10 @@ impl Core for ResourceCore {
         match message {
             Message::Perform { speaker, request_id, request, answer } => {
                 let reply = self.may_speak(now, &speaker, request.session()).and_then(|()| {
-                    let reply =
-                        self.pool.handle(now, &request_id, request).map_err(|error| status::of_error(&error))?;
+                    let reply = self
+                        .pool
+                        .handle_as(now, &speaker, &request_id, request)
+                        .map_err(|error| status::of_error(&error))?;
                     Ok((reply, self.pool.revision()))
                 });
                 desk.reply(answer, reply);
@@ -181,7 +183,7 @@ impl Core for ResourceCore {
                     return desk.reply(answer, Err(refused));
                 }
                 request.deadline = Some(now + wait.min(self.config.max_wait()));
-                match self.pool.handle(now, &request_id, Request::Acquire(request)) {
+                match self.pool.handle_as(now, &speaker, &request_id, Request::Acquire(request)) {
                     Ok(Reply::Queued(waiter)) => {
                         self.tickets.insert(ticket, waiter);
                         self.calls.entry(waiter).or_default().push((ticket, answer));
@@ -226,8 +228,8 @@ impl Core for ResourceCore {
                 }
                 desk.reply(answer, reported);
             }
-            Message::Explain { request_id, answer } => {
-                let explained = self.explain(&request_id);
+            Message::Explain { caller, request_id, answer } => {
+                let explained = self.explain(&caller, &request_id);
                 desk.reply(answer, explained);
             }
             Message::Watch { after, filter, answer } => {
@@ -347,7 +349,7 @@ impl ResourceCore {
             Message::Sessions { answer } => desk.tell(answer, self.sessions(desk)),
             Message::WatchDemand { answer, .. } => desk.reply(answer, Err(stopped)),
             Message::ReportShortage { answer, .. } => desk.reply(answer, Err(stopped)),
-            Message::Explain { request_id, answer } => desk.reply(answer, self.explain(&request_id)),
+            Message::Explain { caller, request_id, answer } => desk.reply(answer, self.explain(&caller, &request_id)),
             Message::Watch { after, filter, answer } => {
                 let watch = self.watch(after, filter, desk);
                 desk.reply(answer, watch);

@@ -1,0 +1,166 @@
+//! Requests that are repeated: which answers are remembered, for whom, and for how many requests of others.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+use ratn_model::time::Timestamp;
+use ratn_resources::{
+    AcquireRequest, Limits, Pool, PoolError, Reply, Request, ResourceSpec, SessionId, Snapshot, Speaker, decode, encode,
+};
+use std::time::Duration;
+
+const NOW: Timestamp = Timestamp(0);
+
+fn speaker(name: &str) -> Speaker {
+    Speaker { name: name.into(), for_anybody: false }
+}
+
+fn operator() -> Speaker {
+    Speaker { name: "root".into(), for_anybody: true }
+}
+
+/// Everybody has a session of their own name.
+fn pool_of(limits: Limits, names: &[&str]) -> Pool {
+    let mut pool = Pool::new(limits);
+    for name in names {
+        open(&mut pool, name);
+    }
+    pool
+}
+
+fn open(pool: &mut Pool, name: &str) {
+    pool.keep_alive_as(NOW, &speaker(name), &SessionId::from(name), name, Duration::from_secs(10)).unwrap();
+}
+
+fn create(name: &str, kind: &str) -> Request {
+    Request::Create { session: Some(SessionId::from(name)), spec: ResourceSpec::new(ResourceClass::Module, kind) }
+}
+
+fn acquire(name: &str, kind: &str) -> Request {
+    let block = Requirement::new(ResourceOperation::Block, kind);
+    Request::Acquire(AcquireRequest::new(SessionId::from(name), vec![block]))
+}
+
+/// The id of what was created.
+fn created(pool: &mut Pool, name: &str, request: &str) -> String {
+    match pool.handle_as(NOW, &speaker(name), request, create(name, "Tool")) {
+        Ok(Reply::Created { id, .. }) => id,
+        other => panic!("{other:?}"),
+    }
+}
+
+/// As a manager that is started again finds it: of the records alone, or of a snapshot.
+fn restarted(mut pool: Pool, limits: &Limits, records: bool) -> Pool {
+    let entry = encode(&pool.take_records());
+    let snapshot = Snapshot::decode(&pool.snapshot().encode()).unwrap();
+    let again = if records {
+        Pool::restore(limits.clone(), NOW, None, decode(&entry).unwrap())
+    } else {
+        Pool::restore(limits.clone(), NOW, Some(snapshot), [])
+    };
+    let again = again.unwrap();
+    again.check_invariants().unwrap();
+    again
+}
+
+#[test]
+fn the_same_request_id_of_another_caller_is_another_request_also_after_a_restart() {
+    for records in [false, true] {
+        let limits = Limits::default();
+        let mut pool = pool_of(limits.clone(), &["adam", "eve"]);
+        let (adams, eves) = (created(&mut pool, "adam", "r1"), created(&mut pool, "eve", "r1"));
+        assert_ne!(adams, eves);
+        let other = pool.handle_as(NOW, &speaker("eve"), "r1", create("eve", "Arm"));
+        assert_eq!(other, Err(PoolError::RequestIdReused { id: "r1".to_owned() }), "but hers she has used");
+        // Both wait under one id, too.
+        let mut waiters = Vec::new();
+        for name in ["adam", "eve"] {
+            let Ok(Reply::Queued(waiter)) = pool.handle_as(NOW, &speaker(name), "r2", acquire(name, "Arm")) else {
+                panic!("there is no arm")
+            };
+            assert_eq!(pool.waiter_of(&name.into(), "r2"), Some(waiter));
+            waiters.push(waiter);
+        }
+        assert_eq!(pool.waiter_of(&"who only looks".into(), "r2"), Some(waiters[0]));
+        assert_eq!(pool.waiter_of(&"eve".into(), "r3"), None);
+        assert!(pool.withdraw(NOW, &SessionId::from("eve"), "r2").unwrap());
+        assert!(!pool.withdraw(NOW, &SessionId::from("eve"), "r2").unwrap(), "the other is not hers");
+        pool.check_invariants().unwrap();
+        let mut pool = restarted(pool, &limits, records);
+        assert_eq!((created(&mut pool, "adam", "r1"), created(&mut pool, "eve", "r1")), (adams, eves));
+    }
+}
+
+#[test]
+fn a_request_that_an_operator_makes_for_a_session_has_the_name_space_of_its_opener() {
+    let mut pool = pool_of(Limits::default(), &["adam"]);
+    let first = created(&mut pool, "adam", "r1");
+    let again = pool.handle_as(NOW, &operator(), "r1", create("adam", "Tool")).unwrap();
+    assert!(matches!(again, Reply::Created { id, .. } if id == first));
+    let own = Request::Create { session: None, spec: ResourceSpec::new(ResourceClass::Module, "Tool") };
+    let Ok(Reply::Created { id, .. }) = pool.handle_as(NOW, &operator(), "r1", own) else { panic!() };
+    assert_ne!(id, first);
+}
+
+#[test]
+fn whoever_makes_many_requests_forgets_their_own_answers_and_nobody_elses() {
+    let by_number = Limits { remembered_requests: 20, ..Limits::default() };
+    let per_caller = Limits { remembered_per_caller: 8, ..Limits::default() };
+    let by_bytes = Limits { remembered_bytes_per_caller: 4_000, ..Limits::default() };
+    for limits in [by_number, per_caller, by_bytes] {
+        let mut pool = pool_of(limits.clone(), &["adam", "eve", "mallory"]);
+        let mut kept = Vec::new();
+        for n in 0..5 {
+            for name in ["adam", "eve"] {
+                kept.push((name, n, created(&mut pool, name, &format!("r{n}"))));
+            }
+        }
+        let first = created(&mut pool, "mallory", "r0");
+        for n in 1..60 {
+            created(&mut pool, "mallory", &format!("r{n}"));
+            pool.check_invariants().unwrap();
+        }
+        for (name, n, id) in kept {
+            assert_eq!(created(&mut pool, name, &format!("r{n}")), id, "{name} asks again: {limits:?}");
+        }
+        assert_ne!(created(&mut pool, "mallory", "r0"), first, "{limits:?}");
+        let entry = encode(&pool.take_records());
+        let again = Pool::restore(limits, NOW, None, decode(&entry).unwrap()).unwrap();
+        assert_eq!(again.snapshot(), pool.snapshot());
+    }
+}
+
+#[test]
+fn answers_with_long_lists_of_ids_are_bounded_by_their_bytes_and_the_newest_is_kept_whatever_it_has() {
+    let limits = Limits { remembered_bytes_per_caller: 2_000, ..Limits::default() };
+    let mut pool = pool_of(limits, &["adam"]);
+    for _ in 0..100 {
+        pool.handle_as(NOW, &speaker("adam"), "", create("adam", "Tool")).unwrap();
+    }
+    let delete = |count: u32| Request::DeleteUnits {
+        session: SessionId::from("adam"),
+        requirement: Requirement { count: count.into(), ..Requirement::new(ResourceOperation::Delete, "Tool") },
+    };
+    let short = pool.handle_as(NOW, &speaker("adam"), "short", delete(1)).unwrap();
+    assert_eq!(pool.handle_as(NOW, &speaker("adam"), "short", delete(1)).unwrap(), short);
+    let long = pool.handle_as(NOW, &speaker("adam"), "long", delete(90)).unwrap();
+    pool.check_invariants().unwrap();
+    assert_eq!(pool.handle_as(NOW, &speaker("adam"), "long", delete(90)).unwrap(), long);
+    let again = pool.handle_as(NOW, &speaker("adam"), "short", delete(1)).unwrap();
+    assert_ne!(again, short, "it was forgotten for the long one");
+    pool.check_invariants().unwrap();
+}
+
+#[test]
+fn a_lease_that_was_undone_is_acquired_anew_after_a_restart_too() {
+    for records in [false, true] {
+        let limits = Limits::default();
+        let mut pool = pool_of(limits.clone(), &["adam"]);
+        pool.handle_as(NOW, &speaker("adam"), "", create("adam", "Arm")).unwrap();
+        pool.handle_as(NOW, &speaker("adam"), "r1", acquire("adam", "Arm")).unwrap();
+        let first = pool.leases().remove(0);
+        assert!(pool.withdraw(NOW, &SessionId::from("adam"), "r1").unwrap());
+        let mut pool = restarted(pool, &limits, records);
+        assert!(matches!(pool.handle_as(NOW, &speaker("adam"), "r1", acquire("adam", "Arm")), Ok(Reply::Queued(_))));
+        assert!(pool.leases().remove(0).token > first.token);
+    }
+}
