@@ -7,6 +7,7 @@ use super::core::{HeldBy, ProjectError, ProjectRequest, WorldPool};
 use super::history::{Commit, Difference, History, Kept, Version};
 use super::leases::{Known, LiveLeases};
 use super::{WorldPoolConfig, status};
+use crate::access::Caller;
 use crate::durable_actor::{self, Core, Desk, Journal, JournalError, floor};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
@@ -78,6 +79,7 @@ pub(super) enum Message {
         answer: Answer<SceneDelta>,
     },
     Release {
+        by: Caller,
         projection: ProjectionId,
         answer: Answer<bool>,
     },
@@ -96,6 +98,7 @@ pub(super) enum Update {
 /// A projection as it was asked for.
 #[derive(Debug)]
 pub(super) struct NewProjection {
+    pub(super) by: Caller,
     pub(super) request_id: String,
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
@@ -241,15 +244,15 @@ impl Core for WorldCore {
                 let scene = self.pool.scene(projection, &bases).map_err(|error| status::of_query(&error));
                 desk.reply(answer, scene);
             }
-            Message::Release { projection, answer } => {
-                let released = self.pool.release(projection);
-                desk.reply(answer, Ok(released));
+            Message::Release { by, projection, answer } => {
+                let released = self.pool.release_for(&by, projection).map_err(|error| status::of_release(&error));
+                desk.reply(answer, released);
             }
         }
     }
 
     fn signal(&mut self, live: &LiveLeases, _: &mut WorldDesk) {
-        let ended = self.pool.keep_leases(|lease| live.known(lease) == Known::Lives);
+        let ended = self.pool.keep_leases(|lease| matches!(live.known(lease), Known::Lives { .. }));
         if ended > 0 {
             tracing::debug!(ended, left = self.pool.projections(), "projections ended with their leases");
         }
@@ -320,14 +323,55 @@ impl WorldCore {
         let held_by = match new.lease {
             None => unbound,
             Some(lease) => match self.leases.borrow().known(lease) {
-                Known::Lives => HeldBy::Lease(lease),
+                Known::Lives { opened_by } if !new.by.may_act_for(opened_by) => {
+                    return Err(status::lease_of_another(lease, opened_by, &new.by));
+                }
+                Known::Lives { .. } => HeldBy::Lease(lease),
                 Known::Ended => return Err(status::lease_ended(lease)),
                 // A lease without a resource is never told of.
                 Known::NotYet => unbound,
             },
         };
-        let NewProjection { request_id, base, changes, writers, reads, .. } = new;
-        let request = ProjectRequest { request_id, base, changes, writers, reads, held_by };
+        let NewProjection { by, request_id, base, changes, writers, reads, .. } = new;
+        let request = ProjectRequest { by, request_id, base, changes, writers, reads, held_by };
         self.pool.project(request).map_err(|error: ProjectError| status::of_project(&error))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::super::leases::LiveLeases;
+    use super::*;
+    use crate::access::Role;
+    use tonic::Code;
+
+    #[tokio::test]
+    async fn a_projection_is_made_under_a_lease_of_a_session_that_its_caller_opened() {
+        let (config, directory) = (WorldPoolConfig::default(), tempfile::tempdir().unwrap());
+        let kept = super::super::open(&config, directory.path()).unwrap();
+        let live = watch::Sender::new(LiveLeases::of(LeaseId(3), "world-model", "adam"));
+        let over = CancellationToken::new();
+        let (actor, _ended) = start(config, None, kept, live.subscribe(), Vitals::default(), over).unwrap();
+        let project = async |name: &str, role: Role, lease: u64| {
+            let projection = NewProjection {
+                by: Caller { name: name.into(), roles: [role].into() },
+                request_id: String::new(),
+                base: Revision(0),
+                changes: Vec::new(),
+                writers: Vec::new(),
+                reads: Footprint::Everything,
+                lease: Some(LeaseId(lease)),
+            };
+            let made = actor.request(|answer| Message::Project { projection, answer }).await;
+            made.map(drop).map_err(|refused| (refused.code(), refused.message().to_owned()))
+        };
+        for (name, role) in [("adam", Role::Task), ("world", Role::Agent), ("root", Role::Operator)] {
+            assert_eq!(project(name, role, 3).await, Ok(()), "{name}");
+        }
+        let (code, message) = project("eve", Role::Task, 3).await.unwrap_err();
+        assert!(code == Code::PermissionDenied && message.contains("of a session of `adam`"), "{message}");
+        let ended = project("adam", Role::Task, 2).await.unwrap_err();
+        assert_eq!(ended.0, Code::FailedPrecondition, "{}", ended.1);
     }
 }

@@ -1,5 +1,6 @@
 //! The world pool's config.
 
+use super::memory::Bounds;
 use crate::config::{Check, ConfigError, StorageConfig, rule};
 use ratn_proto::MAX_PAGE_BYTES;
 use ratn_worker::endpoint::Endpoint;
@@ -33,6 +34,10 @@ pub struct WorldPoolConfig {
     pub changes_kept: usize,
     /// Projections at once in all, those without a lease included.
     pub max_projections: usize,
+    /// Of those, projections of one caller that is no operator.
+    pub projections_per_caller: usize,
+    /// Of `max_projections`, so many are only for operators, but never more than half.
+    pub projections_for_operators: usize,
     /// A projection whose lease holds no resource ends after this long, in seconds.
     pub unbound_ttl_s: f64,
     /// Clients that watch at the same time.
@@ -45,8 +50,10 @@ pub struct WorldPoolConfig {
     pub ontology: Option<PathBuf>,
     /// Seconds by predicate, instead of what the ontology declares: a fact that is not written again within them is gone.
     pub ttl_s: BTreeMap<String, f64>,
-    /// Commits and projections remembered so that a repeated id is not performed twice.
+    /// Commits, and projections, remembered so that a repeated id is not performed twice; the caller with the most loses the oldest.
     pub remembered_requests: usize,
+    /// Of those, of one caller, who loses the oldest.
+    pub remembered_per_caller: usize,
     /// What is kept over a restart.
     pub storage: StorageConfig,
 }
@@ -63,6 +70,8 @@ impl Default for WorldPoolConfig {
             revisions_kept: 4_096,
             changes_kept: 1_000_000,
             max_projections: 4_096,
+            projections_per_caller: 1_024,
+            projections_for_operators: 256,
             unbound_ttl_s: 600.0,
             max_watchers: 1_024,
             fact_bytes: 1 << 20,
@@ -70,8 +79,15 @@ impl Default for WorldPoolConfig {
             ontology: None,
             ttl_s: BTreeMap::new(),
             remembered_requests: 65_536,
+            remembered_per_caller: 32_768,
             storage: StorageConfig::default(),
         }
+    }
+}
+
+impl WorldPoolConfig {
+    pub(super) fn remembered(&self) -> Bounds {
+        Bounds { in_all: self.remembered_requests, per_caller: self.remembered_per_caller }
     }
 }
 
@@ -84,6 +100,7 @@ impl Check for WorldPoolConfig {
         rule("revisions_kept", self.revisions_kept >= 1, "at least 1")?;
         rule("changes_kept", self.changes_kept >= 1, "at least 1")?;
         rule("max_projections", self.max_projections >= 1, "at least 1")?;
+        rule("projections_per_caller", self.projections_per_caller >= 1, "at least 1")?;
         rule("unbound_ttl_s", (1.0..=86_400.0).contains(&self.unbound_ttl_s), "from 1 s to a day")?;
         rule("max_watchers", self.max_watchers >= 1, "at least 1")?;
         rule("fact_bytes", (64..=self.commit_bytes).contains(&self.fact_bytes), "from 64 bytes to commit_bytes")?;
@@ -91,6 +108,7 @@ impl Check for WorldPoolConfig {
         let lasting = self.ttl_s.values().all(|ttl_s| TTLS_S.contains(ttl_s));
         rule("ttl_s", lasting, "from 0.001 s to 1,000,000,000 s each")?;
         rule("remembered_requests", self.remembered_requests >= 1, "at least 1")?;
+        rule("remembered_per_caller", self.remembered_per_caller >= 1, "at least 1")?;
         self.storage.check()
     }
 }

@@ -1,8 +1,8 @@
 //! The root's history and the projections of it: a pure state machine.
 //!
 //! A projection is a clone of a kept revision with its changes applied, so it costs its effects, whatever the size of the
-//! world. It shows its declared reads and nothing else, and it ends with its lease. The history is durable, projections are not: they
-//! end with the process, and no later one has the id of an earlier one.
+//! world. It shows its declared reads and nothing else, and it ends with its lease. Whoever made it releases it, or an operator. The history
+//! is durable, projections are not: they end with the process, and no later one has the id of an earlier one.
 
 use super::WorldPoolConfig;
 use super::expiry::Expiry;
@@ -10,6 +10,7 @@ use super::fingerprint::Fingerprint;
 use super::history::{Commit, CommitError, History, RevisionError};
 use super::memory::{Memory, Reused};
 use super::scenes::{Scenes, moves};
+use crate::access::Caller;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
 use ratn_model::ontology::Ontology;
@@ -40,6 +41,8 @@ pub(super) struct WorldPool {
     contradictions: Vec<Contradiction>,
     projected: Memory<ProjectionId>,
     by_lease: BTreeMap<LeaseId, BTreeSet<ProjectionId>>,
+    /// How many each caller made that are there.
+    made: BTreeMap<Arc<str>, usize>,
     last_projection: u64,
 }
 
@@ -51,6 +54,7 @@ pub(super) struct Projection {
     pub(super) moves: Vec<Change>,
     pub(super) reads: Footprint,
     held_by: HeldBy,
+    made_by: Arc<str>,
     request_id: String,
     /// The first that there was.
     contradiction: Option<Contradiction>,
@@ -68,6 +72,7 @@ pub(super) enum HeldBy {
 /// A projection to be made.
 #[derive(Debug)]
 pub(super) struct ProjectRequest {
+    pub(super) by: Caller,
     pub(super) request_id: String,
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
@@ -102,8 +107,21 @@ pub(super) enum ProjectError {
     Change(#[from] ChangeError),
     #[error("{limit} projections exist: release some")]
     TooMany { limit: usize },
+    #[error("{limit} projections exist, and the rest is kept for operators: release some")]
+    KeptForOperators { limit: usize },
+    #[error("projections of {whose}: the quota of {limit} is reached (projections_per_caller): release some")]
+    Quota { whose: Arc<str>, limit: usize },
     #[error("the projection of request `{request_id}` has ended; ask with another request id")]
     Ended { request_id: String },
+}
+
+/// A projection that somebody else made.
+#[derive(Debug, PartialEq, thiserror::Error)]
+#[error("{id} was made by {made_by}: only they and operators release it, not {caller}")]
+pub(super) struct MadeByAnother {
+    id: ProjectionId,
+    made_by: Arc<str>,
+    caller: Arc<str>,
 }
 
 /// A question without an answer.
@@ -136,8 +154,9 @@ impl WorldPool {
             history,
             projections: BTreeMap::new(),
             scenes: Scenes::default(),
-            projected: Memory::new(config.remembered_requests),
+            projected: Memory::new(config.remembered()),
             by_lease: BTreeMap::new(),
+            made: BTreeMap::new(),
             last_projection: floor,
             config,
         };
@@ -258,13 +277,11 @@ impl WorldPool {
     /// The world at a revision with changes applied. A request made before gets its answer again, as long as it lives.
     pub(super) fn project(&mut self, request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
         let fingerprint = Fingerprint::of_projection(request.base, &request.changes, &request.reads, &request.writers);
-        if let Some(id) = self.projected.recall(&request.request_id, fingerprint)? {
+        if let Some(id) = self.projected.recall(&request.by.name, &request.request_id, fingerprint)? {
             let ended = || ProjectError::Ended { request_id: request.request_id.clone() };
             return self.projections.contains_key(&id).then_some(id).ok_or_else(ended);
         }
-        if self.projections.len() >= self.config.max_projections {
-            return Err(ProjectError::TooMany { limit: self.config.max_projections });
-        }
+        self.check_room(&request.by)?;
         let world = self.history.at(request.base)?.project_as(&request.writers, &request.changes)?;
         self.last_projection += 1;
         let id = ProjectionId(self.last_projection);
@@ -273,18 +290,39 @@ impl WorldPool {
         if let HeldBy::Lease(lease) = request.held_by {
             self.by_lease.entry(lease).or_default().insert(id);
         }
-        self.projected.insert(&request.request_id, fingerprint, id);
+        self.projected.insert(&request.by.name, &request.request_id, fingerprint, id);
+        *self.made.entry(request.by.name.clone()).or_default() += 1;
         let projection = Projection {
             world,
             base: request.base,
             moves: moves(&request.changes),
             reads: request.reads,
             held_by: request.held_by,
+            made_by: request.by.name,
             request_id: request.request_id,
             contradiction,
         };
         self.projections.insert(id, projection);
         Ok(id)
+    }
+
+    /// Whether a caller may make one more.
+    fn check_room(&self, caller: &Caller) -> Result<(), ProjectError> {
+        let WorldPoolConfig { max_projections, projections_per_caller, projections_for_operators, .. } = self.config;
+        if self.projections.len() >= max_projections {
+            return Err(ProjectError::TooMany { limit: max_projections });
+        }
+        if caller.is_operator() {
+            return Ok(());
+        }
+        if self.made.get(&caller.name).is_some_and(|made| *made >= projections_per_caller) {
+            return Err(ProjectError::Quota { whose: caller.name.clone(), limit: projections_per_caller });
+        }
+        let limit = max_projections - projections_for_operators.min(max_projections / 2);
+        if self.projections.len() >= limit {
+            return Err(ProjectError::KeptForOperators { limit });
+        }
+        Ok(())
     }
 
     /// What matches any of the patterns, in the order of keys, of the root (now or at a revision) or of a projection; without a pattern everything
@@ -319,10 +357,26 @@ impl WorldPool {
         Ok((facts.into_iter().collect(), revision))
     }
 
+    /// Ends a projection for a caller; false when it had ended before.
+    pub(super) fn release_for(&mut self, caller: &Caller, id: ProjectionId) -> Result<bool, MadeByAnother> {
+        match self.projections.get(&id) {
+            Some(projection) if projection.made_by != caller.name && !caller.is_operator() => {
+                Err(MadeByAnother { id, made_by: projection.made_by.clone(), caller: caller.name.clone() })
+            }
+            _ => Ok(self.release(id)),
+        }
+    }
+
     /// Ends a projection; false when it had ended before.
     pub(super) fn release(&mut self, id: ProjectionId) -> bool {
         let Some(projection) = self.projections.remove(&id) else { return false };
         self.live.remove(id);
+        if let Some(made) = self.made.get_mut(&projection.made_by) {
+            *made -= 1;
+            if *made == 0 {
+                self.made.remove(&projection.made_by);
+            }
+        }
         tracing::trace!(%id, request = projection.request_id, "projection ended");
         if let HeldBy::Lease(lease) = projection.held_by
             && let Some(ids) = self.by_lease.get_mut(&lease)

@@ -6,7 +6,8 @@
 use super::WorldPoolConfig;
 use super::fingerprint::Fingerprint;
 use super::memory::{Memory, Reused};
-use super::record::{CommitRecord, FactRecord, Names, PatternRecord, SnapshotRecord, decode_commits, encode};
+use super::record::{CommitRecord, EntryRecord, FactRecord, Names, PatternRecord, SnapshotRecord, encode};
+use crate::access::Caller;
 use crate::durable_actor::Journaled;
 use bytes::Bytes;
 use ratn_model::fact::{Change, FactKey, FactPattern};
@@ -28,7 +29,7 @@ pub(super) struct History {
     written: usize,
     commits: Memory<Revision>,
     /// Commits since the journal took the last.
-    records: Vec<CommitRecord>,
+    records: EntryRecord,
     /// Revisions since [`History::take_news`].
     news: Vec<Arc<Kept>>,
     revisions_kept: usize,
@@ -38,7 +39,9 @@ pub(super) struct History {
 /// What is to become the next revision.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Commit {
-    /// Unique to what is committed; the same once more gets the answer of before. Empty where facts were too old.
+    /// Who commits; the pool itself where facts were too old.
+    pub(super) by: Caller,
+    /// Unique to what the caller commits; the same once more gets the answer of before. Empty where facts were too old.
     pub(super) id: String,
     pub(super) changes: Vec<Change>,
     /// What the next revision has to be.
@@ -111,8 +114,8 @@ impl History {
         History {
             revisions: VecDeque::from([Arc::new(oldest)]),
             written: 0,
-            commits: Memory::new(config.remembered_requests),
-            records: Vec::new(),
+            commits: Memory::new(config.remembered()),
+            records: EntryRecord::default(),
             news: Vec::new(),
             revisions_kept: config.revisions_kept,
             changes_kept: config.changes_kept,
@@ -130,19 +133,22 @@ impl History {
             for commit in snapshot.commits {
                 history.make_again(commit, &mut names)?;
             }
+            let mut callers = snapshot.callers.into_iter();
             for (id, fingerprint, revision) in snapshot.remembered {
-                history.commits.insert(&id, fingerprint, Revision(revision));
+                history.commits.insert(&callers.next().unwrap_or_default(), &id, fingerprint, Revision(revision));
             }
         }
         for entry in recovered.records {
-            let commits = decode_commits(&entry.payload)
+            let EntryRecord { commits, callers } = EntryRecord::decode(&entry.payload)
                 .map_err(|source| RestoreError::Entry { position: entry.position, source })?;
+            let mut callers = callers.into_iter();
             for commit in commits {
+                let caller = callers.next().unwrap_or_default();
                 let (id, fingerprint, revision) = (commit.id.clone(), commit.fingerprint, Revision(commit.revision));
                 let is_leap = commit.is_leap();
                 history.make_again(commit, &mut names)?;
                 if !is_leap {
-                    history.commits.insert(&id, fingerprint, revision);
+                    history.commits.insert(&caller, &id, fingerprint, revision);
                 }
             }
         }
@@ -154,9 +160,14 @@ impl History {
     pub(super) fn with_revisions_above(mut self, floor: Revision) -> History {
         if self.root().revision() < floor {
             self.go_on_from(floor);
-            self.records.push(CommitRecord { revision: floor.0, ..CommitRecord::default() });
+            self.put_down(&Arc::default(), CommitRecord { revision: floor.0, ..CommitRecord::default() });
         }
         self
+    }
+
+    fn put_down(&mut self, caller: &Arc<str>, record: CommitRecord) {
+        self.records.commits.push(record);
+        self.records.callers.push(caller.clone());
     }
 
     fn go_on_from(&mut self, revision: Revision) {
@@ -172,9 +183,9 @@ impl History {
 
     /// All changes as the next revision, or none. An id committed before gets its answer again.
     pub(super) fn commit(&mut self, commit: &Commit, ontology: Option<&Ontology>) -> Result<Revision, CommitError> {
-        let Commit { id, changes, expected, writer, evidence } = commit;
+        let Commit { by, id, changes, expected, writer, evidence } = commit;
         let fingerprint = Fingerprint::of_commit(changes);
-        if let Some(revision) = self.commits.recall(id, fingerprint)? {
+        if let Some(revision) = self.commits.recall_for(by, id, fingerprint)? {
             return Ok(revision);
         }
         let (root, next) = (self.root().revision().0, self.root().revision().0 + 1);
@@ -197,16 +208,17 @@ impl History {
             Change::Delete { pattern } => Some(PatternRecord::new(pattern)),
             _ => None,
         });
-        self.records.push(CommitRecord {
+        let record = CommitRecord {
             revision: next,
             id: id.clone(),
             fingerprint,
             deleted: deleted.collect(),
             written: facts_of(&written),
-        });
+        };
+        self.put_down(&by.name, record);
         let revision = self.push(id, written);
         self.news.extend(self.revisions.back().cloned());
-        self.commits.insert(id, fingerprint, revision);
+        self.commits.insert(&by.name, id, fingerprint, revision);
         Ok(revision)
     }
 
@@ -300,19 +312,23 @@ impl History {
 impl Journaled for History {
     fn take_entry(&mut self) -> Option<Vec<u8>> {
         let records = std::mem::take(&mut self.records);
-        (!records.is_empty()).then(|| encode(&records))
+        (!records.commits.is_empty()).then(|| encode(&records))
     }
 
     fn snapshot(&self) -> MakeSnapshot {
         let revisions: Vec<Arc<Kept>> = self.revisions.iter().cloned().collect();
-        let remembered: Vec<_> = self.commits.iter().map(|(id, print, at)| (Arc::clone(id), print, at.0)).collect();
+        let remembered: Vec<_> =
+            self.commits.iter().map(|(caller, id, print, at)| (caller.clone(), id.clone(), print, at.0)).collect();
         Box::new(move || {
             let (oldest, later) = (&revisions[0].world, &revisions[1..]);
+            let callers = remembered.iter().map(|(caller, ..)| caller.clone()).collect();
+            let remembered = remembered.into_iter().map(|(_, id, print, at)| (id.to_string(), print, at)).collect();
             Bytes::from(encode(&SnapshotRecord {
                 revision: oldest.revision().0,
                 facts: oldest.iter().map(|(key, fact)| FactRecord::new(key, fact)).collect(),
                 commits: later.iter().map(|kept| kept.record()).collect(),
-                remembered: remembered.into_iter().map(|(id, print, at)| (id.to_string(), print, at)).collect(),
+                remembered,
+                callers,
             }))
         })
     }
@@ -378,7 +394,12 @@ mod tests {
     }
 
     fn commit(id: &str, changes: &[Change]) -> Commit {
-        Commit { id: id.to_owned(), changes: changes.to_vec(), ..Commit::default() }
+        commit_as("adam", id, changes)
+    }
+
+    fn commit_as(name: &str, id: &str, changes: &[Change]) -> Commit {
+        let by = Caller { name: name.into(), ..Caller::default() };
+        Commit { by, id: id.to_owned(), changes: changes.to_vec(), ..Commit::default() }
     }
 
     /// What the log of a pool holds.
@@ -464,6 +485,29 @@ mod tests {
             let entry = [vec![1], bytes].concat();
             let _ = History::restore(Kept { entries: vec![entry.clone()], snapshot: None }.recovered(), &config());
             let _ = History::restore(Kept { entries: Vec::new(), snapshot: Some(entry) }.recovered(), &config());
+        }
+    }
+
+    #[test]
+    fn whose_a_commit_is_is_known_from_entries_and_from_a_snapshot_and_not_from_those_of_an_earlier_version() {
+        let changes = [Change::Set { fact: key(1), value: Value::Int(1) }];
+        let mut history = History::new(&config());
+        history.commit(&commit_as("a", "r", &changes), None).unwrap();
+        let entry = history.take_entry().unwrap();
+        let snapshot = history.snapshot()().to_vec();
+        // An earlier version ends where the list of callers would begin.
+        let earlier = |bytes: &[u8]| [&[2], &bytes.strip_suffix(&[1, 1, b'a']).unwrap()[1..]].concat();
+        let of_entry = |entry: Vec<u8>| Kept { entries: vec![entry], snapshot: None };
+        let of_snapshot = |bytes: Vec<u8>| Kept { entries: Vec::new(), snapshot: Some(bytes) };
+        for kept in [of_entry(entry.clone()), of_snapshot(snapshot.clone())] {
+            let mut again = History::restore(kept.recovered(), &config()).unwrap();
+            assert_eq!(again.commit(&commit_as("a", "r", &changes), None), Ok(Revision(1)));
+            assert_eq!(again.commit(&commit_as("b", "r", &changes), None), Ok(Revision(2)), "another caller's");
+        }
+        for kept in [of_entry(earlier(&entry)), of_snapshot(earlier(&snapshot))] {
+            let mut again = History::restore(kept.recovered(), &config()).unwrap();
+            assert_eq!(again.commit(&commit_as("b", "r", &changes), None), Ok(Revision(1)), "whoever asks the same");
+            assert_eq!(again.commit(&commit_as("b", "r", &[]), None), Ok(Revision(2)), "something else");
         }
     }
 

@@ -15,26 +15,37 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 /// The live leases, by what they hold.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct LiveLeases {
-    held: BTreeMap<LeaseId, BTreeSet<String>>,
+    held: BTreeMap<LeaseId, Held>,
     /// The youngest that was ever told of: ids grow, so an older one that does not live has ended.
     youngest: LeaseId,
     /// Counts snapshots: each tells anew what lives.
     pub(super) snapshots: u64,
 }
 
+/// What a live lease holds.
+#[derive(Debug, Clone, Default, PartialEq)]
+struct Held {
+    resources: BTreeSet<String>,
+    /// Who opened its session, as the resource manager's connection proved; empty where nobody knows.
+    opened_by: String,
+}
+
 /// What is known of a lease.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Known {
-    Lives,
+pub(super) enum Known<'a> {
+    Lives {
+        /// Who opened its session.
+        opened_by: &'a str,
+    },
     Ended,
     /// Too young: the watch has not told of it yet.
     NotYet,
 }
 
 impl LiveLeases {
-    pub(super) fn known(&self, lease: LeaseId) -> Known {
-        if self.held.contains_key(&lease) {
-            Known::Lives
+    pub(super) fn known(&self, lease: LeaseId) -> Known<'_> {
+        if let Some(held) = self.held.get(&lease) {
+            Known::Lives { opened_by: &held.opened_by }
         } else if lease <= self.youngest {
             Known::Ended
         } else {
@@ -48,13 +59,17 @@ impl LiveLeases {
         self.snapshots += 1;
         for resource in resources {
             for holding in &resource.holdings {
-                self.hold(holding.lease, &resource.id);
+                self.hold(holding.lease, resource);
             }
         }
     }
 
-    fn hold(&mut self, lease: LeaseId, resource: &str) {
-        self.held.entry(lease).or_default().insert(resource.to_owned());
+    fn hold(&mut self, lease: LeaseId, resource: &Resource) {
+        let held = self.held.entry(lease).or_default();
+        held.resources.insert(resource.id.clone());
+        if let Some(holding) = resource.holdings.iter().find(|holding| holding.lease == lease) {
+            held.opened_by.clone_from(&holding.opened_by);
+        }
         self.youngest = self.youngest.max(lease);
     }
 
@@ -69,11 +84,11 @@ impl LiveLeases {
         };
         let Some((lease, _)) = event.lease else { return false };
         match event.kind {
-            ResourceEventKind::Leased => self.hold(lease, &event.resource.id),
+            ResourceEventKind::Leased => self.hold(lease, &event.resource),
             ResourceEventKind::Released => {
                 if let Some(held) = self.held.get_mut(&lease) {
-                    held.remove(&event.resource.id);
-                    if held.is_empty() {
+                    held.resources.remove(&event.resource.id);
+                    if held.resources.is_empty() {
                         self.held.remove(&lease);
                     }
                 }
@@ -109,19 +124,40 @@ async fn follow_at(
 }
 
 #[cfg(test)]
+impl LiveLeases {
+    /// One lease that holds one resource.
+    pub(super) fn of(lease: LeaseId, resource: &str, opened_by: &str) -> LiveLeases {
+        let held = Held { resources: [resource.to_owned()].into(), opened_by: opened_by.to_owned() };
+        LiveLeases { held: [(lease, held)].into(), youngest: lease, snapshots: 1 }
+    }
+}
+
+#[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
     use ratn_model::id::{FencingToken, Revision};
-    use ratn_model::resource::ResourceClass;
-    use ratn_proto::types::ResourceEvent;
+    use ratn_model::resource::{Quantity, ResourceClass};
+    use ratn_proto::types::{Holding, ResourceEvent};
+
+    /// Everything is held by a session that adam opened.
+    const ADAMS: Known<'_> = Known::Lives { opened_by: "adam" };
 
     fn event(kind: ResourceEventKind, resource: &str, lease: u64) -> ResourceUpdate {
+        let holding = Holding {
+            lease: LeaseId(lease),
+            token: FencingToken(lease),
+            units: Quantity::ONE,
+            session: "s".to_owned(),
+            holder: String::new(),
+            opened_by: "adam".to_owned(),
+        };
+        let holdings = if kind == ResourceEventKind::Leased { vec![holding] } else { Vec::new() };
         ResourceUpdate::Event(ResourceEvent {
             part: 0,
             revision: Revision(1),
             kind,
-            resource: Resource::new(resource, ResourceClass::World, "WorldModel"),
+            resource: Resource { holdings, ..Resource::new(resource, ResourceClass::World, "WorldModel") },
             lease: Some((LeaseId(lease), FencingToken(lease))),
             reason: String::new(),
         })
@@ -135,7 +171,7 @@ mod tests {
         leases.update(&event(ResourceEventKind::Leased, "planner", 3));
         assert_eq!(leases.known(LeaseId(2)), Known::Ended, "ids grow");
         leases.update(&event(ResourceEventKind::Released, "planner", 3));
-        assert_eq!(leases.known(LeaseId(3)), Known::Lives);
+        assert_eq!(leases.known(LeaseId(3)), ADAMS);
         leases.update(&event(ResourceEventKind::Released, "world", 3));
         assert_eq!(leases.known(LeaseId(3)), Known::Ended);
     }

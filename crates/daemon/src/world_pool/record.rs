@@ -16,7 +16,9 @@ use std::sync::Arc;
 
 /// The version that is written, the first byte. Only variants of enums are ever added to one, at their end; whatever else changes takes
 /// a new number, and the older ones are still read.
-const FORMAT: u8 = 2;
+const FORMAT: u8 = 3;
+/// The last version that does not say who committed.
+const WITHOUT_CALLERS: u8 = 2;
 /// The fingerprints are of the debug text of changes, which says nothing to a later version.
 const DEBUG_FINGERPRINTS: u8 = 1;
 /// What its bytes are, in messages.
@@ -33,6 +35,13 @@ pub(super) struct CommitRecord {
     pub(super) written: Vec<FactRecord>,
 }
 
+/// The commits of one entry, and who asked for each, in the same order; nobody knows where they are not there.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct EntryRecord {
+    pub(super) commits: Vec<CommitRecord>,
+    pub(super) callers: Vec<Arc<str>>,
+}
+
 /// The oldest revision that is kept, the commits since, and the answers that are remembered, the oldest first.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct SnapshotRecord {
@@ -40,6 +49,8 @@ pub(super) struct SnapshotRecord {
     pub(super) facts: Vec<FactRecord>,
     pub(super) commits: Vec<CommitRecord>,
     pub(super) remembered: Vec<(String, Fingerprint, u64)>,
+    /// To whom those answers were given, in the same order; to nobody knows whom where they are not there.
+    pub(super) callers: Vec<Arc<str>>,
 }
 
 /// A fact with who wrote it when.
@@ -71,18 +82,25 @@ pub(super) fn encode<T: Serialize>(value: &T) -> Vec<u8> {
     versioned::encode(FORMAT, value)
 }
 
-/// The commits of one entry.
-pub(super) fn decode_commits(bytes: &[u8]) -> Result<Vec<CommitRecord>, DecodeError> {
-    let (mut commits, version): (Vec<CommitRecord>, u8) = decode(bytes)?;
-    if version == DEBUG_FINGERPRINTS {
-        commits.iter_mut().for_each(|commit| commit.fingerprint = Fingerprint::UNKNOWN);
-    }
-    Ok(commits)
-}
-
+/// A record of this version or an earlier one, and which: each is the one before with one more list at its end.
 fn decode<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<(T, u8), DecodeError> {
     let version = versioned::version(DEBUG_FINGERPRINTS, FORMAT, RECORDS, bytes)?;
-    Ok((versioned::decode(version, RECORDS, bytes)?, version))
+    let record = match version {
+        // An empty list, as postcard writes it.
+        ..=WITHOUT_CALLERS => versioned::decode(version, RECORDS, &[bytes, &[0]].concat())?,
+        _ => versioned::decode(version, RECORDS, bytes)?,
+    };
+    Ok((record, version))
+}
+
+impl EntryRecord {
+    pub(super) fn decode(bytes: &[u8]) -> Result<EntryRecord, DecodeError> {
+        let (mut entry, version): (EntryRecord, u8) = decode(bytes)?;
+        if version == DEBUG_FINGERPRINTS {
+            entry.commits.iter_mut().for_each(|commit| commit.fingerprint = Fingerprint::UNKNOWN);
+        }
+        Ok(entry)
+    }
 }
 
 impl SnapshotRecord {

@@ -164,6 +164,7 @@ mod tests {
 
     fn project(pool: &mut WorldPool, base: u64, changes: Vec<Change>, reads: Footprint) -> ProjectionId {
         let request = ProjectRequest {
+            by: crate::access::Caller::default(),
             request_id: format!("{base} {changes:?} {reads:?}"),
             base: Revision(base),
             changes,

@@ -86,6 +86,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         self.sizes.check("changes", &request.changes)?;
         self.sizes.check("evidence", &request.evidence)?;
         let commit = Commit {
+            by: caller.clone(),
             id: request.commit_id,
             changes: each(request.changes, "changes")?,
             expected: (request.revision != 0).then_some(Revision(request.revision)),
@@ -111,6 +112,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         request.writers.iter().try_for_each(|writer| label(writer, "writers"))?;
         let lease = (request.lease_id != 0).then_some(LeaseId(request.lease_id));
         let projection = NewProjection {
+            by: caller.clone(),
             request_id: request.request_id,
             base: Revision(request.base_revision),
             changes: each(request.changes, "changes")?,
@@ -261,7 +263,8 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     ) -> Result<Response<v1::WorldPoolServiceReleaseResponse>, Status> {
         let (caller, projection) = (Caller::of(&request), ProjectionId(request.into_inner().projection_id));
         let pending = audit::begin(&caller, "", || Mutation::ReleaseProjection { projection: projection.0 });
-        let released = self.actor.request(|answer| Message::Release { projection, answer }).await;
+        let by = caller;
+        let released = self.actor.request(|answer| Message::Release { by, projection, answer }).await;
         pending.ended(&released);
         let released = released?;
         Ok(Response::new(v1::WorldPoolServiceReleaseResponse { released }))

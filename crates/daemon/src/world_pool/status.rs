@@ -1,7 +1,8 @@
 //! The world pool's errors as gRPC statuses.
 
-use super::core::{ProjectError, QueryError};
+use super::core::{MadeByAnother, ProjectError, QueryError};
 use super::history::{CommitError, RevisionError};
+use crate::access::Caller;
 use crate::details::{retry_later, status, status_about};
 use ratn_model::id::LeaseId;
 use std::time::Duration;
@@ -39,7 +40,10 @@ pub(super) fn of_project(error: &ProjectError) -> Status {
         ProjectError::Reused(_) => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
         ProjectError::Change(_) => (Code::FailedPrecondition, "CHANGE_DOES_NOT_APPLY"),
         ProjectError::Ended { .. } => (Code::FailedPrecondition, "PROJECTION_ENDED"),
-        ProjectError::TooMany { .. } => {
+        ProjectError::Quota { .. } => {
+            return retry_later(Code::ResourceExhausted, "QUOTA", error.to_string(), RETRY_DELAY);
+        }
+        ProjectError::TooMany { .. } | ProjectError::KeptForOperators { .. } => {
             return retry_later(Code::ResourceExhausted, "TOO_MANY", error.to_string(), RETRY_DELAY);
         }
     };
@@ -58,4 +62,16 @@ pub(super) fn of_query(error: &QueryError) -> Status {
 pub(super) fn lease_ended(lease: LeaseId) -> Status {
     let message = format!("{lease} has ended: acquire a new one and project under that");
     status(Code::FailedPrecondition, "LEASE_ENDED", message)
+}
+
+pub(super) fn lease_of_another(lease: LeaseId, opened_by: &str, caller: &Caller) -> Status {
+    let message = format!(
+        "{lease} is of a session of `{opened_by}`, and the projection is asked for by `{caller}`: acquire a lease of your own; only agents \
+         and operators project under the leases of others"
+    );
+    status(Code::PermissionDenied, "NOT_YOURS", message)
+}
+
+pub(super) fn of_release(error: &MadeByAnother) -> Status {
+    status(Code::PermissionDenied, "NOT_YOURS", error.to_string())
 }

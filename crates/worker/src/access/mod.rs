@@ -75,7 +75,7 @@ pub fn allowed(operation: Operation, roles: &[Role]) -> bool {
 }
 
 /// Somebody who was let in.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Caller {
     /// Proven by the connection: `uid 1000`, `control (certificate)`, `anonymous`. The same name is the same caller.
     pub name: Arc<str>,
@@ -123,9 +123,9 @@ impl Caller {
         self.roles.contains(&Operator)
     }
 
-    /// Whether they may give goals under a lease of a session that `opener` opened: their own; an agent's and an operator's word is taken for
+    /// Whether they may give goals, and make projections, under a lease of a session that `opener` opened: their own; an agent's and an operator's word is taken for
     /// others, for that is how one provider calls another.
-    pub(crate) fn may_act_for(&self, opener: &str) -> bool {
+    pub fn may_act_for(&self, opener: &str) -> bool {
         *self.name == *opener || self.is_operator() || self.roles.contains(&Agent)
     }
 

@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 use super::*;
+use crate::access::Role;
 use ratn_model::fact::Term;
 use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::value::Value;
@@ -12,6 +13,14 @@ fn key(name: &str) -> FactKey {
 
 fn set(name: &str, value: i64) -> Change {
     Change::Set { fact: key(name), value: Value::Int(value) }
+}
+
+fn operator() -> Caller {
+    Caller { name: "root".into(), roles: [Role::Operator].into() }
+}
+
+fn task(name: &str) -> Caller {
+    Caller { name: name.into(), roles: [Role::Task].into() }
 }
 
 fn pool() -> WorldPool {
@@ -32,6 +41,7 @@ fn commit(
 
 fn project(pool: &mut WorldPool, request: &str, base: u64, lease: u64) -> Result<ProjectionId, ProjectError> {
     pool.project(ProjectRequest {
+        by: operator(),
         request_id: request.to_owned(),
         base: Revision(base),
         changes: vec![set("box", 7)],
@@ -64,6 +74,7 @@ fn a_projection_is_of_its_base_whatever_was_committed_since() {
     commit(&mut pool, "b", &[set("box", 2), set("cup", 2)], None).unwrap();
     let all = Footprint::Everything;
     let request = ProjectRequest {
+        by: operator(),
         request_id: "p".to_owned(),
         base: Revision(1),
         changes: vec![set("box", 7)],
@@ -192,6 +203,7 @@ fn a_fact_says_who_wrote_it_and_what_measured_it() {
     assert_eq!(facts[1].1.measured, None);
     // In a projection each fact says who will have written it.
     let request = ProjectRequest {
+        by: operator(),
         request_id: "p".to_owned(),
         base: Revision(1),
         changes: vec![set("box", 7), set("cup", 8)],
@@ -214,6 +226,7 @@ fn a_commit_says_which_projections_it_contradicts_in_which_fact() {
     commit(&mut pool, "a", &[set("box", 1), set("cup", 1)], None).unwrap();
     let project = |pool: &mut WorldPool, base: u64, reads: &str| {
         let request = ProjectRequest {
+            by: operator(),
             request_id: format!("{base}/{reads}"),
             base: Revision(base),
             changes: vec![set("box", 7)],
@@ -238,6 +251,7 @@ fn a_commit_says_which_projections_it_contradicts_in_which_fact() {
     assert_eq!(pool.contradiction(of_box), Ok(None), "what it did not read is nothing to it");
     // Made of a revision that is not the newest: what has happened since counts.
     let of_all = ProjectRequest {
+        by: operator(),
         request_id: "late".to_owned(),
         base: Revision(1),
         changes: vec![set("box", 7)],
@@ -262,4 +276,78 @@ fn a_commit_says_which_projections_it_contradicts_in_which_fact() {
     assert!(pool.release(of_box));
     commit(&mut pool, "e", &[set("box", 9)], None).unwrap();
     assert!(pool.take_contradictions().iter().all(|found| found.projection == late), "the other has ended");
+}
+
+/// A projection that nothing but time ends.
+fn project_as(pool: &mut WorldPool, by: &Caller, request: &str) -> Result<ProjectionId, ProjectError> {
+    pool.project(ProjectRequest {
+        by: by.clone(),
+        request_id: request.to_owned(),
+        base: Revision(0),
+        changes: Vec::new(),
+        writers: Vec::new(),
+        reads: Footprint::Everything,
+        held_by: HeldBy::Until(Timestamp(5)),
+    })
+}
+
+#[test]
+fn a_projection_is_released_by_who_made_it_or_by_an_operator_and_the_same_request_of_another_makes_another() {
+    let config = WorldPoolConfig::default();
+    let mut pool = WorldPool::new(config.clone(), None, History::new(&config), 0);
+    let (adam, eve) = (task("adam"), task("eve"));
+    let first = project_as(&mut pool, &adam, "run/i1/1").unwrap();
+    assert_eq!(project_as(&mut pool, &adam, "run/i1/1"), Ok(first));
+    let second = project_as(&mut pool, &eve, "run/i1/1").unwrap();
+    assert_ne!(first, second);
+    let refused = pool.release_for(&eve, first).unwrap_err().to_string();
+    assert_eq!(refused, format!("{first} was made by adam: only they and operators release it, not eve"));
+    assert!(pool.has(first));
+    assert_eq!(pool.release_for(&adam, first), Ok(true));
+    assert_eq!(pool.release_for(&eve, first), Ok(false), "it had ended before");
+    assert_eq!(pool.release_for(&operator(), second), Ok(true));
+}
+
+#[test]
+fn one_caller_makes_so_many_projections_and_the_last_ones_of_all_are_operators() {
+    let config = WorldPoolConfig {
+        max_projections: 6,
+        projections_per_caller: 2,
+        projections_for_operators: 1,
+        ..WorldPoolConfig::default()
+    };
+    let mut pool = WorldPool::new(config.clone(), None, History::new(&config), 0);
+    let [adam, eve, cain] = ["adam", "eve", "cain"].map(task);
+    let first = project_as(&mut pool, &adam, "1").unwrap();
+    project_as(&mut pool, &adam, "2").unwrap();
+    let quota = ProjectError::Quota { whose: "adam".into(), limit: 2 };
+    assert_eq!(project_as(&mut pool, &adam, "3"), Err(quota));
+    assert_eq!(project_as(&mut pool, &adam, "1"), Ok(first), "asked for again it is no other");
+    pool.release_for(&adam, first).unwrap();
+    project_as(&mut pool, &adam, "3").unwrap();
+    for request in ["1", "2"] {
+        project_as(&mut pool, &eve, request).unwrap();
+    }
+    project_as(&mut pool, &cain, "1").unwrap();
+    assert_eq!(project_as(&mut pool, &cain, "2"), Err(ProjectError::KeptForOperators { limit: 5 }));
+    project_as(&mut pool, &operator(), "1").unwrap();
+    assert_eq!(project_as(&mut pool, &operator(), "2"), Err(ProjectError::TooMany { limit: 6 }));
+    // What time has ended counts no more.
+    pool.expire(Timestamp(5));
+    assert_eq!((pool.projections(), pool.made.len()), (0, 0));
+    project_as(&mut pool, &adam, "4").unwrap();
+}
+
+#[test]
+fn the_commit_of_another_is_another_and_an_operator_goes_on_with_what_anybody_began() {
+    let mut pool = pool();
+    let mut commit_as = |by: Caller, value: i64| {
+        let commit = Commit { by, id: "run/i1".to_owned(), changes: vec![set("box", value)], ..Commit::default() };
+        pool.commit(Timestamp(0), &commit)
+    };
+    assert_eq!(commit_as(task("adam"), 1), Ok(Revision(1)));
+    assert_eq!(commit_as(operator(), 1), Ok(Revision(1)), "a run is resumed by an operator");
+    assert_eq!(commit_as(task("eve"), 1), Ok(Revision(2)));
+    assert_eq!(commit_as(task("eve"), 2), Err(CommitError::Reused(Reused { id: "run/i1".to_owned() })));
+    assert_eq!(commit_as(task("adam"), 1), Ok(Revision(1)));
 }
