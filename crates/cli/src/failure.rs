@@ -42,14 +42,14 @@ impl fmt::Display for Failure {
     }
 }
 
-/// An error from below that came before anything was started.
+/// An error that came before anything was started.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
-pub(crate) struct Unbegun(pub(crate) String);
+pub(crate) struct NotStarted(pub(crate) String);
 
 impl<E: Into<anyhow::Error>> From<E> for Failure {
     fn from(error: E) -> Self {
         let error = error.into();
-        if error.is::<Unbegun>() { Failure::Refused(format!("ratn: {error:#}")) } else { Failure::Failed(error) }
+        if error.is::<NotStarted>() { Failure::Refused(format!("ratn: {error:#}")) } else { Failure::Failed(error) }
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! The first asks to end in order, the second to end at once, the third ends the process.
 
-use crate::aside::Aside;
+use crate::background_runtime::BackgroundRuntime;
 use ratn_worker::panic::exit_on_panic;
 use std::sync::Arc;
 use tokio::signal::unix::{SignalKind, signal};
@@ -15,7 +15,7 @@ const PATIENCE: u32 = 3;
 #[derive(Debug, Clone)]
 pub(crate) struct Interrupt {
     count: watch::Receiver<u32>,
-    _aside: Arc<Aside>,
+    _runtime: Arc<BackgroundRuntime>,
 }
 
 impl Interrupt {
@@ -24,9 +24,9 @@ impl Interrupt {
     /// # Errors
     /// Where the signals cannot be caught.
     pub(crate) fn listen() -> std::io::Result<Interrupt> {
-        let aside = Aside::start("signals")?;
+        let runtime = BackgroundRuntime::start("signals")?;
         let signals = [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()];
-        let [interrupt, terminate, hangup] = aside.within(|| signals.map(signal));
+        let [interrupt, terminate, hangup] = runtime.enter(|| signals.map(signal));
         let (mut interrupt, mut terminate, mut hangup) = (interrupt?, terminate?, hangup?);
         let (counter, count) = watch::channel(0);
         let listening = async move {
@@ -37,8 +37,8 @@ impl Interrupt {
             tokio::select! { _ = interrupt.recv() => {}, _ = terminate.recv() => {}, _ = hangup.recv() => {} }
             std::process::exit(EXIT_CODE_INTERRUPTED);
         };
-        aside.within(|| tokio::spawn(exit_on_panic("the watch of signals", listening)));
-        Ok(Interrupt { count, _aside: Arc::new(aside) })
+        runtime.enter(|| tokio::spawn(exit_on_panic("the watch of signals", listening)));
+        Ok(Interrupt { count, _runtime: Arc::new(runtime) })
     }
 
     /// Whether the user asked this process to end.

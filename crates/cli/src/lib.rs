@@ -6,7 +6,7 @@
 //! was started: a task file, a config or a command line.
 
 mod arguments;
-mod aside;
+mod background_runtime;
 mod columns;
 mod command;
 mod failure;

@@ -43,7 +43,7 @@ struct Host {
 
 /// What became of a host's certificate.
 #[derive(Debug, Serialize)]
-struct Made {
+struct HostCertificate {
     host: String,
     names: Vec<String>,
     cert: String,
@@ -162,10 +162,10 @@ fn certify(
     now: OffsetDateTime,
     until: OffsetDateTime,
     renew: bool,
-) -> anyhow::Result<Made> {
+) -> anyhow::Result<HostCertificate> {
     let (cert, key) = (directory.join(format!("{}.pem", host.name)), directory.join(format!("{}.key", host.name)));
     let names: Vec<String> = std::iter::once(&host.name).chain(&host.also).cloned().collect();
-    let made = |until| Made {
+    let made = |until| HostCertificate {
         host: host.name.clone(),
         names: names.clone(),
         cert: cert.display().to_string(),
@@ -214,10 +214,10 @@ fn day(date: Date) -> String {
     format!("{:04}-{:02}-{:02}", date.year(), u8::from(date.month()), date.day())
 }
 
-fn table(directory: &Path, made: &[Made]) -> String {
+fn table(directory: &Path, made: &[HostCertificate]) -> String {
     let of = |what: &str| directory.join(what).display().to_string();
     let mut lines = vec![format!("authority  {}  (its key, {}, stays here)", of("ca.pem"), of("ca.key"))];
-    for Made { host, names, cert, key, until } in made {
+    for HostCertificate { host, names, cert, key, until } in made {
         let until =
             until.as_ref().map_or("kept as it is: --renew makes a new one".to_owned(), |day| format!("until {day}"));
         lines.push(format!("{host}  {cert}, {key}  for {}, {until}", names.join(", ")));

@@ -158,7 +158,7 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
             WorkerKind::PathPlanner => ratn_workers::path_planner::run(options, speed).await,
             WorkerKind::Detector => ratn_workers::detector::run(options, arguments.pictures.clone()).await,
         }
-        .map_err(unbegun)
+        .map_err(refused_if_not_started)
     };
     blocking(exit_on_panic("the worker", run))
 }
@@ -244,7 +244,7 @@ fn daemon_on(
             core_ended(failure);
         }
         let _ = followed.await;
-        ended.map_err(unbegun)
+        ended.map_err(refused_if_not_started)
     })
 }
 
@@ -262,9 +262,9 @@ fn core_ended(failure: &CoreFailure) -> ! {
 }
 
 /// Refused where it could not listen, or another one has its state or its place: it has not begun then. Failed otherwise.
-fn unbegun(error: anyhow::Error) -> Failure {
-    let unbegun = error
+fn refused_if_not_started(error: anyhow::Error) -> Failure {
+    let not_started = error
         .chain()
         .any(|cause| cause.is::<BindError>() || cause.is::<OpenError>() || cause.is::<process_manager::RosterError>());
-    if unbegun { Failure::Refused(format!("ratn: {error:#}")) } else { Failure::Failed(error) }
+    if not_started { Failure::Refused(format!("ratn: {error:#}")) } else { Failure::Failed(error) }
 }

@@ -32,7 +32,7 @@ pub(crate) struct Statistics {
     /// How long task control was gone; what ran then went on or was stopped by its provider.
     pub(crate) away_s: f64,
     /// PIAs that began beside an older one whose exceptions are imprecise.
-    pub(crate) imprecise: Vec<Beside>,
+    pub(crate) imprecise: Vec<ImpreciseOverlap>,
     pub(crate) instances: Instances,
     pub(crate) ahead_of_time: AheadOfTime,
     pub(crate) resources: Vec<Busy>,
@@ -62,9 +62,9 @@ pub(crate) struct Instances {
     pub(crate) reused: usize,
 }
 
-/// One PIA beside another.
+/// A PIA that began while another one with imprecise exceptions ran.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct Beside {
+pub(crate) struct ImpreciseOverlap {
     /// What ran, and might have failed.
     pub(crate) older: String,
     /// What began, and would have stood.
@@ -133,7 +133,7 @@ impl Statistics {
             imprecise: run
                 .beside
                 .iter()
-                .map(|(older, younger)| Beside { older: older.clone(), younger: younger.clone() })
+                .map(|(older, younger)| ImpreciseOverlap { older: older.clone(), younger: younger.clone() })
                 .collect(),
             instances: Instances {
                 expanded: run.instances.len(),
@@ -315,7 +315,7 @@ impl Statistics {
         if self.away_s > 0.0 {
             writeln!(f, "  task control was gone for {:.1} s", self.away_s)?;
         }
-        if let Some(Beside { older, younger }) = self.imprecise.first() {
+        if let Some(ImpreciseOverlap { older, younger }) = self.imprecise.first() {
             let all = self.imprecise.len();
             writeln!(
                 f,

@@ -3,7 +3,7 @@
 pub(crate) mod config;
 mod launch;
 
-use crate::failure::Unbegun;
+use crate::failure::NotStarted;
 use crate::task_control::Endpoints;
 use crate::task_control::shell::Place;
 use anyhow::Context;
@@ -62,7 +62,7 @@ impl System {
     ) -> anyhow::Result<System> {
         let directory = RuntimeDirectory::create(directory).map_err(|error| {
             let error = anyhow::Error::from(error);
-            Unbegun(format!("cannot make the runtime directory {}: {error:#}", directory.display()))
+            NotStarted(format!("cannot make the runtime directory {}: {error:#}", directory.display()))
         })?;
         let mut config = config;
         let kept = [&mut config.resource_manager.storage, &mut config.world_pool.storage];

@@ -16,14 +16,14 @@ const MAX_LOGS: usize = 256;
 
 /// Adds up over logs.
 #[derive(Debug, Default)]
-pub(crate) struct Lessons {
+pub(crate) struct LearnedStatistics {
     /// By state: how many attempts ended with an outcome, and how long they took together.
     durations: BTreeMap<String, (u32, f64)>,
     /// By state and outcome: how often.
     outcomes: BTreeMap<String, BTreeMap<String, u32>>,
 }
 
-impl Lessons {
+impl LearnedStatistics {
     /// Adds what one log tells.
     pub(crate) fn add(&mut self, lines: &[LogLine]) {
         let mut fold = Fold::default();
@@ -75,14 +75,14 @@ struct Fold {
 }
 
 impl Fold {
-    fn event(&mut self, lessons: &mut Lessons, at: Timestamp, event: &Event) {
+    fn event(&mut self, statistics: &mut LearnedStatistics, at: Timestamp, event: &Event) {
         match event {
             Event::Finished { instance, attempt, .. } => {
                 let Some((_, began)) = self.started.remove(instance).filter(|started| started.0 == *attempt) else {
                     return;
                 };
                 if let Some(path) = self.paths.get(instance) {
-                    let (count, total_s) = lessons.durations.entry(path.clone()).or_default();
+                    let (count, total_s) = statistics.durations.entry(path.clone()).or_default();
                     *count += 1;
                     *total_s += at.since(began).as_secs_f64();
                 }
@@ -94,7 +94,7 @@ impl Fold {
         }
     }
 
-    fn command(&mut self, lessons: &mut Lessons, at: Timestamp, command: &Command) {
+    fn command(&mut self, statistics: &mut LearnedStatistics, at: Timestamp, command: &Command) {
         match command {
             Command::Start { instance, attempt, .. } => drop(self.started.insert(*instance, (*attempt, at))),
             Command::Cancel { instance, .. } => drop(self.started.remove(instance)),
@@ -105,7 +105,7 @@ impl Fold {
                 let path = without_visits(path);
                 // The number of elements of a collection is no outcome.
                 if decision.parse::<u64>().is_err() {
-                    lessons.came(&path, decision);
+                    statistics.came(&path, decision);
                 }
                 self.decided.insert(path);
             }
@@ -123,14 +123,14 @@ impl Fold {
 /// # Errors
 /// A log that is named and does not read. In a folder, what is no log of the task is left out.
 pub(crate) fn from_files(named: &[PathBuf], task: &str) -> Result<Learned, Failure> {
-    let mut lessons = Lessons::default();
+    let mut statistics = LearnedStatistics::default();
     let mut used = 0_usize;
     for path in named {
         if path.is_dir() {
             let logs = logs_in(path).map_err(|error| refused(path, &error))?;
             for lines in logs.iter().filter_map(|log| log::read(log).ok()).map(|log| log.lines) {
                 if of_task(&lines, task) {
-                    lessons.add(&lines);
+                    statistics.add(&lines);
                     used += 1;
                 }
             }
@@ -139,15 +139,15 @@ pub(crate) fn from_files(named: &[PathBuf], task: &str) -> Result<Learned, Failu
             if !of_task(&lines, task) {
                 return Err(refused(path, &format!("is not of the task `{task}`")));
             }
-            lessons.add(&lines);
+            statistics.add(&lines);
             used += 1;
         }
     }
     if !named.is_empty() {
-        let states = lessons.durations.len();
+        let states = statistics.durations.len();
         output::progress(format_args!("learned from {used} event logs how long {states} states take"));
     }
-    Ok(lessons.learned())
+    Ok(statistics.learned())
 }
 
 fn refused(path: &Path, reason: &dyn std::fmt::Display) -> Failure {
@@ -194,10 +194,10 @@ mod tests {
 
     #[test]
     fn durations_are_means_and_outcomes_are_shares_of_what_was_real() {
-        let mut lessons = Lessons::default();
-        lessons.add(&lines(LOOK));
+        let mut statistics = LearnedStatistics::default();
+        statistics.add(&lines(LOOK));
         // The second visit was squashed: neither its duration nor its outcome is known.
-        let learned = lessons.learned();
+        let learned = statistics.learned();
         assert_eq!(learned.durations_s, [("all/look".to_owned(), 2.0)].into());
         let shares: Vec<String> = learned.outcomes.iter().map(|(path, shares)| format!("{path} {shares:?}")).collect();
         assert_eq!(shares, [r#"all/found {"else": 0.5, "then": 0.5}"#, r#"all/look {"success": 1.0}"#]);
@@ -205,10 +205,10 @@ mod tests {
 
     #[test]
     fn logs_add_up() {
-        let mut lessons = Lessons::default();
-        lessons.add(&lines(LOOK));
-        lessons.add(&lines(&LOOK.replace("\"at\":2000000000", "\"at\":6000000000").replace("then", "else")));
-        let learned = lessons.learned();
+        let mut statistics = LearnedStatistics::default();
+        statistics.add(&lines(LOOK));
+        statistics.add(&lines(&LOOK.replace("\"at\":2000000000", "\"at\":6000000000").replace("then", "else")));
+        let learned = statistics.learned();
         assert_eq!(learned.durations_s["all/look"], 4.0);
         assert_eq!(learned.outcomes["all/found"], [("else".to_owned(), 0.75), ("then".to_owned(), 0.25)].into());
     }

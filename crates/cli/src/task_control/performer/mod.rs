@@ -14,8 +14,8 @@ use super::ledger::{Confirmed, acquire_request};
 use super::outside::Outside;
 use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorded, Recorder, said};
 use super::shell::Place;
-use crate::aside::Aside;
-use crate::failure::Unbegun;
+use crate::background_runtime::BackgroundRuntime;
+use crate::failure::NotStarted;
 use crate::output;
 use anyhow::{Context, bail};
 use futures::FutureExt;
@@ -86,7 +86,7 @@ pub(super) struct Performer {
     world: WorldClient,
     session: Session,
     /// Where the session is kept alive, whatever this thread does.
-    _aside: Aside,
+    _background: BackgroundRuntime,
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
     outside: Outside,
@@ -138,10 +138,10 @@ impl Performer {
         let channels = Channels::new();
         let run = run.to_owned();
         let manager = &place.endpoints.resource_manager;
-        let aside = Aside::start("session").context("cannot keep a session alive")?;
+        let background = BackgroundRuntime::start("session").context("cannot keep a session alive")?;
         // Over a connection of its own.
         let open = || Session::open_as(&Channels::new(), manager, run.clone(), "task-control", DEFAULT_TTL);
-        let session = aside.within(open);
+        let session = background.enter(open);
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, manager, session.id())?;
         only_run(&resources, task).await?;
@@ -169,7 +169,7 @@ impl Performer {
             actions: ActionClient::new(channels),
             world,
             session,
-            _aside: aside,
+            _background: background,
             events,
             records,
             outside: Outside::default(),
@@ -507,7 +507,7 @@ pub(crate) async fn only_run(resources: &ResourceClient, task: &str) -> anyhow::
         Ok(_) => Ok(()),
         Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
             let message = "another run is under way on this system: wait for its end, or use a system of your own";
-            Err(Unbegun(message.to_owned()).into())
+            Err(NotStarted(message.to_owned()).into())
         }
         Err(error) => bail!("cannot begin the run: {}", said(&error)),
     }
