@@ -35,16 +35,16 @@ pub struct Provider {
 struct Shared {
     client: ResourceClient,
     state: watch::Receiver<SessionState>,
-    /// By id. Held during a call, so that an older wish never overtakes a newer one.
-    wishes: Mutex<BTreeMap<String, Wish>>,
+    /// By id. Held during a call, so that an older state never overtakes a newer one.
+    desired: Mutex<BTreeMap<String, DesiredState>>,
     missing: Notify,
     /// Of what is offered: what is watched.
     kinds: watch::Sender<BTreeSet<String>>,
 }
 
-/// What shall be so at the manager.
+/// What a resource shall be at the manager: there, or gone.
 #[derive(Debug, Default)]
-struct Wish {
+struct DesiredState {
     /// What shall be there; `None` for what shall be gone.
     resource: Option<Resource>,
     /// Why it is not so yet, as told in the log.
@@ -63,7 +63,7 @@ impl Provider {
         let shared = Arc::new(Shared {
             client,
             state: session.state(),
-            wishes: Mutex::default(),
+            desired: Mutex::default(),
             missing: Notify::new(),
             kinds: watch::Sender::default(),
         });
@@ -85,19 +85,19 @@ impl Provider {
     /// # Errors
     /// [`CallError::Refused`] when the manager does not want it; it is not offered again.
     pub async fn offer(&self, resource: Resource) -> Result<bool, CallError> {
-        self.wish(resource.id.clone(), Some(resource)).await
+        self.set_desired(resource.id.clone(), Some(resource)).await
     }
 
     /// As [`Provider::offer`] for each of them, several at a time; what became of each, by id.
     pub async fn offer_all(&self, resources: Vec<Resource>) -> Vec<(String, Result<bool, CallError>)> {
-        let mut wishes = self.shared.wishes.lock().await;
+        let mut desired = self.shared.desired.lock().await;
         let ids: BTreeSet<String> = resources.iter().map(|resource| resource.id.clone()).collect();
         for resource in resources {
             self.shared.watch_for(&resource.kind);
-            let wish = wishes.entry(resource.id.clone()).or_default();
-            wish.resource = Some(resource);
+            let entry = desired.entry(resource.id.clone()).or_default();
+            entry.resource = Some(resource);
         }
-        self.shared.ask(&mut wishes, &ids).await
+        self.shared.ask(&mut desired, &ids).await
     }
 
     /// Withdraws a resource; who holds a lease of it loses it. True once it is gone; false when the manager cannot be asked
@@ -106,14 +106,14 @@ impl Provider {
     /// # Errors
     /// [`CallError::Refused`] when the manager does not let it go; that is not asked again.
     pub async fn withdraw(&self, id: &str) -> Result<bool, CallError> {
-        self.wish(id.to_owned(), None).await
+        self.set_desired(id.to_owned(), None).await
     }
 
     /// Withdraws a resource unless somebody holds it. True once it is gone; false when it is held, or the manager cannot be asked
     /// now: then it stays.
     pub async fn withdraw_unless_held(&self, id: &str) -> bool {
-        let mut wishes = self.shared.wishes.lock().await;
-        let Some(resource) = wishes.get(id).and_then(|wish| wish.resource.clone()) else { return true };
+        let mut desired = self.shared.desired.lock().await;
+        let Some(resource) = desired.get(id).and_then(|entry| entry.resource.clone()) else { return true };
         if !self.shared.state.borrow().alive {
             return false;
         }
@@ -124,7 +124,7 @@ impl Provider {
         match self.shared.client.delete_matching(requirement).await {
             Ok(deleted) => {
                 debug_assert_eq!(deleted, [id], "attributes of a resource are its own");
-                wishes.remove(id);
+                desired.remove(id);
                 true
             }
             Err(error) => {
@@ -134,19 +134,19 @@ impl Provider {
         }
     }
 
-    async fn wish(&self, id: String, resource: Option<Resource>) -> Result<bool, CallError> {
-        let mut wishes = self.shared.wishes.lock().await;
+    async fn set_desired(&self, id: String, resource: Option<Resource>) -> Result<bool, CallError> {
+        let mut desired = self.shared.desired.lock().await;
         if let Some(resource) = &resource {
             self.shared.watch_for(&resource.kind);
         }
-        wishes.entry(id.clone()).or_default().resource = resource;
-        let asked = self.shared.ask(&mut wishes, &BTreeSet::from([id])).await;
+        desired.entry(id.clone()).or_default().resource = resource;
+        let asked = self.shared.ask(&mut desired, &BTreeSet::from([id])).await;
         asked.into_iter().next().map_or(Ok(true), |(_, done)| done)
     }
 
     /// What is offered, by id.
     pub async fn offered(&self) -> Vec<Resource> {
-        self.shared.wishes.lock().await.values().filter_map(|wish| wish.resource.clone()).collect()
+        self.shared.desired.lock().await.values().filter_map(|entry| entry.resource.clone()).collect()
     }
 }
 
@@ -157,9 +157,9 @@ impl Shared {
 
     /// A resource is gone. What was to be there, and was, is offered again.
     async fn vanished(&self, id: &str, reason: &str) {
-        let mut wishes = self.wishes.lock().await;
-        let Some(wish) = wishes.get_mut(id).filter(|wish| wish.there && wish.resource.is_some()) else { return };
-        wish.there = false;
+        let mut desired = self.desired.lock().await;
+        let Some(entry) = desired.get_mut(id).filter(|entry| entry.there && entry.resource.is_some()) else { return };
+        entry.there = false;
         if self.state.borrow().alive {
             tracing::warn!(
                 resource = id,
@@ -171,27 +171,27 @@ impl Shared {
     }
 
     /// Asks for these, several at a time, if the session lives: true for what is so now, false for what will be asked for again. What
-    /// is gone, or refused for good, is no wish any more.
+    /// is gone, or refused for good, is not desired any more.
     async fn ask(
         &self,
-        wishes: &mut BTreeMap<String, Wish>,
+        desired: &mut BTreeMap<String, DesiredState>,
         ids: &BTreeSet<String>,
     ) -> Vec<(String, Result<bool, CallError>)> {
         if !self.state.borrow().alive {
             self.missing.notify_one();
             return ids.iter().map(|id| (id.clone(), Ok(false))).collect();
         }
-        let wished = ids.iter().filter_map(|id| Some((id.clone(), wishes.get(id)?.resource.clone())));
+        let wished = ids.iter().filter_map(|id| Some((id.clone(), desired.get(id)?.resource.clone())));
         let asked: Vec<_> = wished.map(|(id, resource)| ask(self.client.clone(), id, resource)).collect();
         let answers: Vec<_> = stream::iter(asked).buffer_unordered(AT_ONCE).collect().await;
         let mut concluded = Vec::with_capacity(answers.len());
         for (id, answer) in answers {
-            let Some(wish) = wishes.get_mut(&id) else { continue };
-            let done = wish.conclude(&id, answer);
+            let Some(entry) = desired.get_mut(&id) else { continue };
+            let done = entry.conclude(&id, answer);
             match &done {
                 Ok(false) => self.missing.notify_one(),
-                Ok(true) if wish.resource.is_some() => {}
-                Ok(true) | Err(_) => drop(wishes.remove(&id)),
+                Ok(true) if entry.resource.is_some() => {}
+                Ok(true) | Err(_) => drop(desired.remove(&id)),
             }
             concluded.push((id, done));
         }
@@ -208,11 +208,11 @@ async fn ask(client: ResourceClient, id: String, resource: Option<Resource>) -> 
     (id, answer)
 }
 
-impl Wish {
+impl DesiredState {
     /// Whether it is so now; an error where it never will be.
     fn conclude(&mut self, id: &str, answer: Result<(), CallError>) -> Result<bool, CallError> {
         match answer {
-            Err(error) if is_passing(&error) => {
+            Err(error) if is_transient(&error) => {
                 let problem = error.to_string();
                 if self.problem != problem {
                     tracing::warn!(resource = %id, "the resource manager will be asked again: {problem}");
@@ -232,7 +232,7 @@ impl Wish {
 
 /// Whether asking again later may help: nobody answers, the session is not known (yet, or any more), or a session that has
 /// a resource of this id may end.
-fn is_passing(error: &CallError) -> bool {
+fn is_transient(error: &CallError) -> bool {
     use Code::{AlreadyExists, DeadlineExceeded, FailedPrecondition, ResourceExhausted};
     matches!(error.code(), None | Some(FailedPrecondition | ResourceExhausted | DeadlineExceeded | AlreadyExists))
 }
@@ -263,10 +263,10 @@ async fn restore(shared: Arc<Shared>) {
 
 /// Asks for everything; whether all is so (or refused for good).
 async fn ask_for_all(shared: &Shared) -> bool {
-    let mut wishes = shared.wishes.lock().await;
-    let ids = wishes.keys().cloned().collect();
+    let mut desired = shared.desired.lock().await;
+    let ids = desired.keys().cloned().collect();
     let mut all = true;
-    for (id, done) in shared.ask(&mut wishes, &ids).await {
+    for (id, done) in shared.ask(&mut desired, &ids).await {
         match done {
             Ok(done) => all &= done,
             Err(error) => tracing::warn!(resource = %id, %error, "the resource manager refuses for good"),
@@ -293,11 +293,11 @@ async fn watch_own(shared: Arc<Shared>) {
 
 async fn watch_kinds(shared: &Shared, kinds: &BTreeSet<String>) {
     let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
-    let there = |wishes: &BTreeMap<String, Wish>| -> BTreeSet<String> {
-        wishes.iter().filter(|(_, wish)| wish.there).map(|(id, _)| id.clone()).collect()
+    let there = |desired: &BTreeMap<String, DesiredState>| -> BTreeSet<String> {
+        desired.iter().filter(|(_, entry)| entry.there).map(|(id, _)| id.clone()).collect()
     };
     // Known before the snapshot is made: what is not in it is gone.
-    let before = there(&*shared.wishes.lock().await);
+    let before = there(&*shared.desired.lock().await);
     let Ok(mut watch) = shared.client.watch(&kinds).await else { return };
     while let Ok(Some(update)) = watch.next().await {
         match update {

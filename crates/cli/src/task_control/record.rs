@@ -9,7 +9,7 @@ use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
 use ratn_model::measurement::Evidence;
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_proto::types::Resource;
-use ratn_worker::client::patiently;
+use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{CallError, Commit, Projection, ResourceClient, WorldClient};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -143,7 +143,7 @@ impl Recorder {
         if cancelled() {
             return None;
         }
-        let made = patiently(|| self.world.project(wanted.clone())).await;
+        let made = retry_unanswered(|| self.world.project(wanted.clone())).await;
         match made {
             Ok(projection) if cancelled() => {
                 let _ = self.world.release(projection).await;
@@ -200,11 +200,11 @@ pub(super) async fn commit_next(
     let mut attempts = MAX_OVERTAKEN;
     loop {
         commit.revision = Some(Revision(known.0 + 1));
-        match patiently(|| world.commit_as(commit.clone())).await {
+        match retry_unanswered(|| world.commit_as(commit.clone())).await {
             Ok((revision, _)) => return Ok(revision),
             Err(error) if error.code() == Some(tonic::Code::FailedPrecondition) && attempts > 0 => {
                 attempts -= 1;
-                let (_, root) = patiently(|| world.diff(known, None, &[])).await?;
+                let (_, root) = retry_unanswered(|| world.diff(known, None, &[])).await?;
                 if root == known {
                     return Err(error);
                 }
@@ -234,7 +234,7 @@ pub(super) async fn operate_once(
         // The executive gives these to an acquire.
         ResourceOperation::Block | ResourceOperation::Exists => Ok(()),
     };
-    patiently(ask).await
+    retry_unanswered(ask).await
 }
 
 /// An error with its sources in one line.

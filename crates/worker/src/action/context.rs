@@ -2,7 +2,7 @@
 
 use super::goal::GoalEntry;
 use super::{ActionFailure, InputError, Port};
-use crate::client::{ActionClient, CallError, Channels, WorldClient, patiently};
+use crate::client::{ActionClient, CallError, Channels, WorldClient, retry_unanswered};
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::safety::{Safety, SafetyState};
 use ratn_model::fact::{Change, FactPattern};
@@ -271,7 +271,7 @@ impl GoalContext {
     pub async fn facts(&self, patterns: &[FactPattern]) -> Result<Vec<FactRecord>, WorldFailure> {
         let client = self.world_client()?;
         // It may be started again just now.
-        Ok(patiently(|| client.query(self.projection, patterns)).await?)
+        Ok(retry_unanswered(|| client.query(self.projection, patterns)).await?)
     }
 
     pub(super) fn world_client(&self) -> Result<WorldClient, WorldFailure> {

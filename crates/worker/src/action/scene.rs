@@ -2,7 +2,7 @@
 
 use super::GoalContext;
 use super::context::WorldFailure;
-use crate::client::patiently;
+use crate::client::retry_unanswered;
 use ratn_world::digest::Digest;
 use ratn_world::scene::Scene;
 use ratn_world::scene::delta::Scenes;
@@ -35,12 +35,12 @@ impl GoalContext {
     pub async fn scene(&self, cache: &SceneCache) -> Result<Arc<Scene>, WorldFailure> {
         let client = self.world_client()?;
         let bases: Vec<Digest> = cache.kept().digests().collect();
-        let delta = patiently(|| client.scene(self.projection, &bases)).await?;
+        let delta = retry_unanswered(|| client.scene(self.projection, &bases)).await?;
         if let Ok(scene) = cache.kept().apply(&delta) {
             return Ok(scene);
         }
         // Other goals have used others meanwhile.
-        let whole = patiently(|| client.scene(self.projection, &[])).await?;
+        let whole = retry_unanswered(|| client.scene(self.projection, &[])).await?;
         Ok(cache.kept().apply(&whole)?)
     }
 }

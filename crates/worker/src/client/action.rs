@@ -1,6 +1,6 @@
 //! The client of action services: workers, and the modules of the robot.
 
-use super::patience::{PAUSE, TRIES};
+use super::retry::{PAUSE, TRIES};
 use super::{CallError, Channels};
 use crate::endpoint::Endpoint;
 use crate::trace::Traced;

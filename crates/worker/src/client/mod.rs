@@ -3,17 +3,17 @@
 mod action;
 mod error;
 mod health;
-mod patience;
 mod process;
 mod resource;
+mod retry;
 mod world;
 
 pub use action::{ActionClient, ActionInfo, Fate, ProviderInfo};
 pub use error::CallError;
 pub use health::{Health, NOT_SERVING, wait_until_serving};
-pub use patience::{PAUSE, patiently, until_answered};
 pub use process::{LogPieces, ProcessClient, WorkerWatch};
 pub use resource::{AcquireOptions, DemandWatch, ResourceClient, ResourceWatch};
+pub use retry::{PAUSE, retry_unanswered, retry_until_answered};
 pub use world::{Commit, Projection, ProjectionWatch, WorldClient, WorldWatch};
 
 use crate::endpoint::{Endpoint, connect_lazily};

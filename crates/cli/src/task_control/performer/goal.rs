@@ -9,7 +9,7 @@ use ratn_model::measurement::Measurement;
 use ratn_model::program::{ABORTED, PREEMPTED};
 use ratn_model::value::Value;
 use ratn_proto::types::{Goal, GoalOutcome};
-use ratn_worker::client::patiently;
+use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{ActionClient, CallError, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::DEFAULT_TTL;
@@ -133,13 +133,13 @@ impl Performing {
     async fn would_be_known(&self, endpoint: &Endpoint) -> bool {
         let Some((lease, provider)) = self.provider(endpoint) else { return false };
         let owner = async || {
-            let resource = patiently(|| self.resources.get(&provider)).await.ok()?;
+            let resource = retry_unanswered(|| self.resources.get(&provider)).await.ok()?;
             let held = resource.holdings.iter().any(|holding| holding.lease == lease);
             held.then_some(resource.session)
         };
         let lives = async {
             let owned_by = owner().await?;
-            let sessions = patiently(|| self.resources.sessions()).await.ok()?;
+            let sessions = retry_unanswered(|| self.resources.sessions()).await.ok()?;
             let ttl_ms = sessions.iter().find(|session| session.id == owned_by)?.ttl_ms;
             tokio::time::sleep(Duration::from_millis(ttl_ms) + SESSION_SLACK).await;
             Some(owner().await? == owned_by)

@@ -30,7 +30,7 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{self, Resource, WorldChange};
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
-use ratn_worker::client::{patiently, until_answered};
+use ratn_worker::client::{retry_unanswered, retry_until_answered};
 use ratn_worker::session::{DEFAULT_TTL, Session};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
@@ -190,7 +190,7 @@ impl Performer {
 
     /// The root world as it is now; of every revision after it [`Performer::accept`] will hear.
     pub(super) async fn root(&mut self) -> anyhow::Result<(Revision, Vec<(FactKey, Value)>)> {
-        let (revision, facts) = patiently(|| self.world.root()).await?;
+        let (revision, facts) = retry_unanswered(|| self.world.root()).await?;
         self.follow(revision)?;
         Ok((revision, facts.into_iter().map(|fact| (fact.key, fact.value)).collect()))
     }
@@ -326,10 +326,10 @@ impl Performer {
                 Some(lease) => Ok(lease),
                 None => tokio::select! {
                     // A manager that does not answer is waited for until the run gives its session up ([`Performer::lost`]).
-                    answer = until_answered(ask) => answer,
+                    answer = retry_until_answered(ask) => answer,
                     () = withdrawn.cancelled() => {
                         // The call is dropped; what was granted meanwhile goes back.
-                        let _ = patiently(|| resources.withdraw(&options.request)).await;
+                        let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
                         return;
                     }
                 },
@@ -486,12 +486,12 @@ impl Performer {
                 let _ = job.ended.await;
             }
             if let Some(projection) = projection
-                && let Err(error) = patiently(|| world.release(projection)).await
+                && let Err(error) = retry_unanswered(|| world.release(projection)).await
             {
                 tracing::warn!(%instance, "a projection was not given back: {}", said(&error));
             }
             if let Some(lease) = lease
-                && let Err(error) = patiently(|| resources.release(lease)).await
+                && let Err(error) = retry_unanswered(|| resources.release(lease)).await
             {
                 tracing::warn!(%instance, "a lease was not given back: {}", said(&error));
             }
@@ -503,7 +503,7 @@ impl Performer {
 /// goes with the run's session.
 pub(crate) async fn only_run(resources: &ResourceClient, task: &str) -> anyhow::Result<()> {
     let claim = Resource::new(RUN, ResourceClass::Task, "Run").with_attribute("task", Value::String(task.to_owned()));
-    match patiently(|| resources.create(claim.clone())).await {
+    match retry_unanswered(|| resources.create(claim.clone())).await {
         Ok(_) => Ok(()),
         Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
             let message = "another run is under way on this system: wait for its end, or use a system of your own";

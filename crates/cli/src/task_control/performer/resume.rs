@@ -15,7 +15,7 @@ use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, Revision};
 use ratn_proto::types::{Resource, WorldUpdate};
-use ratn_worker::client::patiently;
+use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{Channels, WorldClient};
 use ratn_world::world::World;
 use std::cmp::Reverse;
@@ -24,7 +24,7 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Refuses a world that is not the run's. Changes nothing.
 pub(in crate::task_control) async fn check_world(endpoints: &Endpoints, ledger: &Ledger) -> anyhow::Result<()> {
     let world = WorldClient::new(&Channels::new(), &endpoints.world_pool)?;
-    let (root, _) = patiently(|| world.root()).await?;
+    let (root, _) = retry_unanswered(|| world.root()).await?;
     if root < ledger.first_revision {
         bail!(
             "the world pool's root is at {root}, and the run began at {}: the world pool has lost its \
@@ -41,7 +41,7 @@ pub(in crate::task_control) async fn remembers(endpoints: &Endpoints, ledger: &L
         return Ok(true);
     }
     let world = WorldClient::new(&Channels::new(), &endpoints.world_pool)?;
-    let (root, _) = patiently(|| world.root()).await?;
+    let (root, _) = retry_unanswered(|| world.root()).await?;
     Ok(youngest_there(&world, ledger, root).await?.0.is_some())
 }
 
@@ -54,12 +54,12 @@ async fn youngest_there(
 ) -> anyhow::Result<(Option<usize>, Revision)> {
     // Any fact says how far back the pool can tell.
     let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
-    let (_, oldest) = patiently(|| world.history(any.clone())).await?;
+    let (_, oldest) = retry_unanswered(|| world.history(any.clone())).await?;
     let after = oldest.max(ledger.first_revision);
     let run = &ledger.origin.run;
     let ids: BTreeMap<String, usize> =
         ledger.commits.iter().enumerate().map(|(place, decided)| (decided.id(run), place + 1)).collect();
-    let mut watch = patiently(|| world.watch(Some(after), &[])).await?;
+    let mut watch = retry_unanswered(|| world.watch(Some(after), &[])).await?;
     let (mut told, mut there) = (after, None);
     while told < root {
         let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
@@ -97,7 +97,7 @@ impl Performer {
         }
         // What crossed with the end of task control goes back; a waiting one has left the queue with its connection.
         for request in &ledger.withdrawn {
-            let _ = patiently(|| self.resources.withdraw(request)).await;
+            let _ = retry_unanswered(|| self.resources.withdraw(request)).await;
         }
         for (instance, asked) in ledger.projecting {
             let attempt = asked.attempt;
@@ -119,7 +119,7 @@ impl Performer {
     /// Makes every commit that the world pool does not have, and compares the two worlds: what is otherwise in the pool was changed
     /// from outside.
     async fn commit_again(&mut self, ledger: &Ledger, mirror: &World) -> anyhow::Result<Option<Event>> {
-        let (mut root, _) = patiently(|| self.world.root()).await?;
+        let (mut root, _) = retry_unanswered(|| self.world.root()).await?;
         let there = self.commits_there(ledger, root).await?;
         for decided in &ledger.commits[there..] {
             let commit = decided.clone().commit(&self.run);
@@ -156,7 +156,7 @@ impl Performer {
     }
 
     async fn living_leases(&self) -> anyhow::Result<BTreeSet<LeaseId>> {
-        let resources = patiently(|| self.resources.list(&[])).await?;
+        let resources = retry_unanswered(|| self.resources.list(&[])).await?;
         let own = |resource: Resource| {
             let holdings = resource.holdings.into_iter().filter(|holding| holding.session == self.run);
             holdings.map(|holding| holding.lease).collect::<Vec<_>>()

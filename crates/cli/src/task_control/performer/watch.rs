@@ -6,7 +6,7 @@ use ratn_executive::protocol::Event;
 use ratn_model::id::{InstanceId, Revision};
 use ratn_proto::types::WorldUpdate;
 use ratn_worker::client::{CallError, WorldClient};
-use ratn_worker::client::{PAUSE, patiently};
+use ratn_worker::client::{PAUSE, retry_unanswered};
 use tokio::sync::mpsc;
 
 /// Tells of every revision after one, in order and without a gap, as long as somebody listens. A pool that comes back with its
@@ -33,7 +33,7 @@ pub(super) async fn follow(world: WorldClient, mut after: Revision, events: mpsc
 }
 
 async fn tell(world: &WorldClient, after: &mut Revision, events: &mpsc::Sender<Answer>) -> Result<(), CallError> {
-    let mut watch = patiently(|| world.watch(Some(*after), &[])).await?;
+    let mut watch = retry_unanswered(|| world.watch(Some(*after), &[])).await?;
     while let Some(update) = watch.next().await? {
         if let WorldUpdate::Changed(change) = update {
             *after = change.revision;
