@@ -25,23 +25,23 @@ const LOOK_INTERVAL: Duration = Duration::from_millis(250);
 /// The resources wanted, by id.
 pub(crate) type Wanted = BTreeMap<String, Resource>;
 
-/// What became of a resource.
+/// What became of a resource that was to be offered or withdrawn.
 #[derive(Debug)]
-pub(crate) enum Offering {
-    /// It is there.
-    There(String),
-    /// It was to leave, and is gone.
-    Gone(String),
-    /// It was to leave, and somebody holds it. It is tried again.
-    Kept(String),
+pub(crate) enum OfferEvent {
+    /// The resource manager has it.
+    Offered(String),
+    /// It was draining, and the resource manager does not have it any more.
+    Withdrawn(String),
+    /// It is draining, and somebody holds it: the withdrawal is tried again.
+    StillHeld(String),
 }
 
-/// How resources come and go.
+/// Reports which resources are offered, and withdraws those that are to drain.
 #[derive(Debug)]
-pub(crate) struct Turnover {
-    pub(crate) told: mpsc::Sender<Offering>,
-    /// Those of the wanted that are to go as soon as nobody holds them.
-    pub(crate) leaving: watch::Receiver<BTreeSet<String>>,
+pub(crate) struct OfferLifecycle {
+    pub(crate) events: mpsc::Sender<OfferEvent>,
+    /// Those of the wanted that are withdrawn as soon as nobody holds them.
+    pub(crate) draining: watch::Receiver<BTreeSet<String>>,
 }
 
 /// Where the resource manager is.
@@ -60,8 +60,8 @@ pub(crate) struct Link {
     pub(crate) session: Option<String>,
     pub(crate) ttl: Duration,
     pub(crate) wanted: watch::Receiver<Wanted>,
-    /// Hears of each resource once it is there, and gives back those that are free.
-    pub(crate) there: Option<Turnover>,
+    /// For a provider whose resources come and go.
+    pub(crate) lifecycle: Option<OfferLifecycle>,
     /// Hears what is missing.
     pub(crate) demand: Option<DemandLink>,
 }
@@ -139,19 +139,19 @@ impl Link {
                 }
             }
             refused.retain(|id, resource| wanted.get(id) == Some(resource));
-            let leaving = self.let_go(&provider, &mut offered).await;
+            let draining = self.withdraw_drained(&provider, &mut offered).await;
             let is_new = |(id, resource): &(&String, &Resource)| {
-                offered.get(*id) != Some(*resource) && !refused.contains_key(*id) && !leaving.contains(*id)
+                offered.get(*id) != Some(*resource) && !refused.contains_key(*id) && !draining.contains(*id)
             };
             let new = wanted.iter().filter(is_new).map(|(_, resource)| resource.clone()).collect();
-            let mut settled = leaving.is_empty();
+            let mut settled = draining.is_empty();
             for (id, done) in provider.offer_all(new).await {
                 let resource = wanted.get(&id).cloned().into_iter().map(|resource| (id.clone(), resource));
                 match done {
                     Ok(true) => {
                         offered.extend(resource);
-                        if let Some(there) = &self.there {
-                            let _ = there.told.send(Offering::There(id)).await;
+                        if let Some(lifecycle) = &self.lifecycle {
+                            let _ = lifecycle.events.send(OfferEvent::Offered(id)).await;
                         }
                     }
                     // The provider offers it by itself as soon as it can; asked again only to learn that it has.
@@ -175,7 +175,7 @@ impl Link {
             panic_point("link");
             tokio::select! {
                 changed = self.wanted.changed() => return changed.is_ok(),
-                () = more_leave(&mut self.there) => return true,
+                () = drains_changed(&mut self.lifecycle) => return true,
                 () = tokio::time::sleep(LOOK_INTERVAL) => match self.manager.has_moved_from(endpoint) {
                     true => return false,
                     false if !settled => return true,
@@ -196,23 +196,26 @@ impl Link {
         Ok(())
     }
 
-    /// Withdraws those that leave and that nobody holds; those that leave.
-    async fn let_go(&mut self, provider: &Provider, offered: &mut Wanted) -> BTreeSet<String> {
-        let Some(there) = &mut self.there else { return BTreeSet::new() };
-        let leaving = there.leaving.borrow_and_update().clone();
-        for id in &leaving {
+    /// Withdraws the draining resources that nobody holds; returns all that are draining.
+    async fn withdraw_drained(&mut self, provider: &Provider, offered: &mut Wanted) -> BTreeSet<String> {
+        let Some(lifecycle) = &mut self.lifecycle else { return BTreeSet::new() };
+        let draining = lifecycle.draining.borrow_and_update().clone();
+        for id in &draining {
             let gone = !offered.contains_key(id) || provider.withdraw_unless_held(id).await;
             if gone {
                 offered.remove(id);
             }
-            let _ = there.told.send(if gone { Offering::Gone(id.clone()) } else { Offering::Kept(id.clone()) }).await;
+            let _ = lifecycle
+                .events
+                .send(if gone { OfferEvent::Withdrawn(id.clone()) } else { OfferEvent::StillHeld(id.clone()) })
+                .await;
         }
-        leaving
+        draining
     }
 }
 
-async fn more_leave(there: &mut Option<Turnover>) {
-    let changed = async { there.as_mut()?.leaving.changed().await.ok() };
+async fn drains_changed(lifecycle: &mut Option<OfferLifecycle>) {
+    let changed = async { lifecycle.as_mut()?.draining.changed().await.ok() };
     if changed.await.is_none() {
         std::future::pending().await
     }

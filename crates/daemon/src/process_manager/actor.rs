@@ -6,13 +6,13 @@ use super::machine::Sample;
 use super::offered;
 use super::pools::{Command, Event, PoolError, Pools, Restart};
 use super::predecessor::Adopted;
-use super::processes::{Processes, Told};
+use super::processes::{ProcessEvents, Processes};
 use super::roster::Roster;
 use super::spawner::Outcome;
 use super::tracking::Tracker;
 use super::usage::Usage;
 use crate::demand::{Shortages, Use};
-use crate::link::{Offering, Wanted};
+use crate::link::{OfferEvent, Wanted};
 use nix::sys::signal::Signal;
 use ratn_model::time::Timestamp;
 use ratn_panic_point::panic_point;
@@ -73,10 +73,10 @@ pub(super) struct Parts {
     pub(super) adopted: Vec<Adopted>,
     /// What the link shall offer.
     pub(super) wanted: watch::Sender<Wanted>,
-    /// What of it is to go as soon as nobody holds it.
-    pub(super) leaves: watch::Sender<BTreeSet<String>>,
-    /// What became of it.
-    pub(super) there: mpsc::Receiver<Offering>,
+    /// Those of them that are withdrawn as soon as nobody holds them.
+    pub(super) drains: watch::Sender<BTreeSet<String>>,
+    /// What became of these resources.
+    pub(super) offer_events: mpsc::Receiver<OfferEvent>,
     /// Who is held.
     pub(super) uses: mpsc::Receiver<Use>,
     /// What is missing.
@@ -95,7 +95,7 @@ struct Actor {
     processes: Processes,
     start: Instant,
     wanted: watch::Sender<Wanted>,
-    leaves: watch::Sender<BTreeSet<String>>,
+    drains: watch::Sender<BTreeSet<String>>,
     short: watch::Sender<Shortages>,
     watchers: Vec<mpsc::Sender<WorkerStatus>>,
     usage: Usage,
@@ -117,15 +117,15 @@ pub(super) fn start(
         before,
         adopted,
         wanted,
-        leaves,
-        there,
+        drains,
+        offer_events,
         uses,
         demand,
         short,
         looks,
     } = parts;
     let (drained, tracking) = (Drained::of(&directory), tracker.mode());
-    let (processes, told) = Processes::start(&config, directory, roster, tracker)?;
+    let (processes, events) = Processes::start(&config, directory, roster, tracker)?;
     let mut pools = Pools::new(&config.host, config.templates).with_labels(config.labels.clone());
     pools.go_on_after(&before);
     let actor = Actor {
@@ -136,13 +136,13 @@ pub(super) fn start(
         tracking,
         start: Instant::now(),
         wanted,
-        leaves,
+        drains,
         short,
         watchers: Vec::new(),
         usage: Usage::new(),
         drained,
     };
-    let inputs = Inputs { messages, told, there, uses, demand, looks };
+    let inputs = Inputs { messages, events, offer_events, uses, demand, looks };
     let running = async move {
         let _ = vitals.guard("the actor of the pools", actor.run(adopted, inputs, &vitals, shutdown)).await;
     };
@@ -159,8 +159,8 @@ impl Handle {
 
 struct Inputs {
     messages: mpsc::Receiver<Message>,
-    told: Told,
-    there: mpsc::Receiver<Offering>,
+    events: ProcessEvents,
+    offer_events: mpsc::Receiver<OfferEvent>,
     uses: mpsc::Receiver<Use>,
     demand: mpsc::Receiver<Vec<Demand>>,
     looks: mpsc::Receiver<Sample>,
@@ -183,14 +183,14 @@ impl Actor {
             panic_point("process-manager-actor");
             let deadline = self.pools.next_deadline().map(|at| self.start + Duration::from_nanos(at.0));
             tokio::select! {
-                Some(outcome) = inputs.told.outcomes.recv() => self.became(outcome),
-                Some((id, endpoint)) = inputs.told.serving.recv() => {
+                Some(outcome) = inputs.events.outcomes.recv() => self.became(outcome),
+                Some((id, endpoint)) = inputs.events.serving.recv() => {
                     self.processes.serves(&id, &endpoint);
                     self.handle(Event::Serving { id, endpoint });
                 }
-                Some(health) = inputs.told.health.recv() => {
+                Some(health) = inputs.events.health.recv() => {
                     // They are asked together, so they answer together.
-                    let more = std::iter::from_fn(|| inputs.told.health.try_recv().ok()).take(AT_ONCE);
+                    let more = std::iter::from_fn(|| inputs.events.health.try_recv().ok()).take(AT_ONCE);
                     for (id, answer) in std::iter::once(health).chain(more) {
                         self.handle(match answer {
                             Ok(()) => Event::Answered { id },
@@ -198,10 +198,10 @@ impl Actor {
                         });
                     }
                 }
-                Some(offering) = inputs.there.recv() => self.handle(match offering {
-                    Offering::There(id) => Event::Offered { id },
-                    Offering::Gone(id) => Event::Withdrawn { id },
-                    Offering::Kept(id) => Event::Kept { id },
+                Some(event) = inputs.offer_events.recv() => self.handle(match event {
+                    OfferEvent::Offered(id) => Event::Offered { id },
+                    OfferEvent::Withdrawn(id) => Event::Withdrawn { id },
+                    OfferEvent::StillHeld(id) => Event::Kept { id },
                 }),
                 Some(Use { id, held }) = inputs.uses.recv() => self.handle(Event::Used { id, held }),
                 Some(demand) = inputs.demand.recv() => self.handle(Event::Demanded(demand)),
@@ -212,7 +212,7 @@ impl Actor {
                 () = shutdown.cancelled() => break,
             }
         }
-        self.end(&mut inputs.told.outcomes).await;
+        self.end(&mut inputs.events.outcomes).await;
     }
 
     fn adopt(&mut self, adopted: Adopted) {
@@ -341,17 +341,17 @@ impl Actor {
                 Command::Offer { worker, kind } => self.offer(&worker, &kind),
                 Command::Withdraw { id } => {
                     self.wanted.send_if_modified(|wanted| wanted.remove(&id).is_some());
-                    self.leaves.send_if_modified(|leaves| leaves.remove(&id));
+                    self.drains.send_if_modified(|drains| drains.remove(&id));
                 }
-                // Also where it leaves already: then it is tried at once.
-                Command::Retire { id } => self.leaves.send_modify(|leaves| {
-                    leaves.insert(id);
+                // Also where it drains already: then it is tried at once.
+                Command::Retire { id } => self.drains.send_modify(|drains| {
+                    drains.insert(id);
                 }),
                 Command::Keep { id } => {
-                    self.leaves.send_if_modified(|leaves| leaves.remove(&id));
+                    self.drains.send_if_modified(|drains| drains.remove(&id));
                 }
                 Command::Check { id, within } => self.processes.check(&id, within),
-                Command::Tell(worker) => self.watchers.retain(|watcher| watcher.try_send(worker.clone()).is_ok()),
+                Command::Notify(worker) => self.watchers.retain(|watcher| watcher.try_send(worker.clone()).is_ok()),
             }
         }
         self.short.send_if_modified(|said| {

@@ -57,7 +57,7 @@ pub(super) struct Groups {
 
 /// What is in force for a worker; its groups go with this.
 #[derive(Debug, Default)]
-pub(super) struct InForce {
+pub(super) struct AppliedLimits {
     words: Vec<String>,
     groups: Vec<Group>,
 }
@@ -77,8 +77,8 @@ impl Limits {
     }
 
     /// Puts them on a process that has just been started.
-    pub(super) fn enforce(&self, id: &str, pid: u32, groups: &Groups) -> InForce {
-        let mut force = InForce::default();
+    pub(super) fn enforce(&self, id: &str, pid: u32, groups: &Groups) -> AppliedLimits {
+        let mut force = AppliedLimits::default();
         let mut missing = *self;
         if let Some(v2) = groups.v2.as_deref() {
             match self.group(v2, id, pid) {
@@ -182,10 +182,10 @@ impl Limits {
     }
 }
 
-impl InForce {
+impl AppliedLimits {
     /// Those of a worker that was taken over, whose groups go with this.
-    pub(super) fn adopted(groups: Vec<PathBuf>) -> InForce {
-        InForce { words: Vec::new(), groups: groups.into_iter().map(|path| Group { path }).collect() }
+    pub(super) fn adopted(groups: Vec<PathBuf>) -> AppliedLimits {
+        AppliedLimits { words: Vec::new(), groups: groups.into_iter().map(|path| Group { path }).collect() }
     }
 
     /// The directories of its groups.

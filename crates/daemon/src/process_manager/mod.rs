@@ -44,7 +44,7 @@ pub use template::{Liveness, Needs, Template};
 pub use tracking::Tracking;
 
 use crate::demand::{DemandLink, Shortages};
-use crate::link::{LINK, Link, Manager, Turnover, Wanted};
+use crate::link::{LINK, Link, Manager, OfferLifecycle, Wanted};
 use anyhow::Context;
 use machine::Machine;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
@@ -62,8 +62,8 @@ use tracking::Tracker;
 
 /// The role's name: of its endpoint file, its command and its section of a config.
 pub const ROLE: &str = "process-manager";
-/// What became of resources which the actor was not told of yet.
-const THERE: usize = 1_024;
+/// Reports of the link that wait for the actor.
+const OFFER_EVENTS: usize = 1_024;
 /// A child that was being started when its process manager was killed holds the place until its program begins.
 const TAKE_PATIENCE: Duration = Duration::from_millis(500);
 /// States of the demand that the actor was not told of yet.
@@ -117,9 +117,9 @@ pub async fn run_as(
     let host = offered::host(&config, &endpoint);
     let offered = workers.chain([host.clone()]);
     wanted.send_modify(|wanted| wanted.extend(offered.map(|resource| (resource.id.clone(), resource))));
-    let (told, there) = mpsc::channel(THERE);
-    let (leaves, leaving) = watch::channel(BTreeSet::new());
-    let (used, uses) = mpsc::channel(THERE);
+    let (report, offer_events) = mpsc::channel(OFFER_EVENTS);
+    let (drains, draining) = watch::channel(BTreeSet::new());
+    let (used, uses) = mpsc::channel(OFFER_EVENTS);
     let (heard, demand) = mpsc::channel(DEMANDS);
     let (short, shortages) = watch::channel(Shortages::new());
     let link = Link {
@@ -128,7 +128,7 @@ pub async fn run_as(
         session: Some(session_of(&directory).context("cannot keep the session's name")?),
         ttl: Duration::from_millis(config.session_ttl_ms),
         wanted: to_offer,
-        there: Some(Turnover { told, leaving }),
+        lifecycle: Some(OfferLifecycle { events: report, draining }),
         demand: Some(DemandLink {
             kinds: config.kinds(),
             attributes: offered::attributes(&config.host, &config.labels),
@@ -150,8 +150,8 @@ pub async fn run_as(
         before,
         adopted,
         wanted,
-        leaves,
-        there,
+        drains,
+        offer_events,
         uses,
         demand,
         short,

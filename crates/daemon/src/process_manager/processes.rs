@@ -8,7 +8,7 @@ use super::log::{Awaited, EndedLogs};
 use super::log_file::log_file;
 use super::parameter;
 use super::predecessor::{self, Adopted, adopt_socket};
-use super::readiness::{Pulse, Readiness, Signs};
+use super::readiness::{HealthCheck, Readiness, ReadinessCheck};
 use super::roster::{Entry, Intent, Roster};
 use super::spawner::{self, Job, Outcome};
 use super::template::Template;
@@ -37,8 +37,8 @@ const REAP_INTERVAL: Duration = Duration::from_secs(5);
 /// A part of this process, for the log.
 const HEALTH_OF_WORKER: &str = "the health check of a worker";
 
-/// What is told of them.
-pub(super) struct Told {
+/// What happens to the processes.
+pub(super) struct ProcessEvents {
     pub(super) outcomes: mpsc::Receiver<Outcome>,
     /// The id and the endpoint of each that serves.
     pub(super) serving: mpsc::Receiver<(String, String)>,
@@ -81,7 +81,7 @@ pub(super) struct Processes {
     outcomes: mpsc::Sender<Outcome>,
     roster: Roster,
     tracker: Tracker,
-    tell: Tell,
+    senders: EventSenders,
     by_id: BTreeMap<String, Process>,
     ended_logs: EndedLogs,
     /// Takes leave of orphans.
@@ -89,7 +89,7 @@ pub(super) struct Processes {
 }
 
 #[derive(Debug, Clone)]
-struct Tell {
+struct EventSenders {
     serving: mpsc::Sender<(String, String)>,
     health: mpsc::Sender<(String, Result<(), String>)>,
 }
@@ -121,7 +121,7 @@ impl Processes {
         directory: RuntimeDirectory,
         roster: Roster,
         tracker: Tracker,
-    ) -> io::Result<(Processes, Told)> {
+    ) -> io::Result<(Processes, ProcessEvents)> {
         let (told, outcomes) = mpsc::channel(OUTCOMES);
         let (serving, served) = mpsc::channel(OUTCOMES);
         let (health, answered) = mpsc::channel(OUTCOMES);
@@ -140,11 +140,11 @@ impl Processes {
                 AbortOnDropHandle::new(tokio::spawn(exit_on_panic("the reaper of orphans", reap(children))))
             }),
             tracker,
-            tell: Tell { serving, health },
+            senders: EventSenders { serving, health },
             by_id: BTreeMap::new(),
             ended_logs: EndedLogs::default(),
         };
-        Ok((processes, Told { outcomes, serving: served, health: answered }))
+        Ok((processes, ProcessEvents { outcomes, serving: served, health: answered }))
     }
 
     /// Begins a worker of a template.
@@ -169,11 +169,14 @@ impl Processes {
         let fill = |text: &str| parameter::fill(text, &builtin, &template.parameters);
         let _ = std::fs::remove_file(&endpoint_file);
         let socket = notify_socket(&directory, id);
-        let signs = template.readiness.signs(&socket).and_then(|signs| match (&signs, &account) {
-            (Signs::Notify { .. }, Some(account)) => account.give(&socket).map(|()| signs),
-            _ => Ok(signs),
+        let readiness_check = template.readiness.readiness_check(&socket).and_then(|readiness_check| {
+            match (&readiness_check, &account) {
+                (ReadinessCheck::Notify { .. }, Some(account)) => account.give(&socket).map(|()| readiness_check),
+                _ => Ok(readiness_check),
+            }
         });
-        let signs = signs.map_err(|error| BeginError::Socket { socket: socket.clone(), reason: error.to_string() })?;
+        let readiness_check = readiness_check
+            .map_err(|error| BeginError::Socket { socket: socket.clone(), reason: error.to_string() })?;
         let mut env = environment::passed(std::env::vars_os(), &template.pass_env);
         // Not a template's to say.
         let marker = self.tracker.environment(id);
@@ -185,14 +188,14 @@ impl Processes {
             env.insert(adoption::SOCKET_VARIABLE.into(), adopt_socket(&directory, id).into());
             env.insert(adoption::GRACE_VARIABLE.into(), template.adopt_grace_s.to_string().into());
         }
-        if let Signs::Notify { watchdog, .. } = signs {
+        if let ReadinessCheck::Notify { watchdog, .. } = readiness_check {
             env.insert("NOTIFY_SOCKET".into(), socket.into());
             let patience_us = template.liveness.timeout().as_micros().to_string();
             env.extend(watchdog.then(|| ("WATCHDOG_USEC".into(), patience_us.into())));
         }
         env.extend([marker]);
-        let awaited = match (&signs, &template.readiness) {
-            (Signs::Line(seen), Readiness::Line { contains }) => Some(Awaited::new(contains, seen.clone())),
+        let awaited = match (&readiness_check, &template.readiness) {
+            (ReadinessCheck::Line(seen), Readiness::Line { contains }) => Some(Awaited::new(contains, seen.clone())),
             _ => None,
         };
         let job = Job {
@@ -217,8 +220,14 @@ impl Processes {
         let (ask, questions) = mpsc::channel(1);
         let within = template.start_timeout();
         let (known, is_known) = oneshot::channel();
-        let attended =
-            attend(directory.clone(), id.to_owned(), (signs, within), is_known, questions, self.tell.clone());
+        let attended = attend(
+            directory.clone(),
+            id.to_owned(),
+            (readiness_check, within),
+            is_known,
+            questions,
+            self.senders.clone(),
+        );
         let attended = Some((tokio::spawn(exit_on_panic(HEALTH_OF_WORKER, attended)).abort_handle(), ask));
         let process = Process { directory, pid: 0, template: Some(template.clone()), known: Some(known), attended };
         self.by_id.insert(id.to_owned(), process);
@@ -259,13 +268,13 @@ impl Processes {
         let directory = account::directory_of(&self.directory, &entry.template);
         let account = entry.template.user.as_deref().and_then(|user| Account::named(user).ok());
         let socket = notify_socket(&directory, &id);
-        let pulse = entry.template.readiness.pulse(&socket, &endpoint);
+        let health_check = entry.template.readiness.health_check(&socket, &endpoint);
         if let Some(account) = account {
             // Where it is not one that notifies there is none.
             let _ = account.give(&socket);
         }
-        let attended = pulse.map(|pulse| {
-            let answered = answer(pulse, id.clone(), questions, self.tell.health.clone());
+        let attended = health_check.map(|health_check| {
+            let answered = answer(health_check, id.clone(), questions, self.senders.health.clone());
             (tokio::spawn(exit_on_panic(HEALTH_OF_WORKER, answered)).abort_handle(), ask)
         });
         let process = Process { directory, pid: entry.pid, template: None, known: None, attended };
@@ -342,32 +351,32 @@ fn notify_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
 async fn attend(
     directory: RuntimeDirectory,
     id: String,
-    (signs, within): (Signs, Duration),
+    (readiness_check, within): (ReadinessCheck, Duration),
     known: oneshot::Receiver<()>,
     questions: mpsc::Receiver<Duration>,
-    tell: Tell,
+    senders: EventSenders,
 ) {
-    let pulse = match signs.ready(&directory, &id, within).await {
-        Ok((endpoint, pulse)) => {
+    let health_check = match readiness_check.ready(&directory, &id, within).await {
+        Ok((endpoint, health_check)) => {
             // Its sender goes when it is known.
             let _ = known.await;
-            drop(tell.serving.send((id.clone(), endpoint)).await);
-            pulse
+            drop(senders.serving.send((id.clone(), endpoint)).await);
+            health_check
         }
         Err(reason) => return tracing::debug!(id, reason, "a worker is not ready"),
     };
-    answer(pulse, id, questions, tell.health).await;
+    answer(health_check, id, questions, senders.health).await;
 }
 
 /// Tells whether it still serves whenever that is asked.
 async fn answer(
-    mut pulse: Pulse,
+    mut health_check: HealthCheck,
     id: String,
     mut questions: mpsc::Receiver<Duration>,
     health: mpsc::Sender<(String, Result<(), String>)>,
 ) {
     while let Some(within) = questions.recv().await {
-        let answer = pulse.beats(within).await;
+        let answer = health_check.beats(within).await;
         if health.send((id.clone(), answer)).await.is_err() {
             return;
         }
@@ -389,9 +398,9 @@ mod tests {
         let (known, is_known) = oneshot::channel();
         let seen = Arc::new(Notify::new());
         seen.notify_one();
-        let signs = (Signs::Line(seen), Duration::from_secs(10));
-        let tell = Tell { serving, health: mpsc::channel(1).0 };
-        let attended = attend(directory, "w-1@here".to_owned(), signs, is_known, mpsc::channel(1).1, tell);
+        let readiness_check = (ReadinessCheck::Line(seen), Duration::from_secs(10));
+        let senders = EventSenders { serving, health: mpsc::channel(1).0 };
+        let attended = attend(directory, "w-1@here".to_owned(), readiness_check, is_known, mpsc::channel(1).1, senders);
         let attended = tokio::spawn(attended);
         for _ in 0..100 {
             tokio::task::yield_now().await;

@@ -48,7 +48,7 @@ pub enum Readiness {
 
 /// What is looked at until a worker is ready.
 #[derive(Debug)]
-pub(super) enum Signs {
+pub(super) enum ReadinessCheck {
     Health,
     Notify { socket: UnixDatagram, watchdog: bool },
     Line(Arc<Notify>),
@@ -57,7 +57,7 @@ pub(super) enum Signs {
 
 /// What is asked whether a worker still serves.
 #[derive(Debug)]
-pub(super) enum Pulse {
+pub(super) enum HealthCheck {
     Health(Health),
     Port(u16),
     Watchdog(Watchdog),
@@ -87,69 +87,70 @@ impl Readiness {
     }
 
     /// What is asked of one that has been ready before; nothing where it cannot be.
-    pub(super) fn pulse(&self, socket: &Path, endpoint: &str) -> Option<Pulse> {
+    pub(super) fn health_check(&self, socket: &Path, endpoint: &str) -> Option<HealthCheck> {
         match self {
-            Readiness::Health => Some(Pulse::Health(Health::of(endpoint.parse().ok()?))),
-            Readiness::Port { port } => Some(Pulse::Port(*port)),
+            Readiness::Health => Some(HealthCheck::Health(Health::of(endpoint.parse().ok()?))),
+            Readiness::Port { port } => Some(HealthCheck::Port(*port)),
             Readiness::Notify { watchdog: true } => {
-                bind(socket).ok().map(|socket| Pulse::Watchdog(Watchdog::on(socket)))
+                bind(socket).ok().map(|socket| HealthCheck::Watchdog(Watchdog::on(socket)))
             }
             Readiness::Notify { watchdog: false } | Readiness::Line { .. } => None,
         }
     }
 
     /// What to look at; before the worker is started. `socket` is where it may notify.
-    pub(super) fn signs(&self, socket: &Path) -> io::Result<Signs> {
+    pub(super) fn readiness_check(&self, socket: &Path) -> io::Result<ReadinessCheck> {
         Ok(match self {
-            Readiness::Health => Signs::Health,
-            Readiness::Notify { watchdog } => Signs::Notify { socket: bind(socket)?, watchdog: *watchdog },
-            Readiness::Line { .. } => Signs::Line(Arc::default()),
-            Readiness::Port { port } => Signs::Port(*port),
+            Readiness::Health => ReadinessCheck::Health,
+            Readiness::Notify { watchdog } => ReadinessCheck::Notify { socket: bind(socket)?, watchdog: *watchdog },
+            Readiness::Line { .. } => ReadinessCheck::Line(Arc::default()),
+            Readiness::Port { port } => ReadinessCheck::Port(*port),
         })
     }
 }
 
-impl Signs {
+impl ReadinessCheck {
     /// Returns where the worker serves (empty where it does not say) once it is ready.
     pub(super) async fn ready(
         self,
         directory: &RuntimeDirectory,
         id: &str,
         within: Duration,
-    ) -> Result<(String, Pulse), String> {
+    ) -> Result<(String, HealthCheck), String> {
         // A worker that is no server has no endpoint.
         let endpoint = || directory.find(id).map(|endpoint| endpoint.to_string()).unwrap_or_default();
         match self {
-            Signs::Health => {
+            ReadinessCheck::Health => {
                 let endpoint = directory.wait_for(id, within).await.map_err(|error| error.to_string())?;
                 let mut health = Health::of(endpoint.clone());
                 health.serving(within).await.map_err(|error| error.to_string())?;
-                Ok((endpoint.to_string(), Pulse::Health(health)))
+                Ok((endpoint.to_string(), HealthCheck::Health(health)))
             }
-            Signs::Notify { socket, watchdog } => {
+            ReadinessCheck::Notify { socket, watchdog } => {
                 heard(&socket, b"READY=1").await.map_err(|error| error.to_string())?;
-                let pulse = if watchdog { Pulse::Watchdog(Watchdog::on(socket)) } else { Pulse::None };
-                Ok((endpoint(), pulse))
+                let health_check =
+                    if watchdog { HealthCheck::Watchdog(Watchdog::on(socket)) } else { HealthCheck::None };
+                Ok((endpoint(), health_check))
             }
-            Signs::Line(seen) => {
+            ReadinessCheck::Line(seen) => {
                 seen.notified().await;
-                Ok((endpoint(), Pulse::None))
+                Ok((endpoint(), HealthCheck::None))
             }
-            Signs::Port(port) => {
-                let mut pulse = Pulse::Port(port);
-                pulse.beats(within).await?;
-                Ok((format!("http://{}:{port}", Ipv4Addr::LOCALHOST), pulse))
+            ReadinessCheck::Port(port) => {
+                let mut health_check = HealthCheck::Port(port);
+                health_check.beats(within).await?;
+                Ok((format!("http://{}:{port}", Ipv4Addr::LOCALHOST), health_check))
             }
         }
     }
 }
 
-impl Pulse {
+impl HealthCheck {
     /// Returns once it says that it serves.
     pub(super) async fn beats(&mut self, within: Duration) -> Result<(), String> {
         match self {
-            Pulse::Health(health) => health.serving(within).await.map_err(|error| error.to_string()),
-            Pulse::Port(port) => {
+            HealthCheck::Health(health) => health.serving(within).await.map_err(|error| error.to_string()),
+            HealthCheck::Port(port) => {
                 let connected = tokio::time::timeout(within, async {
                     while TcpStream::connect((Ipv4Addr::LOCALHOST, *port)).await.is_err() {
                         tokio::time::sleep(TRY_AGAIN_AFTER).await;
@@ -159,11 +160,11 @@ impl Pulse {
                     .await
                     .map_err(|_| format!("no connection to port {port} within {:.1} s", within.as_secs_f64()))
             }
-            Pulse::Watchdog(watchdog) => {
+            HealthCheck::Watchdog(watchdog) => {
                 let heard = tokio::time::timeout(within, watchdog.heard.notified()).await;
                 heard.map_err(|_| format!("no WATCHDOG=1 within {:.1} s", within.as_secs_f64()))
             }
-            Pulse::None => Ok(()),
+            HealthCheck::None => Ok(()),
         }
     }
 }

@@ -5,7 +5,7 @@
 //! pipe that nobody writes to: it ends with the process manager, however that ends. Nothing runs in the child before exec.
 
 use super::account::Account;
-use super::limits::{Groups, InForce, Limits};
+use super::limits::{AppliedLimits, Groups, Limits};
 use super::log::{Awaited, BOUND_INTERVAL, Log};
 use super::predecessor::Adopted;
 use super::tracking::Tracker;
@@ -164,7 +164,7 @@ struct Watched {
     child: Child,
     log: Log,
     awaited: Option<Awaited>,
-    force: InForce,
+    force: AppliedLimits,
     /// Its log is to be kept bounded: it writes it by itself.
     bounds: bool,
 }
@@ -209,7 +209,7 @@ pub(super) fn watch_adopted(
     let watching = async move {
         let bounding =
             log.as_ref().ok().map(|log| AbortOnDropHandle::new(tokio::spawn(log.clone().keep_bounded(BOUND_INTERVAL))));
-        let force = InForce::adopted(entry.groups);
+        let force = AppliedLimits::adopted(entry.groups);
         exit.wait().await;
         drop((parent_lives, bounding));
         signal(entry.pid, Signal::SIGKILL);
@@ -222,7 +222,7 @@ pub(super) fn watch_adopted(
 }
 
 /// Its groups, and what it had started outside of them.
-async fn end_rest(id: &str, force: InForce, tracker: Tracker) {
+async fn end_rest(id: &str, force: AppliedLimits, tracker: Tracker) {
     let of = id.to_owned();
     let end_rest = move || {
         panic_point("end-of-worker");

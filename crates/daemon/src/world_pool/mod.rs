@@ -82,7 +82,7 @@ pub async fn run_as(
         session: None,
         ttl: Duration::from_millis(config.session_ttl_ms),
         wanted,
-        there: None,
+        lifecycle: None,
         demand: None,
     };
     // Calls under way need all of it until the last has ended.

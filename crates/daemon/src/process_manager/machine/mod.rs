@@ -2,7 +2,7 @@
 //! the process manager starts and kept up to date, so that a task can require them; and room for workers.
 //!
 //! ```text
-//!   sample.rs (sysinfo, statvfs, /sys) ──Sample──▶ Told (what everybody knows, and what has changed enough) ──▶ offered resources
+//!   sample.rs (sysinfo, statvfs, /sys) ──Sample──▶ DeadbandFilter (what was published, and what has changed enough) ──▶ offered resources
 //!                                         └────▶ the pools: is there room for one more worker?
 //! ```
 
@@ -31,7 +31,7 @@ pub struct MachineConfig {
     pub reserved_cores: u32,
     /// Whether the battery that the kernel knows is offered as `Battery`, where there is one.
     pub battery: bool,
-    /// A value is told again when it has changed by this share of what there can be.
+    /// A value is published again when it has changed by this share of what there can be.
     pub step: f64,
 }
 
@@ -49,21 +49,21 @@ impl MachineConfig {
     }
 }
 
-/// What was told last. A value that goes to and fro by less than a step is told once.
+/// Publishes a value again only when it differs from the one that was published last by a step or more (a deadband, "send on delta").
 #[derive(Debug)]
-pub(super) struct Told {
+pub(super) struct DeadbandFilter {
     step: f64,
     sample: Option<Sample>,
 }
 
-impl Told {
-    pub(super) fn new(step: f64) -> Told {
-        Told { step, sample: None }
+impl DeadbandFilter {
+    pub(super) fn new(step: f64) -> DeadbandFilter {
+        DeadbandFilter { step, sample: None }
     }
 
-    /// What is to be told now: the sample with the old value of everything that has not changed enough; nothing where that is all.
-    pub(super) fn tell(&mut self, now: &Sample) -> Option<Sample> {
-        let Some(told) = &self.sample else {
+    /// What is to be published now: the sample with the old value of everything that has not changed enough; nothing where that is all.
+    pub(super) fn pass(&mut self, now: &Sample) -> Option<Sample> {
+        let Some(published) = &self.sample else {
             self.sample = Some(now.clone());
             return self.sample.clone();
         };
@@ -72,16 +72,16 @@ impl Told {
         let numbers = |was: f64, is: f64| if far(was, is, self.step) { is } else { was };
         let next = Sample {
             cores: now.cores,
-            load_per_core: numbers(told.load_per_core, now.load_per_core),
+            load_per_core: numbers(published.load_per_core, now.load_per_core),
             idle_cores: numbers(
-                told.idle_cores / f64::from(now.cores.max(1)),
+                published.idle_cores / f64::from(now.cores.max(1)),
                 now.idle_cores / f64::from(now.cores.max(1)),
             ) * f64::from(now.cores.max(1)),
             memory_bytes: now.memory_bytes,
-            free_memory_bytes: bytes(told.free_memory_bytes, now.free_memory_bytes, now.memory_bytes),
+            free_memory_bytes: bytes(published.free_memory_bytes, now.free_memory_bytes, now.memory_bytes),
             disk_bytes: now.disk_bytes,
-            free_disk_bytes: bytes(told.free_disk_bytes, now.free_disk_bytes, now.disk_bytes),
-            battery: match (told.battery, now.battery) {
+            free_disk_bytes: bytes(published.free_disk_bytes, now.free_disk_bytes, now.disk_bytes),
+            battery: match (published.battery, now.battery) {
                 (Some(was), Some(is)) => Some(numbers(was, is)),
                 (_, is) => is,
             },
@@ -93,7 +93,7 @@ impl Told {
     }
 }
 
-/// At least a step apart; so that nothing is lost at the ends, where there can be no step more, exactly nothing and exactly all are told.
+/// At least a step apart; so that nothing is lost at the ends, where there can be no step more, exactly nothing and exactly all are published.
 fn far(was: f64, is: f64, step: f64) -> bool {
     (was - is).abs() >= step || (is == 0.0 && was != 0.0)
 }
@@ -114,7 +114,7 @@ impl Machine {
         wanted: watch::Sender<Wanted>,
         looks: mpsc::Sender<Sample>,
     ) {
-        let mut told = Told::new(self.config.step);
+        let mut published = DeadbandFilter::new(self.config.step);
         let mut sampler = Sampler::new(directory.path().to_owned(), self.config.battery);
         loop {
             let looked = tokio::task::spawn_blocking(move || {
@@ -123,7 +123,7 @@ impl Machine {
             });
             let Ok((back, sample)) = looked.await else { return };
             sampler = back;
-            if let Some(sample) = told.tell(&sample) {
+            if let Some(sample) = published.pass(&sample) {
                 let resources = self.resources(&sample);
                 wanted.send_modify(|wanted| wanted.extend(resources.into_iter().map(|one| (one.id.clone(), one))));
             }
@@ -163,20 +163,24 @@ mod tests {
 
     #[test]
     fn what_goes_to_and_fro_is_told_once_and_a_step_is_told_at_once() {
-        let mut told = Told::new(0.05);
-        assert_eq!(told.tell(&sample(500, 0.8)), Some(sample(500, 0.8)));
+        let mut published = DeadbandFilter::new(0.05);
+        assert_eq!(published.pass(&sample(500, 0.8)), Some(sample(500, 0.8)));
         for free in [520, 470, 540, 460] {
-            assert_eq!(told.tell(&sample(free, 0.8)), None, "{free}");
+            assert_eq!(published.pass(&sample(free, 0.8)), None, "{free}");
         }
-        assert_eq!(told.tell(&sample(449, 0.8)), Some(sample(449, 0.8)));
-        assert_eq!(told.tell(&sample(495, 0.78)), None, "from 449 on");
-        assert_eq!(told.tell(&sample(495, 0.74)).unwrap(), sample(449, 0.74), "the rest stays as it was told");
+        assert_eq!(published.pass(&sample(449, 0.8)), Some(sample(449, 0.8)));
+        assert_eq!(published.pass(&sample(495, 0.78)), None, "from 449 on");
+        assert_eq!(
+            published.pass(&sample(495, 0.74)).unwrap(),
+            sample(449, 0.74),
+            "the rest stays as it was published"
+        );
     }
 
     #[test]
     fn nothing_left_is_told_however_small_the_step() {
-        let mut told = Told::new(0.05);
-        told.tell(&sample(20, 0.5));
-        assert_eq!(told.tell(&sample(0, 0.5)), Some(sample(0, 0.5)));
+        let mut published = DeadbandFilter::new(0.05);
+        published.pass(&sample(20, 0.5));
+        assert_eq!(published.pass(&sample(0, 0.5)), Some(sample(0, 0.5)));
     }
 }

@@ -124,8 +124,8 @@ pub enum Command {
         /// How long it has for its answer.
         within: Duration,
     },
-    /// Tell watchers.
-    Tell(WorkerStatus),
+    /// Notify those who watch the workers.
+    Notify(WorkerStatus),
 }
 
 /// A request that is refused.

@@ -201,7 +201,7 @@ impl Pool {
         commands.push(Command::Withdraw { id: id.to_owned() });
         let exited = worker.exited(reason);
         let reason = exited.reason.clone();
-        commands.push(Command::Tell(exited));
+        commands.push(Command::Notify(exited));
         if !worker.is_stopping() {
             let words = if last_words.is_empty() { String::new() } else { format!("; its last words: {last_words}") };
             let what = format!("{id}: {reason}{words}");

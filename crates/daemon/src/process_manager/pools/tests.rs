@@ -149,7 +149,7 @@ fn a_crash_withdraws_the_resource_at_once_and_starts_another_under_a_new_id() {
     pools.exited(at(60.0), "planner-1@compute", "killed by signal 9", "");
     let commands = pools.take_commands();
     assert_eq!(commands[0], Command::Withdraw { id: "planner-1@compute".into() });
-    assert!(matches!(&commands[1], Command::Tell(worker) if worker.reason == "killed by signal 9"));
+    assert!(matches!(&commands[1], Command::Notify(worker) if worker.reason == "killed by signal 9"));
     assert!(matches!(&commands[2], Command::Start { id, .. } if id == "planner-2@compute"));
 }
 
@@ -208,7 +208,7 @@ fn a_worker_that_does_not_serve_in_time_is_killed_and_counts_as_a_crash() {
         pools
             .take_commands()
             .iter()
-            .any(|command| matches!(command, Command::Tell(worker) if worker.reason == "not ready within 3 s"))
+            .any(|command| matches!(command, Command::Notify(worker) if worker.reason == "not ready within 3 s"))
     );
 }
 
@@ -426,7 +426,7 @@ fn a_worker_that_does_not_answer_is_taken_away_at_once_and_replaced() {
     assert_eq!(pools.take_commands(), [Command::Withdraw { id: id() }, Command::Kill { id: id() }]);
     pools.exited(at(14.2), &id(), "killed by signal 9", "");
     let commands = pools.take_commands();
-    assert!(matches!(&commands[1], Command::Tell(worker) if worker.reason == "hung: not serving within 10.0 s"));
+    assert!(matches!(&commands[1], Command::Notify(worker) if worker.reason == "hung: not serving within 10.0 s"));
     assert!(matches!(&commands[2], Command::Start { id, .. } if id == "planner-2@compute"));
 }
 

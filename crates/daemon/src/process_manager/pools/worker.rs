@@ -86,7 +86,7 @@ impl Worker {
             }
             Phase::Starting { .. } | Phase::Serving | Phase::Ready | Phase::Leaving { .. } => {}
         }
-        commands.push(Command::Tell(self.status()));
+        commands.push(Command::Notify(self.status()));
     }
 
     /// It serves as a resource of `kind`. Too late is too late.
@@ -110,7 +110,7 @@ impl Worker {
         if self.phase == Phase::Serving {
             self.phase = Phase::Ready;
             self.idle_since = self.idle_since.and(Some(now));
-            commands.push(Command::Tell(self.status()));
+            commands.push(Command::Notify(self.status()));
         }
     }
 
@@ -348,7 +348,7 @@ mod tests {
     fn commands(act: impl FnOnce(&mut Vec<Command>)) -> Vec<Command> {
         let mut commands = Vec::new();
         act(&mut commands);
-        commands.retain(|command| !matches!(command, Command::Tell(_)));
+        commands.retain(|command| !matches!(command, Command::Notify(_)));
         commands
     }
 
