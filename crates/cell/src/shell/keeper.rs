@@ -50,7 +50,7 @@ pub(crate) struct State {
 /// Sends messages to the keeper. Clones share it; it ends with the last of them.
 #[derive(Debug, Clone)]
 pub(crate) struct Keeper {
-    messages: Sender<Letter>,
+    messages: Sender<QueuedMessage>,
     room: Arc<Semaphore>,
     tickets: Arc<AtomicU64>,
     optics: Arc<Optics>,
@@ -61,7 +61,7 @@ pub(crate) struct Keeper {
 pub(crate) struct Motion {
     ticket: Ticket,
     ending: oneshot::Receiver<Ending>,
-    messages: Sender<Letter>,
+    messages: Sender<QueuedMessage>,
     over: bool,
 }
 
@@ -81,7 +81,7 @@ pub(crate) enum KeeperError {
 }
 
 /// A message with the room that it takes in the queue.
-struct Letter {
+struct QueuedMessage {
     message: Message,
     _room: Option<OwnedSemaphorePermit>,
 }
@@ -106,7 +106,7 @@ pub(crate) fn start(cell: Cell, recorder: Recorder, clock: RobotClock, vitals: V
     Ok(keeper)
 }
 
-fn keeper_of(cell: &Cell) -> (Keeper, Receiver<Letter>) {
+fn keeper_of(cell: &Cell) -> (Keeper, Receiver<QueuedMessage>) {
     let (messages, inbox) = channel();
     let optics = Arc::new(Optics { robot: cell.robot().clone(), noise: cell.config().camera.noise });
     let room = Arc::new(Semaphore::new(MAX_MESSAGES));
@@ -168,7 +168,7 @@ impl Keeper {
     }
 
     fn send(&self, message: Message, room: OwnedSemaphorePermit) -> Result<(), KeeperError> {
-        self.messages.send(Letter { message, _room: Some(room) }).map_err(|_| KeeperError::Ended)
+        self.messages.send(QueuedMessage { message, _room: Some(room) }).map_err(|_| KeeperError::Ended)
     }
 }
 
@@ -178,7 +178,7 @@ impl Brakes for Keeper {
     async fn apply(&self, state: &SafetyState) -> Result<(), String> {
         let (applied, done) = oneshot::channel();
         let message = Message::Safety { state: state.clone(), applied };
-        self.messages.send(Letter { message, _room: None }).map_err(|_| KeeperError::Ended.to_string())?;
+        self.messages.send(QueuedMessage { message, _room: None }).map_err(|_| KeeperError::Ended.to_string())?;
         done.await.map_err(|_| KeeperError::Ended.to_string())
     }
 }
@@ -201,7 +201,7 @@ impl Motion {
         self.over = true;
         let stop = Event::Stop { ticket: self.ticket, reason: "the goal was told to stop".to_owned() };
         // A keeper that has ended moves nothing.
-        let _ = self.messages.send(Letter { message: Message::Happened(stop), _room: None });
+        let _ = self.messages.send(QueuedMessage { message: Message::Happened(stop), _room: None });
     }
 }
 
@@ -213,7 +213,7 @@ impl Drop for Motion {
     }
 }
 
-fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Receiver<Letter>, vitals: &Vitals) {
+fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Receiver<QueuedMessage>, vitals: &Vitals) {
     let mut waiting: BTreeMap<Ticket, oneshot::Sender<Ending>> = BTreeMap::new();
     loop {
         vitals.beat();
@@ -221,7 +221,7 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
         let most = if cell.is_restless() { RESTLESS_SLEEP } else { MAX_SLEEP };
         let sleep = cell.next_wake().map_or(most, |moment| clock.until(moment).min(most));
         let message = match inbox.recv_timeout(sleep) {
-            Ok(letter) => Some(letter.message),
+            Ok(queued) => Some(queued.message),
             Err(RecvTimeoutError::Timeout) => None,
             Err(RecvTimeoutError::Disconnected) => return,
         };
@@ -306,7 +306,7 @@ mod tests {
         let stopping = tokio::spawn(stopped.stop());
         tokio::task::yield_now().await;
 
-        let stops = inbox.try_iter().filter_map(|letter| match letter.message {
+        let stops = inbox.try_iter().filter_map(|queued| match queued.message {
             Message::Happened(Event::Stop { ticket, .. }) => Some(ticket),
             _ => None,
         });
