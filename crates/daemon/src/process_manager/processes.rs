@@ -376,7 +376,7 @@ async fn answer(
     health: mpsc::Sender<(String, Result<(), String>)>,
 ) {
     while let Some(within) = questions.recv().await {
-        let answer = health_check.beats(within).await;
+        let answer = health_check.check(within).await;
         if health.send((id.clone(), answer)).await.is_err() {
             return;
         }

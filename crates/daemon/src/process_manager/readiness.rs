@@ -138,7 +138,7 @@ impl ReadinessCheck {
             }
             ReadinessCheck::Port(port) => {
                 let mut health_check = HealthCheck::Port(port);
-                health_check.beats(within).await?;
+                health_check.check(within).await?;
                 Ok((format!("http://{}:{port}", Ipv4Addr::LOCALHOST), health_check))
             }
         }
@@ -147,7 +147,7 @@ impl ReadinessCheck {
 
 impl HealthCheck {
     /// Returns once it says that it serves.
-    pub(super) async fn beats(&mut self, within: Duration) -> Result<(), String> {
+    pub(super) async fn check(&mut self, within: Duration) -> Result<(), String> {
         match self {
             HealthCheck::Health(health) => health.serving(within).await.map_err(|error| error.to_string()),
             HealthCheck::Port(port) => {

@@ -114,7 +114,7 @@ impl Machine {
         wanted: watch::Sender<Wanted>,
         looks: mpsc::Sender<Sample>,
     ) {
-        let mut published = DeadbandFilter::new(self.config.step);
+        let mut filter = DeadbandFilter::new(self.config.step);
         let mut sampler = Sampler::new(directory.path().to_owned(), self.config.battery);
         loop {
             let looked = tokio::task::spawn_blocking(move || {
@@ -123,7 +123,7 @@ impl Machine {
             });
             let Ok((back, sample)) = looked.await else { return };
             sampler = back;
-            if let Some(sample) = published.pass(&sample) {
+            if let Some(sample) = filter.pass(&sample) {
                 let resources = self.resources(&sample);
                 wanted.send_modify(|wanted| wanted.extend(resources.into_iter().map(|one| (one.id.clone(), one))));
             }
@@ -163,24 +163,20 @@ mod tests {
 
     #[test]
     fn what_goes_to_and_fro_is_told_once_and_a_step_is_told_at_once() {
-        let mut published = DeadbandFilter::new(0.05);
-        assert_eq!(published.pass(&sample(500, 0.8)), Some(sample(500, 0.8)));
+        let mut filter = DeadbandFilter::new(0.05);
+        assert_eq!(filter.pass(&sample(500, 0.8)), Some(sample(500, 0.8)));
         for free in [520, 470, 540, 460] {
-            assert_eq!(published.pass(&sample(free, 0.8)), None, "{free}");
+            assert_eq!(filter.pass(&sample(free, 0.8)), None, "{free}");
         }
-        assert_eq!(published.pass(&sample(449, 0.8)), Some(sample(449, 0.8)));
-        assert_eq!(published.pass(&sample(495, 0.78)), None, "from 449 on");
-        assert_eq!(
-            published.pass(&sample(495, 0.74)).unwrap(),
-            sample(449, 0.74),
-            "the rest stays as it was published"
-        );
+        assert_eq!(filter.pass(&sample(449, 0.8)), Some(sample(449, 0.8)));
+        assert_eq!(filter.pass(&sample(495, 0.78)), None, "from 449 on");
+        assert_eq!(filter.pass(&sample(495, 0.74)).unwrap(), sample(449, 0.74), "the rest stays as it was published");
     }
 
     #[test]
     fn nothing_left_is_told_however_small_the_step() {
-        let mut published = DeadbandFilter::new(0.05);
-        published.pass(&sample(20, 0.5));
-        assert_eq!(published.pass(&sample(0, 0.5)), Some(sample(0, 0.5)));
+        let mut filter = DeadbandFilter::new(0.05);
+        filter.pass(&sample(20, 0.5));
+        assert_eq!(filter.pass(&sample(0, 0.5)), Some(sample(0, 0.5)));
     }
 }
