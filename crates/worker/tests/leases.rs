@@ -190,8 +190,9 @@ async fn what_the_confirmation_of_a_lease_adds_to_a_goal() {
         for (provider, took) in [&watched.provider, &believing].into_iter().zip(&mut took) {
             let began = Instant::now();
             let goal = goal(&format!("run/{i}/1"), "double", 7);
-            provider.client.execute(&provider.endpoint, goal, |_, _| {}).await.unwrap();
+            let outcome = provider.client.execute(&provider.endpoint, goal, |_, _| {}).await.unwrap();
             took.push(began.elapsed());
+            assert!(outcome.is_success(), "a refusal is no goal: {outcome:?}");
         }
     }
     took.iter_mut().for_each(|took| took.sort());

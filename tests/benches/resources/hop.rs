@@ -1,6 +1,10 @@
 //! What a node costs beside its work: a chain of nodes that do nothing, each of which blocks a worker and is performed by it, through
 //! `ratn run` and the real daemons.
 //!
+//! A node waits for its lease and for its goal. It takes over the lease of the node before it while nobody else waits for that
+//! (`performer/handover.rs`), and asks for one otherwise. The goal goes over the one stream to the worker, which performs it when its own watch of
+//! the resource manager confirms the lease.
+//!
 //! Resource manager, world pool, process manager, worker and task control are processes of their own on Unix sockets, as `ratn up` has
 //! them; a node gets its input from the one before it, so no two can run at once. What is measured is in the event log: from the
 //! end of one node to the end of the next. An echo takes turns with the runs.
