@@ -45,22 +45,6 @@ impl Files for SlowDisk {
     fn create(&self, path: &Path) -> io::Result<Box<dyn LogFile>> {
         Ok(Box::new(SlowFile(self.clone(), Disk.create(path)?)))
     }
-
-    fn create_directory(&self, path: &Path) -> io::Result<()> {
-        Disk.create_directory(path)
-    }
-
-    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
-        Disk.rename(from, to)
-    }
-
-    fn remove(&self, path: &Path) -> io::Result<()> {
-        Disk.remove(path)
-    }
-
-    fn sync_directory(&self, path: &Path) -> io::Result<()> {
-        Disk.sync_directory(path)
-    }
 }
 
 impl LogFile for SlowFile {

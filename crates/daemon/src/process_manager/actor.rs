@@ -109,25 +109,11 @@ pub(super) fn start(
     shutdown: CancellationToken,
 ) -> std::io::Result<(Handle, JoinHandle<()>)> {
     let (inbox, messages) = mpsc::channel(INBOX);
-    let Parts {
-        config,
-        directory,
-        roster,
-        tracker,
-        before,
-        adopted,
-        wanted,
-        drains,
-        offer_events,
-        uses,
-        demand,
-        short,
-        looks,
-    } = parts;
-    let (drained, tracking) = (Drained::of(&directory), tracker.mode());
-    let (processes, events) = Processes::start(&config, directory, roster, tracker)?;
+    let (config, adopted) = (parts.config, parts.adopted);
+    let (drained, tracking) = (Drained::of(&parts.directory), parts.tracker.mode());
+    let (processes, events) = Processes::start(&config, parts.directory, parts.roster, parts.tracker)?;
     let mut pools = Pools::new(&config.host, config.templates).with_labels(config.labels.clone());
-    pools.go_on_after(&before);
+    pools.go_on_after(&parts.before);
     let actor = Actor {
         pools,
         processes,
@@ -135,14 +121,21 @@ pub(super) fn start(
         labels: config.labels,
         tracking,
         start: Instant::now(),
-        wanted,
-        drains,
-        short,
+        wanted: parts.wanted,
+        drains: parts.drains,
+        short: parts.short,
         watchers: Vec::new(),
         usage: Usage::new(),
         drained,
     };
-    let inputs = Inputs { messages, events, offer_events, uses, demand, looks };
+    let inputs = Inputs {
+        messages,
+        events,
+        offer_events: parts.offer_events,
+        uses: parts.uses,
+        demand: parts.demand,
+        looks: parts.looks,
+    };
     let running = async move {
         let _ = vitals.guard("the actor of the pools", actor.run(adopted, inputs, &vitals, shutdown)).await;
     };

@@ -31,60 +31,50 @@ pub trait LogFile: fmt::Debug + Send {
     fn sync(&mut self) -> io::Result<()>;
 }
 
-/// A disk.
+/// A disk: the file system of this machine, unless an implementation does something else.
 pub trait Files: fmt::Debug + Send + Sync {
     /// An empty file; what was there is gone.
     ///
     /// # Errors
     /// What the system says.
-    fn create(&self, path: &Path) -> io::Result<Box<dyn LogFile>>;
+    fn create(&self, path: &Path) -> io::Result<Box<dyn LogFile>> {
+        Ok(Box::new(OpenOptions::new().create(true).write(true).truncate(true).open(path)?))
+    }
     /// A directory in one that is there.
     ///
     /// # Errors
     /// What the system says, also that it is there already.
-    fn create_directory(&self, path: &Path) -> io::Result<()>;
+    fn create_directory(&self, path: &Path) -> io::Result<()> {
+        fs::create_dir(path)
+    }
     /// Another name for a file or a directory, in place of what had the name.
     ///
     /// # Errors
     /// What the system says.
-    fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        fs::rename(from, to)
+    }
     /// The file is gone.
     ///
     /// # Errors
     /// What the system says.
-    fn remove(&self, path: &Path) -> io::Result<()>;
+    fn remove(&self, path: &Path) -> io::Result<()> {
+        fs::remove_file(path)
+    }
     /// Returns when the names in it are on the disk.
     ///
     /// # Errors
     /// What the system says.
-    fn sync_directory(&self, path: &Path) -> io::Result<()>;
-}
-
-/// The system's.
-#[derive(Debug)]
-pub struct Disk;
-
-impl Files for Disk {
-    fn create(&self, path: &Path) -> io::Result<Box<dyn LogFile>> {
-        Ok(Box::new(OpenOptions::new().create(true).write(true).truncate(true).open(path)?))
-    }
-
-    fn create_directory(&self, path: &Path) -> io::Result<()> {
-        fs::create_dir(path)
-    }
-
-    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
-        fs::rename(from, to)
-    }
-
-    fn remove(&self, path: &Path) -> io::Result<()> {
-        fs::remove_file(path)
-    }
-
     fn sync_directory(&self, path: &Path) -> io::Result<()> {
         File::open(path)?.sync_all()
     }
 }
+
+/// The file system of this machine.
+#[derive(Debug)]
+pub struct Disk;
+
+impl Files for Disk {}
 
 impl LogFile for File {
     fn write(&mut self, bytes: &[u8]) -> io::Result<()> {

@@ -144,18 +144,6 @@ impl Files for Unsynced {
         Ok(Box::new(UnsyncedFile(Disk.create(path)?)))
     }
 
-    fn create_directory(&self, path: &Path) -> io::Result<()> {
-        Disk.create_directory(path)
-    }
-
-    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
-        Disk.rename(from, to)
-    }
-
-    fn remove(&self, path: &Path) -> io::Result<()> {
-        Disk.remove(path)
-    }
-
     fn sync_directory(&self, _: &Path) -> io::Result<()> {
         Ok(())
     }
