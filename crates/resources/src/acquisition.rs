@@ -24,7 +24,7 @@ impl Pool {
     /// # Errors
     /// An unknown session, other operations than block, consume and exists, a passed deadline, a full queue.
     pub fn acquire(&mut self, now: Timestamp, request: AcquireRequest) -> Result<WaiterId, PoolError> {
-        self.advance(now);
+        self.begin(now);
         self.enqueue(request, RequestId::default(), Fingerprint::UNKNOWN)
     }
 
@@ -33,7 +33,7 @@ impl Pool {
     /// # Errors
     /// A waiter that has been answered already.
     pub fn cancel(&mut self, now: Timestamp, id: WaiterId) -> Result<(), PoolError> {
-        self.advance(now);
+        self.begin(now);
         self.queue.get(id).ok_or(PoolError::UnknownWaiter { waiter: id })?;
         self.refuse(id, Refusal::Cancelled);
         self.schedule();
@@ -46,7 +46,7 @@ impl Pool {
     /// # Errors
     /// An acquire of another session.
     pub fn withdraw(&mut self, now: Timestamp, caller: &SessionId, request_id: &str) -> Result<bool, PoolError> {
-        self.advance(now);
+        self.begin(now);
         let Some(session) = self.sessions.get(caller) else { return Ok(false) };
         match self.memory.reply(&RequestId::new(&session.opened_by, request_id)) {
             Some(Recalled::Waiting(id)) => {
@@ -72,7 +72,7 @@ impl Pool {
     /// # Errors
     /// An unknown or ended lease, or one of another session.
     pub fn release(&mut self, now: Timestamp, session: Option<&SessionId>, id: LeaseId) -> Result<(), PoolError> {
-        self.advance(now);
+        self.begin(now);
         let record = self.leases.get(&id).ok_or(PoolError::UnknownLease { lease: id })?;
         if let Some(caller) = session {
             check_owner(|| id.to_string(), &record.session, caller)?;
@@ -111,7 +111,7 @@ impl Pool {
         lease: LeaseId,
         resource: &str,
     ) -> Result<bool, PoolError> {
-        self.advance(now);
+        self.begin(now);
         let unknown = || PoolError::UnknownResource { id: resource.to_owned() };
         let slot = self.resources.find(resource).ok_or_else(unknown)?;
         let ending = self.ending.get(&lease).filter(|ending| ending.slots.contains_key(&slot));
@@ -136,7 +136,7 @@ impl Pool {
     /// # Errors
     /// An unknown or ended lease.
     pub fn undo_grant(&mut self, now: Timestamp, id: LeaseId) -> Result<(), PoolError> {
-        self.advance(now);
+        self.begin(now);
         if !self.leases.contains_key(&id) {
             return Err(PoolError::UnknownLease { lease: id });
         }

@@ -16,6 +16,7 @@ use crate::resource::{Resource, ResourceView, add_to, remove_from, take_from};
 use crate::session::Session;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Quantity;
+use ratn_model::time::Timestamp;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -37,15 +38,19 @@ impl Pool {
             Effect::SessionKept { session, client, ttl } => {
                 let expires = self.now + *ttl;
                 if let Some(known) = self.sessions.get_mut(session) {
-                    self.timers.remove(&(known.expires, Timer::Session(session.clone())));
-                    (known.ttl, known.expires) = (*ttl, expires);
+                    let before = std::mem::replace(&mut known.expires, expires);
+                    known.ttl = *ttl;
                     known.name.clone_from(client);
+                    if ttl.is_zero() {
+                        known.ending.get_or_insert(EndReason::SessionExpired);
+                    }
+                    self.stop_timer(before, Timer::Session(session.clone()));
                 } else {
                     let new = Session::new(client.clone(), Arc::default(), *ttl, expires);
                     self.callers.opened(&new.opened_by);
                     self.sessions.insert(session.clone(), new);
                 }
-                self.timers.insert((expires, Timer::Session(session.clone())));
+                self.start_session_timer(session, expires);
                 Ok(())
             }
             Effect::SessionOpened { session, client, ttl, opened_by } => {
@@ -60,7 +65,8 @@ impl Pool {
             }
             Effect::SessionEnded { session } => {
                 let known = self.sessions.remove(session).ok_or_else(|| format!("{session} is not there"))?;
-                self.timers.remove(&(known.expires, Timer::Session(session.clone())));
+                self.stop_timer(known.expires, Timer::Session(session.clone()));
+                self.resources.closed(session);
                 self.callers.closed(&known.opened_by);
                 Ok(())
             }
@@ -99,8 +105,10 @@ impl Pool {
                 for (session, _) in &resource.consumers {
                     self.session_mut(session)?.consumed.remove(slot);
                 }
-                if !resource.consumed().is_zero() {
-                    self.leases.values_mut().for_each(|lease| lease.consumed.retain(|(consumed, _)| consumed != slot));
+                self.crowds.remove(slot);
+                for lease in self.undoable.remove(slot).unwrap_or_default() {
+                    let record = self.leases.get_mut(&lease).ok_or_else(|| format!("{lease} is not there"))?;
+                    record.consumed.retain(|(consumed, _)| consumed != slot);
                 }
                 for (lease, _) in resource.holders {
                     if self.end_standstill(lease, *slot) {
@@ -132,7 +140,9 @@ impl Pool {
                 let slots = std::mem::take(&mut self.session_mut(session)?.consumed);
                 for lease in self.session_mut(session)?.leases.clone() {
                     let known = self.leases.get_mut(&lease).ok_or_else(|| format!("{lease} is not there"))?;
-                    known.consumed.retain(|(slot, _)| !slots.contains(slot));
+                    let (gone, left) = known.consumed.drain(..).partition(|(slot, _)| slots.contains(slot));
+                    known.consumed = left;
+                    self.not_undoable(lease, gone);
                 }
                 for slot in slots {
                     self.change(slot, |resource| remove_from(&mut resource.consumers, session));
@@ -158,20 +168,22 @@ impl Pool {
             Effect::LeaseEnded { lease, reason } => {
                 let record = self.leases.remove(lease).ok_or_else(|| format!("{lease} is not there"))?;
                 if let Some(expires) = record.expires {
-                    self.timers.remove(&(expires, Timer::Lease(*lease)));
+                    self.stop_timer(expires, Timer::Lease(*lease));
                 }
                 let slots = record.slots();
                 for slot in &slots {
                     if !self.begin_standstill(*lease, &record, *slot, *reason) {
                         self.change(*slot, |resource| remove_from(&mut resource.holders, lease));
                     }
+                    self.held_otherwise(*slot, *lease);
                 }
+                self.not_undoable(*lease, record.consumed);
                 self.session_mut(&record.session)?.leases.remove(lease);
                 if *reason == EndReason::Undelivered {
                     self.memory.forget_grant(*lease);
                 }
                 let resources = self.views(&slots)?;
-                let LeaseRecord { token, session, .. } = record;
+                let (token, session) = (record.token, record.session);
                 self.publish(Change::LeaseEnded { lease: *lease, token, session, resources, reason: *reason });
                 Ok(())
             }
@@ -183,6 +195,7 @@ impl Pool {
                 }
                 self.change(*slot, |resource| remove_from(&mut resource.holders, lease))
                     .ok_or_else(|| missing(*slot))?;
+                self.held_otherwise(*slot, *lease);
                 let resource = self.view(*slot)?;
                 self.publish(Change::UnitsFreed { lease: *lease, token, resource, confirmed: *confirmed });
                 Ok(())
@@ -228,6 +241,8 @@ impl Pool {
         let opened_by = session.opened_by.clone();
         let slots = granted.slots();
         self.leases.insert(lease, LeaseRecord { expires, opened_by, ..granted.clone() });
+        self.undoable(lease, &granted.consumed);
+        slots.iter().for_each(|slot| self.held_otherwise(*slot, lease));
         let resources = self.views(&slots)?;
         let (token, session) = (granted.token, granted.session.clone());
         self.publish(Change::LeaseGranted { lease, token, session, resources });
@@ -260,8 +275,35 @@ impl Pool {
         if ending.slots.is_empty() {
             self.ending.remove(&lease);
         }
-        self.timers.remove(&(until, Timer::Standstill(lease, slot)));
+        self.stop_timer(until, Timer::Standstill(lease, slot));
         true
+    }
+
+    /// A session with no time to live ends.
+    pub(crate) fn start_session_timer(&mut self, session: &SessionId, expires: Timestamp) {
+        if self.sessions.get(session).is_some_and(|known| known.ending.is_some()) {
+            self.resources.close(session);
+            self.overdue.insert(Timer::Session(session.clone()));
+        } else {
+            self.timers.insert((expires, Timer::Session(session.clone())));
+        }
+    }
+
+    pub(crate) fn undoable(&mut self, lease: LeaseId, consumed: &[(Slot, Quantity)]) {
+        for (slot, _) in consumed {
+            self.undoable.entry(*slot).or_default().insert(lease);
+        }
+    }
+
+    fn not_undoable(&mut self, lease: LeaseId, consumed: Vec<(Slot, Quantity)>) {
+        for (slot, _) in consumed {
+            if let Some(leases) = self.undoable.get_mut(&slot) {
+                leases.remove(&lease);
+                if leases.is_empty() {
+                    self.undoable.remove(&slot);
+                }
+            }
+        }
     }
 
     /// Changes a resource, and tells the queue.
@@ -283,8 +325,7 @@ impl Pool {
     }
 
     fn view(&self, slot: Slot) -> Result<ResourceView, Misfit> {
-        let view = |resource: &Resource| resource.view(slot, &self.leases, &self.ending, self.now);
-        self.resources.get(slot).map(view).ok_or_else(|| missing(slot))
+        self.resources.get(slot).map(|resource| self.view_of((slot, resource))).ok_or_else(|| missing(slot))
     }
 
     fn views(&self, slots: &[Slot]) -> Result<Vec<ResourceView>, Misfit> {

@@ -197,7 +197,7 @@ impl<'a> Search<'a> {
         let of = |units: &Units| units.get(&slot).copied().unwrap_or_default();
         match self.available {
             Available::Existing => resource.quantity(),
-            _ if self.resources.is_crowded(resource) => Quantity::ZERO,
+            _ if self.resources.is_kept_back(resource) => Quantity::ZERO,
             Available::Free(reserved) => resource.free().saturating_sub(of(reserved)),
             Available::FreeTo(reserved, own) => {
                 let of_others = own.iter().fold(of(reserved), |left, own| left.saturating_sub(of(own)));

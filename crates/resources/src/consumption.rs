@@ -21,7 +21,7 @@ impl Pool {
         session: &SessionId,
         requirement: &Requirement,
     ) -> Result<Vec<String>, PoolError> {
-        self.advance(now);
+        self.begin(now);
         self.session(session)?;
         self.check_requirements(std::slice::from_ref(requirement), &[ResourceOperation::Consume])?;
         let assignment = Assignment::of(&self.resources, Available::Free(&self.queue.reserved), &[requirement]);
@@ -42,7 +42,7 @@ impl Pool {
     /// # Errors
     /// An unknown or expired session.
     pub fn end_task(&mut self, now: Timestamp, session: &SessionId) -> Result<(), PoolError> {
-        self.advance(now);
+        self.begin(now);
         if !self.session(session)?.consumed.is_empty() {
             self.commit(Effect::TaskEnded { session: session.clone() });
             self.schedule();

@@ -23,7 +23,7 @@ impl Pool {
         session: Option<&SessionId>,
         spec: ResourceSpec,
     ) -> Result<ResourceView, PoolError> {
-        self.advance(now);
+        self.begin(now);
         session.map(|id| self.session(id)).transpose()?;
         self.check_spec(&spec)?;
         let mut numbered = self.last_number;
@@ -60,7 +60,7 @@ impl Pool {
     /// # Errors
     /// An unknown resource, or one that belongs to another session.
     pub fn delete(&mut self, now: Timestamp, session: Option<&SessionId>, id: &str) -> Result<(), PoolError> {
-        self.advance(now);
+        self.begin(now);
         let found = self.resources.find(id).and_then(|slot| Some((slot, self.resources.get(slot)?)));
         let (slot, resource) = found.ok_or_else(|| PoolError::UnknownResource { id: id.to_owned() })?;
         may_delete(resource, session)?;
@@ -80,7 +80,7 @@ impl Pool {
         session: &SessionId,
         requirement: &Requirement,
     ) -> Result<Vec<String>, PoolError> {
-        self.advance(now);
+        self.begin(now);
         self.session(session)?;
         self.check_requirements(std::slice::from_ref(requirement), &[ResourceOperation::Delete])?;
         let whole = requirement.count.is_whole();

@@ -79,7 +79,7 @@ impl Pool {
         kind: &str,
         reason: &str,
     ) -> Result<(), PoolError> {
-        self.advance(now);
+        self.begin(now);
         self.session(session)?;
         self.check_name("kind", kind)?;
         if reason.is_empty() {

@@ -14,6 +14,12 @@ pub enum PoolError {
         /// Which.
         session: SessionId,
     },
+    /// The session has ended, and not everything that hung on it is gone yet.
+    #[error("{session} is ending: try again in a moment")]
+    SessionEnding {
+        /// Which.
+        session: SessionId,
+    },
     /// No such lease, or it has ended.
     #[error("{lease} is unknown or has ended")]
     UnknownLease {

@@ -114,6 +114,20 @@ pub enum Change {
     },
 }
 
+impl Change {
+    /// The resources that it tells of.
+    pub fn resources(&self) -> &[ResourceView] {
+        match self {
+            Change::ResourceCreated(resource)
+            | Change::ResourceUpdated(resource)
+            | Change::ResourceDeleted { resource, .. }
+            | Change::ResourceLost { resource, .. }
+            | Change::UnitsFreed { resource, .. } => std::slice::from_ref(resource),
+            Change::LeaseGranted { resources, .. } | Change::LeaseEnded { resources, .. } => resources,
+        }
+    }
+}
+
 /// Why a lease or a resource ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum EndReason {

@@ -1,8 +1,9 @@
 //! What time does to the pool: sessions expire, waiters reach their deadline, leases their end,
 //! and providers the bound within which they confirm standstill.
 //!
-//! Everything that is due is ended before anything is granted, so that a waiter whose session or deadline has passed is
-//! never handed a lease, however late the pool was called.
+//! Waiters whose session or deadline has passed leave before anything is granted, however late the pool was called. What else is
+//! due ends in the same turn, unless that would take long: then the rest is overdue, and [`Pool::next_deadline`] asks for the next
+//! turn at once. What is overdue is held until it has ended, and nobody gets it meanwhile.
 
 use crate::event::{EndReason, Refusal};
 use crate::id::{SessionId, Slot, WaiterId};
@@ -10,6 +11,13 @@ use crate::pool::Pool;
 use crate::record::Effect;
 use ratn_model::id::LeaseId;
 use ratn_model::time::Timestamp;
+
+/// Resources that are looked at in one turn: some milliseconds.
+const WORK_PER_TURN: usize = 100_000;
+/// And in one call: what others are owed does not make it much longer.
+const WORK_PER_CALL: usize = 20_000;
+/// The end of a lease at a resource takes as long as looking at so many of them.
+const WORK_PER_END: usize = 25;
 
 /// What ends at a moment.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -22,44 +30,101 @@ pub(crate) enum Timer {
 }
 
 impl Pool {
-    /// The next moment at which time alone changes something: call [`Pool::advance`] then. At once, where what a turn does for
-    /// those who wait was not enough.
+    /// The next moment at which time alone changes something: call [`Pool::advance`] then. At once, where what a turn does was not
+    /// enough.
     pub fn next_deadline(&self) -> Option<Timestamp> {
-        if self.queue.is_behind() {
+        if self.queue.is_behind() || !self.overdue.is_empty() {
             return Some(self.now);
         }
         let timer = self.timers.first().map(|(at, _)| *at).filter(|at| *at < Timestamp(u64::MAX));
         timer.into_iter().chain(self.served_later()).min()
     }
 
-    /// Ends what has run out by `now`, then grants what became free. Every other method does this first.
+    /// A turn: ends what has run out by `now`, then grants what became free.
     pub fn advance(&mut self, now: Timestamp) {
+        self.turn(now, WORK_PER_TURN);
+    }
+
+    /// As [`Pool::advance`], with less that is put off. Every other method does this first.
+    pub(crate) fn begin(&mut self, now: Timestamp) {
+        self.turn(now, WORK_PER_CALL);
+    }
+
+    /// Whether this turn has done its share.
+    pub(crate) fn has_done_enough(&self) -> bool {
+        self.worked >= self.enough
+    }
+
+    /// The same of what ends: half of the share is for those who wait.
+    pub(crate) fn has_ended_enough(&self) -> bool {
+        self.worked >= self.enough / 2
+    }
+
+    /// So many holdings have ended.
+    pub(crate) fn ended(&mut self, holdings: usize) {
+        self.worked += WORK_PER_END * holdings;
+    }
+
+    fn turn(&mut self, now: Timestamp, enough: usize) {
         // A clock that goes back is a clock that stands still.
         self.now = self.now.max(now);
-        self.looked_at = 0;
+        (self.worked, self.enough) = (0, enough);
         let now = self.now;
         self.pace.iter_mut().for_each(|pace| pace.heard_of(now));
-        let mut ended = self.queue.is_behind() || !self.queue.ready.is_empty();
+        let mut ended = self.queue.is_behind() || !self.queue.ready.is_empty() || !self.overdue.is_empty();
         while self.timers.first().is_some_and(|(at, _)| *at <= self.now) {
             let Some((_, timer)) = self.timers.pop_first() else { break };
             ended = true;
             match timer {
-                Timer::Session(id) => self.end_session(&id, EndReason::SessionExpired),
-                Timer::Lease(lease) => self.commit(Effect::LeaseEnded { lease, reason: EndReason::HeldTooLong }),
-                Timer::Standstill(lease, slot) => {
-                    self.commit(Effect::UnitsFreed { lease, slot, confirmed: false });
-                }
+                Timer::Session(id) => self.begin_end(&id, EndReason::SessionExpired),
+                Timer::Lease(_) | Timer::Standstill(..) => drop(self.overdue.insert(timer)),
                 Timer::Waiter(id) => {
                     let explained = if self.has_done_enough() { None } else { self.explained(id) };
                     let (waited_for, looked_at) =
                         explained.map(|(e, looked_at)| (e.to_string(), looked_at)).unwrap_or_default();
-                    self.looked_at += looked_at;
+                    self.worked += looked_at;
                     self.refuse(id, Refusal::Deadline { waited_for });
                 }
             }
         }
+        self.end_overdue();
         if ended {
             self.schedule();
         }
+    }
+
+    /// Ends what is due, as much of it as a turn may.
+    pub(crate) fn end_overdue(&mut self) {
+        while !self.has_ended_enough()
+            && let Some(timer) = self.overdue.first().cloned()
+        {
+            match timer {
+                Timer::Session(id) => self.end_some_of(&id),
+                Timer::Lease(lease) => {
+                    self.ended(self.leases.get(&lease).map_or(0, |record| record.held.len()) + 1);
+                    self.commit(Effect::LeaseEnded { lease, reason: EndReason::HeldTooLong });
+                }
+                Timer::Standstill(lease, slot) => {
+                    self.ended(1);
+                    self.commit(Effect::UnitsFreed { lease, slot, confirmed: false });
+                }
+                // It leaves at its deadline.
+                Timer::Waiter(_) => drop(self.overdue.remove(&timer)),
+            }
+        }
+        // Also after a restart they go on ending.
+        let begun = |timer: &Timer| if let Timer::Session(id) = timer { Some(id.clone()) } else { None };
+        let begun: Vec<SessionId> = self.overdue.iter().map_while(begun).collect();
+        for session in begun {
+            let Some(known) = self.sessions.get(&session).filter(|known| !known.ttl.is_zero()) else { continue };
+            let (client, ttl) = (known.name.clone(), std::time::Duration::ZERO);
+            self.commit(Effect::SessionKept { session, client, ttl });
+        }
+    }
+
+    /// Nothing is to end any more at a moment, or what was due has ended.
+    pub(crate) fn stop_timer(&mut self, at: Timestamp, timer: Timer) {
+        self.overdue.remove(&timer);
+        self.timers.remove(&(at, timer));
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::caller::Callers;
 use crate::expiry::Timer;
+use crate::id::SessionId;
 use crate::pool::Pool;
 use ratn_model::time::Timestamp;
 use std::collections::BTreeSet;
@@ -38,6 +39,12 @@ impl Pool {
             }
         }
         ensure(self.resources.index_agrees(), || "the index of kinds does not agree with the resources".to_owned())?;
+        ensure(self.crowds_agree(), || "the holders of a resource as they are shown are not those it has".to_owned())?;
+        let undoable = self.leases.iter().flat_map(|(id, lease)| lease.consumed.iter().map(|(slot, _)| (*slot, *id)));
+        let indexed = self.undoable.iter().flat_map(|(slot, leases)| leases.iter().map(|lease| (*slot, *lease)));
+        ensure(undoable.collect::<BTreeSet<_>>() == indexed.collect(), || {
+            "what can be taken back is indexed otherwise".to_owned()
+        })?;
         let mut tokens = 0;
         for (id, record) in &self.leases {
             ensure(record.token.0 > tokens, || format!("{id}: tokens do not grow"))?;
@@ -84,7 +91,17 @@ impl Pool {
         let provided: usize = self.sessions.values().map(|s| s.provides.len()).sum();
         let owned = self.resources.iter().filter(|(_, resource)| resource.owner.is_some()).count();
         ensure(provided == owned, || "a session provides a resource that is gone".to_owned())?;
-        ensure(self.timers == self.expected_timers(), || "the timers do not agree with what they are for".to_owned())?;
+        let ending = |id: &SessionId| self.sessions.get(id).is_some_and(|session| session.ending.is_some());
+        let overdue = |timer: &Timer| !matches!(timer, Timer::Session(id) if !ending(id));
+        ensure(self.overdue.iter().all(overdue), || "a session that lives is overdue".to_owned())?;
+        let unwritten = self.sessions.values().any(|session| session.ending.is_some() != session.ttl.is_zero());
+        ensure(!unwritten, || "that a session ends is not written down".to_owned())?;
+        let timers = self.timers.iter().map(|(_, timer)| timer).chain(&self.overdue).cloned().collect::<BTreeSet<_>>();
+        let expected = self.expected_timers();
+        let named: BTreeSet<Timer> = expected.iter().map(|(_, timer)| timer.clone()).collect();
+        ensure(self.timers.is_subset(&expected) && timers == named, || {
+            "the timers do not agree with what they are for".to_owned()
+        })?;
         self.memory.check(&self.limits)?;
         let waiting = self.queue.iter().filter(|(_, waiter)| !waiter.request_id.is_empty()).count();
         ensure(self.memory.waiting() == waiting, || "a request id waits without a waiter".to_owned())

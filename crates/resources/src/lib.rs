@@ -38,6 +38,7 @@ mod assignment;
 mod caller;
 mod consumption;
 mod creation;
+mod crowd;
 mod demand;
 mod error;
 mod event;
@@ -64,6 +65,7 @@ mod session;
 mod snapshot;
 mod validation;
 
+pub use crowd::Holders;
 pub use demand::Demand;
 pub use error::PoolError;
 pub use event::{Change, EndReason, Notice, Refusal, WatchEvent};

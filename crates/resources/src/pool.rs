@@ -1,6 +1,7 @@
 //! The pool: its state, requests with their ids, and what can be seen of it.
 
 use crate::caller::Callers;
+use crate::crowd::Crowds;
 use crate::error::PoolError;
 use crate::event::{Notice, WatchEvent};
 use crate::expiry::Timer;
@@ -35,6 +36,10 @@ pub struct Pool {
     pub(crate) leases: Leases,
     /// What leases that have ended have left.
     pub(crate) ending: EndingLeases,
+    /// Who has units of a resource with many holders; of the three above.
+    pub(crate) crowds: Crowds,
+    /// Leases with consumption that can be taken back, by the resource that was consumed of.
+    pub(crate) undoable: BTreeMap<Slot, BTreeSet<LeaseId>>,
     pub(crate) memory: RequestMemory,
     pub(crate) revision: Revision,
     pub(crate) last_lease: u64,
@@ -53,8 +58,12 @@ pub struct Pool {
     pub(crate) callers: Callers,
     /// How fast tokens may grow; as fast as they like where nobody said from where.
     pub(crate) pace: Option<Pace>,
-    /// How many resources were looked at in this turn for those who wait.
-    pub(crate) looked_at: usize,
+    /// What is due and has not ended yet.
+    pub(crate) overdue: BTreeSet<Timer>,
+    /// How much was done in this turn, counted in resources that were looked at.
+    pub(crate) worked: usize,
+    /// With so much the rest is left to the next turn.
+    pub(crate) enough: usize,
     pub(crate) notices: Vec<Notice>,
     pub(crate) records: Vec<Record>,
 }
@@ -130,7 +139,7 @@ impl Pool {
         request_id: &str,
         request: Request,
     ) -> Result<Reply, PoolError> {
-        self.advance(now);
+        self.begin(now);
         if request_id.is_empty() {
             return self.perform(now, speaker, RequestId::default(), Fingerprint::UNKNOWN, request);
         }
@@ -186,7 +195,7 @@ impl Pool {
     /// One resource.
     pub fn get(&self, id: &str) -> Option<ResourceView> {
         let slot = self.resources.find(id)?;
-        self.resources.get(slot).map(|resource| resource.view(slot, &self.leases, &self.ending, self.now))
+        self.resources.get(slot).map(|resource| self.view_of((slot, resource)))
     }
 
     /// Every resource, in the order of ids.
@@ -199,8 +208,8 @@ impl Pool {
         self.resources.after(id).take(most).map(|one| self.view_of(one)).collect()
     }
 
-    fn view_of(&self, (slot, resource): (Slot, &Resource)) -> ResourceView {
-        resource.view(slot, &self.leases, &self.ending, self.now)
+    pub(crate) fn view_of(&self, (slot, resource): (Slot, &Resource)) -> ResourceView {
+        resource.view(self.holders(slot, resource))
     }
 
     /// Every live lease, in the order of ids.

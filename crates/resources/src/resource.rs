@@ -1,11 +1,10 @@
 //! A resource: its description, who has how much of it, and therefore what is free.
 
+use crate::crowd::Holders;
 use crate::id::{SessionId, Slot};
-use crate::lease::{EndingLeases, Leases};
 use ratn_model::condition::Condition;
 use ratn_model::id::{FencingToken, LeaseId, Revision};
 use ratn_model::resource::{LeasedResource, Quantity, Requirement, ResourceClass};
-use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
@@ -82,10 +81,8 @@ pub struct ResourceView {
     pub consumed: Quantity,
     /// The session with which it vanishes.
     pub owner: Option<SessionId>,
-    /// Who holds some of it now, in the order of leases.
-    pub holdings: Vec<Holding>,
-    /// What is neither held nor free yet, in the order of leases.
-    pub ending: Vec<EndingUnits>,
+    /// Who holds some of it, and what is neither held nor free yet.
+    pub holders: Holders,
     /// The pool's revision when it was created or updated.
     pub revision: Revision,
 }
@@ -280,6 +277,12 @@ impl Resource {
         self.spent + self.consumers.iter().map(|(_, amount)| *amount).sum()
     }
 
+    /// What a session has consumed of it that returns.
+    pub(crate) fn consumed_by(&self, session: &SessionId) -> Quantity {
+        let found = self.consumers.binary_search_by(|(other, _)| other.cmp(session));
+        found.map_or(Quantity::ZERO, |at| self.consumers[at].1)
+    }
+
     /// What exists and is not consumed, held or not.
     pub(crate) fn quantity(&self) -> Quantity {
         self.description.capacity.saturating_sub(self.consumed())
@@ -294,22 +297,13 @@ impl Resource {
         self.quantity().saturating_sub(self.held())
     }
 
-    pub(crate) fn view(&self, slot: Slot, leases: &Leases, ending: &EndingLeases, now: Timestamp) -> ResourceView {
+    pub(crate) fn view(&self, holders: Holders) -> ResourceView {
         ResourceView {
             description: self.description.clone(),
             free: self.free(),
             consumed: self.consumed(),
             owner: self.owner.clone(),
-            holdings: self
-                .holders
-                .iter()
-                .filter_map(|(id, units)| leases.get(id).map(|lease| lease.holding(*id, *units)))
-                .collect(),
-            ending: self
-                .holders
-                .iter()
-                .filter_map(|(id, units)| ending.get(id).map(|lease| lease.view(*id, slot, *units, now)))
-                .collect(),
+            holders,
             revision: self.revision,
         }
     }

@@ -3,7 +3,7 @@
 //! A slot is a small number that a resource keeps for its life; the lowest vacant one is given next, so the same history
 //! gives the same slots. Every change of a resource goes through [`Resources::change`], which keeps the indices right.
 
-use crate::id::Slot;
+use crate::id::{SessionId, Slot};
 use crate::kinds::Kinds;
 use crate::resource::{Description, Resource};
 use ratn_model::resource::{Quantity, Requirement};
@@ -16,6 +16,8 @@ pub(crate) struct Resources {
     kinds: Kinds,
     /// More leases than these do not hold some of one resource; none where nothing is said.
     max_holders: Option<usize>,
+    /// Sessions that end: what they provide is given to nobody any more.
+    closing: BTreeSet<SessionId>,
     slots: Vec<Option<Resource>>,
     vacant: BTreeSet<Slot>,
     by_id: BTreeMap<Box<str>, Slot>,
@@ -45,9 +47,20 @@ impl Resources {
         self.max_holders = Some(holders);
     }
 
-    /// Whether as many leases hold some of it as may.
-    pub(crate) fn is_crowded(&self, resource: &Resource) -> bool {
+    /// What a session provides is given to nobody any more.
+    pub(crate) fn close(&mut self, provider: &SessionId) {
+        self.closing.insert(provider.clone());
+    }
+
+    /// Nothing of a session is left.
+    pub(crate) fn closed(&mut self, provider: &SessionId) {
+        self.closing.remove(provider);
+    }
+
+    /// Whether nobody can have more of a resource: as many leases hold some of it as may, or its provider ends.
+    pub(crate) fn is_kept_back(&self, resource: &Resource) -> bool {
         self.max_holders.is_some_and(|most| resource.holders.len() >= most)
+            || (!self.closing.is_empty() && resource.owner.as_ref().is_some_and(|owner| self.closing.contains(owner)))
     }
 
     pub(crate) fn len(&self) -> usize {

@@ -10,7 +10,7 @@
 //! it goes to the first in its family that lacks it. Only where the order is disturbed (a more urgent one arrives, something
 //! that was reserved is gone) is a family shared out anew. The work is that for those who get something.
 //!
-//! One turn looks at no more than [`LOOKED_AT_PER_TURN`] resources (and at those of one more waiter): what is left is put off to the next
+//! One turn looks at a bounded number of resources (`expiry.rs`) (and at those of one more waiter): what is left is put off to the next
 //! turn, which [`Pool::next_deadline`] asks for at once. Until then nobody is served past the queue.
 
 use crate::assignment::{Assignment, Available};
@@ -23,15 +23,7 @@ use std::collections::BTreeSet;
 use std::ops::Bound;
 use std::sync::Arc;
 
-/// Resources that are looked at in one turn for those who wait: some milliseconds.
-const LOOKED_AT_PER_TURN: usize = 100_000;
-
 impl Pool {
-    /// Whether this turn has done its share for those who wait.
-    pub(crate) fn has_done_enough(&self) -> bool {
-        self.looked_at >= LOOKED_AT_PER_TURN
-    }
-
     /// Grants whatever can be granted.
     pub(crate) fn schedule(&mut self) {
         loop {
@@ -80,7 +72,7 @@ impl Pool {
         let Some(waiter) = self.queue.waiters.get(&place.1) else { return };
         let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
         let assignment = Assignment::of(&self.resources, Available::Existing, &requirements);
-        self.looked_at += 1 + assignment.looked_at;
+        self.worked += 1 + assignment.looked_at;
         let hopeful = assignment.is_complete();
         let known = if hopeful { self.queue.hopeless.remove(&place) } else { self.queue.hopeless.insert(place) };
         self.queue.demand_changed |= known || !hopeful;
@@ -146,7 +138,7 @@ impl Pool {
             }
             let Some(group) = self.queue.groups.get(&key) else { continue };
             let (exhausted, looked_at) = group.exhausted(&self.resources, &self.queue.reserved);
-            self.looked_at += 1 + looked_at;
+            self.worked += 1 + looked_at;
             if exhausted {
                 continue;
             }
@@ -197,7 +189,7 @@ impl Pool {
         let kept = self.limits.overtaken == 0 || known.strict.last().is_some_and(|last| place <= *last);
         let passes = self.passes(place, family);
         let Some((indices, assignment)) = self.assigned(place, family) else { return };
-        self.looked_at += assignment.looked_at;
+        self.worked += assignment.looked_at;
         let complete = assignment.is_complete();
         if (complete && !passes) || (!complete && kept) {
             self.reserve(place, family, &indices, assignment);

@@ -8,6 +8,7 @@ use crate::limits::Limits;
 use crate::pool::Pool;
 use crate::record::Effect;
 use ratn_model::id::LeaseId;
+use ratn_model::resource::Quantity;
 use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -24,6 +25,9 @@ pub(crate) struct Session {
     pub(crate) ttl: Duration,
     /// When it expires unless kept alive.
     pub(crate) expires: Timestamp,
+    /// It ends, and why: it is nobody's any more, though not everything that hung on it is gone yet. Where that takes several turns,
+    /// its `ttl` is 0, which is how it is written down.
+    pub(crate) ending: Option<EndReason>,
     /// The resources that vanish with it.
     pub(crate) provides: BTreeSet<Slot>,
     /// Its leases.
@@ -81,6 +85,7 @@ impl Session {
             opened_by,
             ttl,
             expires,
+            ending: ttl.is_zero().then_some(EndReason::SessionExpired),
             provides: BTreeSet::new(),
             leases: BTreeSet::new(),
             waiters: BTreeSet::new(),
@@ -109,7 +114,7 @@ impl Pool {
     /// another `ttl` is written down.
     ///
     /// # Errors
-    /// A session that another opened, a malformed name, no time to live, or too many sessions.
+    /// A session that another opened or that is still ending, a malformed name, no time to live, or too many sessions.
     pub fn keep_alive_as(
         &mut self,
         now: Timestamp,
@@ -119,6 +124,9 @@ impl Pool {
         ttl: Duration,
     ) -> Result<bool, PoolError> {
         self.check_speaker(now, speaker, id)?;
+        if self.sessions.get(id).is_some_and(|session| session.ending.is_some()) {
+            return Err(PoolError::SessionEnding { session: id.clone() });
+        }
         if ttl.is_zero() {
             return Err(malformed("session time to live 0", "a session lives for more than 0 seconds"));
         }
@@ -170,7 +178,7 @@ impl Pool {
     /// # Errors
     /// A session that another opened.
     pub fn check_speaker(&mut self, now: Timestamp, speaker: &Speaker, id: &SessionId) -> Result<(), PoolError> {
-        self.advance(now);
+        self.begin(now);
         match self.sessions.get(id) {
             Some(session) if !speaker.for_anybody && session.opened_by != speaker.name => {
                 Err(PoolError::SessionOfAnother {
@@ -187,7 +195,7 @@ impl Pool {
     /// may have promised meanwhile is kept.
     #[must_use]
     pub fn with_session_grace(mut self, grace: Duration) -> Pool {
-        for (id, session) in &mut self.sessions {
+        for (id, session) in self.sessions.iter_mut().filter(|(_, session)| session.ending.is_none()) {
             self.timers.remove(&(session.expires, Timer::Session(id.clone())));
             session.expires = session.expires + grace;
             self.timers.insert((session.expires, Timer::Session(id.clone())));
@@ -197,17 +205,19 @@ impl Pool {
 
     /// How long a session lives without a keep-alive; nothing where it is unknown.
     pub fn session_ttl(&self, id: &SessionId) -> Option<Duration> {
-        self.sessions.get(id).map(|session| session.ttl)
+        self.session(id).ok().map(|session| session.ttl)
     }
 
-    /// Ends a session and everything that hangs on it.
+    /// Ends a session and everything that hangs on it. From now on it is unknown; where much hangs on it, the rest of that goes in the
+    /// next turns.
     ///
     /// # Errors
     /// An unknown or expired session.
     pub fn close_session(&mut self, now: Timestamp, id: &SessionId) -> Result<(), PoolError> {
-        self.advance(now);
+        self.begin(now);
         self.session(id)?;
-        self.end_session(id, EndReason::SessionClosed);
+        self.begin_end(id, EndReason::SessionClosed);
+        self.end_overdue();
         self.schedule();
         Ok(())
     }
@@ -234,28 +244,49 @@ impl Pool {
 
     /// Whether a session is there.
     pub fn has_session(&self, id: &SessionId) -> bool {
-        self.sessions.contains_key(id)
+        self.session(id).is_ok()
     }
 
     pub(crate) fn session(&self, id: &SessionId) -> Result<&Session, PoolError> {
-        self.sessions.get(id).ok_or_else(|| PoolError::UnknownSession { session: id.clone() })
+        let known = self.sessions.get(id).filter(|session| session.ending.is_none());
+        known.ok_or_else(|| PoolError::UnknownSession { session: id.clone() })
     }
 
-    pub(crate) fn end_session(&mut self, id: &SessionId, reason: EndReason) {
-        let Some(session) = self.sessions.get(id).cloned() else { return };
-        for waiter in session.waiters {
+    /// Nobody has a session any more: its waiters leave, and what else hangs on it begins to go.
+    pub(crate) fn begin_end(&mut self, id: &SessionId, reason: EndReason) {
+        let Some(session) = self.sessions.get_mut(id) else { return };
+        session.ending = Some(reason);
+        let (expires, waiters) = (session.expires, std::mem::take(&mut session.waiters));
+        self.stop_timer(expires, Timer::Session(id.clone()));
+        self.shortages.remove(id);
+        self.resources.close(id);
+        for waiter in waiters {
             self.refuse(waiter, Refusal::SessionEnded);
         }
-        for lease in session.leases {
-            self.commit(Effect::LeaseEnded { lease, reason });
+        self.overdue.insert(Timer::Session(id.clone()));
+        self.end_some_of(id);
+    }
+
+    /// Ends what hangs on a session that ends, as much of it as a turn may; and the session with the last of it.
+    pub(crate) fn end_some_of(&mut self, id: &SessionId) {
+        while let Some(session) = self.sessions.get(id)
+            && let Some(reason) = session.ending
+            && !self.has_ended_enough()
+        {
+            let (lease, consumed) = (session.leases.first(), session.consumed.first());
+            let (effect, holdings) = if let Some(&lease) = lease {
+                (Effect::LeaseEnded { lease, reason }, self.leases.get(&lease).map_or(0, |record| record.held.len()))
+            } else if let Some(&slot) = consumed {
+                let amount = self.resources.get(slot).map_or(Quantity::ZERO, |resource| resource.consumed_by(id));
+                (Effect::Returned { session: id.clone(), slot, amount }, 0)
+            } else if let Some(&slot) = session.provides.first() {
+                let holders = self.resources.get(slot).map_or(0, |resource| resource.holders.len());
+                (Effect::ResourceDeleted { slot, reason }, holders)
+            } else {
+                (Effect::SessionEnded { session: id.clone() }, 0)
+            };
+            self.ended(holdings + 1);
+            self.commit(effect);
         }
-        if !session.consumed.is_empty() {
-            self.commit(Effect::TaskEnded { session: id.clone() });
-        }
-        for slot in session.provides {
-            self.commit(Effect::ResourceDeleted { slot, reason });
-        }
-        self.shortages.remove(id);
-        self.commit(Effect::SessionEnded { session: id.clone() });
     }
 }

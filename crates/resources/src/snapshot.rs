@@ -162,9 +162,9 @@ impl Pool {
         for (id, client, ttl) in snapshot.sessions {
             let opened_by = openers.remove(&id).unwrap_or_default();
             let expires = self.now + ttl;
-            self.timers.insert((expires, Timer::Session(id.clone())));
             self.callers.opened(&opened_by);
-            self.sessions.insert(id, Session::new(client, opened_by, ttl, expires));
+            self.sessions.insert(id.clone(), Session::new(client, opened_by, ttl, expires));
+            self.start_session_timer(&id, expires);
         }
         for (slot, resource) in snapshot.resources {
             let consumers = resource.consumers.iter().map(|(session, _)| (session, false));
@@ -187,6 +187,7 @@ impl Pool {
                 self.sessions.get_mut(&lease.session).ok_or_else(|| format!("{} is not there", lease.session))?;
             session.leases.insert(id);
             lease.opened_by = session.opened_by.clone();
+            self.undoable(id, &lease.consumed);
             self.leases.insert(id, lease);
         }
         let mut ended = snapshot.ended.into_iter();
@@ -199,6 +200,7 @@ impl Pool {
             }
             self.ending.insert(id, ending);
         }
+        self.gather_crowds();
         let mut answered = snapshot.answered.into_iter();
         for (id, fingerprint, reply) in snapshot.answers {
             let id = RequestId::new(&answered.next().unwrap_or_default(), &id);

@@ -338,7 +338,7 @@ proptest! {
                         prop_assert!(!pool.confirm_standstill(at, None, *lease, &resource.id).unwrap());
                     }
                     if let Some(lease) = model.ending.keys().nth(index).copied() {
-                        let left = pool.list().into_iter().filter(|view| view.ending.iter().any(|ending| ending.lease == lease));
+                        let left = pool.list().into_iter().filter(|view| view.holders.ending().any(|ending| ending.lease == lease));
                         for resource in left.collect::<Vec<_>>() {
                             prop_assert!(pool.confirm_standstill(at, None, lease, &resource.id).unwrap());
                             prop_assert!(!pool.confirm_standstill(at, None, lease, &resource.id).unwrap());
@@ -446,8 +446,8 @@ fn compare(pool: &mut Pool, model: &mut Model) -> Result<(), TestCaseError> {
         let kind = KINDS.iter().position(|kind| *kind == resource.kind).unwrap();
         free[kind] += resource.free.thousandths();
         // No unit has two holders.
-        let held: Quantity = resource.holdings.iter().map(|holding| holding.units).sum();
-        let ending: Quantity = resource.ending.iter().map(|ending| ending.units).sum();
+        let held: Quantity = resource.holders.live().map(|holding| holding.units).sum();
+        let ending: Quantity = resource.holders.ending().map(|ending| ending.units).sum();
         prop_assert_eq!(held + ending + resource.consumed + resource.free, resource.capacity);
     }
     prop_assert_eq!(free, [0, 1, 2, 3].map(|kind| model.free(kind)));

@@ -78,7 +78,8 @@ fn acquired(resources: &[(usize, u64)], divisible: bool, wants: &[(usize, u64)])
     // What is under the lease is under it: no resource gives more than it has.
     let free: u64 = pool.list().iter().map(|resource| resource.free.thousandths()).sum();
     let there: u64 = resources.iter().map(|(_, parts)| parts * PART).sum();
-    let held: u64 = pool.list().iter().flat_map(|r| r.holdings.iter().map(|h| h.units.thousandths())).sum();
+    let held: u64 =
+        pool.list().iter().flat_map(|r| r.holders.live().map(|h| h.units.thousandths()).collect::<Vec<_>>()).sum();
     assert_eq!(free + held, there);
     !pool.leases().is_empty()
 }

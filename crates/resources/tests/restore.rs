@@ -8,8 +8,8 @@ use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_resources::{
-    AcquireRequest, DecodeError, FORMAT, Limits, Pool, Record, Request, ResourceSpec, RestoreError, SessionId,
-    Snapshot, Speaker, decode, encode,
+    AcquireRequest, DecodeError, EndingUnits, FORMAT, Holding, Limits, Pool, Record, Request, ResourceSpec,
+    ResourceView, RestoreError, SessionId, Snapshot, Speaker, decode, encode,
 };
 use std::time::Duration;
 
@@ -116,7 +116,7 @@ fn perform(pool: &mut Pool, now: u64, step: &Step, id: u8) -> String {
         Step::Confirm(index) => {
             let ending = pool.list().into_iter().flat_map(|view| {
                 let id = view.id.clone();
-                view.ending.into_iter().map(move |ending| (ending.lease, id.clone()))
+                view.holders.ending().map(move |ending| (ending.lease, id.clone())).collect::<Vec<_>>()
             });
             let (lease, resource) =
                 ending.collect::<Vec<_>>().get(*index).cloned().unwrap_or((LeaseId(0), "the-Arm".into()));
@@ -138,10 +138,13 @@ fn restored(now: u64, snapshot: &[u8], entries: &[Vec<u8>]) -> Pool {
 }
 
 /// Every resource; how much of a bound is left is not kept.
-fn without_bounds(pool: &Pool) -> Vec<ratn_resources::ResourceView> {
-    let mut list = pool.list();
-    list.iter_mut().flat_map(|view| &mut view.ending).for_each(|ending| ending.within = Duration::ZERO);
-    list
+fn without_bounds(pool: &Pool) -> Vec<(ResourceView, Vec<Holding>, Vec<EndingUnits>)> {
+    let apart = |mut view: ResourceView| {
+        let holders = std::mem::take(&mut view.holders);
+        let ending = holders.ending().map(|ending| EndingUnits { within: Duration::ZERO, ..ending });
+        (view, holders.live().cloned().collect(), ending.collect())
+    };
+    pool.list().into_iter().map(apart).collect()
 }
 
 /// The same state after the queue is gone and every session has been kept alive.
@@ -289,7 +292,7 @@ fn who_opened_a_session_is_known_from_records_and_from_a_snapshot_and_not_of_one
     let from_snapshot = Pool::restore(Limits::default(), now, Some(kept), []).unwrap();
     for mut again in [from_records, from_snapshot] {
         assert_eq!(&*again.sessions()[0].opened_by, "a");
-        assert_eq!(&*again.get("arm").unwrap().holdings[0].opened_by, "a");
+        assert_eq!(&*again.get("arm").unwrap().holders.live().next().unwrap().opened_by, "a");
         let refused = again.keep_alive_as(now, &speaker("b", false), &id, "s", Duration::from_secs(10)).unwrap_err();
         assert_eq!(refused.to_string(), "session `s` belongs to a, not to b");
         assert_eq!(again.keep_alive_as(now, &speaker("root", true), &id, "s", Duration::from_secs(10)), Ok(false));

@@ -85,8 +85,9 @@ fn what_a_lost_session_held_is_granted_when_its_provider_has_confirmed_standstil
     let [Change::LeaseEnded { resources, .. }] = &changes[..] else {
         panic!("the provider hears at once: {changes:?}")
     };
-    assert!(resources[0].free.is_zero() && resources[0].holdings.is_empty());
-    assert_eq!((resources[0].ending[0].lease, resources[0].ending[0].within), (bench.lease, BOUND));
+    assert!(resources[0].free.is_zero() && resources[0].holders.live().next().is_none());
+    let left = resources[0].holders.ending().next().unwrap();
+    assert_eq!((left.lease, left.within), (bench.lease, BOUND));
     bench.pool.advance(at(2_400));
     assert!(bench.granted().is_empty());
     let waits =

@@ -17,6 +17,8 @@ use tokio_util::sync::CancellationToken;
 
 /// Messages that are put into an order together.
 const AT_ONCE: usize = 64;
+/// Urgent messages that are taken in a row while others wait.
+const URGENT_AT_ONCE: usize = 64;
 /// What came together is written down together, and nothing else is looked at meanwhile, unless that takes longer than this.
 const TURN: Duration = Duration::from_millis(1);
 
@@ -42,6 +44,8 @@ impl<C: Core> Actor<C> {
         over: CancellationToken,
     ) {
         let mut arrived = Vec::new();
+        // Since other messages were.
+        let mut urgent_taken = 0;
         let mut tick = tokio::time::interval(TICK);
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
@@ -53,11 +57,16 @@ impl<C: Core> Actor<C> {
             }
             let deadline = self.core.next_deadline(&self.desk).map(|at| self.desk.instant(at));
             let (running, room) = (self.desk.stopped().is_none(), !self.outbox.is_full() && !self.desk.is_full());
+            // What is urgent comes first, but not for ever.
+            let urgent_first = urgent_taken < URGENT_AT_ONCE || !room || inbox.messages.is_empty();
             tokio::select! {
                 biased;
                 () = over.cancelled() => return self.end(),
                 () = draining.cancelled(), if !self.drained => self.drain(),
-                Some(urgent) = inbox.urgent.recv() => self.receive_urgent(urgent),
+                Some(urgent) = inbox.urgent.recv(), if urgent_first => {
+                    urgent_taken += 1;
+                    self.receive_urgent(urgent);
+                }
                 Ok(()) = signals.changed() => self.core.signal(&signals.borrow_and_update(), &mut self.desk),
                 progress = self.journal.changed(), if running => self.written(progress),
                 _ = tick.tick() => {}
@@ -67,10 +76,12 @@ impl<C: Core> Actor<C> {
                     if count == 0 {
                         return self.end();
                     }
+                    urgent_taken = 0;
                     C::order(&mut arrived);
                     let mut turn = Instant::now();
                     for message in arrived.drain(..) {
-                        while let Ok(urgent) = inbox.urgent.try_recv() {
+                        for _ in 0..URGENT_AT_ONCE {
+                            let Ok(urgent) = inbox.urgent.try_recv() else { break };
                             self.receive_urgent(urgent);
                         }
                         let alone = C::is_large(&message);

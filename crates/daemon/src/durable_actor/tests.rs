@@ -33,10 +33,16 @@ enum Message {
     Count(Answer<usize>),
     /// Answered when it is taken, whatever the disk does.
     Taken(oneshot::Sender<()>),
+    /// How many pings were taken.
+    Pings(oneshot::Sender<usize>),
     Panic,
 }
 
-struct BlobCore(Blobs);
+#[derive(Default)]
+struct BlobCore {
+    blobs: Blobs,
+    pings: usize,
+}
 
 impl Journaled for Blobs {
     fn take_entry(&mut self) -> Option<Vec<u8>> {
@@ -52,13 +58,13 @@ impl Journaled for Blobs {
 impl Core for BlobCore {
     type State = Blobs;
     type Message = Message;
-    type Urgent = Infallible;
+    type Urgent = oneshot::Sender<()>;
     type Said = Infallible;
     type Update = ();
     type Signal = ();
 
     fn state(&mut self) -> &mut Blobs {
-        &mut self.0
+        &mut self.blobs
     }
 
     fn restore(&mut self, _: &Journal, _: &Desk<Self>) -> Result<(), JournalError> {
@@ -74,18 +80,20 @@ impl Core for BlobCore {
     fn receive(&mut self, message: Message, desk: &mut Desk<Self>) {
         match message {
             Message::Add(length, answer) => {
-                self.0.lengths.push(length);
-                self.0.entry = Some(vec![7; length]);
-                desk.reply(answer, Ok(self.0.lengths.len()));
+                self.blobs.lengths.push(length);
+                self.blobs.entry = Some(vec![7; length]);
+                desk.reply(answer, Ok(self.blobs.lengths.len()));
             }
-            Message::Count(answer) => desk.reply(answer, Ok(self.0.lengths.len())),
+            Message::Count(answer) => desk.reply(answer, Ok(self.blobs.lengths.len())),
             Message::Taken(answer) => drop(answer.send(())),
+            Message::Pings(answer) => drop(answer.send(self.pings)),
             Message::Panic => panic!("a defect"),
         }
     }
 
-    fn receive_urgent(&mut self, urgent: Infallible, _: &mut Desk<Self>) {
-        match urgent {}
+    fn receive_urgent(&mut self, ping: oneshot::Sender<()>, _: &mut Desk<Self>) {
+        self.pings += 1;
+        let _ = ping.send(());
     }
 
     fn signal(&mut self, (): &(), _: &mut Desk<Self>) {}
@@ -122,7 +130,8 @@ fn begin(place: &Path, disk: &SlowDisk) -> (Handle<BlobCore>, Vitals) {
     let vitals = Vitals::default();
     let signals = watch::Sender::new(()).subscribe();
     let (never, over) = (CancellationToken::new(), CancellationToken::new());
-    let (handle, _) = start(BlobCore(blobs), journal, signals, vitals.clone(), never, over).unwrap();
+    let (handle, _) =
+        start(BlobCore { blobs, ..BlobCore::default() }, journal, signals, vitals.clone(), never, over).unwrap();
     (handle, vitals)
 }
 
@@ -206,4 +215,27 @@ async fn a_disk_that_fails_makes_the_daemon_unwell_and_what_was_not_on_it_is_ref
     assert!(unwell.is_some_and(|why| why.contains("the disk is gone")), "health says so");
     assert_eq!(vitals.condition().borrow().failure, None, "what is on the disk can still be read");
     assert!(in_time(handle.request(Message::Count)).await.is_ok());
+}
+
+#[tokio::test]
+async fn a_message_is_taken_among_pings_without_end() {
+    let place = tempfile::tempdir().unwrap();
+    let (handle, _) = begin(place.path(), &SlowDisk::default());
+    let (clients, pings) = (500, 100);
+    let pinging = (0..clients).map(|_| {
+        let handle = handle.clone();
+        tokio::spawn(async move {
+            for _ in 0..pings {
+                handle.ask_urgently(|ping| ping).await.unwrap();
+            }
+        })
+    });
+    let pinging: Vec<_> = pinging.collect();
+    in_time(handle.ask_urgently(|ping| ping)).await.unwrap();
+    let taken = in_time(handle.ask(Message::Pings)).await.unwrap();
+    assert!(taken < clients * pings / 2, "{taken} pings were taken first");
+    for client in pinging {
+        in_time(client).await.unwrap();
+    }
+    assert_eq!(in_time(handle.ask(Message::Pings)).await.unwrap(), clients * pings + 1, "and no ping is forgotten");
 }

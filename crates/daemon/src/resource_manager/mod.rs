@@ -16,6 +16,7 @@ mod providers;
 mod service;
 mod status;
 mod stream;
+mod told;
 mod watch_filter;
 mod wire;
 

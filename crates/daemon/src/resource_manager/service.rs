@@ -15,7 +15,7 @@ use futures::{Stream, StreamExt};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Lease, Requirement, ResourceOperation};
 use ratn_proto::convert::{all, each, label, name, names, ports, required};
-use ratn_proto::types::{Resource, ResourceFilter, ResourceUpdate, WatchPosition};
+use ratn_proto::types::{Resource, ResourceFilter, WatchPosition};
 use ratn_proto::v1;
 use ratn_resources::{AcquireRequest, Reply, Request as PoolRequest, ResourceSpec, SessionId};
 use ratn_worker::multiplex::SessionCalls;
@@ -439,13 +439,15 @@ impl v1::resource_service_server::ResourceService for Service {
         }
         let (part, in_parts) = (request.after_part, request.in_parts);
         let after = request.after_revision.map(|revision| WatchPosition { revision: Revision(revision), part });
-        let filter = WatchFilter {
+        let filter = Arc::new(WatchFilter {
             kinds: request.kinds.into_iter().collect(),
             resources: request.resource_ids.into_iter().collect(),
-        };
-        let updates = self.actor.ask(|answer| Message::Watch { after, filter, answer }).await??;
+        });
+        let watch = |answer| Message::Watch { after, filter: filter.clone(), answer };
+        let updates = self.actor.ask(watch).await??;
         let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
-            .flat_map(move |update| futures::stream::iter(messages(ResourceUpdate::clone(&update).into(), in_parts)))
+            .flat_map(move |told| futures::stream::iter(told.updates(&filter, after)))
+            .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)))
             // After a snapshot that does not fit nothing follows.
             .scan(false, |over, message| {
                 let before = std::mem::replace(over, message.is_err());

@@ -19,6 +19,9 @@ pub(super) fn of_error(error: &PoolError) -> Status {
         PoolError::NotEnough { .. } => (Code::FailedPrecondition, "NOT_ENOUGH"),
         PoolError::Malformed { .. } => (Code::InvalidArgument, "MALFORMED"),
         PoolError::RequestIdReused { .. } => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
+        PoolError::SessionEnding { .. } => {
+            return retry_later(Code::Unavailable, "SESSION_ENDING", error.to_string(), RETRY_DELAY);
+        }
         PoolError::Quota { .. } => {
             return retry_later(Code::ResourceExhausted, "QUOTA", error.to_string(), RETRY_DELAY);
         }

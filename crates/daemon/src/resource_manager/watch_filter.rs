@@ -1,6 +1,6 @@
 //! Which resources a watch is about: a provider hears of its own, and not of everybody's.
 
-use ratn_proto::types::ResourceUpdate;
+use ratn_resources::ResourceView;
 use std::collections::BTreeSet;
 
 /// All of them where a set is empty; where both are not, those that are in both.
@@ -12,16 +12,8 @@ pub(super) struct WatchFilter {
 
 impl WatchFilter {
     /// Whether it is about a resource.
-    pub(super) fn passes(&self, id: &str, kind: &str) -> bool {
-        (self.kinds.is_empty() || self.kinds.contains(kind))
-            && (self.resources.is_empty() || self.resources.contains(id))
-    }
-
-    /// Whether it is about what an update tells of. A snapshot was made for it.
-    pub(super) fn passes_update(&self, update: &ResourceUpdate) -> bool {
-        match update {
-            ResourceUpdate::Snapshot { .. } => true,
-            ResourceUpdate::Event(event) => self.passes(&event.resource.id, &event.resource.kind),
-        }
+    pub(super) fn passes(&self, resource: &ResourceView) -> bool {
+        (self.kinds.is_empty() || self.kinds.contains(&resource.kind))
+            && (self.resources.is_empty() || self.resources.contains(&resource.id))
     }
 }

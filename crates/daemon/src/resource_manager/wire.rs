@@ -18,7 +18,7 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
     } else {
         ResourceState::Leased
     };
-    let holding = |holding: ratn_resources::Holding| Holding {
+    let holding = |holding: &ratn_resources::Holding| Holding {
         lease: holding.lease,
         token: holding.token,
         units: holding.units,
@@ -26,7 +26,7 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
         holder: holding.purpose.to_string(),
         opened_by: holding.opened_by.to_string(),
     };
-    let ending = |ending: &ratn_resources::EndingUnits| EndingUnits {
+    let ending = |ending: ratn_resources::EndingUnits| EndingUnits {
         lease: ending.lease,
         token: ending.token,
         units: ending.units,
@@ -47,8 +47,8 @@ pub(super) fn resource(view: &ResourceView) -> Resource {
         revision: view.revision,
         state,
         free: view.free,
-        holdings: view.holdings.iter().cloned().map(holding).collect(),
-        ending: view.ending.iter().map(ending).collect(),
+        holdings: view.holders.live().map(holding).collect(),
+        ending: view.holders.ending().map(ending).collect(),
     }
 }
 
@@ -58,7 +58,7 @@ pub(super) fn lease(lease: Lease, session_id: String) -> v1::Lease {
 }
 
 /// One event of the pool may touch several resources: one event each, all of one revision.
-pub(super) fn events(event: &WatchEvent) -> Vec<ResourceEvent> {
+pub(super) fn events(event: &WatchEvent, wanted: impl Fn(&ResourceView) -> bool) -> Vec<ResourceEvent> {
     use ResourceEventKind::{Created, Deleted, Leased, Released, Updated};
     let revision = event.revision;
     let of = |part, kind, view: &ResourceView, lease, reason: String| ResourceEvent {
@@ -70,9 +70,11 @@ pub(super) fn events(event: &WatchEvent) -> Vec<ResourceEvent> {
         part,
     };
     let each = |kind, views: &[ResourceView], lease, reason: &str| {
-        (0..).zip(views).map(|(part, view)| of(part, kind, view, lease, reason.to_owned())).collect()
+        let views = (0..).zip(views).filter(|(_, view)| wanted(view));
+        views.map(|(part, view)| of(part, kind, view, lease, reason.to_owned())).collect()
     };
     match &event.change {
+        change if !change.resources().iter().any(&wanted) => Vec::new(),
         Change::ResourceCreated(view) => vec![of(0, Created, view, None, String::new())],
         Change::ResourceUpdated(view) => vec![of(0, Updated, view, None, String::new())],
         Change::ResourceDeleted { resource, reason } => vec![of(0, Deleted, resource, None, reason.to_string())],

@@ -1,10 +1,9 @@
 //! What leaves when its records are on the disk: grants to whoever still waits, events to everybody who watches.
 
 use super::{ResourceCore, ResourceDesk};
-use crate::resource_manager::{status, wire};
-use ratn_proto::types::{ResourceEvent, ResourceUpdate};
+use crate::resource_manager::status;
+use crate::resource_manager::told::Told;
 use ratn_resources::{Change, Notice};
-use std::sync::Arc;
 
 impl ResourceCore {
     pub(super) fn notify(&mut self, notice: Notice, desk: &mut ResourceDesk) {
@@ -14,7 +13,8 @@ impl ResourceCore {
                 if let Change::LeaseEnded { lease, .. } = &event.change {
                     self.shared.remove(lease);
                 }
-                wire::events(&event).into_iter().for_each(|event| publish(event, desk));
+                tracing::trace!(revision = event.revision.0, change = ?event.change, "event");
+                desk.watchers.publish(&Told::Event(event));
             }
             Notice::Granted { waiter, lease } => {
                 let id = lease.id;
@@ -30,12 +30,4 @@ impl ResourceCore {
             }
         }
     }
-}
-
-fn publish(event: ResourceEvent, desk: &mut ResourceDesk) {
-    if desk.watchers.len() == 0 {
-        return;
-    }
-    tracing::trace!(revision = event.revision.0, kind = ?event.kind, resource = event.resource.id, "event");
-    desk.watchers.publish(&Arc::new(ResourceUpdate::Event(event)));
 }

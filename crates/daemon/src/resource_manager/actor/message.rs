@@ -1,12 +1,13 @@
 //! What the service asks of the actor, and how it gets there.
 
 use super::super::providers::Provisions;
+use super::super::told::Told;
 use super::super::watch_filter::WatchFilter;
 use super::ResourceCore;
 use crate::resource_manager::Granted;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Requirement;
-use ratn_proto::types::{Demand, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition};
+use ratn_proto::types::{Demand, SessionStatus, WaitingAcquire, WatchPosition};
 use ratn_resources::{AcquireRequest, Quantity, Reply, Request, ResourceView, SessionId, Speaker};
 use std::cmp::Reverse;
 use std::sync::Arc;
@@ -106,8 +107,8 @@ pub(in super::super) enum Message {
     Watch {
         /// Without a snapshot: what happened after this.
         after: Option<WatchPosition>,
-        filter: WatchFilter,
-        answer: Answer<mpsc::Receiver<Arc<ResourceUpdate>>>,
+        filter: Arc<WatchFilter>,
+        answer: Answer<mpsc::Receiver<Told>>,
     },
 }
 

@@ -13,6 +13,7 @@ mod watchers;
 pub(super) use message::{Handle, KeptAlive, Message};
 
 use super::providers::Providers;
+use super::told::Told;
 use super::{Granted, ResourceManagerConfig, status};
 use crate::details::ending;
 use crate::durable_actor::{self, Core, Desk, Journal, JournalError};
@@ -21,11 +22,9 @@ use message::{Ping, most_urgent_first};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
-use ratn_proto::types::ResourceUpdate;
 use ratn_resources::{Notice, Pool, PoolError, Reply, Request, SessionId, Speaker, WaiterId};
 use ratn_worker::vitals::Vitals;
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
@@ -100,7 +99,7 @@ impl Core for ResourceCore {
     type Message = Message;
     type Urgent = Ping;
     type Said = Said;
-    type Update = Arc<ResourceUpdate>;
+    type Update = Told;
     type Signal = ResourceManagerConfig;
 
     fn state(&mut self) -> &mut Pool {

@@ -1,11 +1,11 @@
 //! What a watch begins with: everything as it is, or what happened after a position that is known.
 
 use super::{ResourceCore, ResourceDesk};
+use crate::resource_manager::status;
+use crate::resource_manager::told::Told;
 use crate::resource_manager::watch_filter::WatchFilter;
-use crate::resource_manager::{status, wire};
 use ratn_model::id::Revision;
-use ratn_proto::types::{ResourceEvent, ResourceUpdate, WatchPosition};
-use ratn_resources::ResourceView;
+use ratn_proto::types::WatchPosition;
 use std::sync::Arc;
 use tokio::sync::mpsc;
 use tonic::Status;
@@ -14,24 +14,23 @@ impl ResourceCore {
     pub(super) fn watch(
         &self,
         after: Option<WatchPosition>,
-        filter: WatchFilter,
+        filter: Arc<WatchFilter>,
         desk: &mut ResourceDesk,
-    ) -> Result<mpsc::Receiver<Arc<ResourceUpdate>>, Status> {
+    ) -> Result<mpsc::Receiver<Told>, Status> {
         desk.watchers.admit(self.config.max_watchers)?;
-        let Some(after) = after else {
-            let wanted = |view: &&ResourceView| filter.passes(&view.description.id, &view.description.kind);
-            let resources = self.pool.list().iter().filter(wanted).map(wire::resource).collect();
-            let (revision, youngest) = (self.pool.revision(), self.pool.youngest_lease());
-            let first = vec![Arc::new(ResourceUpdate::Snapshot { revision, resources, youngest })];
-            return desk.watch_where(first, move |update| filter.passes_update(update));
+        let first = match after {
+            None => {
+                let resources = self.pool.list().into_iter().filter(|view| filter.passes(view)).collect();
+                let (revision, youngest) = (self.pool.revision(), self.pool.youngest_lease());
+                vec![Told::Snapshot { revision, resources, youngest }]
+            }
+            Some(after) => {
+                // Some of this revision may have been seen.
+                let before = Revision(after.revision.0.saturating_sub(u64::from(after.part.is_some())));
+                let events = self.pool.changes_after(before).map_err(|compacted| status::of_compacted(&compacted))?;
+                events.into_iter().map(Told::Event).filter(|told| told.concerns(&filter)).collect()
+            }
         };
-        // Some of this revision may have been seen.
-        let before = Revision(after.revision.0.saturating_sub(u64::from(after.part.is_some())));
-        let events = self.pool.changes_after(before).map_err(|compacted| status::of_compacted(&compacted))?;
-        let events = events.iter().flat_map(|event| wire::events(event));
-        let unseen = |event: &ResourceEvent| event.revision > after.revision || Some(event.part) > after.part;
-        let first = events.filter(unseen).map(|event| Arc::new(ResourceUpdate::Event(event)));
-        let first = first.filter(|update| filter.passes_update(update)).collect();
-        desk.watch_where(first, move |update| filter.passes_update(update))
+        desk.watch_where(first, move |told| told.concerns(&filter))
     }
 }

@@ -1,0 +1,45 @@
+//! What watchers are told, as the pool has it. The wire's messages are made of it where they are sent: the holders of a resource that
+//! thousands of leases hold are in every event of it, and the actor has no time for that.
+
+use super::watch_filter::WatchFilter;
+use super::wire;
+use ratn_model::id::{LeaseId, Revision};
+use ratn_proto::types::{ResourceEvent, ResourceUpdate, WatchPosition};
+use ratn_resources::{ResourceView, WatchEvent};
+use std::sync::Arc;
+
+/// See the module.
+#[derive(Debug, Clone)]
+pub(super) enum Told {
+    /// What is there, of what a watch is about; events follow from the next revision on.
+    Snapshot { revision: Revision, resources: Vec<ResourceView>, youngest: LeaseId },
+    /// What happened since.
+    Event(Arc<WatchEvent>),
+}
+
+impl Told {
+    /// Whether some of it is what a watch is about. A snapshot was made for it.
+    pub(super) fn concerns(&self, filter: &WatchFilter) -> bool {
+        match self {
+            Told::Snapshot { .. } => true,
+            Told::Event(event) => event.change.resources().iter().any(|resource| filter.passes(resource)),
+        }
+    }
+
+    /// What a watch is told of it: what it is about, behind what it has seen.
+    pub(super) fn updates(&self, filter: &WatchFilter, after: Option<WatchPosition>) -> Vec<ResourceUpdate> {
+        match self {
+            Told::Snapshot { revision, resources, youngest } => {
+                let resources = resources.iter().map(wire::resource).collect();
+                vec![ResourceUpdate::Snapshot { revision: *revision, resources, youngest: *youngest }]
+            }
+            Told::Event(event) => {
+                let unseen = |event: &ResourceEvent| {
+                    after.is_none_or(|after| event.revision > after.revision || Some(event.part) > after.part)
+                };
+                let events = wire::events(event, |resource| filter.passes(resource)).into_iter();
+                events.filter(unseen).map(ResourceUpdate::Event).collect()
+            }
+        }
+    }
+}
