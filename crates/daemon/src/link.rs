@@ -1,5 +1,5 @@
-//! The link of a provider to the resource manager: finds it, keeps a session, and keeps the resources there equal to those
-//! wanted, also after the manager came back, on another port if need be.
+//! The link of a provider to the resource manager: it finds the manager, keeps a session alive, and keeps the resources at the manager equal to
+//! those that the provider wants to offer. The link goes on when the manager was started again, also at another address.
 
 use crate::demand::DemandLink;
 use crate::resource_manager;
@@ -17,12 +17,12 @@ use tokio_util::sync::CancellationToken;
 
 /// A part of a daemon, for its log.
 pub(crate) const LINK: &str = "the link to the resource manager";
-/// How long is waited for a manager before that is said in the log (and waited on).
+/// After so long without a manager the log says so, again and again; the link goes on waiting.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// How often is looked whether the manager has moved, and whether something is still to be offered.
+/// The pause between two looks whether the manager has another address, and whether a resource is still to be offered.
 const LOOK_INTERVAL: Duration = Duration::from_millis(250);
 
-/// The resources wanted, by id.
+/// The resources that the provider wants to offer, by id.
 pub(crate) type Wanted = BTreeMap<String, Resource>;
 
 /// What became of a resource that was to be offered or withdrawn.
@@ -44,7 +44,7 @@ pub(crate) struct OfferLifecycle {
     pub(crate) draining: watch::Receiver<BTreeSet<String>>,
 }
 
-/// Where the resource manager is.
+/// How the resource manager is found.
 #[derive(Debug, Clone)]
 pub(crate) struct Manager {
     pub(crate) configured: Option<Endpoint>,
@@ -54,20 +54,20 @@ pub(crate) struct Manager {
 /// A provider's link.
 pub(crate) struct Link {
     pub(crate) manager: Manager,
-    /// Who this is, for people.
+    /// The name of the provider, for people.
     pub(crate) client: String,
-    /// The session's id; a fresh one for every manager without.
+    /// The id of the session; `None` for a new id with every manager.
     pub(crate) session: Option<String>,
     pub(crate) ttl: Duration,
     pub(crate) wanted: watch::Receiver<Wanted>,
     /// For a provider whose resources come and go.
     pub(crate) lifecycle: Option<OfferLifecycle>,
-    /// Hears what is missing.
+    /// For a provider that makes resources on demand.
     pub(crate) demand: Option<DemandLink>,
 }
 
 impl Manager {
-    /// Where it is, as soon as it is there.
+    /// The address of the resource manager; waits until there is one.
     pub(crate) async fn find(&self) -> Endpoint {
         loop {
             if let Some(endpoint) = &self.configured {
@@ -83,14 +83,14 @@ impl Manager {
         }
     }
 
-    /// Whether it is somewhere else now.
+    /// Whether the resource manager has another address than this one now.
     pub(crate) fn has_moved_from(&self, endpoint: &Endpoint) -> bool {
         self.configured.is_none() && self.directory.find(resource_manager::ROLE).is_ok_and(|found| found != *endpoint)
     }
 }
 
 impl Link {
-    /// Keeps it up until `shutdown`; then the session is closed, and with it every resource is gone.
+    /// Keeps the link up until `shutdown`. Then it closes the session, and with the session every resource is gone.
     pub(crate) async fn keep(mut self, shutdown: CancellationToken) {
         let channels = Channels::new();
         let mut demand = self.demand.take();
@@ -117,7 +117,7 @@ impl Link {
         }
     }
 
-    /// Returns when the manager is somewhere else.
+    /// Returns when the manager has another address.
     async fn keep_at(&mut self, channels: &Channels, endpoint: &Endpoint, session: &Session) -> Result<(), CallError> {
         while session.alive(LOOK_INTERVAL).await.is_err() {
             if self.manager.has_moved_from(endpoint) {
@@ -154,7 +154,7 @@ impl Link {
                             let _ = lifecycle.events.send(OfferEvent::Offered(id)).await;
                         }
                     }
-                    // The provider offers it by itself as soon as it can; asked again only to learn that it has.
+                    // The provider goes on trying by itself. The link asks again to learn when it has succeeded.
                     Ok(false) => settled = false,
                     Err(error) => {
                         tracing::error!(id, %error, "the resource manager does not take the resource");
@@ -168,8 +168,8 @@ impl Link {
         }
     }
 
-    /// Waits until other resources are wanted, or until those that are not settled can be looked at again; false where the manager
-    /// has moved, or nothing is wanted ever again.
+    /// Waits until other resources are wanted, or until those that are not settled can be tried again. Returns false when the manager
+    /// has another address, or when the provider has ended.
     async fn has_news(&mut self, endpoint: &Endpoint, settled: bool) -> bool {
         loop {
             panic_point("link");
@@ -185,7 +185,7 @@ impl Link {
         }
     }
 
-    /// Withdraws what a process before this one offered in the same session, and what is not wanted now.
+    /// Withdraws resources that an earlier process offered in the same session and that this one does not want.
     async fn withdraw_left(&mut self, provider: &Provider, session: &str) -> Result<(), CallError> {
         let own = ResourceFilter { session: session.to_owned(), ..ResourceFilter::default() };
         for left in provider.client().list_where(own).await? {
@@ -221,7 +221,7 @@ async fn drains_changed(lifecycle: &mut Option<OfferLifecycle>) {
     }
 }
 
-/// Does not end.
+/// Follows the demand, for a provider that makes resources on demand. Does not end.
 async fn follow(demand: &mut Option<DemandLink>, channels: &Channels, endpoint: &Endpoint, session: &Session) {
     match demand {
         Some(demand) => demand.follow(channels, endpoint, session).await,

@@ -1,7 +1,7 @@
-//! Offering resources under a session, again whenever the resource manager has forgotten them, and withdrawing them. What
-//! the manager cannot be told now it is told as soon as it can.
+//! Offers resources under a session, and withdraws them. A resource that the resource manager has forgotten is offered again. While the
+//! manager cannot be reached, offers and withdrawals wait.
 //!
-//! A provider watches what it offers: where somebody else deleted it, it says so in the log and offers it again.
+//! A provider watches its resources at the manager. When somebody else has deleted one, the provider logs that and offers it again.
 
 use crate::client::{CallError, Channels, ResourceClient};
 use crate::endpoint::Endpoint;
@@ -24,7 +24,7 @@ const PART: &str = "the provider of resources";
 /// The pause before the manager is asked again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Keeps the resources that it was given with the resource manager, as long as the session lives.
+/// Keeps resources offered at the resource manager, as long as the session lives.
 #[derive(Debug)]
 pub struct Provider {
     shared: Arc<Shared>,
@@ -45,11 +45,11 @@ struct Shared {
 /// What a resource shall be at the manager: there, or gone.
 #[derive(Debug, Default)]
 struct DesiredState {
-    /// What shall be there; `None` for what shall be gone.
+    /// The resource to be offered; `None` for one that is to be withdrawn.
     resource: Option<Resource>,
-    /// Why it is not so yet, as told in the log.
+    /// Why the manager does not have this state yet, as the log has said.
     problem: String,
-    /// The manager has said that it is there.
+    /// The manager has confirmed that it has the resource.
     there: bool,
 }
 

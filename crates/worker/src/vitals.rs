@@ -1,11 +1,11 @@
-//! How a daemon's core is, as the core itself says: whether it takes its turns, whether it can do what it is for, and why it has ended.
+//! The condition of a daemon's core, as the core reports it: whether it takes its turns, whether it can do its work, and why it has ended.
 //!
 //! ```text
 //!   core ── beat, at every turn ──────────▶ systemd's watchdog (a core that hangs is silent)
 //!        ── unwell / well ────────────────▶ gRPC health, systemd's status
 //!        ── fail (panicked, fenced) ──────▶ serving ends at once, the process with a code of its own
 //! ```
-//! Clones are the same.
+//! Clones share one condition.
 
 use std::any::Any;
 use std::sync::Arc;
@@ -20,15 +20,15 @@ pub const EXIT_CODE_FENCED: u8 = 74;
 /// Why a core has ended before its time.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CoreFailure {
-    /// By a defect.
+    /// A defect of the program: a panic.
     #[error("{part} has ended by a defect, and the process with it: {what}; please report it")]
     Panicked {
-        /// What of the daemon.
+        /// Which part of the process.
         part: String,
-        /// What the panic said.
+        /// The message of the panic.
         what: String,
     },
-    /// Another process has its state. It says nothing more, and ends.
+    /// Another process has taken over the state. This one answers nothing more, and ends.
     #[error("{what}")]
     Fenced {
         /// Which state, and what to do.
@@ -37,14 +37,14 @@ pub enum CoreFailure {
 }
 
 impl CoreFailure {
-    /// Of a panic that was caught.
+    /// The failure of a part whose panic was caught.
     pub fn of_panic(part: &str, panic: &(dyn Any + Send)) -> CoreFailure {
         let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
         let what = text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "it panicked".to_owned());
         CoreFailure::Panicked { part: part.to_owned(), what }
     }
 
-    /// What the process ends with.
+    /// The exit code of the process.
     pub fn exit_code(&self) -> u8 {
         match self {
             CoreFailure::Panicked { .. } => EXIT_CODE_PANICKED,
@@ -53,12 +53,12 @@ impl CoreFailure {
     }
 }
 
-/// What is known of a core.
+/// The condition of a core.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Condition {
-    /// Why it cannot do what it is for; it is served all the same, for what it still can.
+    /// Why the core cannot do its work; it is served all the same, for what it still can do.
     pub unwell: Option<String>,
-    /// Why it has ended. The first reason stays.
+    /// Why the core has ended. The first reason stays.
     pub failure: Option<CoreFailure>,
 }
 
@@ -74,18 +74,18 @@ struct Inner {
 }
 
 impl Vitals {
-    /// The core takes its turn. From the first beat on others are waited for.
+    /// The core takes a turn. From the first beat on the watchdog expects more.
     pub fn beat(&self) {
         self.0.beats.fetch_add(1, Ordering::Relaxed);
         self.0.beating.store(true, Ordering::Relaxed);
     }
 
-    /// How often it did; nothing for a process that has no core that beats.
+    /// The number of beats; `None` for a process whose core does not beat.
     pub fn beats(&self) -> Option<u64> {
         self.0.beating.load(Ordering::Relaxed).then(|| self.0.beats.load(Ordering::Relaxed))
     }
 
-    /// It cannot do what it is for.
+    /// The core cannot do its work.
     pub fn unwell(&self, why: impl Into<String>) {
         let why = Some(why.into());
         self.0.condition.send_if_modified(|condition| {
@@ -95,12 +95,12 @@ impl Vitals {
         });
     }
 
-    /// It can again.
+    /// The core can do its work again.
     pub fn well(&self) {
         self.0.condition.send_if_modified(|condition| condition.unwell.take().is_some());
     }
 
-    /// It has ended.
+    /// The core has ended.
     pub fn fail(&self, failure: CoreFailure) {
         tracing::error!(%failure, "the process ends");
         self.0.condition.send_if_modified(|condition| {
@@ -110,24 +110,24 @@ impl Vitals {
         });
     }
 
-    /// How it is, and every change of it.
+    /// The condition, and every change of it.
     pub fn condition(&self) -> watch::Receiver<Condition> {
         self.0.condition.subscribe()
     }
 
-    /// Resolves when it has ended before its time.
+    /// Resolves when the core has ended before its time.
     pub async fn failed(&self) -> CoreFailure {
         let mut condition = self.condition();
         let failed =
             condition.wait_for(|condition| condition.failure.is_some()).await.map(|found| found.failure.clone());
         match failed.ok().flatten() {
             Some(failure) => failure,
-            // Nobody can say so any more.
+            // Every sender is gone.
             None => std::future::pending().await,
         }
     }
 
-    /// Does `work`; a panic in it is the core's end.
+    /// Does `work`. A panic in it is the end of the core.
     pub async fn guard<T>(&self, part: &str, work: impl Future<Output = T>) -> Option<T> {
         use futures::FutureExt;
         match std::panic::AssertUnwindSafe(work).catch_unwind().await {
@@ -139,7 +139,7 @@ impl Vitals {
         }
     }
 
-    /// As [`Vitals::guard`], of what blocks.
+    /// As [`Vitals::guard`], for work that blocks its thread.
     pub fn guard_blocking<T>(&self, part: &str, work: impl FnOnce() -> T) -> Option<T> {
         match std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)) {
             Ok(done) => Some(done),

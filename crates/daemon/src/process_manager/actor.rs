@@ -1,4 +1,4 @@
-//! The one task that owns the pools: performs their commands, and tells them what became of it.
+//! The one task that owns the pools. It performs their commands and hands them the events that follow.
 
 use super::config::{Labels, ProcessManagerConfig};
 use super::drained::Drained;
@@ -28,17 +28,17 @@ use tonic::Status;
 
 /// Messages that wait for the actor; more make their senders wait.
 const INBOX: usize = 256;
-/// Answers that are taken in before anything else gets its turn.
+/// Answers to health checks that are handled in one turn.
 const AT_ONCE: usize = 256;
-/// The actor takes a turn at least so often.
+/// The longest pause between two turns of the actor.
 const TICK: Duration = Duration::from_secs(1);
-/// Changes that wait for a watcher; one that has more to catch up with is cut off.
+/// Changes that wait for a watcher. A watcher that is further behind is cut off.
 const WATCH_BUFFER: usize = 4_096;
 /// Clients that watch at the same time.
 const MAX_WATCHERS: usize = 256;
 /// When the process manager ends, workers have this long to end by themselves: less than the grace of its own end.
 const SHUTDOWN_PATIENCE: Duration = Duration::from_millis(400);
-/// What is killed in the end is waited for this long.
+/// The actor waits this long for workers that it has killed at the end.
 const KILL_PATIENCE: Duration = Duration::from_millis(400);
 
 /// What the service asks of the actor.
@@ -65,25 +65,25 @@ pub(super) struct Parts {
     pub(super) config: ProcessManagerConfig,
     pub(super) directory: RuntimeDirectory,
     pub(super) roster: Roster,
-    /// Which processes are whose.
+    /// Knows which processes belong to which worker.
     pub(super) tracker: Tracker,
-    /// The ids of the workers that a process manager before this one left.
+    /// The ids of the workers that the last process manager left.
     pub(super) before: Vec<String>,
-    /// Those of them that were taken over.
+    /// The workers among them that were taken over.
     pub(super) adopted: Vec<Adopted>,
-    /// What the link shall offer.
+    /// The resources that the link shall offer.
     pub(super) wanted: watch::Sender<Wanted>,
-    /// Those of them that are withdrawn as soon as nobody holds them.
+    /// The ids of offered resources that are withdrawn as soon as nobody holds them.
     pub(super) drains: watch::Sender<BTreeSet<String>>,
     /// What became of these resources.
     pub(super) offer_events: mpsc::Receiver<OfferEvent>,
-    /// Who is held.
+    /// Which workers are held.
     pub(super) uses: mpsc::Receiver<Use>,
-    /// What is missing.
+    /// The demand for workers that nobody has.
     pub(super) demand: mpsc::Receiver<Vec<Demand>>,
-    /// Why there is no more.
+    /// Why the demand cannot be met.
     pub(super) short: watch::Sender<Shortages>,
-    /// What the machine has.
+    /// Measurements of the machine.
     pub(super) looks: mpsc::Receiver<Sample>,
 }
 

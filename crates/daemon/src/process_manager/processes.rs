@@ -28,7 +28,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
 use tokio_util::task::AbortOnDropHandle;
 
-/// What became of processes that waits for the actor.
+/// Events of processes that wait for the actor.
 const OUTCOMES: usize = 1_024;
 
 /// The pause between two looks for orphans that have ended.
@@ -46,21 +46,21 @@ pub(super) struct ProcessEvents {
     pub(super) health: mpsc::Receiver<(String, Result<(), String>)>,
 }
 
-/// A worker that cannot be begun.
+/// Why a worker cannot be started.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum BeginError {
     /// Too many processes are being started at once.
     #[error("cannot be started: too many processes are being started")]
     Busy,
-    /// It cannot run as the user that its template says.
+    /// The worker cannot run as the user of its template.
     #[error("cannot be started: {0}")]
     User(String),
-    /// Its socket cannot be made.
+    /// The socket of the worker's notifications cannot be made.
     #[error("cannot be started: no socket {} for it to notify: {reason}", socket.display())]
     Socket {
-        /// Where it was to be.
+        /// The path of the socket.
         socket: PathBuf,
-        /// Why not.
+        /// Why the socket cannot be made.
         reason: String,
     },
 }
@@ -69,13 +69,13 @@ pub(super) struct Processes {
     host: String,
     /// Where workers find the resource manager, which confirms the leases of their goals.
     manager: ManagerLocation,
-    /// What every worker has in its environment besides.
+    /// Variables in the environment of every worker.
     worker_environment: BTreeMap<&'static str, PathBuf>,
     max_log_bytes: u64,
-    /// Where groups of processes are made.
+    /// The directories in which cgroups are made.
     groups: Groups,
     directory: RuntimeDirectory,
-    /// What a template without a program runs.
+    /// The program of a template that names none.
     this_program: PathBuf,
     jobs: mpsc::Sender<Job>,
     outcomes: mpsc::Sender<Outcome>,
@@ -84,7 +84,7 @@ pub(super) struct Processes {
     senders: EventSenders,
     by_id: BTreeMap<String, Process>,
     ended_logs: EndedLogs,
-    /// Takes leave of orphans.
+    /// Reaps orphans: waits for those that have ended.
     reaping: Option<AbortOnDropHandle<()>>,
 }
 
@@ -96,12 +96,12 @@ struct EventSenders {
 
 #[derive(Debug)]
 struct Process {
-    /// Where its files are.
+    /// The directory of the worker's files.
     directory: RuntimeDirectory,
     pid: u32,
-    /// As it was started from, until that is in the roster.
+    /// The template that the worker was started from, until the roster has it.
     template: Option<Template>,
-    /// Who waits until it is known.
+    /// Dropped when the process is known; the readiness check waits for that.
     known: Option<oneshot::Sender<()>>,
     attended: Option<(AbortHandle, mpsc::Sender<Duration>)>,
 }
@@ -115,7 +115,7 @@ pub(super) fn manager_of(config: &ProcessManagerConfig, directory: &RuntimeDirec
 }
 
 impl Processes {
-    /// None yet. Needs a tokio runtime.
+    /// No processes yet. Needs a tokio runtime.
     pub(super) fn start(
         config: &ProcessManagerConfig,
         directory: RuntimeDirectory,
@@ -147,7 +147,7 @@ impl Processes {
         Ok((processes, ProcessEvents { outcomes, serving: served, health: answered }))
     }
 
-    /// Begins a worker of a template.
+    /// Starts a worker of a template.
     pub(super) fn begin(&mut self, id: &str, template: &Template) -> Result<(), BeginError> {
         let directory = account::directory_of(&self.directory, template);
         let account = template.user.as_deref().map(Account::named).transpose().map_err(BeginError::User)?;
@@ -178,7 +178,7 @@ impl Processes {
         let readiness_check = readiness_check
             .map_err(|error| BeginError::Socket { socket: socket.clone(), reason: error.to_string() })?;
         let mut env = environment::passed(std::env::vars_os(), &template.pass_env);
-        // Not a template's to say.
+        // Inserted last: a template cannot change the marker.
         let marker = self.tracker.environment(id);
         env.insert(RESOURCE_MANAGER_VARIABLE.into(), self.manager.to_string().into());
         env.extend(self.worker_environment.iter().map(|(name, file)| ((*name).into(), file.into())));
@@ -213,7 +213,7 @@ impl Processes {
             program: template.program.clone().unwrap_or_else(|| self.this_program.clone()),
         };
         let place = self.jobs.try_reserve().map_err(|_| BeginError::Busy)?;
-        // Before there is a process that only this one knows of.
+        // Written before the process exists: a successor knows of every process.
         let group = self.tracker.group_of(id);
         self.roster.starts(Intent { id: id.to_owned(), group, template: template.clone() });
         place.send(job);
@@ -234,7 +234,7 @@ impl Processes {
         Ok(())
     }
 
-    /// Its process is there.
+    /// The process of a worker has been started.
     pub(super) fn spawned(&mut self, id: &str, pid: u32, limits: &str, groups: Vec<PathBuf>) {
         let Some(process) = self.by_id.get_mut(id) else { return };
         process.pid = pid;
@@ -254,12 +254,12 @@ impl Processes {
         }
     }
 
-    /// Where it serves.
+    /// The worker serves at this endpoint.
     pub(super) fn serves(&mut self, id: &str, endpoint: &str) {
         self.roster.serves(id, endpoint);
     }
 
-    /// One that was taken over is watched from now on.
+    /// Watches a worker that was taken over from an earlier process manager.
     pub(super) fn adopt(&mut self, adopted: Adopted) {
         let entry = adopted.entry.clone();
         let id = entry.id.clone();
@@ -270,7 +270,7 @@ impl Processes {
         let socket = notify_socket(&directory, &id);
         let health_check = entry.template.readiness.health_check(&socket, &endpoint);
         if let Some(account) = account {
-            // Where it is not one that notifies there is none.
+            // A worker that does not notify has no socket.
             let _ = account.give(&socket);
         }
         let attended = health_check.map(|health_check| {
@@ -284,13 +284,13 @@ impl Processes {
         spawner::watch_adopted(adopted, &self.log_file(&id), self.max_log_bytes, tracker, self.outcomes.clone());
     }
 
-    /// Its process is gone.
+    /// The process of a worker has ended.
     pub(super) fn exited(&mut self, id: &str) {
         if let Some(Process { directory, attended, .. }) = self.by_id.remove(id) {
             if let Some((attended, _)) = attended {
                 attended.abort();
             }
-            // One that was killed could not take them back itself.
+            // A worker that was killed could not remove its files itself.
             let left = [directory.endpoint_file(id), notify_socket(&directory, id), adopt_socket(&directory, id)];
             for file in left {
                 let _ = std::fs::remove_file(file);
@@ -300,10 +300,10 @@ impl Processes {
         self.ended_logs.add(self.log_file(id));
     }
 
-    /// Asks one that serves whether it still does.
+    /// Asks a worker that serves whether it still does.
     pub(super) fn check(&self, id: &str, within: Duration) {
         if let Some((_, ask)) = self.by_id.get(id).and_then(|process| process.attended.as_ref()) {
-            // Full where the last question has not been answered: then that answer serves.
+            // The queue is full while the last question has no answer: that answer will do.
             let _ = ask.try_send(within);
         }
     }
@@ -315,7 +315,7 @@ impl Processes {
         }
     }
 
-    /// Whatever it takes: the workers, and all that they started.
+    /// Kills the workers and all processes that they started.
     pub(super) async fn end_all(&mut self) {
         self.by_id.values().for_each(|process| spawner::signal(process.pid, Signal::SIGKILL));
         drop(self.reaping.take());
@@ -331,7 +331,7 @@ impl Processes {
     }
 }
 
-/// Orphans that have ended are zombies until somebody looks.
+/// Reaps orphans again and again: one that has ended is a zombie until its parent waits for it.
 async fn reap(children: Children) {
     let mut looks = tokio::time::interval(REAP_INTERVAL);
     loop {
@@ -345,9 +345,8 @@ fn notify_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
     directory.path().join(format!("{id}.notify"))
 }
 
-/// Tells once a worker is ready, and whether it still is whenever that is asked. One that never is is the pools' business: they
-/// know when it is too late. A small one can be ready before its process is known: then that is waited for, or its resource would name
-/// none.
+/// Reports when a worker is ready, then answers each health check. The pools end a worker that is not ready in time. A small worker
+/// can be ready before its process id is known: the report waits for the id, because the worker's resource names it.
 async fn attend(
     directory: RuntimeDirectory,
     id: String,
@@ -368,7 +367,7 @@ async fn attend(
     answer(health_check, id, questions, senders.health).await;
 }
 
-/// Tells whether it still serves whenever that is asked.
+/// Answers each health check of a worker.
 async fn answer(
     mut health_check: HealthCheck,
     id: String,

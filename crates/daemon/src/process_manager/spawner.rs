@@ -40,35 +40,35 @@ pub(super) struct Job {
     pub(super) id: String,
     pub(super) program: PathBuf,
     pub(super) args: Vec<String>,
-    /// All of it.
+    /// The whole environment.
     pub(super) env: BTreeMap<OsString, OsString>,
     pub(super) directory: Option<PathBuf>,
-    /// The user that it runs as, where that is another one than this process's.
+    /// The user of the process; `None` for the user of this process.
     pub(super) account: Option<Account>,
     pub(super) limits: Limits,
-    /// Where groups of processes are made.
+    /// The directories in which cgroups are made.
     pub(super) groups: Groups,
-    /// A line of its standard output that is waited for.
+    /// A line of its standard output that shows that it is ready.
     pub(super) awaited: Option<Awaited>,
     pub(super) log: PathBuf,
     pub(super) max_log_bytes: u64,
-    /// It is to outlive this process: then it writes its log by itself.
+    /// The process is to outlive this one: it writes its log by itself.
     pub(super) outlives: bool,
 }
 
-/// What becomes of a job, in this order.
+/// What becomes of a job: `Spawned`, then `Exited`.
 #[derive(Debug)]
 pub(super) enum Outcome {
-    /// The process is there.
+    /// The process has been started.
     Spawned {
         id: String,
         pid: u32,
-        /// What it may use, for people.
+        /// The limits in force, for people.
         limits: String,
-        /// Its groups of cgroups.
+        /// Its cgroups.
         groups: Vec<PathBuf>,
     },
-    /// It is gone, or never was.
+    /// The process has ended, or could not be started.
     Exited { id: String, reason: String, last_words: String },
 }
 
@@ -165,7 +165,7 @@ struct Watched {
     log: Log,
     awaited: Option<Awaited>,
     force: AppliedLimits,
-    /// Its log is to be kept bounded: it writes it by itself.
+    /// The process writes its log by itself; the log is kept bounded from here.
     bounds: bool,
 }
 
@@ -196,7 +196,7 @@ async fn watch(worker: Watched, tracker: Tracker, outcomes: mpsc::Sender<Outcome
     let _ = outcomes.send(Outcome::Exited { id, reason, last_words: log.last_words() }).await;
 }
 
-/// Watches one that was taken over until its end; how that was nobody says who is not its parent.
+/// Watches a worker that was taken over until its end. Only a parent is told the exit status, so the reason is not known.
 pub(super) fn watch_adopted(
     adopted: Adopted,
     log: &Path,
@@ -221,7 +221,7 @@ pub(super) fn watch_adopted(
     tokio::spawn(exit_on_panic(WATCH_OF_WORKER, watching));
 }
 
-/// Its groups, and what it had started outside of them.
+/// Ends what is left in the cgroups of a worker, and what the worker had started outside of them.
 async fn end_rest(id: &str, force: AppliedLimits, tracker: Tracker) {
     let of = id.to_owned();
     let end_rest = move || {
