@@ -3,7 +3,7 @@
 //! A log is in the order of events, so what is checked of every start of a PIA in it holds at every moment of the run.
 
 use super::blind;
-use super::reference::{self, Fail, Given, Told};
+use super::reference::{self, Fail, Given, ReferenceResult};
 use super::replay::replayed;
 use super::story::{Act, Story, are_beside, story};
 use super::weak;
@@ -164,21 +164,21 @@ fn against_reference(
     if shares && !conditions.blind {
         return None;
     }
-    let told = match should_be(program, conditions, outside) {
-        Ok(told) => told,
+    let wanted = match should_be(program, conditions, outside) {
+        Ok(wanted) => wanted,
         Err(Fail::NotMine(_)) => return None,
         Err(problem) => return Some(format!("the reference does not come to an end: {problem:?}")),
     };
     let of = |mode: &str, problem: Option<String>| problem.map(|p| format!("{mode} mode and the reference: {p}"));
     if shares {
-        return of("HSM", reference::outcomes(&told, hsm, before));
+        return of("HSM", reference::outcomes(&wanted, hsm, before));
     }
-    of("HSM", reference::disagreement(program, &told, hsm, before)).or_else(|| {
+    of("HSM", reference::disagreement(program, &wanted, hsm, before)).or_else(|| {
         // What is beside or behind an imprecise failure is not the prefix of a program.
         match conditions.weak {
             true if weak::fails(hsm) || weak::fails(cdtn) => None,
-            true => of("CDTN", reference::end(&told, cdtn)),
-            false => of("CDTN", reference::disagreement(program, &told, cdtn, after)),
+            true => of("CDTN", reference::end(&wanted, cdtn)),
+            false => of("CDTN", reference::disagreement(program, &wanted, cdtn, after)),
         }
     })
 }
@@ -195,7 +195,11 @@ pub fn no_verdict(program: &Program, conditions: &Conditions) -> Option<&'static
 }
 
 /// What the reference says of a program.
-fn should_be(program: &Program, conditions: &Conditions, outside: &[(Trigger, Event)]) -> Result<Told, Fail> {
+fn should_be(
+    program: &Program,
+    conditions: &Conditions,
+    outside: &[(Trigger, Event)],
+) -> Result<ReferenceResult, Fail> {
     let task_resources = RESOURCES.iter().filter(|(_, class, _)| *class == ResourceClass::Task);
     reference::evaluate(Given {
         program,

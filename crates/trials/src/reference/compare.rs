@@ -1,6 +1,6 @@
 //! What a run did beside what it should have done.
 
-use super::Told;
+use super::ReferenceResult;
 use crate::state_of;
 use crate::story::Story;
 use ratn_model::program::{Program, StateKind};
@@ -12,45 +12,49 @@ use std::collections::BTreeMap;
 type Threads<'a> = BTreeMap<String, Vec<(&'a str, &'a str)>>;
 
 /// The first thing that a run did otherwise.
-pub(in super::super) fn disagreement(program: &Program, told: &Told, run: &Run, story: &Story) -> Option<String> {
-    end(told, run)
-        .or_else(|| acts(program, told, story))
-        .or_else(|| results(told, story))
-        .or_else(|| (told.changes != story.changes).then(|| differ("what became real", &told.changes, &story.changes)))
+pub(in super::super) fn disagreement(
+    program: &Program,
+    wanted: &ReferenceResult,
+    run: &Run,
+    story: &Story,
+) -> Option<String> {
+    end(wanted, run).or_else(|| acts(program, wanted, story)).or_else(|| results(wanted, story)).or_else(|| {
+        (wanted.changes != story.changes).then(|| differ("what became real", &wanted.changes, &story.changes))
+    })
 }
 
 /// Whatever does not depend on the world: how the task and its actions ended.
-pub(in super::super) fn outcomes(told: &Told, run: &Run, story: &Story) -> Option<String> {
-    task(told, run).or_else(|| results(told, story))
+pub(in super::super) fn outcomes(wanted: &ReferenceResult, run: &Run, story: &Story) -> Option<String> {
+    task(wanted, run).or_else(|| results(wanted, story))
 }
 
 /// Outcome and outputs.
-fn task(told: &Told, run: &Run) -> Option<String> {
-    if told.outcome != run.outcome {
-        return Some(differ("outcomes", &told.outcome, (&run.outcome, &run.reason)));
+fn task(wanted: &ReferenceResult, run: &Run) -> Option<String> {
+    if wanted.outcome != run.outcome {
+        return Some(differ("outcomes", &wanted.outcome, (&run.outcome, &run.reason)));
     }
-    (told.outputs != run.outputs).then(|| differ("outputs", &told.outputs, &run.outputs))
+    (wanted.outputs != run.outputs).then(|| differ("outputs", &wanted.outputs, &run.outputs))
 }
 
 /// Outcome, outputs, world and task resources.
-pub(in super::super) fn end(told: &Told, run: &Run) -> Option<String> {
-    if let Some(problem) = task(told, run) {
+pub(in super::super) fn end(wanted: &ReferenceResult, run: &Run) -> Option<String> {
+    if let Some(problem) = task(wanted, run) {
         return Some(problem);
     }
-    if !told.facts.iter().eq(run.world.iter().map(|(key, fact)| (key, &fact.value))) {
+    if !wanted.facts.iter().eq(run.world.iter().map(|(key, fact)| (key, &fact.value))) {
         let show = |all: Vec<(String, &Value)>| all.iter().map(|(k, v)| format!("{k} = {v}")).collect::<Vec<_>>();
-        let expected = show(told.facts.iter().map(|(key, value)| (key.to_string(), value)).collect());
+        let expected = show(wanted.facts.iter().map(|(key, value)| (key.to_string(), value)).collect());
         let found = show(run.world.iter().map(|(key, fact)| (key.to_string(), &fact.value)).collect());
         return Some(differ("worlds", expected, found));
     }
-    let left: BTreeMap<&str, u64> = told.units.iter().filter(|(_, n)| **n > 0).map(|(k, n)| (&**k, *n)).collect();
+    let left: BTreeMap<&str, u64> = wanted.units.iter().filter(|(_, n)| **n > 0).map(|(k, n)| (&**k, *n)).collect();
     let found = run.units.iter().map(|(kind, units)| (&**kind, units.thousandths())).filter(|(_, n)| *n > 0);
     let found: BTreeMap<&str, u64> = found.collect();
     (left != found).then(|| differ("task resources", left, found))
 }
 
-fn acts(program: &Program, told: &Told, story: &Story) -> Option<String> {
-    let expected = threads(program, told.acts.iter().map(|(path, goal)| (&**path, &**goal)));
+fn acts(program: &Program, wanted: &ReferenceResult, story: &Story) -> Option<String> {
+    let expected = threads(program, wanted.acts.iter().map(|(path, goal)| (&**path, &**goal)));
     let found = threads(program, story.acts.iter().map(|act| (&*act.path, &*act.goal)));
     (expected != found).then(|| differ("PIAs", expected, found))
 }
@@ -78,12 +82,12 @@ fn thread<'a>(program: &Program, path: &'a str) -> &'a str {
     ""
 }
 
-fn results(told: &Told, story: &Story) -> Option<String> {
+fn results(wanted: &ReferenceResult, story: &Story) -> Option<String> {
     let paths = |all: &BTreeMap<String, Vec<_>>| all.iter().map(|(p, all)| (p.clone(), all.len())).collect::<Vec<_>>();
-    if paths(&told.results) != paths(&story.retired) {
-        return Some(differ("retired instances", paths(&told.results), paths(&story.retired)));
+    if paths(&wanted.results) != paths(&story.retired) {
+        return Some(differ("retired instances", paths(&wanted.results), paths(&story.retired)));
     }
-    for ((path, expected), found) in told.results.iter().zip(story.retired.values()) {
+    for ((path, expected), found) in wanted.results.iter().zip(story.retired.values()) {
         for (expected, found) in expected.iter().zip(found) {
             if !expected.may_be(found) {
                 return Some(differ(&format!("the results of {path}"), expected, found));

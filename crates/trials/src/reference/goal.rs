@@ -64,7 +64,7 @@ impl Reference<'_> {
     fn tell(&mut self, path: &str, in_routine: bool, outcome: &str, ports: (Outputs, Outputs)) {
         if !in_routine {
             let result = Real::new(outcome.to_owned(), is_good(outcome).then_some(ports));
-            self.told.results.entry(path.to_owned()).or_default().push(result);
+            self.result.results.entry(path.to_owned()).or_default().push(result);
         }
     }
 
@@ -146,7 +146,7 @@ impl Reference<'_> {
             timeout_s: state.annotations.timeout_s,
         };
         if state.annotations.nature == Nature::Irreversible {
-            self.told.acts.push((path.to_owned(), goal_text(&goal)));
+            self.result.acts.push((path.to_owned(), goal_text(&goal)));
         }
         // A world only because the oracle wants one.
         let world = World::from_facts(facts, Revision(0));
@@ -165,8 +165,8 @@ impl Reference<'_> {
             let Event::WorldChanged { facts, .. } = event else { continue };
             for (key, value) in facts {
                 match value {
-                    Some(value) => drop(self.told.facts.insert(key, value)),
-                    None => drop(self.told.facts.remove(&key)),
+                    Some(value) => drop(self.result.facts.insert(key, value)),
+                    None => drop(self.result.facts.remove(&key)),
                 }
             }
         }

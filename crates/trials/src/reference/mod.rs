@@ -68,7 +68,7 @@ pub(super) enum Fail {
 
 /// What should become of a program.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Told {
+pub(super) struct ReferenceResult {
     pub(super) outcome: String,
     pub(super) outputs: Outputs,
     pub(super) facts: Facts,
@@ -109,14 +109,14 @@ struct Reference<'a> {
     /// How regions ended.
     regions: BTreeMap<StateId, String>,
     steps: usize,
-    told: Told,
+    result: ReferenceResult,
 }
 
 /// Evaluates a program from its start to its end.
 ///
 /// # Errors
 /// [`Fail::NotMine`].
-pub(super) fn evaluate(given: Given<'_>) -> Result<Told, Fail> {
+pub(super) fn evaluate(given: Given<'_>) -> Result<ReferenceResult, Fail> {
     let Given { program, seed, parameters, facts, units, refused, outside, oracle } = given;
     let mut reference = Reference {
         program,
@@ -127,11 +127,11 @@ pub(super) fn evaluate(given: Given<'_>) -> Result<Told, Fail> {
         outputs: BTreeMap::new(),
         regions: BTreeMap::new(),
         steps: 0,
-        told: Told { facts, units, ..Told::default() },
+        result: ReferenceResult { facts, units, ..ReferenceResult::default() },
     };
     let mut variables: Vec<(String, Value)> = parameters.into_iter().collect();
-    reference.told.outcome = reference.task(&mut variables)?;
-    Ok(reference.told)
+    reference.result.outcome = reference.task(&mut variables)?;
+    Ok(reference.result)
 }
 
 impl Reference<'_> {
@@ -153,9 +153,9 @@ impl Reference<'_> {
             for output in &program.outputs {
                 let value = output.value.read(&self.place(variables, None));
                 match fails(value)? {
-                    Ok(value) => drop(self.told.outputs.insert(output.name.clone(), value)),
+                    Ok(value) => drop(self.result.outputs.insert(output.name.clone(), value)),
                     Err(_) => {
-                        self.told.outputs.clear();
+                        self.result.outputs.clear();
                         return Ok(ABORTED.to_owned());
                     }
                 }
@@ -168,7 +168,7 @@ impl Reference<'_> {
     fn place<'p>(&'p self, variables: &[(String, Value)], own: Option<&'p Outputs>) -> Place<'p> {
         Place {
             program: self.program,
-            facts: &self.told.facts,
+            facts: &self.result.facts,
             outputs: &self.outputs,
             regions: &self.regions,
             variables: variables.to_vec(),
@@ -179,9 +179,9 @@ impl Reference<'_> {
 
     /// Changes happen, all of them or none.
     fn change(&mut self, changes: Vec<Change>) -> Result<(), Fail> {
-        self.told.facts = effects::applied(&self.told.facts, &changes, self.program.ontology.as_ref())?;
+        self.result.facts = effects::applied(&self.result.facts, &changes, self.program.ontology.as_ref())?;
         for change in changes {
-            self.told.changes.entry(change.pattern().predicate).or_default().push(change);
+            self.result.changes.entry(change.pattern().predicate).or_default().push(change);
         }
         Ok(())
     }

@@ -32,7 +32,9 @@ impl Reference<'_> {
         for line in wanted {
             match line.operation {
                 Operation::Consume => self.take(line)?,
-                Operation::Exists if self.told.units.get(&line.kind).is_some_and(|u| *u < line.count.thousandths()) => {
+                Operation::Exists
+                    if self.result.units.get(&line.kind).is_some_and(|u| *u < line.count.thousandths()) =>
+                {
                     return Err(Fail::NotMine("a resource that is not there"));
                 }
                 _ => {}
@@ -58,7 +60,7 @@ impl Reference<'_> {
         self.selected(&lines, variables, Some(own))?;
         for line in lines {
             if line.operation == Operation::Create {
-                *self.told.units.entry(line.kind.clone()).or_default() += line.count.thousandths();
+                *self.result.units.entry(line.kind.clone()).or_default() += line.count.thousandths();
             } else {
                 self.take(line)?;
             }
@@ -90,7 +92,7 @@ impl Reference<'_> {
 
     fn take(&mut self, line: &ResourceExpr) -> Result<(), Fail> {
         // What is no task resource is not counted.
-        let Some(units) = self.told.units.get_mut(&line.kind) else { return Ok(()) };
+        let Some(units) = self.result.units.get_mut(&line.kind) else { return Ok(()) };
         let left = units.checked_sub(line.count.thousandths());
         *units = left.ok_or(Fail::NotMine("a resource that is not there"))?;
         Ok(())

@@ -19,10 +19,10 @@ impl Reference<'_> {
         let blocks = around.iter().flat_map(|s| &s.annotations.resources);
         let mut blocks = blocks.filter(|line| line.operation == ResourceOperation::Block);
         if !blocks.any(|line| line.kind == WORLD_MODEL) {
-            return self.told.facts.clone();
+            return self.result.facts.clone();
         }
         if state.annotations.reads.is_none() && !matches!(state.annotations.nature, Nature::Senses(_)) {
-            return self.told.facts.clone();
+            return self.result.facts.clone();
         }
         let mut read: Vec<&FactExpr> = around.iter().flat_map(|s| s.annotations.reads.iter().flatten()).collect();
         read.extend(state.annotations.senses());
@@ -40,7 +40,7 @@ impl Reference<'_> {
             });
         }
         let patterns: Vec<FactPattern> = read.into_iter().map(|fact| as_far_as_known(fact, place)).collect();
-        let facts = self.told.facts.iter().filter(|(key, _)| patterns.iter().any(|pattern| fits(pattern, key)));
+        let facts = self.result.facts.iter().filter(|(key, _)| patterns.iter().any(|pattern| fits(pattern, key)));
         facts.map(|(key, value)| (key.clone(), value.clone())).collect()
     }
 }
