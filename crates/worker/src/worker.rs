@@ -183,7 +183,8 @@ impl Worker {
         self
     }
 
-    /// Serves until a signal, the parent's end or the shutdown token says otherwise. Goals under way are told to stop.
+    /// Serves until a signal, the parent's end or the shutdown token says otherwise. Goals under way are told to stop. A panic of the SDK itself
+    /// ends the process ([`crate::panic`]); a panic of an action aborts its goal.
     ///
     /// # Errors
     /// [`WorkerError`].

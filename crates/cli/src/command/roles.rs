@@ -18,7 +18,7 @@ use ratn_storage::OpenError;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::server::{BindError, Exposure, ServeError, Serving};
+use ratn_worker::server::{BindError, Exposure, Serving};
 use ratn_worker::vitals::CoreFailure;
 use ratn_worker::worker::WorkerOptions;
 use ratn_worker::{shutdown, tls};
@@ -240,18 +240,13 @@ fn daemon_on(
             ended = exit_on_panic(role, run(system, host)) => ended,
             failure = overdue => core_ended(&failure),
         };
-        if let Some(failure) = ended.as_ref().err().and_then(core_failure) {
-            core_ended(failure);
+        // Also where it ended so during the drain.
+        let failure = vitals.condition().borrow().failure.clone();
+        if let Some(failure) = failure {
+            core_ended(&failure);
         }
         let _ = followed.await;
         ended.map_err(refused_if_not_started)
-    })
-}
-
-fn core_failure(error: &anyhow::Error) -> Option<&CoreFailure> {
-    error.chain().find_map(|cause| match cause.downcast_ref::<ServeError>() {
-        Some(ServeError::Core(failure)) => Some(failure),
-        _ => cause.downcast_ref(),
     })
 }
 
