@@ -1,6 +1,7 @@
 //! Configs from TOML: unknown keys are refused, and every error names the file and the place in it.
 
 pub use ratn_storage::Durability;
+use ratn_worker::endpoint::Endpoint;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -44,10 +45,36 @@ pub trait Check {
     fn check(&self) -> Result<(), ConfigError>;
 }
 
-/// Where and how a daemon keeps its state. All keys are optional.
+/// What keeps a daemon's state.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Engine {
+    /// A log in files of this host.
+    #[default]
+    Log,
+    /// A log in etcd: several processes may stand by for one another.
+    Etcd,
+}
+
+/// Where and how a daemon keeps its state. All keys are optional; of etcd's, `endpoints` and `prefix` are needed with that engine, and
+/// mean nothing without.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct StorageConfig {
+    /// `log` or `etcd`.
+    pub engine: Engine,
+    /// The members of etcd.
+    pub endpoints: Vec<Endpoint>,
+    /// What stands before every key in etcd, as `/ratn/cell-7`; each role has its own keys behind it.
+    pub prefix: String,
+    /// The file with the authority that signed the certificates of etcd's members (PEM).
+    pub ca: Option<PathBuf>,
+    /// The file with the certificate that is shown to etcd (PEM).
+    pub cert: Option<PathBuf>,
+    /// The file with its private key (PEM).
+    pub key: Option<PathBuf>,
+    /// Starts also where an older state of etcd was restored: what was acknowledged since then is gone.
+    pub accept_restored: bool,
     /// A directory of its own; `state/<role>` in the runtime directory unless given.
     pub directory: Option<PathBuf>,
     /// When an answer may leave: `none` at once, `group` when what it tells of is on the disk (many share a sync), `each` likewise,
@@ -59,7 +86,18 @@ pub struct StorageConfig {
 
 impl Default for StorageConfig {
     fn default() -> Self {
-        StorageConfig { directory: None, durability: Durability::default(), compact_bytes: 16 << 20 }
+        StorageConfig {
+            engine: Engine::default(),
+            endpoints: Vec::new(),
+            prefix: String::new(),
+            ca: None,
+            cert: None,
+            key: None,
+            accept_restored: false,
+            directory: None,
+            durability: Durability::default(),
+            compact_bytes: 16 << 20,
+        }
     }
 }
 
@@ -72,7 +110,18 @@ impl StorageConfig {
 
 impl Check for StorageConfig {
     fn check(&self) -> Result<(), ConfigError> {
-        rule("storage.compact_bytes", self.compact_bytes >= 1 << 16, "at least 65536")
+        rule("storage.compact_bytes", self.compact_bytes >= 1 << 16, "at least 65536")?;
+        if self.engine == Engine::Log {
+            return rule("storage.endpoints", self.endpoints.is_empty(), "only with `engine = \"etcd\"`");
+        }
+        let member = |endpoint: &Endpoint| matches!(endpoint, Endpoint::Tcp { .. } | Endpoint::Tls { .. });
+        let members = !self.endpoints.is_empty() && self.endpoints.iter().all(member);
+        rule("storage.endpoints", members, "the addresses of etcd's members, as [\"https://a:2379\"]")?;
+        let named = self.prefix.starts_with('/') && self.prefix.trim_matches('/') != "";
+        rule("storage.prefix", named, "begins with / and says more, as \"/ratn/cell-7\"")?;
+        rule("storage.key", self.cert.is_some() == self.key.is_some(), "goes together with storage.cert")?;
+        let durable = "group, with `engine = \"etcd\"`: etcd keeps what it has acknowledged";
+        rule("storage.durability", self.durability == Durability::Group, durable)
     }
 }
 

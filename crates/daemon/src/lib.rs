@@ -23,6 +23,7 @@ pub mod quota;
 pub mod reload;
 pub mod resource_manager;
 pub mod service;
+mod standby;
 pub mod supervisor;
 pub mod telemetry;
 pub mod world_pool;

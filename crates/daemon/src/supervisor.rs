@@ -70,6 +70,7 @@ impl Supervisor {
                     let now = *phase.borrow_and_update();
                     match now {
                         Phase::Starting => {}
+                        Phase::StandingBy => say(&[NotifyState::Ready, NotifyState::Status("standing by")]),
                         Phase::Serving => say(&[NotifyState::Ready, NotifyState::Status("serving")]),
                         Phase::Draining => say(&[NotifyState::Stopping, NotifyState::Status("draining")]),
                     }

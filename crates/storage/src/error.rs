@@ -137,6 +137,12 @@ pub enum Fault {
         /// Which log.
         place: String,
     },
+    /// Another process leads, as it may where several stand by for one log.
+    #[error("another process leads {place} now, so nothing more is accepted from this one")]
+    Deposed {
+        /// Which log.
+        place: String,
+    },
     /// The thread that writes has ended by a defect.
     #[error("the thread that writes {place} has ended, so nothing more is accepted: start again, and report it")]
     Ended {
@@ -146,6 +152,14 @@ pub enum Fault {
     /// The writer was closed.
     #[error("the log is closed")]
     Closed,
+}
+
+impl Fault {
+    /// Whether somebody else has the writer's place, or may have it.
+    #[must_use]
+    pub fn is_lost_place(&self) -> bool {
+        matches!(self, Fault::Fenced { .. } | Fault::Deposed { .. })
+    }
 }
 
 /// Why a record was not appended.

@@ -73,6 +73,9 @@ pub trait Store: fmt::Debug + Send + Sync {
     /// # Errors
     /// Where what is there is damaged or of a newer format, or where reading fails.
     fn read(&self) -> Result<Recovered, ReadError>;
+
+    /// Where it is, for people.
+    fn place(&self) -> String;
 }
 
 /// The one writer of a log. When it is dropped, what was appended is written first, and the place becomes free.
@@ -112,7 +115,7 @@ pub trait Place: fmt::Debug + Send + Sync {
     /// Whether it is still the writer's. Says nothing of the moment after the look. May take as long as the disk takes to answer.
     ///
     /// # Errors
-    /// [`Fault::Fenced`] where somebody else has it or may have; another one where it cannot be seen.
+    /// One that [`Fault::is_lost_place`] where somebody else has it or may have; another one where it cannot be seen.
     fn check(&self) -> Result<(), Fault>;
 }
 

@@ -94,8 +94,8 @@ fn a_writer_that_says_nothing_for_a_second_is_got_past_and_writes_nothing_more()
     append_durably(&mut *new, b"new");
     assert!(matches!(old.place().check(), Err(Fault::Remote { .. })), "nothing is known while it is cut off");
     proxy.lose_all(false);
-    assert!(matches!(old.durable().wait_blocking(lost), Err(Fault::Fenced { .. })));
-    assert!(matches!(old.place().check(), Err(Fault::Fenced { .. })));
+    assert!(matches!(old.durable().wait_blocking(lost), Err(Fault::Deposed { .. })));
+    assert!(matches!(old.place().check(), Err(Fault::Deposed { .. })));
     drop(old);
     append_durably(&mut *new, b"newer");
     drop(new);
@@ -226,7 +226,7 @@ fn an_older_state_of_etcd_is_refused_unless_told() {
     // The writer that was there knows more than etcd does.
     let position = writer.append(b"more").unwrap();
     let fault = writer.durable().wait_blocking(position).unwrap_err();
-    assert!(fault.to_string().contains("an older state of etcd") || matches!(fault, Fault::Fenced { .. }), "{fault}");
+    assert!(fault.to_string().contains("an older state of etcd") || matches!(fault, Fault::Deposed { .. }), "{fault}");
     drop(writer);
     // Who opens it anew, too: by the cluster that it was written to.
     let fresh = store(endpoints.clone(), "/test/restored", "test");

@@ -1,6 +1,7 @@
 //! Where a server is: a TCP address, with TLS or without, or a Unix socket. Written `http://host:port`, `host:port`,
-//! `https://host:port` or `unix:/path`.
+//! `https://host:port` or `unix:/path`. Several of them, with commas between, are servers of which one leads.
 
+use crate::leader::LeaderConnector;
 use crate::tls::connect::Connector;
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -42,6 +43,8 @@ pub enum Endpoint {
     },
     /// At a path of the file system.
     Unix(PathBuf),
+    /// At whichever of these leads; the others stand by. For connecting only.
+    AnyOf(Vec<Endpoint>),
 }
 
 /// Text that is no endpoint.
@@ -78,6 +81,14 @@ impl Endpoint {
         Endpoint::Unix(PathBuf::new())
     }
 
+    /// Each server: itself, where it is one.
+    pub fn members(&self) -> &[Endpoint] {
+        match self {
+            Endpoint::AnyOf(members) => members,
+            one => std::slice::from_ref(one),
+        }
+    }
+
     /// Whether it is [`Endpoint::local`].
     pub fn is_local(&self) -> bool {
         *self == Endpoint::local()
@@ -93,6 +104,10 @@ impl fmt::Display for Endpoint {
             Endpoint::Tls { host, port } => write!(f, "https://{host}:{port}"),
             Endpoint::Unix(_) if self.is_local() => f.write_str(LOCAL),
             Endpoint::Unix(path) => write!(f, "unix:{}", path.display()),
+            Endpoint::AnyOf(members) => {
+                let members: Vec<String> = members.iter().map(Endpoint::to_string).collect();
+                f.write_str(&members.join(","))
+            }
         }
     }
 }
@@ -102,6 +117,14 @@ impl FromStr for Endpoint {
 
     fn from_str(text: &str) -> Result<Endpoint, EndpointError> {
         let refuse = |problem: String| EndpointError { text: text.to_owned(), problem };
+        if text.contains(',') {
+            let members: Vec<Endpoint> =
+                text.split(',').map(|member| member.trim().parse()).collect::<Result<_, _>>()?;
+            if members.iter().any(Endpoint::is_local) {
+                return Err(refuse("`local` is the one server of this host, and none of several".to_owned()));
+            }
+            return Ok(Endpoint::AnyOf(members));
+        }
         if text == LOCAL {
             return Ok(Endpoint::local());
         }
@@ -152,8 +175,9 @@ impl TryFrom<String> for Endpoint {
 /// [`ConnectError`] when the endpoint makes no URI.
 pub fn connect_lazily(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
     let configured = configured(endpoint)?;
-    Ok(match tls_of(endpoint) {
-        Some(connector) => configured.connect_with_connector_lazy(connector),
+    Ok(match connector_of(endpoint) {
+        Some(By::Tls(connector)) => configured.connect_with_connector_lazy(connector),
+        Some(By::Leader(connector)) => configured.connect_with_connector_lazy(connector),
         None => configured.connect_lazy(),
     })
 }
@@ -175,17 +199,25 @@ pub(crate) async fn connect_to_ask(endpoint: &Endpoint) -> Result<Channel, Conne
 }
 
 async fn connected(endpoint: &Endpoint, configured: tonic::transport::Endpoint) -> Result<Channel, ConnectError> {
-    let connected = match tls_of(endpoint) {
-        Some(connector) => configured.connect_with_connector(connector).await,
+    let connected = match connector_of(endpoint) {
+        Some(By::Tls(connector)) => configured.connect_with_connector(connector).await,
+        Some(By::Leader(connector)) => configured.connect_with_connector(connector).await,
         None => configured.connect().await,
     };
     connected.map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
 }
 
-/// TLS is the connector's: tonic's own would be as it was when the channel was made.
-fn tls_of(endpoint: &Endpoint) -> Option<Connector> {
+/// What tonic does not do by itself.
+enum By {
+    /// TLS: tonic's own would be as it was when the channel was made.
+    Tls(Connector),
+    Leader(LeaderConnector),
+}
+
+fn connector_of(endpoint: &Endpoint) -> Option<By> {
     match endpoint {
-        Endpoint::Tls { host, .. } => Some(Connector::to(host)),
+        Endpoint::Tls { host, .. } => Some(By::Tls(Connector::to(host))),
+        Endpoint::AnyOf(members) => Some(By::Leader(LeaderConnector::among(members))),
         Endpoint::Tcp { .. } | Endpoint::Unix(_) => None,
     }
 }
@@ -200,7 +232,7 @@ fn configured(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, Connect
 fn unwatched(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, ConnectError> {
     let failed = |source| ConnectError { endpoint: endpoint.clone(), source };
     let mut configured = tonic::transport::Endpoint::from_shared(address_of(endpoint)).map_err(failed)?;
-    if let Endpoint::Tls { .. } = endpoint {
+    if let Some(endpoint @ Endpoint::Tls { .. }) = endpoint.members().first() {
         let origin = tonic::transport::Endpoint::from_shared(endpoint.to_string()).map_err(failed)?;
         configured = configured.origin(origin.uri().clone());
     }
@@ -212,6 +244,8 @@ fn address_of(endpoint: &Endpoint) -> String {
     match endpoint {
         Endpoint::Tls { host, port } => Endpoint::Tcp { host: host.clone(), port: *port }.to_string(),
         Endpoint::Tcp { .. } | Endpoint::Unix(_) => endpoint.to_string(),
+        // Only for the name of the server in requests: the connector knows where they go.
+        Endpoint::AnyOf(members) => members.first().map(address_of).unwrap_or_default(),
     }
 }
 
@@ -230,6 +264,7 @@ mod tests {
             ("local", "local"),
             ("unix:/run/ratn/x.sock", "unix:/run/ratn/x.sock"),
             ("unix:///run/ratn/x.sock", "unix:/run/ratn/x.sock"),
+            ("https://a:4000, https://b:4000", "https://a:4000,https://b:4000"),
         ] {
             let endpoint: Endpoint = text.parse().unwrap();
             assert_eq!(endpoint.to_string(), printed);
@@ -239,7 +274,7 @@ mod tests {
 
     #[test]
     fn what_is_no_endpoint_is_refused_with_the_reason() {
-        for text in ["", "compute", "compute:port", ":80", "unix:relative", "http://a/b:80"] {
+        for text in ["", "compute", "compute:port", ":80", "unix:relative", "http://a/b:80", "a:1,", "a:1,compute"] {
             let error = text.parse::<Endpoint>().unwrap_err().to_string();
             assert!(error.contains("expected http://host:port"), "{error}");
         }

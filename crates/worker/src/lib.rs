@@ -36,6 +36,7 @@ pub mod client;
 pub mod connections;
 pub mod endpoint;
 pub mod gate;
+mod leader;
 pub mod lease_watch;
 pub mod multiplex;
 pub mod panic;

@@ -15,6 +15,7 @@ use crate::unix_socket::{self, SocketAccess};
 use crate::vitals::{CoreFailure, Vitals};
 use std::convert::Infallible;
 use std::io;
+use std::os::fd::AsFd;
 use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -60,6 +61,8 @@ pub struct Serving {
 pub enum Phase {
     /// Nobody is served yet.
     Starting,
+    /// Everybody is refused: another process leads, and this one takes its place when it is gone.
+    StandingBy,
     /// Everybody is.
     Serving,
     /// Only what is under way.
@@ -77,7 +80,8 @@ pub struct Bound {
 #[derive(Debug)]
 enum Listener {
     Tcp(TcpListener),
-    Unix(UnixListener, SocketFile),
+    /// The file is somebody else's to remove where there is none.
+    Unix(UnixListener, Option<SocketFile>),
 }
 
 /// Removes the socket's file in the end, unless a successor has put its own there.
@@ -221,9 +225,13 @@ pub async fn bind_as(listen: &Endpoint, exposure: &Exposure) -> Result<Bound, Bi
             }
             let listener = unix_socket::listen(path, &exposure.socket).map_err(failed)?;
             let file = SocketFile { path: path.clone(), identity: identity(path).map_err(failed)? };
-            let listener = Listener::Unix(listener, file);
+            let listener = Listener::Unix(listener, Some(file));
             Ok(Bound { listener, endpoint: listen.clone(), tls: None })
         }
+        Endpoint::AnyOf(_) => Err(failed(io::Error::new(
+            io::ErrorKind::InvalidInput,
+            "a server listens on one address; several are for those who connect",
+        ))),
     }
 }
 
@@ -241,6 +249,24 @@ impl Default for Serving {
 }
 
 impl Bound {
+    /// The same listener once more, for who serves before the one who is to serve.
+    ///
+    /// # Errors
+    /// Where the system refuses.
+    pub fn again(&self) -> io::Result<Bound> {
+        let listener = match &self.listener {
+            Listener::Tcp(listener) => {
+                let copy = std::net::TcpListener::from(listener.as_fd().try_clone_to_owned()?);
+                Listener::Tcp(TcpListener::from_std(copy)?)
+            }
+            Listener::Unix(listener, _) => {
+                let copy = std::os::unix::net::UnixListener::from(listener.as_fd().try_clone_to_owned()?);
+                Listener::Unix(UnixListener::from_std(copy)?, None)
+            }
+        };
+        Ok(Bound { listener, endpoint: self.endpoint.clone(), tls: self.tls.clone() })
+    }
+
     /// Where it is to be reached.
     pub fn endpoint(&self) -> &Endpoint {
         &self.endpoint

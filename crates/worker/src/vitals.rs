@@ -16,6 +16,8 @@ use tokio::sync::watch;
 pub const EXIT_CODE_PANICKED: u8 = 70;
 /// The exit code of a daemon whose state another process has taken over (`EX_IOERR` of `sysexits.h`).
 pub const EXIT_CODE_FENCED: u8 = 74;
+/// The exit code of a daemon in whose place another one leads (`EX_TEMPFAIL` of `sysexits.h`): started again, it stands by.
+pub const EXIT_CODE_DEPOSED: u8 = 75;
 
 /// Why a core has ended before its time.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -34,6 +36,12 @@ pub enum CoreFailure {
         /// Which state, and what to do.
         what: String,
     },
+    /// Another process leads, as it may where several share a state. It says nothing more, and ends.
+    #[error("{what}")]
+    Deposed {
+        /// Which state.
+        what: String,
+    },
 }
 
 impl CoreFailure {
@@ -49,6 +57,7 @@ impl CoreFailure {
         match self {
             CoreFailure::Panicked { .. } => EXIT_CODE_PANICKED,
             CoreFailure::Fenced { .. } => EXIT_CODE_FENCED,
+            CoreFailure::Deposed { .. } => EXIT_CODE_DEPOSED,
         }
     }
 }

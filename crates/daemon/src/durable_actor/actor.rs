@@ -203,7 +203,11 @@ impl<C: Core> Actor<C> {
         self.outbox.take_all();
         self.desk.take_outgoing();
         self.desk.watchers.clear();
-        self.vitals.fail(CoreFailure::Fenced { what: fault.to_string() });
+        let what = fault.to_string();
+        self.vitals.fail(match fault {
+            Fault::Deposed { .. } => CoreFailure::Deposed { what },
+            _ => CoreFailure::Fenced { what },
+        });
     }
 
     /// Nothing changes any more. What was not on the disk has not happened.
@@ -213,7 +217,7 @@ impl<C: Core> Actor<C> {
             Some(Fault::Ended { .. }) => {
                 self.vitals.fail(CoreFailure::Panicked { part: "the log".to_owned(), what: fault.to_string() });
             }
-            Some(fenced @ Fault::Fenced { .. }) => {
+            Some(fenced) if fenced.is_lost_place() => {
                 self.desk.stop(Stopped { status, unreadable: true });
                 return self.fenced(fenced);
             }

@@ -10,6 +10,7 @@ use super::may_speak::MaySpeak;
 use crate::config::StorageConfig;
 use crate::details::retry_later;
 use crate::metrics;
+use ratn_storage::etcd::Bounds;
 use ratn_storage::{
     AppendError, CompactError, Durable, Fault, Log, MakeSnapshot, OpenError, Options, Position, Progress, ReadError,
     Recovered, Store, Writer,
@@ -17,6 +18,7 @@ use ratn_storage::{
 use ratn_worker::vitals::Vitals;
 use std::error::Error;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use tonic::{Code, Status};
 
@@ -43,7 +45,7 @@ pub(crate) trait Journaled {
 #[derive(Debug)]
 pub(crate) struct Journal {
     role: &'static str,
-    store: Box<dyn Store>,
+    store: Arc<dyn Store>,
     /// Nothing after the end.
     writer: Option<Box<dyn Writer>>,
     durable: Durable,
@@ -83,17 +85,7 @@ pub(crate) fn floor() -> u64 {
 }
 
 impl Journal {
-    /// Takes the place of the one writer, and restores the state.
-    pub(crate) fn open<T, E: Error + Send + Sync + 'static>(
-        role: &'static str,
-        config: &StorageConfig,
-        directory: &Path,
-        restore: impl FnOnce(Recovered) -> Result<T, E>,
-    ) -> Result<(T, Journal), JournalError> {
-        Journal::open_log(role, config, Journal::log(config, directory), restore)
-    }
-
-    /// The log of a journal.
+    /// The log of a journal in files.
     pub(crate) fn log(config: &StorageConfig, directory: &Path) -> Log {
         let options = Options {
             durability: config.durability,
@@ -104,16 +96,19 @@ impl Journal {
         Log::new(directory, options)
     }
 
-    /// As [`Journal::open`], of a log that may be on another disk.
-    pub(crate) fn open_log<T, E: Error + Send + Sync + 'static>(
+    /// The bounds of a journal in etcd.
+    pub(crate) fn bounds() -> Bounds {
+        Bounds { record: RECORD_BYTES, buffered: BUFFERED_BYTES, ..Bounds::default() }
+    }
+
+    /// Takes the place of the one writer, and restores the state. Blocks.
+    pub(crate) fn open<T, E: Error + Send + Sync + 'static>(
         role: &'static str,
         config: &StorageConfig,
-        log: Log,
+        store: Arc<dyn Store>,
         restore: impl FnOnce(Recovered) -> Result<T, E>,
     ) -> Result<(T, Journal), JournalError> {
         let begin = Instant::now();
-        let directory = log.directory().to_owned();
-        let store = Box::new(log);
         let (recovered, writer) = store.open().map_err(|source| JournalError::Open { role, source })?;
         if let Some(torn) = &recovered.torn {
             tracing::warn!(
@@ -137,8 +132,7 @@ impl Journal {
         let entries = recovered.records.len();
         let state = restore(recovered).map_err(|error| JournalError::Restore { role, source: error.into() })?;
         let took_ms = u64::try_from(begin.elapsed().as_millis()).unwrap_or(u64::MAX);
-        let place = directory.display();
-        tracing::info!(%place, entries, took_ms, durability = %config.durability, "state restored");
+        tracing::info!(place = journal.store.place(), entries, took_ms, durability = %config.durability, "state restored");
         Ok((state, journal))
     }
 
@@ -189,9 +183,11 @@ impl Journal {
         if waiting <= MOST_WAITING_BYTES && self.unwritten.is_none() {
             return None;
         }
+        let stalled = self.durable.progress().stalled;
+        let why = stalled.as_deref().unwrap_or("see what slows its disk down");
         let message = format!(
-            "the disk of the {} does not keep up: {waiting} bytes wait to be written, and nothing is taken on while more than \
-             {MOST_WAITING_BYTES} do; ask again, and see what slows that disk down",
+            "the storage of the {} does not keep up: {waiting} bytes wait to be written, and nothing is taken on while more than \
+             {MOST_WAITING_BYTES} do; ask again; {why}",
             self.role
         );
         Some(retry_later(Code::ResourceExhausted, "STORAGE_BEHIND", message, BEHIND_RETRY))

@@ -107,7 +107,7 @@ fn look(place: &dyn Place) -> Result<Confirmed, Fault> {
     let began = Instant::now();
     match place.check() {
         Ok(()) => Ok(Confirmed::At(began)),
-        Err(fault @ Fault::Fenced { .. }) => Ok(Confirmed::Lost(fault)),
+        Err(fault) if fault.is_lost_place() => Ok(Confirmed::Lost(fault)),
         Err(fault) => Err(fault),
     }
 }

@@ -12,6 +12,7 @@ use ratn_worker::vitals::{CoreFailure, EXIT_CODE_FENCED, EXIT_CODE_PANICKED, Vit
 use std::convert::Infallible;
 use std::future::Future;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{oneshot, watch};
 use tokio_util::sync::CancellationToken;
@@ -126,7 +127,7 @@ fn begin(place: &Path, disk: &SlowDisk) -> (Handle<BlobCore>, Vitals) {
         let lengths = recovered.records.iter().map(|record| record.payload.len()).collect();
         Ok(Blobs { lengths, entry: None })
     };
-    let (blobs, journal) = Journal::open_log("blobs", &config, log, restore).unwrap();
+    let (blobs, journal) = Journal::open("blobs", &config, Arc::new(log), restore).unwrap();
     let vitals = Vitals::default();
     let signals = watch::Sender::new(()).subscribe();
     let (never, over) = (CancellationToken::new(), CancellationToken::new());

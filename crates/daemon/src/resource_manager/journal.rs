@@ -6,8 +6,8 @@ use crate::durable_actor::{CONFIRMED_FOR, Journal, JournalError, Journaled, floo
 use bytes::Bytes;
 use ratn_model::id::Revision;
 use ratn_resources::{DecodeError, Limits, Pool, Record, RestoreError, Snapshot, decode, encode};
-use ratn_storage::{Log, MakeSnapshot, Position, Recovered};
-use std::path::Path;
+use ratn_storage::{MakeSnapshot, Position, Recovered, Store};
+use std::sync::Arc;
 
 /// Why a log is none of a pool.
 #[derive(Debug, thiserror::Error)]
@@ -33,13 +33,12 @@ impl Journaled for Pool {
 }
 
 /// Takes the place of the one writer, and restores the pool. Without durability somebody may have heard of revisions that are lost.
-pub(super) fn open(config: &StorageConfig, directory: &Path, limits: Limits) -> Result<(Pool, Journal), JournalError> {
-    open_log(config, Journal::log(config, directory), limits)
-}
-
-/// The same of a log that may be on another disk.
-pub(super) fn open_log(config: &StorageConfig, log: Log, limits: Limits) -> Result<(Pool, Journal), JournalError> {
-    let (pool, journal) = Journal::open_log(ROLE, config, log, |recovered| restore(recovered, limits))?;
+pub(super) fn open(
+    config: &StorageConfig,
+    store: Arc<dyn Store>,
+    limits: Limits,
+) -> Result<(Pool, Journal), JournalError> {
+    let (pool, journal) = Journal::open(ROLE, config, store, |recovered| restore(recovered, limits))?;
     let may_have_lost = config.durability == Durability::None && pool.revision() > Revision(0);
     let floor = if may_have_lost { floor() } else { 0 };
     // A predecessor that was got past may have promised more than it wrote down.
@@ -72,7 +71,12 @@ mod tests {
     use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
     use ratn_model::time::Timestamp;
     use ratn_resources::{AcquireRequest, ResourceSpec, SessionId};
+    use std::path::Path;
     use std::time::{Duration, Instant};
+
+    fn open_at(config: &StorageConfig, directory: &Path) -> (Pool, Journal) {
+        open(config, Arc::new(Journal::log(config, directory)), Limits::default()).unwrap()
+    }
 
     #[test]
     fn when_the_state_is_lost_tokens_are_above_all_that_were_handed_out_as_fast_as_can_be() {
@@ -82,7 +86,7 @@ mod tests {
         let mut highest = 0;
         for life in 0..3 {
             // Each finds nothing of what the one before had kept.
-            let (mut pool, _journal) = open(&config, &place.path().join(life.to_string()), Limits::default()).unwrap();
+            let (mut pool, _journal) = open_at(&config, &place.path().join(life.to_string()));
             let began = Instant::now();
             let now = || Timestamp(u64::try_from(began.elapsed().as_nanos()).unwrap());
             pool.keep_alive(now(), &session, "s", Duration::from_secs(60)).unwrap();
@@ -110,7 +114,7 @@ mod tests {
         for (durability, skips) in [(Durability::None, true), (Durability::Group, false)] {
             let config = StorageConfig { durability, ..StorageConfig::default() };
             let directory = place.path().join(durability.to_string());
-            let start = || open(&config, &directory, Limits::default()).unwrap();
+            let start = || open_at(&config, &directory);
             let (mut pool, mut journal) = start();
             assert_eq!(pool.revision(), Revision(0), "nobody has heard of any");
             pool.create(Timestamp(0), None, ResourceSpec::new(ResourceClass::Module, "Tool")).unwrap();

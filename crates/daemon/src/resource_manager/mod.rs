@@ -22,11 +22,12 @@ mod wire;
 
 pub use config::ResourceManagerConfig;
 
+use crate::standby::Place;
 use anyhow::Context;
 use ratn_model::resource::Lease;
 use ratn_proto::v1::resource_service_server::ResourceServiceServer;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::server::{Services, Serving, bind_as};
+use ratn_worker::server::{Services, Serving};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -59,10 +60,17 @@ pub async fn run_as(
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
     let config = live.borrow().clone();
-    let storage = config.storage.directory_of(ROLE, directory.path());
-    let (pool, journal) = journal::open(&config.storage, &storage, config.limits.clone())?;
+    let (storage, limits) = (config.storage.clone(), config.limits.clone());
+    let open = move |store| journal::open(&storage, store, limits.clone());
+    let place = Place {
+        role: ROLE,
+        storage: &config.storage,
+        listen: &config.listen,
+        directory: &directory,
+        serving: &serving,
+    };
+    let Some(((pool, journal), bound)) = place.take(open, &shutdown).await? else { return Ok(()) };
     let kept = (pool.with_kinds(config.hierarchy()), journal);
-    let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let over = CancellationToken::new();
     let _over = over.clone().drop_guard();

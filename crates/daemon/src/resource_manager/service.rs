@@ -622,7 +622,8 @@ mod tests {
     #[tokio::test]
     async fn a_lease_that_two_calls_of_one_request_got_goes_back_when_both_are_dropped() {
         let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
-        let kept = journal::open(&config.storage, directory.path(), config.limits.clone()).unwrap();
+        let log = Journal::log(&config.storage, directory.path());
+        let kept = journal::open(&config.storage, Arc::new(log), config.limits.clone()).unwrap();
         let (actor, _) = actor::start(
             watch::Sender::new(config).subscribe(),
             kept,
@@ -658,7 +659,8 @@ mod tests {
     /// An actor with one arm that is free, and a session.
     async fn with_an_arm() -> (Handle, SessionId, tempfile::TempDir) {
         let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
-        let kept = journal::open(&config.storage, directory.path(), config.limits.clone()).unwrap();
+        let log = Journal::log(&config.storage, directory.path());
+        let kept = journal::open(&config.storage, Arc::new(log), config.limits.clone()).unwrap();
         let signals = watch::Sender::new(config).subscribe();
         let (actor, _) =
             actor::start(signals, kept, Default::default(), Default::default(), Default::default()).unwrap();
@@ -729,7 +731,7 @@ mod tests {
         let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
         let disk = SlowDisk::default();
         let log = Journal::log(&config.storage, directory.path()).on(disk.files());
-        let kept = journal::open_log(&config.storage, log, config.limits.clone()).unwrap();
+        let kept = journal::open(&config.storage, Arc::new(log), config.limits.clone()).unwrap();
         let signals = watch::Sender::new(config).subscribe();
         let (actor, _) =
             actor::start(signals, kept, Default::default(), Default::default(), Default::default()).unwrap();

@@ -26,6 +26,7 @@ pub use config::WorldPoolConfig;
 use crate::config::Durability;
 use crate::durable_actor::{Journal, JournalError, floor};
 use crate::link::{LINK, Link, Manager};
+use crate::standby::Place;
 use anyhow::Context;
 use history::History;
 use ratn_model::id::Revision;
@@ -33,10 +34,12 @@ use ratn_model::ontology::{Ontology, turtle};
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
 use ratn_proto::v1::world_pool_service_server::WorldPoolServiceServer;
+use ratn_storage::Store;
 use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::server::{Services, Serving, bind_as};
+use ratn_worker::server::{Services, Serving};
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -67,9 +70,16 @@ pub async fn run_as(
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
     let ontology = config.ontology.as_deref().map(ontology).transpose()?;
-    let storage = config.storage.directory_of(ROLE, directory.path());
-    let kept = open(&config, &storage)?;
-    let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
+    let kept_as = config.clone();
+    let place = Place {
+        role: ROLE,
+        storage: &config.storage,
+        listen: &config.listen,
+        directory: &directory,
+        serving: &serving,
+    };
+    let open = move |store| open(&kept_as, store);
+    let Some((kept, bound)) = place.take(open, &shutdown).await? else { return Ok(()) };
     let endpoint = bound.endpoint().clone();
     let manager = Manager { configured: config.resource_manager.clone(), directory: directory.clone() };
     let room = Resource::new(format!("world-model@{}", config.host), ResourceClass::World, &config.kind)
@@ -109,9 +119,9 @@ pub async fn run_as(
 }
 
 /// Takes the place of the one writer, and restores the history. Without durability somebody may have heard of revisions that are lost.
-fn open(config: &WorldPoolConfig, directory: &Path) -> Result<(History, Journal), JournalError> {
+fn open(config: &WorldPoolConfig, store: Arc<dyn Store>) -> Result<(History, Journal), JournalError> {
     let restore = |recovered| History::restore(recovered, config);
-    let (history, journal) = Journal::open(ROLE, &config.storage, directory, restore)?;
+    let (history, journal) = Journal::open(ROLE, &config.storage, store, restore)?;
     let may_have_lost = config.storage.durability == Durability::None && history.root().revision() > Revision(0);
     let floor = if may_have_lost { floor() } else { 0 };
     Ok((history.with_revisions_above(Revision(floor)), journal))
@@ -149,7 +159,7 @@ mod tests {
             let storage = StorageConfig { durability, ..StorageConfig::default() };
             let config = WorldPoolConfig { storage, ..WorldPoolConfig::default() };
             let directory = place.path().join(durability.to_string());
-            let start = || open(&config, &directory).unwrap();
+            let start = || open(&config, Arc::new(Journal::log(&config.storage, &directory))).unwrap();
             let mut told = Revision(0);
             for round in 0..3 {
                 let (mut history, mut journal) = start();

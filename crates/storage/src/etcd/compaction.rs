@@ -51,7 +51,7 @@ impl Compaction {
 
     fn perform(&self, operation: RequestOp) -> Result<(), Fault> {
         let answer = self.shared.perform(&self.shared.term.guarded(vec![operation]))?;
-        if answer.succeeded { Ok(()) } else { Err(self.shared.term.fenced()) }
+        if answer.succeeded { Ok(()) } else { Err(self.shared.term.deposed()) }
     }
 
     fn failure(&self, fault: Fault) -> CompactionFailure {

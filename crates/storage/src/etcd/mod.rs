@@ -144,6 +144,10 @@ impl Store for Etcd {
         let seen = Seen::look(&self.client, &self.keys)?;
         Ok(contents::read(&self.client, &self.keys, &seen, seen.revision)?.recovered)
     }
+
+    fn place(&self) -> String {
+        format!("{} in etcd at {}", self.keys.prefix(), self.client.place())
+    }
 }
 
 /// Attempts of what is done once, when the log is opened.

@@ -208,15 +208,15 @@ impl Term {
         leader == self.leader
     }
 
-    pub(super) fn fenced(&self) -> Fault {
+    pub(super) fn deposed(&self) -> Fault {
         self.lost.store(true, Ordering::SeqCst);
-        Fault::Fenced { place: self.keys.prefix().to_owned() }
+        Fault::Deposed { place: self.keys.prefix().to_owned() }
     }
 
     /// That the place is held, said to everybody, and confirmed.
     pub(super) fn renew(&self) -> Result<(), Fault> {
         if self.lost.load(Ordering::SeqCst) {
-            return Err(self.fenced());
+            return Err(self.deposed());
         }
         let alive = self.guarded(vec![put(self.keys.alive(), text(&self.epoch.0))]);
         let until = Instant::now() + 2 * PATIENCE;
@@ -229,7 +229,7 @@ impl Term {
         };
         match answer {
             Ok(answer) if answer.succeeded => Ok(()),
-            Ok(_) => Err(self.fenced()),
+            Ok(_) => Err(self.deposed()),
             Err(error) => Err(self.fault("ask for", &error)),
         }
     }

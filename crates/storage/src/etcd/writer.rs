@@ -195,7 +195,7 @@ impl Writing {
         for part in puts {
             let answer = self.shared.perform(&term.guarded(vec![part]))?;
             if !answer.succeeded {
-                return Err(term.fenced());
+                return Err(term.deposed());
             }
         }
         let head = Head { position: last.0, epoch: term.epoch.0 };
@@ -213,7 +213,7 @@ impl Writing {
             let mut found = answer.responses.into_iter();
             let leader = found_one(found.next()).map_or(0, |kv| kv.mod_revision);
             if !term.is_since(leader) {
-                return Err(term.fenced());
+                return Err(term.deposed());
             }
             // An attempt without an answer may have been performed: then the head is where it was to be.
             let kv = found_one(found.next());
@@ -238,7 +238,7 @@ impl EtcdWriter {
         let renew = move || {
             let _ended = Ended(renewed.clone());
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(RENEW_INTERVAL) {
-                if let Err(fault @ Fault::Fenced { .. }) = renewed.term.renew() {
+                if let Err(fault @ Fault::Deposed { .. }) = renewed.term.renew() {
                     renewed.pending.stop(&fault);
                     return;
                 }

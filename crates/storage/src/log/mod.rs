@@ -197,6 +197,10 @@ impl Store for Log {
     fn read(&self) -> Result<Recovered, ReadError> {
         Ok(contents::read(&self.directory)?.recovered())
     }
+
+    fn place(&self) -> String {
+        self.directory.display().to_string()
+    }
 }
 
 impl FromStr for Durability {

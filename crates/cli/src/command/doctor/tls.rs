@@ -64,7 +64,7 @@ fn is_reached(endpoint: &Endpoint) -> bool {
         Endpoint::Tcp { host, .. } | Endpoint::Tls { host, .. } => {
             host != "localhost" && host.parse().map_or(true, |address: std::net::IpAddr| !address.is_loopback())
         }
-        Endpoint::Unix(_) => false,
+        Endpoint::Unix(_) | Endpoint::AnyOf(_) => false,
     }
 }
 
@@ -72,7 +72,7 @@ fn is_reached(endpoint: &Endpoint) -> bool {
 fn names(listens: &[(&'static str, Endpoint)]) -> Vec<String> {
     let host = |endpoint: &Endpoint| match endpoint {
         Endpoint::Tcp { host, port } | Endpoint::Tls { host, port } => Some((host.clone(), *port)),
-        Endpoint::Unix(_) => None,
+        Endpoint::Unix(_) | Endpoint::AnyOf(_) => None,
     };
     let own = |(host, _): &(String, u16)| std::net::TcpListener::bind((host.as_str(), 0)).is_ok();
     let mut names: Vec<String> =

@@ -1,0 +1,183 @@
+//! Taking the place of the one process that serves a role, and standing by while another one has it.
+//!
+//! ```text
+//!   log in files: open the state ──▶ bind ──▶ serve
+//!   etcd:         bind ──▶ open the state ──▶ serve
+//!                   │          ▲ the leader is gone
+//!                   └─ held ───┴── standing by: health NOT_SERVING, every call refused with who leads
+//! ```
+//! Who stands by is ready for a service manager. Clients that know several addresses go to the one that is SERVING.
+
+use crate::config::{Engine, StorageConfig};
+use crate::details::retry_later;
+use crate::durable_actor::{Journal, JournalError};
+use anyhow::Context;
+use ratn_storage::etcd::{Connect, Holder};
+use ratn_storage::{Etcd, EtcdOptions, OpenError, Store};
+use ratn_worker::endpoint::{Endpoint, connect_lazily};
+use ratn_worker::gate::{Gate, Identity};
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::server::{Bound, Phase, Services, Serving, bind_as};
+use ratn_worker::vitals::Vitals;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+use tonic::codegen::http;
+use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity as Shown};
+use tonic::{Code, Status};
+
+/// When whoever was refused by a standby should ask again.
+const RETRY_DELAY: Duration = Duration::from_millis(200);
+/// A connection attempt to a member of etcd that takes longer has failed.
+const CONNECT_TIMEOUT: Duration = Duration::from_millis(500);
+/// A member of etcd that does not answer a ping for so long is connected to anew.
+const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(2));
+
+/// A role that is to be served.
+pub(crate) struct Place<'a> {
+    pub(crate) role: &'static str,
+    pub(crate) storage: &'a StorageConfig,
+    pub(crate) listen: &'a Endpoint,
+    pub(crate) directory: &'a RuntimeDirectory,
+    pub(crate) serving: &'a Serving,
+}
+
+impl Place<'_> {
+    /// The state, and where to serve it; nothing where `shutdown` came while another process had it.
+    pub(crate) async fn take<T: Send + 'static>(
+        self,
+        open: impl Fn(Arc<dyn Store>) -> Result<T, JournalError> + Clone + Send + 'static,
+        shutdown: &CancellationToken,
+    ) -> anyhow::Result<Option<(T, Bound)>> {
+        let listen = self.directory.listen(self.listen, self.role)?;
+        if self.storage.engine == Engine::Log {
+            let directory = self.storage.directory_of(self.role, self.directory.path());
+            let kept = open(Arc::new(Journal::log(self.storage, &directory)))?;
+            return Ok(Some((kept, bind_as(&listen, &self.serving.exposure).await?)));
+        }
+        let bound = bind_as(&listen, &self.serving.exposure).await?;
+        let store: Arc<dyn Store> = Arc::new(etcd(self.storage, self.role, bound.endpoint())?);
+        let kept = self.await_place(store, &bound, open, shutdown).await?;
+        Ok(kept.map(|kept| (kept, bound)))
+    }
+
+    async fn await_place<T: Send + 'static>(
+        &self,
+        store: Arc<dyn Store>,
+        bound: &Bound,
+        open: impl Fn(Arc<dyn Store>) -> Result<T, JournalError> + Clone + Send + 'static,
+        shutdown: &CancellationToken,
+    ) -> anyhow::Result<Option<T>> {
+        let elected = CancellationToken::new();
+        // However this ends, nobody is refused any more.
+        let _elected = elected.clone().drop_guard();
+        let mut standby: Option<Arc<NotTheLeader>> = None;
+        loop {
+            let attempt = {
+                let (store, open) = (store.clone(), open.clone());
+                tokio::task::spawn_blocking(move || open(store))
+            };
+            let opened = tokio::select! {
+                opened = attempt => opened.context("the state could not be opened")?,
+                // The place, should it just have been got, is given up when the attempt has ended.
+                () = shutdown.cancelled() => return Ok(None),
+            };
+            let held = match opened {
+                Ok(kept) => return Ok(Some(kept)),
+                Err(JournalError::Open { source: OpenError::Held { holder, .. }, .. }) => holder,
+                Err(error) => return Err(error.into()),
+            };
+            match &standby {
+                Some(gate) => gate.led_by(held),
+                None => {
+                    tracing::info!(role = self.role, leader = held, "standing by");
+                    let gate = Arc::new(NotTheLeader { role: self.role, leader: Mutex::new(held) });
+                    self.stand_by(bound, gate.clone(), elected.clone())?;
+                    standby = Some(gate);
+                }
+            }
+        }
+    }
+
+    /// Refuses everybody until `elected`.
+    fn stand_by(&self, bound: &Bound, gate: Arc<NotTheLeader>, elected: CancellationToken) -> anyhow::Result<()> {
+        let bound = bound.again().context("cannot listen while standing by")?;
+        let vitals = Vitals::default();
+        vitals.unwell("standing by");
+        let serving = Serving { gate, vitals, phase: watch::Sender::new(Phase::Starting), ..self.serving.clone() };
+        self.serving.phase.send_replace(Phase::StandingBy);
+        tokio::spawn(async move {
+            if let Err(error) = bound.serve_as(Services::new(), serving, elected).await {
+                tracing::warn!(%error, "nobody is told any more who leads");
+            }
+        });
+        Ok(())
+    }
+}
+
+/// Lets nobody in, and says who leads.
+struct NotTheLeader {
+    role: &'static str,
+    leader: Mutex<String>,
+}
+
+impl NotTheLeader {
+    fn led_by(&self, leader: String) {
+        *self.leader.lock().unwrap_or_else(PoisonError::into_inner) = leader;
+    }
+}
+
+impl Gate for NotTheLeader {
+    fn admit(&self, _: &Identity, path: &str, _: &mut http::Extensions) -> Result<(), Status> {
+        if path.starts_with("/grpc.") {
+            return Ok(());
+        }
+        let leader = self.leader.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let message = format!("this {} is not the leader, it stands by: ask {leader}", self.role);
+        Err(retry_later(Code::Unavailable, "NOT_THE_LEADER", message, RETRY_DELAY))
+    }
+
+    fn answered(&self, _: &str, _: Code, _: Duration) {}
+}
+
+/// The log of a role in etcd.
+pub(crate) fn etcd(config: &StorageConfig, role: &str, address: &Endpoint) -> anyhow::Result<Etcd> {
+    let read = |file: &Path| std::fs::read(file).with_context(|| format!("cannot read {}", file.display()));
+    let mut tls = ClientTlsConfig::new();
+    if let Some(ca) = &config.ca {
+        tls = tls.ca_certificate(Certificate::from_pem(read(ca)?));
+    }
+    if let (Some(cert), Some(key)) = (&config.cert, &config.key) {
+        tls = tls.identity(Shown::from_pem(read(cert)?, read(key)?));
+    }
+    let connect: Connect = Arc::new(move |address| connect(address, &tls));
+    Ok(Etcd::new(EtcdOptions {
+        endpoints: config.endpoints.iter().map(Endpoint::to_string).collect(),
+        connect,
+        prefix: format!("{}/{role}", config.prefix.trim_end_matches('/')),
+        holder: Holder { address: address.to_string(), about: format!("process {}", std::process::id()) },
+        bounds: Journal::bounds(),
+        accept_restored: config.accept_restored,
+    })?)
+}
+
+fn connect(address: &str, tls: &ClientTlsConfig) -> Result<Channel, String> {
+    let endpoint: Endpoint = address.parse().map_err(|error| format!("{error}"))?;
+    let (Endpoint::Tcp { .. } | Endpoint::Tls { .. }) = endpoint else {
+        return connect_lazily(&endpoint).map_err(|error| error.to_string());
+    };
+    let mut configured =
+        tonic::transport::Endpoint::from_shared(address.to_owned()).map_err(|error| error.to_string())?;
+    if let Endpoint::Tls { .. } = endpoint {
+        configured = configured.tls_config(tls.clone()).map_err(|error| error.to_string())?;
+    }
+    let (interval, timeout) = KEEPALIVE;
+    Ok(configured
+        .connect_timeout(CONNECT_TIMEOUT)
+        .tcp_nodelay(true)
+        .http2_keep_alive_interval(interval)
+        .keep_alive_timeout(timeout)
+        .connect_lazy())
+}

@@ -1,0 +1,193 @@
+//! One of several servers leads, the others stand by: a connection to them is a connection to the one that leads, and moves with it.
+//!
+//! ```text
+//!   connect ── which of them says SERVING? ──▶ connection ── it says nothing for a second, or NOT_SERVING,
+//!      ▲                                           │          and another one says SERVING
+//!      └──────────── made anew ◀── broken ─────────┘
+//! ```
+//! Only gRPC health is asked: who stands by says NOT_SERVING. Whoever uses the connection sees what it sees of any connection that breaks.
+
+use crate::endpoint::{CONNECT_TIMEOUT, Endpoint, connect_to_ask};
+use crate::tls::connect::Connector;
+use futures::StreamExt;
+use futures::stream::FuturesUnordered;
+use hyper_util::rt::TokioIo;
+use std::future::Future;
+use std::io;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::{Duration, Instant};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::{TcpStream, UnixStream};
+use tokio_util::sync::{CancellationToken, DropGuard, WaitForCancellationFutureOwned};
+use tonic::codegen::{Service, StdError, http::Uri};
+use tonic::transport::Channel;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
+
+/// How often a server is asked whether it still leads.
+const ASK_INTERVAL: Duration = Duration::from_millis(250);
+/// And how soon it has to answer.
+const ANSWER_DEADLINE: Duration = Duration::from_millis(500);
+/// A server that has not said for so long that it leads is left for one that does.
+const SILENCE: Duration = Duration::from_millis(1_000);
+/// The pause between two rounds of questions while none of them leads.
+const LOOK_INTERVAL: Duration = Duration::from_millis(50);
+
+/// Connects to whichever of several servers leads.
+#[derive(Debug, Clone)]
+pub(crate) struct LeaderConnector {
+    members: Arc<[Endpoint]>,
+}
+
+impl LeaderConnector {
+    pub(crate) fn among(members: &[Endpoint]) -> LeaderConnector {
+        LeaderConnector { members: members.into() }
+    }
+}
+
+impl Service<Uri> for LeaderConnector {
+    type Response = TokioIo<ToLeader>;
+    type Error = StdError;
+    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, StdError>> + Send>>;
+
+    fn poll_ready(&mut self, _: &mut Context<'_>) -> Poll<Result<(), StdError>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn call(&mut self, _: Uri) -> Self::Future {
+        let members = self.members.clone();
+        Box::pin(async move {
+            let leader = tokio::time::timeout(CONNECT_TIMEOUT, find(&members, None)).await;
+            let leader = leader.map_err(|_| {
+                let members: Vec<String> = members.iter().map(Endpoint::to_string).collect();
+                io::Error::new(io::ErrorKind::NotConnected, format!("none of {} leads", members.join(", ")))
+            })?;
+            let stream = open(&leader).await?;
+            let (broken, watched) = (CancellationToken::new(), CancellationToken::new());
+            let watch = watch(members, leader, broken.clone());
+            tokio::spawn(watched.clone().run_until_cancelled_owned(watch));
+            Ok(TokioIo::new(ToLeader {
+                stream,
+                broken: Box::pin(broken.cancelled_owned()),
+                _watched: watched.drop_guard(),
+            }))
+        })
+    }
+}
+
+/// The first that says that it leads, apart from one of them.
+async fn find(members: &[Endpoint], apart_from: Option<&Endpoint>) -> Endpoint {
+    let others = members.iter().filter(|member| Some(*member) != apart_from);
+    let mut seeking: FuturesUnordered<_> = others
+        .map(|member| async move {
+            let mut asked = Asked { member, client: None };
+            while !asked.leads().await {
+                tokio::time::sleep(LOOK_INTERVAL).await;
+            }
+            member.clone()
+        })
+        .collect();
+    match seeking.next().await {
+        Some(leader) => leader,
+        None => std::future::pending().await,
+    }
+}
+
+/// Breaks a connection when its server leads no more, and another one does.
+async fn watch(members: Arc<[Endpoint]>, leader: Endpoint, broken: CancellationToken) {
+    let mut asked = Asked { member: &leader, client: None };
+    let mut led = Instant::now();
+    loop {
+        tokio::time::sleep(ASK_INTERVAL).await;
+        if asked.leads().await {
+            led = Instant::now();
+        }
+        if led.elapsed() < SILENCE {
+            continue;
+        }
+        // Asked until one of them leads: the server itself may be the next.
+        let other = tokio::time::timeout(SILENCE, find(&members, Some(&leader))).await;
+        if let Ok(other) = other {
+            tracing::info!(from = %leader, to = %other, "another server leads");
+            broken.cancel();
+            return;
+        }
+    }
+}
+
+struct Asked<'a> {
+    member: &'a Endpoint,
+    client: Option<HealthClient<Channel>>,
+}
+
+impl Asked<'_> {
+    async fn leads(&mut self) -> bool {
+        let answered = tokio::time::timeout(ANSWER_DEADLINE, async {
+            let mut client = match self.client.take() {
+                Some(client) => client,
+                None => HealthClient::new(connect_to_ask(self.member).await.ok()?),
+            };
+            let answer = client.check(HealthCheckRequest { service: String::new() }).await.ok()?;
+            // Kept for the next question, as it has answered.
+            self.client = Some(client);
+            Some(answer.into_inner().status() == ServingStatus::Serving)
+        });
+        answered.await.ok().flatten().unwrap_or(false)
+    }
+}
+
+async fn open(endpoint: &Endpoint) -> Result<Box<dyn Stream>, StdError> {
+    Ok(match endpoint {
+        Endpoint::Tcp { host, port } => {
+            let stream = TcpStream::connect((host.as_str(), *port)).await?;
+            stream.set_nodelay(true)?;
+            Box::new(stream)
+        }
+        Endpoint::Tls { host, port } => {
+            let address = Endpoint::Tcp { host: host.clone(), port: *port }.to_string().parse()?;
+            Box::new(Connector::to(host).call(address).await?.into_inner())
+        }
+        Endpoint::Unix(path) => Box::new(UnixStream::connect(path).await?),
+        Endpoint::AnyOf(_) => return Err("a server of several is one server".into()),
+    })
+}
+
+trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
+impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
+
+/// A connection that breaks when its server leads no more.
+pub(crate) struct ToLeader {
+    stream: Box<dyn Stream>,
+    broken: Pin<Box<WaitForCancellationFutureOwned>>,
+    _watched: DropGuard,
+}
+
+impl AsyncRead for ToLeader {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        if self.broken.as_mut().poll(context).is_ready() {
+            return Poll::Ready(Err(io::Error::new(io::ErrorKind::ConnectionAborted, "another server leads")));
+        }
+        Pin::new(&mut self.stream).poll_read(context, buffer)
+    }
+}
+
+impl AsyncWrite for ToLeader {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write(context, bytes)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
+}
