@@ -5,6 +5,7 @@
 pub(crate) mod crashes;
 pub(crate) mod host;
 pub(crate) mod motions;
+pub(crate) mod tool_clients;
 
 use anyhow::{Context, bail};
 use std::path::{Path, PathBuf};

@@ -1,6 +1,7 @@
 //! What the tests of the log share.
 #![allow(dead_code, reason = "each test uses some of it")]
 
+pub(crate) mod cluster;
 pub(crate) mod etcd;
 pub(crate) mod promises;
 

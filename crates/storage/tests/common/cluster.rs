@@ -1,0 +1,220 @@
+//! etcd for tests: members as processes of their own, in a directory that vanishes, and a proxy that loses answers.
+//!
+//! Tests of other packages include this file. Without `etcd` on the machine tests of it say that they are skipped; with `RATN_NEEDS_ETCD=1` they fail.
+
+use std::io::{Read, Write};
+use std::net::{Shutdown, TcpListener, TcpStream};
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+use tempfile::TempDir;
+
+/// A cluster.
+pub(crate) struct Cluster {
+    pub(crate) members: Vec<Member>,
+    arguments: Vec<String>,
+    _directory: TempDir,
+}
+
+pub(crate) struct Member {
+    pub(crate) client: String,
+    arguments: Vec<String>,
+    process: Option<Child>,
+}
+
+/// Whether there is an etcd; says so where there is none.
+pub(crate) fn is_there() -> bool {
+    let there =
+        Command::new("etcd").arg("--version").stdout(Stdio::null()).status().is_ok_and(|status| status.success());
+    assert!(there || std::env::var_os("RATN_NEEDS_ETCD").is_none(), "etcd is needed and not there");
+    if !there {
+        eprintln!("skipped: no etcd on this machine (scripts/check-etcd installs it)");
+    }
+    there
+}
+
+fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+}
+
+impl Cluster {
+    pub(crate) fn start(count: usize, arguments: &[&str]) -> Cluster {
+        let directory = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
+        let ports: Vec<(u16, u16)> = (0..count).map(|_| (free_port(), free_port())).collect();
+        let initial: Vec<String> =
+            ports.iter().enumerate().map(|(i, (_, peer))| format!("m{i}=http://127.0.0.1:{peer}")).collect();
+        let members = ports.iter().enumerate().map(|(i, (client, peer))| {
+            let (client, peer) = (format!("http://127.0.0.1:{client}"), format!("http://127.0.0.1:{peer}"));
+            let data = directory.path().join(format!("m{i}")).display().to_string();
+            let name = format!("m{i}");
+            let arguments: Vec<String> = [
+                "--name",
+                &name,
+                "--data-dir",
+                &data,
+                "--listen-client-urls",
+                &client,
+                "--advertise-client-urls",
+                &client,
+                "--listen-peer-urls",
+                &peer,
+                "--initial-advertise-peer-urls",
+                &peer,
+                "--initial-cluster",
+                &initial.join(","),
+                "--heartbeat-interval",
+                "50",
+                "--election-timeout",
+                "500",
+                "--logger",
+                "zap",
+                "--log-level",
+                "error",
+            ]
+            .map(str::to_owned)
+            .into();
+            Member { client, arguments, process: None }
+        });
+        let members = members.collect();
+        let arguments = arguments.iter().map(|&argument| argument.to_owned()).collect();
+        let mut cluster = Cluster { members, arguments, _directory: directory };
+        for index in 0..count {
+            cluster.run(index);
+        }
+        cluster.await_health();
+        cluster
+    }
+
+    pub(crate) fn run(&mut self, index: usize) {
+        let member = &mut self.members[index];
+        let mut command = Command::new("etcd");
+        command.args(&member.arguments).args(&self.arguments).stdin(Stdio::null());
+        member.process = Some(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap());
+    }
+
+    pub(crate) fn kill(&mut self, index: usize) {
+        if let Some(mut process) = self.members[index].process.take() {
+            process.kill().unwrap();
+            process.wait().unwrap();
+        }
+    }
+
+    pub(crate) fn endpoints(&self) -> Vec<String> {
+        self.members.iter().map(|member| member.client.clone()).collect()
+    }
+
+    /// Puts a snapshot of etcd in place of what the only member has.
+    pub(crate) fn restore(&mut self, snapshot: &str) {
+        self.kill(0);
+        let member = &self.members[0];
+        let of = |name: &str| {
+            let at = member.arguments.iter().position(|argument| argument == name).unwrap();
+            member.arguments[at + 1].clone()
+        };
+        std::fs::remove_dir_all(of("--data-dir")).unwrap();
+        let mut command = Command::new("etcdctl");
+        command.env("ETCDCTL_API", "3").args(["snapshot", "restore", snapshot, "--initial-cluster-token", "restored"]);
+        for name in ["--name", "--data-dir", "--initial-cluster"] {
+            command.args([name, &of(name)]);
+        }
+        command.args(["--initial-advertise-peer-urls", &of("--initial-advertise-peer-urls")]);
+        assert!(command.output().unwrap().status.success());
+        self.run(0);
+        self.await_health();
+    }
+
+    /// `etcdctl` at every member.
+    pub(crate) fn ctl(&self, arguments: &[&str]) -> std::process::Output {
+        let mut command = Command::new("etcdctl");
+        command.env("ETCDCTL_API", "3").arg("--endpoints").arg(self.endpoints().join(",")).args(arguments);
+        command.output().unwrap()
+    }
+
+    pub(crate) fn await_health(&self) {
+        let begin = Instant::now();
+        while !self.ctl(&["endpoint", "health"]).status.success() {
+            assert!(begin.elapsed() < Duration::from_secs(60), "etcd does not become healthy");
+            thread::sleep(Duration::from_millis(50));
+        }
+    }
+}
+
+impl Drop for Cluster {
+    fn drop(&mut self) {
+        for index in 0..self.members.len() {
+            self.kill(index);
+        }
+    }
+}
+
+/// Passes bytes on, both ways, until it is told to lose the answers, or everything.
+pub(crate) struct Proxy {
+    pub(crate) address: String,
+    loses: Arc<Loses>,
+}
+
+#[derive(Default)]
+struct Loses {
+    answers: AtomicBool,
+    /// Connections are refused and broken.
+    all: AtomicBool,
+}
+
+impl Proxy {
+    pub(crate) fn to(target: &str) -> Proxy {
+        let target = target.strip_prefix("http://").unwrap().to_owned();
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = format!("http://{}", listener.local_addr().unwrap());
+        let loses = Arc::new(Loses::default());
+        let shared = loses.clone();
+        thread::spawn(move || {
+            for near in listener.incoming().flatten() {
+                let far = TcpStream::connect(&target);
+                let Ok(far) = far.map_err(drop).and_then(|far| match shared.all.load(Ordering::SeqCst) {
+                    true => Err(()),
+                    false => Ok(far),
+                }) else {
+                    let _ = near.shutdown(Shutdown::Both);
+                    continue;
+                };
+                let (near_too, far_too) = (near.try_clone().unwrap(), far.try_clone().unwrap());
+                pass(near, far, shared.clone(), false);
+                pass(far_too, near_too, shared.clone(), true);
+            }
+        });
+        Proxy { address, loses }
+    }
+
+    /// What is asked arrives, what is answered does not.
+    pub(crate) fn lose_answers(&self, lose: bool) {
+        self.loses.answers.store(lose, Ordering::SeqCst);
+    }
+
+    /// Nothing arrives; connections that were open are broken.
+    pub(crate) fn lose_all(&self, lose: bool) {
+        self.loses.all.store(lose, Ordering::SeqCst);
+    }
+}
+
+/// A connection that has lost bytes is broken as soon as it would pass some on again.
+fn pass(mut from: TcpStream, mut to: TcpStream, loses: Arc<Loses>, answers: bool) {
+    thread::spawn(move || {
+        let (mut bytes, mut has_lost) = ([0; 16_384], false);
+        while let Ok(count @ 1..) = from.read(&mut bytes) {
+            if loses.all.load(Ordering::SeqCst) {
+                break;
+            }
+            if answers && loses.answers.load(Ordering::SeqCst) {
+                has_lost = true;
+                continue;
+            }
+            if has_lost || to.write_all(&bytes[..count]).is_err() {
+                break;
+            }
+        }
+        let _ = from.shutdown(Shutdown::Both);
+        let _ = to.shutdown(Shutdown::Both);
+    });
+}
