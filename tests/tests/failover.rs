@@ -75,7 +75,7 @@ impl Pair {
             let members: Vec<String> = to_etcd.iter().map(|proxy| format!("{:?}", proxy.address)).collect();
             let config = place.path().join(format!("{name}.toml"));
             let text = format!(
-                "[resource-manager]\nlisten = {itself:?}\n[resource-manager.storage]\nengine = \"etcd\"\n\
+                "[service.access]\nanonymous = [\"operator\"]\n[resource-manager]\nlisten = {itself:?}\n[resource-manager.storage]\nengine = \"etcd\"\n\
                  endpoints = [{}]\nprefix = \"/ratn/test\"\n",
                 members.join(", ")
             );

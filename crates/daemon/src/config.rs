@@ -1,10 +1,12 @@
 //! Configs from TOML: unknown keys are refused, and every error names the file and the place in it.
 
 pub use ratn_storage::Durability;
+use ratn_storage::Store;
 use ratn_worker::endpoint::Endpoint;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// A config that cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -102,6 +104,20 @@ impl Default for StorageConfig {
 }
 
 impl StorageConfig {
+    /// What a role's state is kept in, for who copies it.
+    ///
+    /// # Errors
+    /// Where a file of it cannot be read.
+    pub fn store(&self, role: &str) -> anyhow::Result<Arc<dyn Store>> {
+        Ok(match self.engine {
+            Engine::Log => {
+                let directory = self.directory.clone().unwrap_or_else(|| role.into());
+                Arc::new(crate::durable_actor::Journal::log(self, &directory))
+            }
+            Engine::Etcd => Arc::new(crate::standby::etcd(self, role, &Endpoint::loopback())?),
+        })
+    }
+
     /// Where a role keeps its state.
     pub fn directory_of(&self, role: &str, runtime_directory: &Path) -> PathBuf {
         self.directory.clone().unwrap_or_else(|| state_directory(runtime_directory).join(role))

@@ -236,6 +236,15 @@ pub enum CopyError {
     /// What would be copied is not a whole log.
     #[error(transparent)]
     Read(#[from] ReadError),
+    /// A place cannot be taken.
+    #[error(transparent)]
+    Open(#[from] OpenError),
+    /// The copy cannot be written.
+    #[error("the copy cannot be written")]
+    Write(#[from] AppendError),
+    /// The copy has no snapshot.
+    #[error("the copy gets no snapshot: {0}")]
+    Snapshot(String),
     /// There is no log to copy.
     #[error("there is no log in {place}")]
     Nothing {
@@ -243,7 +252,7 @@ pub enum CopyError {
         place: String,
     },
     /// Nothing is overwritten.
-    #[error("{place} is not empty: choose a directory that is empty or not there yet")]
+    #[error("{place} is not empty: nothing is overwritten, choose one that is empty or not there yet")]
     NotEmpty {
         /// Where the copy was to go.
         place: String,
@@ -258,6 +267,12 @@ pub enum CopyError {
         /// What the system said.
         source: io::Error,
     },
+}
+
+impl From<Fault> for CopyError {
+    fn from(fault: Fault) -> CopyError {
+        CopyError::Write(fault.into())
+    }
 }
 
 fn advice(source: &io::Error) -> &'static str {

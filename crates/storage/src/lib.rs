@@ -62,9 +62,11 @@ pub mod etcd;
 pub mod log;
 mod pending;
 pub mod store;
+mod transfer;
 
 pub use durable::{Durable, Progress};
 pub use error::{AppendError, CompactError, CompactionFailure, CopyError, Fault, OpenError, ReadError};
 pub use etcd::{Etcd, EtcdOptions};
 pub use log::{Copied, Disk, Durability, Files, Log, LogFile, Options, backup, restore};
 pub use store::{Epoch, MakeSnapshot, Place, Position, Record, Recovered, Snapshot, Store, TornEnd, Writer};
+pub use transfer::{transfer, transfer_running};

@@ -6,7 +6,7 @@ mod common;
 use common::etcd::{Cluster, Proxy, is_there, options, store};
 use common::{append_durably, payloads, promises};
 use ratn_storage::etcd::Bounds;
-use ratn_storage::{Etcd, Fault, OpenError, ReadError, Store, Writer};
+use ratn_storage::{Etcd, Fault, OpenError, Position, ReadError, Store, Writer, transfer, transfer_running};
 use std::time::{Duration, Instant};
 
 /// A log of these bounds for each name.
@@ -278,4 +278,38 @@ fn without_any_member_opening_says_whom_it_asked() {
     let log = store(vec!["http://127.0.0.1:1".to_owned()], "/test/nobody", "test");
     let error = log.open().map(drop).unwrap_err().to_string();
     assert!(error.contains("cannot read from http://127.0.0.1:1"), "{error}");
+}
+
+#[test]
+fn a_log_goes_from_files_to_etcd_and_back_and_never_over_another() {
+    if !is_there() {
+        return;
+    }
+    let (cluster, place) = (Cluster::start(1, &[]), tempfile::tempdir().unwrap());
+    let in_files = |name: &str| ratn_storage::Log::new(place.path().join(name), ratn_storage::Options::default());
+    let in_etcd = store(cluster.endpoints(), "/test/copy", "test");
+    let (_, mut writer) = in_files("first").open().unwrap();
+    for number in 0..10_u8 {
+        append_durably(&mut *writer, &[number]);
+    }
+    writer.compact(Position(4), Box::new(|| bytes::Bytes::from_static(b"four"))).unwrap();
+    common::compacted(&*writer);
+    assert!(transfer(&in_files("first"), &in_etcd).is_err(), "it is being written");
+    writer.close().unwrap();
+    transfer(&in_files("first"), &in_etcd).unwrap();
+    let error = transfer(&in_files("first"), &in_etcd).unwrap_err();
+    assert!(error.to_string().contains("nothing is overwritten"), "{error}");
+    let is_the_same = |log: &dyn Store| {
+        let read = log.read().unwrap();
+        assert_eq!(read.snapshot.unwrap().payload, "four");
+        assert_eq!(payloads(&read.records), (4..10_u8).map(|number| vec![number]).collect::<Vec<_>>());
+    };
+    is_the_same(&in_etcd);
+    transfer(&in_etcd, &in_files("back")).unwrap();
+    is_the_same(&in_files("back"));
+    let (_, _writer) = in_etcd.open().unwrap();
+    assert!(transfer(&in_etcd, &in_files("again")).is_err());
+    transfer_running(&in_etcd, &in_files("backup")).unwrap();
+    is_the_same(&in_files("backup"));
+    assert!(matches!(transfer(&in_files("nothing"), &in_files("other")), Err(ratn_storage::CopyError::Nothing { .. })));
 }

@@ -2,7 +2,7 @@
 //! told: nothing that was acknowledged is lost, nothing is granted twice, tokens grow.
 
 use super::crashes::{AGAIN, PATIENCE, Random, wait_until};
-use anyhow::{Context, bail, ensure};
+use anyhow::{bail, ensure};
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::{Lease, Requirement, ResourceClass, ResourceOperation};
 use ratn_proto::types::Resource;

@@ -70,6 +70,21 @@ pub(crate) enum StateCommand {
         /// A folder that is empty or not there yet: nothing is overwritten
         target: PathBuf,
     },
+    /// Copy a state to where another config keeps it: from files to etcd, or back. End its daemons first
+    Copy {
+        /// Whose state: `resource-manager` or `world-pool`
+        #[arg(value_parser = ["resource-manager", "world-pool"])]
+        role: String,
+        /// The config with the storage that it is in
+        #[arg(long, value_name = "FILE")]
+        from: PathBuf,
+        /// The config with the storage that it goes to; nothing is overwritten
+        #[arg(long, value_name = "FILE")]
+        to: PathBuf,
+        /// The state as it is at this moment, for a backup: its daemons may run
+        #[arg(long)]
+        running: bool,
+    },
     /// Say what is in a state or a copy, and whether it is whole
     Show {
         /// The folder

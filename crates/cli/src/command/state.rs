@@ -1,10 +1,14 @@
-//! `ratn state backup|restore|show`: what a daemon keeps on the disk, copied while it runs, put back, looked at.
+//! `ratn state backup|restore|copy|show`: what a daemon keeps, copied while it runs, put back, moved to other storage, looked at.
 
 use crate::arguments::{StateArguments, StateCommand};
 use crate::failure::Failure;
 use crate::output;
+use crate::system::config::SystemConfig;
 use anyhow::Context;
-use ratn_storage::{Copied, CopyError, Log, Options, Position, Store, backup, restore};
+use ratn_daemon::config::Engine;
+use ratn_storage::{
+    Copied, CopyError, Log, OpenError, Options, Position, Store, backup, restore, transfer, transfer_running,
+};
 use serde_json::json;
 use std::path::Path;
 
@@ -13,6 +17,7 @@ pub(super) fn run(arguments: &StateArguments) -> Result<(), Failure> {
     match &arguments.command {
         StateCommand::Backup { state, target } => copied(backup(state, target), arguments.json, target),
         StateCommand::Restore { backup, target } => copied(restore(backup, target), arguments.json, target),
+        StateCommand::Copy { role, from, to, running } => moved(role, from, to, *running, arguments.json),
         StateCommand::Show { state } => show(state, arguments.json),
     }
 }
@@ -29,6 +34,31 @@ fn copied(copied: Result<Copied, CopyError>, as_json: bool, target: &Path) -> Re
             "{}: records through {through}, those through {snapshot} in a snapshot",
             target.display()
         ))?,
+    }
+    Ok(())
+}
+
+fn moved(role: &str, from: &Path, to: &Path, running: bool, as_json: bool) -> Result<(), Failure> {
+    let store = |file: &Path| {
+        let config = SystemConfig::load(Some(file))?;
+        let storage = if role == "world-pool" { config.world_pool.storage } else { config.resource_manager.storage };
+        if storage.engine == Engine::Log && storage.directory.is_none() {
+            let what = format!("ratn: {}: [{role}.storage] names no `directory`", file.display());
+            return Err(Failure::Refused(what));
+        }
+        Ok(storage.store(role).with_context(|| format!("the storage of {}", file.display()))?)
+    };
+    let (from, to) = (store(from)?, store(to)?);
+    let copied = if running { transfer_running(&*from, &*to) } else { transfer(&*from, &*to) };
+    let through = copied.map_err(|error| match error {
+        CopyError::Nothing { .. } | CopyError::NotEmpty { .. } | CopyError::Open(OpenError::Held { .. }) => {
+            Failure::Refused(format!("ratn: {error}"))
+        }
+        other => Failure::Failed(other.into()),
+    })?;
+    match as_json {
+        true => output::result(json!({ "from": from.place(), "to": to.place(), "through": through.0 }))?,
+        false => output::result(format!("{} has the state of {}", to.place(), from.place()))?,
     }
     Ok(())
 }

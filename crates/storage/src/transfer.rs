@@ -1,0 +1,60 @@
+//! A log from one place to another, whatever each is kept in: from files to etcd and back.
+
+use crate::error::{CompactError, CopyError};
+use crate::store::{Position, Recovered, Store};
+
+/// What stands in place of the records of a snapshot: the position that the snapshot stands for. Nobody reads it.
+const PLACEHOLDER: &[u8] = b"";
+
+/// Copies a log into one that is empty. Its records get positions of their own; what they say is the same. The source's place is taken
+/// meanwhile, so that nothing is written there that the copy lacks. Holds the whole log in memory. Blocks.
+///
+/// # Errors
+/// Where either has a writer, the source cannot be read, the target is not empty, or writing fails: then throw the target away.
+pub fn transfer(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
+    let (recovered, held) = from.open()?;
+    let copied = put(recovered, from, to);
+    drop(held);
+    copied
+}
+
+/// As [`transfer`], of a log that may be written meanwhile: the copy is what it was at one moment. For backups.
+///
+/// # Errors
+/// As [`transfer`].
+pub fn transfer_running(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
+    put(from.read()?, from, to)
+}
+
+fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
+    if recovered.last() == Position(0) {
+        return Err(CopyError::Nothing { place: from.place() });
+    }
+    let (there, mut writer) = to.open()?;
+    if there.last() != Position(0) {
+        return Err(CopyError::NotEmpty { place: to.place() });
+    }
+    let mut durable = writer.durable();
+    if let Some(snapshot) = recovered.snapshot {
+        let through = writer.append(PLACEHOLDER)?;
+        durable.wait_blocking(through)?;
+        let payload = snapshot.payload;
+        writer.compact(through, Box::new(move || payload)).map_err(|error| match error {
+            CompactError::Stopped(fault) => CopyError::Write(fault.into()),
+            other => CopyError::Snapshot(other.to_string()),
+        })?;
+        // The snapshot counts before anything is put behind it.
+        while durable.progress().compacting {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+        if let Some(failure) = durable.progress().compaction_failure {
+            return Err(CopyError::Snapshot(failure.to_string()));
+        }
+    }
+    for record in &recovered.records {
+        let position = writer.append(&record.payload)?;
+        // One at a time: what waits is bounded.
+        durable.wait_blocking(position)?;
+    }
+    Ok(writer.close()?)
+}
