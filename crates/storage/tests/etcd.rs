@@ -3,7 +3,8 @@
 
 mod common;
 
-use common::etcd::{Cluster, Proxy, is_there, options, store};
+use common::cluster::{Cluster, Proxy, is_there};
+use common::etcd::{options, store};
 use common::{append_durably, payloads, promises};
 use ratn_storage::etcd::Bounds;
 use ratn_storage::{Etcd, Fault, OpenError, Position, ReadError, Store, Writer, transfer, transfer_running};

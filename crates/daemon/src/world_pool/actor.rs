@@ -349,7 +349,8 @@ mod tests {
     #[tokio::test]
     async fn a_projection_is_made_under_a_lease_of_a_session_that_its_caller_opened() {
         let (config, directory) = (WorldPoolConfig::default(), tempfile::tempdir().unwrap());
-        let kept = super::super::open(&config, directory.path()).unwrap();
+        let log = Journal::log(&config.storage, directory.path());
+        let kept = super::super::open(&config, Arc::new(log)).unwrap();
         let live = watch::Sender::new(LiveLeases::of(LeaseId(3), "world-model", "adam"));
         let over = CancellationToken::new();
         let (actor, _ended) = start(config, None, kept, live.subscribe(), Vitals::default(), over).unwrap();

@@ -1,6 +1,5 @@
 //! Logs in etcd for tests.
 
-pub(crate) use super::cluster::{Cluster, Proxy, is_there};
 use ratn_storage::etcd::{Bounds, Connect, Holder};
 use ratn_storage::{Etcd, EtcdOptions};
 use std::sync::Arc;
