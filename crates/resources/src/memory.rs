@@ -128,15 +128,15 @@ impl RequestMemory {
             let recalled = Recalled::Answered(answer.reply.clone());
             return same(id, answer.fingerprint, fingerprint).map(|()| Some(recalled));
         }
-        let unknown = self.answer(&RequestId { caller: Arc::default(), ..id.clone() });
-        let unknown = unknown.filter(|answer| answer.fingerprint.may_be(fingerprint));
+        let unknown = self.unknown(id).filter(|answer| answer.fingerprint.may_be(fingerprint));
         Ok(unknown.map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
     /// The same, whatever the request was.
     pub(crate) fn reply(&self, id: &RequestId) -> Option<Recalled> {
         let waiting = self.waiting.get(id).map(|(_, waiter)| Recalled::Waiting(*waiter));
-        waiting.or_else(|| self.answer(id).map(|answer| Recalled::Answered(answer.reply.clone())))
+        let answer = || self.answer(id).or_else(|| self.unknown(id));
+        waiting.or_else(|| answer().map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
     /// Who waits under this id: the caller's own waiter, else that of the first caller who has one.
@@ -239,6 +239,11 @@ impl RequestMemory {
 
     fn answer(&self, id: &RequestId) -> Option<&Answer> {
         self.callers.get(&id.caller)?.get(&id.id)
+    }
+
+    /// What nobody knows whom was answered under this id.
+    fn unknown(&self, id: &RequestId) -> Option<&Answer> {
+        self.callers.get("")?.get(&id.id)
     }
 
     /// The answers with whom they were given to, the oldest first.

@@ -335,6 +335,22 @@ fn answers_that_an_earlier_version_remembers_for_nobody_knows_whom_are_given_to_
     let other = pool.handle_as(now, &speaker("b"), "r1", create("Tool")).unwrap();
     assert!(matches!(other, ratn_resources::Reply::Created { id, .. } if id == "Tool-2"), "another request of b's own");
     pool.check_invariants().unwrap();
+    // What was acquired then is withdrawn by its session, and by no other.
+    let mut pool = Pool::new(Limits::default());
+    pool.keep_alive_as(now, &speaker("a"), &id, "s", Duration::from_secs(10)).unwrap();
+    pool.handle_as(now, &speaker("a"), "", create("Arm")).unwrap();
+    let acquire = AcquireRequest::new(id.clone(), vec![requirement(ResourceOperation::Block, 0, 1)]);
+    pool.handle_as(now, &speaker("a"), "q1", Request::Acquire(acquire)).unwrap();
+    let bytes = pool.snapshot().encode();
+    let mut earlier = bytes.strip_suffix(&[1, 1, b'a', 0]).unwrap().to_vec();
+    earlier[0] = 5;
+    let earlier = Snapshot::decode(&earlier).unwrap();
+    let mut pool = Pool::restore(Limits::default(), now, Some(earlier), []).unwrap();
+    let other = SessionId::from("other");
+    pool.keep_alive_as(now, &speaker("b"), &other, "o", Duration::from_secs(10)).unwrap();
+    assert!(pool.withdraw(now, &other, "q1").is_err());
+    assert_eq!((pool.withdraw(now, &id, "q1"), pool.leases().len()), (Ok(true), 0));
+    pool.check_invariants().unwrap();
     // A record of before: `r1` was done, whatever it asked, and none was forgotten for it.
     let records = decode(&[5, 1, 9, 2, b'r', b'1', 0, 3, 0]).unwrap();
     let mut pool = Pool::restore(Limits::default(), now, None, records).unwrap();

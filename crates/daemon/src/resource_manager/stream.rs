@@ -27,6 +27,9 @@ use tracing::Instrument;
 /// When to ask again after a refusal for the number of calls.
 const RETRY_DELAY: Duration = Duration::from_millis(10);
 
+/// What a withdraw on a stream counts as.
+const WITHDRAW: &str = "/ratn.v1.ResourceService/Withdraw";
+
 /// Grants of a stream that are known by the ids of their calls: more than can be under way to a client that reads.
 const GRANTS: usize = 4_096;
 
@@ -95,12 +98,18 @@ impl Serve<SessionCalls> for CallerService {
         if let Err(malformed) = name(&request_id, "request_id").and_then(|()| name(&session_id, "session_id")) {
             return Some(Err(malformed.into()));
         }
-        let late = if end() { None } else { Some(self.grants.leases.remove(&ended)) };
-        if let Some(Some(lease)) = late {
+        let mut withdrawn = end();
+        if !withdrawn && let Some(lease) = self.grants.leases.remove(&ended) {
             self.service.actor.send_later(Message::Return { lease });
             audit::begin(&self.caller, &request_id, || Mutation::Withdraw { session: session_id }).ended(&Ok(()));
+            withdrawn = true;
         }
-        Some(Ok(Kind::Withdraw(v1::WithdrawResponse { withdrawn: late != Some(None) })))
+        // The end of a call was counted with the call.
+        let counts = self.quotas.as_ref().filter(|_| !withdrawn);
+        if let Some(Err(refused)) = counts.map(|quotas| quotas.admit(&self.caller, WITHDRAW, Instant::now())) {
+            return Some(Err(refused));
+        }
+        Some(Ok(Kind::Withdraw(v1::WithdrawResponse { withdrawn })))
     }
 
     fn too_many(&self) -> Status {
@@ -119,7 +128,7 @@ async fn measured(
     let path = match &call {
         Some(Asked::Block(_)) => "/ratn.v1.ResourceService/Block",
         Some(Asked::Acquire(_)) => "/ratn.v1.ResourceService/Acquire",
-        Some(Asked::Withdraw(_)) => "/ratn.v1.ResourceService/Withdraw",
+        Some(Asked::Withdraw(_)) => WITHDRAW,
         Some(Asked::Release(_)) => "/ratn.v1.ResourceService/Release",
         Some(Asked::KeepAlive(_)) | None => "/ratn.v1.ResourceService/KeepAlive",
     };
