@@ -277,8 +277,13 @@ impl Pool {
             let (effect, holdings) = if let Some(&lease) = lease {
                 (Effect::LeaseEnded { lease, reason }, self.leases.get(&lease).map_or(0, |record| record.held.len()))
             } else if let Some(&slot) = consumed {
-                let amount = self.resources.get(slot).map_or(Quantity::ZERO, |resource| resource.consumed_by(id));
-                (Effect::Returned { session: id.clone(), slot, amount }, 0)
+                let resource = self.resources.get(slot);
+                let amount = resource.map_or(Quantity::ZERO, |resource| resource.consumed_by(id));
+                match resource.is_some_and(|resource| resource.description.renewable) {
+                    true => (Effect::Returned { session: id.clone(), slot, amount }, 0),
+                    // It was renewable when it was consumed.
+                    false => (Effect::TaskEnded { session: id.clone() }, session.consumed.len()),
+                }
             } else if let Some(&slot) = session.provides.first() {
                 let holders = self.resources.get(slot).map_or(0, |resource| resource.holders.len());
                 (Effect::ResourceDeleted { slot, reason }, holders)

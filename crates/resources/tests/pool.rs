@@ -733,3 +733,17 @@ fn tokens_do_not_grow_faster_than_the_microseconds_that_they_began_with() {
     assert!(now >= start + Duration::from_micros(300) && now < start + Duration::from_micros(400));
     pool.check_invariants().unwrap();
 }
+
+#[test]
+fn a_session_that_consumed_what_is_not_renewable_any_more_ends_and_what_it_consumed_returns() {
+    let mut bench = Bench::new();
+    let battery = ResourceSpec::new(ResourceClass::System, "Battery").id("battery").capacity(2);
+    bench.create("a", battery.clone());
+    let consume = requirement(ResourceOperation::Consume, "Battery", 1);
+    bench.pool.consume(bench.now, &session("b"), &consume).unwrap();
+    bench.create("a", ResourceSpec { renewable: false, ..battery });
+    bench.pool.close_session(bench.now, &session("b")).unwrap();
+    assert!(bench.pool.sessions().iter().all(|known| known.id != session("b")), "it is gone");
+    assert_eq!(bench.pool.get("battery").unwrap().free, 2);
+    bench.pool.check_invariants().unwrap();
+}
