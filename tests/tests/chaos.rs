@@ -1,4 +1,4 @@
-//! Workers, managers and task control are killed at random while tasks run: every task ends as it does in HSM mode when nobody is
+//! Workers, managers and task control are killed at random while tasks run, and managers and the cell suspended: every task ends as it does in HSM mode when nobody is
 //! killed, no process is left that nobody watches, and no lease that nobody has.
 //!
 //! `RATN_KILLS` [20] and `RATN_SEED` [1] say how many and when; `scripts/soak-chaos` does 1,000.
@@ -6,6 +6,7 @@
 mod support;
 
 use anyhow::{Context, ensure};
+use nix::sys::signal::Signal;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::time::Duration;
@@ -14,8 +15,20 @@ use support::host::{Host, ROLES};
 use support::motions::{lines, motions};
 use support::{Started, repository, wait_for};
 
-/// Who is killed; the cell is the robot, and a robot is not started again in the middle of a motion.
-const VICTIMS: [Victim; 5] = [Victim::TaskControl, Victim::Worker, Victim::Role(0), Victim::Role(1), Victim::Role(2)];
+/// Who is killed or suspended; the cell is the robot, and a robot is not started again in the middle of a motion.
+const VICTIMS: [Victim; 9] = [
+    Victim::TaskControl,
+    Victim::Worker,
+    Victim::Role(0),
+    Victim::Role(1),
+    Victim::Role(2),
+    Victim::Suspended(0),
+    Victim::Suspended(1),
+    Victim::Suspended(2),
+    Victim::Suspended(3),
+];
+/// How long a role is suspended: less than its session lives, but for the resource manager, which has none.
+const SUSPENDED_MS: [u64; 4] = [4_500, 1_500, 1_500, 1_500];
 /// A node is computed at most three times, so no more workers than this are lost in one task: one by itself, some with their manager.
 const WORKERS_LOST: u32 = 2;
 const KILLS_A_TASK: u64 = 6;
@@ -33,6 +46,8 @@ enum Victim {
     Worker,
     /// One of [`ROLES`].
     Role(usize),
+    /// The same, which goes on after a while.
+    Suspended(usize),
 }
 
 /// One task, with its task control.
@@ -60,6 +75,11 @@ impl<'a> Task<'a> {
             Victim::Role(role) => {
                 self.host.kill(ROLES[role])?;
                 self.host.start_role(ROLES[role])
+            }
+            Victim::Suspended(role) => {
+                self.host.signal(ROLES[role], Signal::SIGSTOP)?;
+                std::thread::sleep(Duration::from_millis(50 + random.below(SUSPENDED_MS[role])));
+                self.host.signal(ROLES[role], Signal::SIGCONT)
             }
             Victim::Worker => {
                 let workers = self.host.workers();

@@ -3,7 +3,9 @@
 mod support;
 
 use anyhow::{Context, ensure};
+use nix::sys::signal::Signal;
 use std::process::Command;
+use std::time::Duration;
 use support::host::Host;
 use support::{Place, Process, Started, repository, wait_for};
 
@@ -72,6 +74,52 @@ fn a_run_whose_resource_manager_stays_away_ends_preempted_and_the_robot_holds() 
     wait_for("the robot to hold", || Ok((host.begun()?.len() == host.ended()?).then_some(())))?;
     // What was interrupted is over; the next run finds everything free again.
     host.start_role("resource-manager")?;
+    host.is_whole()
+}
+
+/// One motion of some seconds.
+const SLOWLY: &str = r#"
+task: slowly
+states:
+  - far:
+      action: arm/move_to
+      in: { joints: "joints(0.9, -1.2, 0, 0.9, 0, -0.6, 0)", speed: 0.03 }
+      pia: true
+      reads: []
+      resources: [{ block: Arm }]
+"#;
+/// Longer than sessions live.
+const LONG: Duration = Duration::from_millis(3_600);
+
+#[test]
+fn a_run_survives_a_suspended_resource_manager_with_a_motion_under_way() -> anyhow::Result<()> {
+    let host = Host::start()?;
+    let (task, log) = (host.place.path().join("slowly.yaml"), host.place.path().join("log.jsonl"));
+    std::fs::write(&task, SLOWLY)?;
+    let (task, log) = (task.to_str().context("a path")?, log.to_str().context("a path")?);
+    let mut run = host.place.start_as("run", &["run", task, &host.config(), "--log", log])?;
+    wait_for("a motion", || Ok((!host.begun()?.is_empty()).then_some(()))).with_context(|| run.said())?;
+    host.signal("resource-manager", Signal::SIGSTOP)?;
+    std::thread::sleep(LONG);
+    let record = std::fs::read_to_string(host.place.path().join("cellerr"))?;
+    ensure!(record.contains("the resource manager is not heard"), "the cell's session did not run out");
+    ensure!(host.ended()? == 0, "the motion was to be under way");
+    host.signal("resource-manager", Signal::SIGCONT)?;
+    let (code, out, err) = run.finish()?;
+    ensure!(code == Some(0), "{code:?} {out}{err}");
+    ensure!(host.begun()?.len() == 1 && host.ended()? == 1, "one motion, and to its end");
+    host.is_whole()
+}
+
+#[test]
+fn a_task_survives_a_suspended_resource_manager_whatever_is_under_way() -> anyhow::Result<()> {
+    let host = Host::start()?;
+    let mut run = run_until_a_motion(&host)?;
+    host.signal("resource-manager", Signal::SIGSTOP)?;
+    std::thread::sleep(LONG);
+    host.signal("resource-manager", Signal::SIGCONT)?;
+    let (code, out, err) = run.finish()?;
+    ensure!(code == Some(0) && out.contains("delivered = 1"), "{code:?} {out}{err}");
     host.is_whole()
 }
 

@@ -4,14 +4,19 @@ use crate::core::faults::{Fault, MAX_FAULTS};
 use ratn_perception::camera::Intrinsics;
 use ratn_perception::noise::Noise;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::provider::standstill_bound;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
+use std::time::Duration;
 
 /// The most boxes that a cell can have: as many as there are places on the base.
 pub const MAX_BOXES: usize = 9;
 
 /// The most of each kind of tableware that a cell can have: as many as there are places for it on the table.
 pub const MAX_TABLEWARE: usize = 3;
+
+/// The longest that the resource manager waits for standstill.
+const LONGEST_STANDSTILL: Duration = Duration::from_secs(60);
 
 /// What the cell is furnished for: the paper's two experiments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -68,6 +73,11 @@ pub struct CellConfig {
     pub speed: f64,
     /// How long the session with the resource manager outlives the last keep-alive, in milliseconds.
     pub session_ttl_ms: u64,
+    /// When a lease of what moves has ended, the next one is granted when the cell has confirmed that nothing moves any more, and at the
+    /// latest after this, in milliseconds: at least `session_ttl_ms`, for which the cell may not have heard of it. 3 s more than that
+    /// unless given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub standstill_ms: Option<u64>,
     /// Where an emergency stop is kept, so that it outlasts the process; a folder that a reboot leaves alone. `state/cell` in the runtime
     /// directory unless given.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -210,6 +220,12 @@ impl CellConfig {
         Goods { boxes, bowls, forks, cups, plates }
     }
 
+    /// The bound within which the next lease of what moves is granted.
+    pub fn standstill(&self) -> Duration {
+        let unless_given = standstill_bound(Duration::from_millis(self.session_ttl_ms)).min(LONGEST_STANDSTILL);
+        self.standstill_ms.map_or(unless_given, Duration::from_millis)
+    }
+
     /// Checks what the types cannot say.
     ///
     /// # Errors
@@ -233,6 +249,13 @@ impl CellConfig {
                 self.session_ttl_ms as f64,
                 (500..=600_000).contains(&self.session_ttl_ms),
                 "500 to 600000",
+            ),
+            (
+                "standstill_ms",
+                self.standstill_ms.unwrap_or_default() as f64,
+                self.standstill_ms
+                    .is_none_or(|ms| self.session_ttl_ms <= ms && Duration::from_millis(ms) <= LONGEST_STANDSTILL),
+                "at least session_ttl_ms, and at most 60000",
             ),
             (
                 "controllers.arm_stiffness",
@@ -339,6 +362,7 @@ impl Default for CellConfig {
             seed: 1,
             speed: 1.0,
             session_ttl_ms: 3000,
+            standstill_ms: None,
             state_dir: None,
             record: None,
             faults: Vec::new(),
@@ -397,6 +421,12 @@ mod tests {
     fn an_unknown_key_and_an_impossible_value_are_refused() {
         assert!(toml::from_str::<CellConfig>("boxs = 3").is_err());
         assert!(toml::from_str::<CellConfig>("[gripper]\nopen = 1").is_err());
+        let text = "standstill_ms = 2999";
+        let refused = toml::from_str::<CellConfig>(text).unwrap().check().unwrap_err().to_string();
+        assert_eq!(
+            refused,
+            "`standstill_ms` of the cell is 2999: it must be at least session_ttl_ms, and at most 60000"
+        );
         let config: CellConfig = toml::from_str("boxes = 10").unwrap();
         assert_eq!(config.check().unwrap_err().to_string(), "`boxes` of the cell is 10: it must be 1 to 9");
     }

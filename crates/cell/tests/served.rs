@@ -301,6 +301,31 @@ async fn the_modules_vanish_when_the_cell_ends() {
     system.end.cancel();
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_cell_that_ends_in_mid_motion_stops_it_and_then_takes_its_modules_back() {
+    let system = system(1.0, 1).await;
+    let lease = system.acquire(&["Arm"]).await;
+    let mut watch = system.resources.watch(&["Arm"]).await.unwrap();
+    let moving = system.execute(&lease, "Arm", "move_to", to_observation());
+    let ending = async {
+        system.under_way().await;
+        let ended = std::time::Instant::now();
+        system.cell_end.cancel();
+        loop {
+            if let Some(ResourceUpdate::Event(event)) = watch.next().await.unwrap()
+                && event.kind == ResourceEventKind::Deleted
+            {
+                break ended.elapsed();
+            }
+        }
+    };
+    let (outcome, took) = tokio::join!(moving, ending);
+    assert!(outcome.as_ref().is_err_and(CallError::is_crash), "{outcome:?}");
+    let session = Duration::from_millis(CellConfig::default().session_ttl_ms);
+    assert!(took < session, "{took:?}: its session ran out by itself");
+    system.end.cancel();
+}
+
 /// Where the arm is.
 async fn arm(cell: &Endpoint) -> v1::Joints {
     let mut client = CellServiceClient::new(connect(cell).await.unwrap());
@@ -333,7 +358,7 @@ async fn carry(mut from: OwnedReadHalf, mut to: OwnedWriteHalf, mut hangs: watch
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_arm_stops_each_time_that_the_line_to_the_manager_hangs() {
+async fn an_arm_stands_still_each_time_that_the_line_to_the_manager_hangs() {
     let temporary = tempfile::tempdir().unwrap();
     let directory = RuntimeDirectory::create(temporary.path()).unwrap();
     let end = CancellationToken::new();
@@ -364,11 +389,21 @@ async fn an_arm_stops_each_time_that_the_line_to_the_manager_hangs() {
             // What the manager said of the lease has come over the line.
             while arm(&cell).await == before {}
             hang.send_replace(true);
+            // It moves in every step of some milliseconds, or stands.
+            loop {
+                let here = arm(&cell).await;
+                tokio::time::sleep(Duration::from_millis(100)).await;
+                if here == arm(&cell).await {
+                    break;
+                }
+            }
+            // The cell's session is over at the manager, and every lease of its modules.
+            while resources.list(&["Arm"]).await.unwrap().iter().any(|arm| !arm.holdings.is_empty()) {}
+            hang.send_replace(false);
         };
         let outcome = async { tokio::join!(outcome, hanging).0 };
-        let outcome = tokio::time::timeout(Duration::from_secs(5), outcome).await.expect("soon").unwrap();
+        let outcome = tokio::time::timeout(DEADLINE, outcome).await.expect("soon").unwrap();
         assert_eq!(outcome.outcome, "aborted", "{outcome:?}");
-        hang.send_replace(false);
         resources.release(lease.id).await.unwrap();
     }
     end.cancel();

@@ -2,9 +2,12 @@
 //! manager cannot be reached, offers and withdrawals wait.
 //!
 //! A provider watches its resources at the manager. When somebody else has deleted one, the provider logs that and offers it again.
+//! One of what moves ([`Provider::start_at_rest`]) offers nothing at which an earlier goal still runs.
 
+use crate::action::STOP_GRACE;
 use crate::client::{CallError, Channels, ResourceClient};
 use crate::endpoint::Endpoint;
+use crate::lease_watch::LeaseWatch;
 use crate::panic::exit_on_panic;
 use crate::session::{Session, SessionState};
 use futures::{StreamExt, stream};
@@ -24,6 +27,12 @@ const PART: &str = "the provider of resources";
 /// The pause before the manager is asked again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
+/// The `standstill_ms` of what moves, at a provider whose session lives for `session_ttl` without a ping: for so long it may not have heard
+/// that a lease has ended, and stops by itself then; its actions have returned [`STOP_GRACE`] after that.
+pub fn standstill_bound(session_ttl: Duration) -> Duration {
+    session_ttl + STOP_GRACE
+}
+
 /// Keeps resources offered at the resource manager, as long as the session lives.
 #[derive(Debug)]
 pub struct Provider {
@@ -38,6 +47,8 @@ struct Shared {
     /// By id. Held during a call, so that an older state never overtakes a newer one.
     desired: Mutex<BTreeMap<String, DesiredState>>,
     missing: Notify,
+    /// Of the resources that are offered only where nothing moves.
+    leases: Option<LeaseWatch>,
     /// Of what is offered: what is watched.
     kinds: watch::Sender<BTreeSet<String>>,
 }
@@ -59,12 +70,36 @@ impl Provider {
     /// # Errors
     /// As [`Channels::get`].
     pub fn start(channels: &Channels, endpoint: &Endpoint, session: &Session) -> Result<Provider, CallError> {
+        Provider::start_with(channels, endpoint, session, None)
+    }
+
+    /// As [`Provider::start`], of resources that `leases` watches: one that the manager has not got, or has not got any more, is offered
+    /// when no goal runs at it. Its next holder finds it at rest.
+    ///
+    /// # Errors
+    /// As [`Channels::get`].
+    pub fn start_at_rest(
+        channels: &Channels,
+        endpoint: &Endpoint,
+        session: &Session,
+        leases: &LeaseWatch,
+    ) -> Result<Provider, CallError> {
+        Provider::start_with(channels, endpoint, session, Some(leases.clone()))
+    }
+
+    fn start_with(
+        channels: &Channels,
+        endpoint: &Endpoint,
+        session: &Session,
+        leases: Option<LeaseWatch>,
+    ) -> Result<Provider, CallError> {
         let client = ResourceClient::new(channels, endpoint, session.id())?;
         let shared = Arc::new(Shared {
             client,
             state: session.state(),
             desired: Mutex::default(),
             missing: Notify::new(),
+            leases,
             kinds: watch::Sender::default(),
         });
         let end = CancellationToken::new();
@@ -155,6 +190,10 @@ impl Shared {
         self.kinds.send_if_modified(|kinds| !kinds.contains(kind) && kinds.insert(kind.to_owned()));
     }
 
+    async fn is_gone(&self, id: &str) -> bool {
+        self.client.get(id).await.is_err_and(|error| error.code() == Some(Code::NotFound))
+    }
+
     /// A resource is gone. What was to be there, and was, is offered again.
     async fn vanished(&self, id: &str, reason: &str) {
         let mut desired = self.desired.lock().await;
@@ -181,10 +220,16 @@ impl Shared {
             self.missing.notify_one();
             return ids.iter().map(|id| (id.clone(), Ok(false))).collect();
         }
-        let wished = ids.iter().filter_map(|id| Some((id.clone(), desired.get(id)?.resource.clone())));
+        let (moving, ids): (BTreeSet<&String>, BTreeSet<&String>) = ids.iter().partition(|id| self.moves(desired, id));
+        let wished = ids.iter().filter_map(|&id| Some((id.clone(), desired.get(id)?.resource.clone())));
         let asked: Vec<_> = wished.map(|(id, resource)| ask(self.client.clone(), id, resource)).collect();
         let answers: Vec<_> = stream::iter(asked).buffer_unordered(AT_ONCE).collect().await;
-        let mut concluded = Vec::with_capacity(answers.len());
+        let mut concluded = Vec::with_capacity(answers.len() + moving.len());
+        for id in moving {
+            tracing::debug!(resource = %id, "a goal still runs at it: it is offered when that has ended");
+            self.missing.notify_one();
+            concluded.push((id.clone(), Ok(false)));
+        }
         for (id, answer) in answers {
             let Some(entry) = desired.get_mut(&id) else { continue };
             let done = entry.conclude(&id, answer);
@@ -196,6 +241,12 @@ impl Shared {
             concluded.push((id, done));
         }
         concluded
+    }
+
+    /// Whether something still moves of what the manager has not got.
+    fn moves(&self, desired: &BTreeMap<String, DesiredState>, id: &str) -> bool {
+        let is_missing = desired.get(id).is_some_and(|entry| entry.resource.is_some() && !entry.there);
+        is_missing && self.leases.as_ref().is_some_and(|leases| !leases.is_at_rest(id))
     }
 }
 
@@ -240,7 +291,8 @@ fn is_transient(error: &CallError) -> bool {
 /// Asks for everything again whenever the session was made anew, and for what is not so yet.
 async fn restore(shared: Arc<Shared>) {
     let mut state = shared.state.clone();
-    let mut restored = 0;
+    // Of the first session nothing was there before.
+    let (mut restored, mut seen) = (0, 1);
     loop {
         let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { return };
         if generation == restored {
@@ -251,6 +303,10 @@ async fn restore(shared: Arc<Shared>) {
                     Err(_) => return,
                 },
             }
+        }
+        if std::mem::replace(&mut seen, generation) != generation {
+            // Nothing is there of before.
+            shared.desired.lock().await.values_mut().for_each(|entry| entry.there = false);
         }
         if ask_for_all(&shared).await {
             restored = generation;
@@ -303,8 +359,12 @@ async fn watch_kinds(shared: &Shared, kinds: &BTreeSet<String>) {
         match update {
             ResourceUpdate::Snapshot { resources, .. } => {
                 let shown: BTreeSet<String> = resources.into_iter().map(|resource| resource.id).collect();
-                for id in before.difference(&shown) {
-                    shared.vanished(id, "it went while nobody watched").await;
+                let now = there(&*shared.desired.lock().await);
+                for id in before.union(&now).filter(|id| !shown.contains(*id)) {
+                    // What came while the watch began may have come after the snapshot, or gone before it.
+                    if before.contains(id) || shared.is_gone(id).await {
+                        shared.vanished(id, "it went while nobody watched").await;
+                    }
                 }
             }
             ResourceUpdate::Event(event) if event.kind == ResourceEventKind::Deleted => {

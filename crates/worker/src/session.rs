@@ -176,6 +176,14 @@ impl Session {
         }
     }
 
+    /// Does not ping it any more, without a word to the manager: what it owns and holds stays its own there until its time to live is over.
+    pub async fn abandon(mut self) {
+        if let Some(task) = self.task.take() {
+            task.abort();
+            let _ = task.await;
+        }
+    }
+
     /// Ends it with the manager, so that what it holds is free at once.
     pub async fn close(mut self) {
         self.end.cancel();

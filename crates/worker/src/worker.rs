@@ -11,7 +11,7 @@ use crate::client::{CallError, Channels};
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::lease_watch::{LeaseWatch, ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use crate::panic::exit_on_panic;
-use crate::provider::Provider;
+use crate::provider::{Provider, standstill_bound};
 use crate::runtime_directory::publish_file;
 use crate::safety::Safety;
 use crate::server::{BindError, Exposure, ServeError, Services, Serving, bind_as};
@@ -24,6 +24,7 @@ use std::collections::BTreeSet;
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 
@@ -125,6 +126,7 @@ pub struct Worker {
     options: WorkerOptions,
     actions: ActionServerBuilder,
     safety: Option<Safety>,
+    standstill: Option<Duration>,
     /// The resources that actions name themselves.
     resources: BTreeSet<String>,
     leases: Leases,
@@ -144,7 +146,8 @@ impl Worker {
     pub fn new(options: WorkerOptions) -> Worker {
         let actions = ActionServer::builder(options.id.clone()).one_at_a_time();
         let shutdown = CancellationToken::new();
-        Worker { options, actions, safety: None, resources: BTreeSet::new(), leases: Leases::Confirmed, shutdown }
+        let (resources, leases) = (BTreeSet::new(), Leases::Confirmed);
+        Worker { options, actions, safety: None, standstill: None, resources, leases, shutdown }
     }
 
     /// With an action. One that names a resource of its own needs leases of that.
@@ -159,6 +162,15 @@ impl Worker {
     #[must_use]
     pub fn safety(mut self, safety: Safety) -> Worker {
         self.safety = Some(safety);
+        self
+    }
+
+    /// The bound within which what it moves stands still when a lease has ended: the next lease of its resource is granted when the
+    /// actions of that one's goals have returned, and at the latest after this. For a worker that offers its resource itself; one with a
+    /// [`Safety`] has [`standstill_bound`] unless given, one without has none: its resource is granted anew at once.
+    #[must_use]
+    pub fn standstill(mut self, bound: Duration) -> Worker {
+        self.standstill = Some(bound);
         self
     }
 
@@ -189,13 +201,14 @@ impl Worker {
     /// # Errors
     /// [`WorkerError`].
     pub async fn run(self) -> Result<(), WorkerError> {
-        let Worker { options, mut actions, safety, mut resources, leases: asked, shutdown } = self;
+        let Worker { options, mut actions, safety, standstill, mut resources, leases: asked, shutdown } = self;
         let has_resource = !options.id.is_empty() || !resources.is_empty();
         match asked {
             _ if safety.is_some() && !has_resource => return Err(WorkerError::MovesWithoutLease),
             Leases::Confirmed if !has_resource => return Err(WorkerError::NoId),
             _ => {}
         }
+        let standstill = standstill.or_else(|| safety.is_some().then(|| standstill_bound(DEFAULT_TTL)));
         let system = |what: &str| {
             let what = what.to_owned();
             move |source| WorkerError::System { what, source }
@@ -256,7 +269,7 @@ impl Worker {
             None => None,
         };
         let offered = match &options.resource_manager {
-            Some(manager) => Some(offer(&channels, manager, &options, &endpoint, &leases).await?),
+            Some(manager) => Some(offer(&channels, manager, &options, &endpoint, &leases, standstill).await?),
             None => None,
         };
         tracing::info!(id = %options.id, %endpoint, "serving");
@@ -273,8 +286,7 @@ impl Worker {
                 Ok(()) => session.close().await,
                 Err(_) => {
                     tracing::error!(id = %options.id, "goals still run at the end: the session is left to run out by itself");
-                    // Dropped, it would be ended with the manager.
-                    std::mem::forget(session);
+                    session.abandon().await;
                 }
             }
         }
@@ -310,14 +322,18 @@ async fn offer(
     options: &WorkerOptions,
     endpoint: &Endpoint,
     leases: &LeaseWatch,
+    standstill: Option<Duration>,
 ) -> Result<Offered, CallError> {
     let session = Session::open(channels, manager, &options.id, DEFAULT_TTL);
     let watch = leases.follow_session(channels, manager, &session, DEFAULT_TTL)?;
     let watching = AbortOnDropHandle::new(tokio::spawn(exit_on_panic(LEASES, watch)));
-    let provider = Provider::start(channels, manager, &session)?;
-    let resource = Resource::new(&options.id, ResourceClass::Process, &options.kind)
+    let provider = Provider::start_at_rest(channels, manager, &session, leases)?;
+    let mut resource = Resource::new(&options.id, ResourceClass::Process, &options.kind)
         .with_endpoint(endpoint)
         .on_host(&options.host);
+    if let Some(bound) = standstill {
+        resource = resource.with_standstill(bound);
+    }
     provider.offer(resource).await?;
     Ok(Offered { session, provider, watching })
 }

@@ -7,11 +7,12 @@ use common::{Provider, RESOURCE, begin, goal, lease, provider_built};
 use ratn_model::id::{FencingToken, LeaseId, Revision};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_proto::types::{Goal, GoalOutcome, Holding, Resource, ResourceEvent, ResourceEventKind, ResourceUpdate};
-use ratn_worker::action::ActionServerBuilder;
+use ratn_worker::action::{Action, ActionResult, ActionServerBuilder, GoalContext};
 use ratn_worker::client::CallError;
 use ratn_worker::lease_watch::{GRANT_WAIT, LeaseWatch};
 use ratn_worker::server::DRAIN_DEADLINE;
-use std::sync::atomic::Ordering;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 use tonic::Code;
 
@@ -127,6 +128,64 @@ async fn without_the_manager_nothing_begins_and_what_is_under_way_ends() {
     // Refused meanwhile, and given again: nothing had begun.
     assert!(outcome.unwrap().is_success());
     assert_eq!(watched.runs(), 1);
+}
+
+/// `step`: takes steps until it is told to stop, and none while it is suspended.
+struct Step(Arc<AtomicUsize>);
+
+#[tonic::async_trait]
+impl Action for Step {
+    fn name(&self) -> &str {
+        "step"
+    }
+
+    fn can_be_suspended(&self) -> bool {
+        true
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        goal.progress("stepping");
+        loop {
+            goal.while_held().await?;
+            goal.checkpoint()?;
+            self.0.fetch_add(1, Ordering::SeqCst);
+            tokio::task::yield_now().await;
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_suspended_goal_stands_still_until_the_manager_is_heard_and_goes_on_only_under_a_lease_that_lives() {
+    for lives in [true, false] {
+        let steps = Arc::new(AtomicUsize::new(0));
+        let watched = watched(|builder| builder.action(Step(Arc::clone(&steps)))).await;
+        watched.holds(&[7], 7);
+        let stepping = begin(&watched.provider, goal("a", "step", 7)).await;
+        watched.watch.unheard("silence");
+        // At most the step that it was at.
+        tokio::task::yield_now().await;
+        let stood = steps.load(Ordering::SeqCst);
+        for _ in 0..1_000 {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(steps.load(Ordering::SeqCst), stood);
+        let refused = watched.provider.client.execute(&watched.provider.endpoint, goal("b", "double", 7), |_, _| {});
+        assert!(tokio::time::timeout(2 * GRANT_WAIT, refused).await.is_err(), "it is tried again and again");
+        assert_eq!((watched.runs(), steps.load(Ordering::SeqCst)), (0, stood));
+        let reason = if lives {
+            watched.holds(&[7], 7);
+            while steps.load(Ordering::SeqCst) == stood {
+                tokio::task::yield_now().await;
+            }
+            watched.watch.unheard("silence");
+            watched.watch.lost("silence for too long");
+            "the lease may have ended: silence for too long"
+        } else {
+            watched.holds(&[8], 8);
+            "the lease ended: it ended while the resource manager was not heard"
+        };
+        assert_eq!(stepping.await.unwrap().unwrap(), GoalOutcome::aborted(reason));
+    }
 }
 
 #[tokio::test]

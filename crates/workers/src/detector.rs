@@ -75,6 +75,11 @@ impl Action for Segment {
         "Every object that stands on a surface, the nearest to the camera first."
     }
 
+    fn can_be_suspended(&self) -> bool {
+        // It moves nothing.
+        true
+    }
+
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let (pose, size) = (goal.port("region").field("pose").pose()?, goal.port("region").field("size").list()?);
         let [x, y, ..] = &size[..] else {
@@ -108,6 +113,11 @@ impl Action for Locate {
 
     fn description(&self) -> &str {
         "Where an object that was seen before stands now."
+    }
+
+    fn can_be_suspended(&self) -> bool {
+        // It moves nothing.
+        true
     }
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {

@@ -59,6 +59,11 @@ impl Action for PlanAction {
         "A collision-free motion of the arm from joints to joints or to a pose of the tool, timed."
     }
 
+    fn can_be_suspended(&self) -> bool {
+        // It moves nothing.
+        true
+    }
+
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let begin = Instant::now();
         let (request, budget_s) = goal::request(&goal)?;

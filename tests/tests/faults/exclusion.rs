@@ -43,6 +43,7 @@ pub(crate) fn check(steps: &[Step], history: &History, bound: Duration) -> (Vec<
         }
     }
     wrong.extend(two_holders(history));
+    wrong.extend(granted_in_motion(&intervals, history));
     let latest = intervals.iter().flat_map(|(token, (_, last))| {
         let next = history.holds.iter().filter(move |hold| hold.token > *token).map(|hold| hold.granted).min();
         next.map(|granted| last.saturating_sub(granted))
@@ -52,6 +53,23 @@ pub(crate) fn check(steps: &[Step], history: &History, bound: Duration) -> (Vec<
         wrong.push(format!("it moved for {latest:?} after the next one was granted it; {bound:?} is allowed"));
     }
     (wrong, Measured { steps: steps.len(), holders: intervals.len(), latest })
+}
+
+/// Motions that went on when the next client had been granted the tool, of holders that had not given it back: the provider confirms that
+/// they stand still, or offers the tool anew when they do.
+fn granted_in_motion(intervals: &BTreeMap<u64, (u64, u64)>, history: &History) -> Vec<String> {
+    let mut wrong = Vec::new();
+    for hold in &history.holds {
+        let Some((_, last)) = intervals.get(&hold.token) else { continue };
+        let next = history.holds.iter().filter(|next| next.token > hold.token).min_by_key(|next| next.token);
+        if let Some(next) = next
+            && next.granted < hold.released
+            && next.granted < *last
+        {
+            wrong.push(format!("it moved until {last} for {hold:?}, when {next:?} had been granted"));
+        }
+    }
+    wrong
 }
 
 /// Leases of the tool whose holders were both told that they have it, while neither had given it back nor could have lost it.

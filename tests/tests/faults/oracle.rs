@@ -159,6 +159,17 @@ fn steps_that_no_provider_may_take_are_found() {
 }
 
 #[test]
+fn a_grant_of_what_still_moves_is_found_unless_its_holder_gave_it_back() {
+    let mut history = with_tool();
+    let late = [step(2, 12), step(2, 45)];
+    assert_eq!(exclusion::check(&late, &history, BOUND).0, Vec::<String>::new());
+    // Its session may have expired, so that nothing else is wrong.
+    (history.holds[0].released, history.holds[1].granted) = (NEVER, 3 * TTL);
+    assert_eq!(exclusion::check(&late, &history, BOUND).0, Vec::<String>::new());
+    assert_eq!(exclusion::check(&[step(2, 12), step(2, 3 * TTL + 1)], &history, BOUND).0.len(), 1);
+}
+
+#[test]
 fn two_that_were_both_told_that_they_hold_the_tool_are_found() {
     let mut history = with_tool();
     history.holds[0].released = NEVER;

@@ -28,6 +28,9 @@ pub(crate) const KIND: &str = "Tool";
 /// The time to live of the provider's session, and how long it trusts leases while it does not hear the manager.
 pub(crate) const TTL: Duration = Duration::from_millis(400);
 
+/// The bound within which the tool stands still; longer than a round, so that only the provider's word counts.
+const BOUND: Duration = Duration::from_secs(60);
+
 /// Tells a provider process where it serves, where the manager is and where it writes its steps.
 const SOCKET: &str = "RATN_TEST_PROVIDER";
 const MANAGER: &str = "RATN_TEST_MANAGER";
@@ -143,9 +146,10 @@ async fn provide(socket: PathBuf, manager: Endpoint, file: File) -> anyhow::Resu
 
     let channels = Channels::new();
     let session = Session::open_as(&channels, &manager, KIND.to_owned(), KIND, TTL);
-    let provider = Provider::start(&channels, &manager, &session)?;
+    let provider = Provider::start_at_rest(&channels, &manager, &session, &leases)?;
     let watching = leases.follow_session(&channels, &manager, &session, TTL)?;
     let resource = Resource::new(TOOL, ResourceClass::Module, KIND).with_endpoint(&endpoint);
+    let resource = resource.with_standstill(BOUND);
     let offering = async {
         while let Err(error) = provider.offer(resource.clone()).await {
             eprintln!("not offered: {error}");
@@ -167,10 +171,15 @@ impl Action for Move {
         "move"
     }
 
+    fn can_be_suspended(&self) -> bool {
+        true
+    }
+
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let steps = goal.optional_int("steps")?.unwrap_or(1);
         let lease = goal.lease.clone().ok_or_else(|| ActionFailure::aborted("no lease"))?;
         for _ in 0..steps {
+            goal.while_held().await?;
             goal.checkpoint()?;
             let line = format!("{} {} {} {}\n", goal.id, lease.id.0, lease.token.0, super::history::now());
             (&self.file).write_all(line.as_bytes())?;

@@ -64,6 +64,11 @@ impl Host {
         Ok(())
     }
 
+    /// For a role that runs.
+    pub(crate) fn signal(&self, role: &str, signal: Signal) -> anyhow::Result<()> {
+        self.running.get(role).context("it runs")?.signal(signal)
+    }
+
     /// Ends every role in order; nothing is left.
     pub(crate) fn end(self) -> anyhow::Result<()> {
         for process in self.running.values() {

@@ -117,18 +117,28 @@ impl Action for ModuleAction {
         Some(&self.resource)
     }
 
+    fn can_be_suspended(&self) -> bool {
+        true
+    }
+
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let request = (self.read)(&goal)?;
         goal.while_held().await?;
+        let mut suspended = goal.suspended();
         let mut motion = self.keeper.perform(request)?;
-        let ending = tokio::select! {
-            biased;
-            ending = motion.ended() => ending,
-            () = goal.cancelled.cancelled() => match motion.stop().await {
-                // It had been done before the word came.
-                Ok(Ending::Done(product)) => Ok(Ending::Done(product)),
-                _ => return Err(goal.stopped()),
-            },
+        let ending = loop {
+            motion.suspend(*suspended.borrow_and_update());
+            tokio::select! {
+                biased;
+                ending = motion.ended() => break ending,
+                () = goal.cancelled.cancelled() => match motion.stop().await {
+                    // It had been done before the word came.
+                    Ok(Ending::Done(product)) => break Ok(Ending::Done(product)),
+                    _ => return Err(goal.stopped()),
+                },
+                // The sender is in the goal.
+                _ = suspended.changed() => {}
+            }
         };
         match ending? {
             Ending::Done(product) => self.outcome(product).await,

@@ -19,7 +19,7 @@ use ratn_perception::noise::Noise;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::safety::{Brakes, SafetyState};
 use ratn_worker::vitals::Vitals;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -62,6 +62,7 @@ pub(crate) struct Motion {
     ticket: Ticket,
     ending: oneshot::Receiver<Ending>,
     messages: Sender<QueuedMessage>,
+    suspended: bool,
     over: bool,
 }
 
@@ -69,6 +70,13 @@ pub(crate) struct Motion {
 struct Optics {
     robot: Robot,
     noise: Noise,
+}
+
+/// Why the robot is to stand still.
+#[derive(Debug, Default)]
+struct Holds {
+    safety: SafetyState,
+    suspended: BTreeSet<Ticket>,
 }
 
 /// The keeper does not take the message.
@@ -90,6 +98,7 @@ enum Message {
     Start { ticket: Ticket, request: Request, ended: oneshot::Sender<Ending> },
     Happened(Event),
     Safety { state: SafetyState, applied: oneshot::Sender<()> },
+    Suspend { ticket: Ticket, suspended: bool },
     Reset { seed: u64, goods: Goods, state: oneshot::Sender<State> },
     State(oneshot::Sender<State>),
     Fault { fault: Fault, taken: oneshot::Sender<bool> },
@@ -119,7 +128,7 @@ impl Keeper {
         let ticket = Ticket(self.tickets.fetch_add(1, Ordering::Relaxed) + 1);
         let (ended, ending) = oneshot::channel();
         self.ask(Message::Start { ticket, request, ended })?;
-        Ok(Motion { ticket, ending, messages: self.messages.clone(), over: false })
+        Ok(Motion { ticket, ending, messages: self.messages.clone(), suspended: false, over: false })
     }
 
     /// Tells the core of an event, as soon as there is room.
@@ -188,7 +197,18 @@ impl Motion {
     pub(crate) async fn ended(&mut self) -> Result<Ending, KeeperError> {
         let ending = (&mut self.ending).await.map_err(|_| KeeperError::Ended);
         self.over = true;
+        self.suspend(false);
         ending
+    }
+
+    /// Has the robot stand still until this is taken back or the goal has ended. What suspends one goal suspends those of every module:
+    /// the resource manager is not heard.
+    pub(crate) fn suspend(&mut self, suspended: bool) {
+        if std::mem::replace(&mut self.suspended, suspended) != suspended {
+            let message = Message::Suspend { ticket: self.ticket, suspended };
+            // A keeper that has ended moves nothing.
+            let _ = self.messages.send(QueuedMessage { message, _room: None });
+        }
     }
 
     /// Tells it to stop, and how it ends then. Never refused: there is at most one such message per goal.
@@ -202,6 +222,7 @@ impl Motion {
         let stop = Event::Stop { ticket: self.ticket, reason: "the goal was told to stop".to_owned() };
         // A keeper that has ended moves nothing.
         let _ = self.messages.send(QueuedMessage { message: Message::Happened(stop), _room: None });
+        self.suspend(false);
     }
 }
 
@@ -213,8 +234,29 @@ impl Drop for Motion {
     }
 }
 
+impl Holds {
+    fn suspend(&mut self, ticket: Ticket, suspended: bool) {
+        if suspended {
+            self.suspended.insert(ticket);
+        } else {
+            self.suspended.remove(&ticket);
+        }
+    }
+
+    /// What is to be in force.
+    fn state(&self) -> SafetyState {
+        match &self.safety {
+            SafetyState::Ready if !self.suspended.is_empty() => {
+                SafetyState::Held { reason: "the resource manager is not heard".to_owned() }
+            }
+            state => state.clone(),
+        }
+    }
+}
+
 fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Receiver<QueuedMessage>, vitals: &Vitals) {
     let mut waiting: BTreeMap<Ticket, oneshot::Sender<Ending>> = BTreeMap::new();
+    let mut holds = Holds::default();
     loop {
         vitals.beat();
         panic_point("cell-core");
@@ -231,7 +273,12 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
             None => (Event::Tick, None),
             Some(Message::Safety { state, applied }) => {
                 safety = Some(applied);
-                (Event::Safety { state }, None)
+                holds.safety = state;
+                (Event::Safety { state: holds.state() }, None)
+            }
+            Some(Message::Suspend { ticket, suspended }) => {
+                holds.suspend(ticket, suspended);
+                (Event::Safety { state: holds.state() }, None)
             }
             Some(Message::Start { ticket, request, ended }) => {
                 waiting.insert(ticket, ended);

@@ -9,6 +9,7 @@ use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
 use ratn_panic_point::panic_point;
 use ratn_proto::types::Resource;
+use ratn_worker::action::ActionServer;
 use ratn_worker::client::{CallError, Channels};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::lease_watch::LeaseWatch;
@@ -36,24 +37,43 @@ pub(crate) struct Link {
     pub(crate) keeper: Keeper,
     /// Who holds the modules.
     pub(crate) leases: LeaseWatch,
+    /// Who performs their goals.
+    pub(crate) server: ActionServer,
+    /// How long goals have to end in, at the end.
+    pub(crate) patience: Duration,
 }
 
 impl Link {
-    /// Keeps the link until `shutdown`.
+    /// Keeps the link until `shutdown`; then everything is stopped, and the session ends when nothing moves any more.
     pub(crate) async fn keep(self, shutdown: CancellationToken) {
         while !shutdown.is_cancelled() {
             let Some(Some(manager)) = shutdown.run_until_cancelled(self.find()).await else { continue };
             let ttl = Duration::from_millis(self.config.session_ttl_ms);
             let session = Session::open(&self.channels, &manager, &format!("cell@{}", self.config.host), ttl);
-            let linked = shutdown.run_until_cancelled(self.offer(&manager, &session)).await;
+            let linked = shutdown.run_until_cancelled(Box::pin(self.offer(&manager, &session))).await;
             if let Some(Err(error)) = linked {
                 tracing::warn!(%manager, %error, "the resource manager does not want the cell's resources");
+            }
+            if shutdown.is_cancelled() {
+                return self.end(session).await;
             }
             // The modules, and every lease of them, end with the session.
             self.leases.lost("the cell's session with the resource manager has ended");
             session.close().await;
             // Gives a manager that refuses time to come to its senses.
             let _ = shutdown.run_until_cancelled(tokio::time::sleep(LOOK_INTERVAL)).await;
+        }
+    }
+
+    async fn end(&self, session: Session) {
+        match tokio::time::timeout(self.patience, self.server.shut_down()).await {
+            Ok(()) => session.close().await,
+            Err(_) => {
+                tracing::error!(
+                    "something still moves at the end: the modules are the cell's until its session has run out"
+                );
+                session.abandon().await;
+            }
         }
     }
 
@@ -69,13 +89,17 @@ impl Link {
 
     /// Offers everything and keeps the battery's level up to date, until the manager is somewhere else.
     async fn offer(&self, manager: &Endpoint, session: &Session) -> Result<(), CallError> {
-        let provider = Provider::start(&self.channels, manager, session)?;
+        let provider = Provider::start_at_rest(&self.channels, manager, session, &self.leases)?;
         let patience = Duration::from_millis(self.config.session_ttl_ms);
         let watching = self.leases.follow_session(&self.channels, manager, session, patience)?;
         let offering = async {
             for module in Module::ALL {
                 let id = resource_id(module, &self.config.host);
-                let resource = Resource::new(id, ResourceClass::Module, module.kind()).with_endpoint(&self.endpoint);
+                let mut resource =
+                    Resource::new(id, ResourceClass::Module, module.kind()).with_endpoint(&self.endpoint);
+                if module != Module::Camera {
+                    resource = resource.with_standstill(self.config.standstill());
+                }
                 provider.offer(resource.on_host(&self.config.host)).await?;
             }
             let mut told = f64::NEG_INFINITY;

@@ -71,13 +71,20 @@ pub async fn run_as(
     let leases = actions::leases(&config);
     let server = actions::server(&keeper, &config, channels.clone(), safety.clone(), &leases);
     let services = Services::new()
-        .with(server.into_service())
+        .with(server.clone().into_service())
         .with(safety.into_service())
         .with(CellServiceServer::new(service::Service::new(keeper.clone(), config.scene)));
-    let link =
-        link::Link { config, directory: directory.clone(), channels, endpoint: endpoint.clone(), keeper, leases };
-    // Motions under way have their leases until the last has ended.
-    let over = CancellationToken::new();
+    let link = link::Link {
+        config,
+        directory: directory.clone(),
+        channels,
+        endpoint: endpoint.clone(),
+        keeper,
+        leases,
+        server,
+        patience: serving.drain,
+    };
+    let over = shutdown.child_token();
     let _over = over.clone().drop_guard();
     let linked = tokio::spawn(exit_on_panic("the link to the resource manager", link.keep(over.clone())));
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;

@@ -19,6 +19,7 @@ use ratn_world::world::{ChangeError, World};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
 
@@ -234,17 +235,30 @@ impl GoalContext {
         if self.cancelled.is_cancelled() { Err(self.stopped()) } else { Ok(()) }
     }
 
-    /// Returns at once where no hold is in force, else when it is over: for an action that moves something in steps, between them.
+    /// Returns at once where no hold is in force and the goal is not suspended, else when that is over: for an action that moves something
+    /// in steps, between them.
     ///
     /// # Errors
     /// [`GoalContext::stopped`].
     pub async fn while_held(&self) -> Result<(), ActionFailure> {
-        let mut state = self.safety.watch();
+        let (mut state, mut suspended) = (self.safety.watch(), self.suspended());
         let over = async {
-            // The sender is in the goal's server.
-            let _ = state.wait_for(|state| !matches!(state, SafetyState::Held { .. })).await;
+            loop {
+                // The senders are in the goal's server, and in the goal.
+                let _ = state.wait_for(|state| !matches!(state, SafetyState::Held { .. })).await;
+                if !*suspended.borrow_and_update() {
+                    return;
+                }
+                let _ = suspended.wait_for(|suspended| !suspended).await;
+            }
         };
         self.unless_cancelled(over).await
+    }
+
+    /// Whether the goal is suspended, and every change of that: nothing may move for it while it is, for its lease may have ended. Only
+    /// goals of an action that can be ([`super::Action::can_be_suspended`]) are; the others end.
+    pub fn suspended(&self) -> watch::Receiver<bool> {
+        self.entry.suspension()
     }
 
     /// What a goal that was told to stop comes to: `preempted`, `aborted` where its lease ended, `stopped` by an emergency stop.

@@ -115,6 +115,8 @@ pub(crate) struct GoalEntry {
     pub(crate) result: watch::Sender<Option<Ending>>,
     /// Fires when its action has returned; an action that does not stop in time does so after its result was told.
     pub(crate) returned: CancellationToken,
+    /// It stands still, for its lease may have ended.
+    suspended: watch::Sender<bool>,
     stop_when_abandoned: bool,
     /// For how long nobody may listen to it.
     grace: Duration,
@@ -148,6 +150,7 @@ impl GoalEntry {
             progress: broadcast::channel(PROGRESS_KEPT).0,
             result: watch::channel(None).0,
             returned: CancellationToken::new(),
+            suspended: watch::Sender::new(false),
             stop_when_abandoned,
             grace: Duration::from_millis(goal.grace_ms).min(MAX_GRACE),
             cause: Mutex::new(None),
@@ -170,6 +173,19 @@ impl GoalEntry {
     /// Why it ends, if it ends without success.
     pub(crate) fn blame(&self, cause: StopCause) {
         self.cause.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(cause);
+    }
+
+    /// Suspends it, or lets it go on.
+    pub(crate) fn suspend(&self, suspended: bool) {
+        self.suspended.send_if_modified(|now| std::mem::replace(now, suspended) != suspended);
+    }
+
+    pub(crate) fn is_suspended(&self) -> bool {
+        *self.suspended.borrow()
+    }
+
+    pub(crate) fn suspension(&self) -> watch::Receiver<bool> {
+        self.suspended.subscribe()
     }
 
     pub(crate) fn is_over(&self) -> bool {

@@ -28,6 +28,7 @@ pub(crate) use authority::MANAGER_UNHEARD;
 pub use context::{CallFailure, GoalContext, WorldFailure};
 pub use port::{InputError, Port};
 pub use ratn_proto::types::{Goal, GoalOutcome};
+pub use run::STOP_GRACE;
 pub use scene::SceneCache;
 pub use server::{ActionServer, ActionServerBuilder};
 
@@ -54,6 +55,13 @@ pub trait Action: Send + Sync + 'static {
     /// Whether a goal is stopped when the last client that listens to it has gone.
     fn cancel_when_abandoned(&self) -> bool {
         true
+    }
+
+    /// Whether a goal is suspended, instead of ended, while the resource manager is not heard: its lease may have ended, so nothing may
+    /// move for it. For an action that stands still while the goal is ([`GoalContext::while_held`], [`GoalContext::suspended`]), and for
+    /// one that moves nothing.
+    fn can_be_suspended(&self) -> bool {
+        false
     }
 
     /// Does it. Has to look at `goal.cancelled` (or `goal.checkpoint()?`) and to end soon once that fired: its resource is its own until

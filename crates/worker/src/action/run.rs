@@ -21,7 +21,7 @@ use tokio::task::JoinError;
 use tracing::Instrument;
 
 /// Of a goal that was told to stop and does not the result is told after this long; it keeps its resource until it has ended.
-pub(super) const STOP_GRACE: Duration = Duration::from_secs(3);
+pub const STOP_GRACE: Duration = Duration::from_secs(3);
 
 /// Runs a goal to its end, whatever its action does.
 pub(super) async fn run(

@@ -2,14 +2,14 @@
 
 use super::admission::{Admission, Limits, State};
 use super::authority::Authority;
-use super::goal::{Ending, Fingerprint, GoalEntry, StopCause};
+use super::goal::{Ending, Fingerprint, GoalEntry, LeaseKey, StopCause};
 use super::run::run;
 use super::service::Messages;
 use super::{Action, GoalContext};
 use crate::access::Caller;
 use crate::client::Channels;
 use crate::gate::ending;
-use crate::lease_watch::{EndedHolding, GRANT_WAIT, LeaseListener, LeaseWatch};
+use crate::lease_watch::{Claim, EndedHolding, GRANT_WAIT, LeaseListener, LeaseWatch, Standing};
 use crate::panic::exit_on_panic;
 use crate::safety::Safety;
 use crate::trace;
@@ -20,6 +20,7 @@ use std::future::pending;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep_until};
+use tokio_util::sync::CancellationToken;
 use tonic::Status;
 use tracing::Instrument;
 
@@ -309,8 +310,41 @@ impl LeaseListener for Inner {
         self.stop_where(is_under, &StopCause::LeaseEnded(ended.reason.clone()));
     }
 
+    fn leases_unheard(&self, reason: &str) {
+        let state = self.state();
+        for goal in state.running().filter(|goal| !goal.resource.is_empty()) {
+            if self.actions.get(&goal.action).is_some_and(|action| action.can_be_suspended()) {
+                goal.suspend(true);
+            } else {
+                goal.stop(StopCause::LeaseUnheard(reason.to_owned()));
+            }
+        }
+    }
+
+    fn leases_heard(&self) {
+        let Some(watch) = self.authority.watch() else { return };
+        let state = self.state();
+        for goal in state.running().filter(|goal| goal.is_suspended()) {
+            let is_held = goal.lease.is_some_and(|(lease, token)| {
+                let claim = Claim { resource: &goal.resource, lease, token, session: &goal.session };
+                watch.check(&claim) == Standing::Confirmed
+            });
+            if is_held {
+                goal.suspend(false);
+            } else {
+                goal.stop(StopCause::LeaseEnded("it ended while the resource manager was not heard".to_owned()));
+            }
+        }
+    }
+
     fn leases_lost(&self, reason: &str) {
         self.stop_where(|goal| !goal.resource.is_empty(), &StopCause::LeaseUnheard(reason.to_owned()));
+    }
+
+    fn under_way(&self, resource: &str, lease: Option<LeaseKey>) -> Vec<CancellationToken> {
+        let state = self.state();
+        let at = state.running().filter(|goal| goal.resource == resource);
+        at.filter(|goal| lease.is_none() || goal.lease == lease).map(|goal| goal.returned.clone()).collect()
     }
 }
 

@@ -7,9 +7,10 @@
 //! While the watch is interrupted nothing is confirmed, so that nothing begins, and nothing has ended, so that what is under way goes on. Lease ids grow with the grants: an id
 //! beyond every one heard of may have been granted a moment ago, any other that holds nothing has ended or never was.
 
+use super::standstill::{Ending, Endings};
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_proto::types::{Resource, ResourceEvent, ResourceEventKind, ResourceUpdate};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Why nothing is confirmed before the first word of the manager.
 const NEVER_HEARD: &str = "the resource manager has not been heard yet";
@@ -63,6 +64,8 @@ pub struct EndedHolding {
 #[derive(Debug)]
 pub struct Holdings {
     by_resource: BTreeMap<String, BTreeMap<LeaseId, Holder>>,
+    /// Whose end this provider is to confirm.
+    endings: Endings,
     /// The largest id heard of.
     youngest: LeaseId,
     /// The session that provides the resources, where that is known: what another one provides under their ids is not this provider.
@@ -89,6 +92,7 @@ impl Default for Holdings {
     fn default() -> Holdings {
         Holdings {
             by_resource: BTreeMap::new(),
+            endings: Endings::default(),
             youngest: LeaseId(0),
             owner: None,
             contact: Contact::Unheard(NEVER_HEARD.to_owned()),
@@ -147,6 +151,7 @@ impl Holdings {
 
     /// The watch tells something; what has ended with it.
     pub fn tell(&mut self, update: &ResourceUpdate) -> Vec<EndedHolding> {
+        self.endings.tell(update, self.owner.as_deref());
         match update {
             ResourceUpdate::Snapshot { resources, youngest, .. } => {
                 let gone: Vec<String> = self.by_resource.keys().cloned().collect();
@@ -188,10 +193,21 @@ impl Holdings {
         }
     }
 
-    /// Nothing is known any more: every lease may have ended.
-    pub fn lost(&mut self, reason: &str) {
-        self.by_resource.clear();
+    /// Every lease may have ended. The next snapshot says which have.
+    pub fn unheard(&mut self, reason: &str) {
+        self.endings.clear();
         self.contact = Contact::Unheard(reason.to_owned());
+    }
+
+    /// Nothing is known any more, and what is heard next is compared with nothing.
+    pub fn lost(&mut self, reason: &str) {
+        self.unheard(reason);
+        self.by_resource.clear();
+    }
+
+    /// Leases that have ended, and of which the manager waits for this provider to confirm standstill.
+    pub(super) fn endings(&self) -> BTreeSet<Ending> {
+        self.endings.all()
     }
 
     /// Whether the manager has been heard, and not lost since.
@@ -342,6 +358,11 @@ mod tests {
         refuted(&holdings, claim(6), "is over");
         assert_eq!(holdings.tell(&snapshot(&[arm(&[7])], 7)), []);
         assert_eq!(holdings.check(&claim(7)), Standing::Confirmed);
+        holdings.unheard("silence");
+        assert_eq!(holdings.check(&claim(7)), Standing::Unheard("silence".to_owned()));
+        let ended = holdings.tell(&snapshot(&[arm(&[8])], 8));
+        assert_eq!(ended.iter().map(|ended| ended.lease).collect::<Vec<_>>(), [LeaseId(7)], "it ended meanwhile");
+        holdings.tell(&snapshot(&[arm(&[7])], 8));
         holdings.lost("silence");
         assert_eq!(holdings.check(&claim(7)), Standing::Unheard("silence".to_owned()));
         holdings.tell(&snapshot(&[arm(&[7])], 7));

@@ -6,25 +6,31 @@
 //! ```
 //! A provider makes one [`LeaseWatch`] for its resources, gives it to its [`crate::action::ActionServer`], and has it follow the
 //! manager. While the watch is interrupted nothing begins. What is under way goes on as long as the provider's own session lives (without
-//! a session: for a time after the manager's last answer, and it is asked often enough); then every goal under a lease ends. What the
-//! manager says first after that is compared with what is under way.
+//! a session: for a time after the manager's last answer, and it is asked often enough). Then every goal under a lease ends, but for those
+//! that can be suspended ([`crate::action::Action::can_be_suspended`]): they stand still until the manager is heard again, and end when it
+//! is given up. What the manager says first is compared with what is under way: a goal goes on only where its lease lives.
+//!
+//! Of what a lease has left of the provider's own resources when it ended, standstill is confirmed (`standstill.rs`).
 
 mod holdings;
 mod location;
+mod standstill;
 
 pub use holdings::{Claim, EndedHolding, Holdings, Standing};
 pub use location::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 
 use crate::client::{CallError, Channels, ResourceClient, ResourceWatch};
 use crate::endpoint::Endpoint;
-use crate::session::{Session, SessionState};
-use ratn_model::id::LeaseId;
+use crate::session::{GIVEN_UP_AFTER, Session, SessionState};
+use ratn_model::id::{FencingToken, LeaseId};
 use ratn_panic_point::panic_point;
+use ratn_proto::types::ResourceUpdate;
 use std::future::{pending, ready};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, sleep_until, timeout, timeout_at};
+use tokio_util::sync::CancellationToken;
 
 /// A lease that has not been heard of is waited for so long: its grant reaches its holder and this provider at about the same time.
 pub const GRANT_WAIT: Duration = Duration::from_secs(1);
@@ -33,6 +39,9 @@ pub const GRANT_WAIT: Duration = Duration::from_secs(1);
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 /// A manager to which this provider has no session is asked something so often within the time that it is trusted without an answer.
 const QUESTIONS_PER_PATIENCE: u32 = 4;
+/// A goal is suspended for so many times the patience at the most: longer than a client believes that its session may live
+/// ([`Session::gone`]), so that its own end comes first.
+const SUSPENDED_FOR: u32 = GIVEN_UP_AFTER + 1;
 /// How often it is said that there is no watch.
 const WARN_INTERVAL: Duration = Duration::from_secs(10);
 
@@ -41,8 +50,17 @@ pub(crate) trait LeaseListener: Send + Sync {
     /// A lease does not hold a resource any more.
     fn lease_ended(&self, ended: &EndedHolding);
 
-    /// Every lease may have ended.
+    /// Every lease may have ended, and it may be heard again which have not.
+    fn leases_unheard(&self, reason: &str);
+
+    /// The manager has told which leases live.
+    fn leases_heard(&self);
+
+    /// Every lease may have ended, and that is not waited for any more.
     fn leases_lost(&self, reason: &str);
+
+    /// The goals of a resource that run, those of one lease (id and token) where it is named: each fires when its action has returned.
+    fn under_way(&self, resource: &str, lease: Option<(LeaseId, FencingToken)>) -> Vec<CancellationToken>;
 }
 
 /// What is known of the leases of a provider's resources. A handle: clones share everything.
@@ -112,8 +130,14 @@ impl LeaseWatch {
         self.shared.holdings().is_heard()
     }
 
+    /// Whether no goal runs at a resource, also none that was told to stop.
+    pub fn is_at_rest(&self, resource: &str) -> bool {
+        self.shared.under_way(resource, None).is_none_or(|under_way| under_way.is_empty())
+    }
+
     /// Follows the manager of a session that provides the resources, for as long as the future is polled; leases are trusted as long
-    /// as the session lives, and for `patience` after the watch broke. Drop the future before the session is closed.
+    /// as the session lives, and for `patience` after the watch broke. Standstill of what a lease has left is confirmed as soon as the
+    /// actions of its goals have returned. Drop the future before the session is closed.
     ///
     /// # Errors
     /// As [`Channels::get`].
@@ -124,9 +148,16 @@ impl LeaseWatch {
         session: &Session,
         patience: Duration,
     ) -> Result<impl Future<Output = ()> + Send + use<>, CallError> {
-        let client = Box::new(ResourceClient::new(channels, manager, "")?);
-        let source = Source::Session { client, state: session.state(), id: session.id().to_owned() };
-        Ok(self.clone().follow(source, patience))
+        let client = ResourceClient::new(channels, manager, session.id())?;
+        let confirming = self.clone().confirm_standstill(client.clone(), patience);
+        let source = Source::Session { client: Box::new(client), state: session.state(), id: session.id().to_owned() };
+        let following = self.clone().follow(source, patience);
+        Ok(async move {
+            tokio::select! {
+                () = following => {}
+                () = confirming => {}
+            }
+        })
     }
 
     /// Follows the manager of a location, wherever it is, for as long as the future is polled; for a provider whose resources another
@@ -157,10 +188,20 @@ impl LeaseWatch {
     }
 
     /// Takes what the manager tells. For tests of providers without a manager; else [`LeaseWatch::follow_session`] does it.
-    pub fn tell(&self, update: &ratn_proto::types::ResourceUpdate) {
+    pub fn tell(&self, update: &ResourceUpdate) {
         let ended = self.shared.holdings().tell(update);
         // Whoever waits for the next lease finds the goals of the last one told to stop.
         self.shared.tell(|listener| ended.iter().for_each(|ended| listener.lease_ended(ended)));
+        if matches!(update, ResourceUpdate::Snapshot { .. }) {
+            self.shared.tell(|listener| listener.leases_heard());
+        }
+        self.shared.heard.send_modify(|heard| *heard += 1);
+    }
+
+    /// Every lease may have ended: what can be suspended is, until the manager is heard, and the rest ends.
+    pub fn unheard(&self, reason: &str) {
+        self.shared.holdings().unheard(reason);
+        self.shared.tell(|listener| listener.leases_unheard(reason));
         self.shared.heard.send_modify(|heard| *heard += 1);
     }
 
@@ -200,14 +241,22 @@ impl LeaseWatch {
             };
             following = match begun {
                 Some(begun) => begun,
-                None => {
-                    let reason = "the resource manager is not heard";
-                    tracing::warn!("{reason}: goals under a lease end, and none begins");
-                    self.lost(reason);
-                    self.begin(&source, patience).await
-                }
+                None => self.heard_again(&source, patience).await,
             };
         }
+    }
+
+    /// A watch, after the manager was not heard for longer than it is trusted.
+    async fn heard_again(&self, source: &Source, patience: Duration) -> Following {
+        let reason = "the resource manager is not heard";
+        tracing::warn!("{reason}: goals under a lease end, or are suspended, and none begins");
+        self.unheard(reason);
+        if let Ok(begun) = timeout(patience * SUSPENDED_FOR, self.begin(source, patience)).await {
+            return begun;
+        }
+        tracing::warn!("{reason}: suspended goals end");
+        self.lost(reason);
+        self.begin(source, patience).await
     }
 
     /// Returns when the manager of a location has answered nothing for the time: one that hangs breaks no connection. That of a session
@@ -323,11 +372,20 @@ impl Shared {
     }
 
     fn tell(&self, say: impl Fn(&dyn LeaseListener)) {
+        self.listeners().iter().for_each(|listener| say(&**listener));
+    }
+
+    /// As [`LeaseListener::under_way`], of all listeners; `None` without any, for nobody knows then.
+    fn under_way(&self, resource: &str, lease: Option<(LeaseId, FencingToken)>) -> Option<Vec<CancellationToken>> {
+        let listeners = self.listeners();
+        let under_way = listeners.iter().flat_map(|listener| listener.under_way(resource, lease));
+        (!listeners.is_empty()).then(|| under_way.collect())
+    }
+
+    fn listeners(&self) -> Vec<Arc<dyn LeaseListener>> {
         let mut listeners = self.listeners.lock().unwrap_or_else(PoisonError::into_inner);
         listeners.retain(|listener| listener.strong_count() > 0);
-        let there: Vec<Arc<dyn LeaseListener>> = listeners.iter().filter_map(Weak::upgrade).collect();
-        drop(listeners);
-        there.iter().for_each(|listener| say(&**listener));
+        listeners.iter().filter_map(Weak::upgrade).collect()
     }
 }
 

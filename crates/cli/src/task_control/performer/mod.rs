@@ -120,8 +120,6 @@ struct Job {
     attempt: u32,
     /// What it works under; a routine's serves several jobs.
     lease: Option<LeaseId>,
-    /// It does not work on a projection.
-    in_environment: bool,
     stop: CancellationToken,
     ended: JoinHandle<()>,
 }
@@ -212,15 +210,10 @@ impl Performer {
         *self.recorded.lock().unwrap_or_else(PoisonError::into_inner) = confirmed;
     }
 
-    /// Resolves when the session with the resource manager, and with it every lease, is gone: with something under way in the
-    /// environment as soon as the manager is not heard for a time to live, for that stops then. Otherwise the run waits for it for
-    /// longer: a manager that was suspended still knows what the run holds.
+    /// Resolves when the session with the resource manager, and with it every lease, is gone. A manager that is not heard is waited for,
+    /// also with a motion under way: its provider has it stand still meanwhile, and one that was suspended still knows what the run holds.
     pub(super) async fn lost(&self) {
-        if self.jobs.values().any(|job| job.in_environment) {
-            self.session.lost().await;
-        } else {
-            self.session.gone().await;
-        }
+        self.session.gone().await;
     }
 
     /// What the executive made of an event is performed next, all of it.
@@ -411,7 +404,6 @@ impl Performer {
     fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal, given: Given) {
         let stop = CancellationToken::new();
         let lease = goal.lease.as_ref().map(|lease| lease.id);
-        let in_environment = goal.projection.is_none();
         let provider = self.provider_of(&goal);
         let (source, endpoint) = match provider {
             Ok(resource) => (
@@ -445,7 +437,7 @@ impl Performer {
             },
         };
         let ended = tokio::spawn(trace::within(self.trace.child(), performing.perform(given)));
-        self.jobs.insert(instance, Job { attempt, lease, in_environment, stop, ended });
+        self.jobs.insert(instance, Job { attempt, lease, stop, ended });
     }
 
     /// The provider of a goal: the leased resource of its kind.

@@ -1,0 +1,226 @@
+//! A driver written with the SDK and a real resource manager: what a holder loses is granted anew when nothing moves for it any more.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod support;
+
+use ratn_model::resource::{Lease, ResourceClass};
+use ratn_proto::types::{Goal, Resource};
+use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
+use ratn_worker::client::{AcquireOptions, ActionClient, ResourceClient, fresh_id};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::lease_watch::LeaseWatch;
+use ratn_worker::provider::Provider;
+use ratn_worker::server::{Services, bind};
+use ratn_worker::session::Session;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+use support::{DEADLINE, Daemon, TestSystem, block, in_time};
+use tokio::sync::Semaphore;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
+
+const ARM: &str = "arm@here";
+/// Far longer than anything here takes, where nothing else is said.
+const BOUND: Duration = Duration::from_secs(50);
+
+/// `move`: moves until it is told to stop, and then until it has room to stand still.
+struct Move {
+    stands: Arc<Semaphore>,
+    /// When each motion began and when it stood still.
+    motions: Arc<Mutex<Vec<(Instant, Instant)>>>,
+}
+
+#[tonic::async_trait]
+impl Action for Move {
+    fn name(&self) -> &str {
+        "move"
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        let began = Instant::now();
+        goal.progress("moving");
+        goal.cancelled.cancelled().await;
+        self.stands.acquire().await.unwrap().forget();
+        self.motions.lock().unwrap().push((began, Instant::now()));
+        Err(goal.stopped())
+    }
+}
+
+/// The driver, with the arm offered.
+struct Driver {
+    endpoint: Endpoint,
+    stands: Arc<Semaphore>,
+    motions: Arc<Mutex<Vec<(Instant, Instant)>>>,
+    provider: Provider,
+    session: Session,
+    _watching: AbortOnDropHandle<()>,
+    _place: tempfile::TempDir,
+}
+
+impl Driver {
+    async fn start(system: &TestSystem, manager: &Daemon, bound: Duration) -> Driver {
+        let place = tempfile::tempdir().unwrap();
+        let (stands, motions) = (Arc::new(Semaphore::new(0)), Arc::default());
+        let leases = LeaseWatch::of([ARM]);
+        let moving = Move { stands: Arc::clone(&stands), motions: Arc::clone(&motions) };
+        let server = ActionServer::builder(ARM).action(moving).one_at_a_time().leases(&leases).build();
+        let bound_at = bind(&Endpoint::Unix(place.path().join("driver.sock"))).await.unwrap();
+        let endpoint = bound_at.endpoint().clone();
+        tokio::spawn(bound_at.serve(Services::new().with(server.into_service()), CancellationToken::new()));
+        let session = Session::open(&system.channels, &manager.endpoint, "driver", DEADLINE);
+        let watch = leases.follow_session(&system.channels, &manager.endpoint, &session, DEADLINE).unwrap();
+        let provider = Provider::start_at_rest(&system.channels, &manager.endpoint, &session, &leases).unwrap();
+        in_time(session.alive(DEADLINE)).await.unwrap();
+        let arm = Resource::new(ARM, ResourceClass::Module, "Arm").with_endpoint(&endpoint).with_standstill(bound);
+        assert!(in_time(provider.offer(arm)).await.unwrap());
+        let _watching = AbortOnDropHandle::new(tokio::spawn(watch));
+        Driver { endpoint, stands, motions, provider, session, _watching, _place: place }
+    }
+
+    /// A motion under a lease, once it has begun.
+    async fn moves(&self, system: &TestSystem, lease: &Lease) {
+        let (begun, began) = tokio::sync::oneshot::channel();
+        let mut begun = Some(begun);
+        let (client, endpoint) = (ActionClient::new(system.channels.clone()), self.endpoint.clone());
+        let goal =
+            Goal { id: fresh_id("goal"), action: "move".to_owned(), lease: Some(lease.clone()), ..Goal::default() };
+        tokio::spawn(async move {
+            client
+                .execute(&endpoint, goal, |_, _| {
+                    if let Some(begun) = begun.take() {
+                        let _ = begun.send(());
+                    }
+                })
+                .await
+        });
+        in_time(began).await.unwrap();
+    }
+
+    fn last(&self) -> Option<Instant> {
+        self.motions.lock().unwrap().last().map(|(_, stood)| *stood)
+    }
+}
+
+async fn acquire(client: &ResourceClient) -> (Lease, Instant) {
+    let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+    (client.acquire(vec![block("Arm")], options).await.unwrap(), Instant::now())
+}
+
+/// Waits until the manager shows that the arm is ending, or is not there.
+async fn is_lost(client: &ResourceClient) {
+    in_time(async {
+        while client.list(&["Arm"]).await.unwrap().iter().any(|arm| !arm.holdings.is_empty()) {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_holder_loses_is_granted_when_its_motion_stands_still_and_not_before() {
+    for how in ["its session ends", "somebody ends its lease", "somebody deletes the resource"] {
+        let system = TestSystem::new();
+        let manager = system.resource_manager().await;
+        let driver = Driver::start(&system, &manager, BOUND).await;
+        let (holder, next) = (system.client(&manager, "holder").await, system.client(&manager, "next").await);
+        let (held, _) = in_time(acquire(&holder.resources)).await;
+        driver.moves(&system, &held).await;
+        let granted = {
+            let client = next.resources.clone();
+            tokio::spawn(async move { acquire(&client).await })
+        };
+        let operator = ResourceClient::new(&system.channels, &manager.endpoint, "").unwrap();
+        match how {
+            "its session ends" => holder.session.close().await,
+            "somebody ends its lease" => assert!(operator.release(held.id).await.unwrap()),
+            _ => operator.delete(ARM).await.unwrap(),
+        }
+        is_lost(&operator).await;
+        // Nobody has it while it moves.
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        assert!(!granted.is_finished() && driver.last().is_none(), "{how}");
+        driver.stands.add_permits(1);
+        let (_, at) = in_time(granted).await.unwrap();
+        assert!(driver.last().is_some_and(|stood| stood <= at), "{how}");
+        manager.end().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_nothing_moves_for_is_granted_at_once_and_what_its_holder_gives_back_too() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let driver = Driver::start(&system, &manager, BOUND).await;
+    let (holder, next) = (system.client(&manager, "holder").await, system.client(&manager, "next").await);
+    let (held, _) = in_time(acquire(&holder.resources)).await;
+    let operator = ResourceClient::new(&system.channels, &manager.endpoint, "").unwrap();
+    assert!(operator.release(held.id).await.unwrap());
+    let (again, _) = in_time(acquire(&next.resources)).await;
+    // Its own motion may still be stopping: that is the holder's concern, and the next goal waits for it.
+    driver.moves(&system, &again).await;
+    assert!(next.resources.release(again.id).await.unwrap());
+    in_time(acquire(&holder.resources)).await;
+    assert_eq!(driver.last(), None);
+    manager.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_motion_that_does_not_stop_is_never_confirmed_and_the_bound_decides() {
+    const SHORT: Duration = Duration::from_millis(700);
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let driver = Driver::start(&system, &manager, SHORT).await;
+    let (holder, next) = (system.client(&manager, "holder").await, system.client(&manager, "next").await);
+    let (held, _) = in_time(acquire(&holder.resources)).await;
+    driver.moves(&system, &held).await;
+    let revoked = Instant::now();
+    holder.session.close().await;
+    let (lease, at) = in_time(acquire(&next.resources)).await;
+    assert!(at - revoked >= SHORT && driver.last().is_none());
+    // And still nothing begins beside it.
+    let waits = tokio::time::timeout(Duration::from_millis(300), driver.moves(&system, &lease));
+    assert!(waits.await.is_err());
+    driver.stands.add_permits(1);
+    manager.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_confirmation_is_repeated_until_the_manager_answers() {
+    let system = TestSystem::new();
+    let place = tempfile::tempdir().unwrap();
+    let at = Endpoint::Unix(place.path().join("rm.sock"));
+    let state = tempfile::tempdir().unwrap();
+    let config = || ratn_daemon::resource_manager::ResourceManagerConfig {
+        listen: at.clone(),
+        storage: ratn_daemon::config::StorageConfig { directory: Some(state.path().to_owned()), ..Default::default() },
+        ..Default::default()
+    };
+    let manager = system.resource_manager_with(config()).await;
+    let driver = Driver::start(&system, &manager, BOUND).await;
+    let (holder, next) = (system.client(&manager, "holder").await, system.client(&manager, "next").await);
+    let (held, _) = in_time(acquire(&holder.resources)).await;
+    driver.moves(&system, &held).await;
+    holder.session.close().await;
+    manager.end().await;
+    // It stands still while there is nobody to tell.
+    driver.stands.add_permits(1);
+    in_time(async {
+        while driver.last().is_none() {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+    let manager = system.resource_manager_with(config()).await;
+    let granted = in_time(async {
+        loop {
+            let options = AcquireOptions { deadline: DEADLINE, ..AcquireOptions::default() };
+            if let Ok(lease) = next.resources.acquire(vec![block("Arm")], options).await {
+                return lease;
+            }
+        }
+    });
+    assert!(granted.await.token > held.token);
+    assert_eq!(driver.session.state().borrow().generation, 1, "the same session");
+    drop(driver.provider);
+    manager.end().await;
+}

@@ -1,0 +1,175 @@
+//! Confirming standstill: what a lease that has ended otherwise than by its holder's release had of a resource is granted anew when the
+//! resource's provider says that nothing moves any more for that lease.
+//!
+//! ```text
+//!   the watch tells of units that are ending ─▶ the goals of that lease have returned ─▶ ConfirmStandstill
+//! ```
+//! This is done for resources of the provider's own session, as long as it follows the manager. A goal whose action does not return is
+//! never confirmed: the bound that the resource was offered with (`standstill_ms`) decides then.
+
+use super::{LeaseWatch, RETRY_INTERVAL};
+use crate::client::{CallError, ResourceClient};
+use ratn_model::id::{FencingToken, LeaseId};
+use ratn_proto::types::{Resource, ResourceEventKind, ResourceUpdate};
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+use tokio::time::{sleep, timeout};
+use tokio_util::task::AbortOnDropHandle;
+use tonic::Code;
+
+/// What a lease that has ended has left of a resource, until its provider has confirmed standstill.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Ending {
+    pub(super) resource: String,
+    pub(super) lease: LeaseId,
+    pub(super) token: FencingToken,
+}
+
+/// All that a provider is to confirm, as the manager says. Pure.
+#[derive(Debug, Default)]
+pub(super) struct Endings(BTreeSet<Ending>);
+
+impl Endings {
+    /// The watch tells something of resources, those of `owner` among them. Without an owner another process offers them, and confirms.
+    pub(super) fn tell(&mut self, update: &ResourceUpdate, owner: Option<&str>) {
+        let of = |resource: &Resource| -> Vec<Ending> {
+            let is_own = owner == Some(resource.session.as_str());
+            let ending = resource.ending.iter().filter(|_| is_own);
+            let left = |(lease, token)| Ending { resource: resource.id.clone(), lease, token };
+            ending.map(|units| left((units.lease, units.token))).collect()
+        };
+        match update {
+            ResourceUpdate::Snapshot { resources, .. } => self.0 = resources.iter().flat_map(of).collect(),
+            ResourceUpdate::Event(event) => {
+                self.0.retain(|ending| ending.resource != event.resource.id);
+                if event.kind != ResourceEventKind::Deleted {
+                    self.0.extend(of(&event.resource));
+                }
+            }
+        }
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.0.clear();
+    }
+
+    pub(super) fn all(&self) -> BTreeSet<Ending> {
+        self.0.clone()
+    }
+}
+
+impl LeaseWatch {
+    /// Confirms what is to be confirmed, for as long as it is polled; `client` speaks for the session that provides the resources.
+    pub(super) async fn confirm_standstill(self, client: ResourceClient, patience: Duration) {
+        let mut heard = self.heard();
+        let mut confirming: BTreeMap<Ending, AbortOnDropHandle<()>> = BTreeMap::new();
+        loop {
+            heard.mark_unchanged();
+            let endings = self.shared.holdings().endings();
+            // What is not ending any more needs no confirmation.
+            confirming.retain(|ending, _| endings.contains(ending));
+            for ending in endings {
+                confirming.entry(ending).or_insert_with_key(|ending| {
+                    let confirm = self.clone().confirm(client.clone(), ending.clone(), patience);
+                    AbortOnDropHandle::new(tokio::spawn(confirm))
+                });
+            }
+            if heard.changed().await.is_err() {
+                return;
+            }
+        }
+    }
+
+    async fn confirm(self, client: ResourceClient, ending: Ending, patience: Duration) {
+        let Ending { resource, lease, token } = ending;
+        // No goal begins under it any more: the watch refutes it.
+        let Some(under_way) = self.shared.under_way(&resource, Some((lease, token))) else {
+            return tracing::debug!(%lease, resource, "no action server has this watch: its standstill is not confirmed");
+        };
+        for goal in under_way {
+            goal.cancelled().await;
+        }
+        loop {
+            match timeout(patience, client.confirm_standstill(lease, &resource)).await {
+                Ok(Ok(freed)) => return tracing::debug!(%lease, resource, freed, "standstill is confirmed"),
+                Ok(Err(error)) if is_final(&error) => {
+                    return tracing::warn!(%lease, resource, %error, "standstill is not confirmed");
+                }
+                Ok(Err(error)) => tracing::debug!(%lease, resource, %error, "standstill is confirmed again"),
+                Err(_) => tracing::debug!(%lease, resource, "the resource manager does not answer to a standstill"),
+            }
+            sleep(RETRY_INTERVAL).await;
+        }
+    }
+}
+
+/// Whether the same answer would come again.
+fn is_final(error: &CallError) -> bool {
+    use Code::{InvalidArgument, NotFound, PermissionDenied, Unimplemented};
+    matches!(error.code(), Some(InvalidArgument | NotFound | PermissionDenied | Unimplemented))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_model::id::Revision;
+    use ratn_model::resource::{Quantity, ResourceClass};
+    use ratn_proto::types::{EndingUnits, ResourceEvent};
+
+    fn resource(id: &str, session: &str, ending: &[u64]) -> Resource {
+        let units = |&lease: &u64| EndingUnits {
+            lease: LeaseId(lease),
+            token: FencingToken(10 * lease),
+            units: Quantity::ONE,
+            session: "holder".to_owned(),
+            within_ms: 6_000,
+        };
+        let mut resource = Resource::new(id, ResourceClass::Module, "Arm");
+        (resource.session, resource.ending) = (session.to_owned(), ending.iter().map(units).collect());
+        resource
+    }
+
+    fn snapshot(resources: &[Resource]) -> ResourceUpdate {
+        let (revision, youngest) = (Revision(1), LeaseId(9));
+        ResourceUpdate::Snapshot { revision, resources: resources.to_vec(), youngest }
+    }
+
+    fn event(kind: ResourceEventKind, resource: Resource) -> ResourceUpdate {
+        let (revision, reason) = (Revision(2), String::new());
+        ResourceUpdate::Event(ResourceEvent { revision, kind, resource, lease: None, reason, part: 0 })
+    }
+
+    fn left(endings: &Endings) -> Vec<(String, u64)> {
+        endings.all().into_iter().map(|ending| (ending.resource, ending.lease.0)).collect()
+    }
+
+    #[test]
+    fn what_is_ending_is_to_be_confirmed_until_the_manager_says_that_it_is_free() {
+        let (mut endings, owner) = (Endings::default(), Some("cell"));
+        endings.tell(&event(ResourceEventKind::Released, resource("arm", "cell", &[7])), owner);
+        endings.tell(&event(ResourceEventKind::Released, resource("base", "cell", &[7])), owner);
+        assert_eq!(left(&endings), [("arm".to_owned(), 7), ("base".to_owned(), 7)]);
+        endings.tell(&event(ResourceEventKind::Updated, resource("arm", "cell", &[])), owner);
+        assert_eq!(left(&endings), [("base".to_owned(), 7)]);
+        endings.tell(&event(ResourceEventKind::Deleted, resource("base", "cell", &[7])), owner);
+        assert_eq!(left(&endings), []);
+    }
+
+    #[test]
+    fn a_snapshot_tells_all_that_is_ending_also_what_began_to_while_nothing_was_heard() {
+        let (mut endings, owner) = (Endings::default(), Some("cell"));
+        endings.tell(&snapshot(&[resource("arm", "cell", &[7]), resource("base", "cell", &[])]), owner);
+        endings.tell(&snapshot(&[resource("arm", "cell", &[]), resource("base", "cell", &[8])]), owner);
+        assert_eq!(left(&endings), [("base".to_owned(), 8)]);
+    }
+
+    #[test]
+    fn of_what_another_session_provides_nothing_is_confirmed() {
+        let mut endings = Endings::default();
+        endings.tell(&snapshot(&[resource("arm", "another cell", &[7])]), Some("cell"));
+        assert_eq!(left(&endings), []);
+        // A pooled worker: its process manager offers it.
+        endings.tell(&snapshot(&[resource("arm", "", &[7])]), None);
+        assert_eq!(left(&endings), []);
+    }
+}
