@@ -1,5 +1,6 @@
 //! Acquire, and how one ends: granted, refused, withdrawn, released.
 
+use crate::caller::{Share, for_all};
 use crate::error::{PoolError, check_owner, malformed};
 use crate::event::{EndReason, Notice, Refusal};
 use crate::expiry::Timer;
@@ -12,6 +13,7 @@ use crate::pool::Pool;
 use crate::queue::{AcquireRequest, Waiter};
 use crate::record::Effect;
 use crate::resource::{Resource, Units};
+use crate::session::Session;
 use crate::session::Speaker;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::{Lease, ResourceOperation};
@@ -164,7 +166,11 @@ impl Pool {
         self.next_waiter += 1;
         let id = WaiterId(self.next_waiter);
         let place = (Reverse(request.priority), id);
-        if let Some(taken) = self.at_once(place, &request.requirements) {
+        let known = self.session(&request.session)?;
+        self.check_leases(known)?;
+        if self.may_grant_to(known)
+            && let Some(taken) = self.at_once(place, &request.requirements)
+        {
             self.give(id, request, request_id, fingerprint, taken);
             self.schedule();
             return Ok(id);
@@ -174,16 +180,13 @@ impl Pool {
             return Err(full.clone());
         }
         let groups: Vec<Key> = request.requirements.iter().map(key).collect();
-        let new = groups.iter().filter(|key| !self.queue.groups.contains_key(*key)).count();
-        if self.queue.groups.len() + new > self.limits.selectors {
-            return Err(PoolError::TooMany { what: "different selectors waited for", limit: self.limits.selectors });
-        }
+        self.check_selectors(self.session(&request.session)?, &groups)?;
         if let Some(deadline) = request.deadline {
             self.timers.insert((deadline, Timer::Waiter(id)));
         }
         if let Some(session) = self.sessions.get_mut(&request.session) {
             session.waiters.insert(id);
-            self.callers.waits(&session.opened_by);
+            self.callers.waits(&session.opened_by, &groups);
         }
         if !request_id.is_empty() {
             self.memory.wait(&request_id, fingerprint, id);
@@ -202,10 +205,42 @@ impl Pool {
         }
     }
 
+    /// Whether the caller of a session may have one more lease.
+    fn check_leases(&self, session: &Session) -> Result<(), PoolError> {
+        let (caller, limit) = (&session.opened_by, self.limits.leases_per_caller);
+        if session.is_operators() || self.callers.leases(caller) + self.callers.waiters(caller) < limit {
+            return Ok(());
+        }
+        Err(PoolError::Quota { what: "leases", whose: caller.clone(), quota: "leases_per_caller", limit })
+    }
+
+    /// Whether somebody may wait for these.
+    fn check_selectors(&self, session: &Session, groups: &[Key]) -> Result<(), PoolError> {
+        let share = Share {
+            what: "different selectors waited for",
+            rest: "different selectors waited for (the rest is kept for operators)",
+            there: self.queue.groups.len(),
+            limit: self.limits.selectors,
+            for_operators: self.limits.selectors_for_operators,
+            of_caller: 0,
+            quota: ("selectors_per_caller", usize::MAX),
+        };
+        let new = groups.iter().filter(|key| !self.queue.groups.contains_key(*key)).count();
+        share.check(new, session)?;
+        let (caller, limit) = (&session.opened_by, self.limits.selectors_per_caller);
+        let own = self.callers.selectors(caller) + self.callers.new_selectors(caller, groups);
+        if session.is_operators() || own <= limit {
+            return Ok(());
+        }
+        let what = "different selectors waited for";
+        Err(PoolError::Quota { what, whose: caller.clone(), quota: "selectors_per_caller", limit })
+    }
+
     /// Why one more of a session could not wait, if it could not.
     fn no_room(&self, session: &SessionId) -> Result<Option<PoolError>, PoolError> {
         let (known, limits) = (self.session(session)?, &self.limits);
         let (of_session, caller) = (known.waiters.len(), &known.opened_by);
+        let for_all = for_all(limits.waiters, limits.waiters_for_operators);
         Ok(if !caller.is_empty() && self.callers.waiters(caller) >= limits.waiters_per_caller {
             let (what, quota) = ("waiters", "waiters_per_caller");
             Some(PoolError::Quota { what, whose: caller.clone(), quota, limit: limits.waiters_per_caller })
@@ -213,6 +248,8 @@ impl Pool {
             Some(PoolError::TooMany { what: "waiters of one session", limit: limits.waiters_per_session })
         } else if self.queue.len() >= limits.waiters {
             Some(PoolError::TooMany { what: "waiters", limit: limits.waiters })
+        } else if !known.is_operators() && self.queue.len() >= for_all {
+            Some(PoolError::TooMany { what: "waiters (the rest is kept for operators)", limit: for_all })
         } else {
             None
         })
@@ -300,7 +337,7 @@ impl Pool {
         }
         if let Some(session) = self.sessions.get_mut(&waiter.request.session) {
             session.waiters.remove(&id);
-            self.callers.waits_no_more(&session.opened_by);
+            self.callers.waits_no_more(&session.opened_by, &waiter.groups);
         }
         let fingerprint = self.memory.waited(&waiter.request_id).unwrap_or_default();
         Some((waiter, fingerprint))

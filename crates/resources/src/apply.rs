@@ -80,7 +80,10 @@ impl Pool {
                 self.queue.touched(&self.resources, *slot, None, Some(&seen), false);
                 self.last_number = (*numbered).max(self.last_number);
                 if let Some(owner) = owner {
-                    self.session_mut(owner)?.provides.insert(*slot);
+                    let session = self.session_mut(owner)?;
+                    session.provides.insert(*slot);
+                    let caller = session.opened_by.clone();
+                    self.callers.provides(&caller);
                 }
                 let view = self.view(*slot)?;
                 self.publish(Change::ResourceCreated(view));
@@ -100,7 +103,10 @@ impl Pool {
                 let resource = self.resources.remove(*slot).ok_or_else(|| missing(*slot))?;
                 self.queue.touched(&self.resources, *slot, Some(&Seen::of(&resource)), None, false);
                 if let Some(owner) = &resource.owner {
-                    self.session_mut(owner)?.provides.remove(slot);
+                    let session = self.session_mut(owner)?;
+                    session.provides.remove(slot);
+                    let caller = session.opened_by.clone();
+                    self.callers.provides_no_more(&caller);
                 }
                 for (session, _) in &resource.consumers {
                     self.session_mut(session)?.consumed.remove(slot);
@@ -179,6 +185,7 @@ impl Pool {
                 }
                 self.not_undoable(*lease, record.consumed);
                 self.session_mut(&record.session)?.leases.remove(lease);
+                self.callers.holds_no_more(&record.opened_by);
                 if *reason == EndReason::Undelivered {
                     self.memory.forget_grant(*lease);
                 }
@@ -239,6 +246,7 @@ impl Pool {
         let session = self.session_mut(&granted.session)?;
         session.leases.insert(lease);
         let opened_by = session.opened_by.clone();
+        self.callers.holds(&opened_by);
         let slots = granted.slots();
         self.leases.insert(lease, LeaseRecord { expires, opened_by, ..granted.clone() });
         self.undoable(lease, &granted.consumed);
@@ -256,6 +264,9 @@ impl Pool {
             return false;
         }
         let until = self.now + standstill;
+        if !self.ending.contains_key(&lease) {
+            self.callers.holds(&record.opened_by);
+        }
         let ending = self.ending.entry(lease).or_insert_with(|| EndingLease {
             token: record.token,
             session: record.session.clone(),
@@ -273,6 +284,7 @@ impl Pool {
         let Some(ending) = self.ending.get_mut(&lease) else { return false };
         let Some(Bound(until)) = ending.slots.remove(&slot) else { return false };
         if ending.slots.is_empty() {
+            self.callers.holds_no_more(&ending.opened_by);
             self.ending.remove(&lease);
         }
         self.stop_timer(until, Timer::Standstill(lease, slot));

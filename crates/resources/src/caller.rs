@@ -1,7 +1,11 @@
-//! What each caller has in the pool: how many sessions it opened, and how many acquires of those wait. Counted beside the sessions,
-//! which say whose they are; kept nowhere.
+//! What each caller has in the pool: how many sessions it opened, what those provide and hold, how many of their acquires wait, and for
+//! how many selectors. Counted beside the sessions, which say whose they are; kept nowhere. Whether one may have more: [`Share`].
 
-use crate::session::Sessions;
+use crate::error::PoolError;
+use crate::group::Key;
+use crate::lease::EndingLeases;
+use crate::queue::Queue;
+use crate::session::{Session, Sessions};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -9,20 +13,70 @@ use std::sync::Arc;
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Callers(BTreeMap<Arc<str>, Has>);
 
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 struct Has {
     sessions: usize,
+    resources: usize,
+    /// Those included that have ended while a provider has not confirmed standstill.
+    leases: usize,
     waiters: usize,
+    /// How many requirements of its waiters select what.
+    selectors: BTreeMap<Key, usize>,
+}
+
+/// Of something that has a bound, what there is, and what may be.
+pub(crate) struct Share {
+    pub(crate) what: &'static str,
+    /// As [`Share::what`], of what is left for operators alone.
+    pub(crate) rest: &'static str,
+    pub(crate) there: usize,
+    pub(crate) limit: usize,
+    pub(crate) for_operators: usize,
+    pub(crate) of_caller: usize,
+    /// The name of this bound, and the bound.
+    pub(crate) quota: (&'static str, usize),
+}
+
+impl Share {
+    /// Whether there may be so many more for a session.
+    pub(crate) fn check(&self, more: usize, session: &Session) -> Result<(), PoolError> {
+        let Share { what, rest, there, limit, for_operators, of_caller, quota: (quota, most) } = *self;
+        if there + more > limit {
+            return Err(PoolError::TooMany { what, limit });
+        }
+        if session.is_operators() {
+            return Ok(());
+        }
+        if of_caller + more > most {
+            return Err(PoolError::Quota { what, whose: session.opened_by.clone(), quota, limit: most });
+        }
+        let for_all = for_all(limit, for_operators);
+        if there + more > for_all {
+            return Err(PoolError::TooMany { what: rest, limit: for_all });
+        }
+        Ok(())
+    }
+}
+
+/// What of a bound is for everybody: at least half of it.
+pub(crate) fn for_all(limit: usize, for_operators: usize) -> usize {
+    limit - for_operators.min(limit / 2)
 }
 
 impl Callers {
-    /// As the sessions say.
-    pub(crate) fn of(sessions: &Sessions) -> Callers {
+    /// As the sessions, leases that end and waiters say.
+    pub(crate) fn of(sessions: &Sessions, ending: &EndingLeases, queue: &Queue) -> Callers {
         let mut callers = Callers::default();
         for session in sessions.values() {
-            callers.opened(&session.opened_by);
-            session.waiters.iter().for_each(|_| callers.waits(&session.opened_by));
+            let caller = &session.opened_by;
+            callers.opened(caller);
+            session.provides.iter().for_each(|_| callers.provides(caller));
+            session.leases.iter().for_each(|_| callers.holds(caller));
+            for waiter in session.waiters.iter().filter_map(|id| queue.get(*id)) {
+                callers.waits(caller, &waiter.groups);
+            }
         }
+        ending.values().for_each(|ending| callers.holds(&ending.opened_by));
         callers
     }
 
@@ -30,8 +84,45 @@ impl Callers {
         self.0.get(caller).map_or(0, |has| has.sessions)
     }
 
+    pub(crate) fn resources(&self, caller: &str) -> usize {
+        self.0.get(caller).map_or(0, |has| has.resources)
+    }
+
+    pub(crate) fn leases(&self, caller: &str) -> usize {
+        self.0.get(caller).map_or(0, |has| has.leases)
+    }
+
     pub(crate) fn waiters(&self, caller: &str) -> usize {
         self.0.get(caller).map_or(0, |has| has.waiters)
+    }
+
+    pub(crate) fn selectors(&self, caller: &str) -> usize {
+        self.0.get(caller).map_or(0, |has| has.selectors.len())
+    }
+
+    /// How many of these a caller does not wait for yet.
+    pub(crate) fn new_selectors(&self, caller: &str, groups: &[Key]) -> usize {
+        let mut groups: Vec<&Key> = groups.iter().collect();
+        groups.sort_unstable();
+        groups.dedup();
+        let known = |key: &Key| self.0.get(caller).is_some_and(|has| has.selectors.contains_key(key));
+        groups.into_iter().filter(|key| !known(key)).count()
+    }
+
+    pub(crate) fn provides(&mut self, caller: &Arc<str>) {
+        self.0.entry(caller.clone()).or_default().resources += 1;
+    }
+
+    pub(crate) fn provides_no_more(&mut self, caller: &str) {
+        self.less(caller, |has| &mut has.resources);
+    }
+
+    pub(crate) fn holds(&mut self, caller: &Arc<str>) {
+        self.0.entry(caller.clone()).or_default().leases += 1;
+    }
+
+    pub(crate) fn holds_no_more(&mut self, caller: &str) {
+        self.less(caller, |has| &mut has.leases);
     }
 
     pub(crate) fn opened(&mut self, caller: &Arc<str>) {
@@ -42,11 +133,21 @@ impl Callers {
         self.less(caller, |has| &mut has.sessions);
     }
 
-    pub(crate) fn waits(&mut self, caller: &Arc<str>) {
-        self.0.entry(caller.clone()).or_default().waiters += 1;
+    pub(crate) fn waits(&mut self, caller: &Arc<str>, groups: &[Key]) {
+        let has = self.0.entry(caller.clone()).or_default();
+        has.waiters += 1;
+        groups.iter().for_each(|key| *has.selectors.entry(key.clone()).or_default() += 1);
     }
 
-    pub(crate) fn waits_no_more(&mut self, caller: &str) {
+    pub(crate) fn waits_no_more(&mut self, caller: &str, groups: &[Key]) {
+        let Some(has) = self.0.get_mut(caller) else { return };
+        for key in groups {
+            let Some(count) = has.selectors.get_mut(key) else { continue };
+            *count -= 1;
+            if *count == 0 {
+                has.selectors.remove(key);
+            }
+        }
         self.less(caller, |has| &mut has.waiters);
     }
 

@@ -1,5 +1,6 @@
 //! Create and delete: what is in the pool.
 
+use crate::caller::Share;
 use crate::error::{PoolError, check_owner, malformed};
 use crate::event::EndReason;
 use crate::id::{SessionId, Slot};
@@ -42,10 +43,8 @@ impl Pool {
                 let description = Arc::new(spec.described(id.clone()));
                 self.commit(Effect::ResourceUpdated { slot, description });
             }
-            None if self.resources.len() >= self.limits.resources => {
-                return Err(PoolError::TooMany { what: "resources", limit: self.limits.resources });
-            }
             None => {
+                self.check_room(session)?;
                 let (slot, owner) = (self.resources.next_slot(), session.cloned());
                 let description = Arc::new(spec.described(id.clone()));
                 self.commit(Effect::ResourceCreated { slot, description, owner, numbered });
@@ -136,6 +135,25 @@ impl Pool {
                 return id;
             }
         }
+    }
+
+    /// Whether there may be one more resource of a session; without one it is an operator's.
+    fn check_room(&self, session: Option<&SessionId>) -> Result<(), PoolError> {
+        let limit = self.limits.resources;
+        let Some(session) = session.map(|id| self.session(id)).transpose()? else {
+            let room = self.resources.len() < limit;
+            return if room { Ok(()) } else { Err(PoolError::TooMany { what: "resources", limit }) };
+        };
+        let share = Share {
+            what: "resources",
+            rest: "resources (the rest is kept for operators)",
+            there: self.resources.len(),
+            limit,
+            for_operators: self.limits.resources_for_operators,
+            of_caller: self.callers.resources(&session.opened_by),
+            quota: ("resources_per_caller", self.limits.resources_per_caller),
+        };
+        share.check(1, session)
     }
 
     fn check_standstill(&self, spec: &ResourceSpec) -> Result<(), PoolError> {

@@ -80,12 +80,16 @@ impl Pool {
             })?;
             // No lost wake-up: whoever can be served has been.
             let obstacles = self.explain(id).map_or(0, |explanation| explanation.obstacles.len());
-            let waits = obstacles > 0 || !self.may_grant() || self.queue.is_behind();
+            let session = self.sessions.get(&waiter.request.session);
+            let may_have = session.is_some_and(|session| self.may_grant_to(session));
+            let waits = obstacles > 0 || !may_have || self.queue.is_behind();
             ensure(waits, || format!("{id} waits for nothing"))?;
         }
         let ids: usize = self.sessions.values().map(|s| s.waiters.len()).sum();
         ensure(ids == self.queue.len(), || "a session knows a waiter that is not in the queue".to_owned())?;
-        ensure(self.callers == Callers::of(&self.sessions), || "what callers have is miscounted".to_owned())?;
+        ensure(self.callers == Callers::of(&self.sessions, &self.ending, &self.queue), || {
+            "what callers have is miscounted".to_owned()
+        })?;
         let leases: usize = self.sessions.values().map(|s| s.leases.len()).sum();
         ensure(leases == self.leases.len(), || "a session knows a lease that has ended".to_owned())?;
         let provided: usize = self.sessions.values().map(|s| s.provides.len()).sum();

@@ -9,6 +9,10 @@ use serde::{Deserialize, Serialize};
 pub struct Limits {
     /// Resources in all.
     pub resources: usize,
+    /// Of these, what the sessions of one caller that is no operator provide.
+    pub resources_per_caller: usize,
+    /// Of all resources, so many are only for operators; at most half of them, as of all that follow.
+    pub resources_for_operators: usize,
     /// Sessions in all.
     pub sessions: usize,
     /// Sessions of one caller that is no operator.
@@ -19,16 +23,26 @@ pub struct Limits {
     pub waiters: usize,
     /// Queued acquires of all sessions that one caller opened.
     pub waiters_per_caller: usize,
+    /// Of all queued acquires, so many are only for operators.
+    pub waiters_for_operators: usize,
     /// Queued acquires of one session.
     pub waiters_per_session: usize,
     /// Different selectors (kind, class, attributes) that are waited for.
     pub selectors: usize,
+    /// Of these, what one caller that is no operator waits for.
+    pub selectors_per_caller: usize,
+    /// Of all selectors, so many are only for operators.
+    pub selectors_for_operators: usize,
     /// How often a waiter may be overtaken (a later one gets what it waits for) before what it waits for is kept for it. Never
     /// (0) is the default: the most urgent request is not made later by less urgent ones, and units may be idle until the rest
     /// of what it waits for comes. A larger number uses them meanwhile.
     pub overtaken: u32,
     /// Leases in all: those that live, and those that have ended while a provider has not confirmed standstill.
     pub leases: usize,
+    /// Of these, those of one caller that is no operator; its queued acquires count too, for each may become one.
+    pub leases_per_caller: usize,
+    /// Of all leases, so many are only for operators.
+    pub leases_for_operators: usize,
     /// Requirements of one acquire.
     pub requirements: usize,
     /// Units that one requirement may ask for.
@@ -65,15 +79,22 @@ impl Default for Limits {
     fn default() -> Self {
         Limits {
             resources: 100_000,
+            resources_per_caller: 45_000,
+            resources_for_operators: 5_000,
             sessions: 10_000,
             sessions_per_caller: 2_500,
             sessions_for_operators: 500,
             waiters: 10_000,
-            waiters_per_caller: 6_000,
+            waiters_per_caller: 4_500,
+            waiters_for_operators: 500,
             waiters_per_session: 4_096,
             selectors: 10_000,
+            selectors_per_caller: 4_500,
+            selectors_for_operators: 500,
             overtaken: 0,
             leases: 100_000,
+            leases_per_caller: 45_000,
+            leases_for_operators: 5_000,
             requirements: 32,
             units: 100_000,
             units_per_request: 4_096,

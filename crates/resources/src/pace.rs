@@ -5,7 +5,9 @@
 //! ```
 //! More grants than one a microsecond are made a little later. A process takes longer to be started than [`AHEAD`] microseconds.
 
+use crate::caller::for_all;
 use crate::pool::Pool;
+use crate::session::Session;
 use ratn_model::time::Timestamp;
 use std::time::Duration;
 
@@ -41,6 +43,12 @@ impl Pool {
     /// Whether one more lease may be granted now.
     pub(crate) fn may_grant(&self) -> bool {
         self.leases.len() + self.ending.len() < self.limits.leases && !self.is_ahead_of_time()
+    }
+
+    /// The same of one for a session: of all leases some are only for operators.
+    pub(crate) fn may_grant_to(&self, session: &Session) -> bool {
+        let for_all = for_all(self.limits.leases, self.limits.leases_for_operators);
+        self.may_grant() && (session.is_operators() || self.leases.len() + self.ending.len() < for_all)
     }
 
     /// Whether the next token would be ahead of the time.

@@ -41,7 +41,11 @@ impl Pool {
             if !self.may_grant() {
                 return;
             }
-            let Some((_, id)) = self.queue.ready.first().copied() else { return };
+            let may_have = |(_, id): &&Place| {
+                let session = self.queue.get(*id).and_then(|waiter| self.sessions.get(&waiter.request.session));
+                session.is_some_and(|session| self.may_grant_to(session))
+            };
+            let Some((_, id)) = self.queue.ready.iter().find(may_have).copied() else { return };
             let Some(waiter) = self.queue.get(id) else { return };
             let taken = waiter.reserved.clone();
             self.grant(id, taken);

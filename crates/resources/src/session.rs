@@ -1,5 +1,6 @@
 //! Sessions: everything that a client provides, holds, waits for or has consumed hangs on one.
 
+use crate::caller::for_all;
 use crate::error::{PoolError, malformed};
 use crate::event::{EndReason, Refusal};
 use crate::expiry::Timer;
@@ -21,6 +22,8 @@ pub(crate) struct Session {
     pub(crate) name: String,
     /// Who opened it, as the connection proved: nobody else speaks for it. Empty where nobody knows.
     pub(crate) opened_by: Arc<str>,
+    /// Whether that is an operator: as its last ping said; before the first one after a restart nobody knows.
+    pub(crate) for_anybody: bool,
     /// How long it lives without a keep-alive.
     pub(crate) ttl: Duration,
     /// When it expires unless kept alive.
@@ -83,6 +86,7 @@ impl Session {
         Session {
             name,
             opened_by,
+            for_anybody: false,
             ttl,
             expires,
             ending: ttl.is_zero().then_some(EndReason::SessionExpired),
@@ -91,6 +95,11 @@ impl Session {
             waiters: BTreeSet::new(),
             consumed: BTreeSet::new(),
         }
+    }
+
+    /// Whether it is an operator's, or of one who is not known.
+    pub(crate) fn is_operators(&self) -> bool {
+        self.for_anybody || self.opened_by.is_empty()
     }
 }
 
@@ -130,6 +139,20 @@ impl Pool {
         if ttl.is_zero() {
             return Err(malformed("session time to live 0", "a session lives for more than 0 seconds"));
         }
+        let opened = self.kept_alive(speaker, id, client, ttl)?;
+        if let Some(session) = self.sessions.get_mut(id).filter(|session| session.opened_by == speaker.name) {
+            session.for_anybody = speaker.for_anybody;
+        }
+        Ok(opened)
+    }
+
+    fn kept_alive(
+        &mut self,
+        speaker: &Speaker,
+        id: &SessionId,
+        client: &str,
+        ttl: Duration,
+    ) -> Result<bool, PoolError> {
         match self.sessions.get_mut(id) {
             Some(session) if session.ttl == ttl => {
                 self.timers.remove(&(session.expires, Timer::Session(id.clone())));
@@ -166,7 +189,7 @@ impl Pool {
             let (whose, quota) = (speaker.name.clone(), "sessions_per_caller");
             return Err(PoolError::Quota { what: "sessions", whose, quota, limit: sessions_per_caller });
         }
-        let for_all = sessions.saturating_sub(sessions_for_operators);
+        let for_all = for_all(sessions, sessions_for_operators);
         if self.sessions.len() >= for_all {
             return Err(PoolError::TooMany { what: "sessions (the rest is kept for operators)", limit: for_all });
         }

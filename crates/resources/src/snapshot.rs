@@ -5,6 +5,7 @@
 //!     └──── snapshot ────▶ file             (waiters ask again, sessions have their whole TTL once more)
 //! ```
 
+use crate::caller::Callers;
 use crate::expiry::Timer;
 use crate::fingerprint::Fingerprint;
 use crate::id::{SessionId, Slot};
@@ -162,7 +163,6 @@ impl Pool {
         for (id, client, ttl) in snapshot.sessions {
             let opened_by = openers.remove(&id).unwrap_or_default();
             let expires = self.now + ttl;
-            self.callers.opened(&opened_by);
             self.sessions.insert(id.clone(), Session::new(client, opened_by, ttl, expires));
             self.start_session_timer(&id, expires);
         }
@@ -201,6 +201,7 @@ impl Pool {
             self.ending.insert(id, ending);
         }
         self.gather_crowds();
+        self.callers = Callers::of(&self.sessions, &self.ending, &self.queue);
         let mut answered = snapshot.answered.into_iter();
         for (id, fingerprint, reply) in snapshot.answers {
             let id = RequestId::new(&answered.next().unwrap_or_default(), &id);

@@ -52,6 +52,22 @@ fn open(pool: &mut Pool, speaker: &Speaker, name: &str) -> Result<(), String> {
     opened.map(drop).map_err(|error| error.to_string())
 }
 
+/// As adam, who has a session.
+fn adam_acquires(pool: &mut Pool, requirement: Requirement) -> Result<(), String> {
+    open(pool, &adam(), "adam")?;
+    let (leases, waiting) = (pool.leases().len(), pool.waiting());
+    let kind = requirement.kind.clone();
+    acquire(pool, "adam", vec![requirement])?;
+    let waits = kind == "Tool" && pool.waiting() > waiting && pool.leases().len() == leases;
+    if waits { Err("waits".to_owned()) } else { Ok(()) }
+}
+
+fn adam_creates(pool: &mut Pool) -> Result<(), String> {
+    open(pool, &adam(), "adam")?;
+    let created = pool.create(NOW, Some(&SessionId::from("adam")), tool());
+    created.map(drop).map_err(|error| error.to_string())
+}
+
 fn with_attributes(count: usize) -> ResourceSpec {
     (0..count).fold(tool(), |spec, number| spec.attribute(format!("a{number}"), Value::Int(0)))
 }
@@ -127,6 +143,58 @@ fn rows() -> Vec<(&'static str, Limits, Act, &'static str)> {
             "different selectors waited for: the limit of 3 is reached",
         ),
         ("leases", Limits { leases: EDGE, ..all() }, |pool, _| one_more_lease(pool), "waits"),
+        (
+            "leases_per_caller",
+            Limits { leases_per_caller: EDGE, ..all() },
+            |pool, _| adam_acquires(pool, block("Tool", 1)),
+            "leases of adam: the quota of 3 is reached (limits.leases_per_caller)",
+        ),
+        (
+            "leases_per_caller",
+            Limits { leases_per_caller: EDGE, ..all() },
+            |pool, _| adam_acquires(pool, block("Nothing", 1)),
+            "leases of adam: the quota of 3 is reached (limits.leases_per_caller)",
+        ),
+        (
+            "leases_for_operators",
+            Limits { leases: EDGE + 1, leases_for_operators: 1, ..all() },
+            |pool, _| adam_acquires(pool, block("Tool", 1)),
+            "waits",
+        ),
+        (
+            "resources_per_caller",
+            Limits { resources_per_caller: EDGE, ..all() },
+            |pool, _| adam_creates(pool),
+            "resources of adam: the quota of 3 is reached (limits.resources_per_caller)",
+        ),
+        (
+            "resources_for_operators",
+            Limits { resources: EDGE + 2, resources_for_operators: 1, ..all() },
+            |pool, _| adam_creates(pool),
+            "resources (the rest is kept for operators): the limit of 4",
+        ),
+        (
+            "waiters_for_operators",
+            Limits { waiters: EDGE + 1, waiters_for_operators: 1, ..all() },
+            |pool, _| adam_acquires(pool, block("Nothing", 1)),
+            "waiters (the rest is kept for operators): the limit of 3",
+        ),
+        (
+            "selectors_per_caller",
+            Limits { selectors_per_caller: EDGE, ..all() },
+            |pool, n| {
+                // What another waits for counts for adam too.
+                acquire(pool, "s", vec![block(&format!("Nothing{n}"), 1)])?;
+                adam_acquires(pool, block(&format!("Nothing{n}"), 1))
+            },
+            "different selectors waited for of adam: the quota of 3 is reached (limits.selectors_per_caller)",
+        ),
+        (
+            "selectors_for_operators",
+            Limits { selectors: EDGE + 1, selectors_for_operators: 1, ..all() },
+            |pool, n| adam_acquires(pool, block(&format!("Nothing{n}"), 1)),
+            "different selectors waited for (the rest is kept for operators): the limit of 3",
+        ),
         ("holders", Limits { holders: EDGE, ..all() }, |pool, _| one_more_lease(pool), "waits"),
         (
             "requirements",
@@ -221,15 +289,22 @@ fn every_bound_at_its_edge_and_one_past_it() {
     // A new bound belongs into the table (those of bytes are below, `overtaken` is measured by `against_model.rs`).
     let Limits {
         resources: _,
+        resources_per_caller: _,
+        resources_for_operators: _,
         sessions: _,
         sessions_per_caller: _,
         sessions_for_operators: _,
         waiters: _,
         waiters_per_caller: _,
+        waiters_for_operators: _,
         waiters_per_session: _,
         selectors: _,
+        selectors_per_caller: _,
+        selectors_for_operators: _,
         overtaken: _,
         leases: _,
+        leases_per_caller: _,
+        leases_for_operators: _,
         requirements: _,
         units: _,
         units_per_request: _,
@@ -301,4 +376,49 @@ fn resources_and_requirements_have_bounds_in_bytes() {
     create(&mut pool, endpoint(1_024)).unwrap();
     let refused = create(&mut pool, endpoint(1_025)).unwrap_err();
     assert!(refused.contains("1025 bytes of `endpoint`: at most 1024"), "{refused}");
+}
+
+#[test]
+fn two_callers_cannot_take_all_and_operators_have_room_left() {
+    let limits = Limits::default();
+    let bounds = [
+        (limits.resources, limits.resources_per_caller, limits.resources_for_operators),
+        (limits.sessions, limits.sessions_per_caller, limits.sessions_for_operators),
+        (limits.waiters, limits.waiters_per_caller, limits.waiters_for_operators),
+        (limits.selectors, limits.selectors_per_caller, limits.selectors_for_operators),
+        (limits.leases, limits.leases_per_caller, limits.leases_for_operators),
+    ];
+    for (in_all, per_caller, for_operators) in bounds {
+        assert!(2 * per_caller < in_all - for_operators && for_operators > 0, "{in_all} {per_caller} {for_operators}");
+    }
+}
+
+#[test]
+fn an_operator_is_granted_a_lease_past_those_who_wait_for_the_share_of_all() {
+    let mut pool = Pool::new(Limits { leases: 2, leases_for_operators: 1, ..Limits::default() });
+    create(&mut pool, tool()).unwrap();
+    adam_acquires(&mut pool, block("Tool", 1)).unwrap();
+    adam_acquires(&mut pool, block("Tool", 1)).unwrap_err();
+    let root = Speaker { name: "root".into(), for_anybody: true };
+    open(&mut pool, &root, "root").unwrap();
+    acquire(&mut pool, "root", vec![block("Tool", 1)]).unwrap();
+    assert_eq!((pool.leases().len(), pool.waiting()), (2, 1));
+    let of_adam = pool.leases()[0].id;
+    pool.release(NOW, None, of_adam).unwrap();
+    assert_eq!((pool.leases().len(), pool.waiting()), (1, 1), "root's lease is in the share of all");
+    let of_root = pool.leases()[0].id;
+    pool.release(NOW, None, of_root).unwrap();
+    assert_eq!((pool.leases().len(), pool.waiting()), (1, 0));
+    pool.check_invariants().unwrap();
+}
+
+#[test]
+fn a_bound_on_leases_that_is_lowered_holds_from_then_on() {
+    let mut pool = Pool::new(Limits::default());
+    create(&mut pool, tool()).unwrap();
+    (0..3).for_each(|_| adam_acquires(&mut pool, block("Tool", 1)).unwrap());
+    pool.set_limits(Limits { leases: 4, ..Limits::default() });
+    adam_acquires(&mut pool, block("Tool", 1)).unwrap_err();
+    assert_eq!(pool.leases().len(), 3, "half of 4 is kept for operators, and what is there stays");
+    pool.check_invariants().unwrap();
 }
