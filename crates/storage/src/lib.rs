@@ -4,7 +4,7 @@
 //!   append ──▶ buffer ──▶ one thread: write, sync, "durable through 4711", again ──▶ answers that waited for it leave
 //! ```
 //! [`Store`] and [`Writer`] are what is promised, wherever the log is: append, read, compact, one guarded writer. [`Log`] keeps it in
-//! files. Payloads are bytes; what they mean, and in which version, is their owner's.
+//! files, [`Etcd`] in etcd, where several processes may stand by for its writer; [`transfer`] copies it from one to the other. Payloads are bytes; what they mean, and in which version, is their owner's.
 //!
 //! ```
 //! use ratn_storage::{Log, Options, Store};
