@@ -2,6 +2,7 @@
 
 pub use ratn_storage::Durability;
 use ratn_storage::Store;
+use ratn_storage::etcd::Holder;
 use ratn_worker::endpoint::Endpoint;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -116,6 +117,17 @@ impl StorageConfig {
             }
             Engine::Etcd => Arc::new(crate::standby::etcd(self, role, &Endpoint::loopback())?),
         })
+    }
+
+    /// Who leads, as etcd says: where and what it is. Nobody where the state is in files. Blocks.
+    ///
+    /// # Errors
+    /// Where etcd does not answer, or a file for its TLS cannot be read.
+    pub fn leader(&self, role: &str) -> anyhow::Result<Option<Holder>> {
+        match self.engine {
+            Engine::Log => Ok(None),
+            Engine::Etcd => Ok(crate::standby::etcd(self, role, &Endpoint::loopback())?.holder()?),
+        }
     }
 
     /// Where a role keeps its state.

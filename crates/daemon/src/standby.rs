@@ -13,7 +13,7 @@ use crate::details::retry_later;
 use crate::durable_actor::{Journal, JournalError};
 use anyhow::Context;
 use ratn_storage::etcd::{Connect, Holder};
-use ratn_storage::{Etcd, EtcdOptions, OpenError, Store};
+use ratn_storage::{Etcd, EtcdOptions, OpenError, ReadError, Store};
 use ratn_worker::endpoint::{Endpoint, connect_lazily};
 use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -30,6 +30,8 @@ use tonic::{Code, Status};
 
 /// When whoever was refused by a standby should ask again.
 const RETRY_DELAY: Duration = Duration::from_millis(200);
+/// Where etcd does not answer, it is asked again after so long.
+const AGAIN: Duration = Duration::from_millis(500);
 /// A connection attempt to a member of etcd that takes longer has failed.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(500);
 /// A member of etcd that does not answer a ping for so long is connected to anew.
@@ -84,16 +86,25 @@ impl Place<'_> {
                 // The place, should it just have been got, is given up when the attempt has ended.
                 () = shutdown.cancelled() => return Ok(None),
             };
-            let held = match opened {
+            let why = match opened {
                 Ok(kept) => return Ok(Some(kept)),
-                Err(JournalError::Open { source: OpenError::Held { holder, .. }, .. }) => holder,
+                Err(JournalError::Open { source: OpenError::Held { holder, .. }, .. }) => format!("{holder} leads"),
+                // etcd comes and goes; who stands by waits for it.
+                Err(JournalError::Open { source: OpenError::Read(error @ ReadError::Remote { .. }), .. }) => {
+                    let why = format!("nobody is known to lead: {error}");
+                    if standby.as_ref().is_none_or(|standby| standby.says() != why) {
+                        tracing::warn!(role = self.role, "{why}");
+                    }
+                    tokio::time::sleep(AGAIN).await;
+                    why
+                }
                 Err(error) => return Err(error.into()),
             };
             match &standby {
-                Some(gate) => gate.led_by(held),
+                Some(gate) => gate.say(why),
                 None => {
-                    tracing::info!(role = self.role, leader = held, "standing by");
-                    let gate = Arc::new(NotTheLeader { role: self.role, leader: Mutex::new(held) });
+                    tracing::info!(role = self.role, why, "standing by");
+                    let gate = Arc::new(NotTheLeader { role: self.role, why: Mutex::new(why) });
                     self.stand_by(bound, gate.clone(), elected.clone())?;
                     standby = Some(gate);
                 }
@@ -120,12 +131,16 @@ impl Place<'_> {
 /// Lets nobody in, and says who leads.
 struct NotTheLeader {
     role: &'static str,
-    leader: Mutex<String>,
+    why: Mutex<String>,
 }
 
 impl NotTheLeader {
-    fn led_by(&self, leader: String) {
-        *self.leader.lock().unwrap_or_else(PoisonError::into_inner) = leader;
+    fn say(&self, why: String) {
+        *self.why.lock().unwrap_or_else(PoisonError::into_inner) = why;
+    }
+
+    fn says(&self) -> String {
+        self.why.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 }
 
@@ -134,8 +149,7 @@ impl Gate for NotTheLeader {
         if path.starts_with("/grpc.") {
             return Ok(());
         }
-        let leader = self.leader.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let message = format!("this {} is not the leader, it stands by: ask {leader}", self.role);
+        let message = format!("this {} stands by: {}", self.role, self.says());
         Err(retry_later(Code::Unavailable, "NOT_THE_LEADER", message, RETRY_DELAY))
     }
 

@@ -170,9 +170,12 @@ fn classify(status: &Status, address: &str) -> CallError {
     let said = status.message();
     match status.code() {
         Code::ResourceExhausted if said.contains("space exceeded") => CallError::NoSpace,
-        Code::InvalidArgument | Code::PermissionDenied | Code::Unauthenticated | Code::Unimplemented => {
-            CallError::Refused(format!("{address} says: {said}"))
-        }
+        // Out of range: the revision that was asked for has been compacted.
+        Code::InvalidArgument
+        | Code::OutOfRange
+        | Code::PermissionDenied
+        | Code::Unauthenticated
+        | Code::Unimplemented => CallError::Refused(format!("{address} says: {said}")),
         // Also what says that it was not performed: it is tried again anyhow.
         _ => CallError::Unknown(format!("{address}: {said}")),
     }

@@ -37,7 +37,7 @@ use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 use term::{Seen, Silence};
-use writer::{EtcdWriter, Shared};
+use writer::{EtcdWriter, Renewing, Shared};
 
 /// Where a log in etcd is, and who opens it.
 #[derive(Clone)]
@@ -108,6 +108,10 @@ impl Store for Etcd {
         let seen = term::await_vacancy(&self.client, &self.keys, &mut silence)?;
         let term = term::take(&self.client, &self.keys, &seen, &self.options.holder, self.options.accept_restored)?;
         let term = Arc::new(term);
+        let system =
+            |source| OpenError::Io { action: "start a thread for", place: self.options.prefix.clone(), source };
+        // From now on: what is there may take longer to read than the place waits.
+        let renewing = Renewing::start(term.clone()).map_err(system)?;
         // A transaction of the predecessor may have come between.
         let seen = Seen::look(&self.client, &self.keys)?;
         let contents = contents::read(&self.client, &self.keys, &seen, 0)?;
@@ -132,17 +136,20 @@ impl Store for Etcd {
                 Err(error) => return Err(term::unreadable(&self.client, &error).into()),
             }
         }
-        let writer = EtcdWriter::start(Arc::new(shared), contents.head).map_err(|source| OpenError::Io {
-            action: "start a thread for",
-            place: self.options.prefix.clone(),
-            source,
-        })?;
+        let writer = EtcdWriter::start(Arc::new(shared), contents.head, renewing).map_err(system)?;
         Ok((recovered, Box::new(writer)))
     }
 
     fn read(&self) -> Result<Recovered, ReadError> {
-        let seen = Seen::look(&self.client, &self.keys)?;
-        Ok(contents::read(&self.client, &self.keys, &seen, seen.revision)?.recovered)
+        let mut attempt = 1;
+        loop {
+            let seen = Seen::look(&self.client, &self.keys)?;
+            match contents::read(&self.client, &self.keys, &seen, seen.revision) {
+                // etcd may compact that revision away while it is read.
+                Err(ReadError::Remote { .. }) if attempt < READ_ATTEMPTS => attempt += 1,
+                read => return Ok(read?.recovered),
+            }
+        }
     }
 
     fn place(&self) -> String {
@@ -150,6 +157,8 @@ impl Store for Etcd {
     }
 }
 
+/// How often a whole log is read at one revision of etcd before it is given up.
+const READ_ATTEMPTS: u32 = 3;
 /// Attempts of what is done once, when the log is opened.
 const REACH: std::time::Duration = std::time::Duration::from_secs(10);
 

@@ -20,7 +20,7 @@ use crate::store::{MakeSnapshot, Place, Position, Writer};
 use bytes::Bytes;
 use std::collections::VecDeque;
 use std::io;
-use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -66,8 +66,7 @@ pub(super) struct EtcdWriter {
     shared: Arc<Shared>,
     writing: Option<JoinHandle<()>>,
     compaction: Option<JoinHandle<()>>,
-    /// Ends the thread that renews.
-    renewing: Option<(mpsc::Sender<()>, JoinHandle<()>)>,
+    renewing: Renewing,
 }
 
 impl Shared {
@@ -230,23 +229,60 @@ impl Writing {
     }
 }
 
-impl EtcdWriter {
-    pub(super) fn start(shared: Arc<Shared>, head: i64) -> io::Result<EtcdWriter> {
-        let writing = Writing { shared: shared.clone(), head };
+/// Says that the place is held, from the moment it was taken: reading a long log may take longer than a silence. Gives the place up in
+/// the end.
+#[derive(Debug)]
+pub(super) struct Renewing {
+    term: Arc<Term>,
+    /// Who hears that the place is lost, once there is a writer.
+    writer: Arc<OnceLock<Arc<Shared>>>,
+    /// Ends the thread; nothing after the end.
+    thread: Option<(mpsc::Sender<()>, JoinHandle<()>)>,
+}
+
+impl Renewing {
+    pub(super) fn start(term: Arc<Term>) -> io::Result<Renewing> {
         let (end, ended) = mpsc::channel::<()>();
-        let renewed = shared.clone();
+        let writer = Arc::new(OnceLock::<Arc<Shared>>::new());
+        let (renewed, tell) = (term.clone(), writer.clone());
         let renew = move || {
-            let _ended = Ended(renewed.clone());
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(RENEW_INTERVAL) {
-                if let Err(fault @ Fault::Deposed { .. }) = renewed.term.renew() {
-                    renewed.pending.stop(&fault);
+                // One that is found lost before there is a writer is found lost again.
+                if let (Err(fault @ Fault::Deposed { .. }), Some(writer)) = (renewed.renew(), tell.get()) {
+                    writer.pending.stop(&fault);
                     return;
                 }
             }
         };
-        let renewing = thread::Builder::new().name("etcd-renewer".to_owned()).spawn(renew)?;
+        let thread = thread::Builder::new().name("etcd-renewer".to_owned()).spawn(renew)?;
+        Ok(Renewing { term, writer, thread: Some((end, thread)) })
+    }
+
+    fn watched_by(&self, writer: &Arc<Shared>) {
+        let _ = self.writer.set(writer.clone());
+    }
+
+    fn end(&mut self) {
+        if let Some((end, thread)) = self.thread.take() {
+            drop(end);
+            let _ = thread.join();
+            self.term.give_up();
+        }
+    }
+}
+
+impl Drop for Renewing {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+impl EtcdWriter {
+    pub(super) fn start(shared: Arc<Shared>, head: i64, renewing: Renewing) -> io::Result<EtcdWriter> {
+        let writing = Writing { shared: shared.clone(), head };
         let writing = thread::Builder::new().name("etcd-writer".to_owned()).spawn(move || writing.run())?;
-        Ok(EtcdWriter { shared, writing: Some(writing), compaction: None, renewing: Some((end, renewing)) })
+        renewing.watched_by(&shared);
+        Ok(EtcdWriter { shared, writing: Some(writing), compaction: None, renewing })
     }
 
     /// Writes what waits, gives up the place, and ends every thread.
@@ -256,11 +292,7 @@ impl EtcdWriter {
             // Its panic has stopped the log already, with a fault.
             let _ = thread.join();
         }
-        if let Some((end, renewing)) = self.renewing.take() {
-            drop(end);
-            let _ = renewing.join();
-            self.shared.term.give_up();
-        }
+        self.renewing.end();
         self.shared.pending.stop(&Fault::Closed);
     }
 }

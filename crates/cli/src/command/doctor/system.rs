@@ -4,9 +4,11 @@
 use super::Findings;
 use super::tls::listens;
 use crate::system::config::SystemConfig;
+use ratn_daemon::config::{Engine, StorageConfig};
 use ratn_daemon::process_manager::HOST_KIND;
-use ratn_daemon::resource_manager;
+use ratn_daemon::{resource_manager, world_pool};
 use ratn_proto::types::{HostPools, Resource};
+use ratn_storage::etcd::Holder;
 use ratn_worker::client::{Channels, Health, NOT_SERVING, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::{FindError, RuntimeDirectory};
@@ -23,9 +25,16 @@ const SLIGHT_OFFSET_MS: i64 = 20;
 /// … and certificates and deadlines doubtful.
 const LARGE_OFFSET_MS: i64 = 5_000;
 
+/// Those that may stand by for one another.
+const ROLES: [&str; 2] = [resource_manager::ROLE, world_pool::ROLE];
+
 pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, directory: &Path) {
     let directory = RuntimeDirectory::at(directory);
     let mut manager = None;
+    let kept = [(ROLES[0], &config.resource_manager.storage), (ROLES[1], &config.world_pool.storage)];
+    for (role, storage) in kept.into_iter().filter(|(_, storage)| storage.engine == Engine::Etcd) {
+        leader(findings, role, storage.clone()).await;
+    }
     for (role, listen) in listens(config) {
         match directory.find(role) {
             Ok(endpoint) => {
@@ -44,6 +53,24 @@ pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, direct
     }
 }
 
+/// Who leads where several stand by for one another.
+async fn leader(findings: &mut Findings, role: &'static str, storage: StorageConfig) {
+    let place = storage.prefix.clone();
+    let about = format!("{role}, leader");
+    match tokio::task::spawn_blocking(move || storage.leader(role)).await {
+        Ok(Ok(Some(Holder { address, about: what }))) => {
+            findings.ok(about, format!("{address} ({what}), by {place} in etcd"))
+        }
+        Ok(Ok(None)) => {
+            findings.problem(about, format!("nobody leads, by {place} in etcd"), format!("start `ratn {role}`"))
+        }
+        Ok(Err(error)) => {
+            findings.problem(about, format!("{error:#}"), "see whether etcd is well: `etcdctl endpoint health`")
+        }
+        Err(error) => findings.problem(about, error.to_string(), "please report it"),
+    }
+}
+
 async fn role_answers(findings: &mut Findings, role: &str, endpoint: &Endpoint) -> bool {
     match Health::of(endpoint.clone()).serving(PATIENCE).await {
         Ok(()) => {
@@ -53,7 +80,7 @@ async fn role_answers(findings: &mut Findings, role: &str, endpoint: &Endpoint) 
         Err(error) => {
             // The last thing that it said.
             let (found, help) = if error.to_string().contains(NOT_SERVING) {
-                let help = "its log says why; where its disk is full or failed, see to that and start it again";
+                let help = "a standby is so, too; else its log says why; where its disk is full or failed, see to that and start it again";
                 (
                     format!("answers at {endpoint}, and says that it cannot do what it is for (NOT_SERVING)"),
                     help.to_owned(),
