@@ -145,7 +145,7 @@ impl Check for StorageConfig {
         let member = |endpoint: &Endpoint| matches!(endpoint, Endpoint::Tcp { .. } | Endpoint::Tls { .. });
         let members = !self.endpoints.is_empty() && self.endpoints.iter().all(member);
         rule("storage.endpoints", members, "the addresses of etcd's members, as [\"https://a:2379\"]")?;
-        let named = self.prefix.starts_with('/') && self.prefix.trim_matches('/') != "";
+        let named = self.prefix.starts_with('/') && !self.prefix.trim_matches('/').is_empty();
         rule("storage.prefix", named, "begins with / and says more, as \"/ratn/cell-7\"")?;
         rule("storage.key", self.cert.is_some() == self.key.is_some(), "goes together with storage.cert")?;
         let durable = "group, with `engine = \"etcd\"`: etcd keeps what it has acknowledged";
