@@ -129,9 +129,10 @@ pub enum Fault {
         /// What the service said.
         what: String,
     },
-    /// Another writer has taken the place, past the lock.
+    /// Another writer has taken the place, past the lock; or a file of the log was removed or replaced.
     #[error(
-        "another writer has taken {place}, so nothing more is accepted from this one: see who else uses it, and end one of them"
+        "another writer has taken {place}, or its files were removed or replaced, so nothing more is accepted from this one: see who \
+         else uses it, and end one of them"
     )]
     Fenced {
         /// Which log.

@@ -209,6 +209,10 @@ impl Pending {
         self.work.notify_one();
     }
 
+    pub(crate) fn is_closing(&self) -> bool {
+        self.lock().closing
+    }
+
     /// Books a compaction.
     pub(crate) fn begin_compaction(&self, through: Position) -> Result<(), CompactError> {
         let mut state = self.lock();

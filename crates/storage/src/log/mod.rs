@@ -174,6 +174,8 @@ impl Store for Log {
         let contents = contents::read(&self.directory)?;
         let active = self.take_over(&contents)?;
         lock.describe(active.header.epoch);
+        let segment = directory::segment(&self.directory, active.header.number);
+        lock.writes(segment).map_err(failed("look at the segment of"))?;
         let recovered = Recovered { epoch: active.header.epoch, ..contents.recovered() };
         let mut segments: Vec<_> =
             contents.segments.iter().map(|segment| (segment.header.number, segment.header.first)).collect();

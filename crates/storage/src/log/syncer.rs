@@ -15,9 +15,13 @@ use crate::store::Position;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 /// So many bytes are reserved at once. Reserving costs about as much as a sync, and is to be rare.
 const RESERVE: u64 = 1 << 20;
+
+/// After a look at the place that failed.
+const LOOK_AGAIN: Duration = Duration::from_millis(50);
 
 /// The segment that is written.
 #[derive(Debug)]
@@ -116,9 +120,20 @@ impl Syncer {
     fn sync(&mut self, through: Position) -> Result<(), Fault> {
         self.reserve();
         self.active.file.sync().map_err(|error| self.fault("sync", error))?;
-        self.lock.check()?;
+        self.check_place()?;
         self.shared.pending.synced(through);
         Ok(())
+    }
+
+    /// Returns when the place is seen to be this writer's. Where it cannot be seen, nothing is known and nothing is lost: it is looked
+    /// again, until the writer is closed.
+    fn check_place(&self) -> Result<(), Fault> {
+        loop {
+            match self.lock.check() {
+                Err(Fault::Io { .. }) if !self.shared.pending.is_closing() => std::thread::sleep(LOOK_AGAIN),
+                seen => return seen,
+            }
+        }
     }
 
     /// For the syncs after the next one. Where the disk has no room for it, it may still have room for records.
@@ -134,10 +149,13 @@ impl Syncer {
         // Only the last segment may have an end that is no record, however records are made durable.
         self.active.file.cut().map_err(|error| self.fault("cut", error))?;
         self.active.file.sync().map_err(|error| self.fault("sync", error))?;
-        self.lock.check()?;
+        self.check_place()?;
         let header = SegmentHeader { number: self.active.header.number + 1, first, ..self.active.header };
         self.active = begin(&*self.files, &self.shared.directory, header, &[])
             .map_err(|(action, path, error)| fault(action, path, error))?;
+        // Before a compaction may remove the one before.
+        let path = directory::segment(&self.shared.directory, header.number);
+        self.lock.writes(path.clone()).map_err(|error| fault("look at", path, error))?;
         self.shared.segment_begun(header.number, first);
         Ok(())
     }

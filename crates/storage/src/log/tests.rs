@@ -341,6 +341,36 @@ fn a_newer_format_is_refused_by_name() {
 }
 
 #[test]
+fn a_writer_whose_segment_was_replaced_by_a_copy_or_removed_acknowledges_nothing_more() {
+    let replaced = |segment: &Path| {
+        let copy = segment.with_extension("copy");
+        fs::copy(segment, &copy).unwrap();
+        fs::rename(&copy, segment).unwrap();
+    };
+    let removed = |segment: &Path| fs::remove_file(segment).unwrap();
+    for (case, spoil) in [("replaced", &replaced as &dyn Fn(&Path)), ("removed", &removed)] {
+        let directory = tempfile::tempdir().unwrap();
+        let log = Log::new(directory.path(), Options { segment_bytes: 64, ..Options::default() });
+        let (_, mut writer) = log.open().unwrap();
+        let place = writer.place();
+        let append = |writer: &mut Box<dyn crate::Writer>| {
+            let last = writer.append(&[7; 100]).unwrap();
+            writer.durable().wait_blocking(last)
+        };
+        // Also after the segment has changed.
+        for _ in 0..3 {
+            append(&mut writer).unwrap();
+            place.check().unwrap();
+        }
+        let newest = *directory::list(directory.path()).unwrap().segments.last().unwrap();
+        assert!(newest > 1);
+        spoil(&directory::segment(directory.path(), newest));
+        assert!(matches!(place.check(), Err(Fault::Fenced { .. })), "{case}");
+        assert!(matches!(append(&mut writer), Err(Fault::Fenced { .. })), "{case}");
+    }
+}
+
+#[test]
 fn a_writer_that_was_got_past_acknowledges_nothing_more() {
     let directory = tempfile::tempdir().unwrap();
     let log = Log::new(directory.path(), Options::default());
