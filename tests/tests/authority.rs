@@ -9,11 +9,11 @@ use ratn_proto::v1::execute_response::Kind;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_worker::endpoint::{Endpoint, connect};
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::trace::Traced;
 use std::time::Duration;
 use support::{Place, wait_for};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::Channel;
 use tonic::{Code, Status};
 
 /// One module of the cell and one pooled worker: kind and an action that needs no input (or says that it does).
@@ -22,7 +22,7 @@ const TTL_MS: u64 = 60_000;
 
 /// A session of the honest holder.
 struct Holder {
-    resources: ResourceServiceClient<Channel>,
+    resources: ResourceServiceClient<Traced>,
     _pings: mpsc::Sender<v1::KeepAliveRequest>,
 }
 

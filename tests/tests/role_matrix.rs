@@ -6,11 +6,11 @@
 mod servers;
 
 use ratn_daemon::access::{LiveAccess, Role};
+use ratn_worker::trace::Traced;
 use servers::{ROLES, call, methods, only, servers, serves};
 use std::collections::{BTreeMap, BTreeSet};
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
-use tonic::transport::Channel;
 
 /// Who may, by what the option says.
 fn may(access: &str, roles: &[Role]) -> bool {
@@ -28,7 +28,7 @@ fn may(access: &str, roles: &[Role]) -> bool {
 }
 
 /// Whether the gate let the call in; what the service says of it is its own business.
-async fn let_in(channel: &Channel, path: &str) -> bool {
+async fn let_in(channel: &Traced, path: &str) -> bool {
     match call(channel, path, Vec::new()).await {
         Some(Err(status)) if status.code() == Code::PermissionDenied => !status.message().contains("has the roles"),
         Some(Err(status)) => {

@@ -115,6 +115,16 @@ pub(crate) fn too_large() -> Status {
     status(Code::ResourceExhausted, "TOO_LARGE", message)
 }
 
+/// An answer that has no pages: as it is where it fits into one message, else refused with what to ask for instead.
+pub(crate) fn whole<T: Message>(answer: T, what: &str, instead: &str) -> Result<T, Status> {
+    let bytes = answer.encoded_len();
+    if bytes <= MAX_MESSAGE_BYTES {
+        return Ok(answer);
+    }
+    let message = format!("{what} has {bytes} bytes, more than the {MAX_MESSAGE_BYTES} of a message: {instead}");
+    Err(status(Code::ResourceExhausted, "TOO_LARGE", message))
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
@@ -147,6 +157,28 @@ mod tests {
         assert!(!whole.fill([at_edge(0)], &mut Filled::default()).unwrap());
         let refused = whole.fill([at_edge(1)], &mut Filled::default()).unwrap_err();
         assert!(refused.code() == Code::ResourceExhausted && refused.message().contains("page_bytes"), "{refused}");
+    }
+
+    #[test]
+    fn answers_without_pages_at_the_edge_of_a_message_and_one_byte_past_it() {
+        use ratn_proto::v1;
+        let named = |bytes| v1::FactKey { predicate: "x".repeat(bytes), ..Default::default() };
+        let scene = |bytes| v1::GetSceneResponse { from: vec![7; bytes], ..Default::default() };
+        let contradiction = |bytes| v1::WatchProjectionResponse {
+            contradiction: Some(v1::Contradiction { fact: Some(named(bytes)), ..Default::default() }),
+        };
+        fn check<T: Message>(with: impl Fn(usize) -> T) {
+            // Near the edge the length of a field takes as many bytes as at the edge.
+            let near = MAX_MESSAGE_BYTES - 1_000;
+            let edge = near + (MAX_MESSAGE_BYTES - with(near).encoded_len());
+            assert_eq!(whole(with(edge), "it", "ask for less").unwrap().encoded_len(), MAX_MESSAGE_BYTES);
+            let refused = whole(with(edge + 1), "it", "ask for less").map(|_| ()).unwrap_err();
+            let says =
+                format!("it has {} bytes, more than the {MAX_MESSAGE_BYTES} of a message", MAX_MESSAGE_BYTES + 1);
+            assert!(refused.code() == Code::ResourceExhausted && refused.message().starts_with(&says), "{refused}");
+        }
+        check(scene);
+        check(contradiction);
     }
 
     #[test]

@@ -5,12 +5,14 @@
 //!                           └───▶ RESOURCE_EXHAUSTED: which quota, and whose
 //! ```
 //! Quotas are by name ([`Caller::name`]): all who are anonymous are one caller. Operators have none, and a share of what all others can take
-//! together is kept for them. Sessions and acquires that wait have theirs in the pool ([`ratn_resources::Limits`]).
+//! together is kept for them. Sessions and acquires that wait have theirs in the pool ([`ratn_resources::Limits`]). Calls of health and
+//! reflection count like all others, but [`HEALTH_CHECKS_PER_S`] checks of a caller are answered whatever else it does: whoever watches
+//! over the process may have the same name as a client that does too much.
 
-use crate::access::Caller;
+use crate::access::{Caller, HEALTH_CHECK};
 use crate::config::{Check, ConfigError, rule};
 use crate::details::retry_later;
-use crate::metrics;
+use crate::metrics::Metrics;
 use ratn_worker::connections::ConnectionLimits;
 use ratn_worker::gate::Permit;
 use serde::{Deserialize, Serialize};
@@ -35,6 +37,10 @@ pub struct QuotaConfig {
     pub connections: usize,
     /// Connections of one caller with calls under way.
     pub connections_in_use: usize,
+    /// Of `connections`: only operators' and new connections have them, for all others leave so many without calls under way. A sixth
+    /// unless given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub connections_for_operators: Option<usize>,
     /// From a connection to its first call, the handshake of TLS included, in milliseconds.
     pub first_call_ms: u64,
     /// A connection without a call under way is closed after so long, in milliseconds.
@@ -46,6 +52,7 @@ impl QuotaConfig {
         ConnectionLimits {
             connections: self.connections,
             of_one_caller: self.connections_in_use,
+            for_operators: self.connections_for_operators.unwrap_or(self.connections / OPERATORS_PART).max(1),
             first_call: Duration::from_millis(self.first_call_ms),
             idle: Duration::from_millis(self.idle_ms),
         }
@@ -61,6 +68,7 @@ impl Default for QuotaConfig {
             watches_of_all: 896,
             connections: 768,
             connections_in_use: 512,
+            connections_for_operators: None,
             first_call_ms: 10_000,
             idle_ms: 600_000,
         }
@@ -74,12 +82,19 @@ impl Check for QuotaConfig {
         rule("quotas.watches", self.watches >= 1, "at least 1")?;
         rule("quotas.connections", self.connections >= 2, "at least 2")?;
         rule("quotas.connections_in_use", self.connections_in_use >= 1, "at least 1")?;
+        let for_operators = 1..self.connections.max(2);
+        let good = self.connections_for_operators.is_none_or(|share| for_operators.contains(&share));
+        rule("quotas.connections_for_operators", good, "at least 1, and fewer than quotas.connections")?;
         rule("quotas.first_call_ms", (10..=600_000).contains(&self.first_call_ms), "from 10 ms to 10 minutes")?;
         rule("quotas.idle_ms", self.idle_ms >= 1_000, "at least 1 s")?;
         rule("quotas.watches_of_all", self.watches_of_all >= self.watches, "at least quotas.watches")
     }
 }
 
+/// Operators have this part of all connections unless the config says otherwise.
+const OPERATORS_PART: usize = 6;
+/// Health checks of one caller in a second that are answered also where its quotas are used up.
+const HEALTH_CHECKS_PER_S: u32 = 20;
 /// When whoever has too much may ask again.
 const RETRY_DELAY: Duration = Duration::from_millis(200);
 
@@ -88,6 +103,7 @@ const RETRY_DELAY: Duration = Duration::from_millis(200);
 pub(crate) struct Quotas {
     config: QuotaConfig,
     use_of: Arc<Mutex<Use>>,
+    metrics: Arc<Metrics>,
 }
 
 #[derive(Debug, Default)]
@@ -100,49 +116,90 @@ struct Use {
 struct UseOfOne {
     calls: usize,
     watches: usize,
-    /// Calls that may begin now, refilled with time.
-    tokens: f64,
+    /// Calls that may begin now.
+    rate: Tokens,
+    /// Health checks beyond the quotas.
+    checks: Tokens,
+}
+
+/// What may be taken at once, refilled with time.
+#[derive(Debug)]
+struct Tokens {
+    left: f64,
     refilled: Instant,
 }
 
-impl Quotas {
-    pub(crate) fn new(config: QuotaConfig) -> Quotas {
-        Quotas { config, use_of: Arc::default() }
+impl Tokens {
+    /// As many as may come at once.
+    fn full(per_s: u32, now: Instant) -> Tokens {
+        Tokens { left: f64::from(per_s) * 2.0, refilled: now }
     }
 
-    /// One more call of a caller, until the permit is dropped; none is needed by an operator.
+    /// One of them, if there is one.
+    fn take(&mut self, per_s: u32, now: Instant) -> bool {
+        let passed = now.saturating_duration_since(self.refilled).as_secs_f64();
+        self.left = (self.left + passed * f64::from(per_s)).min(f64::from(per_s) * 2.0);
+        self.refilled = now;
+        let taken = self.left >= 1.0;
+        if taken {
+            self.left -= 1.0;
+        }
+        taken
+    }
+}
+
+impl Quotas {
+    pub(crate) fn new(config: QuotaConfig, metrics: Arc<Metrics>) -> Quotas {
+        Quotas { config, use_of: Arc::default(), metrics }
+    }
+
+    /// One more call of a caller, until the permit is dropped; none is needed by an operator, and by a health check beyond the quotas.
     pub(crate) fn admit(&self, caller: &Caller, path: &str, now: Instant) -> Result<Option<Permit>, Status> {
-        if caller.is_operator() || !path.starts_with("/ratn.") {
+        if caller.is_operator() {
             return Ok(None);
         }
-        let QuotaConfig { calls_per_s, calls, watches, watches_of_all, .. } = self.config;
-        let mut use_of = self.use_of();
-        let all = use_of.watches;
-        let burst = f64::from(calls_per_s) * 2.0;
-        let fresh = || UseOfOne { calls: 0, watches: 0, tokens: burst, refilled: now };
-        let one = use_of.callers.entry(caller.name.clone()).or_insert_with(fresh);
-        let passed = now.saturating_duration_since(one.refilled).as_secs_f64();
-        one.tokens = (one.tokens + passed * f64::from(calls_per_s)).min(burst);
-        one.refilled = now;
         let is_watch = is_watch(path);
-        if one.tokens < 1.0 {
-            return Err(refused("calls_per_s", "calls a second", &caller.name, u64::from(calls_per_s)));
-        }
-        one.tokens -= 1.0;
-        if one.calls >= calls {
-            return Err(refused("calls", "calls under way", &caller.name, calls as u64));
-        }
-        if is_watch && one.watches >= watches {
-            return Err(refused("watches", "watches", &caller.name, watches as u64));
-        }
-        if is_watch && all >= watches_of_all {
-            return Err(refused("watches_of_all", "watches", "all who are no operators", watches_of_all as u64));
+        let mut use_of = self.use_of();
+        let all_watches = use_of.watches;
+        let rate = self.config.calls_per_s;
+        let fresh = || UseOfOne {
+            calls: 0,
+            watches: 0,
+            rate: Tokens::full(rate, now),
+            checks: Tokens::full(HEALTH_CHECKS_PER_S, now),
+        };
+        let one = use_of.callers.entry(caller.name.clone()).or_insert_with(fresh);
+        if let Err(beyond) = self.within(one, all_watches, is_watch, now) {
+            if path == HEALTH_CHECK && one.checks.take(HEALTH_CHECKS_PER_S, now) {
+                return Ok(None);
+            }
+            self.metrics.refused("call", beyond.reason());
+            return Err(beyond.of(&caller.name));
         }
         one.calls += 1;
         one.watches += usize::from(is_watch);
         use_of.watches += usize::from(is_watch);
         drop(use_of);
         Ok(Some(Permit::new(Held { quotas: self.clone(), caller: caller.name.clone(), is_watch })))
+    }
+
+    /// Whether a caller may have one call more.
+    fn within(&self, one: &mut UseOfOne, all_watches: usize, is_watch: bool, now: Instant) -> Result<(), Beyond> {
+        let QuotaConfig { calls_per_s, calls, watches, watches_of_all, .. } = self.config;
+        let beyond = |key, what, most| Err(Beyond { key, what, most });
+        if !one.rate.take(calls_per_s, now) {
+            return beyond("calls_per_s", "calls a second", calls_per_s as usize);
+        }
+        if one.calls >= calls {
+            return beyond("calls", "calls under way", calls);
+        }
+        if is_watch && one.watches >= watches {
+            return beyond("watches", "watches", watches);
+        }
+        if is_watch && all_watches >= watches_of_all {
+            return beyond(WATCHES_OF_ALL, "watches", watches_of_all);
+        }
+        Ok(())
     }
 
     fn use_of(&self) -> MutexGuard<'_, Use> {
@@ -179,13 +236,30 @@ fn is_watch(path: &str) -> bool {
     path.rsplit('/').next().is_some_and(|method| method.starts_with("Watch"))
 }
 
-fn refused(quota: &'static str, what: &str, whose: &str, most: u64) -> Status {
-    let reason = format!("QUOTA_{}", quota.to_uppercase());
-    if let Some(metrics) = metrics::get() {
-        metrics.refused("call", reason.clone());
+/// The key of the one quota that is not of one caller.
+const WATCHES_OF_ALL: &str = "watches_of_all";
+
+/// A quota that is used up.
+#[derive(Debug, Clone, Copy)]
+struct Beyond {
+    key: &'static str,
+    what: &'static str,
+    most: usize,
+}
+
+impl Beyond {
+    /// In one word, for programs.
+    fn reason(self) -> String {
+        format!("QUOTA_{}", self.key.to_uppercase())
     }
-    let message = format!("{what} of {whose}: the quota of {most} is reached (service.quotas.{quota})");
-    retry_later(Code::ResourceExhausted, &reason, message, RETRY_DELAY)
+
+    /// What its caller is told.
+    fn of(self, caller: &str) -> Status {
+        let Beyond { key, what, most } = self;
+        let whose = if key == WATCHES_OF_ALL { "all who are no operators" } else { caller };
+        let message = format!("{what} of {whose}: the quota of {most} is reached (service.quotas.{key})");
+        retry_later(Code::ResourceExhausted, &self.reason(), message, RETRY_DELAY)
+    }
 }
 
 #[cfg(test)]
@@ -196,6 +270,10 @@ mod tests {
 
     const WATCH: &str = "/ratn.v1.ResourceService/Watch";
     const LIST: &str = "/ratn.v1.ResourceService/List";
+
+    fn quotas(config: QuotaConfig) -> Quotas {
+        Quotas::new(config, Arc::new(Metrics::new("cell")))
+    }
 
     fn caller(name: &str, role: Role) -> Caller {
         Caller { name: name.into(), roles: [role].as_slice().into() }
@@ -212,7 +290,7 @@ mod tests {
             (LIST, 5, "calls under way of eve: the quota of 5 is reached (service.quotas.calls)"),
             (WATCH, 3, "watches of eve: the quota of 3 is reached (service.quotas.watches)"),
         ] {
-            let quotas = Quotas::new(config.clone());
+            let quotas = self::quotas(config.clone());
             let (eve, adam) = (caller("eve", Role::Viewer), caller("adam", Role::Task));
             let mut held: Vec<Option<Permit>> = (0..most).map(|_| quotas.admit(&eve, path, now).unwrap()).collect();
             let refused = quotas.admit(&eve, path, now).unwrap_err();
@@ -226,7 +304,7 @@ mod tests {
 
     #[test]
     fn a_share_of_the_watches_is_kept_for_operators() {
-        let quotas = Quotas::new(QuotaConfig { watches: 3, watches_of_all: 4, ..QuotaConfig::default() });
+        let quotas = self::quotas(QuotaConfig { watches: 3, watches_of_all: 4, ..QuotaConfig::default() });
         let now = Instant::now();
         let mut held = Vec::new();
         for (name, count) in [("eve", 3), ("adam", 1)] {
@@ -239,7 +317,7 @@ mod tests {
 
     #[test]
     fn calls_a_second_are_refilled_with_time() {
-        let quotas = Quotas::new(QuotaConfig { calls_per_s: 10, ..QuotaConfig::default() });
+        let quotas = self::quotas(QuotaConfig { calls_per_s: 10, ..QuotaConfig::default() });
         let (eve, now) = (caller("eve", Role::Viewer), Instant::now());
         for _ in 0..20 {
             quotas.admit(&eve, LIST, now).unwrap();
@@ -249,5 +327,34 @@ mod tests {
         assert!(quotas.admit(&eve, LIST, now + Duration::from_millis(99)).is_err());
         assert!(quotas.admit(&eve, LIST, now + Duration::from_millis(101)).is_ok());
         assert!(quotas.admit(&caller("adam", Role::Viewer), LIST, now).is_ok());
+    }
+
+    #[test]
+    fn calls_of_health_and_reflection_count_and_so_many_checks_are_always_answered() {
+        let quotas = self::quotas(QuotaConfig { calls: 2, watches: 1, ..QuotaConfig::default() });
+        let (eve, now) = (caller("eve", Role::Viewer), Instant::now());
+        let admitted = |path: &str, at| quotas.admit(&eve, path, at);
+        let reflection = "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo";
+        let _watch = admitted("/grpc.health.v1.Health/Watch", now).unwrap().unwrap();
+        let refused = admitted("/grpc.health.v1.Health/Watch", now).unwrap_err();
+        assert!(refused.message().contains("watches of eve: the quota of 1"), "{refused}");
+        let _call = admitted(reflection, now).unwrap().unwrap();
+        let refused = admitted(reflection, now).unwrap_err();
+        assert!(refused.message().contains("calls under way of eve: the quota of 2"), "{refused}");
+        let checks = |at| (0..1_000).filter(|_| admitted(HEALTH_CHECK, at).is_ok()).count();
+        assert_eq!(checks(now), 2 * HEALTH_CHECKS_PER_S as usize);
+        assert_eq!(checks(now + Duration::from_millis(1_001)), HEALTH_CHECKS_PER_S as usize);
+        assert!(quotas.admit(&caller("adam", Role::Viewer), HEALTH_CHECK, now).unwrap().is_some());
+    }
+
+    #[test]
+    fn operators_have_a_sixth_of_the_connections_unless_the_config_says_otherwise() {
+        let share = |connections, connections_for_operators| {
+            let config = QuotaConfig { connections, connections_for_operators, ..QuotaConfig::default() };
+            config.check().map(|()| config.connections().for_operators).ok()
+        };
+        assert_eq!(share(768, None), Some(128));
+        assert_eq!((share(2, None), share(5, None)), (Some(1), Some(1)));
+        assert_eq!((share(30, Some(29)), share(30, Some(30)), share(30, Some(0))), (Some(29), None, None));
     }
 }

@@ -6,9 +6,10 @@
 
 use crate::access::{ACCESS_VARIABLE, AccessConfig, Caller, LiveAccess, RoleGate};
 use crate::config::{Check, ConfigError, rule};
-use crate::metrics;
+use crate::metrics::Metrics;
 use crate::quota::{QuotaConfig, Quotas};
 use crate::telemetry::{self, LogConfig};
+use ratn_worker::connections::OutOfConnections;
 use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::server::{Exposure, Serving};
 use ratn_worker::tls::{self, ClientTls, LiveServerTls, ServerTls, TlsError};
@@ -100,13 +101,13 @@ impl ServiceConfig {
         environment
     }
 
-    /// How a daemon serves.
-    pub fn serving(&self) -> Serving {
-        self.serving_with(&LiveAccess::new(self.access.clone()))
+    /// How a daemon serves that counts here.
+    pub fn serving(&self, metrics: &Arc<Metrics>) -> Serving {
+        self.serving_with(&LiveAccess::new(self.access.clone()), metrics)
     }
 
     /// As [`ServiceConfig::serving`], with roles that may change meanwhile.
-    pub fn serving_with(&self, access: &LiveAccess) -> Serving {
+    pub fn serving_with(&self, access: &LiveAccess, metrics: &Arc<Metrics>) -> Serving {
         Serving {
             exposure: Exposure {
                 tls: self.tls.clone().map(LiveServerTls::new),
@@ -115,7 +116,8 @@ impl ServiceConfig {
             },
             gate: Arc::new(QuotaGate {
                 roles: RoleGate::new(access.clone()),
-                quotas: Quotas::new(self.quotas.clone()),
+                quotas: Quotas::new(self.quotas.clone(), metrics.clone()),
+                metrics: metrics.clone(),
             }),
             connections: self.quotas.connections(),
             drain: Duration::from_millis(self.drain_ms),
@@ -128,15 +130,17 @@ impl ServiceConfig {
 struct QuotaGate {
     roles: RoleGate,
     quotas: Quotas,
+    metrics: Arc<Metrics>,
 }
 
 impl Gate for QuotaGate {
-    fn admit(&self, identity: &Identity, path: &str, extensions: &mut http::Extensions) -> Result<(), Status> {
-        self.roles.admit(identity, path, extensions)?;
-        let caller = extensions.get::<Caller>().cloned();
-        if let Some(caller) = caller
-            && let Some(permit) = self.quotas.admit(&caller, path, Instant::now())?
-        {
+    fn caller(&self, identity: &Identity) -> Caller {
+        self.roles.caller(identity)
+    }
+
+    fn admit(&self, caller: &Caller, path: &str, extensions: &mut http::Extensions) -> Result<(), Status> {
+        self.roles.admit(caller, path, extensions)?;
+        if let Some(permit) = self.quotas.admit(caller, path, Instant::now())? {
             extensions.insert(permit);
         }
         // For the calls on a stream.
@@ -145,8 +149,10 @@ impl Gate for QuotaGate {
     }
 
     fn answered(&self, path: &str, code: Code, took: Duration) {
-        if let Some(metrics) = metrics::get() {
-            metrics.call(path, code, took);
-        }
+        self.metrics.call(path, code, took);
+    }
+
+    fn out_of_connections(&self, why: &OutOfConnections) {
+        self.metrics.refused("connect", why.reason().to_owned());
     }
 }

@@ -8,6 +8,7 @@
 //! ```
 //! Who stands by is ready for a service manager. Clients that know several addresses go to the one that is SERVING.
 
+use crate::access::{Caller, RoleGate};
 use crate::config::{Engine, StorageConfig};
 use crate::details::retry_later;
 use crate::durable_actor::{Journal, JournalError};
@@ -18,6 +19,7 @@ use ratn_worker::endpoint::{Endpoint, connect_lazily};
 use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Bound, Phase, Services, Serving, bind_as};
+use ratn_worker::trace::Traced;
 use ratn_worker::vitals::Vitals;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -145,7 +147,11 @@ impl NotTheLeader {
 }
 
 impl Gate for NotTheLeader {
-    fn admit(&self, _: &Identity, path: &str, _: &mut http::Extensions) -> Result<(), Status> {
+    fn caller(&self, identity: &Identity) -> Caller {
+        RoleGate::default().caller(identity)
+    }
+
+    fn admit(&self, _: &Caller, path: &str, _: &mut http::Extensions) -> Result<(), Status> {
         if path.starts_with("/grpc.") {
             return Ok(());
         }
@@ -180,7 +186,7 @@ pub(crate) fn etcd(config: &StorageConfig, role: &str, address: &Endpoint) -> an
 fn connect(address: &str, tls: &ClientTlsConfig) -> Result<Channel, String> {
     let endpoint: Endpoint = address.parse().map_err(|error| format!("{error}"))?;
     let (Endpoint::Tcp { .. } | Endpoint::Tls { .. }) = endpoint else {
-        return connect_lazily(&endpoint).map_err(|error| error.to_string());
+        return connect_lazily(&endpoint).map(Traced::into_channel).map_err(|error| error.to_string());
     };
     let mut configured =
         tonic::transport::Endpoint::from_shared(address.to_owned()).map_err(|error| error.to_string())?;

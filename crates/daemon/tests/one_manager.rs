@@ -14,13 +14,13 @@ use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_worker::client::{AcquireOptions, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::Session;
+use ratn_worker::trace::Traced;
 use ratn_worker::vitals::CoreFailure;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 use support::{DEADLINE, TestSystem, block, in_time};
 use tokio_util::sync::CancellationToken;
-use tonic::transport::Channel;
 
 fn config(listen: Endpoint, state: &Path) -> ResourceManagerConfig {
     let storage = StorageConfig { directory: Some(state.to_owned()), ..StorageConfig::default() };
@@ -29,7 +29,7 @@ fn config(listen: Endpoint, state: &Path) -> ResourceManagerConfig {
 
 /// One ping over a stream of its own; nothing where it is not answered.
 async fn ping(
-    client: &mut ResourceServiceClient<Channel>,
+    client: &mut ResourceServiceClient<Traced>,
     session: &str,
     ttl: Duration,
 ) -> Option<v1::KeepAliveResponse> {

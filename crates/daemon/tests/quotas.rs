@@ -3,6 +3,7 @@
 
 mod support;
 
+use ratn_daemon::metrics::Metrics;
 use ratn_daemon::quota::QuotaConfig;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::service::ServiceConfig;
@@ -10,6 +11,7 @@ use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_resources::Limits;
 use ratn_worker::endpoint::Endpoint;
+use std::sync::Arc;
 use std::time::Duration;
 use support::{DEADLINE, TestSystem, in_time};
 use tokio::io::AsyncReadExt;
@@ -22,9 +24,10 @@ use tonic::{Code, Status};
 async fn manager(system: &TestSystem, quotas: QuotaConfig, limits: Limits) -> (Endpoint, CancellationToken) {
     let listen = "127.0.0.1:0".parse().unwrap();
     let config = ResourceManagerConfig { listen, limits, ..Default::default() };
-    let serving = ServiceConfig { quotas, ..Default::default() }.serving();
+    let metrics = Arc::new(Metrics::new(resource_manager::ROLE));
+    let serving = ServiceConfig { quotas, ..Default::default() }.serving(&metrics);
     let (live, end) = (tokio::sync::watch::Sender::new(config).subscribe(), CancellationToken::new());
-    tokio::spawn(resource_manager::run_as(live, system.directory.clone(), serving, end.clone()));
+    tokio::spawn(resource_manager::run_as(live, system.directory.clone(), serving, metrics, end.clone()));
     (system.directory.wait_for(resource_manager::ROLE, DEADLINE).await.unwrap(), end)
 }
 

@@ -10,10 +10,10 @@ use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_resources::Limits;
 use ratn_worker::client::{AcquireOptions, CallError};
+use ratn_worker::trace::Traced;
 use std::time::Duration;
 use support::{Client, Daemon, TestSystem, block, in_time};
 use tokio::task::JoinHandle;
-use tonic::transport::Channel;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
@@ -95,7 +95,7 @@ async fn a_large_request_is_overtaken_as_often_as_configured_and_no_more() {
     in_time(third).await.unwrap().unwrap();
 }
 
-fn raw(system: &TestSystem, manager: &Daemon) -> ResourceServiceClient<Channel> {
+fn raw(system: &TestSystem, manager: &Daemon) -> ResourceServiceClient<Traced> {
     ResourceServiceClient::new(system.channels.get(&manager.endpoint).unwrap())
 }
 

@@ -4,21 +4,24 @@
 mod support;
 
 use ratn_daemon::access::{AccessConfig, CertificateAccess, Role, UserAccess};
+use ratn_daemon::metrics::Metrics;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::service::ServiceConfig;
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::tls::ServerTls;
+use ratn_worker::trace::Traced;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, ExtendedKeyUsagePurpose, IsCa, KeyPair};
 use std::path::Path;
+use std::sync::Arc;
 use support::{TestSystem, in_time};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity};
 
-type Raw = ResourceServiceClient<Channel>;
+type Raw = ResourceServiceClient<Traced>;
 
 fn create(session: &str, class: v1::ResourceClass) -> v1::CreateRequest {
     let resource = v1::Resource { class: class.into(), kind: "Thing".into(), capacity: 1.0, ..Default::default() };
@@ -51,11 +54,12 @@ impl Started {
 
 async fn start(system: &TestSystem, listen: Endpoint, service: &ServiceConfig) -> Started {
     let config = ResourceManagerConfig { listen, ..Default::default() };
-    let shutdown = CancellationToken::new();
+    let (shutdown, metrics) = (CancellationToken::new(), Arc::new(Metrics::new(resource_manager::ROLE)));
     let run = resource_manager::run_as(
         tokio::sync::watch::Sender::new(config).subscribe(),
         system.directory.clone(),
-        service.serving(),
+        service.serving(&metrics),
+        metrics.clone(),
         shutdown.clone(),
     );
     let running = tokio::spawn(run);
@@ -144,7 +148,9 @@ impl Authority {
         if let Some(shown) = shown {
             tls = tls.identity(Identity::from_pem(&shown.pem, &shown.key));
         }
-        Raw::new(Channel::from_shared(endpoint.to_string()).unwrap().tls_config(tls).unwrap().connect_lazy())
+        Raw::new(Traced::new(
+            Channel::from_shared(endpoint.to_string()).unwrap().tls_config(tls).unwrap().connect_lazy(),
+        ))
     }
 }
 

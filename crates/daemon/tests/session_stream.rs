@@ -302,3 +302,70 @@ async fn a_call_that_a_client_drops_leaves_another_one_of_its_request_as_it_is()
     assert!(b.resources.release(granted.id).await.unwrap(), "it still holds it");
     manager.end().await;
 }
+
+/// A frame of HTTP/2: its kind, flags and stream.
+fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
+    let length = u32::try_from(payload.len()).unwrap().to_be_bytes();
+    [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
+}
+
+const DATA: u8 = 0;
+const HEADERS: u8 = 1;
+const SETTINGS: u8 = 4;
+const PING: u8 = 6;
+const GO_AWAY: u8 = 7;
+
+/// The kind of the first frame that answers `requests` of the smallest size on one stream, sent at once by a client that reads no answers:
+/// a ping after them is answered, or the connection ends.
+async fn answered(path: &std::path::Path, requests: usize) -> u8 {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let mut headers = Vec::new();
+    for (name, value) in [
+        (":method", "POST"),
+        (":scheme", "http"),
+        (":path", "/ratn.v1.ResourceService/Session"),
+        (":authority", "localhost"),
+        ("content-type", "application/grpc"),
+        ("te", "trailers"),
+    ] {
+        let length = |text: &str| u8::try_from(text.len()).unwrap();
+        // Written out, and in no table.
+        headers.push(0);
+        headers.push(length(name));
+        headers.extend(name.as_bytes());
+        headers.push(length(value));
+        headers.extend(value.as_bytes());
+    }
+    // A message without a field: five bytes of gRPC.
+    let smallest = frame(DATA, 0, 1, &[0; 5]);
+    let all = [
+        b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec(),
+        frame(SETTINGS, 0, 0, &[]),
+        frame(HEADERS, 4, 1, &headers),
+        smallest.repeat(requests),
+        frame(PING, 0, 0, &[7; 8]),
+    ]
+    .concat();
+    let (mut from, mut to) = tokio::net::UnixStream::connect(path).await.unwrap().into_split();
+    let sent = tokio::spawn(async move { to.write_all(&all).await.map(|()| to) });
+    loop {
+        let mut head = [0; 9];
+        in_time(from.read_exact(&mut head)).await.unwrap();
+        let length = u32::from_be_bytes([0, head[0], head[1], head[2]]);
+        let mut payload = vec![0; length as usize];
+        in_time(from.read_exact(&mut payload)).await.unwrap();
+        if (head[3] == PING && payload == [7; 8]) || head[3] == GO_AWAY {
+            sent.abort();
+            return head[3];
+        }
+    }
+}
+
+#[tokio::test]
+async fn as_many_requests_as_a_stream_may_have_wait_on_a_connection_however_small_they_are() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let ratn_worker::endpoint::Endpoint::Unix(path) = &manager.endpoint else { panic!("{}", manager.endpoint) };
+    assert_eq!(answered(path, 4_096).await, PING);
+    assert_eq!(answered(path, 12_000).await, GO_AWAY, "there is a bound");
+}

@@ -13,13 +13,13 @@ use ratn_worker::action::ActionServer;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::safety::Safety;
 use ratn_worker::server::{Services, bind};
+use ratn_worker::trace::Traced;
 use std::collections::BTreeMap;
 use std::time::Duration;
 use support::{TestSystem, in_time};
 use tokio_util::sync::CancellationToken;
 use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
 use tonic::codegen::http::uri::PathAndQuery;
-use tonic::transport::Channel;
 use tonic::{Code, Request, Status};
 
 /// Texts that say what they like: data of a task, and what the standard wants ignored when it is bad.
@@ -72,7 +72,7 @@ impl Decoder for Plain {
 }
 
 /// How a call with this as its only message ends: with what is said of it, or with an answer.
-async fn call(channel: &Channel, path: &str, message: Vec<u8>) -> Result<Vec<u8>, Status> {
+async fn call(channel: &Traced, path: &str, message: Vec<u8>) -> Result<Vec<u8>, Status> {
     let mut client = tonic::client::Grpc::new(channel.clone());
     client.ready().await.unwrap();
     let path: PathAndQuery = path.parse().unwrap();
@@ -102,7 +102,7 @@ fn failure(path: &str, answer: &[u8]) -> Option<Status> {
 const ELSEWHERE: &str = "CellService";
 
 /// A daemon of each kind but the cell.
-async fn channels(system: &TestSystem) -> (BTreeMap<&'static str, Channel>, Vec<support::Daemon>, CancellationToken) {
+async fn channels(system: &TestSystem) -> (BTreeMap<&'static str, Traced>, Vec<support::Daemon>, CancellationToken) {
     let (manager, pool, processes) =
         (system.resource_manager().await, system.world_pool(4).await, system.process_manager(Vec::new()).await);
     let (end, bound) = (CancellationToken::new(), bind(&system.directory.socket("provider")).await.unwrap());

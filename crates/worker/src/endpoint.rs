@@ -3,12 +3,12 @@
 
 use crate::leader::LeaderConnector;
 use crate::tls::connect::Connector;
+use crate::trace::Traced;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
-use tonic::transport::Channel;
 
 /// A connection attempt that takes longer has failed.
 pub const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
@@ -173,20 +173,20 @@ impl TryFrom<String> for Endpoint {
 ///
 /// # Errors
 /// [`ConnectError`] when the endpoint makes no URI.
-pub fn connect_lazily(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
+pub fn connect_lazily(endpoint: &Endpoint) -> Result<Traced, ConnectError> {
     let configured = configured(endpoint)?;
-    Ok(match connector_of(endpoint) {
+    Ok(Traced::new(match connector_of(endpoint) {
         Some(By::Tls(connector)) => configured.connect_with_connector_lazy(connector),
         Some(By::Leader(connector)) => configured.connect_with_connector_lazy(connector),
         None => configured.connect_lazy(),
-    })
+    }))
 }
 
 /// A channel that is connected.
 ///
 /// # Errors
 /// [`ConnectError`] when nobody answers there within [`CONNECT_TIMEOUT`].
-pub async fn connect(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
+pub async fn connect(endpoint: &Endpoint) -> Result<Traced, ConnectError> {
     connected(endpoint, configured(endpoint)?).await
 }
 
@@ -194,17 +194,17 @@ pub async fn connect(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
 ///
 /// # Errors
 /// As [`connect`].
-pub(crate) async fn connect_to_ask(endpoint: &Endpoint) -> Result<Channel, ConnectError> {
+pub(crate) async fn connect_to_ask(endpoint: &Endpoint) -> Result<Traced, ConnectError> {
     connected(endpoint, unwatched(endpoint)?).await
 }
 
-async fn connected(endpoint: &Endpoint, configured: tonic::transport::Endpoint) -> Result<Channel, ConnectError> {
+async fn connected(endpoint: &Endpoint, configured: tonic::transport::Endpoint) -> Result<Traced, ConnectError> {
     let connected = match connector_of(endpoint) {
         Some(By::Tls(connector)) => configured.connect_with_connector(connector).await,
         Some(By::Leader(connector)) => configured.connect_with_connector(connector).await,
         None => configured.connect().await,
     };
-    connected.map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
+    connected.map(Traced::new).map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
 }
 
 /// What tonic does not do by itself.

@@ -1,8 +1,8 @@
 //! Who calls, and a gate that every call of a server passes before anything of it is read.
 //!
 //! ```text
-//!   connection ─▶ Identity ─▶ Gate::admit(identity, path) ─┬─▶ service (finds the Caller among the request's extensions)
-//!   (uid, certificate)                                     └─▶ PERMISSION_DENIED
+//!   connection ─▶ Identity ─▶ Gate::caller ─▶ Gate::admit(caller, path) ─┬─▶ service (finds the Caller in the request)
+//!   (uid, certificate)                                                   └─▶ PERMISSION_DENIED, RESOURCE_EXHAUSTED
 //!                            Gate::answered(path, code, duration) ◀─ answer
 //! ```
 //! The trace of a call that carries one (`traceparent`) is that of everything done for it. What is admitted is the gate's business.
@@ -10,7 +10,8 @@
 //! A server that drains refuses what is new ([`ending`]), and knows what is still under way: a call is over when its last byte of
 //! answer is. Health and reflection are answered to the end, and nobody waits for them.
 
-use crate::connections::{InUse, Link, LinkInfo};
+use crate::access::{Caller, HEALTH_CHECK};
+use crate::connections::{InUse, Link, LinkInfo, OutOfConnections};
 use crate::protocol;
 use crate::trace::{self, TraceContext};
 use http_body::{Frame, SizeHint};
@@ -56,14 +57,20 @@ pub enum Identity {
 
 /// Decides about calls. Shared by all connections of a server.
 pub trait Gate: Send + Sync + 'static {
+    /// Who is at the other end of a connection.
+    fn caller(&self, identity: &Identity) -> Caller;
+
     /// Whether a call may go on; what it leaves in the extensions the service finds in the request.
     ///
     /// # Errors
     /// The status that the caller gets instead.
-    fn admit(&self, identity: &Identity, path: &str, extensions: &mut http::Extensions) -> Result<(), Status>;
+    fn admit(&self, caller: &Caller, path: &str, extensions: &mut http::Extensions) -> Result<(), Status>;
 
     /// A call was answered (a stream: began to be).
     fn answered(&self, path: &str, code: Code, took: Duration);
+
+    /// A connection was not accepted, or a call refused, because there are too many connections.
+    fn out_of_connections(&self, _why: &OutOfConnections) {}
 }
 
 /// What a gate leaves in the extensions of a call that it admits: dropped when the last byte of the answer has been sent, or nobody
@@ -228,17 +235,8 @@ where
     fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
         let began = Instant::now();
         let path = request.uri().clone();
-        let identity = identity_of(request.extensions());
         let Gated { gate, calls } = self.gated.clone();
-        let in_use = link_of(request.extensions()).map(|link| link.begin(&identity)).transpose();
-        let admitted = in_use.and_then(|in_use| {
-            if is_counted(path.path()) {
-                protocol::check(request.headers())?;
-            }
-            gate.admit(&identity, path.path(), request.extensions_mut())?;
-            let permit = request.extensions_mut().remove::<Permit>();
-            Ok(Held { _call: calls.begin(is_counted(path.path()))?, _permit: permit, _in_use: in_use })
-        });
+        let admitted = admit(&*gate, &calls, &mut request);
         let held = match admitted {
             Ok(held) => held,
             Err(status) => {
@@ -264,6 +262,32 @@ where
             }
         }
     }
+}
+
+/// What lasts as long as the call does, or why it may not begin.
+fn admit(gate: &dyn Gate, calls: &Calls, request: &mut http::Request<Body>) -> Result<Held, Status> {
+    let path = request.uri().clone();
+    let counted = is_counted(path.path());
+    if counted {
+        protocol::check(request.headers())?;
+    }
+    let caller = gate.caller(&identity_of(request.extensions()));
+    gate.admit(&caller, path.path(), request.extensions_mut())?;
+    let permit = request.extensions_mut().remove::<Permit>();
+    let in_use = match link_of(request.extensions()) {
+        // Whoever watches over the process is answered also where the caller's share is used up.
+        Some(link) if path.path() == HEALTH_CHECK => {
+            link.touch();
+            None
+        }
+        Some(link) => {
+            let begun = link.begin(&caller).inspect_err(|why| gate.out_of_connections(why));
+            Some(begun.map_err(|why| why.status())?)
+        }
+        None => None,
+    };
+    request.extensions_mut().insert(caller);
+    Ok(Held { _call: calls.begin(counted)?, _permit: permit, _in_use: in_use })
 }
 
 /// The code of an answer that is only a status; a body may still end with another.

@@ -9,6 +9,7 @@
 
 use crate::endpoint::{CONNECT_TIMEOUT, Endpoint, connect_to_ask};
 use crate::tls::connect::Connector;
+use crate::trace::Traced;
 use futures::StreamExt;
 use futures::stream::FuturesUnordered;
 use hyper_util::rt::TokioIo;
@@ -22,7 +23,6 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpStream, UnixStream};
 use tokio_util::sync::{CancellationToken, DropGuard, WaitForCancellationFutureOwned};
 use tonic::codegen::{Service, StdError, http::Uri};
-use tonic::transport::Channel;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
@@ -120,7 +120,7 @@ async fn watch(members: Arc<[Endpoint]>, leader: Endpoint, broken: CancellationT
 
 struct Asked<'a> {
     member: &'a Endpoint,
-    client: Option<HealthClient<Channel>>,
+    client: Option<HealthClient<Traced>>,
 }
 
 impl Asked<'_> {

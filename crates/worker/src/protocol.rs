@@ -4,8 +4,8 @@
 //! ```text
 //!   ratn-protocol: 1-1 0.1.0            oldest and newest version of the protocol, and the program's own
 //! ```
-//! Every call over [`crate::client::Channels`] says it, and every server of [`crate::server`] looks. A client that does not say it (one of
-//! another program) is let in: it has read the proto files and knows what it speaks.
+//! Every call over a channel of [`crate::endpoint`] says it, pings of sessions too, and every server of [`crate::server`] looks. A client that
+//! does not say it (one of another program) is let in: it has read the proto files and knows what it speaks.
 
 use std::fmt;
 use std::str::FromStr;

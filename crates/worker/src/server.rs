@@ -6,9 +6,9 @@
 //! ```
 
 use crate::access::RoleGate;
-use crate::connections::{ConnectionLimits, Connections};
+use crate::connections::{Connection, ConnectionLimits, Connections, OutOfConnections, Peer};
 use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
-use crate::gate::{Calls, Gate, Gated};
+use crate::gate::{Calls, Gate, Gated, Identity};
 use crate::tls::accept::handshakes;
 use crate::tls::{LiveServerTls, TlsError};
 use crate::unix_socket::{self, SocketAccess};
@@ -20,7 +20,7 @@ use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::net::{TcpListener, UnixListener, UnixStream};
+use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 use tokio::sync::watch;
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::UnixListenerStream;
@@ -38,6 +38,11 @@ pub const DRAIN_DEADLINE: Duration = Duration::from_millis(500);
 const CLOSE_PATIENCE: Duration = Duration::from_millis(100);
 /// The metadata of one call has at most this many bytes.
 const MAX_METADATA_BYTES: u32 = 16 * 1024;
+
+/// What a connection may hold of requests that nobody has read yet. It also bounds small messages: h2 closes a connection when the
+/// overhead of small frames that wait is more than half of this (`data_frame_budget` of its server), at 256 bytes a frame. So 4,096
+/// requests may wait on a connection, however small: as many as a stream may have calls under way ([`crate::multiplex`]).
+const CONNECTION_WINDOW_BYTES: u32 = 2 * 1024 * 1024;
 
 /// How calls are let in, and how serving ends.
 #[derive(Clone)]
@@ -313,14 +318,15 @@ impl Bound {
         let closing = CancellationToken::new();
         let router = tonic::transport::Server::builder()
             .http2_max_header_list_size(MAX_METADATA_BYTES)
-            .layer(Gated { gate: serving.gate, calls: calls.clone() })
+            .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
+            .layer(Gated { gate: serving.gate.clone(), calls: calls.clone() })
             .http2_keepalive_interval(Some(KEEPALIVE_INTERVAL))
             .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
             .add_routes(services.routes.add_service(health_service).add_service(reflection));
 
         let first_call = serving.connections.first_call;
         let connections = Connections::new(serving.connections);
-        let accepting = connections.clone();
+        let accepting = Accepting { connections: connections.clone(), gate: serving.gate };
         let served = {
             let stop = closing.clone().cancelled_owned();
             // On the heap: it is large, and within the future of every daemon.
@@ -328,7 +334,7 @@ impl Bound {
                 match self.listener {
                     Listener::Tcp(listener) => {
                         let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-                        let incoming = incoming.filter_map(move |stream| accepting.admit(stream));
+                        let incoming = incoming.filter_map(move |stream| accepting.over_tcp(stream).transpose());
                         match self.tls {
                             Some(tls) => {
                                 let incoming = handshakes(incoming, tls, first_call);
@@ -339,7 +345,7 @@ impl Bound {
                     }
                     Listener::Unix(listener, file) => {
                         let incoming = UnixListenerStream::new(listener);
-                        let incoming = incoming.filter_map(move |stream| accepting.admit(stream));
+                        let incoming = incoming.filter_map(move |stream| accepting.over_unix(stream).transpose());
                         // Removed while it is still listened on: afterwards the file may be a successor's.
                         let stop = async {
                             stop.await;
@@ -380,6 +386,38 @@ impl Bound {
             () = drained => Ok(()),
             never = connections.sweep() => match never {},
         }
+    }
+}
+
+/// What takes in the connections that a listener gives.
+struct Accepting {
+    connections: Connections,
+    gate: Arc<dyn Gate>,
+}
+
+impl Accepting {
+    fn over_tcp(&self, accepted: io::Result<TcpStream>) -> io::Result<Option<Connection<TcpStream>>> {
+        let stream = accepted?;
+        let peer = Peer::of_host(stream.peer_addr().ok().map(|address| address.ip()));
+        Ok(self.accept(stream, peer))
+    }
+
+    fn over_unix(&self, accepted: io::Result<UnixStream>) -> io::Result<Option<Connection<UnixStream>>> {
+        let stream = accepted?;
+        let identity = match stream.peer_cred() {
+            Ok(peer) => Identity::User { uid: peer.uid(), pid: peer.pid() },
+            Err(_) => Identity::Anonymous,
+        };
+        let peer = Peer::of_user(&identity, self.gate.caller(&identity).is_operator());
+        Ok(self.accept(stream, peer))
+    }
+
+    fn accept<S>(&self, stream: S, peer: Peer) -> Option<Connection<S>> {
+        let accepted = self.connections.accept(stream, peer);
+        if accepted.is_none() {
+            self.gate.out_of_connections(&OutOfConnections::All);
+        }
+        accepted
     }
 }
 

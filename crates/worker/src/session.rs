@@ -10,6 +10,7 @@
 use crate::client::{Channels, fresh_id};
 use crate::endpoint::Endpoint;
 use crate::panic::exit_on_panic;
+use crate::trace::Traced;
 use ratn_panic_point::panic_point;
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
@@ -19,7 +20,6 @@ use tokio::task::JoinHandle;
 use tokio::time::{Instant, timeout};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::transport::Channel;
 
 /// How long a session lives without a ping unless said otherwise.
 pub const DEFAULT_TTL: Duration = Duration::from_secs(3);
@@ -297,7 +297,7 @@ impl Keeper {
         }
     }
 
-    fn connect(&self) -> Option<ResourceServiceClient<Channel>> {
+    fn connect(&self) -> Option<ResourceServiceClient<Traced>> {
         self.channels.get(&self.endpoint).ok().map(ResourceServiceClient::new)
     }
 

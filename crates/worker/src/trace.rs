@@ -116,6 +116,11 @@ impl Traced {
     pub fn new(channel: Channel) -> Traced {
         Traced(channel)
     }
+
+    /// The channel itself, for servers of other programs.
+    pub fn into_channel(self) -> Channel {
+        self.0
+    }
 }
 
 impl Service<http::Request<Body>> for Traced {

@@ -5,6 +5,7 @@ mod common;
 
 use common::{Provider, RESOURCE, begin, goal, lease, provider};
 use ratn_model::value::Value;
+use ratn_proto::MAX_PORTS_BYTES;
 use ratn_proto::types::{Goal, GoalOutcome};
 use ratn_worker::client::CallError;
 use ratn_worker::endpoint::Endpoint;
@@ -158,7 +159,9 @@ async fn an_unknown_action_is_refused_with_those_that_there_are() {
     let error = run(&provider, goal("a", "fly", 1)).await.unwrap_err();
     assert_eq!(error.code(), Some(Code::InvalidArgument));
     assert!(
-        error.to_string().contains("no action `fly`: there are ask, double, end, panic, relay, stay, trace, wait"),
+        error
+            .to_string()
+            .contains("no action `fly`: there are ask, double, end, fill, panic, relay, stay, trace, wait"),
         "{error}"
     );
     assert!(!error.is_crash());
@@ -243,4 +246,55 @@ async fn a_goal_is_of_the_trace_of_whoever_gave_it() {
     assert_ne!(there.span_id().to_string(), context.span_id().to_string());
     // Who is part of none makes none.
     assert_eq!(trace_of("b").await, "");
+}
+
+/// The bytes of a text under the name `text`, beside which there is nothing else, with which ports have as many as they may.
+fn largest_text(beside: Option<f64>) -> usize {
+    let with = |bytes: usize| {
+        let text = ("text".to_owned(), Value::String("x".repeat(bytes)));
+        let ports = beside.map(|x| ("x".to_owned(), Value::Float(x))).into_iter().chain([text]).collect();
+        ratn_proto::convert::ports_bytes(&ratn_proto::convert::wire_ports(ports))
+    };
+    // Near the edge the length of a text takes as many bytes as at the edge.
+    let near = MAX_PORTS_BYTES - 1_000;
+    near + (MAX_PORTS_BYTES - with(near))
+}
+
+#[tokio::test]
+async fn the_inputs_and_the_outputs_of_a_goal_at_their_edge_and_one_byte_past_it() {
+    let provider = provider(None).await;
+    let largest_output = largest_text(None);
+    let largest_input = |output: usize| largest_text(Some(output as f64));
+    for (number, (input, output, is_refused)) in [
+        (0, largest_output, None),
+        (0, largest_output + 1, Some("aborted")),
+        (largest_input(1), 1, None),
+        (largest_input(1) + 1, 1, Some("INVALID_ARGUMENT")),
+        (largest_input(largest_output), largest_output, None),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let text = Value::String("x".repeat(input));
+        let inputs = [("x".to_owned(), Value::Float(output as f64)), ("text".to_owned(), text)].into();
+        let ended = run(&provider, Goal { inputs, ..goal(&format!("g{number}"), "fill", 1) }).await;
+        let says = format!("at most {MAX_PORTS_BYTES}");
+        match (is_refused, ended) {
+            (None, Ok(outcome)) => {
+                assert!(outcome.is_success(), "{input} {output}: {}", outcome.reason);
+                assert_eq!(outcome.reason, input.to_string());
+                let Some(Value::String(text)) = outcome.outputs.get("text") else { panic!("no text") };
+                assert_eq!(text.len(), output);
+            }
+            (Some("aborted"), Ok(outcome)) => {
+                assert_eq!(outcome.outcome, "aborted");
+                assert!(outcome.reason.contains(&says) && outcome.outputs.is_empty(), "{}", outcome.reason);
+            }
+            (Some(_), Err(refused)) => {
+                assert_eq!(refused.code(), Some(Code::InvalidArgument));
+                assert!(refused.to_string().contains(&says), "{refused}");
+            }
+            (expected, ended) => panic!("{input} {output}: {expected:?}, and it was {:?}", ended.map(|o| o.outcome)),
+        }
+    }
 }

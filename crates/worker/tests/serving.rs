@@ -177,7 +177,9 @@ async fn a_worker_serves_from_its_options_and_leaves_nothing_behind() {
 #[tokio::test]
 async fn a_client_of_a_version_without_a_protocol_in_common_is_refused_at_its_first_call_with_both_versions() {
     let provider = provider(None).await;
-    let channel = connect(&provider.endpoint).await.unwrap();
+    // As others have them: channels of this program say what it speaks.
+    let channel =
+        tonic::transport::Endpoint::from_shared(provider.endpoint.to_string()).unwrap().connect().await.unwrap();
     let describe = async |said: Option<&'static str>| {
         let mut question = tonic::Request::new(DescribeRequest {});
         if let Some(said) = said {

@@ -10,6 +10,7 @@ use ratn_proto::v1::resource_service_server::{ResourceService, ResourceServiceSe
 use ratn_proto::v1::*;
 use ratn_worker::client::Channels;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::protocol::{HEADER, NEWEST, OLDEST};
 use ratn_worker::provider::Provider;
 use ratn_worker::server::{Services, bind};
 use ratn_worker::session::Session;
@@ -29,6 +30,8 @@ struct Pool {
     resources: BTreeMap<String, ratn_proto::v1::Resource>,
     /// Ids that another session has.
     taken: BTreeSet<String>,
+    /// What streams of pings said of their protocol, in order.
+    protocols: Vec<Option<String>>,
 }
 
 #[derive(Clone)]
@@ -72,6 +75,8 @@ impl ResourceService for Manager {
         request: Request<Streaming<KeepAliveRequest>>,
     ) -> Result<Response<Self::KeepAliveStream>, Status> {
         let manager = self.clone();
+        let protocol = request.metadata().get(HEADER).map(|said| said.to_str().unwrap().to_owned());
+        manager.pool.lock().unwrap().protocols.push(protocol);
         let answers = request.into_inner().map(move |ping| {
             let ping = ping?;
             let mut pool = manager.pool.lock().unwrap();
@@ -226,6 +231,8 @@ async fn a_session_lives_until_it_is_closed() {
     manager.until(|pool| pool.sessions.contains(&id)).await;
     session.close().await;
     manager.until(|pool| pool.sessions.is_empty()).await;
+    let spoken = Some(format!("{OLDEST}-{NEWEST} {}", env!("CARGO_PKG_VERSION")));
+    assert_eq!(manager.pool.lock().unwrap().protocols, [spoken.clone(), spoken], "the farewell says it, too");
 }
 
 #[tokio::test]

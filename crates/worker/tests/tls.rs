@@ -1,10 +1,12 @@
 //! Certificates that are replaced while a process runs: what its server shows, and what its clients do.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
+use ratn_worker::access::{Caller, Role};
 use ratn_worker::endpoint::{Endpoint, connect, connect_lazily};
 use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::server::{Exposure, Services, Serving, bind_as};
 use ratn_worker::tls::{self, ClientTls, LiveServerTls, ServerTls, read_again};
+use ratn_worker::trace::Traced;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, ExtendedKeyUsagePurpose, IsCa, KeyPair};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -63,16 +65,23 @@ impl Files {
 struct Remembering(Mutex<Option<Vec<u8>>>);
 
 impl Gate for Remembering {
-    fn admit(&self, identity: &Identity, _: &str, _: &mut http::Extensions) -> Result<(), Status> {
-        let Identity::Certificate { der } = identity else { return Err(Status::unauthenticated("no certificate")) };
-        *self.0.lock().unwrap() = Some(der.to_vec());
-        Ok(())
+    fn caller(&self, identity: &Identity) -> Caller {
+        *self.0.lock().unwrap() = match identity {
+            Identity::Certificate { der } => Some(der.to_vec()),
+            Identity::User { .. } | Identity::Anonymous => None,
+        };
+        Caller { name: "somebody".into(), roles: [Role::Viewer].as_slice().into() }
+    }
+
+    fn admit(&self, _: &Caller, _: &str, _: &mut http::Extensions) -> Result<(), Status> {
+        let is_known = self.0.lock().unwrap().is_some();
+        if is_known { Ok(()) } else { Err(Status::unauthenticated("no certificate")) }
     }
 
     fn answered(&self, _: &str, _: Code, _: Duration) {}
 }
 
-async fn ask(channel: Channel) -> Result<(), Status> {
+async fn ask(channel: Traced) -> Result<(), Status> {
     let check = HealthCheckRequest { service: String::new() };
     tokio::time::timeout(LONG, HealthClient::new(channel).check(check)).await.unwrap().map(drop)
 }
@@ -81,7 +90,7 @@ async fn ask(channel: Channel) -> Result<(), Status> {
 async fn stranger(endpoint: &Endpoint, authority: &Authority, shown: &Signed) -> Result<(), Status> {
     let tls = ClientTlsConfig::new().domain_name("localhost").ca_certificate(Certificate::from_pem(authority.0.pem()));
     let tls = tls.identity(tonic::transport::Identity::from_pem(&shown.pem, &shown.key));
-    ask(Channel::from_shared(endpoint.to_string()).unwrap().tls_config(tls).unwrap().connect_lazy()).await
+    ask(Traced::new(Channel::from_shared(endpoint.to_string()).unwrap().tls_config(tls).unwrap().connect_lazy())).await
 }
 
 /// The certificate that is shown to who connects now.

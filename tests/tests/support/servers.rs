@@ -3,20 +3,22 @@
 
 use prost_reflect::DescriptorPool;
 use ratn_daemon::access::{AccessConfig, LiveAccess, Role, UserAccess};
+use ratn_daemon::metrics::Metrics;
 use ratn_daemon::service::ServiceConfig;
 use ratn_daemon::{process_manager, resource_manager, world_pool};
 use ratn_worker::client::Channels;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::Safety;
+use ratn_worker::trace::Traced;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
 use tonic::codegen::http::uri::PathAndQuery;
-use tonic::transport::Channel;
 use tonic::{Code, Request, Status};
 
 /// Starting takes at most this long.
@@ -83,7 +85,7 @@ impl Decoder for Plain {
 }
 
 /// How a call with one message is answered; `None` where it is not, for now.
-pub async fn call(channel: &Channel, path: &str, message: Vec<u8>) -> Option<Result<(), Status>> {
+pub async fn call(channel: &Traced, path: &str, message: Vec<u8>) -> Option<Result<(), Status>> {
     let called = async {
         let mut client = tonic::client::Grpc::new(channel.clone());
         client.ready().await.unwrap();
@@ -102,23 +104,25 @@ pub fn only(roles: &[Role]) -> AccessConfig {
 /// A server: in which role which channel is to be used.
 pub struct Server {
     pub name: &'static str,
-    pub channels: Vec<Channel>,
+    pub channels: Vec<Traced>,
 }
 
 /// The four daemons, of which who calls changes with `access`, and a driver for each role, made as drivers are.
 pub async fn servers(place: &Path, access: &LiveAccess, end: &CancellationToken) -> Vec<Server> {
     let directory = RuntimeDirectory::create(place.join("run")).unwrap();
-    let service = ServiceConfig::default();
+    let (service, metrics) = (ServiceConfig::default(), Arc::new(Metrics::new(resource_manager::ROLE)));
     let manager = resource_manager::run_as(
         tokio::sync::watch::Sender::new(resource_manager::ResourceManagerConfig::default()).subscribe(),
         directory.clone(),
-        service.serving_with(access),
+        service.serving_with(access, &metrics),
+        metrics.clone(),
         end.clone(),
     );
     tokio::spawn(manager);
     directory.wait_for(resource_manager::ROLE, DEADLINE).await.unwrap();
-    let (to, serving) = (directory.clone(), || service.serving_with(access));
-    tokio::spawn(world_pool::run_as(world_pool::WorldPoolConfig::default(), to.clone(), serving(), end.clone()));
+    let (to, serving) = (directory.clone(), || service.serving_with(access, &metrics));
+    let (config, counted) = (world_pool::WorldPoolConfig::default(), Arc::new(Metrics::new(world_pool::ROLE)));
+    tokio::spawn(world_pool::run_as(config, to.clone(), serving(), counted, end.clone()));
     let config = process_manager::ProcessManagerConfig::default();
     tokio::spawn(process_manager::run_as(config, to.clone(), serving(), end.clone()));
     tokio::spawn(ratn_cell::run_as(ratn_cell::config::CellConfig::default(), to, serving(), end.clone()));
@@ -156,7 +160,7 @@ pub async fn servers(place: &Path, access: &LiveAccess, end: &CancellationToken)
 }
 
 /// Whether a server has a service, as its health says.
-pub async fn serves(channel: &Channel, service: &str) -> bool {
+pub async fn serves(channel: &Traced, service: &str) -> bool {
     let mut question = vec![0x0a, u8::try_from(service.len()).unwrap()];
     question.extend(service.as_bytes());
     match call(channel, "/grpc.health.v1.Health/Check", question).await.unwrap() {

@@ -87,8 +87,8 @@ pub(crate) struct WorkerArguments {
     #[arg(value_enum)]
     pub(crate) worker: WorkerKind,
     /// Its resource's id, `path-planner-1@compute`; goals need a lease of it, which the resource manager of --resource-manager or
-    /// $RATN_RESOURCE_MANAGER confirms. Without it no lease is asked for
-    #[arg(long, value_name = "ID", default_value = "")]
+    /// $RATN_RESOURCE_MANAGER confirms
+    #[arg(long, value_name = "ID", value_parser = clap::builder::NonEmptyStringValueParser::new())]
     pub(crate) id: String,
     /// Its resource's kind
     #[arg(long, value_name = "KIND", default_value = "")]

@@ -48,7 +48,7 @@ pub(crate) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
 async fn reset(
     arguments: &ResetArguments,
     world: &WorldClient,
-    mut cell: CellServiceClient<tonic::transport::Channel>,
+    mut cell: CellServiceClient<ratn_worker::trace::Traced>,
 ) -> anyhow::Result<String> {
     let before =
         cell.get_ground_truth(GetGroundTruthRequest {}).await.context("the cell does not answer")?.into_inner();

@@ -11,11 +11,13 @@ use anyhow::Context;
 use ratn_cell::core::recording::{self, Replayed};
 use ratn_daemon::access::LiveAccess;
 use ratn_daemon::config::StorageConfig;
+use ratn_daemon::metrics::Metrics;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::supervisor::Supervisor;
 use ratn_daemon::{metrics, process_manager, resource_manager, telemetry, world_pool};
 use ratn_storage::OpenError;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{BindError, Exposure, Serving};
@@ -25,6 +27,7 @@ use ratn_worker::{shutdown, tls};
 use std::fs::File;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -45,7 +48,7 @@ pub(super) fn resource_manager(arguments: &KeptRoleArguments) -> Result<(), Fail
     // On one thread requests are handled in the order in which they arrive; task control sends the most urgent first.
     let runtime = tokio::runtime::Builder::new_current_thread();
     daemon_on(runtime, arguments, system, resource_manager::ROLE, async |_, host| {
-        resource_manager::run_as(host.bounds, host.directory, host.serving, host.shutdown).await
+        resource_manager::run_as(host.bounds, host.directory, host.serving, host.metrics, host.shutdown).await
     })
 }
 
@@ -55,7 +58,7 @@ pub(super) fn world_pool(arguments: &KeptRoleArguments) -> Result<(), Failure> {
         let mut config = system.world_pool;
         arguments.apply(world_pool::ROLE, &mut config.storage);
         config.listen = host.listen.unwrap_or(config.listen);
-        world_pool::run_as(config, host.directory, host.serving, host.shutdown).await
+        world_pool::run_as(config, host.directory, host.serving, host.metrics, host.shutdown).await
     })
 }
 
@@ -137,6 +140,15 @@ fn replay(file: &Path) -> Result<(), Failure> {
 /// `ratn worker …`
 pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
     telemetry::start();
+    let told = ManagerLocation::from_environment();
+    let told = told.map_err(|error| Failure::Refused(format!("ratn: {RESOURCE_MANAGER_VARIABLE}: {error}")))?;
+    if told.is_none() && arguments.resource_manager.is_none() {
+        return Err(Failure::Refused(format!(
+            "ratn: goals of worker `{}` need a lease, and nobody says which resource manager confirms it: give --resource-manager \
+             ADDRESS, or set {RESOURCE_MANAGER_VARIABLE}",
+            arguments.id
+        )));
+    }
     let options = WorkerOptions {
         id: arguments.id.clone(),
         kind: arguments.kind.clone(),
@@ -169,6 +181,7 @@ struct Host {
     listen: Option<Endpoint>,
     directory: RuntimeDirectory,
     serving: Serving,
+    metrics: Arc<Metrics>,
     shutdown: CancellationToken,
     /// The resource manager's section, as it changes.
     bounds: watch::Receiver<ResourceManagerConfig>,
@@ -214,16 +227,18 @@ fn daemon_on(
         let directory = public_directory(arguments.runtime_dir.as_deref());
         let directory = RuntimeDirectory::create(&directory)
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
+        let metrics = Arc::new(Metrics::new(role));
         if let Some(address) = arguments.metrics.or_else(|| service.metrics.get(role).copied()) {
-            let listening = metrics::listen(metrics::install(role), address, service.insecure).await;
+            let listening = metrics::listen(metrics.clone(), address, service.insecure).await;
             let address = listening.map_err(|error| refused(error.into()))?;
             tracing::info!("metrics are at http://{address}/metrics");
         }
         let (access, bounds) =
             (LiveAccess::new(service.access.clone()), watch::Sender::new(system.resource_manager.clone()));
-        let serving = service.serving_with(&access);
+        let serving = service.serving_with(&access, &metrics);
         let tls = serving.exposure.tls.clone();
-        let host = Host { listen: arguments.listen.clone(), directory, shutdown, bounds: bounds.subscribe(), serving };
+        let (listen, bounds_of) = (arguments.listen.clone(), bounds.subscribe());
+        let host = Host { listen, directory, shutdown, bounds: bounds_of, serving, metrics };
         let reloading = Reloading { file: arguments.config.clone(), running, role, logs, tls, access, bounds };
         let followed =
             supervisor.follow(host.serving.phase.subscribe(), host.serving.vitals.clone(), move || reloading.reload());

@@ -7,13 +7,13 @@ use super::may_speak::{MaySpeak, Speech};
 use super::outbox::Outbox;
 use super::{Core, Journal};
 use crate::details::of_fault;
-use crate::metrics;
 use ratn_panic_point::panic_point;
 use ratn_storage::{AppendError, Fault, Position, Progress};
 use ratn_worker::vitals::{CoreFailure, Vitals};
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
+use tonic::Status;
 
 /// Messages that are put into an order together.
 const AT_ONCE: usize = 64;
@@ -28,12 +28,22 @@ pub(super) struct Actor<C: Core> {
     desk: Desk<C>,
     outbox: Outbox<Outgoing<C>>,
     drained: bool,
+    /// Nothing may be said for now, and health says so.
+    silenced: bool,
     vitals: Vitals,
 }
 
 impl<C: Core> Actor<C> {
     pub(super) fn new(core: C, journal: Journal, may_speak: MaySpeak, vitals: Vitals) -> Actor<C> {
-        Actor { core, journal, desk: Desk::new(may_speak), outbox: Outbox::default(), drained: false, vitals }
+        Actor {
+            core,
+            journal,
+            desk: Desk::new(may_speak),
+            outbox: Outbox::default(),
+            drained: false,
+            silenced: false,
+            vitals,
+        }
     }
 
     pub(super) async fn run(
@@ -52,8 +62,10 @@ impl<C: Core> Actor<C> {
             self.desk.begin_turn();
             self.vitals.beat();
             panic_point("durable-actor");
-            if let Speech::Over(fault) = self.desk.speech().now() {
-                return self.fenced(&fault);
+            match self.desk.speech().now() {
+                Speech::Over(fault) => return self.fenced(&fault),
+                Speech::Held(why) => self.silence(why.as_ref()),
+                Speech::Allowed => self.end_silence(),
             }
             let deadline = self.core.next_deadline(&self.desk).map(|at| self.desk.instant(at));
             let (running, room) = (self.desk.stopped().is_none(), !self.outbox.is_full() && !self.desk.is_full());
@@ -193,8 +205,34 @@ impl<C: Core> Actor<C> {
             }
             Ok(_) => {}
         }
-        if let Some(metrics) = metrics::get() {
-            metrics.journal.commits.inc();
+        self.journal.metrics().commits.inc();
+    }
+
+    /// It cannot be seen who has the state: nothing is said until it can.
+    fn silence(&mut self, why: Option<&Fault>) {
+        if std::mem::replace(&mut self.silenced, true) {
+            return;
+        }
+        let why = why.map_or_else(|| "a look at it does not end".to_owned(), reason_of);
+        tracing::error!(why, "it cannot be seen who has this state: nothing is said until it can");
+        self.tell_health(Some(&why));
+    }
+
+    fn end_silence(&mut self) {
+        if std::mem::take(&mut self.silenced) {
+            tracing::info!("this process is seen to have its state again");
+            self.tell_health(None);
+        }
+    }
+
+    /// A log that has failed stays so, whatever else there is to say.
+    fn tell_health(&self, silence: Option<&str>) {
+        match (self.desk.stopped(), silence) {
+            (Some(stopped), _) => self.vitals.unwell(storage_failed(&stopped.status)),
+            (None, Some(why)) => {
+                self.vitals.unwell(format!("nothing is said: it cannot be seen who has the state ({why})"))
+            }
+            (None, None) => self.vitals.well(),
         }
     }
 
@@ -223,11 +261,9 @@ impl<C: Core> Actor<C> {
             }
             _ => {}
         }
-        self.vitals.unwell(format!("storage failed: {}", status.message()));
+        self.vitals.unwell(storage_failed(&status));
         tracing::error!(fault = status.message(), "changes are refused from now on");
-        if let Some(metrics) = metrics::get() {
-            metrics.journal.failed.set(1);
-        }
+        self.journal.metrics().failed.set(1);
         while let Some(outgoing) = self.take_durable().filter(|_| self.desk.may_speak()) {
             self.hand_out(outgoing);
         }
@@ -246,6 +282,18 @@ impl<C: Core> Actor<C> {
             tracing::error!(error = format!("{error:#}"), "what is on the disk cannot be read either");
             self.desk.set_unreadable();
         }
+    }
+}
+
+fn storage_failed(status: &Status) -> String {
+    format!("storage failed: {}", status.message())
+}
+
+/// What the system said; a fault's own text speaks of writing.
+fn reason_of(fault: &Fault) -> String {
+    match fault {
+        Fault::Io { action, place, source } => format!("cannot {action} {place}: {source}"),
+        other => other.to_string(),
     }
 }
 

@@ -9,7 +9,7 @@
 use super::may_speak::MaySpeak;
 use crate::config::StorageConfig;
 use crate::details::retry_later;
-use crate::metrics;
+use crate::metrics::JournalMetrics;
 use ratn_storage::etcd::Bounds;
 use ratn_storage::{
     AppendError, CompactError, Durable, Fault, Log, MakeSnapshot, OpenError, Options, Position, Progress, ReadError,
@@ -57,6 +57,7 @@ pub(crate) struct Journal {
     /// Bytes of entries since the last snapshot.
     since_snapshot: u64,
     snapshot_bytes: u64,
+    metrics: JournalMetrics,
 }
 
 /// Why the state of before cannot be had.
@@ -128,6 +129,7 @@ impl Journal {
             compact_bytes: config.compact_bytes,
             since_snapshot: recovered.records.iter().map(|record| record.payload.len() as u64).sum(),
             snapshot_bytes: recovered.snapshot.as_ref().map_or(0, |snapshot| snapshot.payload.len() as u64),
+            metrics: JournalMetrics::default(),
         };
         let entries = recovered.records.len();
         let state = restore(recovered).map_err(|error| JournalError::Restore { role, source: error.into() })?;
@@ -170,11 +172,19 @@ impl Journal {
         let Some(writer) = &mut self.writer else { return Err(Fault::Closed.into()) };
         self.last = writer.append(entry)?;
         self.since_snapshot += entry.len() as u64;
-        if let Some(metrics) = metrics::get() {
-            metrics.journal.entries.inc();
-            metrics.journal.bytes.inc_by(entry.len() as u64);
-        }
+        self.metrics.entries.inc();
+        self.metrics.bytes.inc_by(entry.len() as u64);
         Ok(())
+    }
+
+    /// Counts there from now on.
+    #[must_use]
+    pub(crate) fn counting(self, metrics: &JournalMetrics) -> Journal {
+        Journal { metrics: metrics.clone(), ..self }
+    }
+
+    pub(super) fn metrics(&self) -> &JournalMetrics {
+        &self.metrics
     }
 
     /// Why nothing more is taken on for now: the disk is behind.

@@ -4,6 +4,9 @@
 //! every answer the actor compares: the last look that found the place held began less than [`CONFIRMED_FOR`] (G) ago, or nothing
 //! leaves. A process that was suspended finds its confirmation too old, before anything else that it does.
 //!
+//! Where the state directory cannot be looked at (permissions, a file system that hangs) nothing is confirmed either. The actor is
+//! [`Speech::Held`] then, and its health says why until a look succeeds.
+//!
 //! # Why a predecessor does no harm
 //!
 //! Let a successor take the place at T. Every look of the predecessor that began after T fails, so it says nothing after T + G.
@@ -41,12 +44,20 @@ enum Confirmed {
     Lost(Fault),
 }
 
+/// What the looks have found.
+#[derive(Debug, Clone)]
+struct Found {
+    confirmed: Confirmed,
+    /// Why nothing is known since: what the system said to the last look.
+    unseen: Option<Fault>,
+}
+
 /// What may be said now.
 #[derive(Debug)]
 pub(super) enum Speech {
     Allowed,
-    /// Not for now: the last confirmation is too old.
-    Held,
+    /// Not for now: the last confirmation is too old. Why, as far as is known.
+    Held(Option<Fault>),
     /// Never again.
     Over(Fault),
 }
@@ -54,49 +65,52 @@ pub(super) enum Speech {
 /// See the module. The thread ends with it.
 #[derive(Debug)]
 pub(super) struct MaySpeak {
-    confirmed: watch::Receiver<Confirmed>,
+    found: watch::Receiver<Found>,
     _end: mpsc::Sender<()>,
 }
 
 impl MaySpeak {
     /// Looks at once, and from then on beside.
     pub(super) fn begin(place: Box<dyn Place>, vitals: Vitals) -> std::io::Result<MaySpeak> {
-        let (confirm, confirmed) = watch::channel(look(&*place).unwrap_or(Confirmed::NotYet));
+        let first = match look(&*place) {
+            Ok(confirmed) => Found { confirmed, unseen: None },
+            Err(fault) => Found { confirmed: Confirmed::NotYet, unseen: Some(fault) },
+        };
+        let (tell, found) = watch::channel(first);
         let (end, ended) = mpsc::channel::<()>();
         let keep = move || {
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(CONFIRM_INTERVAL) {
                 panic_point("may-speak");
                 match look(&*place) {
-                    Ok(found) => {
-                        let over = matches!(found, Confirmed::Lost(_));
-                        confirm.send_replace(found);
+                    Ok(confirmed) => {
+                        let over = matches!(confirmed, Confirmed::Lost(_));
+                        tell.send_replace(Found { confirmed, unseen: None });
                         if over {
                             return;
                         }
                     }
-                    Err(fault) => {
-                        tracing::warn!(%fault, "it cannot be seen who has this state: nothing is said until it can")
-                    }
+                    Err(fault) => tell.send_modify(|found| found.unseen = Some(fault)),
                 }
             }
         };
         thread::Builder::new()
             .name("may-speak".to_owned())
             .spawn(move || vitals.guard_blocking("the watch of its place", keep))?;
-        Ok(MaySpeak { confirmed, _end: end })
+        Ok(MaySpeak { found, _end: end })
     }
 
     pub(super) fn now(&self) -> Speech {
-        match &*self.confirmed.borrow() {
+        let found = self.found.borrow();
+        match &found.confirmed {
             Confirmed::At(began) if began.elapsed() < CONFIRMED_FOR => Speech::Allowed,
-            Confirmed::At(_) | Confirmed::NotYet => Speech::Held,
+            Confirmed::At(_) | Confirmed::NotYet => Speech::Held(found.unseen.clone()),
             Confirmed::Lost(fault) => Speech::Over(fault.clone()),
         }
     }
 
-    /// Returns at the next confirmation.
+    /// Returns after the next look.
     pub(super) async fn changed(&mut self) {
-        if self.confirmed.changed().await.is_err() && !matches!(self.now(), Speech::Over(_)) {
+        if self.found.changed().await.is_err() && !matches!(self.now(), Speech::Over(_)) {
             std::future::pending::<()>().await;
         }
     }
@@ -109,5 +123,39 @@ fn look(place: &dyn Place) -> Result<Confirmed, Fault> {
         Ok(()) => Ok(Confirmed::At(began)),
         Err(fault) if fault.is_lost_place() => Ok(Confirmed::Lost(fault)),
         Err(fault) => Err(fault),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use std::sync::{Arc, Mutex};
+
+    /// A file system that hangs while a test holds the lock.
+    #[derive(Debug)]
+    struct HangingPlace(Arc<Mutex<()>>);
+
+    impl Place for HangingPlace {
+        fn check(&self) -> Result<(), Fault> {
+            drop(self.0.lock().unwrap());
+            Ok(())
+        }
+    }
+
+    #[tokio::test]
+    async fn nothing_is_said_while_a_look_hangs_and_again_when_it_has_ended() {
+        let hangs = Arc::new(Mutex::new(()));
+        let mut speech = MaySpeak::begin(Box::new(HangingPlace(hangs.clone())), Vitals::default()).unwrap();
+        assert!(matches!(speech.now(), Speech::Allowed));
+        {
+            let _hanging = hangs.lock().unwrap();
+            while !matches!(speech.now(), Speech::Held(None)) {
+                thread::yield_now();
+            }
+        }
+        while !matches!(speech.now(), Speech::Allowed) {
+            speech.changed().await;
+        }
     }
 }

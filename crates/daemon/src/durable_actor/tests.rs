@@ -170,6 +170,56 @@ async fn whoever_was_got_past_says_nothing_more_and_ends() {
 }
 
 #[tokio::test]
+async fn a_copy_in_the_place_of_the_segment_is_noticed_without_a_write_and_ends_the_process() {
+    let place = tempfile::tempdir().unwrap();
+    let (handle, vitals) = begin(place.path(), &SlowDisk::default());
+    assert_eq!(in_time(handle.request(|answer| Message::Add(1, answer))).await.unwrap(), 1);
+    let files = std::fs::read_dir(place.path()).unwrap().map(|entry| entry.unwrap().path());
+    for segment in files.filter(|path| path.extension().is_some_and(|extension| extension == "log")) {
+        let copy = segment.with_extension("copy");
+        std::fs::copy(&segment, &copy).unwrap();
+        std::fs::rename(&copy, &segment).unwrap();
+    }
+    let failure = in_time(vitals.failed()).await;
+    assert_eq!(failure.exit_code(), EXIT_CODE_FENCED, "{failure}");
+    assert!(in_time(handle.request(Message::Count)).await.is_err());
+}
+
+#[tokio::test]
+async fn a_state_directory_that_cannot_be_looked_at_makes_the_daemon_silent_and_unwell_until_it_can() {
+    let directory = tempfile::tempdir().unwrap();
+    let (real, link) = (directory.path().join("real"), directory.path().join("state"));
+    std::fs::create_dir(&real).unwrap();
+    std::os::unix::fs::symlink(&real, &link).unwrap();
+    let (handle, vitals) = begin(&link, &SlowDisk::default());
+    assert_eq!(in_time(handle.request(|answer| Message::Add(1, answer))).await.unwrap(), 1);
+    assert_eq!(vitals.condition().borrow().unwell, None);
+    // A link that leads to itself cannot be followed, by root neither.
+    std::fs::remove_file(&link).unwrap();
+    std::os::unix::fs::symlink(&link, &link).unwrap();
+    let mut condition = vitals.condition();
+    let unwell = in_time(condition.wait_for(|condition| condition.unwell.is_some())).await.unwrap().unwell.clone();
+    let why = unwell.unwrap();
+    assert!(
+        why.contains("it cannot be seen who has the state (cannot look at") && why.contains("writer.lock"),
+        "{why}"
+    );
+    let ((answer, mut counted), (answer_to_add, mut added)) = (oneshot::channel(), oneshot::channel());
+    let (later, taken) = oneshot::channel();
+    handle.send(Message::Count(answer)).await.unwrap();
+    handle.send(Message::Add(1, answer_to_add)).await.unwrap();
+    handle.send(Message::Taken(later)).await.unwrap();
+    in_time(taken).await.unwrap();
+    assert!(counted.try_recv().is_err() && added.try_recv().is_err(), "nothing is said");
+    std::fs::remove_file(&link).unwrap();
+    std::os::unix::fs::symlink(&real, &link).unwrap();
+    in_time(condition.wait_for(|condition| condition.unwell.is_none())).await.unwrap();
+    assert_eq!(in_time(counted).await.unwrap().unwrap(), 1, "what was held back leaves");
+    assert_eq!(in_time(added).await.unwrap().unwrap(), 2, "and what was written meanwhile");
+    assert_eq!(condition.borrow().failure, None);
+}
+
+#[tokio::test]
 async fn a_disk_that_is_behind_refuses_what_is_new_and_takes_it_again_when_it_has_caught_up() {
     let place = tempfile::tempdir().unwrap();
     let disk = SlowDisk::default();

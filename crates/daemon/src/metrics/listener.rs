@@ -53,7 +53,7 @@ pub enum ListenError {
 ///
 /// # Errors
 /// [`ListenError`]; beyond loopback unless `insecure`.
-pub async fn listen(metrics: &'static Metrics, address: SocketAddr, insecure: bool) -> Result<SocketAddr, ListenError> {
+pub async fn listen(metrics: Arc<Metrics>, address: SocketAddr, insecure: bool) -> Result<SocketAddr, ListenError> {
     if !address.ip().is_loopback() && !insecure {
         return Err(ListenError::Exposed { address });
     }
@@ -64,7 +64,7 @@ pub async fn listen(metrics: &'static Metrics, address: SocketAddr, insecure: bo
     Ok(address)
 }
 
-async fn serve(metrics: &'static Metrics, listener: TcpListener) {
+async fn serve(metrics: Arc<Metrics>, listener: TcpListener) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
         let Ok((connection, _)) = listener.accept().await else {
@@ -72,16 +72,17 @@ async fn serve(metrics: &'static Metrics, listener: TcpListener) {
             continue;
         };
         let Ok(place) = Arc::clone(&places).try_acquire_owned() else { continue };
+        let metrics = metrics.clone();
         tokio::spawn(async move {
             // Who left, or was too slow, hears nothing.
-            let _ = tokio::time::timeout(PATIENCE, answer(metrics, connection)).await;
+            let _ = tokio::time::timeout(PATIENCE, answer(&metrics, connection)).await;
             drop(place);
         });
     }
 }
 
 /// One request of a connection, and its answer.
-async fn answer(metrics: &'static Metrics, connection: TcpStream) -> hyper::Result<()> {
+async fn answer(metrics: &Metrics, connection: TcpStream) -> hyper::Result<()> {
     let page = service_fn(async |request: Request<Incoming>| Ok::<_, Infallible>(page(metrics, &request)));
     http1::Builder::new()
         .timer(TokioTimer::new())
@@ -127,7 +128,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_page_is_shown_and_nothing_else() {
-        let metrics = super::super::install("resource-manager");
+        let metrics = Arc::new(Metrics::new("resource-manager"));
         let address = listen(metrics, "127.0.0.1:0".parse().unwrap(), false).await.unwrap();
         let shown = ask(address, b"GET /metrics HTTP/1.1\r\nHost: here\r\n\r\n").await;
         assert!(shown.starts_with("HTTP/1.1 200 OK\r\n") && shown.ends_with("# EOF\n"), "{shown}");
@@ -141,7 +142,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_head_has_so_many_headers_and_bytes_and_no_more() {
-        let metrics = super::super::install("resource-manager");
+        let metrics = Arc::new(Metrics::new("resource-manager"));
         let address = listen(metrics, "127.0.0.1:0".parse().unwrap(), false).await.unwrap();
         let with_headers = |count: usize| {
             let headers: String = (0..count).map(|n| format!("x-{n}: y\r\n")).collect();
@@ -160,7 +161,7 @@ mod tests {
 
     #[tokio::test]
     async fn more_connections_than_there_are_places_for_are_closed_at_once() {
-        let metrics = super::super::install("resource-manager");
+        let metrics = Arc::new(Metrics::new("resource-manager"));
         let address = listen(metrics, "127.0.0.1:0".parse().unwrap(), false).await.unwrap();
         let mut silent = Vec::new();
         for _ in 0..MAX_CONNECTIONS {
@@ -174,7 +175,7 @@ mod tests {
 
     #[tokio::test]
     async fn other_machines_see_it_only_where_it_is_said() {
-        let metrics = super::super::install("resource-manager");
+        let metrics = Arc::new(Metrics::new("resource-manager"));
         let refused = listen(metrics, "0.0.0.0:0".parse().unwrap(), false).await.unwrap_err();
         assert!(matches!(refused, ListenError::Exposed { .. }), "{refused}");
     }

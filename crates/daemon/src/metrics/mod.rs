@@ -1,7 +1,6 @@
 //! What a daemon counts and measures, for Prometheus: in the text form of OpenMetrics, at `/metrics` of a listener of its own.
 //!
-//! Like the logs they are the process's: [`install`] once, and whoever has something to count finds them. Without that nothing is
-//! counted. Labels take few values: methods of this system, gRPC codes, reasons of refusals; never what a client sent.
+//! Made once for each daemon and handed to whoever has something to count; whether they are shown is another matter ([`listen`]). Labels take few values: methods of this system, gRPC codes, reasons of refusals; never what a client sent.
 
 mod listener;
 
@@ -16,7 +15,6 @@ use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 use ratn_proto::access::method_of;
-use std::sync::OnceLock;
 use std::time::Duration;
 use tonic::Code;
 
@@ -25,8 +23,6 @@ const CALL_SECONDS: [f64; 15] =
     [5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 5.0];
 /// Seconds in the queue: from none to what a task waits for another.
 const WAIT_SECONDS: [f64; 11] = [1e-4, 1e-3, 1e-2, 0.1, 0.5, 1.0, 5.0, 10.0, 60.0, 300.0, 1800.0];
-
-static METRICS: OnceLock<Metrics> = OnceLock::new();
 
 /// All of them. Daemons other than the resource manager have only the calls, and the world pool its journal.
 #[derive(Debug)]
@@ -44,8 +40,8 @@ pub struct Metrics {
     pub(crate) journal: JournalMetrics,
 }
 
-/// Of what is kept over a restart.
-#[derive(Debug, Default)]
+/// Of what is kept over a restart. Clones count together.
+#[derive(Debug, Clone, Default)]
 pub(crate) struct JournalMetrics {
     pub(crate) entries: Counter,
     pub(crate) bytes: Counter,
@@ -76,16 +72,6 @@ struct Refusal {
     reason: String,
 }
 
-/// Counts from now on, for a process of this role.
-pub fn install(role: &str) -> &'static Metrics {
-    METRICS.get_or_init(|| Metrics::new(role))
-}
-
-/// Where they are wanted.
-pub(crate) fn get() -> Option<&'static Metrics> {
-    METRICS.get()
-}
-
 impl JournalMetrics {
     fn register(&self, registry: &mut Registry) {
         let JournalMetrics { entries, bytes, commits, failed } = self;
@@ -99,7 +85,8 @@ impl JournalMetrics {
 }
 
 impl Metrics {
-    fn new(role: &str) -> Metrics {
+    /// Of a daemon of this role, which has counted nothing yet.
+    pub fn new(role: &str) -> Metrics {
         let metrics = Metrics {
             registry: Registry::with_prefix("ratn"),
             calls: Family::new_with_constructor(|| Histogram::new(CALL_SECONDS)),
@@ -126,11 +113,11 @@ impl Metrics {
         if role == resource_manager || role == world_pool {
             self.journal.register(&mut self.registry);
         }
+        let registry = &mut self.registry;
+        registry.register("refusals", "What was asked for and refused", self.refusals.clone());
         if role != resource_manager {
             return self;
         }
-        let registry = &mut self.registry;
-        registry.register("refusals", "Changes that were asked for and refused", self.refusals.clone());
         registry.register("grants", "Leases that were granted", self.grants.clone());
         let help = "Time from an acquire's arrival to its grant";
         registry.register_with_unit("queue_wait", help, Unit::Seconds, self.queue_wait.clone());
@@ -155,7 +142,7 @@ impl Metrics {
         self.queue_wait.observe(waited.as_secs_f64());
     }
 
-    /// A change was refused for one of this system's reasons.
+    /// Something was refused for one of this system's reasons.
     pub(crate) fn refused(&self, operation: &'static str, reason: String) {
         self.refusals.get_or_create(&Refusal { operation, reason }).inc();
     }

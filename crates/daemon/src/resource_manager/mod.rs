@@ -22,12 +22,14 @@ mod wire;
 
 pub use config::ResourceManagerConfig;
 
+use crate::metrics::Metrics;
 use crate::standby::Place;
 use anyhow::Context;
 use ratn_model::resource::Lease;
 use ratn_proto::v1::resource_service_server::ResourceServiceServer;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving};
+use std::sync::Arc;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -46,10 +48,11 @@ pub async fn run(
     directory: RuntimeDirectory,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    run_as(watch::Sender::new(config).subscribe(), directory, Serving::default(), shutdown).await
+    let (live, metrics) = (watch::Sender::new(config).subscribe(), Arc::new(Metrics::new(ROLE)));
+    run_as(live, directory, Serving::default(), metrics, shutdown).await
 }
 
-/// As [`run`], served as its host wants it. Of a config that changes its bounds are taken over.
+/// As [`run`], served and counted as its host wants it. Of a config that changes its bounds are taken over.
 ///
 /// # Errors
 /// As [`run`].
@@ -57,6 +60,7 @@ pub async fn run_as(
     live: watch::Receiver<ResourceManagerConfig>,
     directory: RuntimeDirectory,
     serving: Serving,
+    metrics: Arc<Metrics>,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
     let config = live.borrow().clone();
@@ -70,12 +74,13 @@ pub async fn run_as(
         serving: &serving,
     };
     let Some(((pool, journal), bound)) = place.take(open, &shutdown).await? else { return Ok(()) };
-    let kept = (pool.with_kinds(config.hierarchy()), journal);
+    let kept = (pool.with_kinds(config.hierarchy()), journal.counting(&metrics.journal));
     let endpoint = bound.endpoint().clone();
     let over = CancellationToken::new();
     let _over = over.clone().drop_guard();
-    let (actor, ended) = actor::start(live, kept, shutdown.clone(), serving.vitals.clone(), over.clone())?;
-    let service = ResourceServiceServer::new(service::Service::new(actor, shutdown.clone()))
+    let (actor, ended) =
+        actor::start(live, kept, shutdown.clone(), serving.vitals.clone(), metrics.clone(), over.clone())?;
+    let service = ResourceServiceServer::new(service::Service::new(actor, shutdown.clone(), metrics))
         .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;

@@ -8,7 +8,7 @@ use super::{Granted, wire};
 use crate::access::{Caller, speaker};
 use crate::audit::{self, Mutation};
 use crate::details::{self, ending, retry_later, status};
-use crate::metrics;
+use crate::metrics::Metrics;
 use crate::paging::{self, Filled, Page};
 use crate::quota::Quotas;
 use futures::{Stream, StreamExt};
@@ -49,13 +49,19 @@ pub(super) struct Service {
     pub(super) actor: Handle,
     shutdown: CancellationToken,
     next_ticket: Arc<AtomicU64>,
+    pub(super) metrics: Arc<Metrics>,
 }
 
 type Streamed<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 impl Service {
-    pub(super) fn new(actor: Handle, shutdown: CancellationToken) -> Service {
-        Service { actor, shutdown, next_ticket: Arc::default() }
+    pub(super) fn new(actor: Handle, shutdown: CancellationToken, metrics: Arc<Metrics>) -> Service {
+        Service { actor, shutdown, next_ticket: Arc::default(), metrics }
+    }
+
+    /// A refusal is counted by its reason.
+    fn counted<T>(&self, operation: &'static str, outcome: Result<T, Status>) -> Result<T, Status> {
+        outcome.inspect_err(|status| self.metrics.refused(operation, details::reason(status)))
     }
 
     async fn perform(&self, caller: &Caller, request_id: String, request: PoolRequest) -> Result<(Reply, u64), Status> {
@@ -77,9 +83,35 @@ impl Service {
             .await
             .and_then(|done| done);
         pending.ended(&performed);
-        counted(operation, &performed);
-        let (reply, revision) = performed?;
+        let (reply, revision) = self.counted(operation, performed)?;
         Ok((reply, revision.0))
+    }
+
+    pub(super) async fn kept_alive(
+        &self,
+        caller: &Caller,
+        ping: v1::KeepAliveRequest,
+    ) -> Result<v1::KeepAliveResponse, Status> {
+        let session = session(&ping.session_id)?;
+        label(&ping.client, "client")?;
+        let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };
+        let ttl = Duration::from_millis(ping.ttl_ms);
+        let (named, id) = (client.clone(), ping.session_id.clone());
+        let kept = self.actor.keep_alive(speaker(caller), session, client, ttl).await;
+        // Pings that change nothing are not written down.
+        if ttl.is_zero() {
+            audit::begin(caller, "", || Mutation::CloseSession { session: id }).ended(&kept);
+        } else if kept.as_ref().map_or(true, |kept| kept.created) {
+            let open = || Mutation::OpenSession { session: id, client: named, ttl_ms: ping.ttl_ms };
+            audit::begin(caller, "", open).ended(&kept);
+        }
+        let kept = self.counted("keep_alive", kept)?;
+        Ok(v1::KeepAliveResponse {
+            session_id: ping.session_id,
+            ttl_ms: u64::try_from(kept.ttl.as_millis()).unwrap_or(u64::MAX),
+            created: kept.created,
+            revision: kept.revision.0,
+        })
     }
 
     async fn wait_for_grant(
@@ -92,12 +124,11 @@ impl Service {
         let pending = audit::begin(caller, &request_id, || mutation_of_acquire(&request));
         let began = Instant::now();
         let granted = self.granted(caller, request_id, request, wait_ms).await;
-        if let (Ok(_), Some(metrics)) = (&granted, metrics::get()) {
-            metrics.granted(began.elapsed());
+        if granted.is_ok() {
+            self.metrics.granted(began.elapsed());
         }
         pending.ended_with(&granted, |lease| Some(lease.token));
-        counted("acquire", &granted);
-        granted
+        self.counted("acquire", granted)
     }
 
     async fn granted(
@@ -263,8 +294,7 @@ impl v1::resource_service_server::ResourceService for Service {
             .await
             .and_then(|done| done);
         pending.ended(&withdrawn);
-        counted("withdraw", &withdrawn);
-        let withdrawn = withdrawn?;
+        let withdrawn = self.counted("withdraw", withdrawn)?;
         Ok(Response::new(v1::WithdrawResponse { withdrawn }))
     }
 
@@ -364,8 +394,8 @@ impl v1::resource_service_server::ResourceService for Service {
             attributes: ports(request.attributes, "attributes")?,
         };
         let speaker = speaker(&caller);
-        let mut demand =
-            self.actor.ask(|answer| Message::WatchDemand { speaker, session, provisions, answer }).await??;
+        let demand = self.actor.ask(|answer| Message::WatchDemand { speaker, session, provisions, answer }).await;
+        let mut demand = self.counted("watch_demand", demand.and_then(|watch| watch))?;
         demand.mark_changed();
         let stream = futures::stream::unfold(demand, async |mut demand| {
             demand.changed().await.ok()?;
@@ -395,7 +425,7 @@ impl v1::resource_service_server::ResourceService for Service {
         let report = |answer| Message::ReportShortage { speaker, session, kind, most, reason, answer };
         let reported = self.actor.ask(report).await.and_then(|done| done);
         pending.ended(&reported);
-        reported?;
+        self.counted("report_shortage", reported)?;
         Ok(Response::new(v1::ReportShortageResponse {}))
     }
 
@@ -444,7 +474,7 @@ impl v1::resource_service_server::ResourceService for Service {
             resources: request.resource_ids.into_iter().collect(),
         });
         let watch = |answer| Message::Watch { after, filter: filter.clone(), answer };
-        let updates = self.actor.ask(watch).await??;
+        let updates = self.counted("watch", self.actor.ask(watch).await.and_then(|watch| watch))?;
         let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
             .flat_map(move |told| futures::stream::iter(told.updates(&filter, after)))
             .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)))
@@ -472,8 +502,7 @@ impl v1::resource_service_server::ResourceService for Service {
         let (caller, quotas) = (Caller::of(&request), request.extensions().get::<Quotas>().cloned());
         let mut pings = request.into_inner();
         let (sender, answers) = mpsc::channel(KEEP_ALIVE_BUFFER);
-        let actor = self.actor.clone();
-        let shutdown = self.shutdown.clone();
+        let (service, shutdown) = (self.clone(), self.shutdown.clone());
         tokio::spawn(async move {
             loop {
                 let ping = tokio::select! {
@@ -483,7 +512,7 @@ impl v1::resource_service_server::ResourceService for Service {
                 let Ok(Some(ping)) = ping else { return };
                 let permit = quotas.as_ref().map(|quotas| quotas.admit(&caller, PING, Instant::now())).transpose();
                 let answer = match permit {
-                    Ok(_permit) => kept_alive(&actor, &caller, ping).await,
+                    Ok(_permit) => service.kept_alive(&caller, ping).await,
                     Err(refused) => Err(refused),
                 };
                 let failed = answer.is_err();
@@ -503,33 +532,6 @@ impl v1::resource_service_server::ResourceService for Service {
         let calls = CallerService::new(self.clone(), Caller::of(&request), quotas);
         Ok(Response::new(Answers::new(calls, request.into_inner(), Some(self.shutdown.clone()))))
     }
-}
-
-pub(super) async fn kept_alive(
-    actor: &Handle,
-    caller: &Caller,
-    ping: v1::KeepAliveRequest,
-) -> Result<v1::KeepAliveResponse, Status> {
-    let session = session(&ping.session_id)?;
-    label(&ping.client, "client")?;
-    let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };
-    let ttl = Duration::from_millis(ping.ttl_ms);
-    let (named, id) = (client.clone(), ping.session_id.clone());
-    let kept = actor.keep_alive(speaker(caller), session, client, ttl).await;
-    // Pings that change nothing are not written down.
-    if ttl.is_zero() {
-        audit::begin(caller, "", || Mutation::CloseSession { session: id }).ended(&kept);
-    } else if kept.as_ref().map_or(true, |kept| kept.created) {
-        let open = || Mutation::OpenSession { session: id, client: named, ttl_ms: ping.ttl_ms };
-        audit::begin(caller, "", open).ended(&kept);
-    }
-    let kept = kept?;
-    Ok(v1::KeepAliveResponse {
-        session_id: ping.session_id,
-        ttl_ms: u64::try_from(kept.ttl.as_millis()).unwrap_or(u64::MAX),
-        created: kept.created,
-        revision: kept.revision.0,
-    })
 }
 
 /// A snapshot in messages that are not too large; anything else as it is.
@@ -564,13 +566,6 @@ fn session(id: &str) -> Result<SessionId, Status> {
 /// Without a session a call speaks for the operator.
 fn optional_session(id: &str) -> Result<Option<SessionId>, Status> {
     (!id.is_empty()).then(|| session(id)).transpose()
-}
-
-/// A refusal is counted by its reason.
-fn counted<T>(operation: &'static str, outcome: &Result<T, Status>) {
-    if let (Err(status), Some(metrics)) = (outcome, metrics::get()) {
-        metrics.refused(operation, details::reason(status));
-    }
 }
 
 /// What the audit log says of a request.
@@ -619,6 +614,10 @@ mod tests {
     use ratn_resources::Speaker;
     use tokio::sync::watch;
 
+    fn metrics() -> Arc<Metrics> {
+        Arc::new(Metrics::new(super::super::ROLE))
+    }
+
     #[tokio::test]
     async fn a_lease_that_two_calls_of_one_request_got_goes_back_when_both_are_dropped() {
         let (config, directory) = (ResourceManagerConfig::default(), tempfile::tempdir().unwrap());
@@ -629,6 +628,7 @@ mod tests {
             kept,
             Default::default(),
             Default::default(),
+            metrics(),
             Default::default(),
         )
         .unwrap();
@@ -663,7 +663,7 @@ mod tests {
         let kept = journal::open(&config.storage, Arc::new(log), config.limits.clone()).unwrap();
         let signals = watch::Sender::new(config).subscribe();
         let (actor, _) =
-            actor::start(signals, kept, Default::default(), Default::default(), Default::default()).unwrap();
+            actor::start(signals, kept, Default::default(), Default::default(), metrics(), Default::default()).unwrap();
         let session = SessionId::from("s");
         actor.keep_alive(Speaker::trusted(), session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
         let create = PoolRequest::Create { session: None, spec: ResourceSpec::new(ResourceClass::Module, "Arm") };
@@ -734,7 +734,7 @@ mod tests {
         let kept = journal::open(&config.storage, Arc::new(log), config.limits.clone()).unwrap();
         let signals = watch::Sender::new(config).subscribe();
         let (actor, _) =
-            actor::start(signals, kept, Default::default(), Default::default(), Default::default()).unwrap();
+            actor::start(signals, kept, Default::default(), Default::default(), metrics(), Default::default()).unwrap();
         let speaker = || Speaker::trusted();
         let ping = async |session: &str, ttl_s| {
             let ttl = Duration::from_secs(ttl_s);

@@ -2,11 +2,10 @@
 //! unary calls do; so does one of which the client says that it dropped it, also when its answer was under way to the client.
 
 use super::actor::Message;
-use super::service::{Service, kept_alive};
+use super::service::Service;
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
 use crate::details::{retry_later, status};
-use crate::metrics;
 use crate::quota::Quotas;
 use futures::StreamExt;
 use futures::stream::once;
@@ -32,6 +31,9 @@ const WITHDRAW: &str = "/ratn.v1.ResourceService/Withdraw";
 
 /// Grants of a stream that are known by the ids of their calls: more than can be under way to a client that reads.
 const GRANTS: usize = 4_096;
+
+/// The reason of a refusal for the number of calls.
+const TOO_MANY: &str = "TOO_MANY";
 
 /// What performs the calls of one caller.
 #[derive(Debug)]
@@ -113,8 +115,9 @@ impl Serve<SessionCalls> for CallerService {
     }
 
     fn too_many(&self) -> Status {
+        self.service.metrics.refused("call", TOO_MANY.to_owned());
         let message = format!("{} calls are under way on this stream: wait for answers", Self::MAX_CALLS);
-        retry_later(Code::ResourceExhausted, "TOO_MANY", message, RETRY_DELAY)
+        retry_later(Code::ResourceExhausted, TOO_MANY, message, RETRY_DELAY)
     }
 }
 
@@ -134,17 +137,16 @@ async fn measured(
     };
     caller.admit(path)?;
     let _permit = quotas.map(|quotas| quotas.admit(&caller, path, began)).transpose()?;
+    let metrics = service.metrics.clone();
     let answered = performed(service, caller, call).await;
-    if let Some(metrics) = metrics::get() {
-        let code = answered.as_ref().map_or_else(Status::code, |_| Code::Ok);
-        metrics.call(path, code, began.elapsed());
-    }
+    let code = answered.as_ref().map_or_else(Status::code, |_| Code::Ok);
+    metrics.call(path, code, began.elapsed());
     answered
 }
 
 async fn performed(service: Service, caller: Caller, call: Option<Asked>) -> Result<Kind, Status> {
     Ok(match call {
-        Some(Asked::KeepAlive(ping)) => Kind::KeepAlive(kept_alive(&service.actor, &caller, ping).await?),
+        Some(Asked::KeepAlive(ping)) => Kind::KeepAlive(service.kept_alive(&caller, ping).await?),
         Some(Asked::Block(block)) => Kind::Block(service.block(caller.request(block)).await?.into_inner()),
         Some(Asked::Acquire(acquire)) => Kind::Acquire(service.acquire(caller.request(acquire)).await?.into_inner()),
         Some(Asked::Release(release)) => Kind::Release(service.release(caller.request(release)).await?.into_inner()),

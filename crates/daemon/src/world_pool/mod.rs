@@ -26,6 +26,7 @@ pub use config::WorldPoolConfig;
 use crate::config::Durability;
 use crate::durable_actor::{Journal, JournalError, floor};
 use crate::link::{LINK, Link, Manager};
+use crate::metrics::Metrics;
 use crate::standby::Place;
 use anyhow::Context;
 use history::History;
@@ -56,10 +57,10 @@ pub async fn run(
     directory: RuntimeDirectory,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    run_as(config, directory, Serving::default(), shutdown).await
+    run_as(config, directory, Serving::default(), Arc::new(Metrics::new(ROLE)), shutdown).await
 }
 
-/// As [`run`], served as its host wants it.
+/// As [`run`], served and counted as its host wants it.
 ///
 /// # Errors
 /// As [`run`].
@@ -67,6 +68,7 @@ pub async fn run_as(
     config: WorldPoolConfig,
     directory: RuntimeDirectory,
     serving: Serving,
+    metrics: Arc<Metrics>,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
     let ontology = config.ontology.as_deref().map(ontology).transpose()?;
@@ -79,7 +81,8 @@ pub async fn run_as(
         serving: &serving,
     };
     let open = move |store| open(&kept_as, store);
-    let Some((kept, bound)) = place.take(open, &shutdown).await? else { return Ok(()) };
+    let Some(((history, journal), bound)) = place.take(open, &shutdown).await? else { return Ok(()) };
+    let kept = (history, journal.counting(&metrics.journal));
     let endpoint = bound.endpoint().clone();
     let manager = Manager { configured: config.resource_manager.clone(), directory: directory.clone() };
     let room = Resource::new(format!("world-model@{}", config.host), ResourceClass::World, &config.kind)

@@ -200,7 +200,8 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let projection = ProjectionId(request.into_inner().projection_id);
         let validity = self.actor.request(|answer| Message::WatchProjection { projection, answer }).await?;
         let told = tokio_stream::wrappers::WatchStream::new(validity).map(|contradiction| {
-            Ok(v1::WatchProjectionResponse { contradiction: contradiction.map(v1::Contradiction::from) })
+            let told = v1::WatchProjectionResponse { contradiction: contradiction.map(v1::Contradiction::from) };
+            paging::whole(told, "the contradiction", "query the fact in the projection and in the root")
         });
         Ok(Response::new(Box::pin(told.take_until(self.shutdown.clone().cancelled_owned()))))
     }
@@ -254,7 +255,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let bases: Result<Vec<Digest>, Malformed> = request.bases.iter().map(|base| digest(base, "bases")).collect();
         let bases = bases?;
         let scene = self.actor.request(|answer| Message::Scene { projection, bases, answer }).await?;
-        Ok(Response::new(scene.into()))
+        Ok(Response::new(paging::whole(scene.into(), "the scene", "make a projection that reads less of it")?))
     }
 
     async fn release(

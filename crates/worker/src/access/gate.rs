@@ -128,7 +128,7 @@ fn read(path: &Path) -> Result<AccessConfig, AccessError> {
     }
 }
 
-/// Admits by the table of [`super::TABLE`], and leaves the [`Caller`] in the request. Who runs the process, and root, are operators over
+/// Admits by the table of [`super::TABLE`]. Who runs the process, and root, are operators over
 /// its Unix socket.
 #[derive(Debug, Clone)]
 pub struct RoleGate {
@@ -150,11 +150,12 @@ impl Default for RoleGate {
 }
 
 impl Gate for RoleGate {
-    fn admit(&self, identity: &Identity, path: &str, extensions: &mut http::Extensions) -> Result<(), Status> {
-        let caller = self.access.caller(identity, self.own_uid);
-        caller.admit(path)?;
-        extensions.insert(caller);
-        Ok(())
+    fn caller(&self, identity: &Identity) -> Caller {
+        self.access.caller(identity, self.own_uid)
+    }
+
+    fn admit(&self, caller: &Caller, path: &str, _: &mut http::Extensions) -> Result<(), Status> {
+        caller.admit(path)
     }
 
     fn answered(&self, _: &str, _: Code, _: Duration) {}

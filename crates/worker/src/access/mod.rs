@@ -55,9 +55,12 @@ pub const TABLE: [(Operation, &[Role]); 12] = [
     (Administer, &[Operator]),
 ];
 
+/// How a process is asked whether it serves.
+pub const HEALTH_CHECK: &str = "/grpc.health.v1.Health/Check";
+
 /// The methods of gRPC's own that every server has.
 const OF_GRPC: [&str; 4] = [
-    "/grpc.health.v1.Health/Check",
+    HEALTH_CHECK,
     "/grpc.health.v1.Health/List",
     "/grpc.health.v1.Health/Watch",
     "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo",

@@ -152,7 +152,7 @@ impl ActionClient {
     }
 
     fn client(&self, endpoint: &Endpoint) -> Result<ActionServiceClient<Traced>, CallError> {
-        Ok(ActionServiceClient::new(self.channels.traced(endpoint)?)
+        Ok(ActionServiceClient::new(self.channels.get(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES))
     }

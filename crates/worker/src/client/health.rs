@@ -2,8 +2,8 @@
 
 use super::CallError;
 use crate::endpoint::{Endpoint, connect_to_ask};
+use crate::trace::Traced;
 use std::time::Duration;
-use tonic::transport::Channel;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
@@ -18,7 +18,7 @@ pub const NOT_SERVING: &str = "its health is not SERVING";
 #[derive(Debug, Clone)]
 pub struct Health {
     endpoint: Endpoint,
-    client: Option<HealthClient<Channel>>,
+    client: Option<HealthClient<Traced>>,
 }
 
 impl Health {

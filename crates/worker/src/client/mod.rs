@@ -24,7 +24,6 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
-use tonic::transport::Channel;
 
 /// So many channels are kept; beyond it all are forgotten and made anew as they are needed.
 const MAX_CHANNELS: usize = 256;
@@ -36,7 +35,7 @@ const MAX_STREAMS: usize = 256;
 /// broke.
 #[derive(Debug, Clone, Default)]
 pub struct Channels {
-    kept: Arc<Mutex<BTreeMap<Endpoint, Channel>>>,
+    kept: Arc<Mutex<BTreeMap<Endpoint, Traced>>>,
     goals: Arc<Mutex<BTreeMap<Endpoint, Multiplexer<GoalCalls>>>>,
 }
 
@@ -46,11 +45,11 @@ impl Channels {
         Channels::default()
     }
 
-    /// The channel to `endpoint`. Needs a tokio runtime.
+    /// The channel to `endpoint`: its calls carry the trace of the task that makes them, and say the protocol. Needs a tokio runtime.
     ///
     /// # Errors
     /// [`CallError::Broken`] when the endpoint makes no URI.
-    pub fn get(&self, endpoint: &Endpoint) -> Result<Channel, CallError> {
+    pub fn get(&self, endpoint: &Endpoint) -> Result<Traced, CallError> {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(channel) = kept.get(endpoint) {
             return Ok(channel.clone());
@@ -62,14 +61,6 @@ impl Channels {
             .map_err(|error| CallError::Broken { endpoint: endpoint.clone(), reason: chain(&error) })?;
         kept.insert(endpoint.clone(), channel.clone());
         Ok(channel)
-    }
-
-    /// As [`Channels::get`]; the calls over it carry the trace of the task that makes them.
-    ///
-    /// # Errors
-    /// As [`Channels::get`].
-    pub fn traced(&self, endpoint: &Endpoint) -> Result<Traced, CallError> {
-        self.get(endpoint).map(Traced::new)
     }
 
     /// The stream of the goals that are given to the provider at `endpoint`.

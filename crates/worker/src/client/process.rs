@@ -36,7 +36,7 @@ impl ProcessClient {
     /// # Errors
     /// As [`Channels::get`].
     pub fn new(channels: &Channels, endpoint: &Endpoint) -> Result<ProcessClient, CallError> {
-        let client = ProcessServiceClient::new(channels.traced(endpoint)?);
+        let client = ProcessServiceClient::new(channels.get(endpoint)?);
         Ok(ProcessClient { endpoint: endpoint.clone(), client })
     }
 

@@ -76,7 +76,7 @@ impl ResourceClient {
     /// # Errors
     /// As [`Channels::get`].
     pub fn new(channels: &Channels, endpoint: &Endpoint, session: &str) -> Result<ResourceClient, CallError> {
-        let client = ResourceServiceClient::new(channels.traced(endpoint)?)
+        let client = ResourceServiceClient::new(channels.get(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         let (endpoint, session, calls) = (endpoint.clone(), session.to_owned(), Multiplexer::default());

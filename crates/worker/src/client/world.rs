@@ -115,7 +115,7 @@ impl WorldClient {
     /// # Errors
     /// As [`Channels::get`].
     pub fn new(channels: &Channels, endpoint: &Endpoint) -> Result<WorldClient, CallError> {
-        let client = WorldPoolServiceClient::new(channels.traced(endpoint)?)
+        let client = WorldPoolServiceClient::new(channels.get(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         Ok(WorldClient { endpoint: endpoint.clone(), client })

@@ -328,7 +328,7 @@ impl SafetyClient {
     /// # Errors
     /// Where the endpoint is none.
     pub fn new(channels: &Channels, endpoint: &Endpoint) -> Result<SafetyClient, CallError> {
-        let client = SafetyServiceClient::new(channels.traced(endpoint)?);
+        let client = SafetyServiceClient::new(channels.get(endpoint)?);
         Ok(SafetyClient { client, endpoint: endpoint.clone() })
     }
 

@@ -39,6 +39,9 @@ pub struct Panic;
 /// `trace`: says of which trace it is.
 pub struct Trace;
 
+/// `fill`: has as many bytes of text as x says; the length of its own text is in the reason.
+pub struct Fill;
+
 /// `relay`: has the lease's Doubler double x.
 pub struct Relay;
 
@@ -109,6 +112,19 @@ impl Action for Trace {
     async fn execute(&self, _: GoalContext) -> ActionResult {
         let context = ratn_worker::trace::current().map_or_else(String::new, |context| context.to_string());
         Ok(GoalOutcome::success().with_output("trace", Value::String(context)))
+    }
+}
+
+#[tonic::async_trait]
+impl Action for Fill {
+    fn name(&self) -> &str {
+        "fill"
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        let (bytes, heard) = (goal.input_float("x")?, goal.input_string("text").map_or(0, str::len));
+        let outcome = GoalOutcome::success().with_output("text", Value::String("x".repeat(bytes as usize)));
+        Ok(GoalOutcome { reason: heard.to_string(), ..outcome })
     }
 }
 
@@ -188,6 +204,7 @@ pub async fn provider_built(
         .action(Trace)
         .action(Relay)
         .action(End)
+        .action(Fill)
         .action(Ask)
         .build();
     let bound = bind(&listen).await.unwrap();

@@ -17,7 +17,7 @@ use super::told::Told;
 use super::{Granted, ResourceManagerConfig, status};
 use crate::details::ending;
 use crate::durable_actor::{self, Core, Desk, Journal, JournalError};
-use crate::metrics::{self, Amounts};
+use crate::metrics::{Amounts, Metrics};
 use message::{Ping, most_urgent_first};
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Lease;
@@ -25,6 +25,7 @@ use ratn_model::time::Timestamp;
 use ratn_resources::{Notice, Pool, PoolError, Reply, Request, SessionId, Speaker, WaiterId};
 use ratn_worker::vitals::Vitals;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
@@ -57,6 +58,7 @@ pub(super) struct ResourceCore {
     opening: BTreeMap<SessionId, usize>,
     /// What everybody may know of.
     told: Revision,
+    metrics: Arc<Metrics>,
 }
 
 /// Starts the actor on what was kept. With `draining` everybody who waits is told to ask the successor; with `over` it ends.
@@ -65,6 +67,7 @@ pub(super) fn start(
     (pool, journal): (Pool, Journal),
     draining: CancellationToken,
     vitals: Vitals,
+    metrics: Arc<Metrics>,
     over: CancellationToken,
 ) -> Result<(Handle, JoinHandle<()>), JournalError> {
     let core = ResourceCore {
@@ -79,6 +82,7 @@ pub(super) fn start(
         demand: Vec::new(),
         providers: Providers::new(live.borrow().provider_patience()),
         opening: BTreeMap::new(),
+        metrics,
     };
     durable_actor::start(core, journal, live, vitals, draining, over)
 }
@@ -311,9 +315,8 @@ impl Core for ResourceCore {
         if desk.may_speak() {
             self.spread_demand(desk);
         }
-        let Some(metrics) = metrics::get() else { return };
         let [resources, sessions, leases, waiters] = self.pool.amounts();
-        metrics.set(Amounts { resources, sessions, leases, waiters, watchers: desk.watchers.len() });
+        self.metrics.set(Amounts { resources, sessions, leases, waiters, watchers: desk.watchers.len() });
     }
 }
 
