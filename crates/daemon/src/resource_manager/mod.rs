@@ -1,7 +1,7 @@
 //! The resource manager: owns every resource of a system, and says who has what.
 //!
 //! ```text
-//!   gRPC call ──▶ service.rs ──message──▶ actor (Pool of ratn-resources, a clock) ──answer, event──▶ service.rs
+//!   gRPC call ──▶ service/ ──message──▶ actor (Pool of ratn-resources, a clock) ──answer, event──▶ service/
 //!   session's stream ──▶ stream.rs, whose every message is such a call
 //!   durable_actor ──records──▶ journal.rs (ratn-storage) ──durable──▶ outbox ──▶ what tells of them leaves
 //! ```

@@ -1,7 +1,6 @@
 //! The calls of a session's stream, each as if it had come on its own, from the stream's caller. Dropped, they leave the queue as
 //! unary calls do; so does one of which the client says that it dropped it, also when its answer was under way to the client.
 
-use super::actor::Message;
 use super::service::Service;
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
@@ -102,7 +101,7 @@ impl Serve<SessionCalls> for CallerService {
         }
         let mut withdrawn = end();
         if !withdrawn && let Some(lease) = self.grants.leases.remove(&ended) {
-            self.service.actor.send_later(Message::Return { lease });
+            self.service.return_later(lease);
             audit::begin(&self.caller, &request_id, || Mutation::Withdraw { session: session_id }).ended(&Ok(()));
             withdrawn = true;
         }
@@ -115,7 +114,7 @@ impl Serve<SessionCalls> for CallerService {
     }
 
     fn too_many(&self) -> Status {
-        self.service.metrics.refused("call", TOO_MANY.to_owned());
+        self.service.metrics().refused("call", TOO_MANY.to_owned());
         let message = format!("{} calls are under way on this stream: wait for answers", Self::MAX_CALLS);
         retry_later(Code::ResourceExhausted, TOO_MANY, message, RETRY_DELAY)
     }
@@ -137,7 +136,7 @@ async fn measured(
     };
     caller.admit(path)?;
     let _permit = quotas.map(|quotas| quotas.admit(&caller, path, began)).transpose()?;
-    let metrics = service.metrics.clone();
+    let metrics = service.metrics().clone();
     let answered = performed(service, caller, call).await;
     let code = answered.as_ref().map_or_else(Status::code, |_| Code::Ok);
     metrics.call(path, code, began.elapsed());

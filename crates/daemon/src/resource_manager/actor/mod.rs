@@ -10,7 +10,7 @@ mod looks;
 mod message;
 mod watchers;
 
-pub(super) use message::{Handle, KeptAlive, Message};
+pub(super) use message::{Answer, Handle, KeptAlive, Message};
 
 use super::providers::Providers;
 use super::told::Told;

@@ -1,0 +1,41 @@
+//! Calls that end a lease: a release, and the confirmation that a machine stands still.
+
+use super::requests::{Requests, odd_reply, optional_session};
+use crate::access::Caller;
+use crate::resource_manager::actor::Message;
+use ratn_model::id::LeaseId;
+use ratn_proto::convert::name;
+use ratn_proto::v1;
+use ratn_resources::{Reply, Request};
+use tonic::{Code, Status};
+
+pub(super) async fn release(
+    requests: &Requests,
+    caller: &Caller,
+    request: v1::ResourceServiceReleaseRequest,
+) -> Result<v1::ResourceServiceReleaseResponse, Status> {
+    let session = optional_session(&request.session_id)?;
+    let release = Request::Release { session, lease: LeaseId(request.lease_id) };
+    let (released, revision) = match requests.perform(caller, request.request_id, release).await {
+        Ok((_, revision)) => (true, revision),
+        Err(status) if status.code() == Code::NotFound => {
+            (false, requests.actor().ask(|answer| Message::Revision { answer }).await?.0)
+        }
+        Err(status) => return Err(status),
+    };
+    Ok(v1::ResourceServiceReleaseResponse { released, revision })
+}
+
+pub(super) async fn confirm_standstill(
+    requests: &Requests,
+    caller: &Caller,
+    request: v1::ConfirmStandstillRequest,
+) -> Result<v1::ConfirmStandstillResponse, Status> {
+    name(&request.resource_id, "resource_id")?;
+    let session = optional_session(&request.session_id)?;
+    let (lease, resource) = (LeaseId(request.lease_id), request.resource_id);
+    let confirm = Request::ConfirmStandstill { session, lease, resource };
+    let (reply, revision) = requests.perform(caller, request.request_id, confirm).await?;
+    let Reply::Touched(freed) = reply else { return Err(odd_reply(&reply)) };
+    Ok(v1::ConfirmStandstillResponse { freed: !freed.is_empty(), revision })
+}

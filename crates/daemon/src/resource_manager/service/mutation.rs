@@ -1,0 +1,34 @@
+//! What the audit log says of a request to the pool.
+
+use crate::audit::{self, Mutation};
+use ratn_resources::{AcquireRequest, Request};
+
+pub(super) fn of(request: &Request) -> Mutation {
+    let session = request.session().map(|session| session.as_str().to_owned()).unwrap_or_default();
+    match request {
+        Request::Create { spec, .. } => Mutation::Create {
+            session,
+            resource: spec.id.clone().unwrap_or_default(),
+            kind: spec.kind.clone(),
+            class: spec.class.to_string(),
+        },
+        Request::Consume { requirement, .. } => Mutation::Consume { session, requirement: requirement.to_string() },
+        Request::Delete { id, .. } => Mutation::Delete { session, target: id.clone() },
+        Request::DeleteUnits { requirement, .. } => Mutation::Delete { session, target: requirement.to_string() },
+        Request::Release { lease, .. } => Mutation::Release { session, lease: lease.0 },
+        Request::ConfirmStandstill { lease, resource, .. } => {
+            Mutation::ConfirmStandstill { session, lease: lease.0, resource: resource.clone() }
+        }
+        Request::EndTask { .. } => Mutation::EndTask { session },
+        Request::Acquire(acquire) => of_acquire(acquire),
+    }
+}
+
+pub(super) fn of_acquire(acquire: &AcquireRequest) -> Mutation {
+    Mutation::Acquire {
+        session: acquire.session.as_str().to_owned(),
+        requirements: acquire.requirements.iter().map(|requirement| audit::cut(&requirement.to_string())).collect(),
+        holder: acquire.purpose.clone(),
+        priority: acquire.priority,
+    }
+}

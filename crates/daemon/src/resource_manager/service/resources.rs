@@ -1,0 +1,135 @@
+//! Calls on the resources themselves: create, consume, delete, and reading them.
+
+use super::requests::{Requests, odd_reply, optional_session, session};
+use crate::access::Caller;
+use crate::details::status;
+use crate::paging::{Filled, Page};
+use crate::resource_manager::actor::Message;
+use crate::resource_manager::wire;
+use ratn_model::resource::Requirement;
+use ratn_proto::convert::{label, name, required};
+use ratn_proto::types::{Resource, ResourceFilter};
+use ratn_proto::v1;
+use ratn_resources::{Reply, Request, ResourceSpec};
+use tonic::{Code, Status};
+
+/// Resources that are looked at in one turn for a list.
+const LISTED_AT_ONCE: usize = 4_096;
+/// Ids that an answer names.
+const MOST_IDS: usize = 1_000;
+
+pub(super) async fn create(
+    requests: &Requests,
+    caller: &Caller,
+    request: v1::CreateRequest,
+) -> Result<v1::CreateResponse, Status> {
+    let resource: Resource = required(request.resource, "resource")?;
+    if !caller.may_create(resource.class) {
+        let message = format!("{caller} may not create resources of the class {}", resource.class);
+        return Err(status(Code::PermissionDenied, "ROLE_MISSING", message));
+    }
+    let spec = ResourceSpec {
+        id: Some(resource.id).filter(|id| !id.is_empty()),
+        class: resource.class,
+        kind: resource.kind,
+        attributes: resource.attributes,
+        capacity: resource.capacity,
+        divisible: resource.divisible,
+        renewable: resource.renewable,
+        host: resource.host,
+    };
+    let session = optional_session(&request.session_id)?;
+    let (reply, _) = requests.perform(caller, request.request_id, Request::Create { session, spec }).await?;
+    let Reply::Created { id, .. } = reply else { return Err(odd_reply(&reply)) };
+    let Some(view) = requests.actor().ask(|answer| Message::Get { id: id.clone(), answer }).await? else {
+        let message = format!("`{id}` was created by this request and is gone since");
+        return Err(status(Code::NotFound, "RESOURCE_UNKNOWN", message));
+    };
+    Ok(v1::CreateResponse { resource: Some(wire::resource(&view).into()) })
+}
+
+pub(super) async fn consume(
+    requests: &Requests,
+    caller: &Caller,
+    request: v1::ConsumeRequest,
+) -> Result<v1::ConsumeResponse, Status> {
+    let requirement: Requirement = required(request.requirement, "requirement")?;
+    let session = session(&request.session_id)?;
+    let consume = Request::Consume { session, requirement };
+    let (reply, revision) = requests.perform(caller, request.request_id, consume).await?;
+    let Reply::Touched(resource_ids) = reply else { return Err(odd_reply(&reply)) };
+    Ok(v1::ConsumeResponse { resource_ids, revision })
+}
+
+pub(super) async fn delete(
+    requests: &Requests,
+    caller: &Caller,
+    request: v1::DeleteRequest,
+) -> Result<v1::DeleteResponse, Status> {
+    use v1::delete_request::Target;
+    let target = request
+        .target
+        .ok_or_else(|| status(Code::InvalidArgument, "MALFORMED", "target: resource_id or requirement is missing"))?;
+    let (resource_ids, revision) = match target {
+        Target::ResourceId(id) => {
+            name(&id, "resource_id")?;
+            let session = optional_session(&request.session_id)?;
+            let delete = Request::Delete { session, id: id.clone() };
+            let (_, revision) = requests.perform(caller, request.request_id, delete).await?;
+            (vec![id], revision)
+        }
+        Target::Requirement(requirement) => {
+            let requirement = Requirement::try_from(requirement).map_err(|m| m.within("requirement"))?;
+            let delete = Request::DeleteUnits { session: session(&request.session_id)?, requirement };
+            let (reply, revision) = requests.perform(caller, request.request_id, delete).await?;
+            let Reply::Touched(ids) = reply else { return Err(odd_reply(&reply)) };
+            (ids, revision)
+        }
+    };
+    Ok(v1::DeleteResponse { resource_ids, revision })
+}
+
+pub(super) async fn exists(requests: &Requests, request: v1::ExistsRequest) -> Result<v1::ExistsResponse, Status> {
+    let requirement: Requirement = required(request.requirement, "requirement")?;
+    let wanted = requirement.count;
+    let (units, mut resource_ids) = requests.actor().ask(|answer| Message::Find { requirement, answer }).await?;
+    resource_ids.truncate(MOST_IDS);
+    Ok(v1::ExistsResponse { exists: units >= wanted, resource_ids })
+}
+
+pub(super) async fn get(
+    requests: &Requests,
+    request: v1::ResourceServiceGetRequest,
+) -> Result<v1::ResourceServiceGetResponse, Status> {
+    let id = request.resource_id;
+    name(&id, "resource_id")?;
+    let Some(view) = requests.actor().ask(|answer| Message::Get { id: id.clone(), answer }).await? else {
+        return Err(status(Code::NotFound, "RESOURCE_UNKNOWN", format!("there is no resource `{id}`")));
+    };
+    Ok(v1::ResourceServiceGetResponse { resource: Some(wire::resource(&view).into()) })
+}
+
+pub(super) async fn list(requests: &Requests, request: v1::ListRequest) -> Result<v1::ListResponse, Status> {
+    label(&request.page_token, "page_token")?;
+    let page = Page::of(request.page_bytes, &request.page_token);
+    // The token is the id of the last on the page before.
+    let mut after = request.page_token.clone();
+    let filter = ResourceFilter::try_from(request)?;
+    let (mut filled, mut first) = (Filled::default(), None);
+    loop {
+        let from = after.clone();
+        let listed = requests.actor().ask(|answer| Message::List { after: from, most: LISTED_AT_ONCE, answer });
+        let (views, revision) = listed.await?;
+        let revision = *first.get_or_insert(revision);
+        let passing = views.iter().filter(|view| wire::passes(view, &filter));
+        let more = page.fill(passing.map(|view| wire::resource(view).into()), &mut filled)?;
+        let full = filled.items.last().filter(|_| more).map(|last: &v1::Resource| last.id.clone());
+        match views.last().filter(|_| views.len() == LISTED_AT_ONCE) {
+            Some(last) if !more => after.clone_from(&last.id),
+            _ => {
+                let (resources, next_page_token) = (filled.items, full.unwrap_or_default());
+                return Ok(v1::ListResponse { resources, revision: revision.0, next_page_token });
+            }
+        }
+    }
+}

@@ -1,0 +1,143 @@
+//! Sessions: the pings that keep them alive, their list, and the end of a task.
+
+use super::Streamed;
+use super::requests::{Requests, session};
+use crate::access::{Caller, speaker};
+use crate::audit::{self, Mutation};
+use crate::paging::{Filled, Page};
+use crate::quota::Quotas;
+use crate::resource_manager::actor::Message;
+use ratn_proto::convert::label;
+use ratn_proto::v1;
+use ratn_resources::Request;
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+use tonic::{Status, Streaming};
+
+/// Answers that wait for a slow reader of a keep-alive stream.
+const KEEP_ALIVE_BUFFER: usize = 16;
+/// What a ping on a stream counts as.
+const PING: &str = "/ratn.v1.ResourceService/KeepAlive";
+
+pub(super) async fn kept_alive(
+    requests: &Requests,
+    caller: &Caller,
+    ping: v1::KeepAliveRequest,
+) -> Result<v1::KeepAliveResponse, Status> {
+    let session = session(&ping.session_id)?;
+    label(&ping.client, "client")?;
+    let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };
+    let ttl = Duration::from_millis(ping.ttl_ms);
+    let (named, id) = (client.clone(), ping.session_id.clone());
+    let kept = requests.actor().keep_alive(speaker(caller), session, client, ttl).await;
+    // Pings that change nothing are not written down.
+    if ttl.is_zero() {
+        audit::begin(caller, "", || Mutation::CloseSession { session: id }).ended(&kept);
+    } else if kept.as_ref().map_or(true, |kept| kept.created) {
+        let open = || Mutation::OpenSession { session: id, client: named, ttl_ms: ping.ttl_ms };
+        audit::begin(caller, "", open).ended(&kept);
+    }
+    let kept = requests.counted("keep_alive", kept)?;
+    Ok(v1::KeepAliveResponse {
+        session_id: ping.session_id,
+        ttl_ms: u64::try_from(kept.ttl.as_millis()).unwrap_or(u64::MAX),
+        created: kept.created,
+        revision: kept.revision.0,
+    })
+}
+
+/// Answers each ping of a stream, until the first refusal.
+pub(super) fn keep_alive(
+    requests: Requests,
+    caller: Caller,
+    quotas: Option<Quotas>,
+    mut pings: Streaming<v1::KeepAliveRequest>,
+    shutdown: CancellationToken,
+) -> Streamed<v1::KeepAliveResponse> {
+    let (sender, answers) = mpsc::channel(KEEP_ALIVE_BUFFER);
+    tokio::spawn(async move {
+        loop {
+            let ping = tokio::select! {
+                ping = pings.message() => ping,
+                () = shutdown.cancelled() => return,
+            };
+            let Ok(Some(ping)) = ping else { return };
+            let permit = quotas.as_ref().map(|quotas| quotas.admit(&caller, PING, Instant::now())).transpose();
+            let answer = match permit {
+                Ok(_permit) => kept_alive(&requests, &caller, ping).await,
+                Err(refused) => Err(refused),
+            };
+            let failed = answer.is_err();
+            if sender.send(answer).await.is_err() || failed {
+                return;
+            }
+        }
+    });
+    Box::pin(tokio_stream::wrappers::ReceiverStream::new(answers))
+}
+
+pub(super) async fn list(
+    requests: &Requests,
+    request: v1::ListSessionsRequest,
+) -> Result<v1::ListSessionsResponse, Status> {
+    let v1::ListSessionsRequest { page_bytes, page_token } = request;
+    label(&page_token, "page_token")?;
+    let sessions = requests.actor().ask(|answer| Message::Sessions { answer }).await?;
+    // The token is the id of the last on the page before.
+    let behind = sessions.into_iter().filter(|session| session.id > page_token).map(v1::SessionStatus::from);
+    let mut filled = Filled::default();
+    let more = Page::of(page_bytes, &page_token).fill(behind, &mut filled)?;
+    let last = filled.items.last().filter(|_| more).map(|session| session.session_id.clone());
+    let next_page_token = last.unwrap_or_default();
+    Ok(v1::ListSessionsResponse { sessions: filled.items, next_page_token })
+}
+
+pub(super) async fn end_task(
+    requests: &Requests,
+    caller: &Caller,
+    request: v1::EndTaskRequest,
+) -> Result<v1::EndTaskResponse, Status> {
+    let end = Request::EndTask { session: session(&request.session_id)? };
+    let (_, revision) = requests.perform(caller, request.request_id, end).await?;
+    Ok(v1::EndTaskResponse { revision })
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::super::test_actor;
+    use crate::durable_actor::slow_disk::SlowDisk;
+    use ratn_resources::{SessionId, Speaker};
+    use std::time::Duration;
+
+    #[tokio::test]
+    async fn a_ping_that_changes_nothing_is_answered_while_the_disk_hangs() {
+        let disk = SlowDisk::default();
+        let (actor, _directory) = test_actor::started(|log| log.on(disk.files()));
+        let speaker = || Speaker::trusted();
+        let ping = async |session: &str, ttl_s| {
+            let ttl = Duration::from_secs(ttl_s);
+            actor.keep_alive(speaker(), SessionId::from(session), "a".to_owned(), ttl).await.unwrap()
+        };
+        assert!(ping("a", 60).await.created && ping("c", 60).await.created);
+        let hangs = disk.hang();
+        let answered = ping("a", 60).await;
+        assert!(!answered.created, "at once, however long the disk takes");
+        let mut opened = Box::pin(ping("b", 60));
+        let mut changed = Box::pin(ping("a", 30));
+        for waits in [&mut opened, &mut changed] {
+            assert!(futures::poll!(&mut *waits).is_pending());
+        }
+        // Behind the two: it waits for the disk as they do, for the session is not on it as it is now.
+        let mut behind = Box::pin(ping("a", 30));
+        assert!(futures::poll!(&mut behind).is_pending());
+        assert!(!ping("c", 60).await.created, "the actor has taken all of them by now");
+        for waits in [&mut opened, &mut changed, &mut behind] {
+            assert!(futures::poll!(&mut *waits).is_pending());
+        }
+        drop(hangs);
+        assert!(opened.await.created);
+        assert!(!changed.await.created && !behind.await.created);
+    }
+}
