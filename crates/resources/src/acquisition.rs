@@ -197,7 +197,7 @@ impl Pool {
         self.schedule();
         match full {
             Some(full) if self.queue.get(id).is_some() => {
-                self.leave(id);
+                self.leave(id, false);
                 self.schedule();
                 Err(full)
             }
@@ -257,7 +257,7 @@ impl Pool {
 
     /// Gives a waiter what was found for it.
     pub(crate) fn grant(&mut self, id: WaiterId, taken: Vec<Units>) {
-        let Some((waiter, fingerprint)) = self.leave(id) else { return };
+        let Some((waiter, fingerprint)) = self.leave(id, true) else { return };
         self.give(id, waiter.request, waiter.request_id, fingerprint, taken);
     }
 
@@ -270,7 +270,6 @@ impl Pool {
         taken: Vec<Units>,
     ) {
         self.overtake((Reverse(request.priority), id), &taken);
-        self.granting = true;
         let (mut held, mut consumed) = (Vec::new(), Vec::new());
         for (requirement, taken) in request.requirements.iter().zip(taken) {
             if requirement.operation == ResourceOperation::Consume {
@@ -293,7 +292,6 @@ impl Pool {
             expires: None,
         };
         self.commit(Effect::LeaseGranted { lease, granted });
-        self.granting = false;
         self.remember(request_id, fingerprint, Remembered::Granted(lease));
         if let Some(lease) = self.lease(lease) {
             self.notices.push(Notice::Granted { waiter: id, lease });
@@ -309,7 +307,7 @@ impl Pool {
     }
 
     pub(crate) fn refuse(&mut self, id: WaiterId, refusal: Refusal) {
-        if self.leave(id).is_some() {
+        if self.leave(id, false).is_some() {
             self.notices.push(Notice::Refused { waiter: id, refusal });
         }
     }
@@ -330,8 +328,8 @@ impl Pool {
     }
 
     /// Takes a waiter from everywhere; with the fingerprint of its request.
-    fn leave(&mut self, id: WaiterId) -> Option<(Waiter, Fingerprint)> {
-        let waiter = self.part(id)?;
+    fn leave(&mut self, id: WaiterId, granted: bool) -> Option<(Waiter, Fingerprint)> {
+        let waiter = self.part(id, granted)?;
         if let Some(deadline) = waiter.request.deadline {
             self.timers.remove(&(deadline, Timer::Waiter(id)));
         }

@@ -77,7 +77,7 @@ impl Pool {
                 if !self.resources.insert(*slot, resource) {
                     return Err(format!("`{}` or {slot} is there already", description.id));
                 }
-                self.queue.touched(&self.resources, *slot, None, Some(&seen), false);
+                self.queue.touch(*slot, None, Some(&seen), self.resources.family(&description.kind));
                 self.last_number = (*numbered).max(self.last_number);
                 if let Some(owner) = owner {
                     let session = self.session_mut(owner)?;
@@ -101,7 +101,8 @@ impl Pool {
             Effect::ResourceDeleted { slot, reason } => {
                 let view = self.view(*slot)?;
                 let resource = self.resources.remove(*slot).ok_or_else(|| missing(*slot))?;
-                self.queue.touched(&self.resources, *slot, Some(&Seen::of(&resource)), None, false);
+                let family = self.resources.family(&resource.description.kind);
+                self.queue.touch(*slot, Some(&Seen::of(&resource)), None, family);
                 if let Some(owner) = &resource.owner {
                     let session = self.session_mut(owner)?;
                     session.provides.remove(slot);
@@ -326,7 +327,8 @@ impl Pool {
         let before = Seen::of(self.resources.get(slot)?);
         let changed = self.resources.change(slot, change)?;
         let after = Seen::of(self.resources.get(slot)?);
-        self.queue.touched(&self.resources, slot, Some(&before), Some(&after), self.granting);
+        let family = self.resources.family(&after.description.kind);
+        self.queue.touch(slot, Some(&before), Some(&after), family);
         Some(changed)
     }
 

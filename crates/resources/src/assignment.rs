@@ -16,6 +16,7 @@ use crate::resource::{Resource, Units};
 use crate::resources::Resources;
 use flow::Flow;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
+use std::cell::Cell;
 use std::iter::Peekable;
 
 /// How far the requirements of one request can be served.
@@ -25,7 +26,7 @@ pub(crate) struct Assignment {
     pub(crate) taken: Vec<Units>,
     /// Per requirement, what is missing.
     pub(crate) missing: Vec<Quantity>,
-    /// How many resources were looked at for it.
+    /// How many resources were looked at for it, those that do not fit included.
     pub(crate) looked_at: usize,
 }
 
@@ -47,24 +48,25 @@ impl Assignment {
 
     /// The maximum assignment of what is available to the requirements.
     pub(crate) fn of(resources: &Resources, available: Available<'_>, requirements: &[&Requirement]) -> Assignment {
+        let looked_at = Cell::new(0);
         let mut search = Search {
             resources,
             available,
             classes: classes(requirements),
             taken: vec![Units::new(); requirements.len()],
             missing: vec![Quantity::ZERO; requirements.len()],
-            looked_at: 0,
+            looked_at: &looked_at,
         };
         for (index, requirement) in requirements.iter().enumerate() {
             if requirement.operation == ResourceOperation::Exists {
                 search.missing[index] = requirement.count.saturating_sub(resources.quantity(requirement));
-                search.looked_at +=
-                    if resources.fits_every(requirement) { 1 } else { resources.count(&requirement.kind) };
+                let fits_every = resources.fits_every(requirement);
+                looked_at.update(|sum| sum + if fits_every { 1 } else { resources.count(&requirement.kind) });
             }
         }
         search.greedy(requirements);
         search.rearrange(requirements);
-        Assignment { taken: search.taken, missing: search.missing, looked_at: search.looked_at }
+        Assignment { taken: search.taken, missing: search.missing, looked_at: looked_at.get() }
     }
 }
 
@@ -82,7 +84,7 @@ struct Search<'a> {
     classes: Vec<Class<'a>>,
     taken: Vec<Units>,
     missing: Vec<Quantity>,
-    looked_at: usize,
+    looked_at: &'a Cell<usize>,
 }
 
 type Candidates<'a> = Box<dyn Iterator<Item = (Slot, &'a Resource)> + 'a>;
@@ -95,13 +97,12 @@ impl<'a> Search<'a> {
         // What one requirement has emptied or cannot use is not looked at again by the next of its class.
         let candidates = self.classes.iter().map(|class| self.candidates(class).peekable());
         let mut candidates: Vec<Peekable<Candidates<'a>>> = candidates.collect();
-        let (alone, mut used, mut looked_at) = (self.classes.len() == 1, Units::new(), 0);
+        let (alone, mut used) = (self.classes.len() == 1, Units::new());
         for (index, class) in classes.into_iter().enumerate() {
             let Some(class) = class else { continue };
             let (grain, mut wanted) = (self.classes[class].grain, requirements[index].count);
             while !wanted.is_zero() {
                 let Some((slot, resource)) = candidates[class].peek().copied() else { break };
-                looked_at += 1;
                 let left = self.available(slot, resource);
                 let left = left.saturating_sub(used.get(&slot).copied().unwrap_or_default()).floor_to(grain);
                 let amount = left.min(wanted);
@@ -119,8 +120,6 @@ impl<'a> Search<'a> {
             }
             self.missing[index] = wanted;
         }
-        drop(candidates);
-        self.looked_at += looked_at;
     }
 
     /// Moves what others took, where a requirement lacks something that they could have elsewhere.
@@ -133,12 +132,10 @@ impl<'a> Search<'a> {
         if classes.len() < 2 {
             return;
         }
-        let mut looked_at = 0;
         let mut flow = Flow::new(classes.iter().map(|class| class.grain).collect());
         for (at, class) in classes.iter().enumerate() {
             for (slot, resource) in self.candidates(class) {
                 flow.fits(at, slot, self.available(slot, resource));
-                looked_at += 1;
             }
         }
         flow.seal();
@@ -149,7 +146,6 @@ impl<'a> Search<'a> {
             }
         }
         let members: Vec<Vec<usize>> = classes.iter().map(|class| class.members.clone()).collect();
-        self.looked_at += looked_at;
         if !flow.improve() {
             return;
         }
@@ -207,10 +203,14 @@ impl<'a> Search<'a> {
     }
 
     fn candidates(&self, class: &Class<'a>) -> Candidates<'a> {
-        let fitting: Candidates<'a> = match self.available {
-            Available::Existing => Box::new(self.resources.fitting(class.selector)),
-            Available::Free(_) | Available::FreeTo(..) => Box::new(self.resources.free(class.selector)),
+        let kind = &class.selector.kind;
+        let of_kind: Candidates<'a> = match self.available {
+            Available::Existing => Box::new(self.resources.all_of(kind)),
+            Available::Free(_) | Available::FreeTo(..) => Box::new(self.resources.free_of(kind)),
         };
+        let (looked_at, selector) = (self.looked_at, class.selector);
+        let of_kind = of_kind.inspect(|_| looked_at.update(|sum| sum + 1));
+        let fitting = Box::new(of_kind.filter(|(_, resource)| resource.description.fits(selector)));
         if class.grain == Quantity::ONE {
             return fitting;
         }

@@ -19,6 +19,19 @@ const WORK_PER_CALL: usize = 20_000;
 /// The end of a lease at a resource takes as long as looking at so many of them.
 const WORK_PER_END: usize = 25;
 
+/// How much is done at a time, counted in resources that are looked at.
+#[derive(Debug, Clone)]
+pub(crate) struct Work {
+    pub(crate) per_turn: usize,
+    pub(crate) per_call: usize,
+}
+
+impl Default for Work {
+    fn default() -> Work {
+        Work { per_turn: WORK_PER_TURN, per_call: WORK_PER_CALL }
+    }
+}
+
 /// What ends at a moment.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Timer {
@@ -42,12 +55,12 @@ impl Pool {
 
     /// A turn: ends what has run out by `now`, then grants what became free.
     pub fn advance(&mut self, now: Timestamp) {
-        self.turn(now, WORK_PER_TURN);
+        self.turn(now, self.work.per_turn);
     }
 
     /// As [`Pool::advance`], with less that is put off. Every other method does this first.
     pub(crate) fn begin(&mut self, now: Timestamp) {
-        self.turn(now, WORK_PER_CALL);
+        self.turn(now, self.work.per_call);
     }
 
     /// Whether this turn has done its share.

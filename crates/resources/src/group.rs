@@ -1,15 +1,14 @@
 //! Who waits for what: waiters whose requirements select the same resources form a group, and groups whose resources may
-//! overlap (of one kind) a family. A change of a resource touches the groups that it fits and nobody else.
+//! overlap (of one kind) a family. A change of a resource touches the groups that it fits and nobody else (`changed.rs`).
 
 use crate::id::Slot;
 use crate::pool::Pool;
-use crate::queue::{Place, Queue, Waiter};
+use crate::queue::{Place, Waiter};
 use crate::resource::{Description, Resource, Units};
 use crate::resources::Resources;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use ratn_model::versioned;
 use std::collections::BTreeSet;
-use std::ops::Bound;
 use std::sync::Arc;
 
 /// What a requirement selects, in bytes.
@@ -23,15 +22,15 @@ pub(crate) struct Group {
     /// Hopeful ones that lack something of the family.
     pub(crate) wanting: BTreeSet<Place>,
     /// Everybody in it, by how much they want.
-    by_amount: BTreeSet<(Quantity, Place)>,
+    pub(crate) by_amount: BTreeSet<(Quantity, Place)>,
     /// Those of them with several requirements in the family: for these it is not enough to count.
-    several: BTreeSet<Place>,
+    pub(crate) several: BTreeSet<Place>,
     /// Requirements in it.
     pub(crate) members: usize,
     /// How much there is, held or not.
-    existing: Quantity,
-    /// Of which of them something is free, where not simply every resource of the kind fits.
-    free: Option<BTreeSet<Slot>>,
+    pub(crate) existing: Quantity,
+    /// Those of which something is free, and some that were, where not simply every resource of the kind fits.
+    pub(crate) free: Option<BTreeSet<Slot>>,
 }
 
 /// Groups that may want the same resources.
@@ -44,14 +43,16 @@ pub(crate) struct Family {
     pub(crate) reserving: BTreeSet<Place>,
     /// Those that must not be overtaken any more: they and all before them reserve.
     pub(crate) strict: BTreeSet<Place>,
+    /// Requirements in it of those of whom it is to be found out whether what exists would do.
+    pub(crate) doubtful: usize,
 }
 
 /// A resource before or after a change.
 #[derive(Debug, Clone)]
 pub(crate) struct Seen {
-    description: Arc<Description>,
-    free: Quantity,
-    quantity: Quantity,
+    pub(crate) description: Arc<Description>,
+    pub(crate) free: Quantity,
+    pub(crate) quantity: Quantity,
 }
 
 pub(crate) fn key(requirement: &Requirement) -> Key {
@@ -83,79 +84,35 @@ impl Group {
         resources.fits(description, &self.selector)
     }
 
+    /// Whether it knows how much exists for it, and everything of which something is free.
+    pub(crate) fn knows(&self, resources: &Resources) -> bool {
+        let known = |(slot, _)| self.free.as_ref().is_none_or(|free| free.contains(&slot));
+        self.existing == resources.quantity(&self.selector) && resources.free(&self.selector).all(known)
+    }
+
     /// Whether there is nothing left of what fits, beside what is reserved; and how many resources were looked at.
-    pub(crate) fn exhausted(&self, resources: &Resources, reserved: &Units) -> (bool, usize) {
-        let mut looked_at = 0;
+    pub(crate) fn exhausted(&mut self, resources: &Resources, reserved: &Units) -> (bool, usize) {
+        let (mut looked_at, mut taken) = (0, Vec::new());
         let mut left = |slot: &Slot| {
             looked_at += 1;
             let free = resources.get(*slot).map(Resource::free).unwrap_or_default();
+            if free.is_zero() {
+                taken.push(*slot);
+            }
             free > reserved.get(slot).copied().unwrap_or_default()
         };
         let some = match &self.free {
             Some(free) => free.iter().any(left),
             None => resources.free(&self.selector).any(|(slot, _)| left(&slot)),
         };
+        if let Some(free) = &mut self.free {
+            for slot in &taken {
+                free.remove(slot);
+            }
+        }
         (!some, looked_at)
     }
 }
-
-impl Queue {
-    /// Keeps the groups right when a resource changes. What is taken for a grant was reserved or free for it: `granted`.
-    pub(crate) fn touched(
-        &mut self,
-        resources: &Resources,
-        slot: Slot,
-        before: Option<&Seen>,
-        after: Option<&Seen>,
-        granted: bool,
-    ) {
-        if self.families.is_empty() {
-            return;
-        }
-        let Some(some) = after.or(before) else { return };
-        let Some((name, family)) = self.families.get_key_value(resources.family(&some.description.kind)) else {
-            return;
-        };
-        for key in &family.groups {
-            let Some(group) = self.groups.get_mut(key) else { continue };
-            let fitting = |seen: Option<&Seen>| {
-                let seen = seen.filter(|seen| resources.fits(&seen.description, &group.selector));
-                seen.map_or((Quantity::ZERO, Quantity::ZERO), |seen| (seen.free, seen.quantity))
-            };
-            let ((free_before, before), (free, quantity)) = (fitting(before), fitting(after));
-            if let Some(slots) = &mut group.free {
-                if free.is_zero() {
-                    slots.remove(&slot);
-                } else {
-                    slots.insert(slot);
-                }
-            }
-            let was = group.existing;
-            group.existing = was.saturating_sub(before) + quantity;
-            if was != group.existing {
-                self.demand_changed |= !self.hopeless.is_empty();
-                // Those to whom it makes a difference; of parts of units every one.
-                let (low, high) = (was.min(group.existing), was.max(group.existing));
-                let last = (Bound::Excluded((low, LAST)), Bound::Included((high, LAST)));
-                let range = if some.description.divisible { (Bound::Unbounded, Bound::Unbounded) } else { last };
-                let (waiters, more) = (&self.waiters, group.existing > was);
-                // More makes hopeful who is not, and less the other way.
-                let concerned = |place: &&Place| waiters.get(&place.1).is_some_and(|waiter| waiter.hopeful != more);
-                let by_amount = group.by_amount.range(range).map(|(_, place)| place);
-                self.doubtful.extend(by_amount.chain(&group.several).filter(concerned).copied());
-            }
-            if free > free_before {
-                self.changed.entry(name.clone()).or_default();
-                self.shared_until.remove(name);
-            } else if free < free_before && !granted {
-                self.changed.insert(name.clone(), true);
-            }
-        }
-    }
-}
-
-/// Behind every place.
-const LAST: Place = (std::cmp::Reverse(i64::MIN), crate::id::WaiterId(u64::MAX));
 
 impl Pool {
     /// Puts a waiter into the queue and its groups.
@@ -169,7 +126,8 @@ impl Pool {
                     let name = self.resources.family(&requirement.kind);
                     let known = self.queue.families.get_key_value(name);
                     let name = known.map_or_else(|| name.into(), |(name, _)| name.clone());
-                    let group = Group::new(&self.resources, requirement, Arc::clone(&name));
+                    let mut group = Group::new(&self.resources, requirement, Arc::clone(&name));
+                    self.queue.touched.as_before(&self.resources, &mut group);
                     self.queue.groups.insert(key.clone(), group);
                     self.queue.families.entry(name.clone()).or_default().groups.insert(key.clone());
                     name
@@ -187,17 +145,17 @@ impl Pool {
         }
         self.queue.order.insert(place);
         self.queue.waiters.insert(id, waiter);
-        self.queue.doubtful.insert(place);
+        self.queue.doubt(place);
     }
 
-    /// Takes a waiter from the queue and its groups. What it had reserved is free for others.
-    pub(crate) fn part(&mut self, id: crate::id::WaiterId) -> Option<Waiter> {
-        self.give_up(id);
+    /// Takes a waiter from the queue and its groups. What it had reserved is free for others, unless it gets that.
+    pub(crate) fn part(&mut self, id: crate::id::WaiterId, granted: bool) -> Option<Waiter> {
+        self.stop_wanting(id, granted);
+        let place = self.queue.get(id)?.place(id);
+        self.queue.doubt_no_more(place);
         let waiter = self.queue.waiters.remove(&id)?;
-        let place = waiter.place(id);
         self.queue.order.remove(&place);
         self.queue.ready.remove(&place);
-        self.queue.doubtful.remove(&place);
         self.queue.demand_changed |= self.queue.hopeless.remove(&place);
         for (requirement, key) in waiter.request.requirements.iter().zip(&waiter.groups) {
             let Some(group) = self.queue.groups.get_mut(key) else { continue };
@@ -212,6 +170,7 @@ impl Pool {
                 family.groups.remove(key);
                 if family.groups.is_empty() {
                     self.queue.families.remove(&group.family);
+                    self.queue.touched.forget(&group.family);
                     self.queue.changed.remove(&group.family);
                     self.queue.shared_until.remove(&group.family);
                 }
@@ -222,6 +181,10 @@ impl Pool {
 
     /// A waiter reserves nothing and wants nothing, though it stays.
     pub(crate) fn give_up(&mut self, id: crate::id::WaiterId) {
+        self.stop_wanting(id, false);
+    }
+
+    fn stop_wanting(&mut self, id: crate::id::WaiterId, granted: bool) {
         let Some(waiter) = self.queue.waiters.get_mut(&id) else { return };
         let place = waiter.place(id);
         let reserved: Vec<Units> = waiter.reserved.iter_mut().map(std::mem::take).collect();
@@ -238,7 +201,8 @@ impl Pool {
                 family.strict.remove(&place);
             }
             // Without one who lacked it, others may reserve what is free.
-            if !units.is_empty() || (wanted && self.limits.overtaken > 0) {
+            let freed = !units.is_empty() && !granted;
+            if freed || ((wanted || granted) && self.limits.overtaken > 0) {
                 self.queue.mark(&family, false);
             }
             units.into_iter().for_each(|(slot, amount)| self.queue.unreserve(slot, amount));

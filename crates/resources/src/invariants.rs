@@ -67,9 +67,13 @@ impl Pool {
         }
         ensure(tokens <= self.last_token, || "a token is ahead of the counter".to_owned())?;
         self.queue.index_agrees()?;
+        self.groups_agree()?;
         for (slot, amount) in &self.queue.reserved {
             let free = self.resources.get(*slot).map(|resource| resource.free()).unwrap_or_default();
-            ensure(free >= *amount, || format!("{slot}: {amount} is reserved and only {free} free"))?;
+            let shared_out_anew = self.queue.changed.values().any(|anew| *anew);
+            ensure(free >= *amount || shared_out_anew, || {
+                format!("{slot}: {amount} is reserved and only {free} free")
+            })?;
         }
         for (id, waiter) in self.queue.iter() {
             ensure(self.sessions.get(&waiter.request.session).is_some_and(|s| s.waiters.contains(&id)), || {

@@ -36,6 +36,7 @@ mod acquisition;
 mod apply;
 mod assignment;
 mod caller;
+mod changed;
 mod consumption;
 mod creation;
 mod crowd;

@@ -4,7 +4,7 @@ use crate::caller::Callers;
 use crate::crowd::Crowds;
 use crate::error::PoolError;
 use crate::event::{Notice, WatchEvent};
-use crate::expiry::Timer;
+use crate::expiry::{Timer, Work};
 use crate::fingerprint::Fingerprint;
 use crate::history::{Compacted, History};
 use crate::id::{SessionId, Slot, WaiterId};
@@ -48,8 +48,6 @@ pub struct Pool {
     pub(crate) history: History,
     // What is not.
     pub(crate) queue: Queue,
-    /// What is taken now was reserved, or free for whom it is taken.
-    pub(crate) granting: bool,
     /// What providers cannot provide, by kind, and why.
     pub(crate) shortages: BTreeMap<SessionId, BTreeMap<String, String>>,
     pub(crate) timers: BTreeSet<(Timestamp, Timer)>,
@@ -60,6 +58,8 @@ pub struct Pool {
     pub(crate) pace: Option<Pace>,
     /// What is due and has not ended yet.
     pub(crate) overdue: BTreeSet<Timer>,
+    /// How much may be done in a turn.
+    pub(crate) work: Work,
     /// How much was done in this turn, counted in resources that were looked at.
     pub(crate) worked: usize,
     /// With so much the rest is left to the next turn.

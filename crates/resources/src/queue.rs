@@ -1,5 +1,6 @@
 //! The queue of acquires: larger priority first, then first come, first served; and what each waiter has reserved.
 
+use crate::changed::Touched;
 use crate::group::{Family, Group, Key};
 use crate::id::{SessionId, Slot, WaiterId};
 use crate::memory::RequestId;
@@ -62,18 +63,24 @@ pub(crate) struct Queue {
     pub(crate) reserved: Units,
     /// Those that lack nothing.
     pub(crate) ready: BTreeSet<Place>,
+    /// Resources that changed, of which the groups of their family do not know yet.
+    pub(crate) touched: Touched,
     /// Families in which something became free; true where what is reserved has to be shared out anew.
     pub(crate) changed: BTreeMap<Arc<str>, bool>,
+    /// The family that was shared out last: the one behind it is next, so that each has its turn.
+    pub(crate) shared: Option<Arc<str>>,
     /// Where sharing out was interrupted in a family: those behind are still to be looked at.
     pub(crate) shared_until: BTreeMap<Arc<str>, Place>,
     /// Those of whom it is to be found out anew whether what exists would do.
-    pub(crate) doubtful: BTreeSet<Place>,
+    doubtful: BTreeSet<Place>,
     /// The last of them that was looked at, while there are more: the one behind it is next, so that each has its turn.
-    pub(crate) doubted: Option<Place>,
+    doubted: Option<Place>,
     /// Those of whom it would not.
     pub(crate) hopeless: BTreeSet<Place>,
     /// What they lack may be something else.
     pub(crate) demand_changed: bool,
+    /// Whether somebody could be served for whom a turn had no time left.
+    pub(crate) unserved: bool,
 }
 
 impl AcquireRequest {
@@ -128,14 +135,49 @@ impl Queue {
 
     /// Whether something was put off to later turns.
     pub(crate) fn is_behind(&self) -> bool {
-        !(self.changed.is_empty() && self.doubtful.is_empty())
+        self.unserved || !(self.touched.is_empty() && self.changed.is_empty() && self.doubtful.is_empty())
+    }
+
+    /// The same of what may concern those who want something of a family.
+    pub(crate) fn is_behind_in(&self, family: &str) -> bool {
+        let in_doubt = self.families.get(family).is_some_and(|family| family.doubtful > 0);
+        in_doubt || self.touched.is_in(family) || self.changed.contains_key(family)
+    }
+
+    /// Whether what a waiter has reserved is free, and all else that it asks for is there. Where much has changed, that is known later.
+    pub(crate) fn is_certain(&self, place: Place) -> bool {
+        let Some(waiter) = self.waiters.get(&place.1) else { return false };
+        let settled = |family: &str| !self.touched.is_in(family) && self.changed.get(family) != Some(&true);
+        let families = waiter.groups.iter().filter_map(|key| self.groups.get(key)).map(|group| &*group.family);
+        !self.doubtful.contains(&place) && families.into_iter().all(settled)
+    }
+
+    /// Of this one it is to be found out anew whether what exists would do.
+    pub(crate) fn doubt(&mut self, place: Place) {
+        if self.doubtful.insert(place) {
+            self.count_doubt(place, |doubtful| *doubtful += 1);
+        }
+    }
+
+    /// It is known, or does not matter any more.
+    pub(crate) fn doubt_no_more(&mut self, place: Place) {
+        if self.doubtful.remove(&place) {
+            self.count_doubt(place, |doubtful| *doubtful -= 1);
+        }
+    }
+
+    fn count_doubt(&mut self, place: Place, count: fn(&mut usize)) {
+        for key in self.waiters.get(&place.1).into_iter().flat_map(|waiter| &waiter.groups) {
+            let family = self.groups.get(key).and_then(|group| self.families.get_mut(&group.family));
+            family.into_iter().for_each(|family| count(&mut family.doubtful));
+        }
     }
 
     /// The next of whom it is to be found out whether what exists would do.
     pub(crate) fn next_doubtful(&mut self) -> Option<Place> {
         let behind = self.doubted.map_or(Bound::Unbounded, Bound::Excluded);
         let next = self.doubtful.range((behind, Bound::Unbounded)).next().or_else(|| self.doubtful.first()).copied()?;
-        self.doubtful.remove(&next);
+        self.doubt_no_more(next);
         self.doubted = (!self.doubtful.is_empty()).then_some(next);
         Some(next)
     }
@@ -161,7 +203,8 @@ impl Queue {
             ensure(waiter.hopeful || waiter.reserved.iter().all(BTreeMap::is_empty), "a hopeless waiter reserves")?;
             let ready = waiter.hopeful && waiter.lacks.is_empty();
             ensure(self.ready.contains(&place) == ready, "who is ready is not among them")?;
-            ensure(self.hopeless.contains(&place) != waiter.hopeful, "who is hopeless is not among them")?;
+            let known = self.hopeless.contains(&place) != waiter.hopeful || self.doubtful.contains(&place);
+            ensure(known, "who is hopeless is not among them")?;
         }
         ensure(self.hopeless.len() <= self.waiters.len(), "somebody hopeless has left")?;
         ensure(reserved == self.reserved, "what is reserved is not what waiters have reserved")?;

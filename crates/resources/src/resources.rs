@@ -164,29 +164,34 @@ impl Resources {
         &'a self,
         requirement: &'a Requirement,
     ) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
-        let all = self.of(&requirement.kind).flat_map(|of_kind| &of_kind.all);
-        self.chosen(requirement, all)
+        self.all_of(&requirement.kind).filter(|(_, resource)| resource.description.fits(requirement))
     }
 
     /// Those of them of which something is free, in the order in which they are given away.
     pub(crate) fn free<'a>(&'a self, requirement: &'a Requirement) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
-        let free = self.of(&requirement.kind).flat_map(|of_kind| of_kind.free.iter().map(|(_, slot)| slot));
-        self.chosen(requirement, free)
+        self.free_of(&requirement.kind).filter(|(_, resource)| resource.description.fits(requirement))
+    }
+
+    /// All of a kind and of the kinds below it, whether they fit or not, in the order of [`Resources::fitting`].
+    pub(crate) fn all_of<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
+        self.present(self.of(kind).flat_map(|of_kind| &of_kind.all))
+    }
+
+    /// Those of them of which something is free, in the order of [`Resources::free`].
+    pub(crate) fn free_of<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
+        self.present(self.of(kind).flat_map(|of_kind| of_kind.free.iter().map(|(_, slot)| slot)))
+    }
+
+    fn present<'a>(
+        &'a self,
+        slots: impl Iterator<Item = &'a Slot> + 'a,
+    ) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
+        slots.filter_map(|slot| self.get(*slot).map(|resource| (*slot, resource)))
     }
 
     /// What there is of a kind and of the kinds below it.
     fn of<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = &'a OfKind> + 'a {
         self.kinds.subclasses(kind).filter_map(|kind| self.by_kind.get(kind))
-    }
-
-    fn chosen<'a>(
-        &'a self,
-        requirement: &'a Requirement,
-        slots: impl Iterator<Item = &'a Slot> + 'a,
-    ) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
-        slots
-            .filter_map(|slot| self.get(*slot).map(|resource| (*slot, resource)))
-            .filter(|(_, resource)| resource.description.fits(requirement))
     }
 
     /// The family of a kind: kinds of different families have no resource in common.

@@ -11,10 +11,13 @@
 //! that was reserved is gone) is a family shared out anew. The work is that for those who get something.
 //!
 //! One turn looks at a bounded number of resources (`expiry.rs`) (and at those of one more waiter): what is left is put off to the next
-//! turn, which [`Pool::next_deadline`] asks for at once. Until then nobody is served past the queue.
+//! turn, which [`Pool::next_deadline`] asks for at once. Families have their turns one after the other, and one that is behind holds
+//! up no other. Until all is known of a family, nobody is served past those who wait for something of it; only who also waits for
+//! something of another family that is behind may be passed meanwhile.
 
 use crate::assignment::{Assignment, Available};
 use crate::group::{Key, takes};
+use crate::id::WaiterId;
 use crate::pool::Pool;
 use crate::queue::Place;
 use crate::resource::Units;
@@ -26,35 +29,72 @@ use std::sync::Arc;
 impl Pool {
     /// Grants whatever can be granted.
     pub(crate) fn schedule(&mut self) {
+        self.queue.unserved = false;
         loop {
-            while !self.has_done_enough()
-                && let Some(place) = self.queue.next_doubtful()
-            {
-                self.reconsider(place);
-            }
-            if !self.has_done_enough()
-                && let Some((family, anew)) = self.queue.changed.pop_first()
-            {
-                self.share_out(&family, anew);
-                continue;
-            }
-            if !self.may_grant() {
+            self.catch_up();
+            let Some(id) = self.next_served() else { return };
+            if self.has_done_enough() {
+                self.queue.unserved = true;
                 return;
             }
-            let may_have = |(_, id): &&Place| {
-                let session = self.queue.get(*id).and_then(|waiter| self.sessions.get(&waiter.request.session));
-                session.is_some_and(|session| self.may_grant_to(session))
-            };
-            let Some((_, id)) = self.queue.ready.iter().find(may_have).copied() else { return };
             let Some(waiter) = self.queue.get(id) else { return };
             let taken = waiter.reserved.clone();
+            self.ended(taken.iter().map(|units| units.len()).sum::<usize>().max(1));
             self.grant(id, taken);
         }
     }
 
+    /// Finds out what changes mean, as far as that goes in this turn. Not all of a turn is for telling groups of them, so that
+    /// something is left for those of whom it is in doubt whether what exists would do, and for sharing out.
+    fn catch_up(&mut self) {
+        while self.worked < self.enough / 8 * 5 && self.settle() {}
+        while self.worked < self.enough / 4 * 3
+            && let Some(place) = self.queue.next_doubtful()
+        {
+            self.reconsider(place);
+        }
+        while !self.has_done_enough()
+            && let Some((family, anew)) = self.next_changed()
+        {
+            self.share_out(&family, anew);
+        }
+    }
+
+    /// The next family in which something became free of which all is known.
+    fn next_changed(&mut self) -> Option<(Arc<str>, bool)> {
+        let behind = self.queue.shared.clone().map_or(Bound::Unbounded, Bound::Excluded);
+        let changed = &self.queue.changed;
+        let mut looked_at = 0;
+        let mut known = |(family, _): &(&Arc<str>, &bool)| {
+            looked_at += 1;
+            let doubtful = self.queue.families.get(*family).is_some_and(|family| family.doubtful > 0);
+            !doubtful && !self.queue.touched.is_in(family)
+        };
+        let next = changed.range::<Arc<str>, _>((behind, Bound::Unbounded)).find(&mut known);
+        let next = next.or_else(|| changed.iter().find(&mut known)).map(|(family, anew)| (family.clone(), *anew));
+        self.worked += looked_at;
+        let (family, anew) = next?;
+        self.queue.changed.remove(&family);
+        self.queue.shared = Some(family.clone());
+        Some((family, anew))
+    }
+
+    /// The first that lacks nothing and may have it now.
+    fn next_served(&self) -> Option<WaiterId> {
+        if !self.may_grant() {
+            return None;
+        }
+        let may_have = |place: &&Place| {
+            let session = self.queue.get(place.1).and_then(|waiter| self.sessions.get(&waiter.request.session));
+            session.is_some_and(|session| self.may_grant_to(session)) && self.queue.is_certain(**place)
+        };
+        self.queue.ready.iter().find(may_have).map(|(_, id)| *id)
+    }
+
     /// What a request can have at once: all of it, or `None`. Nobody waits before it for any of it.
     pub(crate) fn at_once(&self, place: Place, requirements: &[Requirement]) -> Option<Vec<Units>> {
-        if !self.may_grant() || self.queue.is_behind() || self.is_before_others(place, requirements) {
+        let behind = |requirement: &Requirement| self.queue.is_behind_in(self.resources.family(&requirement.kind));
+        if !self.may_grant() || requirements.iter().any(behind) || self.is_before_others(place, requirements) {
             return None;
         }
         let requirements: Vec<&Requirement> = requirements.iter().collect();
@@ -120,6 +160,7 @@ impl Pool {
         let stopped_at = self.queue.shared_until.remove(family).filter(|_| !anew);
         if anew {
             for place in std::mem::take(&mut known.reserving) {
+                self.worked += 1;
                 self.take_back(place, family);
                 if self.limits.overtaken > 0 {
                     self.take_back_elsewhere(place, family);
@@ -133,14 +174,17 @@ impl Pool {
             next.map(|place| (*place, key.clone()))
         };
         let mut heads: BTreeSet<(Place, Key)> = known.groups.iter().filter_map(first).collect();
+        self.worked += known.groups.len();
+        // Somebody gets on each time, and other families have their turn.
+        let most = self.enough.min(self.worked + self.enough / 8);
         let mut before = None;
         while let Some((place, key)) = heads.pop_first() {
-            if self.has_done_enough() && before != Some(place) {
+            if self.worked >= most && before.is_some() && before != Some(place) {
                 self.queue.mark(family, false);
                 self.queue.shared_until.insert(family.clone(), place);
                 return;
             }
-            let Some(group) = self.queue.groups.get(&key) else { continue };
+            let Some(group) = self.queue.groups.get_mut(&key) else { continue };
             let (exhausted, looked_at) = group.exhausted(&self.resources, &self.queue.reserved);
             self.worked += 1 + looked_at;
             if exhausted {

@@ -1,0 +1,146 @@
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+//! Two pools go through the same history: one does all at once, and the other so little in each turn that it is behind after nearly
+//! every step. When that one has caught up, both have granted the same.
+
+use crate::expiry::Work;
+use crate::{AcquireRequest, Limits, Pool, ResourceSpec, SessionId};
+use proptest::prelude::*;
+use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
+use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
+use std::time::Duration;
+
+const NOW: Timestamp = Timestamp(0);
+const KINDS: [&str; 2] = ["Tool", "Camera"];
+
+#[derive(Debug, Clone)]
+enum Step {
+    /// A resource of a kind with an attribute and a capacity, anew or otherwise than before.
+    Create(usize, usize, i64, u32),
+    Delete(usize),
+    /// Who wants what, each of a kind, with an attribute where that is not zero, so many units, and how.
+    Acquire(i64, Vec<(usize, i64, u32, usize)>),
+    Release(usize),
+    Cancel(usize),
+    EndTask,
+}
+
+fn step() -> impl Strategy<Value = Step> {
+    let requirement = (0..2_usize, 0..3_i64, 1..4_u32, 0..6_usize);
+    prop_oneof![
+        3 => (0..8_usize, 0..2_usize, 1..3_i64, 1..4_u32).prop_map(|(id, k, a, c)| Step::Create(id, k, a, c)),
+        1 => (0..8_usize).prop_map(Step::Delete),
+        6 => (0..3_i64, prop::collection::vec(requirement, 1..4)).prop_map(|(p, r)| Step::Acquire(p, r)),
+        4 => (0..8_usize).prop_map(Step::Release),
+        1 => (0..8_usize).prop_map(Step::Cancel),
+        1 => Just(Step::EndTask),
+    ]
+}
+
+fn pool(work: Work) -> Pool {
+    let mut pool = Pool::new(Limits::default());
+    pool.work = work;
+    pool.keep_alive(NOW, &SessionId::from("s"), "s", Duration::from_secs(60)).unwrap();
+    pool
+}
+
+/// Leases by what they are for, in the order of that; what both pools have granted for the same request has the same purpose.
+fn granted(pool: &Pool) -> Vec<String> {
+    let mut purposes: Vec<String> = pool.leases().iter().map(|lease| lease.purpose.to_string()).collect();
+    purposes.sort();
+    purposes
+}
+
+fn perform(pool: &mut Pool, number: usize, step: &Step) {
+    let session = SessionId::from("s");
+    match step {
+        Step::Create(id, kind, attribute, capacity) => {
+            let spec = ResourceSpec::new(ResourceClass::Module, KINDS[*kind]).id(format!("r{id}")).capacity(*capacity);
+            let _ = pool.create(NOW, None, spec.attribute("a", Value::Int(*attribute)));
+        }
+        Step::Delete(id) => drop(pool.delete(NOW, None, &format!("r{id}"))),
+        Step::Acquire(priority, wanted) => {
+            let requirement = |(kind, attribute, count, how): &(usize, i64, u32, usize)| {
+                let operation = match how {
+                    0 => ResourceOperation::Exists,
+                    1 => ResourceOperation::Consume,
+                    _ => ResourceOperation::Block,
+                };
+                let mut requirement = Requirement::new(operation, KINDS[*kind]);
+                requirement.count = Quantity::from(*count);
+                if *attribute > 0 {
+                    requirement.attributes.insert("a".to_owned(), Value::Int(*attribute));
+                }
+                requirement
+            };
+            let request = AcquireRequest::new(session, wanted.iter().map(requirement).collect()).priority(*priority);
+            pool.acquire(NOW, AcquireRequest { purpose: format!("{number}"), ..request }).unwrap();
+        }
+        Step::Release(which) => {
+            let purposes = granted(pool);
+            let Some(purpose) = purposes.get(which % purposes.len().max(1)) else { return };
+            let lease = pool.leases().into_iter().find(|lease| *lease.purpose == **purpose).unwrap();
+            pool.release(NOW, None, lease.id).unwrap();
+        }
+        Step::Cancel(which) => {
+            let waiters = pool.waiters();
+            let Some((waiter, _)) = waiters.get(which % waiters.len().max(1)) else { return };
+            pool.cancel(NOW, *waiter).unwrap();
+        }
+        Step::EndTask => pool.end_task(NOW, &session).unwrap(),
+    }
+}
+
+fn waiting(pool: &Pool) -> Vec<String> {
+    pool.waiters().into_iter().map(|(_, request)| request.purpose).collect()
+}
+
+#[test]
+fn a_pool_that_catches_up_over_many_turns_grants_what_one_grants_that_does_all_at_once() {
+    let rng = TestRng::from_seed(RngAlgorithm::ChaCha, &[7; 32]);
+    let config = Config { cases: 400, failure_persistence: None, ..Config::default() };
+    let behind = std::cell::Cell::new(0);
+    let outcome = TestRunner::new_with_rng(config, rng).run(&prop::collection::vec(step(), 1..40), |steps| {
+        let (mut quick, mut slow) = (pool(Work::default()), pool(Work { per_turn: 9, per_call: 3 }));
+        for (number, step) in steps.iter().enumerate() {
+            perform(&mut quick, number, step);
+            perform(&mut slow, number, step);
+            quick.check_invariants().map_err(TestCaseError::fail)?;
+            slow.check_invariants().map_err(TestCaseError::fail)?;
+            let mut turns = 0;
+            while slow.next_deadline() == Some(NOW) {
+                slow.advance(NOW);
+                slow.check_invariants().map_err(TestCaseError::fail)?;
+                turns += 1;
+                behind.set(behind.get() + usize::from(turns == 1));
+                prop_assert!(turns < 1_000, "it never catches up after {step:?}");
+            }
+            prop_assert_eq!(granted(&quick), granted(&slow), "after {}: {:?}", number, step);
+            prop_assert_eq!(waiting(&quick), waiting(&slow), "after {}: {:?}", number, step);
+        }
+        Ok(())
+    });
+    outcome.unwrap();
+    assert!(behind.get() > 1_000, "it was behind after {} steps only", behind.get());
+}
+
+#[test]
+fn a_pool_that_is_behind_for_long_holds_what_always_holds_and_forgets_nobody() {
+    let rng = TestRng::from_seed(RngAlgorithm::ChaCha, &[8; 32]);
+    let config = Config { cases: 400, failure_persistence: None, ..Config::default() };
+    let outcome = TestRunner::new_with_rng(config, rng).run(&prop::collection::vec(step(), 1..60), |steps| {
+        let mut pool = pool(Work { per_turn: 9, per_call: 3 });
+        for (number, step) in steps.iter().enumerate() {
+            perform(&mut pool, number, step);
+            pool.check_invariants().map_err(TestCaseError::fail)?;
+        }
+        // Then it is not behind, and who could be served does not wait.
+        while pool.next_deadline() == Some(NOW) {
+            pool.advance(NOW);
+            pool.check_invariants().map_err(TestCaseError::fail)?;
+        }
+        Ok(())
+    });
+    outcome.unwrap();
+}
