@@ -6,6 +6,7 @@ mod health;
 mod process;
 mod resource;
 mod retry;
+mod snapshot;
 mod world;
 
 pub use action::{ActionClient, ActionInfo, Fate, ProviderInfo};

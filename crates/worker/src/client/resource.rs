@@ -1,6 +1,6 @@
 //! The client of the resource manager. What is asked for again and again while a task runs goes over the session's stream.
 
-use super::{CallError, Channels, fresh_id};
+use super::{CallError, Channels, fresh_id, snapshot};
 use crate::endpoint::Endpoint;
 use crate::multiplex::SessionCalls;
 use crate::multiplex::client::Multiplexer;
@@ -14,7 +14,6 @@ use ratn_proto::types::{
 };
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
-use ratn_proto::v1::resource_service_watch_response::Kind as Part;
 use ratn_proto::v1::session_request::Kind as Asked;
 use ratn_proto::v1::session_response::Kind as Answered;
 use ratn_proto::{MAX_MESSAGE_BYTES, PAGE_BYTES};
@@ -447,25 +446,9 @@ impl ResourceWatch {
     /// # Errors
     /// [`CallError`] when it broke.
     pub async fn next(&mut self) -> Result<Option<ResourceUpdate>, CallError> {
-        let mut message = self.read().await?;
-        if let Some(Part::Snapshot(whole)) = message.as_mut().and_then(|message| message.kind.as_mut()) {
-            while std::mem::take(&mut whole.more) {
-                let Some(Part::Snapshot(part)) = self.read().await?.and_then(|message| message.kind) else {
-                    let cut = Malformed::new("snapshot.more", "is set, and no further part follows");
-                    return Err(CallError::malformed(&self.endpoint, cut));
-                };
-                whole.resources.extend(part.resources);
-                whole.more = part.more;
-            }
-        }
+        let message = snapshot::next(&self.endpoint, &mut self.stream).await?;
         let update = message.map(ResourceUpdate::try_from).transpose();
         update.map_err(|m| CallError::malformed(&self.endpoint, m))
-    }
-}
-
-impl ResourceWatch {
-    async fn read(&mut self) -> Result<Option<v1::ResourceServiceWatchResponse>, CallError> {
-        self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))
     }
 }
 

@@ -1,16 +1,15 @@
 //! The client of the world pool.
 
-use super::{CallError, Channels};
+use super::{CallError, Channels, snapshot};
 use crate::endpoint::Endpoint;
 use crate::trace::Traced;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::Evidence;
-use ratn_proto::convert::{Malformed, all, each};
+use ratn_proto::convert::{all, each};
 use ratn_proto::types::{Contradiction, FactDifference, FactRecord, FactVersion, WorldUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::world_pool_service_client::WorldPoolServiceClient;
-use ratn_proto::v1::world_pool_service_watch_response::Kind as Part;
 use ratn_proto::{MAX_MESSAGE_BYTES, PAGE_BYTES};
 use ratn_world::digest::Digest;
 use ratn_world::scene::delta::SceneDelta;
@@ -89,23 +88,9 @@ impl WorldWatch {
     /// # Errors
     /// [`CallError`] when it broke.
     pub async fn next(&mut self) -> Result<Option<WorldUpdate>, CallError> {
-        let mut message = self.read().await?;
-        if let Some(Part::Snapshot(whole)) = message.as_mut().and_then(|message| message.kind.as_mut()) {
-            while std::mem::take(&mut whole.more) {
-                let Some(Part::Snapshot(part)) = self.read().await?.and_then(|message| message.kind) else {
-                    let cut = Malformed::new("snapshot.more", "is set, and no further part follows");
-                    return Err(CallError::malformed(&self.endpoint, cut));
-                };
-                whole.facts.extend(part.facts);
-                whole.more = part.more;
-            }
-        }
+        let message = snapshot::next(&self.endpoint, &mut self.stream).await?;
         let update = message.map(WorldUpdate::try_from).transpose();
         update.map_err(|m| CallError::malformed(&self.endpoint, m))
-    }
-
-    async fn read(&mut self) -> Result<Option<v1::WorldPoolServiceWatchResponse>, CallError> {
-        self.stream.message().await.map_err(|s| CallError::from_status(&self.endpoint, &s))
     }
 }
 
