@@ -164,10 +164,14 @@ impl Core for ResourceCore {
     }
 
     fn receive(&mut self, message: Message, desk: &mut ResourceDesk) {
-        if let Some(stopped) = desk.stopped() {
-            let status = stopped.status.clone();
-            return self.receive_stopped(message, status, desk);
-        }
+        let stopped = desk.stopped().map(|stopped| stopped.status.clone());
+        let message = match stopped {
+            None => message,
+            Some(stopped) => match refuse_change(message, stopped, desk) {
+                Some(read) => read,
+                None => return,
+            },
+        };
         let now = desk.now();
         match message {
             Message::Perform { speaker, request_id, request, answer } => {
@@ -330,35 +334,6 @@ impl ResourceCore {
         }
     }
 
-    /// Reads go on, of what is on the disk.
-    fn receive_stopped(&mut self, message: Message, stopped: Status, desk: &mut ResourceDesk) {
-        match message {
-            Message::Perform { answer, .. } => desk.reply(answer, Err(stopped)),
-            Message::Acquire { answer, .. } => desk.reply(answer, Err(stopped)),
-            Message::Withdraw { answer, .. } => desk.reply(answer, Err(stopped)),
-            Message::Abandon { .. } | Message::Return { .. } => {}
-            Message::Find { requirement, answer } => {
-                let fitting = self.pool.fitting(&requirement);
-                let found = (self.pool.exists(&requirement), fitting);
-                desk.tell(answer, found);
-            }
-            Message::Get { id, answer } => desk.tell(answer, self.pool.get(&id)),
-            Message::List { after, most, answer } => {
-                let listed = (self.pool.list_after(&after, most), self.pool.revision());
-                desk.tell(answer, listed);
-            }
-            Message::Revision { answer } => desk.tell(answer, self.pool.revision()),
-            Message::Sessions { answer } => desk.tell(answer, self.sessions(desk)),
-            Message::WatchDemand { answer, .. } => desk.reply(answer, Err(stopped)),
-            Message::ReportShortage { answer, .. } => desk.reply(answer, Err(stopped)),
-            Message::Explain { caller, request_id, answer } => desk.reply(answer, self.explain(&caller, &request_id)),
-            Message::Watch { after, filter, answer } => {
-                let watch = self.watch(after, filter, desk);
-                desk.reply(answer, watch);
-            }
-        }
-    }
-
     fn keep_alive(
         &mut self,
         now: Timestamp,
@@ -382,4 +357,24 @@ impl ResourceCore {
         }
         Ok(KeptAlive { ttl, created, revision: self.pool.revision() })
     }
+}
+
+/// Refuses a change. A read is returned, for reads go on, of what is on the disk.
+fn refuse_change(message: Message, stopped: Status, desk: &mut ResourceDesk) -> Option<Message> {
+    match message {
+        Message::Perform { answer, .. } => desk.reply(answer, Err(stopped)),
+        Message::Acquire { answer, .. } => desk.reply(answer, Err(stopped)),
+        Message::Withdraw { answer, .. } => desk.reply(answer, Err(stopped)),
+        Message::WatchDemand { answer, .. } => desk.reply(answer, Err(stopped)),
+        Message::ReportShortage { answer, .. } => desk.reply(answer, Err(stopped)),
+        Message::Abandon { .. } | Message::Return { .. } => {}
+        read @ (Message::Find { .. }
+        | Message::Get { .. }
+        | Message::List { .. }
+        | Message::Revision { .. }
+        | Message::Sessions { .. }
+        | Message::Explain { .. }
+        | Message::Watch { .. }) => return Some(read),
+    }
+    None
 }
