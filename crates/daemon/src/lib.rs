@@ -26,4 +26,5 @@ pub mod service;
 mod standby;
 pub mod supervisor;
 pub mod telemetry;
+mod watch_stream;
 pub mod world_pool;

@@ -85,6 +85,17 @@ pub(crate) fn parts<T: Message>(items: Vec<T>) -> Vec<Vec<T>> {
     parts
 }
 
+/// A snapshot's items in parts of at most a page each. A client that takes no parts gets all in one part, where that fits into a message.
+pub(crate) fn snapshot_parts<T: Message>(items: Vec<T>, in_parts: bool) -> Result<Vec<Vec<T>>, Status> {
+    let parts = parts(items);
+    if parts.len() == 1 || in_parts {
+        return Ok(parts);
+    }
+    let mut filled = Filled::default();
+    Page::of(0, "").fill(parts.into_iter().flatten(), &mut filled)?;
+    Ok(vec![filled.items])
+}
+
 /// As many from the first on as a page has room for.
 pub(crate) fn first<T: Message>(items: Vec<T>) -> Vec<T> {
     parts(items).swap_remove(0)

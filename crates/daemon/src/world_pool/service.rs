@@ -5,8 +5,9 @@ use super::history::Commit;
 use super::leases::{Known, LiveLeases};
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
-use crate::details::{ending, retry_later, status};
+use crate::details::{retry_later, status};
 use crate::paging::{self, Filled, Page};
+use crate::watch_stream;
 use futures::StreamExt;
 use futures::stream::BoxStream;
 use prost::Message as _;
@@ -173,22 +174,10 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let updates = self.actor.request(|answer| Message::Watch { after, answer }).await?;
         let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
             .filter_map(move |update| futures::future::ready(told(&update, &patterns)))
-            .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)))
-            // After what does not fit nothing follows: the client would miss it.
-            .scan(false, |over, message| {
-                let before = std::mem::replace(over, message.is_err());
-                futures::future::ready((!before).then_some(message))
-            });
-        let shutdown = self.shutdown.clone();
-        let last = futures::stream::once(async move {
-            if shutdown.is_cancelled() {
-                return Err(ending());
-            }
-            let message = "the watch has ended, for it was too slow or the disk failed: watch again";
-            Err(retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER))
-        });
-        let stream = updates.take_until(self.shutdown.clone().cancelled_owned()).chain(last);
-        Ok(Response::new(Box::pin(stream)))
+            .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)));
+        let message = "the watch has ended, for it was too slow or the disk failed: watch again";
+        let cut_off = retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER);
+        Ok(Response::new(watch_stream::ended(updates, self.shutdown.clone(), cut_off)))
     }
 
     type WatchProjectionStream = BoxStream<'static, Result<v1::WatchProjectionResponse, Status>>;
@@ -309,14 +298,10 @@ fn messages(
         }
         _ => return vec![Ok(message)],
     };
-    let mut parts = paging::parts(std::mem::take(&mut snapshot.facts));
-    if parts.len() > 1 && !in_parts {
-        let mut filled = Filled::default();
-        if let Err(too_large) = Page::of(0, "").fill(parts.into_iter().flatten(), &mut filled) {
-            return vec![Err(too_large)];
-        }
-        parts = vec![filled.items];
-    }
+    let parts = match paging::snapshot_parts(std::mem::take(&mut snapshot.facts), in_parts) {
+        Ok(parts) => parts,
+        Err(too_large) => return vec![Err(too_large)],
+    };
     let last = parts.len() - 1;
     let part = |(index, facts)| {
         let snapshot = v1::WorldSnapshot { facts, more: index < last, revision: snapshot.revision };

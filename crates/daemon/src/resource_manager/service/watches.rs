@@ -2,10 +2,11 @@
 
 use super::Streamed;
 use super::requests::Requests;
-use crate::details::{ending, retry_later, status};
-use crate::paging::{self, Filled, Page};
+use crate::details::{retry_later, status};
+use crate::paging;
 use crate::resource_manager::actor::Message;
 use crate::resource_manager::watch_filter::WatchFilter;
+use crate::watch_stream;
 use futures::StreamExt;
 use ratn_model::id::Revision;
 use ratn_proto::convert::names;
@@ -43,21 +44,10 @@ pub(super) async fn watch(
     let updates = requests.counted("watch", requests.actor().request(watch).await)?;
     let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
         .flat_map(move |told| futures::stream::iter(told.updates(&filter, after)))
-        .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)))
-        // After a snapshot that does not fit nothing follows.
-        .scan(false, |over, message| {
-            let before = std::mem::replace(over, message.is_err());
-            futures::future::ready((!before).then_some(message))
-        });
-    let shut_down = shutdown.clone();
-    let last = futures::stream::once(async move {
-        if shut_down.is_cancelled() {
-            return Err(ending());
-        }
-        let message = "the watch has ended, for it was too slow: watch again";
-        Err(retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER))
-    });
-    Ok(Box::pin(updates.take_until(shutdown.cancelled_owned()).chain(last)))
+        .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)));
+    let message = "the watch has ended, for it was too slow: watch again";
+    let cut_off = retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER);
+    Ok(watch_stream::ended(updates, shutdown, cut_off))
 }
 
 /// A snapshot in messages that are not too large; anything else as it is.
@@ -67,15 +57,10 @@ fn messages(
 ) -> Vec<Result<v1::ResourceServiceWatchResponse, Status>> {
     use v1::resource_service_watch_response::Kind;
     let Some(Kind::Snapshot(mut snapshot)) = message.kind else { return vec![Ok(message)] };
-    let mut parts = paging::parts(std::mem::take(&mut snapshot.resources));
-    if parts.len() > 1 && !in_parts {
-        // What is no more than a message is sent as one.
-        let mut filled = Filled::default();
-        if let Err(too_large) = Page::of(0, "").fill(parts.into_iter().flatten(), &mut filled) {
-            return vec![Err(too_large)];
-        }
-        parts = vec![filled.items];
-    }
+    let parts = match paging::snapshot_parts(std::mem::take(&mut snapshot.resources), in_parts) {
+        Ok(parts) => parts,
+        Err(too_large) => return vec![Err(too_large)],
+    };
     let last = parts.len() - 1;
     let part = |(index, resources)| {
         let snapshot = v1::ResourceSnapshot { resources, more: index < last, ..snapshot.clone() };
