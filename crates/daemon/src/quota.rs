@@ -6,7 +6,7 @@
 //! ```
 //! Quotas are by name ([`Caller::name`]): all who are anonymous are one caller. Operators have none, and a share of what all others can take
 //! together is kept for them. Sessions and acquires that wait have theirs in the pool ([`ratn_resources::Limits`]). Calls of health and
-//! reflection count like all others, but [`HEALTH_CHECKS_PER_S`] checks of a caller are answered whatever else it does: whoever watches
+//! reflection count like all others, but `HEALTH_CHECKS_PER_S` checks of a caller are answered whatever else it does: whoever watches
 //! over the process may have the same name as a client that does too much.
 
 use crate::access::{Caller, HEALTH_CHECK};

@@ -9,7 +9,7 @@
 //!
 //! - Connections with calls under way are bounded for each caller, and for all callers that are no operators together. The rest
 //!   ([`ConnectionLimits::for_operators`]) is kept for operators, and for connections that have not had a call yet.
-//! - Where there are as many connections as may be, one without a call under way is closed for a new one ([`State::gives_way`]).
+//! - Where there are as many connections as may be, one without a call under way is closed for a new one (`State::gives_way`).
 //! - A connection without a call is closed at its deadline.
 
 use crate::access::Caller;
