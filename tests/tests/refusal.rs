@@ -176,6 +176,26 @@ fn what_the_command_line_cannot_mean_is_refused() -> anyhow::Result<()> {
 }
 
 #[test]
+fn a_worker_that_is_not_told_enough_is_refused_and_what_is_missing_named() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    for (arguments, missing) in [
+        (&["worker", "path-planner"][..], "--id"),
+        (&["worker", "path-planner", "--id", ""], "--id"),
+        (&["worker", "path-planner", "--resource-manager", "127.0.0.1:1"], "--id"),
+        (&["worker", "detector", "--id", "d1"], "--resource-manager"),
+        (&["worker", "--id", "d1"], "<WORKER>"),
+    ] {
+        let output = place.ratn(arguments).env_remove("RATN_RESOURCE_MANAGER").output()?;
+        let (_, err) = texts(&output);
+        ensure!(output.status.code() == Some(2) && err.contains(missing), "{arguments:?}: {:?}, {err}", output.status);
+    }
+    let output = place.ratn(&["worker", "detector", "--id", "d1"]).env("RATN_RESOURCE_MANAGER", "nowhere").output()?;
+    let (_, err) = texts(&output);
+    ensure!(output.status.code() == Some(2) && err.contains("RATN_RESOURCE_MANAGER"), "{:?}, {err}", output.status);
+    Ok(())
+}
+
+#[test]
 fn a_daemon_that_may_not_listen_or_has_no_state_of_its_own_is_refused() -> anyhow::Result<()> {
     let place = Place::new()?;
     let refused = |arguments: &[&str], why: &str| {
