@@ -12,6 +12,7 @@ mod wire {
 
 use ratn_storage::etcd::{Bounds, Connect, Holder};
 use ratn_storage::{Etcd, EtcdOptions, Log, Options, Store, Writer};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tonic::transport::{Channel, Endpoint};
@@ -19,6 +20,7 @@ use wire::kv_client::KvClient;
 
 const RECORD: [u8; 200] = [7; 200];
 const CLIENTS: usize = 64;
+const AHEAD: usize = 64;
 const TIME: Duration = Duration::from_secs(5);
 
 fn main() {
@@ -51,16 +53,16 @@ fn main() {
         println!("round {round}");
         let one = plain(1);
         println!("  plain transactions, 1 client:     {one}");
-        println!("  log in etcd, 1 client:            {}", waited(log("one").open().unwrap().1, 1).beside(&one));
+        println!("  log in etcd, 1 client:            {}", waited(log("one").open().unwrap().1, 1, 1).beside(&one));
         let many = plain(CLIENTS);
         println!("  plain transactions, {CLIENTS} clients:   {many}");
-        println!(
-            "  log in etcd, {CLIENTS} clients:          {}",
-            waited(log("many").open().unwrap().1, CLIENTS).beside(&many)
-        );
+        let each = waited(log("each").open().unwrap().1, CLIENTS, 1).beside(&many);
+        println!("  log in etcd, {CLIENTS} clients:          {each}");
+        let ahead = waited(log("ahead").open().unwrap().1, CLIENTS, AHEAD).beside(&many);
+        println!("  the same, each {AHEAD} records ahead:   {ahead}");
         let place = tempfile::tempdir_in(&directory).unwrap();
         let files = Log::new(place.path().join("log"), Options::default());
-        println!("  log in files, {CLIENTS} clients:         {}", waited(files.open().unwrap().1, CLIENTS));
+        println!("  log in files, {CLIENTS} clients:         {}", waited(files.open().unwrap().1, CLIENTS, 1));
     }
 }
 
@@ -89,12 +91,14 @@ impl std::fmt::Display for Done {
 }
 
 async fn plain(channels: &[Channel], clients: usize) -> Done {
+    static BEGUN: AtomicUsize = AtomicUsize::new(0);
+    let begun = BEGUN.fetch_add(1, Ordering::Relaxed);
     let begin = Instant::now();
     let tasks: Vec<_> = (0..clients)
         .map(|client| {
             let mut kv = KvClient::new(channels[client % channels.len()].clone());
             tokio::spawn(async move {
-                let key = bytes::Bytes::from(format!("/plain/{}/{client}", std::process::id()));
+                let key = bytes::Bytes::from(format!("/plain/{}/{begun}/{client}", std::process::id()));
                 let (mut revision, mut took) = (0, Vec::new());
                 while begin.elapsed() < TIME {
                     let asked = Instant::now();
@@ -123,7 +127,8 @@ async fn plain(channels: &[Channel], clients: usize) -> Done {
     Done::of(took, begin.elapsed())
 }
 
-fn waited(writer: Box<dyn Writer>, clients: usize) -> Done {
+/// Each client appends so many records before it waits for them.
+fn waited(writer: Box<dyn Writer>, clients: usize, ahead: usize) -> Done {
     let (durable, writer) = (writer.durable(), Mutex::new(writer));
     let begin = Instant::now();
     let took: Vec<Duration> = std::thread::scope(|scope| {
@@ -134,9 +139,10 @@ fn waited(writer: Box<dyn Writer>, clients: usize) -> Done {
                     let mut took = Vec::new();
                     while begin.elapsed() < TIME {
                         let asked = Instant::now();
-                        let position = writer.lock().unwrap().append(&RECORD).unwrap();
+                        let append = |_| writer.lock().unwrap().append(&RECORD).unwrap();
+                        let position = (0..ahead).map(append).last().unwrap();
                         durable.wait_blocking(position).unwrap();
-                        took.push(asked.elapsed());
+                        took.extend(std::iter::repeat_n(asked.elapsed(), ahead));
                     }
                     took
                 })

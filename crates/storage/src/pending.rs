@@ -13,8 +13,6 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio::sync::watch;
 
-/// Where nobody waits for the disk, what comes within this time is written together: waking a thread costs more than an append.
-const LINGER: Duration = Duration::from_millis(5);
 /// A buffer that was larger gives the rest back.
 const KEEP_BYTES: usize = 1 << 20;
 
@@ -140,9 +138,9 @@ impl Pending {
         if state.batch.count == 0 { 0 } else { state.batch.bytes.len() }
     }
 
-    /// For the thread that writes: waits for records, where there is time for more of them, and says whether a compaction has begun since
+    /// For the thread that writes: waits for records, then for more of them for as long as `linger` says, and says whether a compaction has begun since
     /// the last batch. Nothing when all are written and the writer is closing.
-    pub(crate) fn take(&self, there_is_time: bool) -> Option<(Batch, bool)> {
+    pub(crate) fn take(&self, linger: Duration) -> Option<(Batch, bool)> {
         let mut state = self.lock();
         while state.batch.count == 0 {
             if state.closing {
@@ -152,9 +150,9 @@ impl Pending {
             state = self.work.wait(state).unwrap_or_else(PoisonError::into_inner);
         }
         state.idle = false;
-        if there_is_time {
+        if !linger.is_zero() {
             let waits = |state: &mut State| !state.closing && state.batch.bytes.len() < KEEP_BYTES;
-            let waited = self.work.wait_timeout_while(state, LINGER, waits);
+            let waited = self.work.wait_timeout_while(state, linger, waits);
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
         let spare = state.spare.take().unwrap_or_else(|| Batch::new(state.batch.header));

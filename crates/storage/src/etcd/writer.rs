@@ -28,6 +28,10 @@ use std::time::{Duration, Instant};
 pub(super) const PATIENCE: Duration = Duration::from_secs(1);
 /// A transaction that is not performed for so long is told of.
 const STALLED_AFTER: Duration = Duration::from_millis(500);
+/// Where several wait for a transaction, the next one waits for them this part of its time …
+const LINGER_SHARE: u32 = 8;
+/// … and no longer than this.
+const LONGEST_LINGER: Duration = Duration::from_millis(2);
 /// Who closes waits so long for an etcd that does not answer.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 /// Where etcd has no space it is asked again after so long.
@@ -151,11 +155,17 @@ impl Writing {
     fn run(mut self) {
         let shared = self.shared.clone();
         let _ended = Ended(shared.clone());
-        while let Some((batch, _)) = shared.pending.take(false) {
+        let mut linger = Duration::ZERO;
+        while let Some((batch, _)) = shared.pending.take(linger) {
+            let began = Instant::now();
             if let Err(fault) = self.write(&batch) {
                 shared.pending.stop(&fault);
                 return;
             }
+            // Those who were waiting for this batch are about to append again: without a moment for them the next transaction would be for
+            // the first of them alone, and all others wait for two. Who is alone waits for nobody.
+            linger =
+                if batch.count > 1 { (began.elapsed() / LINGER_SHARE).min(LONGEST_LINGER) } else { Duration::ZERO };
             shared.pending.give_back(batch);
         }
     }

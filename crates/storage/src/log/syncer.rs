@@ -23,6 +23,9 @@ const RESERVE: u64 = 1 << 20;
 /// After a look at the place that failed.
 const LOOK_AGAIN: Duration = Duration::from_millis(50);
 
+/// Where nobody waits for the disk, what comes within this time is written together: waking a thread costs more than an append.
+const LINGER: Duration = Duration::from_millis(5);
+
 /// The segment that is written.
 #[derive(Debug)]
 pub(super) struct Active {
@@ -59,7 +62,8 @@ impl Syncer {
     pub(super) fn run(mut self) {
         let shared = self.shared.clone();
         let _ended = Ended(shared.clone());
-        while let Some((mut batch, rotate)) = shared.pending.take(self.durability == Durability::None) {
+        let linger = if self.durability == Durability::None { LINGER } else { Duration::ZERO };
+        while let Some((mut batch, rotate)) = shared.pending.take(linger) {
             ratn_panic_point::panic_point("log-syncer");
             if let Err(fault) = self.commit(&mut batch, rotate) {
                 shared.pending.stop(&fault);
