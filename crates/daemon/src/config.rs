@@ -115,7 +115,7 @@ impl StorageConfig {
                 let directory = self.directory.clone().unwrap_or_else(|| role.into());
                 Arc::new(crate::durable_actor::Journal::log(self, &directory))
             }
-            Engine::Etcd => Arc::new(crate::standby::etcd(self, role, &Endpoint::loopback())?),
+            Engine::Etcd => Arc::new(crate::standby::etcd(self, role, "a copy or a look", None)?),
         })
     }
 
@@ -126,7 +126,7 @@ impl StorageConfig {
     pub fn leader(&self, role: &str) -> anyhow::Result<Option<Holder>> {
         match self.engine {
             Engine::Log => Ok(None),
-            Engine::Etcd => Ok(crate::standby::etcd(self, role, &Endpoint::loopback())?.holder()?),
+            Engine::Etcd => Ok(crate::standby::etcd(self, role, "a copy or a look", None)?.holder()?),
         }
     }
 

@@ -21,7 +21,7 @@ use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Bound, Phase, Services, Serving, bind_as};
 use ratn_worker::trace::Traced;
 use ratn_worker::vitals::Vitals;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::sync::watch;
@@ -62,7 +62,8 @@ impl Place<'_> {
             return Ok(Some((kept, bind_as(&listen, &self.serving.exposure).await?)));
         }
         let bound = bind_as(&listen, &self.serving.exposure).await?;
-        let store: Arc<dyn Store> = Arc::new(etcd(self.storage, self.role, bound.endpoint())?);
+        let mark = self.storage.directory_of(self.role, self.directory.path()).join("seen-in-etcd");
+        let store: Arc<dyn Store> = Arc::new(etcd(self.storage, self.role, &bound.endpoint().to_string(), Some(mark))?);
         let kept = self.await_place(store, &bound, open, shutdown).await?;
         Ok(kept.map(|kept| (kept, bound)))
     }
@@ -163,7 +164,7 @@ impl Gate for NotTheLeader {
 }
 
 /// The log of a role in etcd.
-pub(crate) fn etcd(config: &StorageConfig, role: &str, address: &Endpoint) -> anyhow::Result<Etcd> {
+pub(crate) fn etcd(config: &StorageConfig, role: &str, address: &str, mark: Option<PathBuf>) -> anyhow::Result<Etcd> {
     let read = |file: &Path| std::fs::read(file).with_context(|| format!("cannot read {}", file.display()));
     let mut tls = ClientTlsConfig::new();
     if let Some(ca) = &config.ca {
@@ -177,8 +178,9 @@ pub(crate) fn etcd(config: &StorageConfig, role: &str, address: &Endpoint) -> an
         endpoints: config.endpoints.iter().map(Endpoint::to_string).collect(),
         connect,
         prefix: format!("{}/{role}", config.prefix.trim_end_matches('/')),
-        holder: Holder { address: address.to_string(), about: format!("process {}", std::process::id()) },
+        holder: Holder { address: address.to_owned(), about: format!("process {}", std::process::id()) },
         bounds: Journal::bounds(),
+        mark,
         accept_restored: config.accept_restored,
     })?)
 }

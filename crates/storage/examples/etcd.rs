@@ -44,6 +44,7 @@ fn main() {
             prefix: format!("/measured/{name}-{}", std::process::id()),
             holder: Holder::default(),
             bounds: Bounds::default(),
+            mark: None,
             accept_restored: false,
         })
         .unwrap()

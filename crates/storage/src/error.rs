@@ -22,7 +22,7 @@ pub enum ReadError {
     /// Bytes that once were right no longer are.
     #[error(
         "{place} is damaged at byte {offset}: {what}; what follows it may have been acknowledged, so nothing is left out: restore \
-         a backup to another directory, and keep this one"
+         a backup to another place, and keep this one"
     )]
     Damaged {
         /// In what.
@@ -54,7 +54,7 @@ pub enum ReadError {
         what: String,
     },
     /// Something that belongs to the log is not there.
-    #[error("{place}: {what}; the directory is incomplete: put back what was removed, or restore a backup")]
+    #[error("{place}: {what}; the log is incomplete: put back what was removed, or restore a backup")]
     Incomplete {
         /// Where.
         place: String,
@@ -68,7 +68,7 @@ pub enum ReadError {
 #[non_exhaustive]
 pub enum OpenError {
     /// A second writer.
-    #[error("{place} has a writer already ({holder}): stop it first, or choose another directory")]
+    #[error("{place} has a writer already ({holder}): stop it first, or choose another place")]
     Held {
         /// Which log.
         place: String,
@@ -90,8 +90,8 @@ pub enum OpenError {
     },
     /// The service that keeps the log has another one than before.
     #[error(
-        "the cluster of etcd that has {place} is not the one that this log was written to: an older state of etcd was restored, and what \
-         was acknowledged since then may be gone; see that no robot moves by it, then start once with `storage.accept_restored = true`"
+        "{place} in etcd is older than what was seen there, or of another cluster: an older state of etcd was put in place, and what was \
+         acknowledged since then may be gone; see that no robot moves by it, then start once with `storage.accept_restored = true`"
     )]
     Restored {
         /// Which log.

@@ -128,6 +128,50 @@ fn a_transaction_whose_answer_is_lost_is_there_once() {
 }
 
 #[test]
+fn copies_of_transactions_that_arrive_late_change_nothing() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(3, &[]);
+    let endpoints = cluster.endpoints();
+    let proxy = Proxy::to(&endpoints[0]);
+    let addresses = vec![proxy.address.clone(), endpoints[1].clone(), endpoints[2].clone()];
+    let open_late = || {
+        let options = options(addresses.clone(), "/test/late", "test");
+        // Small parts: a record needs several transactions.
+        let bounds = Bounds { part: 400, ..Bounds::default() };
+        Etcd::new(ratn_storage::EtcdOptions { bounds, ..options }).unwrap()
+    };
+    let mut model: Vec<Vec<u8>> = Vec::new();
+    for round in 0..6_u8 {
+        let log = open_late();
+        // Whoever is asked first is silent: everything is asked once more of another one, and performed there.
+        proxy.hold(true);
+        let (recovered, mut writer) = log.open().unwrap();
+        let through = recovered.snapshot.as_ref().map_or(0, |snapshot| snapshot.through.0 as usize);
+        assert_eq!(payloads(&recovered.records), model[through..], "round {round}");
+        for number in 0..20_u8 {
+            let record = vec![round * 20 + number; 10 + 100 * usize::from(number)];
+            append_durably(&mut *writer, &record);
+            model.push(record);
+            if number == 10 || number == 15 {
+                writer.compact(Position(model.len() as u64), Box::new(|| vec![1; 1_000].into())).unwrap();
+                assert!(common::compacted(&*writer).compaction_failure.is_none());
+            }
+        }
+        // Now all of it arrives once more, from the beginning.
+        proxy.hold(false);
+        append_durably(&mut *writer, b"after");
+        model.push(b"after".to_vec());
+        writer.close().unwrap();
+        let read = log.read().unwrap();
+        let snapshot = read.snapshot.unwrap();
+        assert_eq!(snapshot.payload, vec![1; 1_000]);
+        assert_eq!(payloads(&read.records), model[snapshot.through.0 as usize..], "round {round}");
+    }
+}
+
+#[test]
 fn records_go_on_when_etcds_own_leader_is_killed() {
     if !is_there() {
         return;
@@ -240,13 +284,33 @@ fn an_older_state_of_etcd_is_refused_unless_told() {
     };
     assert!(matches!(error, OpenError::Restored { .. }), "{error}");
     assert!(error.to_string().contains("accept_restored"), "{error}");
-    let options = options(endpoints, "/test/restored", "test");
+    let marked = |name: &str, accept_restored: bool| {
+        let mark = Some(kept.path().join(name));
+        let options = options(endpoints.clone(), "/test/restored", "test");
+        Etcd::new(ratn_storage::EtcdOptions { mark, accept_restored, ..options }).unwrap()
+    };
+    let options = options(endpoints.clone(), "/test/restored", "test");
     let told = Etcd::new(ratn_storage::EtcdOptions { accept_restored: true, ..options }).unwrap();
     let (recovered, writer) = open(&told);
     assert_eq!(payloads(&recovered.records), [b"saved"]);
     drop(writer);
     // Once is enough.
     assert_eq!(open(&fresh).0.records.len(), 1);
+    // The same cluster by its number: a host that has seen more knows. So does one that has seen a log where there is none.
+    assert!(cluster.ctl(&["snapshot", "save", &file]).status.success());
+    let (_, mut writer) = open(&marked("mark", false));
+    append_durably(&mut *writer, b"gone again");
+    drop(writer);
+    assert!(!std::fs::read(kept.path().join("mark")).unwrap().is_empty());
+    cluster.restore(&file);
+    assert!(matches!(marked("mark", false).open(), Err(OpenError::Restored { .. })));
+    let (recovered, writer) = open(&marked("no mark", false));
+    assert_eq!(payloads(&recovered.records), [b"saved"], "nobody knows of it there");
+    drop(writer);
+    assert!(cluster.ctl(&["del", "--prefix", "/test/restored"]).status.success());
+    assert!(matches!(marked("mark", false).open(), Err(OpenError::Restored { .. })));
+    drop(open(&marked("mark", true)));
+    drop(open(&marked("mark", false)));
 }
 
 #[test]

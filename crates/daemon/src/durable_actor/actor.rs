@@ -255,6 +255,8 @@ impl<C: Core> Actor<C> {
             Some(Fault::Ended { .. }) => {
                 self.vitals.fail(CoreFailure::Panicked { part: "the log".to_owned(), what: fault.to_string() });
             }
+            // Another process may be able to write: this one gives the place up, and stands by.
+            Some(Fault::Remote { .. }) => self.vitals.fail(CoreFailure::Deposed { what: fault.to_string() }),
             Some(fenced) if fenced.is_lost_place() => {
                 self.desk.stop(Stopped { status, unreadable: true });
                 return self.fenced(fenced);

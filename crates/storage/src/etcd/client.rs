@@ -1,7 +1,7 @@
-//! Asks etcd: one transaction at a time and caller, at the member that answered last, and at the next one when that does not answer.
+//! Asks etcd: the member that answered last, and the next one beside it when that is silent for a moment; the first answer counts.
 //!
-//! A transaction without an answer may have been performed, may be performed later, or never. Who asked has to find out:
-//! every transaction that writes is therefore guarded so that it has no effect twice.
+//! A transaction without an answer may have been performed, may be performed later, or never, and one with an answer may be performed
+//! once more: a copy may be late. So every transaction that writes is guarded such that it has no effect twice ([`super::chain`]).
 //!
 //! The client has a thread of its own; callers block.
 
@@ -10,17 +10,20 @@ use super::wire::{ResponseHeader, TxnRequest, TxnResponse};
 use std::fmt;
 use std::future::Future;
 use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
 use std::time::{Duration, Instant};
 use tokio::runtime::Runtime;
+use tokio::task::JoinSet;
 use tonic::transport::Channel;
 use tonic::{Code, Status};
 
 /// Makes the channel to a member of the cluster, by its address. Called within the client's runtime.
 pub type Connect = Arc<dyn Fn(&str) -> Result<Channel, String> + Send + Sync>;
 
-/// The largest answer: a page of frames.
-const ANSWER_BYTES: usize = 256 << 20;
+/// The largest answer: a page of frames ([`super::contents`]), with room to spare.
+const ANSWER_BYTES: usize = 512 << 20;
+/// A member that has not answered for so long is not waited for alone.
+const HEDGE: Duration = Duration::from_millis(250);
 
 /// Why there is no answer.
 #[derive(Debug, Clone)]
@@ -29,8 +32,10 @@ pub(super) enum CallError {
     Unknown(String),
     /// etcd has no space. It was not performed.
     NoSpace,
-    /// It will not be performed, however often it is asked for.
+    /// It was not performed, and will hardly be.
     Refused(String),
+    /// It is larger than etcd takes.
+    TooLarge(String),
     /// etcd knows less than it did: an old state was put in place of what it had.
     WentBack { known: i64, found: i64 },
 }
@@ -45,6 +50,12 @@ impl fmt::Display for CallError {
                  disarm`"
             ),
             CallError::Refused(what) => write!(f, "etcd refuses: {what}"),
+            CallError::TooLarge(what) => {
+                write!(
+                    f,
+                    "etcd refuses ({what}): its --max-request-bytes has to be above a MiB, as its default of 1.5 MiB is"
+                )
+            }
             CallError::WentBack { known, found } => write!(
                 f,
                 "etcd was at revision {known} and now is at {found}: an older state of etcd was put in place, and what was acknowledged \
@@ -61,6 +72,8 @@ pub(super) struct Client {
     current: AtomicUsize,
     /// The highest revision of etcd that was seen.
     seen: AtomicI64,
+    /// The revision that was seen, and the lower one that came after it.
+    went_back: OnceLock<(i64, i64)>,
     connect: Connect,
     /// Taken when the client is dropped.
     runtime: Option<Runtime>,
@@ -77,7 +90,8 @@ impl Client {
             tokio::runtime::Builder::new_multi_thread().worker_threads(1).thread_name("etcd").enable_all().build()?;
         let members =
             addresses.iter().map(|address| Member { address: address.clone(), channel: Mutex::default() }).collect();
-        Ok(Client { members, current: AtomicUsize::new(0), seen: AtomicI64::new(0), connect, runtime: Some(runtime) })
+        let (current, seen) = (AtomicUsize::new(0), AtomicI64::new(0));
+        Ok(Client { members, current, seen, went_back: OnceLock::new(), connect, runtime: Some(runtime) })
     }
 
     /// The cluster, for messages.
@@ -86,23 +100,26 @@ impl Client {
         addresses.join(", ")
     }
 
-    /// Performs a transaction at the one member or, where that does not answer in time, says so; the next one is asked next. Blocks.
+    /// Performs a transaction, or says that nobody answered in time. Blocks.
     pub(super) fn attempt(&self, request: TxnRequest, patience: Duration) -> Result<TxnResponse, CallError> {
-        let known = self.seen.load(Ordering::SeqCst);
-        let index = self.current.load(Ordering::SeqCst) % self.members.len().max(1);
-        let answered = self.ask(index, request, patience);
-        if let Err(CallError::Unknown(_)) = &answered {
-            // Only if nobody else has moved on meanwhile.
-            let next = (index + 1) % self.members.len().max(1);
-            let _ = self.current.compare_exchange(index, next, Ordering::SeqCst, Ordering::SeqCst);
+        if let Some(error) = self.went_back() {
+            return Err(error);
         }
-        let answer = answered?;
+        let known = self.seen.load(Ordering::SeqCst);
+        let answer = self.ask(request, patience)?;
         let found = answer.header.as_ref().map_or(0, |header| header.revision);
         if found < known {
-            return Err(CallError::WentBack { known, found });
+            let error = CallError::WentBack { known, found };
+            // For ever: what is missing stays missing when etcd has grown again.
+            self.went_back.get_or_init(|| (known, found));
+            return Err(error);
         }
         self.seen.fetch_max(found, Ordering::SeqCst);
         Ok(answer)
+    }
+
+    fn went_back(&self) -> Option<CallError> {
+        self.went_back.get().map(|(known, found)| CallError::WentBack { known: *known, found: *found })
     }
 
     /// As [`Client::attempt`], again and again until the deadline: for what may be performed twice.
@@ -124,31 +141,78 @@ impl Client {
         }
     }
 
-    fn ask(&self, index: usize, request: TxnRequest, patience: Duration) -> Result<TxnResponse, CallError> {
+    fn ask(&self, request: TxnRequest, patience: Duration) -> Result<TxnResponse, CallError> {
         let unknown = |what: String| Err(CallError::Unknown(what));
-        let (Some(member), Some(runtime)) = (self.members.get(index), &self.runtime) else {
+        let (Some(runtime), true) = (&self.runtime, !self.members.is_empty()) else {
             return unknown("no address of a member is given".to_owned());
         };
-        let address = &member.address;
-        let channel = {
+        let first = self.current.load(Ordering::SeqCst);
+        let order: Vec<usize> = (0..self.members.len()).map(|k| (first + k) % self.members.len()).collect();
+        let channels: Vec<(usize, String, Result<Channel, String>)> = {
             let _within = runtime.enter();
-            let mut channel = member.channel.lock().unwrap_or_else(PoisonError::into_inner);
-            match &*channel {
-                Some(channel) => channel.clone(),
-                None => match (self.connect)(address) {
-                    Ok(new) => channel.insert(new).clone(),
-                    Err(what) => return unknown(format!("{address}: {what}")),
-                },
-            }
+            order.into_iter().map(|index| (index, self.members[index].address.clone(), self.channel(index))).collect()
         };
-        let mut kv =
-            KvClient::new(channel).max_decoding_message_size(ANSWER_BYTES).max_encoding_message_size(ANSWER_BYTES);
-        let call = async move { tokio::time::timeout(patience, kv.txn(request)).await };
-        match blocking(runtime, call) {
-            Some(Ok(Ok(answer))) => Ok(answer.into_inner()),
-            Some(Ok(Err(status))) => Err(classify(&status, address)),
-            Some(Err(_)) => unknown(format!("{address} did not answer within {} ms", patience.as_millis())),
+        match blocking(runtime, hedged(channels, request, patience)) {
+            Some((by, answered)) => {
+                if let Some(by) = by {
+                    self.current.store(by, Ordering::SeqCst);
+                }
+                answered
+            }
             None => unknown("the client is ending".to_owned()),
+        }
+    }
+
+    fn channel(&self, index: usize) -> Result<Channel, String> {
+        let member = &self.members[index];
+        let mut channel = member.channel.lock().unwrap_or_else(PoisonError::into_inner);
+        match &*channel {
+            Some(channel) => Ok(channel.clone()),
+            None => (self.connect)(&member.address).map(|new| channel.insert(new).clone()),
+        }
+    }
+}
+
+/// Asks one after the other, each beside those that have not answered yet, and says who answered.
+async fn hedged(
+    members: Vec<(usize, String, Result<Channel, String>)>,
+    request: TxnRequest,
+    patience: Duration,
+) -> (Option<usize>, Result<TxnResponse, CallError>) {
+    let deadline = tokio::time::Instant::now() + patience;
+    let mut last = format!("nobody answered within {} ms", patience.as_millis());
+    let mut asked = JoinSet::new();
+    let mut members = members.into_iter();
+    loop {
+        match members.next() {
+            Some((index, address, Ok(channel))) => {
+                let request = request.clone();
+                asked.spawn(async move {
+                    let kv = KvClient::new(channel);
+                    let mut kv = kv.max_decoding_message_size(ANSWER_BYTES).max_encoding_message_size(ANSWER_BYTES);
+                    let answered = kv.txn(request).await;
+                    (index, answered.map(tonic::Response::into_inner).map_err(|status| classify(&status, &address)))
+                });
+            }
+            Some((_, address, Err(what))) => {
+                last = format!("{address}: {what}");
+                continue;
+            }
+            None if asked.is_empty() => return (None, Err(CallError::Unknown(last))),
+            None => {}
+        }
+        // Until the next one is asked, too.
+        let until = if members.len() > 0 { deadline.min(tokio::time::Instant::now() + HEDGE) } else { deadline };
+        while !asked.is_empty() {
+            match tokio::time::timeout_at(until, asked.join_next()).await {
+                Ok(Some(Ok((_, Err(CallError::Unknown(what)))))) => last = what,
+                Ok(Some(Ok((index, answered)))) => return (Some(index), answered),
+                Ok(_) => {}
+                Err(_) => break,
+            }
+        }
+        if tokio::time::Instant::now() >= deadline {
+            return (None, Err(CallError::Unknown(last)));
         }
     }
 }
@@ -171,6 +235,7 @@ fn classify(status: &Status, address: &str) -> CallError {
     match status.code() {
         Code::ResourceExhausted if said.contains("space exceeded") => CallError::NoSpace,
         // Out of range: the revision that was asked for has been compacted.
+        Code::InvalidArgument if said.contains("too large") => CallError::TooLarge(format!("{address} says: {said}")),
         Code::InvalidArgument
         | Code::OutOfRange
         | Code::PermissionDenied

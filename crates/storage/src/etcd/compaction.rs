@@ -50,8 +50,7 @@ impl Compaction {
     }
 
     fn perform(&self, operation: RequestOp) -> Result<(), Fault> {
-        let answer = self.shared.perform(&self.shared.term.guarded(vec![operation]))?;
-        if answer.succeeded { Ok(()) } else { Err(self.shared.term.deposed()) }
+        self.shared.change_snapshots(vec![operation])
     }
 
     fn failure(&self, fault: Fault) -> CompactionFailure {

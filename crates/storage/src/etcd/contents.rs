@@ -1,6 +1,6 @@
 //! Reads a log: the snapshot that counts, and the frames behind it up to the head.
 
-use super::client::Client;
+use super::client::{CallError, Client};
 use super::format::{Current, Frame, damaged, parse};
 use super::keys::{Keys, Span, found, found_one, look, range};
 use super::term::{Seen, unreadable};
@@ -11,13 +11,14 @@ use bytes::{Bytes, BytesMut};
 use crc32c::crc32c;
 use std::time::{Duration, Instant};
 
-/// A page may take so long.
-const PATIENCE: Duration = Duration::from_secs(3);
+/// A page may take so long; one that takes longer is asked for in smaller ones.
+const PATIENCE: Duration = Duration::from_secs(5);
 /// And all attempts of it.
-const REACH: Duration = Duration::from_secs(10);
-/// Keys of the first page. Later ones have as many as make about [`PAGE_BYTES`].
-const FIRST_PAGE: i64 = 64;
-const LONGEST_PAGE: i64 = 8_192;
+const REACH: Duration = Duration::from_secs(30);
+/// Keys of the first page. Later ones have as many as make about [`PAGE_BYTES`], judged by the page before.
+const FIRST_PAGE: i64 = 4;
+/// With parts of a MiB not more than an answer may have.
+const LONGEST_PAGE: i64 = 256;
 const PAGE_BYTES: usize = 4 << 20;
 
 /// What is there, and by which frames.
@@ -107,9 +108,15 @@ fn pages(
 ) -> Result<(), ReadError> {
     let mut limit = FIRST_PAGE;
     loop {
-        let page = RangeRequest { key, range_end: range_end.clone(), limit, revision, keys_only: false };
-        let answer = client.repeat(&look(vec![range(page)]), PATIENCE, Instant::now() + REACH);
-        let answer = answer.map_err(|error| unreadable(client, &error))?;
+        let until = Instant::now() + REACH;
+        let answer = loop {
+            let page =
+                RangeRequest { key: key.clone(), range_end: range_end.clone(), limit, revision, keys_only: false };
+            match client.attempt(look(vec![range(page)]), PATIENCE) {
+                Err(CallError::Unknown(_)) if Instant::now() < until => limit = (limit / 2).max(1),
+                answered => break answered.map_err(|error| unreadable(client, &error))?,
+            }
+        };
         let (kvs, more) = found(answer.responses.into_iter().next());
         let bytes: usize = kvs.iter().map(|kv| kv.value.len()).sum();
         let last = kvs.last().map(|kv| kv.key.clone());

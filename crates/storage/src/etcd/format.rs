@@ -3,7 +3,8 @@
 //! ```text
 //!   meta      {"version":1, "store":N, "cluster":N}   the log's number, and etcd's own of the cluster
 //!   leader    {"epoch":N, "holder":{…} or null, "draw":N}
-//!   head      {"position":N, "epoch":N}
+//!   head      {"position":N, "epoch":N, "step":N}
+//!   step      {"epoch":N, "step":N}
 //!   current   {"through":N, "parts":N, "bytes":N, "crc":N}
 //!   frame     crc32c u32 | store u64 | first u64 | count u32 | bytes u64 | parts u32 | bytes of part 0; part K: bytes
 //!             all bytes together: count × ( length u32 | payload )
@@ -54,6 +55,14 @@ pub(super) struct Leader {
 pub(super) struct Head {
     pub(super) position: u64,
     pub(super) epoch: u64,
+    /// Counted within the epoch: no value comes twice.
+    pub(super) step: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Step {
+    pub(super) epoch: u64,
+    pub(super) step: u64,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

@@ -5,6 +5,7 @@
 //!   PREFIX/leader                     who leads; written when somebody takes the place, and when it is given up
 //!   PREFIX/alive                      written again and again by who leads
 //!   PREFIX/head                       the last record that counts
+//!   PREFIX/step                       how often a snapshot, or what it replaces, was changed
 //!   PREFIX/log/POSITION/PART          a frame of records, by the first of them
 //!   PREFIX/snapshot/current           which snapshot counts
 //!   PREFIX/snapshot/THROUGH/PART      a snapshot
@@ -50,6 +51,10 @@ impl Keys {
 
     pub(super) fn head(&self) -> Bytes {
         self.key("head")
+    }
+
+    pub(super) fn step(&self) -> Bytes {
+        self.key("step")
     }
 
     pub(super) fn current(&self) -> Bytes {

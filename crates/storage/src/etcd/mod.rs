@@ -11,11 +11,13 @@
 //!
 //! etcd keeps every version of every key until it is compacted: run it with `--auto-compaction-retention`.
 
+mod chain;
 mod client;
 mod compaction;
 mod contents;
 mod format;
 mod keys;
+mod mark;
 mod term;
 mod writer;
 
@@ -29,14 +31,19 @@ pub use client::Connect;
 pub use format::Holder;
 pub use writer::Bounds;
 
-use crate::error::{OpenError, ReadError};
+use crate::error::{Fault, OpenError, ReadError};
 use crate::store::{Position, Recovered, Store, Writer};
+use chain::Chain;
 use client::Client;
+use contents::Contents;
+use format::{Head, Step, text};
 use keys::{Keys, delete_span};
+use mark::{Height, Mark};
 use std::fmt;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
-use term::{Seen, Silence};
+use term::{Seen, Silence, Term};
 use writer::{EtcdWriter, Renewing, Shared};
 
 /// Where a log in etcd is, and who opens it.
@@ -52,6 +59,8 @@ pub struct EtcdOptions {
     pub holder: Holder,
     /// Bounds.
     pub bounds: Bounds,
+    /// Where this host keeps what it has seen of the log at the most; nothing is kept without.
+    pub mark: Option<PathBuf>,
     /// Opens the log also where an older state of etcd was restored: what was acknowledged since then is gone.
     pub accept_restored: bool,
 }
@@ -62,6 +71,7 @@ pub struct Etcd {
     options: EtcdOptions,
     keys: Keys,
     client: Arc<Client>,
+    mark: Mark,
     silence: Mutex<Option<Silence>>,
 }
 
@@ -90,7 +100,8 @@ impl Etcd {
             source,
         })?;
         let keys = Keys::new(&options.prefix);
-        Ok(Etcd { options, keys, client: Arc::new(client), silence: Mutex::default() })
+        let mark = Mark::new(options.mark.clone());
+        Ok(Etcd { options, keys, client: Arc::new(client), mark, silence: Mutex::default() })
     }
 
     /// Who has the writer's place, as etcd says; it may have left without a word. Blocks.
@@ -102,41 +113,64 @@ impl Etcd {
     }
 }
 
+impl Etcd {
+    /// Reads what is there, and throws away what predecessors had begun and nobody was told of.
+    fn begin(&self, term: &Arc<Term>) -> Result<(Recovered, Shared, Chain), OpenError> {
+        let seen = Seen::look(&self.client, &self.keys)?;
+        let Contents { recovered, frames, head } = contents::read(&self.client, &self.keys, &seen, 0)?;
+        let last = recovered.last();
+        let compacted = recovered.snapshot.as_ref().map_or(Position(0), |snapshot| snapshot.through);
+        let until = Instant::now() + REACH;
+        let perform = |request: &_| {
+            self.client.repeat(request, writer::PATIENCE, until).map_err(|error| term.fault("clear", &error))
+        };
+        let failed = |fault: Fault| match fault {
+            Fault::Deposed { .. } => self.held("somebody who took it just now"),
+            other => ReadError::Remote { place: self.client.place(), what: other.to_string() }.into(),
+        };
+        let mut chain = Chain::from(self.keys.head(), head);
+        let value = text(&Head { position: last.0, epoch: term.epoch.0, step: 1 });
+        let left = vec![delete_span(self.keys.frames_from(last.next()))];
+        chain.step(term, left, value, perform).map_err(failed)?;
+        let mut snapshots = Chain::from(self.keys.step(), seen.step);
+        let value = text(&Step { epoch: term.epoch.0, step: 1 });
+        let left = [self.keys.snapshots_before(compacted), self.keys.snapshots_after(compacted)].map(delete_span);
+        snapshots.step(term, left.into(), value, perform).map_err(failed)?;
+        let shared = Shared::new(term.clone(), self.options.bounds.clone(), last, compacted, frames, snapshots);
+        Ok((recovered, shared, chain))
+    }
+
+    fn held(&self, holder: &str) -> OpenError {
+        OpenError::Held { place: self.keys.prefix().to_owned(), holder: holder.to_owned() }
+    }
+
+    fn system(&self, source: std::io::Error) -> OpenError {
+        OpenError::Io { action: "start a thread for", place: self.options.prefix.clone(), source }
+    }
+}
+
 impl Store for Etcd {
     fn open(&self) -> Result<(Recovered, Box<dyn Writer>), OpenError> {
         let mut silence = self.silence.lock().unwrap_or_else(PoisonError::into_inner);
-        let seen = term::await_vacancy(&self.client, &self.keys, &mut silence)?;
-        let term = term::take(&self.client, &self.keys, &seen, &self.options.holder, self.options.accept_restored)?;
-        let term = Arc::new(term);
-        let system =
-            |source| OpenError::Io { action: "start a thread for", place: self.options.prefix.clone(), source };
-        // From now on: what is there may take longer to read than the place waits.
-        let renewing = Renewing::start(term.clone()).map_err(system)?;
-        // A transaction of the predecessor may have come between.
-        let seen = Seen::look(&self.client, &self.keys)?;
-        let contents = contents::read(&self.client, &self.keys, &seen, 0)?;
-        let recovered = contents.recovered;
-        let compacted = recovered.snapshot.as_ref().map_or(Position(0), |snapshot| snapshot.through);
-        let shared =
-            Shared::new(term.clone(), self.options.bounds.clone(), recovered.last(), compacted, contents.frames);
-        // What predecessors had begun and nobody was told of.
-        for left in [
-            self.keys.frames_from(recovered.last().next()),
-            self.keys.snapshots_before(compacted),
-            self.keys.snapshots_after(compacted),
-        ] {
-            let request = term.guarded(vec![delete_span(left)]);
-            let answer = self.client.repeat(&request, writer::PATIENCE, Instant::now() + REACH);
-            match answer {
-                Ok(answer) if answer.succeeded => {}
-                Ok(_) => {
-                    let place = self.keys.prefix().to_owned();
-                    return Err(OpenError::Held { place, holder: "somebody who took it just now".to_owned() });
-                }
-                Err(error) => return Err(term::unreadable(&self.client, &error).into()),
-            }
+        let vacant = term::await_vacancy(&self.client, &self.keys, &mut silence, &self.mark)?;
+        if self.mark.is_above(Height::of(&vacant)) && !self.options.accept_restored {
+            return Err(OpenError::Restored { place: self.keys.prefix().to_owned() });
         }
-        let writer = EtcdWriter::start(Arc::new(shared), contents.head, renewing).map_err(system)?;
+        let taken = term::take(&self.client, &self.keys, &vacant, &self.options.holder, self.options.accept_restored);
+        if taken.is_err() {
+            // The holder may not have been able to say that it is there, as we were not: silence counts from now on.
+            *silence = None;
+        }
+        let term = Arc::new(taken?);
+        // From now on: what is there may take longer to read than the place waits.
+        let renewing = Renewing::start(term.clone(), self.mark.clone()).map_err(|error| self.system(error))?;
+        let begun = self.begin(&term).map_err(|error| match term.renew() {
+            // What was read in the middle of another one's changes means nothing.
+            Err(Fault::Deposed { .. }) => self.held("somebody who took it just now"),
+            _ => error,
+        });
+        let (recovered, shared, chain) = begun?;
+        let writer = EtcdWriter::start(Arc::new(shared), chain, renewing).map_err(|error| self.system(error))?;
         Ok((recovered, Box::new(writer)))
     }
 

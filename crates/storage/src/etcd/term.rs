@@ -12,6 +12,7 @@
 use super::client::{CallError, Client, cluster_of};
 use super::format::{Head, Holder, Leader, Meta, VERSION, parse, text};
 use super::keys::{Keys, delete, found_one, get, look, put, written_at};
+use super::mark::{Height, Mark};
 use super::wire::{Compare, KeyValue, RequestOp, TxnRequest, TxnResponse};
 use crate::error::{Fault, OpenError, ReadError};
 use crate::store::{Epoch, Place};
@@ -28,8 +29,8 @@ const SILENCE: Duration = Duration::from_millis(1_050);
 const LONGEST_LOOK_PAUSE: Duration = Duration::from_millis(500);
 /// How often somebody looks who wants the place.
 const LOOK_INTERVAL: Duration = Duration::from_millis(50);
-/// One attempt of a small transaction.
-pub(super) const PATIENCE: Duration = Duration::from_millis(400);
+/// A small transaction that takes longer comes too late.
+pub(super) const PATIENCE: Duration = Duration::from_millis(900);
 /// After so long without an answer of any member there is no etcd.
 const REACH: Duration = Duration::from_secs(5);
 
@@ -39,6 +40,8 @@ pub(super) struct Seen {
     pub(super) meta: Option<Meta>,
     pub(super) leader: Option<(i64, Leader)>,
     pub(super) head: Option<(i64, Head)>,
+    /// When `step` was written.
+    pub(super) step: i64,
     /// When `alive` was written.
     alive: i64,
     /// etcd's number of its cluster.
@@ -71,7 +74,7 @@ pub(super) struct Term {
 
 impl Seen {
     pub(super) fn look(client: &Client, keys: &Keys) -> Result<Seen, ReadError> {
-        let request = look([keys.meta(), keys.leader(), keys.head(), keys.alive()].map(get).into());
+        let request = look([keys.meta(), keys.leader(), keys.head(), keys.alive(), keys.step()].map(get).into());
         let answer = client.repeat(&request, PATIENCE, Instant::now() + REACH);
         let answer = answer.map_err(|error| unreadable(client, &error))?;
         Seen::of(keys, answer)
@@ -85,12 +88,12 @@ impl Seen {
         let meta: Option<Meta> = next().map(|kv| parse(&keys.meta(), &kv.value)).transpose()?;
         let leader = with_revision(next(), &keys.leader())?;
         let head = with_revision(next(), &keys.head())?;
-        let alive = next().map_or(0, |kv| kv.mod_revision);
+        let [alive, step] = [(); 2].map(|()| next().map_or(0, |kv| kv.mod_revision));
         if let Some(newer) = meta.as_ref().filter(|meta| meta.version > VERSION) {
             let place = keys.prefix().to_owned();
             return Err(ReadError::Newer { place, found: newer.version, supported: VERSION });
         }
-        Ok(Seen { meta, leader, head, alive, cluster, revision })
+        Ok(Seen { meta, leader, head, step, alive, cluster, revision })
     }
 
     fn holder(&self) -> Option<&Holder> {
@@ -110,7 +113,12 @@ fn with_revision<T: serde::de::DeserializeOwned>(
 }
 
 /// Looks until the place can be taken, or somebody who has it says something.
-pub(super) fn await_vacancy(client: &Client, keys: &Keys, silence: &mut Option<Silence>) -> Result<Seen, OpenError> {
+pub(super) fn await_vacancy(
+    client: &Client,
+    keys: &Keys,
+    silence: &mut Option<Silence>,
+    mark: &Mark,
+) -> Result<Seen, OpenError> {
     loop {
         let seen = Seen::look(client, keys)?;
         let Some(holder) = seen.holder() else { return Ok(seen) };
@@ -127,6 +135,9 @@ pub(super) fn await_vacancy(client: &Client, keys: &Keys, silence: &mut Option<S
             Some(_) => {
                 *silence = Some(Silence { leader, alive, since: now, looked: now });
                 let holder = format!("{}, {}", holder.about, holder.address);
+                if let Some(height) = Height::of(&seen).filter(|height| !mark.is_above(Some(*height))) {
+                    mark.keep(height);
+                }
                 return Err(OpenError::Held { place: keys.prefix().to_owned(), holder });
             }
             None => *silence = Some(Silence { leader, alive, since: now, looked: now }),
@@ -219,12 +230,9 @@ impl Term {
             return Err(self.deposed());
         }
         let alive = self.guarded(vec![put(self.keys.alive(), text(&self.epoch.0))]);
-        let until = Instant::now() + 2 * PATIENCE;
-        let answer = match self.client.repeat(&alive, PATIENCE, until) {
+        let answer = match self.client.attempt(alive, PATIENCE) {
             // It cannot be said, but it can be seen; nor can anybody take the place meanwhile.
-            Err(CallError::NoSpace) => {
-                self.client.repeat(&self.guarded(vec![get(self.keys.leader())]), PATIENCE, until)
-            }
+            Err(CallError::NoSpace) => self.client.attempt(self.guarded(vec![get(self.keys.leader())]), PATIENCE),
             answer => answer,
         };
         match answer {
@@ -238,7 +246,7 @@ impl Term {
     pub(super) fn give_up(&self) {
         let vacant = Leader { epoch: self.epoch.0, holder: None, draw: self.draw };
         let request = self.guarded(vec![put(self.keys.leader(), text(&vacant)), delete(self.keys.alive())]);
-        let _ = self.client.repeat(&request, PATIENCE, Instant::now() + REACH);
+        let _ = self.client.attempt(request, PATIENCE);
         self.lost.store(true, Ordering::SeqCst);
     }
 

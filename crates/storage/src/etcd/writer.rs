@@ -7,25 +7,26 @@
 //! While etcd does not answer or has no space, what is appended waits, and [`Progress::stalled`](crate::Progress) says why. What waits is
 //! bounded: then appends are refused, and accepted again when etcd is back.
 
+use super::chain::Chain;
 use super::client::{CallError, Client, FIRST_PAUSE, LONGEST_PAUSE};
 use super::compaction::Compaction;
-use super::format::{Head, encode_frame, parse, text};
-use super::keys::{found_one, get, put, written_at};
+use super::format::{Head, Step, encode_frame, text};
+use super::keys::put;
+use super::mark::{Height, Mark};
 use super::term::{HeldPlace, RENEW_INTERVAL, Term};
 use super::wire::{RequestOp, TxnRequest};
 use crate::durable::Durable;
 use crate::error::{AppendError, CompactError, CompactionFailure, Fault};
 use crate::pending::{Batch, Pending, RECORD_HEADER};
 use crate::store::{MakeSnapshot, Place, Position, Writer};
-use bytes::Bytes;
 use std::collections::VecDeque;
 use std::io;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-/// One attempt of a transaction with a whole part.
-pub(super) const PATIENCE: Duration = Duration::from_secs(1);
+/// A transaction with a whole part is asked for again after so long.
+pub(super) const PATIENCE: Duration = Duration::from_secs(10);
 /// A transaction that is not performed for so long is told of.
 const STALLED_AFTER: Duration = Duration::from_millis(500);
 /// Where several wait for a transaction, the next one waits for them this part of its time …
@@ -33,7 +34,9 @@ const LINGER_SHARE: u32 = 8;
 /// … and no longer than this.
 const LONGEST_LINGER: Duration = Duration::from_millis(2);
 /// Who closes waits so long for an etcd that does not answer.
-const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
+const CLOSE_PATIENCE: Duration = Duration::from_secs(3);
+/// What etcd refuses is asked for again for so long: some refusals pass.
+const REFUSED_PATIENCE: Duration = Duration::from_secs(5);
 /// Where etcd has no space it is asked again after so long.
 const NO_SPACE_PAUSE: Duration = Duration::from_millis(500);
 
@@ -62,6 +65,8 @@ pub(super) struct Shared {
     pub(super) bounds: Bounds,
     /// (first, last) of every frame that is there.
     frames: Mutex<VecDeque<(Position, Position)>>,
+    /// Of everything but frames.
+    snapshots: Mutex<(Chain, u64)>,
     closing_since: Mutex<Option<Instant>>,
 }
 
@@ -80,9 +85,20 @@ impl Shared {
         last: Position,
         compacted: Position,
         frames: Vec<(Position, Position)>,
+        snapshots: Chain,
     ) -> Shared {
         let pending = Pending::new(term.keys.prefix().to_owned(), 0, last, compacted);
-        Shared { term, pending, bounds, frames: Mutex::new(frames.into()), closing_since: Mutex::default() }
+        let (frames, snapshots) = (Mutex::new(frames.into()), Mutex::new((snapshots, 0)));
+        Shared { term, pending, bounds, frames, snapshots, closing_since: Mutex::default() }
+    }
+
+    /// Changes a snapshot, or what one replaces.
+    pub(super) fn change_snapshots(&self, operations: Vec<RequestOp>) -> Result<(), Fault> {
+        let mut snapshots = self.snapshots.lock().unwrap_or_else(PoisonError::into_inner);
+        let (chain, step) = &mut *snapshots;
+        *step += 1;
+        let value = text(&Step { epoch: self.term.epoch.0, step: *step });
+        chain.step(&self.term, operations, value, |request| self.perform(request))
     }
 
     /// Forgets the frames that hold nothing after this position; from which to which they begin.
@@ -101,7 +117,8 @@ impl Shared {
         let (client, began): (&Client, _) = (&self.term.client, Instant::now());
         let mut pause = FIRST_PAUSE;
         loop {
-            let error = match client.attempt(request.clone(), PATIENCE) {
+            let patience = if self.is_closing() { CLOSE_PATIENCE } else { PATIENCE };
+            let error = match client.attempt(request.clone(), patience) {
                 Ok(answer) => {
                     self.pending.stalled(None);
                     return Ok(answer);
@@ -111,7 +128,12 @@ impl Shared {
             if let Some(fault) = self.pending.fault() {
                 return Err(fault);
             }
-            if !matches!(error, CallError::Unknown(_) | CallError::NoSpace) || self.has_waited_to_close() {
+            let over = match &error {
+                CallError::Unknown(_) | CallError::NoSpace => false,
+                CallError::Refused(_) => began.elapsed() >= REFUSED_PATIENCE,
+                CallError::TooLarge(_) | CallError::WentBack { .. } => true,
+            };
+            if over || self.has_waited_to_close() {
                 return Err(self.term.fault("write to", &error));
             }
             if began.elapsed() >= STALLED_AFTER || matches!(error, CallError::NoSpace) {
@@ -122,9 +144,16 @@ impl Shared {
         }
     }
 
+    fn closing_since(&self) -> Option<Instant> {
+        *self.closing_since.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn is_closing(&self) -> bool {
+        self.closing_since().is_some()
+    }
+
     fn has_waited_to_close(&self) -> bool {
-        let since = self.closing_since.lock().unwrap_or_else(PoisonError::into_inner);
-        since.is_some_and(|since| since.elapsed() >= CLOSE_PATIENCE)
+        self.closing_since().is_some_and(|since| since.elapsed() >= CLOSE_PATIENCE)
     }
 
     fn close(&self) {
@@ -136,8 +165,10 @@ impl Shared {
 /// The thread that writes.
 struct Writing {
     shared: Arc<Shared>,
-    /// The revision of `head`.
-    head: i64,
+    chain: Chain,
+    /// The last record that counts, and how often `head` was written in this epoch.
+    head: Position,
+    step: u64,
 }
 
 /// Says that nobody writes any more, however the thread ended.
@@ -193,47 +224,28 @@ impl Writing {
         Ok(())
     }
 
+    /// With a head that says so.
+    fn put(&mut self, part: RequestOp, head: Position) -> Result<(), Fault> {
+        self.step += 1;
+        self.head = head;
+        let term = &self.shared.term;
+        let value = text(&Head { position: head.0, epoch: term.epoch.0, step: self.step });
+        self.chain.step(term, vec![part], value, |request| self.shared.perform(request))
+    }
+
     fn commit(&mut self, first: Position, last: Position, records: &[u8]) -> Result<(), Fault> {
-        let (term, keys) = (&self.shared.term, &self.shared.term.keys);
+        let shared = self.shared.clone();
+        let (term, keys) = (&shared.term, &shared.term.keys);
         let count = u32::try_from(last.0 - first.0 + 1).unwrap_or(u32::MAX);
-        let parts = encode_frame(term.store, first, count, records, self.shared.bounds.part);
-        let put_part = |(number, part): (u32, Bytes)| put(keys.frame(first, number), part);
-        let mut puts = (0..).zip(parts).map(put_part);
-        let begin = puts.next();
+        let parts = encode_frame(term.store, first, count, records, shared.bounds.part);
+        let mut puts: Vec<RequestOp> =
+            (0..).zip(parts).map(|(number, part)| put(keys.frame(first, number), part)).collect();
+        let begin = puts.remove(0);
         // What is behind the head does not count until the head has moved.
         for part in puts {
-            let answer = self.shared.perform(&term.guarded(vec![part]))?;
-            if !answer.succeeded {
-                return Err(term.deposed());
-            }
+            self.put(part, self.head)?;
         }
-        let head = Head { position: last.0, epoch: term.epoch.0 };
-        let mut success: Vec<RequestOp> = begin.into_iter().collect();
-        success.push(put(keys.head(), text(&head)));
-        let request = TxnRequest {
-            compare: vec![term.guard(), written_at(keys.head(), self.head)],
-            success,
-            failure: vec![get(keys.leader()), get(keys.head())],
-        };
-        let answer = self.shared.perform(&request)?;
-        self.head = if answer.succeeded {
-            answer.header.map_or(0, |header| header.revision)
-        } else {
-            let mut found = answer.responses.into_iter();
-            let leader = found_one(found.next()).map_or(0, |kv| kv.mod_revision);
-            if !term.is_since(leader) {
-                return Err(term.deposed());
-            }
-            // An attempt without an answer may have been performed: then the head is where it was to be.
-            let kv = found_one(found.next());
-            let at = kv.as_ref().map_or(0, |kv| kv.mod_revision);
-            let found: Option<Head> = kv.and_then(|kv| parse(&keys.head(), &kv.value).ok());
-            if found != Some(head) {
-                let what = "its head was moved by somebody who is not its writer".to_owned();
-                return Err(Fault::Remote { action: "write to", place: keys.prefix().to_owned(), what });
-            }
-            at
-        };
+        self.put(begin, last)?;
         self.shared.frames.lock().unwrap_or_else(PoisonError::into_inner).push_back((first, last));
         Ok(())
     }
@@ -251,10 +263,10 @@ pub(super) struct Renewing {
 }
 
 impl Renewing {
-    pub(super) fn start(term: Arc<Term>) -> io::Result<Renewing> {
+    pub(super) fn start(term: Arc<Term>, mark: Mark) -> io::Result<Renewing> {
         let (end, ended) = mpsc::channel::<()>();
         let writer = Arc::new(OnceLock::<Arc<Shared>>::new());
-        let (renewed, tell) = (term.clone(), writer.clone());
+        let (renewed, tell, kept) = (term.clone(), writer.clone(), mark);
         let renew = move || {
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(RENEW_INTERVAL) {
                 // One that is found lost before there is a writer is found lost again.
@@ -262,7 +274,9 @@ impl Renewing {
                     writer.pending.stop(&fault);
                     return;
                 }
+                keep(&kept, &tell);
             }
+            keep(&kept, &tell);
         };
         let thread = thread::Builder::new().name("etcd-renewer".to_owned()).spawn(renew)?;
         Ok(Renewing { term, writer, thread: Some((end, thread)) })
@@ -281,6 +295,14 @@ impl Renewing {
     }
 }
 
+/// What has become durable, for this host to know later.
+fn keep(mark: &Mark, writer: &OnceLock<Arc<Shared>>) {
+    if let Some(writer) = writer.get() {
+        let position = writer.pending.watch().borrow().durable.0;
+        mark.keep(Height { store: writer.term.store, epoch: writer.term.epoch.0, position });
+    }
+}
+
 impl Drop for Renewing {
     fn drop(&mut self) {
         self.end();
@@ -288,8 +310,10 @@ impl Drop for Renewing {
 }
 
 impl EtcdWriter {
-    pub(super) fn start(shared: Arc<Shared>, head: i64, renewing: Renewing) -> io::Result<EtcdWriter> {
-        let writing = Writing { shared: shared.clone(), head };
+    pub(super) fn start(shared: Arc<Shared>, chain: Chain, renewing: Renewing) -> io::Result<EtcdWriter> {
+        let head = shared.pending.appended();
+        // The first step cleared what is behind the head.
+        let writing = Writing { shared: shared.clone(), chain, head, step: 1 };
         let writing = thread::Builder::new().name("etcd-writer".to_owned()).spawn(move || writing.run())?;
         renewing.watched_by(&shared);
         Ok(EtcdWriter { shared, writing: Some(writing), compaction: None, renewing })

@@ -160,6 +160,8 @@ struct Loses {
     answers: AtomicBool,
     /// Connections are refused and broken.
     all: AtomicBool,
+    /// Nothing is lost, and nothing passed on.
+    held: AtomicBool,
 }
 
 impl Proxy {
@@ -192,6 +194,11 @@ impl Proxy {
         self.loses.answers.store(lose, Ordering::SeqCst);
     }
 
+    /// What is sent meanwhile arrives, in order, when this ends.
+    pub(crate) fn hold(&self, hold: bool) {
+        self.loses.held.store(hold, Ordering::SeqCst);
+    }
+
     /// Nothing arrives; connections that were open are broken.
     pub(crate) fn lose_all(&self, lose: bool) {
         self.loses.all.store(lose, Ordering::SeqCst);
@@ -203,6 +210,9 @@ fn pass(mut from: TcpStream, mut to: TcpStream, loses: Arc<Loses>, answers: bool
     thread::spawn(move || {
         let (mut bytes, mut has_lost) = ([0; 16_384], false);
         while let Ok(count @ 1..) = from.read(&mut bytes) {
+            while loses.held.load(Ordering::SeqCst) {
+                thread::sleep(Duration::from_millis(1));
+            }
             if loses.all.load(Ordering::SeqCst) {
                 break;
             }

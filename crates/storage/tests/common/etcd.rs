@@ -21,6 +21,7 @@ pub(crate) fn options(endpoints: Vec<String>, prefix: &str, about: &str) -> Etcd
         prefix: prefix.to_owned(),
         holder: Holder { address: format!("http://{about}"), about: about.to_owned() },
         bounds: Bounds::default(),
+        mark: None,
         accept_restored: false,
     }
 }
