@@ -206,6 +206,11 @@ impl Connections {
         Some(Connection { stream, closed, registered: Registered(link) })
     }
 
+    /// Closes all that are still open.
+    pub(crate) fn close_all(&self) {
+        self.state().open.values().for_each(|open| open.close.cancel());
+    }
+
     /// Closes those whose time is over, for as long as it is polled.
     pub(crate) async fn sweep(&self) -> Infallible {
         let mut interval = tokio::time::interval(SWEEP_INTERVAL);

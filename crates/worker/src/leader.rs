@@ -7,16 +7,18 @@
 //! ```
 //! Only gRPC health is asked: who stands by says NOT_SERVING. Whoever uses the connection sees what it sees of any connection that breaks.
 
-use crate::endpoint::{CONNECT_TIMEOUT, Endpoint, connect_to_ask};
+use crate::client::chain;
+use crate::endpoint::{Endpoint, connect_to_ask};
 use crate::tls::connect::Connector;
 use crate::trace::Traced;
 use futures::StreamExt;
 use futures::stream::FuturesUnordered;
 use hyper_util::rt::TokioIo;
+use std::collections::BTreeMap;
 use std::future::Future;
 use std::io;
 use std::pin::Pin;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
@@ -27,14 +29,16 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
+/// One of them has to lead by then: before an attempt to connect is given up ([`crate::endpoint::CONNECT_TIMEOUT`]).
+const FIND_DEADLINE: Duration = Duration::from_millis(2_800);
 /// How often a server is asked whether it still leads.
 const ASK_INTERVAL: Duration = Duration::from_millis(250);
 /// And how soon it has to answer.
 const ANSWER_DEADLINE: Duration = Duration::from_millis(500);
 /// A server that has not said for so long that it leads is left for one that does.
 const SILENCE: Duration = Duration::from_millis(1_000);
-/// The pause between two rounds of questions while none of them leads.
-const LOOK_INTERVAL: Duration = Duration::from_millis(50);
+/// The pause between two questions of a server that does not lead; grows from the first to the second.
+const LOOK_INTERVALS: (Duration, Duration) = (Duration::from_millis(25), Duration::from_millis(200));
 
 /// Connects to whichever of several servers leads.
 #[derive(Debug, Clone)]
@@ -60,10 +64,16 @@ impl Service<Uri> for LeaderConnector {
     fn call(&mut self, _: Uri) -> Self::Future {
         let members = self.members.clone();
         Box::pin(async move {
-            let leader = tokio::time::timeout(CONNECT_TIMEOUT, find(&members, None)).await;
+            let said = Said::default();
+            let leader = tokio::time::timeout(FIND_DEADLINE, find(&members, None, &said)).await;
             let leader = leader.map_err(|_| {
-                let members: Vec<String> = members.iter().map(Endpoint::to_string).collect();
-                io::Error::new(io::ErrorKind::NotConnected, format!("none of {} leads", members.join(", ")))
+                let said = said.lock().unwrap_or_else(PoisonError::into_inner);
+                let each = |member: &Endpoint| {
+                    let what = said.get(member).map_or("no answer", String::as_str);
+                    format!("{member} ({what})")
+                };
+                let members: Vec<String> = members.iter().map(each).collect();
+                io::Error::new(io::ErrorKind::NotConnected, format!("none of these leads: {}", members.join(", ")))
             })?;
             let stream = open(&leader).await?;
             let (broken, watched) = (CancellationToken::new(), CancellationToken::new());
@@ -78,14 +88,20 @@ impl Service<Uri> for LeaderConnector {
     }
 }
 
+/// What each server that does not lead said last.
+type Said = Mutex<BTreeMap<Endpoint, String>>;
+
 /// The first that says that it leads, apart from one of them.
-async fn find(members: &[Endpoint], apart_from: Option<&Endpoint>) -> Endpoint {
+async fn find(members: &[Endpoint], apart_from: Option<&Endpoint>, said: &Said) -> Endpoint {
     let others = members.iter().filter(|member| Some(*member) != apart_from);
     let mut seeking: FuturesUnordered<_> = others
         .map(|member| async move {
             let mut asked = Asked { member, client: None };
-            while !asked.leads().await {
-                tokio::time::sleep(LOOK_INTERVAL).await;
+            let mut pause = LOOK_INTERVALS.0;
+            while let Err(what) = asked.leads().await {
+                said.lock().unwrap_or_else(PoisonError::into_inner).insert(member.clone(), what);
+                tokio::time::sleep(pause).await;
+                pause = (2 * pause).min(LOOK_INTERVALS.1);
             }
             member.clone()
         })
@@ -102,14 +118,15 @@ async fn watch(members: Arc<[Endpoint]>, leader: Endpoint, broken: CancellationT
     let mut led = Instant::now();
     loop {
         tokio::time::sleep(ASK_INTERVAL).await;
-        if asked.leads().await {
+        // A connection that has to be made anew takes no longer than an answer may.
+        if let Ok(Ok(())) = tokio::time::timeout(ANSWER_DEADLINE, asked.leads()).await {
             led = Instant::now();
         }
         if led.elapsed() < SILENCE {
             continue;
         }
         // Asked until one of them leads: the server itself may be the next.
-        let other = tokio::time::timeout(SILENCE, find(&members, Some(&leader))).await;
+        let other = tokio::time::timeout(SILENCE, find(&members, Some(&leader), &Said::default())).await;
         if let Ok(other) = other {
             tracing::info!(from = %leader, to = %other, "another server leads");
             broken.cancel();
@@ -124,18 +141,19 @@ struct Asked<'a> {
 }
 
 impl Asked<'_> {
-    async fn leads(&mut self) -> bool {
-        let answered = tokio::time::timeout(ANSWER_DEADLINE, async {
-            let mut client = match self.client.take() {
-                Some(client) => client,
-                None => HealthClient::new(connect_to_ask(self.member).await.ok()?),
-            };
-            let answer = client.check(HealthCheckRequest { service: String::new() }).await.ok()?;
-            // Kept for the next question, as it has answered.
-            self.client = Some(client);
-            Some(answer.into_inner().status() == ServingStatus::Serving)
-        });
-        answered.await.ok().flatten().unwrap_or(false)
+    /// Whether it says so; else what it says.
+    async fn leads(&mut self) -> Result<(), String> {
+        let mut client = match self.client.take() {
+            Some(client) => client,
+            None => HealthClient::new(connect_to_ask(self.member).await.map_err(|error| chain(&error))?),
+        };
+        let question = client.check(HealthCheckRequest { service: String::new() });
+        let answer = tokio::time::timeout(ANSWER_DEADLINE, question).await;
+        let answer = answer.map_err(|_| "no answer".to_owned())?.map_err(|status| status.message().to_owned())?;
+        // Kept for the next question, as it has answered.
+        self.client = Some(client);
+        let leads = answer.into_inner().status() == ServingStatus::Serving;
+        if leads { Ok(()) } else { Err("it stands by, or cannot serve: NOT_SERVING".to_owned()) }
     }
 }
 

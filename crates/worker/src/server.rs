@@ -377,6 +377,7 @@ impl Bound {
             closing.cancel();
             // Who watches health would keep a connection open for ever.
             tokio::time::sleep(CLOSE_PATIENCE).await;
+            connections.close_all();
         };
         let endpoint = self.endpoint;
         tokio::select! {

@@ -75,7 +75,8 @@ impl<C: Core> Actor<C> {
                 biased;
                 () = over.cancelled() => return self.end(),
                 () = draining.cancelled(), if !self.drained => self.drain(),
-                Some(urgent) = inbox.urgent.recv(), if urgent_first => {
+                // While nothing may be said its answers wait as all do, so it waits for room as well.
+                Some(urgent) = inbox.urgent.recv(), if urgent_first && (room || self.desk.may_speak()) => {
                     urgent_taken += 1;
                     self.receive_urgent(urgent);
                 }
