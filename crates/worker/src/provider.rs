@@ -1,7 +1,9 @@
 //! Offers resources under a session, and withdraws them. A resource that the resource manager has forgotten is offered again. While the
 //! manager cannot be reached, offers and withdrawals wait.
 //!
-//! A provider watches its resources at the manager. When somebody else has deleted one, the provider logs that and offers it again.
+//! A provider watches its resources at the manager. When somebody else has deleted one, the provider logs that and offers it again. What
+//! a new watch shows first is compared with what was offered: a session may have ended and been made anew unnoticed, when the answer of
+//! the manager that said so was lost.
 //! One of what moves ([`Provider::start_at_rest`]) offers nothing at which an earlier goal still runs.
 
 use crate::action::STOP_GRACE;
@@ -43,6 +45,8 @@ pub struct Provider {
 #[derive(Debug)]
 struct Shared {
     client: ResourceClient,
+    /// The session's id.
+    session: String,
     state: watch::Receiver<SessionState>,
     /// By id. Held during a call, so that an older state never overtakes a newer one.
     desired: Mutex<BTreeMap<String, DesiredState>>,
@@ -96,6 +100,7 @@ impl Provider {
         let client = ResourceClient::new(channels, endpoint, session.id())?;
         let shared = Arc::new(Shared {
             client,
+            session: session.id().to_owned(),
             state: session.state(),
             desired: Mutex::default(),
             missing: Notify::new(),
@@ -190,8 +195,14 @@ impl Shared {
         self.kinds.send_if_modified(|kinds| !kinds.contains(kind) && kinds.insert(kind.to_owned()));
     }
 
-    async fn is_gone(&self, id: &str) -> bool {
-        self.client.get(id).await.is_err_and(|error| error.code() == Some(Code::NotFound))
+    /// Whether the manager says that it has a resource, of this provider's session. Where it says nothing, the resource is offered again:
+    /// that changes nothing where it was there.
+    async fn is_there(&self, id: &str) -> bool {
+        self.client.get(id).await.is_ok_and(|resource| self.is_own(&resource))
+    }
+
+    fn is_own(&self, resource: &Resource) -> bool {
+        resource.session == self.session
     }
 
     /// A resource is gone. What was to be there, and was, is offered again.
@@ -263,6 +274,7 @@ impl DesiredState {
     /// Whether it is so now; an error where it never will be.
     fn conclude(&mut self, id: &str, answer: Result<(), CallError>) -> Result<bool, CallError> {
         match answer {
+            Err(error) if self.resource.is_none() && error.code() == Some(Code::NotFound) => {}
             Err(error) if is_transient(&error) => {
                 let problem = error.to_string();
                 if self.problem != problem {
@@ -271,7 +283,6 @@ impl DesiredState {
                 }
                 return Ok(false);
             }
-            Err(error) if self.resource.is_none() && error.code() == Some(Code::NotFound) => {}
             Err(error) => return Err(error),
             Ok(()) => {}
         }
@@ -281,11 +292,16 @@ impl DesiredState {
     }
 }
 
-/// Whether asking again later may help: nobody answers, the session is not known (yet, or any more), or a session that has
-/// a resource of this id may end.
+/// Whether asking again later may help: nobody answers, the session is not known (yet, or any more), a session that has
+/// a resource of this id may end, or the resource was created and went with its session before that was answered (`NotFound`).
 fn is_transient(error: &CallError) -> bool {
-    use Code::{AlreadyExists, DeadlineExceeded, FailedPrecondition, ResourceExhausted};
-    matches!(error.code(), None | Some(FailedPrecondition | ResourceExhausted | DeadlineExceeded | AlreadyExists))
+    use Code::{AlreadyExists, DeadlineExceeded, FailedPrecondition, NotFound, ResourceExhausted};
+    match error.code() {
+        None => true,
+        Some(code) => {
+            matches!(code, FailedPrecondition | ResourceExhausted | DeadlineExceeded | AlreadyExists | NotFound)
+        }
+    }
 }
 
 /// Asks for everything again whenever the session was made anew, and for what is not so yet.
@@ -358,11 +374,12 @@ async fn watch_kinds(shared: &Shared, kinds: &BTreeSet<String>) {
     while let Ok(Some(update)) = watch.next().await {
         match update {
             ResourceUpdate::Snapshot { resources, .. } => {
-                let shown: BTreeSet<String> = resources.into_iter().map(|resource| resource.id).collect();
+                let shown = resources.into_iter().filter(|resource| shared.is_own(resource));
+                let shown: BTreeSet<String> = shown.map(|resource| resource.id).collect();
                 let now = there(&*shared.desired.lock().await);
                 for id in before.union(&now).filter(|id| !shown.contains(*id)) {
                     // What came while the watch began may have come after the snapshot, or gone before it.
-                    if before.contains(id) || shared.is_gone(id).await {
+                    if before.contains(id) || !shared.is_there(id).await {
                         shared.vanished(id, "it went while nobody watched").await;
                     }
                 }

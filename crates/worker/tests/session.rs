@@ -30,6 +30,14 @@ struct Pool {
     resources: BTreeMap<String, ratn_proto::v1::Resource>,
     /// Ids that another session has.
     taken: BTreeSet<String>,
+    /// So many creations end with their session before they are answered.
+    short_lived: usize,
+    /// Resources are watched, from now on or once more is known.
+    shows: Option<bool>,
+    /// Watches that have begun.
+    watches: usize,
+    /// Questions for one resource are refused so often: the manager is busy.
+    busy: usize,
     /// What streams of pings said of their protocol, in order.
     protocols: Vec<Option<String>>,
 }
@@ -55,6 +63,11 @@ impl ResourceService for Manager {
         if pool.taken.contains(&resource.id) {
             return Err(Status::already_exists("another session has it"));
         }
+        if let Some(left) = pool.short_lived.checked_sub(1) {
+            pool.short_lived = left;
+            return Err(Status::not_found("created by this request and gone since"));
+        }
+        let resource = ratn_proto::v1::Resource { session_id: request.session_id, ..resource };
         pool.resources.insert(resource.id.clone(), resource.clone());
         drop(pool);
         self.changed.send_replace(());
@@ -135,9 +148,16 @@ impl ResourceService for Manager {
 
     async fn get(
         &self,
-        _: Request<ratn_proto::v1::ResourceServiceGetRequest>,
+        request: Request<ratn_proto::v1::ResourceServiceGetRequest>,
     ) -> Result<Response<ratn_proto::v1::ResourceServiceGetResponse>, Status> {
-        Err(Status::unimplemented("not under test"))
+        let mut pool = self.pool.lock().unwrap();
+        if let Some(left) = pool.busy.checked_sub(1) {
+            pool.busy = left;
+            return Err(Status::resource_exhausted("busy"));
+        }
+        let found = pool.resources.get(&request.into_inner().resource_id).cloned();
+        let resource = Some(found.ok_or_else(|| Status::not_found("no such resource"))?);
+        Ok(Response::new(ratn_proto::v1::ResourceServiceGetResponse { resource }))
     }
 
     async fn explain(
@@ -187,7 +207,22 @@ impl ResourceService for Manager {
     type WatchStream = BoxStream<'static, Result<ResourceServiceWatchResponse, Status>>;
 
     async fn watch(&self, _: Request<ResourceServiceWatchRequest>) -> Result<Response<Self::WatchStream>, Status> {
-        Err(Status::unimplemented("not under test"))
+        let manager = self.clone();
+        {
+            let mut pool = manager.pool.lock().unwrap();
+            if pool.shows.is_none() {
+                return Err(Status::unimplemented("not under test"));
+            }
+            pool.watches += 1;
+        }
+        manager.changed.send_replace(());
+        let snapshot = async move {
+            manager.until(|pool| pool.shows == Some(true)).await;
+            let resources = manager.pool.lock().unwrap().resources.values().cloned().collect();
+            let snapshot = ResourceSnapshot { revision: 1, resources, ..ResourceSnapshot::default() };
+            Ok(ResourceServiceWatchResponse { kind: Some(resource_service_watch_response::Kind::Snapshot(snapshot)) })
+        };
+        Ok(Response::new(futures::stream::once(snapshot).chain(futures::stream::pending()).boxed()))
     }
 }
 
@@ -325,4 +360,46 @@ async fn a_resource_that_another_session_still_has_is_offered_until_that_one_is_
     assert!(!provider.offer(arm()).await.unwrap());
     manager.pool.lock().unwrap().taken.clear();
     manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+}
+
+#[tokio::test]
+async fn a_resource_that_went_with_its_session_before_its_creation_was_answered_is_offered_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    manager.pool.lock().unwrap().short_lived = 2;
+    let _serving = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open(&channels, &endpoint, "cell", TTL);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    assert!(!provider.offer(arm()).await.unwrap());
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+}
+
+#[tokio::test]
+async fn what_a_new_watch_does_not_show_is_offered_again_although_nobody_said_that_the_session_was_made_anew() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    // The watch has begun before the arm is offered, and shows nothing yet.
+    manager.pool.lock().unwrap().shows = Some(false);
+    let _serving = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open(&channels, &endpoint, "cell", LONG);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    assert!(provider.offer(Resource::new("spare@sim", ResourceClass::Module, "Arm")).await.unwrap());
+    manager.until(|pool| pool.watches == 1).await;
+    assert!(provider.withdraw("spare@sim").await.unwrap());
+    assert!(provider.offer(arm()).await.unwrap());
+    // The session ended and was made anew by a ping whose answer was lost. The first question for the arm is not answered either.
+    {
+        let mut pool = manager.pool.lock().unwrap();
+        pool.resources.clear();
+        (pool.shows, pool.busy) = (Some(true), 1);
+    }
+    manager.changed.send_replace(());
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    assert_eq!(session.state().borrow().generation, 1);
 }

@@ -149,7 +149,7 @@ impl LeaseWatch {
         patience: Duration,
     ) -> Result<impl Future<Output = ()> + Send + use<>, CallError> {
         let client = ResourceClient::new(channels, manager, session.id())?;
-        let confirming = self.clone().confirm_standstill(client.clone(), patience);
+        let confirming = self.clone().confirm_standstill(client.clone());
         let source = Source::Session { client: Box::new(client), state: session.state(), id: session.id().to_owned() };
         let following = self.clone().follow(source, patience);
         Ok(async move {

@@ -17,6 +17,9 @@ use tokio::time::{sleep, timeout};
 use tokio_util::task::AbortOnDropHandle;
 use tonic::Code;
 
+/// An answer to a confirmation is waited for this long; then the manager is asked again, over a connection made anew where the old one broke.
+const ANSWERED_WITHIN: Duration = Duration::from_secs(1);
+
 /// What a lease that has ended has left of a resource, until its provider has confirmed standstill.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Ending {
@@ -60,7 +63,7 @@ impl Endings {
 
 impl LeaseWatch {
     /// Confirms what is to be confirmed, for as long as it is polled; `client` speaks for the session that provides the resources.
-    pub(super) async fn confirm_standstill(self, client: ResourceClient, patience: Duration) {
+    pub(super) async fn confirm_standstill(self, client: ResourceClient) {
         let mut heard = self.heard();
         let mut confirming: BTreeMap<Ending, AbortOnDropHandle<()>> = BTreeMap::new();
         loop {
@@ -70,7 +73,7 @@ impl LeaseWatch {
             confirming.retain(|ending, _| endings.contains(ending));
             for ending in endings {
                 confirming.entry(ending).or_insert_with_key(|ending| {
-                    let confirm = self.clone().confirm(client.clone(), ending.clone(), patience);
+                    let confirm = self.clone().confirm(client.clone(), ending.clone());
                     AbortOnDropHandle::new(tokio::spawn(confirm))
                 });
             }
@@ -80,7 +83,7 @@ impl LeaseWatch {
         }
     }
 
-    async fn confirm(self, client: ResourceClient, ending: Ending, patience: Duration) {
+    async fn confirm(self, client: ResourceClient, ending: Ending) {
         let Ending { resource, lease, token } = ending;
         // No goal begins under it any more: the watch refutes it.
         let Some(under_way) = self.shared.under_way(&resource, Some((lease, token))) else {
@@ -90,7 +93,7 @@ impl LeaseWatch {
             goal.cancelled().await;
         }
         loop {
-            match timeout(patience, client.confirm_standstill(lease, &resource)).await {
+            match timeout(ANSWERED_WITHIN, client.confirm_standstill(lease, &resource)).await {
                 Ok(Ok(freed)) => return tracing::debug!(%lease, resource, freed, "standstill is confirmed"),
                 Ok(Err(error)) if is_final(&error) => {
                     return tracing::warn!(%lease, resource, %error, "standstill is not confirmed");
