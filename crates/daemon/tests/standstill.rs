@@ -25,6 +25,7 @@ const BOUND: Duration = Duration::from_secs(50);
 
 /// `move`: moves until it is told to stop, and then until it has room to stand still.
 struct Move {
+    told: Arc<Semaphore>,
     stands: Arc<Semaphore>,
     /// When each motion began and when it stood still.
     motions: Arc<Mutex<Vec<(Instant, Instant)>>>,
@@ -40,6 +41,7 @@ impl Action for Move {
         let began = Instant::now();
         goal.progress("moving");
         goal.cancelled.cancelled().await;
+        self.told.add_permits(1);
         self.stands.acquire().await.unwrap().forget();
         self.motions.lock().unwrap().push((began, Instant::now()));
         Err(goal.stopped())
@@ -49,6 +51,8 @@ impl Action for Move {
 /// The driver, with the arm offered.
 struct Driver {
     endpoint: Endpoint,
+    /// A motion was told to stop.
+    told: Arc<Semaphore>,
     stands: Arc<Semaphore>,
     motions: Arc<Mutex<Vec<(Instant, Instant)>>>,
     provider: Provider,
@@ -60,9 +64,10 @@ struct Driver {
 impl Driver {
     async fn start(system: &TestSystem, manager: &Daemon, bound: Duration) -> Driver {
         let place = tempfile::tempdir().unwrap();
-        let (stands, motions) = (Arc::new(Semaphore::new(0)), Arc::default());
+        let (told, stands, motions) = (Arc::new(Semaphore::new(0)), Arc::new(Semaphore::new(0)), Arc::default());
         let leases = LeaseWatch::of([ARM]);
-        let moving = Move { stands: Arc::clone(&stands), motions: Arc::clone(&motions) };
+        leases.brought_to_rest();
+        let moving = Move { told: Arc::clone(&told), stands: Arc::clone(&stands), motions: Arc::clone(&motions) };
         let server = ActionServer::builder(ARM).action(moving).one_at_a_time().leases(&leases).build();
         let bound_at = bind(&Endpoint::Unix(place.path().join("driver.sock"))).await.unwrap();
         let endpoint = bound_at.endpoint().clone();
@@ -74,7 +79,7 @@ impl Driver {
         let arm = Resource::new(ARM, ResourceClass::Module, "Arm").with_endpoint(&endpoint).with_standstill(bound);
         assert!(in_time(provider.offer(arm)).await.unwrap());
         let _watching = AbortOnDropHandle::new(tokio::spawn(watch));
-        Driver { endpoint, stands, motions, provider, session, _watching, _place: place }
+        Driver { endpoint, told, stands, motions, provider, session, _watching, _place: place }
     }
 
     /// A motion under a lease, once it has begun.
@@ -201,6 +206,8 @@ async fn a_confirmation_is_repeated_until_the_manager_answers() {
     let (held, _) = in_time(acquire(&holder.resources)).await;
     driver.moves(&system, &held).await;
     holder.session.close().await;
+    // While it has not heard that, its motion goes on as long as its own session lives.
+    in_time(driver.told.acquire()).await.unwrap().forget();
     manager.end().await;
     // It stands still while there is nobody to tell.
     driver.stands.add_permits(1);

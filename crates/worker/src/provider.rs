@@ -4,7 +4,8 @@
 //! A provider watches its resources at the manager. When somebody else has deleted one, the provider logs that and offers it again. What
 //! a new watch shows first is compared with what was offered: a session may have ended and been made anew unnoticed, when the answer of
 //! the manager that said so was lost.
-//! One of what moves ([`Provider::start_at_rest`]) offers nothing at which an earlier goal still runs.
+//! One of what moves ([`Provider::start_at_rest`]) offers nothing at which an earlier goal still runs, and nothing before its driver has said
+//! that it is at rest.
 
 use crate::action::STOP_GRACE;
 use crate::client::{CallError, Channels, ResourceClient};
@@ -78,7 +79,7 @@ impl Provider {
     }
 
     /// As [`Provider::start`], of resources that `leases` watches: one that the manager has not got, or has not got any more, is offered
-    /// when no goal runs at it. Its next holder finds it at rest.
+    /// when the driver has said [`LeaseWatch::brought_to_rest`] and no goal runs at it. Its next holder finds it at rest.
     ///
     /// # Errors
     /// As [`Channels::get`].
@@ -237,7 +238,7 @@ impl Shared {
         let answers: Vec<_> = stream::iter(asked).buffer_unordered(AT_ONCE).collect().await;
         let mut concluded = Vec::with_capacity(answers.len() + moving.len());
         for id in moving {
-            tracing::debug!(resource = %id, "a goal still runs at it: it is offered when that has ended");
+            tracing::debug!(resource = %id, "it is not at rest: a goal still runs at it, or its driver has not said so");
             self.missing.notify_one();
             concluded.push((id.clone(), Ok(false)));
         }

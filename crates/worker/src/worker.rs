@@ -28,6 +28,9 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 
+/// The pause before the brakes are asked again.
+const BRAKES_AGAIN: Duration = Duration::from_secs(1);
+
 /// A part of the process, for its log.
 const LEASES: &str = "the watch of leases";
 
@@ -167,7 +170,8 @@ impl Worker {
 
     /// The bound within which what it moves stands still when a lease has ended: the next lease of its resource is granted when the
     /// actions of that one's goals have returned, and at the latest after this. For a worker that offers its resource itself; one with a
-    /// [`Safety`] has [`standstill_bound`] unless given, one without has none: its resource is granted anew at once.
+    /// [`Safety`] has [`standstill_bound`] unless given, one without has none: its resource is granted anew at once. A worker without
+    /// [`crate::safety::Brakes`] waits this long before it offers its resource: a process before it may have begun a motion.
     #[must_use]
     pub fn standstill(mut self, bound: Duration) -> Worker {
         self.standstill = Some(bound);
@@ -240,6 +244,11 @@ impl Worker {
         if let Some(safety) = &safety {
             actions = actions.safety(safety.clone());
         }
+        // A pooled worker is offered by its process manager.
+        let _resting = options.resource_manager.is_some().then(|| {
+            let resting = bring_to_rest(leases.clone(), safety.clone(), standstill);
+            AbortOnDropHandle::new(tokio::spawn(exit_on_panic("what brings the worker to rest", resting)))
+        });
         let server = actions.channels(channels.clone()).build();
         let access = match &options.access {
             Some(file) => LiveAccess::of_file(file)?,
@@ -295,6 +304,24 @@ impl Worker {
             Err(error) => Err(WorkerError::System { what: "serve".to_owned(), source: io::Error::other(error) }),
         }
     }
+}
+
+/// Nothing may move of what a process before this one began: its brakes say so. Without brakes the time has passed after which nothing moves.
+async fn bring_to_rest(leases: LeaseWatch, safety: Option<Safety>, standstill: Option<Duration>) {
+    let mut has_brakes = false;
+    if let Some(safety) = safety {
+        has_brakes = loop {
+            match safety.bring_to_rest().await {
+                Ok(has_brakes) => break has_brakes,
+                Err(error) => tracing::warn!(%error, "the worker is not at rest, and not offered"),
+            }
+            tokio::time::sleep(BRAKES_AGAIN).await;
+        };
+    }
+    if let Some(bound) = standstill.filter(|_| !has_brakes) {
+        tokio::time::sleep(bound).await;
+    }
+    leases.brought_to_rest();
 }
 
 /// Nobody is offered a worker that refuses every goal because it has never heard the resource manager.

@@ -8,16 +8,20 @@ use ratn_model::value::Value;
 use ratn_proto::types::Resource;
 use ratn_proto::v1::resource_service_server::{ResourceService, ResourceServiceServer};
 use ratn_proto::v1::*;
+use ratn_worker::action::ActionServer;
 use ratn_worker::client::Channels;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::protocol::{HEADER, NEWEST, OLDEST};
 use ratn_worker::provider::Provider;
+use ratn_worker::safety::{Brakes, Safety, SafetyState};
 use ratn_worker::server::{Services, bind};
 use ratn_worker::session::Session;
+use ratn_worker::worker::{Worker, WorkerOptions};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
@@ -38,6 +42,10 @@ struct Pool {
     watches: usize,
     /// Questions for one resource are refused so often: the manager is busy.
     busy: usize,
+    /// So many confirmations of standstill are never answered.
+    swallowed: usize,
+    /// Confirmations of standstill that arrived.
+    confirmations: usize,
     /// What streams of pings said of their protocol, in order.
     protocols: Vec<Option<String>>,
 }
@@ -187,7 +195,16 @@ impl ResourceService for Manager {
         &self,
         _: Request<ratn_proto::v1::ConfirmStandstillRequest>,
     ) -> Result<Response<ratn_proto::v1::ConfirmStandstillResponse>, Status> {
-        Err(Status::unimplemented("not asked for"))
+        let is_swallowed = {
+            let mut pool = self.pool.lock().unwrap();
+            pool.confirmations += 1;
+            pool.confirmations <= pool.swallowed
+        };
+        self.changed.send_replace(());
+        if is_swallowed {
+            std::future::pending::<()>().await;
+        }
+        Ok(Response::new(ratn_proto::v1::ConfirmStandstillResponse::default()))
     }
 
     async fn report_shortage(
@@ -402,4 +419,85 @@ async fn what_a_new_watch_does_not_show_is_offered_again_although_nobody_said_th
     manager.changed.send_replace(());
     manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
     assert_eq!(session.state().borrow().generation, 1);
+}
+
+#[tokio::test]
+async fn standstill_is_confirmed_when_the_driver_has_said_that_it_is_at_rest_and_again_where_no_answer_comes() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    {
+        // What the process before this one has left: its session still lives, and a lease of the arm has ended.
+        let mut pool = manager.pool.lock().unwrap();
+        (pool.shows, pool.swallowed) = (Some(true), 1);
+        pool.sessions.insert("cell".to_owned());
+        let ending = EndingUnits { lease_id: 7, token: 70, units: 1.0, ..EndingUnits::default() };
+        let mut arm = ratn_proto::v1::Resource::from(arm());
+        (arm.session_id, arm.ending) = ("cell".to_owned(), vec![ending]);
+        pool.resources.insert("arm@sim".to_owned(), arm);
+    }
+    let _serving = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open_as(&channels, &endpoint, "cell".to_owned(), "cell", LONG);
+    let leases = LeaseWatch::of(["arm@sim"]);
+    let _server = ActionServer::builder("arm@sim").leases(&leases).build();
+    let provider = Provider::start_at_rest(&channels, &endpoint, &session, &leases).unwrap();
+    tokio::spawn(leases.follow_session(&channels, &endpoint, &session, LONG).unwrap());
+    session.alive(LONG).await.unwrap();
+    manager.until(|pool| pool.watches > 0).await;
+    let heard = async {
+        while !leases.is_heard() {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(LONG, heard).await.unwrap();
+    // Nothing runs here, but nobody knows what the hardware does.
+    assert!(!leases.is_at_rest("arm@sim") && !provider.offer(arm()).await.unwrap());
+    tokio::time::sleep(3 * TTL).await;
+    assert_eq!(manager.pool.lock().unwrap().confirmations, 0);
+    leases.brought_to_rest();
+    // Far less than the watch was told to be patient.
+    let again = manager.until(|pool| pool.confirmations == 2);
+    tokio::time::timeout(LONG / 2, again).await.expect("no second confirmation");
+    manager.until(|pool| pool.resources["arm@sim"].ending.is_empty()).await;
+}
+
+/// Stands still when there is room to.
+struct SlowBrakes(Arc<Semaphore>);
+
+#[tonic::async_trait]
+impl Brakes for SlowBrakes {
+    async fn apply(&self, state: &SafetyState) -> Result<(), String> {
+        if *state != SafetyState::Ready {
+            self.0.acquire().await.unwrap().forget();
+        }
+        Ok(())
+    }
+}
+
+#[tokio::test]
+async fn a_worker_that_moves_something_is_offered_when_its_brakes_have_brought_it_to_rest() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    manager.pool.lock().unwrap().shows = Some(true);
+    let _serving = manager.serve(&endpoint).await;
+    let stands = Arc::new(Semaphore::new(0));
+    let options = WorkerOptions {
+        id: "arm@sim".to_owned(),
+        kind: "Arm".to_owned(),
+        listen: Endpoint::Unix(directory.path().join("arm.sock")),
+        resource_manager: Some(endpoint),
+        ..WorkerOptions::default()
+    };
+    let shutdown = CancellationToken::new();
+    let worker = Worker::new(options).safety(Safety::new(SlowBrakes(Arc::clone(&stands)))).shutdown(shutdown.clone());
+    let running = tokio::spawn(worker.run());
+    manager.until(|pool| pool.watches > 1).await;
+    tokio::time::sleep(3 * TTL).await;
+    assert!(manager.pool.lock().unwrap().resources.is_empty());
+    stands.add_permits(1);
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    shutdown.cancel();
+    running.await.unwrap().unwrap();
 }

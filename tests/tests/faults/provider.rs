@@ -139,6 +139,8 @@ pub(crate) fn serve() -> anyhow::Result<()> {
 
 async fn provide(socket: PathBuf, manager: Endpoint, file: File) -> anyhow::Result<()> {
     let leases = LeaseWatch::of([TOOL]);
+    // It moves by its steps alone, and they end with their process.
+    leases.brought_to_rest();
     let server = ActionServer::builder(TOOL).action(Move { file }).one_at_a_time().leases(&leases).build();
     let bound = bind(&Endpoint::Unix(socket)).await?;
     let endpoint = bound.endpoint().clone();

@@ -69,6 +69,8 @@ pub async fn run_as(
     let channels = Channels::new();
     let safety = safety(&config, &directory, &keeper).await?;
     let leases = actions::leases(&config);
+    // A simulated robot ends with its process: this one has not moved yet.
+    leases.brought_to_rest();
     let server = actions::server(&keeper, &config, channels.clone(), safety.clone(), &leases);
     let services = Services::new()
         .with(server.clone().into_service())

@@ -76,6 +76,8 @@ struct Shared {
     /// Grows with everything heard.
     heard: watch::Sender<u64>,
     listeners: Mutex<Vec<Weak<dyn LeaseListener>>>,
+    /// The driver has said that nothing moves of what was begun before this process.
+    is_brought_to_rest: watch::Sender<bool>,
 }
 
 /// Where to listen.
@@ -106,6 +108,7 @@ impl LeaseWatch {
             holdings: Mutex::default(),
             heard: watch::channel(0).0,
             listeners: Mutex::default(),
+            is_brought_to_rest: watch::channel(false).0,
         };
         LeaseWatch { shared: Arc::new(shared) }
     }
@@ -130,14 +133,22 @@ impl LeaseWatch {
         self.shared.holdings().is_heard()
     }
 
-    /// Whether no goal runs at a resource, also none that was told to stop.
+    /// The driver says that nothing moves any more of what a process before this one may have begun. A driver that was killed knows nothing of
+    /// its motions when it starts again, and its session may still live. Until the driver says this, no standstill is confirmed and
+    /// [`crate::provider::Provider::start_at_rest`] offers nothing. [`crate::worker::Worker`] says it by itself.
+    pub fn brought_to_rest(&self) {
+        self.shared.is_brought_to_rest.send_replace(true);
+    }
+
+    /// Whether the driver has said [`LeaseWatch::brought_to_rest`], and no goal runs at a resource, also none that was told to stop.
     pub fn is_at_rest(&self, resource: &str) -> bool {
-        self.shared.under_way(resource, None).is_none_or(|under_way| under_way.is_empty())
+        *self.shared.is_brought_to_rest.borrow()
+            && self.shared.under_way(resource, None).is_none_or(|under_way| under_way.is_empty())
     }
 
     /// Follows the manager of a session that provides the resources, for as long as the future is polled; leases are trusted as long
     /// as the session lives, and for `patience` after the watch broke. Standstill of what a lease has left is confirmed as soon as the
-    /// actions of its goals have returned. Drop the future before the session is closed.
+    /// actions of its goals have returned, and not before [`LeaseWatch::brought_to_rest`]. Drop the future before the session is closed.
     ///
     /// # Errors
     /// As [`Channels::get`].

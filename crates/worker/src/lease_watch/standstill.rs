@@ -4,6 +4,9 @@
 //! ```text
 //!   the watch tells of units that are ending ─▶ the goals of that lease have returned ─▶ ConfirmStandstill
 //! ```
+//! Nothing is confirmed before the driver has said that it is at rest ([`LeaseWatch::brought_to_rest`]): the lease may have been that of a
+//! process before this one, whose motion nobody has stopped.
+//!
 //! This is done for resources of the provider's own session, as long as it follows the manager. A goal whose action does not return is
 //! never confirmed: the bound that the resource was offered with (`standstill_ms`) decides then.
 
@@ -85,6 +88,9 @@ impl LeaseWatch {
 
     async fn confirm(self, client: ResourceClient, ending: Ending) {
         let Ending { resource, lease, token } = ending;
+        if self.shared.is_brought_to_rest.subscribe().wait_for(|said| *said).await.is_err() {
+            return;
+        }
         // No goal begins under it any more: the watch refutes it.
         let Some(under_way) = self.shared.under_way(&resource, Some((lease, token))) else {
             return tracing::debug!(%lease, resource, "no action server has this watch: its standstill is not confirmed");

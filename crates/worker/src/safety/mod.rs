@@ -75,6 +75,8 @@ impl Brakes for NoBrakes {
 pub struct Safety {
     state: Arc<watch::Sender<SafetyState>>,
     brakes: Arc<dyn Brakes>,
+    /// False where its actions look at the state themselves: then nobody knows when nothing moves.
+    has_brakes: bool,
     latch: Option<Latch>,
     /// One change at a time; whether a stop is on the disk, as far as that is asked for.
     changing: Arc<Mutex<bool>>,
@@ -99,7 +101,7 @@ pub enum SafetyError {
 
 impl Default for Safety {
     fn default() -> Safety {
-        Safety::new(NoBrakes)
+        Safety { has_brakes: false, ..Safety::new(NoBrakes) }
     }
 }
 
@@ -107,7 +109,7 @@ impl Safety {
     /// Ready, with brakes.
     pub fn new(brakes: impl Brakes) -> Safety {
         let state = Arc::new(watch::Sender::new(SafetyState::Ready));
-        Safety { state, brakes: Arc::new(brakes), latch: None, changing: Arc::default() }
+        Safety { state, brakes: Arc::new(brakes), has_brakes: true, latch: None, changing: Arc::default() }
     }
 
     /// As [`Safety::new`]; a stop is kept in `file`, and one that is there already is in force from the beginning. The file belongs
@@ -216,6 +218,19 @@ impl Safety {
             SafetyState::Ready => Ok(SafetyState::Ready),
             SafetyState::Held { .. } => self.become_ready().await,
         }
+    }
+
+    /// Has the brakes end what a process before this one may have begun; then the state in force is made true again. False where there
+    /// are no brakes.
+    ///
+    /// # Errors
+    /// [`SafetyError::Brakes`].
+    pub(crate) async fn bring_to_rest(&self) -> Result<bool, SafetyError> {
+        let _one = self.changing.lock().await;
+        let starting = SafetyState::Held { reason: "the driver has started".to_owned() };
+        self.brakes.apply(&starting).await.map_err(SafetyError::Brakes)?;
+        self.brakes.apply(&self.state()).await.map_err(SafetyError::Brakes)?;
+        Ok(self.has_brakes)
     }
 
     async fn become_ready(&self) -> Result<SafetyState, SafetyError> {
