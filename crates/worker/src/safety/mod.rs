@@ -101,7 +101,9 @@ pub enum SafetyError {
 
 impl Default for Safety {
     fn default() -> Safety {
-        Safety { has_brakes: false, ..Safety::new(NoBrakes) }
+        let mut safety = Safety::new(NoBrakes);
+        safety.has_brakes = false;
+        safety
     }
 }
 
