@@ -10,7 +10,8 @@ const LIVE: [&str; 6] = [
     "resource-manager.max_watchers",
 ];
 
-/// Keys that differ and that a running daemon does not take over, in order. Tables are compared key by key, all else as a whole.
+/// Keys that differ and that a running daemon does not take over, in order. Tables are compared key by key, all else as a whole. Of
+/// a table that is not there, and of which something is taken over, every key is different.
 pub fn need_a_restart(running: &toml::Table, wanted: &toml::Table) -> Vec<String> {
     let mut different = Vec::new();
     compare("", running, wanted, &mut different);
@@ -22,16 +23,24 @@ fn is_within(key: &str, whole: &str) -> bool {
     key.strip_prefix(whole).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
+/// Whether something of a table is taken over.
+fn has_live(table: &str) -> bool {
+    LIVE.iter().any(|live| is_within(live, table))
+}
+
 fn compare(path: &str, running: &toml::Table, wanted: &toml::Table, different: &mut Vec<String>) {
     let mut keys: Vec<&String> = running.keys().chain(wanted.keys()).collect();
     keys.sort();
     keys.dedup();
     for key in keys {
         let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+        let none = toml::Table::new();
         match (running.get(key), wanted.get(key)) {
             (Some(toml::Value::Table(running)), Some(toml::Value::Table(wanted))) => {
                 compare(&path, running, wanted, different);
             }
+            (Some(toml::Value::Table(running)), None) if has_live(&path) => compare(&path, running, &none, different),
+            (None, Some(toml::Value::Table(wanted))) if has_live(&path) => compare(&path, &none, wanted, different),
             (running, wanted) if running != wanted => different.push(path),
             _ => {}
         }
@@ -56,7 +65,9 @@ mod tests {
             "[service]\ninsecure = true\nlog = {filter = 'debug', format = 'json'}\n[resource-manager]\nlisten = 'local'",
             &["service.insecure", "service.log.format"],
         );
-        check("", "[resource-manager.limits]\nsessions = 3", &["resource-manager"]);
+        check("", "[resource-manager.limits]\nsessions = 3", &[]);
+        check("[resource-manager.limits]\nsessions = 3", "", &[]);
+        check("", "[resource-manager]\nlisten = 'local'\nlimits.sessions = 3", &["resource-manager.listen"]);
         check("[resource-manager.limits]\nsessions = 2", "[resource-manager.limits]\nsessions = 3", &[]);
         check(
             "resource-manager.max_wait_ms = 2",
@@ -68,5 +79,6 @@ mod tests {
     #[test]
     fn what_is_no_longer_there_is_a_difference() {
         check("[cell]\nboxes = 3", "[cell]", &["cell.boxes"]);
+        check("[service]", "[service.tls]\ncert = 'a'", &["service.tls"]);
     }
 }

@@ -3,17 +3,23 @@
 
 mod support;
 
-use ratn_daemon::resource_manager::ResourceManagerConfig;
+use ratn_daemon::metrics::Metrics;
+use ratn_daemon::resource_manager::{ROLE, ResourceManagerConfig, run_as};
 use ratn_model::resource::{Lease, Requirement, ResourceClass};
 use ratn_proto::types::Resource;
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_resources::Limits;
-use ratn_worker::client::{AcquireOptions, CallError};
+use ratn_worker::client::{AcquireOptions, CallError, ResourceClient};
+use ratn_worker::server::Serving;
+use ratn_worker::session::Session;
 use ratn_worker::trace::Traced;
+use std::sync::Arc;
 use std::time::Duration;
-use support::{Client, Daemon, TestSystem, block, in_time};
+use support::{Client, DEADLINE, Daemon, TestSystem, block, in_time};
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
@@ -178,4 +184,39 @@ async fn a_cancelled_call_leaves_the_queue_and_whoever_it_held_up_is_served() {
     until_waiting(&a, 1).await;
     call.abort();
     until_waiting(&a, 0).await;
+}
+
+#[tokio::test]
+async fn a_limit_of_leases_that_changes_binds_in_a_running_manager_at_once() {
+    let system = TestSystem::new();
+    let config = ResourceManagerConfig { listen: system.directory.socket("rm"), ..Default::default() };
+    let (live, end) = (watch::Sender::new(config.clone()), CancellationToken::new());
+    let metrics = Arc::new(Metrics::new(ROLE));
+    let run = run_as(live.subscribe(), system.directory.clone(), Serving::default(), metrics, end.clone());
+    let running = tokio::spawn(run);
+    let endpoint = system.directory.wait_for(ROLE, DEADLINE).await.unwrap();
+    let session = Session::open(&system.channels, &endpoint, "a", Duration::from_secs(5));
+    session.alive(DEADLINE).await.unwrap();
+    let resources = ResourceClient::new(&system.channels, &endpoint, session.id()).unwrap();
+    let a = Client { session, resources };
+    for id in ["p1", "p2", "p3", "p4"] {
+        a.resources.create(Resource::new(id, ResourceClass::Module, "Planner")).await.unwrap();
+    }
+    for _ in 0..2 {
+        a.resources.acquire(vec![block("Planner")], AcquireOptions::default()).await.unwrap();
+    }
+
+    let leases = |leases: usize| {
+        let limits = Limits { leases, leases_for_operators: 0, ..Limits::default() };
+        live.send_replace(ResourceManagerConfig { limits, ..config.clone() });
+    };
+    leases(2);
+    let waits = ask(&a, "a3", 1).await;
+    until_waiting(&a, 1).await;
+    assert!(!waits.is_finished());
+
+    leases(3);
+    in_time(waits).await.unwrap().unwrap();
+    end.cancel();
+    in_time(running).await.unwrap().unwrap();
 }

@@ -247,9 +247,13 @@ impl Core for ResourceCore {
     }
 
     /// Takes over the bounds of a config; the rest needs a restart.
-    fn signal(&mut self, config: &ResourceManagerConfig, _: &mut ResourceDesk) {
+    fn signal(&mut self, config: &ResourceManagerConfig, desk: &mut ResourceDesk) {
         let ResourceManagerConfig { max_session_ttl_ms, max_wait_ms, max_watchers, limits, .. } = config.clone();
         self.pool.set_limits(limits.clone());
+        // With wider bounds somebody may be served who waited.
+        if desk.stopped().is_none() {
+            self.pool.advance(desk.now());
+        }
         self.config =
             ResourceManagerConfig { max_session_ttl_ms, max_wait_ms, max_watchers, limits, ..self.config.clone() };
     }
