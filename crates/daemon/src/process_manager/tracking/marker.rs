@@ -64,6 +64,8 @@ fn ancestry() -> BTreeSet<u32> {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use std::io::{Read, Write};
+    use std::process::{Command, Stdio};
 
     #[test]
     fn a_marker_names_the_worker_of_one_process_manager_and_of_one_inside_it() {
@@ -80,7 +82,11 @@ mod tests {
     fn only_processes_of_the_users_that_are_named_are_found_and_never_this_one() {
         let instance = format!("pm-test-{}", std::process::id());
         let (name, value) = of(&instance, "a-1@here");
-        let mut child = std::process::Command::new("sleep").arg("60").env(name, value).spawn().unwrap();
+        let (input, output) = (Stdio::piped(), Stdio::piped());
+        let mut child = Command::new("cat").env(name, value).stdin(input).stdout(output).spawn().unwrap();
+        // A process has its environment a little after it was started: `cat` answers when it has.
+        child.stdin.as_mut().unwrap().write_all(b"\n").unwrap();
+        child.stdout.as_mut().unwrap().read_exact(&mut [0]).unwrap();
         let uid = nix::unistd::geteuid().as_raw();
         let found =
             |users: &[u32], wanted: &str| carriers(&instance, &users.iter().copied().collect(), |id| id == wanted);
