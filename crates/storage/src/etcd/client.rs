@@ -173,7 +173,8 @@ impl Client {
     }
 }
 
-/// Asks one after the other, each beside those that have not answered yet, and says who answered.
+/// Asks one after the other, round and round, each beside those that have not answered yet, and says who answered. A member whose own
+/// leader has just died may hold a transaction for seconds, and perform the next one at once.
 async fn hedged(
     members: Vec<(usize, String, Result<Channel, String>)>,
     request: TxnRequest,
@@ -181,28 +182,25 @@ async fn hedged(
 ) -> (Option<usize>, Result<TxnResponse, CallError>) {
     let deadline = tokio::time::Instant::now() + patience;
     let mut last = format!("nobody answered within {} ms", patience.as_millis());
-    let mut asked = JoinSet::new();
-    let mut members = members.into_iter();
-    loop {
-        match members.next() {
-            Some((index, address, Ok(channel))) => {
-                let request = request.clone();
+    let (mut asked, mut pause) = (JoinSet::new(), HEDGE);
+    for (number, (index, address, channel)) in members.iter().cycle().enumerate() {
+        match channel {
+            Ok(channel) => {
+                let (index, address, request) = (*index, address.clone(), request.clone());
+                let kv = KvClient::new(channel.clone());
+                let mut kv = kv.max_decoding_message_size(ANSWER_BYTES).max_encoding_message_size(ANSWER_BYTES);
                 asked.spawn(async move {
-                    let kv = KvClient::new(channel);
-                    let mut kv = kv.max_decoding_message_size(ANSWER_BYTES).max_encoding_message_size(ANSWER_BYTES);
                     let answered = kv.txn(request).await;
                     (index, answered.map(tonic::Response::into_inner).map_err(|status| classify(&status, &address)))
                 });
             }
-            Some((_, address, Err(what))) => {
-                last = format!("{address}: {what}");
-                continue;
-            }
-            None if asked.is_empty() => return (None, Err(CallError::Unknown(last))),
-            None => {}
+            Err(what) => last = format!("{address}: {what}"),
         }
-        // Until the next one is asked, too.
-        let until = if members.len() > 0 { deadline.min(tokio::time::Instant::now() + HEDGE) } else { deadline };
+        if (number + 1) % members.len() == 0 {
+            pause *= 2;
+        }
+        // Until the next one is asked, too; at once where all that were asked have failed for the first time.
+        let until = deadline.min(tokio::time::Instant::now() + pause);
         while !asked.is_empty() {
             match tokio::time::timeout_at(until, asked.join_next()).await {
                 Ok(Some(Ok((_, Err(CallError::Unknown(what)))))) => last = what,
@@ -211,10 +209,14 @@ async fn hedged(
                 Err(_) => break,
             }
         }
+        if asked.is_empty() && number >= members.len() {
+            tokio::time::sleep_until(until).await;
+        }
         if tokio::time::Instant::now() >= deadline {
-            return (None, Err(CallError::Unknown(last)));
+            break;
         }
     }
+    (None, Err(CallError::Unknown(last)))
 }
 
 /// Before a call is tried again, doubled every time up to [`LONGEST_PAUSE`].
