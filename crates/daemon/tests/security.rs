@@ -232,6 +232,15 @@ async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_another
         (authority.client(&endpoint, Some(&first)), authority.client(&endpoint, Some(&second)));
     in_time(ping(&mut first, "s", 60_000)).await.unwrap();
     in_time(first.create(create("s", v1::ResourceClass::Task))).await.unwrap();
+    // A task offers nobody to give goals to, whatever it calls the resource: who is granted it would give goals there.
+    let mut forged = create("s", v1::ResourceClass::Task);
+    let resource = forged.resource.as_mut().unwrap();
+    (resource.id, resource.kind) = ("0-arm".to_owned(), "Arm".to_owned());
+    let here = v1::Value { kind: Some(v1::value::Kind::Text("http://127.0.0.1:1".to_owned())) };
+    resource.attributes.insert("endpoint".to_owned(), here);
+    let refused = in_time(first.create(forged)).await.unwrap_err();
+    assert_eq!(refused.code(), Code::PermissionDenied, "{refused}");
+    assert!(refused.message().contains("goals would be given there"), "{refused}");
     // Nor delete what the first created, by what it is.
     in_time(ping(&mut second, "t", 60_000)).await.unwrap();
     let things = v1::Requirement {

@@ -14,7 +14,7 @@ use prost::Message as _;
 use ratn_model::fact::{FactKey, FactPattern};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
 use ratn_proto::MAX_PAGE_BYTES;
-use ratn_proto::convert::{Malformed, all, digest, each, label, name, required};
+use ratn_proto::convert::{Malformed, all, digest, each, few, label, name, required};
 use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
 use ratn_proto::v1;
 use ratn_world::digest::Digest;
@@ -141,6 +141,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     async fn query(&self, request: Request<v1::QueryRequest>) -> Result<Response<v1::QueryResponse>, Status> {
         let request = request.into_inner();
         let projection = request.projection_id.map(ProjectionId);
+        few(request.patterns.len(), "patterns")?;
         let patterns = each(request.patterns, "patterns")?;
         let place = paging::place(&request.page_token)?;
         let page = Page::of(request.page_bytes, &request.page_token);
@@ -169,6 +170,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         request: Request<v1::WorldPoolServiceWatchRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
         let request = request.into_inner();
+        few(request.patterns.len(), "patterns")?;
         let patterns: Vec<FactPattern> = each(request.patterns, "patterns")?;
         let (after, in_parts) = (request.after_revision.map(Revision), request.in_parts);
         let updates = self.actor.request(|answer| Message::Watch { after, answer }).await?;
@@ -197,6 +199,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
 
     async fn diff(&self, request: Request<v1::DiffRequest>) -> Result<Response<v1::DiffResponse>, Status> {
         let request = request.into_inner();
+        few(request.patterns.len(), "patterns")?;
         let patterns: Vec<FactPattern> = each(request.patterns, "patterns")?;
         let from = Revision(request.from_revision);
         let place = paging::place(&request.page_token)?;

@@ -70,6 +70,20 @@ where
     T::try_from(message).map_err(|malformed| malformed.within(field))
 }
 
+/// What a question selects by: a list that is longer would cost others more than its length says.
+pub const MAX_SELECTED: usize = 256;
+
+/// That a list of what is selected by has at most [`MAX_SELECTED`] elements.
+///
+/// # Errors
+/// [`Malformed`] where it has more.
+pub fn few(count: usize, field: &str) -> Result<(), Malformed> {
+    if count <= MAX_SELECTED {
+        return Ok(());
+    }
+    Err(Malformed::new(field, format!("has {count} elements: at most {MAX_SELECTED} are allowed, ask more than once")))
+}
+
 /// Every element of a repeated field, converted.
 ///
 /// # Errors

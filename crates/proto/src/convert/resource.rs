@@ -1,6 +1,6 @@
 //! Resources, requirements, leases, events of the pool.
 
-use super::{Malformed, all, each, label, missing_choice, name, names, ports, required, wire_ports};
+use super::{Malformed, all, each, few, label, missing_choice, name, names, ports, required, wire_ports};
 use crate::types::{
     Demand, EndingUnits, Holding, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceState,
     ResourceUpdate, SessionStatus, WaitingAcquire,
@@ -93,6 +93,8 @@ impl TryFrom<v1::Requirement> for Requirement {
 
     fn try_from(requirement: v1::Requirement) -> Result<Requirement, Malformed> {
         name(&requirement.kind, "kind")?;
+        few(requirement.attributes.len(), "attributes")?;
+        few(requirement.conditions.len(), "conditions")?;
         Ok(Requirement {
             operation: operation(requirement.operation)?,
             kind: requirement.kind,
@@ -496,6 +498,9 @@ impl TryFrom<v1::ListRequest> for ResourceFilter {
     fn try_from(request: v1::ListRequest) -> Result<ResourceFilter, Malformed> {
         label(&request.host, "host")?;
         label(&request.session_id, "session_id")?;
+        few(request.kinds.len(), "kinds")?;
+        few(request.attributes.len(), "attributes")?;
+        few(request.conditions.len(), "conditions")?;
         names(&request.kinds, "kinds")?;
         Ok(ResourceFilter {
             kinds: request.kinds,

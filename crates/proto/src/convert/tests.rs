@@ -404,3 +404,16 @@ fn nesting_and_size_have_an_end() {
     let bytes = v1::Value::from(nested(MAX_DEPTH)).encode_to_vec();
     assert!(v1::Value::decode(bytes.as_slice()).is_ok());
 }
+
+#[test]
+fn what_is_selected_by_is_few() {
+    let kinds = |count: usize| v1::ListRequest { kinds: vec!["Arm".to_owned(); count], ..Default::default() };
+    assert!(ResourceFilter::try_from(kinds(MAX_SELECTED)).is_ok());
+    refused::<ResourceFilter, _>(kinds(MAX_SELECTED + 1), "kinds: has 257 elements: at most 256 are allowed");
+    let attributes = |count: usize| {
+        let attributes = (0..count).map(|number| (number.to_string(), v1::Value::from(Value::Int(1)))).collect();
+        v1::Requirement { kind: "Arm".to_owned(), operation: 1, count: 1.0, attributes, ..Default::default() }
+    };
+    assert!(Requirement::try_from(attributes(MAX_SELECTED)).is_ok());
+    refused::<Requirement, _>(attributes(MAX_SELECTED + 1), "attributes: has 257 elements");
+}

@@ -96,11 +96,13 @@ pub(super) async fn withdraw(
     let v1::WithdrawRequest { request_id, session_id, call } = request;
     name(&request_id, "request_id")?;
     let session = session(&session_id)?;
+    let pending = audit::begin(caller, &request_id, || Mutation::Withdraw { session: session_id });
     if call != 0 {
         let message = "call: is of a session's stream: a withdraw of its own names the request id alone";
-        return Err(status(Code::InvalidArgument, "MALFORMED", message));
+        let refused = Err(status(Code::InvalidArgument, "MALFORMED", message));
+        pending.ended(&refused);
+        return refused;
     }
-    let pending = audit::begin(caller, &request_id, || Mutation::Withdraw { session: session_id });
     let message = |speaker, answer| Message::Withdraw { speaker, session, request_id, answer };
     let withdrawn = requests.change("withdraw", pending, caller, message).await?;
     Ok(v1::WithdrawResponse { withdrawn })

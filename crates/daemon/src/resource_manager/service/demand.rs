@@ -7,7 +7,7 @@ use crate::audit::{self, Mutation};
 use crate::resource_manager::actor::Message;
 use crate::resource_manager::providers::Provisions;
 use futures::StreamExt;
-use ratn_proto::convert::{all, label, name, ports};
+use ratn_proto::convert::{all, few, label, name, ports};
 use ratn_proto::v1;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
@@ -19,6 +19,7 @@ pub(super) async fn watch(
     shutdown: CancellationToken,
 ) -> Result<Streamed<v1::WatchDemandResponse>, Status> {
     let session = session(&request.session_id)?;
+    few(request.provisions.len(), "provisions")?;
     for (index, provision) in request.provisions.iter().enumerate() {
         name(&provision.kind, &format!("provisions[{index}].kind"))?;
     }

@@ -6,9 +6,9 @@ use crate::details::status;
 use crate::paging::{Filled, Page};
 use crate::resource_manager::actor::Message;
 use crate::resource_manager::wire;
-use ratn_model::resource::Requirement;
+use ratn_model::resource::{Requirement, ResourceClass};
 use ratn_proto::convert::{label, name, required};
-use ratn_proto::types::{Resource, ResourceFilter};
+use ratn_proto::types::{ENDPOINT_ATTRIBUTE, Resource, ResourceFilter};
 use ratn_proto::v1;
 use ratn_resources::{Reply, Request, ResourceSpec};
 use tonic::{Code, Status};
@@ -26,6 +26,14 @@ pub(super) async fn create(
     let resource: Resource = required(request.resource, "resource")?;
     if !caller.may_create(resource.class) {
         let message = format!("{caller} may not create resources of the class {}", resource.class);
+        return Err(status(Code::PermissionDenied, "ROLE_MISSING", message));
+    }
+    // Goals go where the endpoint of a granted resource says: only providers say where that is.
+    if !caller.may_create(ResourceClass::Module) && resource.attributes.contains_key(ENDPOINT_ATTRIBUTE) {
+        let message = format!(
+            "{caller} may not create a resource with the attribute `{ENDPOINT_ATTRIBUTE}`: goals would be given there, and only agents \
+             and operators offer who performs them"
+        );
         return Err(status(Code::PermissionDenied, "ROLE_MISSING", message));
     }
     let spec = ResourceSpec {

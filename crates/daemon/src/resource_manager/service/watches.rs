@@ -9,7 +9,7 @@ use crate::resource_manager::watch_filter::WatchFilter;
 use crate::watch_stream;
 use futures::StreamExt;
 use ratn_model::id::Revision;
-use ratn_proto::convert::names;
+use ratn_proto::convert::{few, names};
 use ratn_proto::types::WatchPosition;
 use ratn_proto::v1;
 use std::sync::Arc;
@@ -27,6 +27,7 @@ pub(super) async fn watch(
     request: v1::ResourceServiceWatchRequest,
     shutdown: CancellationToken,
 ) -> Result<Streamed<v1::ResourceServiceWatchResponse>, Status> {
+    few(request.kinds.len(), "kinds")?;
     names(&request.kinds, "kinds")?;
     names(&request.resource_ids, "resource_ids")?;
     if request.resource_ids.len() > MAX_WATCHED {
