@@ -64,3 +64,100 @@ impl Chain {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::super::client::Client;
+    use super::super::keys::{Keys, delete};
+    use super::super::wire::{KeyValue, RangeResponse, ResponseHeader, ResponseOp};
+    use super::super::wire::{compare, request_op, response_op};
+    use super::*;
+    use std::collections::BTreeMap;
+    use std::sync::Arc;
+
+    /// As much of etcd as a step asks of it.
+    #[derive(Default)]
+    struct Model {
+        revision: i64,
+        keys: BTreeMap<Bytes, (Bytes, i64)>,
+    }
+
+    impl Model {
+        fn txn(&mut self, request: &TxnRequest) -> TxnResponse {
+            let holds = request.compare.iter().all(|compare| {
+                let Some(compare::TargetUnion::ModRevision(revision)) = compare.target_union else { return false };
+                self.keys.get(&compare.key).map_or(0, |(_, at)| *at) == revision
+            });
+            let operations = if holds { &request.success } else { &request.failure };
+            self.revision += i64::from(holds);
+            let responses = operations.iter().map(|operation| self.perform(operation)).collect();
+            let header = ResponseHeader { revision: self.revision, ..Default::default() };
+            TxnResponse { header: Some(header), succeeded: holds, responses }
+        }
+
+        fn perform(&mut self, operation: &RequestOp) -> ResponseOp {
+            let response = match operation.request.clone().unwrap() {
+                request_op::Request::RequestPut(put) => {
+                    self.keys.insert(put.key, (put.value, self.revision));
+                    None
+                }
+                request_op::Request::RequestDeleteRange(delete) => {
+                    self.keys.remove(&delete.key);
+                    None
+                }
+                request_op::Request::RequestRange(range) => {
+                    let one = |(value, at): &(Bytes, i64)| KeyValue {
+                        key: range.key.clone(),
+                        value: value.clone(),
+                        mod_revision: *at,
+                        ..Default::default()
+                    };
+                    let kvs = self.keys.get(&range.key).map(one).into_iter().collect();
+                    Some(response_op::Response::ResponseRange(RangeResponse { kvs, ..Default::default() }))
+                }
+            };
+            ResponseOp { response }
+        }
+
+        fn values(&self) -> Vec<(Bytes, Bytes)> {
+            self.keys.iter().map(|(key, (value, _))| (key.clone(), value.clone())).collect()
+        }
+    }
+
+    #[test]
+    fn a_step_has_its_effect_once_although_its_answers_are_lost_and_its_copies_are_late() {
+        let keys = Keys::new("/test");
+        let client = Arc::new(Client::new(&[], Arc::new(|_: &str| Err("nobody".to_owned()))).unwrap());
+        let mut etcd = Model { revision: 1, ..Model::default() };
+        etcd.keys.insert(keys.leader(), (Bytes::from_static(b"us"), 1));
+        let term = Term::since(client, keys.clone(), 1);
+        let mut chain = Chain::from(keys.head(), 0);
+        let mut copies: Vec<TxnRequest> = Vec::new();
+        for step in 0..8_u8 {
+            // A frame is put, and later thrown away again, as a compaction does: a late copy would bring it back.
+            let frame = Bytes::from(format!("frame {}", step / 2));
+            let operation = if step % 2 == 0 { put(frame, vec![step]) } else { delete(frame) };
+            let answer_is_lost = step % 3 == 0;
+            let performed = chain.step(&term, vec![operation], Bytes::from(vec![step]), |request| {
+                copies.push(request.clone());
+                let answer = etcd.txn(request);
+                Ok(if answer_is_lost { etcd.txn(request) } else { answer })
+            });
+            performed.unwrap();
+            let before = etcd.values();
+            for copy in &copies {
+                assert!(!etcd.txn(copy).succeeded, "step {step}");
+            }
+            assert_eq!(etcd.values(), before, "step {step}");
+        }
+        assert_eq!(etcd.keys[&keys.head()].0, vec![7]);
+        // Somebody else leads: nothing is written any more.
+        etcd.revision += 1;
+        etcd.keys.insert(keys.leader(), (Bytes::from_static(b"others"), etcd.revision));
+        let before = etcd.values();
+        let deposed = chain.step(&term, Vec::new(), Bytes::from_static(b"8"), |request| Ok(etcd.txn(request)));
+        assert!(matches!(deposed, Err(Fault::Deposed { .. })));
+        assert_eq!(etcd.values(), before);
+    }
+}

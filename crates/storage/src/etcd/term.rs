@@ -204,6 +204,12 @@ pub(super) fn take(
 }
 
 impl Term {
+    /// Held since a revision, for tests of what it guards.
+    #[cfg(test)]
+    pub(super) fn since(client: Arc<Client>, keys: Keys, leader: i64) -> Term {
+        Term { client, keys, epoch: Epoch(1), store: 1, leader, draw: 1, lost: AtomicBool::new(false) }
+    }
+
     /// Holds as long as the place is held.
     pub(super) fn guard(&self) -> Compare {
         written_at(self.keys.leader(), self.leader)

@@ -6,7 +6,7 @@ use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
@@ -160,8 +160,8 @@ struct Loses {
     answers: AtomicBool,
     /// Connections are refused and broken.
     all: AtomicBool,
-    /// Nothing is lost, and nothing passed on.
-    held: AtomicBool,
+    /// What is asked is passed on up to so many milliseconds later.
+    delay_ms: AtomicU64,
 }
 
 impl Proxy {
@@ -194,9 +194,9 @@ impl Proxy {
         self.loses.answers.store(lose, Ordering::SeqCst);
     }
 
-    /// What is sent meanwhile arrives, in order, when this ends.
-    pub(crate) fn hold(&self, hold: bool) {
-        self.loses.held.store(hold, Ordering::SeqCst);
+    /// What is asked arrives up to so much later, now sooner and now later; what is answered, at once.
+    pub(crate) fn delay(&self, most: Duration) {
+        self.loses.delay_ms.store(most.as_millis() as u64, Ordering::SeqCst);
     }
 
     /// Nothing arrives; connections that were open are broken.
@@ -208,10 +208,12 @@ impl Proxy {
 /// A connection that has lost bytes is broken as soon as it would pass some on again.
 fn pass(mut from: TcpStream, mut to: TcpStream, loses: Arc<Loses>, answers: bool) {
     thread::spawn(move || {
-        let (mut bytes, mut has_lost) = ([0; 16_384], false);
+        let (mut bytes, mut has_lost, mut passed) = ([0; 16_384], false, 1_u64);
         while let Ok(count @ 1..) = from.read(&mut bytes) {
-            while loses.held.load(Ordering::SeqCst) {
-                thread::sleep(Duration::from_millis(1));
+            let most = loses.delay_ms.load(Ordering::SeqCst);
+            if most > 0 && !answers {
+                passed = (passed * 7_919 + 104_729) % 1_000_003;
+                thread::sleep(Duration::from_millis(passed % most));
             }
             if loses.all.load(Ordering::SeqCst) {
                 break;
