@@ -6,8 +6,8 @@
 //! ```
 //! Several processes may try to open one log; one has the writer's place, the others are refused with who it is, and try again. A writer
 //! that says nothing for a second loses the place to whoever asks next. Nothing of consensus is here: etcd decides the order of
-//! transactions, and every write is a transaction that compares the revisions of `leader` and of `head`. So a writer that was got past
-//! writes nothing, and no transaction has an effect twice.
+//! transactions, and every write of a frame or a snapshot is a transaction that compares the revision of `leader` and what the write before
+//! it left (`chain.rs`). So a writer that was got past writes nothing, and no transaction has an effect twice.
 //!
 //! etcd keeps every version of every key until it is compacted: run it with `--auto-compaction-retention`.
 

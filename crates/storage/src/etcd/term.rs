@@ -7,7 +7,8 @@
 //! ```
 //! Safety is in the guards, not in time: every write compares the revision of `leader`, which whoever takes the place changes. Time only
 //! decides when somebody else may take it. Who takes it compares `alive`, too: so the last confirmation of its predecessor was asked for
-//! before the silence began.
+//! before the silence began. (While etcd has no space `alive` cannot be written, and the holder confirms itself by reading; nobody can take
+//! the place then either.)
 
 use super::client::{CallError, Client, cluster_of};
 use super::format::{Head, Holder, Leader, Meta, VERSION, parse, text};
