@@ -40,4 +40,5 @@ pub mod trajectory;
 mod tree;
 pub mod trial;
 mod urdf;
+mod urdf_faults;
 pub mod validate;

@@ -12,9 +12,13 @@ use crate::spheres::{self, Sphere};
 use crate::urdf::{self, Loader, RobotError};
 use ratn_model::pose::Pose;
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 
 /// Joints that can be planned for at once.
 pub const MAX_JOINTS: usize = 16;
+
+/// How far beyond a limit a position is taken as rounded, in radians (metres for a joint that slides).
+pub const ROUNDED: f64 = 1e-4;
 
 /// Limits of a joint that has none, in radians: a whole turn.
 const ENDLESS_RAD: f64 = std::f64::consts::PI;
@@ -35,6 +39,24 @@ pub struct Mechanism {
     pub disabled: BTreeSet<(usize, usize)>,
     /// Links and the names of obstacles that they may touch.
     pub allowed: BTreeSet<(usize, String)>,
+}
+
+/// A position that is beyond a limit.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Beyond {
+    /// The joint's name.
+    pub joint: String,
+    /// As given, in radians (metres for one that slides).
+    pub position: f64,
+    /// How far beyond.
+    pub by: f64,
+}
+
+impl fmt::Display for Beyond {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Beyond { joint, position, by } = self;
+        write!(f, "{joint} is at {position}, beyond the limit by {by:.2e}; taken as the limit")
+    }
 }
 
 /// A rigid link.
@@ -78,6 +100,12 @@ pub enum MechanismError {
     /// The SRDF is not XML.
     #[error("the SRDF is not valid XML: {0}")]
     Srdf(String),
+    /// A joint that is named twice.
+    #[error("the joint `{joint}` is named twice among those to be planned for")]
+    Twice {
+        /// Its name.
+        joint: String,
+    },
     /// Too many joints.
     #[error("{count} joints are to be planned for: at most {MAX_JOINTS} are supported")]
     TooMany {
@@ -107,7 +135,7 @@ impl Mechanism {
         joints: &[String],
         load: &mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>,
     ) -> Result<Mechanism, MechanismError> {
-        let description = urdf_rs::read_from_string(urdf).map_err(RobotError::Urdf)?;
+        let description = urdf::parse(urdf)?;
         let moves = |j: &&urdf_rs::Joint| j.joint_type != urdf_rs::JointType::Fixed && j.mimic.is_none();
         let names: Vec<String> = if joints.is_empty() {
             description.joints.iter().filter(moves).map(|j| j.name.clone()).collect()
@@ -116,6 +144,9 @@ impl Mechanism {
         };
         if names.len() > MAX_JOINTS {
             return Err(MechanismError::TooMany { count: names.len() });
+        }
+        if let Some(joint) = names.iter().enumerate().find_map(|(i, name)| names[..i].contains(name).then_some(name)) {
+            return Err(MechanismError::Twice { joint: joint.clone() });
         }
         let joints = names.iter().map(|name| limits(&description, name)).collect::<Result<Vec<_>, _>>()?;
         let links = links(&description, &names, load)?;
@@ -200,9 +231,33 @@ impl Mechanism {
         self.allowed.is_empty() || !self.allowed.contains(&(link, obstacle.to_owned()))
     }
 
-    /// Whether two links are to be kept apart.
+    /// Whether two links are to be kept apart: not where the SRDF disables the pair, nor where no planned joint moves one against the other.
     pub fn is_checked(&self, a: usize, b: usize) -> bool {
-        a != b && !self.disabled.contains(&(a.min(b), a.max(b)))
+        self.carrier(a) != self.carrier(b) && !self.disabled.contains(&(a.min(b), a.max(b)))
+    }
+
+    /// The link nearest to a link towards the root, itself included, that a planned joint moves.
+    fn carrier(&self, link: usize) -> Option<usize> {
+        let mut next = Some(link);
+        while let Some(here) = next.filter(|here| self.links[*here].drive.is_none()) {
+            next = self.links[here].parent;
+        }
+        next
+    }
+
+    /// Positions, of which those that are beyond a limit by no more than [`ROUNDED`] are at the limit, and which were.
+    pub fn clamped(&self, positions: &[f64]) -> (Vec<f64>, Vec<Beyond>) {
+        let mut beyond = Vec::new();
+        let clamp = |(joint, position): (&Joint, &f64)| {
+            let limit = position.clamp(joint.lower, joint.upper);
+            let by = (position - limit).abs();
+            if by == 0.0 || by > ROUNDED {
+                return *position;
+            }
+            beyond.push(Beyond { joint: joint.name.clone(), position: *position, by });
+            limit
+        };
+        (self.joints.iter().zip(positions).map(clamp).collect(), beyond)
     }
 
     fn listed(&self, srdf: &str) -> Result<BTreeSet<(usize, usize)>, MechanismError> {

@@ -41,6 +41,15 @@ pub enum ProblemError {
     /// Not JSON of this form.
     #[error("not a file of planning problems: {0}")]
     Form(#[from] serde_json::Error),
+    /// No problem at all.
+    #[error("it holds no problems: `problems` is a list of problems for each class")]
+    None,
+    /// A joint that is named twice.
+    #[error("the joint `{joint}` is named twice in `joints`")]
+    Twice {
+        /// Its name.
+        joint: String,
+    },
     /// A value that cannot be.
     #[error("problem {index} of class `{class}`: {reason}")]
     Value {
@@ -60,6 +69,13 @@ impl Problems {
     /// [`ProblemError`] names the line, or the problem and what is wrong with it.
     pub fn parse(text: &str) -> Result<Problems, ProblemError> {
         let file: File = serde_json::from_str(text)?;
+        let twice = file.joints.iter().enumerate().find(|(i, name)| file.joints[..*i].contains(name));
+        if let Some((_, joint)) = twice {
+            return Err(ProblemError::Twice { joint: joint.clone() });
+        }
+        if file.problems.values().all(Vec::is_empty) {
+            return Err(ProblemError::None);
+        }
         let mut classes = BTreeMap::new();
         for (class, entries) in file.problems {
             let read = |entry: Entry| {

@@ -283,7 +283,7 @@ fn compile_obstacle(obstacle: &Obstacle) -> simd::Obstacle {
 
 fn compile_row(order: &[usize], obstacles: &[Obstacle]) -> Row {
     let unused = [Block([f32::INFINITY; 16]); 3];
-    let indices = order.iter().map(|o| *o as u16).collect();
+    let indices = order.iter().map(|o| *o as u32).collect();
     let mut row = Row { obstacles: indices, least: unused, minus_greatest: unused };
     for (lane, o) in order.iter().enumerate() {
         let Obstacle { pose, geometry, .. } = &obstacles[*o];
@@ -368,7 +368,7 @@ fn pairs(mechanism: &Mechanism, groups: &[Group], links: &[usize]) -> Vec<SelfPa
     let mut pairs = Vec::new();
     for first in 0..groups.len() {
         for second in first + 1..groups.len() {
-            if groups[first].frame != groups[second].frame && mechanism.is_checked(links[first], links[second]) {
+            if mechanism.is_checked(links[first], links[second]) {
                 pairs.push(SelfPair { first: first as u16, second: second as u16 });
             }
         }

@@ -5,6 +5,7 @@ use crate::exact::{Exact, Touch};
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::pace::Control;
 use crate::problems::Problem;
+use crate::robot::Joint;
 use crate::simplify::{path_length, simplify};
 use crate::space::{Space, State};
 
@@ -44,6 +45,8 @@ pub struct Found {
     pub first_length_rad: f32,
     /// Samples drawn.
     pub iterations: usize,
+    /// Positions of the start and the goal that were beyond a limit by rounding and are at the limit on the path.
+    pub clamped: Vec<String>,
     /// What the exact check rejects.
     pub touch: Option<Touch>,
 }
@@ -51,7 +54,11 @@ pub struct Found {
 /// Solves a problem; `clock` gives the time in any units.
 pub fn run(mechanism: &Mechanism, problem: &Problem, settings: Settings, clock: &mut dyn FnMut() -> f64) -> Trial {
     let mut space = Space::new(mechanism, &problem.obstacles);
-    let (start, goal) = (state(&problem.start), state(&problem.goal));
+    let ends = [("start", &problem.start), ("goal", &problem.goal)].map(|(which, positions)| {
+        let (positions, beyond) = mechanism.clamped(positions);
+        (positions, beyond.iter().map(|b| format!("{which} state: {b}")).collect::<Vec<_>>())
+    });
+    let (start, goal) = (state(&ends[0].0), state(&ends[1].0));
     let mut go_on = |_: usize| Control::Continue;
     let (mut plan_time, mut simplify_time) = (f64::INFINITY, f64::INFINITY);
     let mut outcome = Err(ConnectError::Cancelled);
@@ -68,10 +75,11 @@ pub fn run(mechanism: &Mechanism, problem: &Problem, settings: Settings, clock: 
         simplify_time = simplify_time.min(end - between);
         outcome = paths;
     }
-    let outcome = outcome.map(|(route, path)| found(mechanism, problem, &route, &path));
+    let clamped = ends.iter().flat_map(|(_, clamped)| clamped.clone()).collect();
+    let outcome = outcome.map(|(route, path)| Found { clamped, ..found(mechanism, problem, &route, &path) });
     let diagnosis = match &outcome {
-        Err(ConnectError::Start) => diagnose(mechanism, problem, &problem.start, "start state"),
-        Err(ConnectError::Goal { .. }) => diagnose(mechanism, problem, &problem.goal, "goal state"),
+        Err(ConnectError::Start) => diagnose(mechanism, problem, &ends[0].0, "start state"),
+        Err(ConnectError::Goal { .. }) => diagnose(mechanism, problem, &ends[1].0, "goal state"),
         _ => Vec::new(),
     };
     Trial { plan: plan_time, simplify: simplify_time, outcome, diagnosis }
@@ -81,7 +89,9 @@ pub fn run(mechanism: &Mechanism, problem: &Problem, settings: Settings, clock: 
 fn diagnose(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which: &str) -> Vec<String> {
     let beyond = mechanism.joints.iter().zip(positions).filter(|(j, q)| !(j.lower..=j.upper).contains(*q));
     let limits = beyond.map(|(joint, position)| {
-        format!("{which}: {} is at {position:.4}, outside {:.4} to {:.4}", joint.name, joint.lower, joint.upper)
+        let by = (position - position.clamp(joint.lower, joint.upper)).abs();
+        let Joint { name, lower, upper, .. } = joint;
+        format!("{which}: {name} is at {position}, outside {lower} to {upper} by {by:.2e}")
     });
     let touches = Exact::new(mechanism, &problem.obstacles).touches(positions);
     limits.chain(touches.iter().map(|touch| format!("{which}: {touch}"))).collect()
@@ -96,6 +106,7 @@ fn found(mechanism: &Mechanism, problem: &Problem, route: &Route, path: &[State]
         length_rad: path_length(path),
         first_length_rad: path_length(&route.path),
         iterations: route.iterations,
+        clamped: Vec::new(),
         touch,
     }
 }

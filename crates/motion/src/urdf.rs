@@ -3,6 +3,8 @@
 use crate::geometry::{Body, Geometry};
 use crate::mesh::{Mesh, MeshError, Meshed};
 use crate::robot::{JOINT_NAMES, Joint, Link, Motion, jerk};
+use crate::urdf_faults;
+pub use crate::urdf_faults::UrdfFault;
 use ratn_model::pose::Pose;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,7 +12,10 @@ use std::sync::Arc;
 /// A URDF that does not describe this kind of robot.
 #[derive(Debug, thiserror::Error)]
 pub enum RobotError {
-    /// Not a URDF.
+    /// Not a URDF, and where.
+    #[error("the robot description is not valid URDF: {0}")]
+    Fault(#[from] UrdfFault),
+    /// Not a URDF for another reason.
     #[error("the robot description is not valid URDF")]
     Urdf(#[from] urdf_rs::UrdfError),
     /// A joint or link that must be there is not.
@@ -44,9 +49,18 @@ pub enum RobotError {
     },
 }
 
+/// What a text describes.
+///
+/// # Errors
+/// [`RobotError::Fault`] names the line.
+pub(crate) fn parse(text: &str) -> Result<urdf_rs::Robot, RobotError> {
+    urdf_faults::check(text)?;
+    Ok(urdf_rs::read_from_string(text)?)
+}
+
 /// The degrees of freedom and the links of a description.
 pub(crate) fn read(text: &str) -> Result<(Vec<Joint>, Vec<Link>), RobotError> {
-    let urdf = urdf_rs::read_from_string(text)?;
+    let urdf = parse(text)?;
     let mut joints = Vec::new();
     for name in JOINT_NAMES {
         let joint = urdf

@@ -487,7 +487,7 @@ fn a_problem_that_cannot_be_says_what_touches_what_and_how_deep() {
     far.start[1] = 2.6;
     let tried = trial::run(&mechanism, &far, settings, &mut clock);
     assert_eq!(tried.outcome, Err(ConnectError::Start));
-    assert!(tried.diagnosis[0].starts_with("start state: j2 is at 2.6000, outside -2.5000 to 2.5000"));
+    assert!(tried.diagnosis[0].starts_with("start state: j2 is at 2.6, outside -2.5 to 2.5 by 1.00e-1"));
 }
 
 #[test]
@@ -508,5 +508,107 @@ fn a_file_of_problems_is_read_and_a_wrong_one_says_where() {
     let flat = object.replace("0.05", "-1");
     let error = Problems::parse(&file("[1, 2]", &flat)).unwrap_err().to_string();
     assert_eq!(error, "problem 3 of class `shelf`: object `can` has no proper size, place or rotation");
+    let error = Problems::parse(&file("[1, 2]", object).replace(r#""b"]"#, r#""a"]"#)).unwrap_err().to_string();
+    assert_eq!(error, "the joint `a` is named twice in `joints`");
+    let error = Problems::parse(r#"{"joints": ["a"], "problems": {"shelf": []}}"#).unwrap_err().to_string();
+    assert!(error.starts_with("it holds no problems"), "{error}");
     assert!(Problems::parse("{").is_err());
+}
+
+#[test]
+fn more_obstacles_than_sixteen_bits_count_are_all_there() {
+    let (urdf, names) = chain(4);
+    let mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let crumb = Geometry::Sphere { radius: 0.001 };
+    // All within reach and none of them near the straight arm, but the last.
+    let place = |i: usize| Pose::at(-0.4 + 0.001 * (i % 300) as f64, 0.3, -0.2 + 0.001 * (i / 300) as f64);
+    let mut obstacles: Vec<Obstacle> =
+        (0..66_000).map(|i| Obstacle { name: String::new(), pose: place(i), geometry: crumb }).collect();
+    assert!(Space::new(&mechanism, &obstacles).is_free(&[0.0; MAX_JOINTS]));
+    let ball = Geometry::Sphere { radius: 0.1 };
+    obstacles.push(Obstacle { name: "ball".into(), pose: Pose::at(0.6, 0.0, 0.0), geometry: ball });
+    assert!(!Space::new(&mechanism, &obstacles).is_free(&[0.0; MAX_JOINTS]));
+}
+
+#[test]
+fn links_that_no_joint_moves_against_each_other_are_a_pair_for_neither_check() {
+    // Two fingers of a hand that overlap as they are made, and a body beside the base.
+    let link = |name: &str, radius: f64| {
+        format!("<link name='{name}'><collision><geometry><sphere radius='{radius}'/></geometry></collision></link>")
+    };
+    let joint = |kind: &str, parent: &str, child: &str, x: f64| {
+        format!(
+            "<joint name='{parent}_{child}' type='{kind}'><origin xyz='{x} 0 0'/><parent link='{parent}'/><child link='{child}'/>\
+             <axis xyz='0 0 1'/><limit lower='-2.8' upper='2.8' effort='1' velocity='1'/></joint>"
+        )
+    };
+    let mut urdf = String::from("<robot name='two arms'>") + &link("base", 0.05) + &link("post", 0.05);
+    urdf += &joint("fixed", "base", "post", 0.02);
+    for (side, x) in [("left", -0.6), ("right", 0.6)] {
+        let [arm, hand, finger, thumb] = ["arm", "hand", "finger", "thumb"].map(|part| format!("{side}_{part}"));
+        urdf += &(link(&arm, 0.04) + &link(&hand, 0.04) + &link(&finger, 0.02) + &link(&thumb, 0.02));
+        urdf += &joint("revolute", "base", &arm, x);
+        urdf += &joint("revolute", &arm, &hand, 0.2);
+        urdf += &joint("fixed", &hand, &finger, 0.05);
+        urdf += &joint("fixed", &hand, &thumb, 0.055);
+    }
+    let nothing = "<robot name='two arms'/>";
+    let mechanism = Mechanism::read(&(urdf + "</robot>"), Some(nothing), &[]).unwrap();
+    assert_eq!(mechanism.joints.len(), 4);
+    let exact = Exact::new(&mechanism, &[]);
+    assert_eq!(exact.touch(&[0.0; 4]), None);
+    let mut space = Space::new(&mechanism, &[]);
+    let mut random = ChaCha8Rng::seed_from_u64(8);
+    for _ in 0..500 {
+        let state = posture(&mut random, &mechanism);
+        assert_eq!(space.is_free(&state), exact.touch(&positions(&mechanism, &state)).is_none(), "{state:?}");
+    }
+}
+
+#[test]
+fn a_position_that_is_rounded_beyond_a_limit_is_taken_as_the_limit_and_said() {
+    let (urdf, names) = chain(4);
+    let mechanism = Mechanism::read(&urdf.replace("2.5'", "3.14159265'"), None, &names).unwrap();
+    let settings = Settings { budget: BUDGET, repetitions: 1 };
+    let try_goal = |goal: f64| {
+        let problem = Problem { index: 0, obstacles: Vec::new(), start: vec![0.0; 4], goal: vec![0.5, goal, 0.0, 0.0] };
+        trial::run(&mechanism, &problem, settings, &mut || 0.0)
+    };
+    for goal in [3.1416, -3.1416] {
+        let found = try_goal(goal).outcome.unwrap();
+        assert!((found.path[found.path.len() - 1][1].abs() - std::f64::consts::PI).abs() < 1e-6);
+        assert_eq!(found.clamped.len(), 1, "{:?}", found.clamped);
+        let expected = format!("goal state: j2 is at {goal}, beyond the limit by 7.35e-6; taken as the limit");
+        assert_eq!(found.clamped[0], expected);
+    }
+    assert!(try_goal(3.14).outcome.unwrap().clamped.is_empty());
+    let tried = try_goal(3.142);
+    assert_eq!(tried.outcome, Err(ConnectError::Goal { goals: 1 }));
+    assert_eq!(tried.diagnosis, ["goal state: j2 is at 3.142, outside -3.14159265 to 3.14159265 by 4.07e-4"]);
+}
+
+#[test]
+fn a_robot_that_is_not_one_says_where_and_why() {
+    let (urdf, names) = chain(2);
+    let refusal = |text: &str, joints: &[String]| {
+        let error = Mechanism::read(text, None, joints).unwrap_err();
+        let mut said = error.to_string();
+        let mut next = std::error::Error::source(&error);
+        while let Some(cause) = next {
+            said += &format!(": {cause}");
+            next = cause.source();
+        }
+        said
+    };
+    let unclosed = urdf.replace("<link name='l1'>", "\n\n<link name='l1'");
+    let said = refusal(&unclosed, &names);
+    assert!(said.contains("line 3"), "{said}");
+    let nameless = urdf.replace("<link name='l0'/>", "\n<link/>");
+    let said = refusal(&nameless, &names);
+    assert!(said.contains("`link`") && said.contains("name") && said.contains("line 2"), "{said}");
+    let worded = urdf.replace("radius='0.035'", "radius='wide'");
+    let said = refusal(&worded, &names);
+    assert!(said.contains("radius") && said.contains("wide"), "{said}");
+    let twice = [names[0].clone(), names[1].clone(), names[0].clone()];
+    assert_eq!(refusal(&urdf, &twice), "the joint `j1` is named twice among those to be planned for");
 }

@@ -1,6 +1,6 @@
 //! What is said of tasks: how they are checked, run, steered, reported and simulated, and of planning problems.
 
-use super::values::{chart, makespan, padding, setting, speed};
+use super::values::{at_least_one, chart, makespan, padding, setting, speed};
 use crate::task_control::checkpoint::EVERY_EVENTS;
 use crate::task_control::control::Word;
 use clap::{Args, ValueEnum};
@@ -146,17 +146,17 @@ pub(crate) struct PlanArguments {
     /// Which links may touch; without it neighbours, and links that touch in the middle of all limits
     #[arg(long, value_name = "FILE")]
     pub(crate) srdf: Option<PathBuf>,
-    /// Problems in JSON: `joints`, and per class `objects`, `start` and `goal`
+    /// Problems in JSON: `joints`, and per class `objects`, `start` and `goal`; the form is in docs/running.md
     #[arg(long, value_name = "FILE")]
     pub(crate) problems: PathBuf,
     /// What the samples are derived from
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub(crate) seed: u64,
     /// Samples per problem before it is given up
-    #[arg(long, value_name = "N", default_value_t = 100_000)]
+    #[arg(long, value_name = "N", default_value_t = 100_000, value_parser = at_least_one)]
     pub(crate) iterations: usize,
     /// Solve each problem this often and take the least times
-    #[arg(long, value_name = "N", default_value_t = 15)]
+    #[arg(long, value_name = "N", default_value_t = 15, value_parser = at_least_one)]
     pub(crate) repeat: usize,
     /// How much larger the robot's shapes are taken
     #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = padding)]

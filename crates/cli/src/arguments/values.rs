@@ -30,6 +30,13 @@ pub(super) fn padding(text: &str) -> Result<f64, String> {
     if (0.0..1e3).contains(&value) { Ok(value) } else { Err("expected 0 to 1000 mm".to_owned()) }
 }
 
+pub(super) fn at_least_one(text: &str) -> Result<usize, String> {
+    match text.parse::<usize>() {
+        Ok(count) if count > 0 => Ok(count),
+        _ => Err("expected a whole number from 1".to_owned()),
+    }
+}
+
 pub(super) fn makespan(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(makespan) if makespan > 0.0 && makespan.is_finite() => Ok(makespan),

@@ -49,6 +49,9 @@ struct Line {
     length_rad: Option<f64>,
     /// Why there is no path, or what the exact check found on it.
     trouble: Option<String>,
+    /// Positions that were beyond a limit by rounding and were taken as the limit.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    clamped: Vec<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     path: Option<Vec<Vec<f64>>>,
 }
@@ -57,13 +60,12 @@ struct Line {
 pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     let urdf = read(&arguments.robot)?;
     let srdf = arguments.srdf.as_deref().map(read).transpose()?;
-    let problems =
-        Problems::parse(&read(&arguments.problems)?).map_err(|error| refused(&arguments.problems, &error))?;
+    let problems = Problems::parse(&read(&arguments.problems)?).map_err(|error| refused(&arguments.problems, error))?;
     let beside = arguments.robot.parent().unwrap_or(Path::new("")).to_owned();
     let meshes = MeshFiles { beside, packages: arguments.packages.clone() };
     let mut load = |name: &str| meshes.read(name);
     let mut mechanism = Mechanism::read_with_meshes(&urdf, srdf.as_deref(), &problems.joints, &mut load)
-        .map_err(|error| refused(&arguments.robot, &error))?;
+        .map_err(|error| refused(&arguments.robot, error))?;
     mechanism.pad_all(arguments.padding_mm * 1e-3);
     let settings = Settings {
         budget: Budget { iterations: arguments.iterations, seed: arguments.seed },
@@ -81,19 +83,27 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     } else {
         output::result(table(&classes))?;
     }
+    verdict(&classes)
+}
+
+/// A failure where a path is rejected, or where there is none at all.
+fn verdict(classes: &[Class]) -> Result<(), Failure> {
     let rejected: usize = classes.iter().map(|c| c.rejected).sum();
     if rejected > 0 {
         return Err(anyhow::anyhow!("{rejected} paths are not free by the exact shapes").into());
+    }
+    if classes.iter().all(|c| c.solved == 0) {
+        return Err(anyhow::anyhow!("none of the problems was solved; above is why").into());
     }
     Ok(())
 }
 
 fn read(path: &Path) -> Result<String, Failure> {
-    input::read_up_to(path, MAX_FILE).map_err(|error| refused(path, &format!("cannot be read: {error}")))
+    input::read_up_to(path, MAX_FILE).map_err(|error| refused(path, anyhow::anyhow!("cannot be read: {error}")))
 }
 
-fn refused(path: &Path, error: &dyn std::fmt::Display) -> Failure {
-    Failure::Refused(format!("{}: {error}", path.display()))
+fn refused(path: &Path, error: impl Into<anyhow::Error>) -> Failure {
+    Failure::Refused(format!("{}: {:#}", path.display(), error.into()))
 }
 
 fn summary(class: &str, trials: Vec<(u64, Trial)>, with_paths: bool) -> Class {
@@ -127,6 +137,7 @@ fn line(index: u64, trial: &Trial, with_paths: bool) -> Line {
         postures: found.map(|f| f.path.len()),
         length_rad: found.map(|f| f64::from(f.length_rad)),
         trouble,
+        clamped: found.map(|f| f.clamped.clone()).unwrap_or_default(),
         path: found.filter(|_| with_paths).map(|f| f.path.clone()),
     }
 }
@@ -170,8 +181,8 @@ fn table(classes: &[Class]) -> String {
     }
     for class in classes {
         for line in &class.results {
-            if let Some(trouble) = &line.trouble {
-                lines.push(format!("{} {}: {trouble}", class.class, line.index));
+            for note in line.clamped.iter().chain(&line.trouble) {
+                lines.push(format!("{} {}: {note}", class.class, line.index));
             }
         }
     }
@@ -181,6 +192,7 @@ fn table(classes: &[Class]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ratn_motion::trial::Found;
 
     #[test]
     fn medians_and_percentiles_are_nearest_ranks() {
@@ -200,5 +212,24 @@ mod tests {
         tight                     0/1         1         -         -         -         -         -         0
         tight 7: none of the 1 goals is free: hand is 3.0 mm inside shelf
         ");
+    }
+
+    #[test]
+    fn a_file_of_which_nothing_was_solved_is_a_failure() {
+        let unsolved = Err(ConnectError::Exhausted { iterations: 9 });
+        let failed = Trial { plan: 1.0, simplify: 0.0, outcome: unsolved, diagnosis: Vec::new() };
+        let found = Found {
+            path: vec![vec![0.0], vec![1.0]],
+            length_rad: 1.0,
+            first_length_rad: 1.0,
+            iterations: 0,
+            clamped: vec!["goal state: elbow is at 3.1416".to_owned()],
+            touch: None,
+        };
+        let solved = Trial { outcome: Ok(found), ..failed.clone() };
+        assert!(verdict(&[summary("shelf", vec![(1, failed.clone())], false)]).is_err());
+        let classes = [summary("shelf", vec![(1, failed), (2, solved)], false)];
+        assert!(verdict(&classes).is_ok());
+        assert!(table(&classes).ends_with("\nshelf 2: goal state: elbow is at 3.1416"));
     }
 }

@@ -44,7 +44,7 @@ pub(crate) struct Group {
 #[derive(Debug, Clone)]
 pub(crate) struct Row {
     /// Indices of the obstacles.
-    pub(crate) obstacles: Vec<u16>,
+    pub(crate) obstacles: Vec<u32>,
     /// Least x, y, z; unused lanes hold infinity.
     pub(crate) least: [Block; 3],
     /// Greatest x, y, z, with the sign changed.
@@ -313,7 +313,7 @@ fn in_obstacles<V: Lanes, const ALL: bool>(edge: &Edge<'_>, scratch: &mut Scratc
         for row in &group.near {
             let mut hits = overlaps::<V>(&bounds, row);
             while hits != 0 {
-                let obstacle = &compiled.obstacles[usize::from(row.obstacles[hits.trailing_zeros() as usize])];
+                let obstacle = &compiled.obstacles[row.obstacles[hits.trailing_zeros() as usize] as usize];
                 hits &= hits - 1;
                 if meets(centre, radius, obstacle) & !found == 0 {
                     continue;

@@ -1,0 +1,43 @@
+//! Measures search and simplification on the problems of a file, a line per problem:
+//! `cargo run --release -p ratn-motion --example search -- URDF SRDF PROBLEMS [REPEAT [CLASS [ITERATIONS]]]`.
+//!
+//! Each line: class, index, outcome, search and simplification in µs (the least of all repetitions), samples drawn, length before and after
+//! simplification, and what the exact shapes reject.
+
+#![allow(clippy::print_stdout, clippy::unwrap_used, clippy::disallowed_methods, reason = "a measurement")]
+
+use ratn_motion::connect::{Budget, ConnectError};
+use ratn_motion::mechanism::Mechanism;
+use ratn_motion::problems::Problems;
+use ratn_motion::trial::{self, Settings};
+use std::time::Instant;
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let read = |i: usize| std::fs::read_to_string(&arguments[i]).unwrap();
+    let number = |i: usize, other: usize| arguments.get(i).map_or(other, |text| text.parse().unwrap());
+    let problems = Problems::parse(&read(2)).unwrap();
+    let mechanism = Mechanism::read(&read(0), Some(&read(1)), &problems.joints).unwrap();
+    let budget = Budget { iterations: number(5, 1_000_000), seed: 1 };
+    let settings = Settings { budget, repetitions: number(3, 1) };
+    let only = arguments.get(4).filter(|class| !class.is_empty());
+    let begin = Instant::now();
+    let mut clock = || begin.elapsed().as_secs_f64() * 1e6;
+    for (class, list) in problems.classes.iter().filter(|(class, _)| only.is_none_or(|only| only == *class)) {
+        for problem in list {
+            let trial = trial::run(&mechanism, problem, settings, &mut clock);
+            let times = format!("{:.3} {:.3}", trial.plan, trial.simplify);
+            match trial.outcome {
+                Ok(found) => {
+                    let touch = found.touch.map_or_else(String::new, |touch| touch.to_string());
+                    let (before, after, samples) = (found.first_length_rad, found.length_rad, found.iterations);
+                    println!("{class} {} solved {times} {samples} {before:.4} {after:.4} {touch}", problem.index);
+                }
+                Err(ConnectError::Start | ConnectError::Goal { .. }) => {
+                    println!("{class} {} invalid {}", problem.index, trial.diagnosis.join("; "));
+                }
+                Err(error) => println!("{class} {} failed {times} {error}", problem.index),
+            }
+        }
+    }
+}
