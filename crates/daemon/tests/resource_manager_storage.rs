@@ -73,6 +73,35 @@ async fn a_restarted_manager_knows_everything_that_it_acknowledged() {
     }
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_session_lives_on_while_the_manager_may_say_nothing_for_many_times_its_time_to_live() {
+    let (system, place) = (TestSystem::new(), tempfile::tempdir().unwrap());
+    let (real, link) = (place.path().join("real"), place.path().join("state"));
+    std::fs::create_dir(&real).unwrap();
+    std::os::unix::fs::symlink(&real, &link).unwrap();
+    let manager = system.resource_manager_with(config(&system, &link, Durability::Group)).await;
+    let ttl = Duration::from_millis(500);
+    let session = Session::open(&system.channels, &manager.endpoint, "holder", ttl);
+    session.alive(DEADLINE).await.unwrap();
+    let client = ResourceClient::new(&system.channels, &manager.endpoint, session.id()).unwrap();
+    let operator = ResourceClient::new(&system.channels, &manager.endpoint, "").unwrap();
+    operator.create(tool("a")).await.unwrap();
+    let lease = client.acquire(vec![block("Tool")], request("take")).await.unwrap();
+    // A link that leads to itself cannot be followed, by root neither.
+    std::fs::remove_file(&link).unwrap();
+    std::os::unix::fs::symlink(&link, &link).unwrap();
+    in_time(session.lost()).await;
+    tokio::time::sleep(6 * ttl).await;
+    assert!(!session.state().borrow().alive, "nothing is said");
+    std::fs::remove_file(&link).unwrap();
+    std::os::unix::fs::symlink(&real, &link).unwrap();
+    session.alive(DEADLINE).await.unwrap();
+    assert_eq!(session.state().borrow().generation, 1, "the manager knows it");
+    let held = client.list(&["Tool"]).await.unwrap().remove(0).holdings;
+    assert_eq!(held.iter().map(|holding| holding.lease).collect::<Vec<_>>(), [lease.id]);
+    manager.end().await;
+}
+
 #[tokio::test]
 async fn a_second_manager_on_the_same_state_is_refused() {
     let system = TestSystem::new();

@@ -67,7 +67,7 @@ impl<C: Core> Actor<C> {
                 Speech::Held(why) => self.silence(why.as_ref()),
                 Speech::Allowed => self.end_silence(),
             }
-            let deadline = self.core.next_deadline(&self.desk).map(|at| self.desk.instant(at));
+            let deadline = self.core.next_deadline(&self.desk).and_then(|at| self.desk.instant(at));
             let (running, room) = (self.desk.stopped().is_none(), !self.outbox.is_full() && !self.desk.is_full());
             // What is urgent comes first, but not for ever.
             let urgent_first = urgent_taken < URGENT_AT_ONCE || !room || inbox.messages.is_empty();

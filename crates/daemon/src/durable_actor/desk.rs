@@ -45,7 +45,7 @@ impl<C: Core> Desk<C> {
         Desk { watchers: Watchers::default(), outgoing: Vec::new(), stopped: None, clock, may_speak }
     }
 
-    /// The time since the start, without pauses of the process.
+    /// The time since the start, without pauses of the process, and without the time in which it might say nothing.
     pub(crate) fn now(&self) -> Timestamp {
         self.clock.at(Instant::now())
     }
@@ -118,7 +118,7 @@ impl<C: Core> Desk<C> {
         Ok(updates)
     }
 
-    pub(super) fn instant(&self, at: Timestamp) -> Instant {
+    pub(super) fn instant(&self, at: Timestamp) -> Option<Instant> {
         self.clock.instant(at)
     }
 
@@ -127,7 +127,8 @@ impl<C: Core> Desk<C> {
     }
 
     pub(super) fn begin_turn(&mut self) {
-        self.clock.look(Instant::now());
+        let may_speak = self.may_speak();
+        self.clock.look(Instant::now(), may_speak);
     }
 
     pub(super) fn speech(&mut self) -> &mut MaySpeak {

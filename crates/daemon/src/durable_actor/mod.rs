@@ -6,7 +6,7 @@
 //! ```
 //! What came together is written down together. When records cannot be written, every change is refused from then on; what can be read
 //! is the state that is on the disk. Nothing at all is said unless this is known to be the one writer ([`may_speak`]), and no deadline
-//! counts the time in which the process was not running ([`clock`]).
+//! counts the time in which the process was not running, or might say nothing ([`clock`]).
 
 mod actor;
 mod clock;

@@ -36,6 +36,10 @@ enum Message {
     Taken(oneshot::Sender<()>),
     /// How many pings were taken.
     Pings(oneshot::Sender<usize>),
+    /// Something is due after so long.
+    Alarm(Duration),
+    /// Whether it was.
+    Rung(oneshot::Sender<bool>),
     Panic,
 }
 
@@ -43,6 +47,8 @@ enum Message {
 struct BlobCore {
     blobs: Blobs,
     pings: usize,
+    alarm: Option<Timestamp>,
+    rung: bool,
 }
 
 impl Journaled for Blobs {
@@ -73,10 +79,14 @@ impl Core for BlobCore {
     }
 
     fn next_deadline(&self, _: &Desk<Self>) -> Option<Timestamp> {
-        None
+        self.alarm
     }
 
-    fn advance(&mut self, _: &mut Desk<Self>) {}
+    fn advance(&mut self, desk: &mut Desk<Self>) {
+        if self.alarm.take_if(|at| *at <= desk.now()).is_some() {
+            self.rung = true;
+        }
+    }
 
     fn receive(&mut self, message: Message, desk: &mut Desk<Self>) {
         match message {
@@ -88,6 +98,8 @@ impl Core for BlobCore {
             Message::Count(answer) => desk.reply(answer, Ok(self.blobs.lengths.len())),
             Message::Taken(answer) => drop(answer.send(())),
             Message::Pings(answer) => drop(answer.send(self.pings)),
+            Message::Alarm(after) => self.alarm = Some(desk.now() + after),
+            Message::Rung(answer) => drop(answer.send(self.rung)),
             Message::Panic => panic!("a defect"),
         }
     }
@@ -204,6 +216,10 @@ async fn a_state_directory_that_cannot_be_looked_at_makes_the_daemon_silent_and_
         why.contains("it cannot be seen who has the state (cannot look at") && why.contains("writer.lock"),
         "{why}"
     );
+    // No deadline comes meanwhile, though the actor takes its turns.
+    handle.send(Message::Alarm(Duration::from_millis(50))).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    assert!(!in_time(handle.ask(Message::Rung)).await.unwrap());
     let ((answer, mut counted), (answer_to_add, mut added)) = (oneshot::channel(), oneshot::channel());
     let (later, taken) = oneshot::channel();
     handle.send(Message::Count(answer)).await.unwrap();
@@ -217,6 +233,9 @@ async fn a_state_directory_that_cannot_be_looked_at_makes_the_daemon_silent_and_
     assert_eq!(in_time(counted).await.unwrap().unwrap(), 1, "what was held back leaves");
     assert_eq!(in_time(added).await.unwrap().unwrap(), 2, "and what was written meanwhile");
     assert_eq!(condition.borrow().failure, None);
+    while !in_time(handle.ask(Message::Rung)).await.unwrap() {
+        tokio::task::yield_now().await;
+    }
 }
 
 #[tokio::test]
