@@ -46,7 +46,7 @@ impl Pool {
                     }
                     self.stop_timer(before, Timer::Session(session.clone()));
                 } else {
-                    let new = Session::new(client.clone(), Arc::default(), *ttl, expires);
+                    let new = Session::new(client.clone(), Arc::default(), 0, *ttl, expires);
                     self.callers.opened(&new.opened_by);
                     self.sessions.insert(session.clone(), new);
                 }
@@ -55,13 +55,15 @@ impl Pool {
             }
             Effect::SessionOpened { session, client, ttl, opened_by } => {
                 let expires = self.now + *ttl;
-                let new = Session::new(client.clone(), opened_by.clone(), *ttl, expires);
-                if self.sessions.insert(session.clone(), new).is_some() {
-                    return Err(format!("{session} is there already"));
+                self.opened(session, Session::new(client.clone(), opened_by.clone(), 0, *ttl, expires))
+            }
+            Effect::SessionNumbered { session, client, ttl, opened_by, number } => {
+                if *number <= self.last_session {
+                    return Err(format!("{session} has number {number}, which is not above {}", self.last_session));
                 }
-                self.callers.opened(opened_by);
-                self.timers.insert((expires, Timer::Session(session.clone())));
-                Ok(())
+                self.last_session = *number;
+                let expires = self.now + *ttl;
+                self.opened(session, Session::new(client.clone(), opened_by.clone(), *number, *ttl, expires))
             }
             Effect::SessionEnded { session } => {
                 let known = self.sessions.remove(session).ok_or_else(|| format!("{session} is not there"))?;
@@ -290,6 +292,16 @@ impl Pool {
         }
         self.stop_timer(until, Timer::Standstill(lease, slot));
         true
+    }
+
+    fn opened(&mut self, id: &SessionId, session: Session) -> Result<(), Misfit> {
+        let (expires, opened_by) = (session.expires, session.opened_by.clone());
+        if self.sessions.insert(id.clone(), session).is_some() {
+            return Err(format!("{id} is there already"));
+        }
+        self.callers.opened(&opened_by);
+        self.timers.insert((expires, Timer::Session(id.clone())));
+        Ok(())
     }
 
     /// A session with no time to live ends.

@@ -45,6 +45,8 @@ pub struct Pool {
     pub(crate) last_lease: u64,
     pub(crate) last_token: u64,
     pub(crate) last_number: u64,
+    /// The number of the session that was opened last.
+    pub(crate) last_session: u64,
     pub(crate) history: History,
     // What is not.
     pub(crate) queue: Queue,
@@ -84,12 +86,12 @@ impl Pool {
         self
     }
 
-    /// The same pool; what it grants from now on has ids and tokens above `floor` too. A restarted manager passes the microseconds
+    /// The same pool; what it grants from now on has ids and tokens above `floor` too, and the sessions that it opens have such numbers. A restarted manager passes the microseconds
     /// of a clock, so that its leases are not refused as old ones, whatever was lost of what it kept: tokens do not grow faster
     /// than those (`pace.rs`).
     #[must_use]
     pub fn above(mut self, floor: u64) -> Pool {
-        for last in [&mut self.last_lease, &mut self.last_token, &mut self.next_waiter] {
+        for last in [&mut self.last_lease, &mut self.last_token, &mut self.last_session, &mut self.next_waiter] {
             *last = floor.max(*last);
         }
         self.pace = Some(Pace::from(self.last_token.max(self.last_lease)));

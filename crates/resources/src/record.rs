@@ -20,7 +20,7 @@ use std::time::Duration;
 
 /// The version that [`encode`] writes, its first byte. Every new variant at the end takes a new number, so that an older program
 /// refuses what it does not know by its version; records since [`OLDEST_FORMAT`] are read as they are.
-pub const FORMAT: u8 = 6;
+pub const FORMAT: u8 = 7;
 /// The oldest version that [`decode`] reads: it has no `Effect::SessionOpened`, as none before this one has `Effect::UnitsFreed`.
 pub const OLDEST_FORMAT: u8 = 2;
 /// The newest version whose fingerprints are of how requests were written then, which says nothing to a later one.
@@ -54,7 +54,7 @@ pub(crate) enum Effect {
     Answered { request_id: String, fingerprint: Fingerprint, reply: Remembered, forget: usize },
     /// What a session consumed of a resource with a grant that was undone is there again.
     Returned { session: SessionId, slot: Slot, amount: Quantity },
-    /// A session is new.
+    /// In records of before: a session without a number is new.
     SessionOpened { session: SessionId, client: String, ttl: Duration, opened_by: Arc<str> },
     /// What a lease that has ended had left of a resource is free: standstill was confirmed, or its bound has passed.
     UnitsFreed { lease: LeaseId, slot: Slot, confirmed: bool },
@@ -66,6 +66,8 @@ pub(crate) enum Effect {
         reply: Remembered,
         forget: Forgotten,
     },
+    /// A session is new.
+    SessionNumbered { session: SessionId, client: String, ttl: Duration, opened_by: Arc<str>, number: u64 },
 }
 
 /// What its bytes are, in messages.

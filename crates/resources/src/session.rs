@@ -24,6 +24,9 @@ pub(crate) struct Session {
     pub(crate) opened_by: Arc<str>,
     /// Whether that is an operator: as its last ping said; before the first one after a restart nobody knows.
     pub(crate) for_anybody: bool,
+    /// Which of all sessions of this pool it is: one that is opened anew under the same id has another number. 0 where it was opened by a
+    /// version that did not number them.
+    pub(crate) number: u64,
     /// How long it lives without a keep-alive.
     pub(crate) ttl: Duration,
     /// When it expires unless kept alive.
@@ -82,11 +85,12 @@ impl Speaker {
 pub(crate) type Sessions = BTreeMap<SessionId, Session>;
 
 impl Session {
-    pub(crate) fn new(name: String, opened_by: Arc<str>, ttl: Duration, expires: Timestamp) -> Session {
+    pub(crate) fn new(name: String, opened_by: Arc<str>, number: u64, ttl: Duration, expires: Timestamp) -> Session {
         Session {
             name,
             opened_by,
             for_anybody: false,
+            number,
             ttl,
             expires,
             ending: ttl.is_zero().then_some(EndReason::SessionExpired),
@@ -170,7 +174,8 @@ impl Pool {
                 self.check_name("client name", client)?;
                 self.check_sessions(speaker)?;
                 let (session, client, opened_by) = (id.clone(), client.to_owned(), speaker.name.clone());
-                self.commit(Effect::SessionOpened { session, client, ttl, opened_by });
+                let number = self.last_session + 1;
+                self.commit(Effect::SessionNumbered { session, client, ttl, opened_by, number });
                 Ok(true)
             }
         }
@@ -224,6 +229,12 @@ impl Pool {
             self.timers.insert((session.expires, Timer::Session(id.clone())));
         }
         self
+    }
+
+    /// The number of a session; 0 where a version opened it that did not number them, nothing where it is unknown. A session that was
+    /// opened anew under its id has another one, also after a restart.
+    pub fn session_number(&self, id: &SessionId) -> Option<u64> {
+        self.session(id).ok().map(|session| session.number)
     }
 
     /// How long a session lives without a keep-alive; nothing where it is unknown.

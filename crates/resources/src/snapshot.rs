@@ -24,7 +24,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The last versions without callers of answers and openers of leases that end, without leases that end, and without openers of sessions.
+/// The last versions without numbers of sessions, without callers of answers and openers of leases that end, without leases that end, and
+/// without openers of sessions.
+const WITHOUT_NUMBERS: u8 = 6;
 const WITHOUT_CALLERS: u8 = 5;
 const WITHOUT_ENDING: u8 = 4;
 const WITHOUT_OPENERS: u8 = 2;
@@ -51,6 +53,9 @@ pub struct Snapshot {
     answered: Vec<Arc<str>>,
     /// Who opened the sessions of the leases that have ended, in their order; as above.
     ended: Vec<Arc<str>>,
+    /// The numbers of the sessions, in their order; 0 where they are not here.
+    numbers: Vec<u64>,
+    last_session: u64,
 }
 
 /// A snapshot or a record that does not fit: the log has a gap, or is of another pool.
@@ -88,13 +93,13 @@ impl Snapshot {
     /// Bytes that it did not write, or another version did.
     pub fn decode(bytes: &[u8]) -> Result<Snapshot, DecodeError> {
         let version = versioned::version(OLDEST_FORMAT, FORMAT, SNAPSHOT, bytes)?;
-        let mut snapshot: Snapshot = match version {
-            // An empty list for each that is missing, as postcard writes it.
-            WITHOUT_OPENERS => versioned::decode(version, SNAPSHOT, &[bytes, &[0; 4]].concat())?,
-            ..=WITHOUT_ENDING => versioned::decode(version, SNAPSHOT, &[bytes, &[0; 3]].concat())?,
-            WITHOUT_CALLERS => versioned::decode(version, SNAPSHOT, &[bytes, &[0; 2]].concat())?,
-            _ => versioned::decode(version, SNAPSHOT, bytes)?,
-        };
+        let without = |last: u8, fields: usize| if version <= last { fields } else { 0 };
+        let missing = without(WITHOUT_OPENERS, 1)
+            + without(WITHOUT_ENDING, 1)
+            + without(WITHOUT_CALLERS, 2)
+            + without(WITHOUT_NUMBERS, 2);
+        // An empty list, or 0, for each that is missing, as postcard writes it.
+        let mut snapshot: Snapshot = versioned::decode(version, SNAPSHOT, &[bytes, &[0; 6][..missing]].concat())?;
         if !knows_fingerprints(version) {
             snapshot.answers.iter_mut().for_each(|(_, fingerprint, _)| *fingerprint = Fingerprint::UNKNOWN);
         }
@@ -127,6 +132,8 @@ impl Pool {
             ending: self.ending.iter().map(|(id, ending)| (*id, ending.without_bounds())).collect(),
             answered: self.memory.iter().map(|(caller, ..)| caller.clone()).collect(),
             ended: self.ending.values().map(|ending| ending.opened_by.clone()).collect(),
+            numbers: self.sessions.values().map(|session| session.number).collect(),
+            last_session: self.last_session,
         }
     }
 
@@ -160,10 +167,12 @@ impl Pool {
         (self.revision, self.last_number) = (snapshot.revision, snapshot.last_number);
         (self.last_lease, self.last_token) = (snapshot.last_lease, snapshot.last_token);
         let mut openers: BTreeMap<SessionId, Arc<str>> = snapshot.openers.into_iter().collect();
+        self.last_session = snapshot.last_session;
+        let mut numbers = snapshot.numbers.into_iter();
         for (id, client, ttl) in snapshot.sessions {
-            let opened_by = openers.remove(&id).unwrap_or_default();
+            let (opened_by, number) = (openers.remove(&id).unwrap_or_default(), numbers.next().unwrap_or(0));
             let expires = self.now + ttl;
-            self.sessions.insert(id.clone(), Session::new(client, opened_by, ttl, expires));
+            self.sessions.insert(id.clone(), Session::new(client, opened_by, number, ttl, expires));
             self.start_session_timer(&id, expires);
         }
         for (slot, resource) in snapshot.resources {

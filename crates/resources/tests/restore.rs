@@ -298,9 +298,10 @@ fn who_opened_a_session_is_known_from_records_and_from_a_snapshot_and_not_of_one
         assert_eq!(again.keep_alive_as(now, &speaker("root", true), &id, "s", Duration::from_secs(10)), Ok(false));
         assert_eq!(&*again.sessions()[0].opened_by, "a", "an operator speaks for it and does not own it");
     }
-    // The snapshot of an earlier version has no openers: it ends where their list would begin. Three more lists follow that, all empty.
+    // The snapshot of an earlier version has no openers: it ends where their list would begin. Three more lists follow that, all empty, and
+    // the numbers of sessions.
     let bytes = snapshot.encode();
-    let openers = [postcard_list(&[("s", "a")]), vec![0; 3]].concat();
+    let openers = [postcard_list(&[("s", "a")]), vec![0; 3], ONE_NUMBERED.to_vec()].concat();
     let mut earlier = bytes.strip_suffix(openers.as_slice()).unwrap().to_vec();
     earlier[0] = 2;
     let mut again = Pool::restore(Limits::default(), now, Some(Snapshot::decode(&earlier).unwrap()), []).unwrap();
@@ -308,9 +309,11 @@ fn who_opened_a_session_is_known_from_records_and_from_a_snapshot_and_not_of_one
     assert!(refused.to_string().contains("only an operator may speak for it"), "{refused}");
     again.check_speaker(now, &speaker("root", true), &id).unwrap();
     // That of the version after it has no leases that end.
-    let mut without_ending = bytes.strip_suffix(&[0; 3]).unwrap().to_vec();
+    let mut without_ending = bytes.strip_suffix(&[&[0; 3][..], &ONE_NUMBERED].concat()[..]).unwrap().to_vec();
     without_ending[0] = 4;
-    assert_eq!(Snapshot::decode(&without_ending).unwrap(), Snapshot::decode(&bytes).unwrap());
+    let mut without_numbers = bytes.strip_suffix(&ONE_NUMBERED).unwrap().to_vec();
+    without_numbers[0] = 6;
+    assert_eq!(Snapshot::decode(&without_ending).unwrap(), Snapshot::decode(&without_numbers).unwrap());
     let newer = Snapshot::decode(&[&[FORMAT + 1], &bytes[1..]].concat());
     assert!(matches!(newer, Err(DecodeError::Version { found, .. }) if found == FORMAT + 1));
 }
@@ -325,7 +328,7 @@ fn answers_that_an_earlier_version_remembers_for_nobody_knows_whom_are_given_to_
     let first = pool.handle_as(now, &speaker("a"), "r1", create("Arm")).unwrap();
     let bytes = pool.snapshot().encode();
     // It ends where the callers of the answers would follow, and the openers of leases that end, of which there are none.
-    let mut earlier = bytes.strip_suffix(&[1, 1, b'a', 0]).unwrap().to_vec();
+    let mut earlier = bytes.strip_suffix(&[&[1, 1, b'a', 0][..], &ONE_NUMBERED].concat()[..]).unwrap().to_vec();
     earlier[0] = 5;
     let earlier = Snapshot::decode(&earlier).unwrap();
     let mut pool = Pool::restore(Limits::default(), now, Some(earlier), []).unwrap();
@@ -342,7 +345,7 @@ fn answers_that_an_earlier_version_remembers_for_nobody_knows_whom_are_given_to_
     let acquire = AcquireRequest::new(id.clone(), vec![requirement(ResourceOperation::Block, 0, 1)]);
     pool.handle_as(now, &speaker("a"), "q1", Request::Acquire(acquire)).unwrap();
     let bytes = pool.snapshot().encode();
-    let mut earlier = bytes.strip_suffix(&[1, 1, b'a', 0]).unwrap().to_vec();
+    let mut earlier = bytes.strip_suffix(&[&[1, 1, b'a', 0][..], &ONE_NUMBERED].concat()[..]).unwrap().to_vec();
     earlier[0] = 5;
     let earlier = Snapshot::decode(&earlier).unwrap();
     let mut pool = Pool::restore(Limits::default(), now, Some(earlier), []).unwrap();
@@ -356,6 +359,53 @@ fn answers_that_an_earlier_version_remembers_for_nobody_knows_whom_are_given_to_
     let mut pool = Pool::restore(Limits::default(), now, None, records).unwrap();
     let again = pool.handle_as(now, &speaker("b"), "r1", Request::Release { session: None, lease: LeaseId(7) });
     assert_eq!(again, Ok(ratn_resources::Reply::Done));
+}
+
+/// The numbers of sessions in a snapshot, where one was opened, and the last number given.
+const ONE_NUMBERED: [u8; 3] = [1, 1, 1];
+
+#[test]
+fn a_session_that_is_opened_anew_has_another_number_from_records_from_a_snapshot_and_where_everything_was_lost() {
+    let (now, id) = (Timestamp(0), SessionId::from("s"));
+    let ping = |pool: &mut Pool| pool.keep_alive(now, &id, "s", Duration::from_secs(10)).unwrap();
+    let mut pool = Pool::new(Limits::default());
+    assert_eq!(pool.session_number(&id), None);
+    assert!(ping(&mut pool));
+    let first = pool.session_number(&id).unwrap();
+    assert!(!ping(&mut pool));
+    assert_eq!(pool.session_number(&id), Some(first));
+    pool.close_session(now, &id).unwrap();
+    assert!(ping(&mut pool));
+    let second = pool.session_number(&id).unwrap();
+    assert!(second > first);
+    let snapshot = Snapshot::decode(&pool.snapshot().encode()).unwrap();
+    let records = decode(&encode(&pool.take_records())).unwrap();
+    let from_records = Pool::restore(Limits::default(), now, None, records).unwrap();
+    let from_snapshot = Pool::restore(Limits::default(), now, Some(snapshot), []).unwrap();
+    let lost = Pool::new(Limits::default()).above(1_000_000);
+    for (mut again, kept) in [(from_records, Some(second)), (from_snapshot, Some(second)), (lost, None)] {
+        assert_eq!(again.session_number(&id), kept);
+        if kept.is_some() {
+            again.close_session(now, &id).unwrap();
+        }
+        assert!(ping(&mut again));
+        assert!(again.session_number(&id).unwrap() > second);
+        again.check_invariants().unwrap();
+    }
+}
+
+#[test]
+fn a_session_of_a_version_that_did_not_number_them_has_number_0_until_it_is_opened_anew() {
+    let (now, id) = (Timestamp(0), SessionId::from("s"));
+    // Opened by `a` for one second, as version 6 wrote it.
+    let opened = decode(&[6, 1, 11, 1, b's', 1, b'c', 1, 0, 1, b'a']).unwrap();
+    let mut pool = Pool::restore(Limits::default(), now, None, opened).unwrap().above(1_000);
+    assert_eq!(pool.session_number(&id), Some(0));
+    pool.keep_alive(now, &id, "c", Duration::from_secs(1)).unwrap();
+    assert_eq!(pool.session_number(&id), Some(0), "a ping does not make it another one");
+    pool.close_session(now, &id).unwrap();
+    pool.keep_alive(now, &id, "c", Duration::from_secs(1)).unwrap();
+    assert!(pool.session_number(&id).unwrap() > 0);
 }
 
 /// Pairs of short texts as they are kept.

@@ -24,7 +24,8 @@
 //!   [`client::WorldClient`], [`client::ProcessClient`] speak the cores' types; [`client::CallError`] tells a refusal from a
 //!   crash; [`client::wait_until_serving`] asks gRPC health.
 //! - [`session::Session`] keeps a session with the resource manager alive and tells when it was lost;
-//!   [`provider::Provider`] offers resources under it, again after the manager came back.
+//!   [`provider::Provider`] offers resources under it, again after the manager came back. What is believed of either ends by
+//!   [`boot_clock::BootClock`], also while the machine is suspended.
 //!
 //! What it deliberately does not do: decide anything. No retries of goals, no choice of resources.
 
@@ -32,6 +33,7 @@ pub mod access;
 pub mod action;
 pub mod adoption;
 pub mod audit;
+pub mod boot_clock;
 pub mod client;
 pub mod connections;
 pub mod endpoint;

@@ -1,5 +1,5 @@
 //! Offers resources under a session, and withdraws them. A resource that the resource manager has forgotten is offered again. While the
-//! manager cannot be reached, offers and withdrawals wait.
+//! manager cannot be reached, offers and withdrawals wait; one that is not answered within [`ANSWERED_WITHIN`] is asked again.
 //!
 //! A provider watches its resources at the manager. When somebody else has deleted one, the provider logs that and offers it again. What
 //! a new watch shows first is compared with what was offered: a session may have ended and been made anew unnoticed, when the answer of
@@ -20,6 +20,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{Mutex, Notify, watch};
+use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::Code;
 
@@ -27,6 +28,8 @@ use tonic::Code;
 const AT_ONCE: usize = 16;
 /// A part of a process, for its log.
 const PART: &str = "the provider of resources";
+/// An answer is waited for this long; then the manager is asked again, over a connection made anew where the old one broke.
+const ANSWERED_WITHIN: Duration = Duration::from_secs(3);
 /// The pause before the manager is asked again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -162,7 +165,7 @@ impl Provider {
         let mut requirement = Requirement::new(ResourceOperation::Delete, resource.kind);
         requirement.class = Some(resource.class);
         requirement.attributes = resource.attributes;
-        match self.shared.client.delete_matching(requirement).await {
+        match answered(&self.shared.client, self.shared.client.delete_matching(requirement)).await {
             Ok(deleted) => {
                 debug_assert_eq!(deleted, [id], "attributes of a resource are its own");
                 desired.remove(id);
@@ -199,7 +202,7 @@ impl Shared {
     /// Whether the manager says that it has a resource, of this provider's session. Where it says nothing, the resource is offered again:
     /// that changes nothing where it was there.
     async fn is_there(&self, id: &str) -> bool {
-        self.client.get(id).await.is_ok_and(|resource| self.is_own(&resource))
+        answered(&self.client, self.client.get(id)).await.is_ok_and(|resource| self.is_own(&resource))
     }
 
     fn is_own(&self, resource: &Resource) -> bool {
@@ -265,10 +268,21 @@ impl Shared {
 /// Tells the manager that a resource is there, or gone; its id and the answer.
 async fn ask(client: ResourceClient, id: String, resource: Option<Resource>) -> (String, Result<(), CallError>) {
     let answer = match resource {
-        Some(resource) => client.create(resource).await.map(drop),
-        None => client.delete(&id).await,
+        Some(resource) => answered(&client, client.create(resource)).await.map(drop),
+        None => answered(&client, client.delete(&id)).await,
     };
     (id, answer)
+}
+
+/// What the manager answers, or that it does not within [`ANSWERED_WITHIN`]: one that hangs breaks no connection.
+async fn answered<T>(
+    client: &ResourceClient,
+    call: impl Future<Output = Result<T, CallError>>,
+) -> Result<T, CallError> {
+    timeout(ANSWERED_WITHIN, call).await.unwrap_or_else(|_| {
+        let reason = format!("no answer within {} s", ANSWERED_WITHIN.as_secs());
+        Err(CallError::Broken { endpoint: client.endpoint().clone(), reason })
+    })
 }
 
 impl DesiredState {
@@ -371,7 +385,7 @@ async fn watch_kinds(shared: &Shared, kinds: &BTreeSet<String>) {
     };
     // Known before the snapshot is made: what is not in it is gone.
     let before = there(&*shared.desired.lock().await);
-    let Ok(mut watch) = shared.client.watch(&kinds).await else { return };
+    let Ok(mut watch) = answered(&shared.client, shared.client.watch(&kinds)).await else { return };
     while let Ok(Some(update)) = watch.next().await {
         match update {
             ResourceUpdate::Snapshot { resources, .. } => {

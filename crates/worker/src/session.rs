@@ -1,12 +1,14 @@
 //! A session with the resource manager: kept alive in the background, continued after a broken connection, opened again
-//! when the manager has forgotten it. What it owned is then gone; [`SessionState::generation`] tells.
+//! when the manager has forgotten it. What it owned is then gone; [`SessionState::generation`] tells, by the number that the manager gives
+//! every session that it makes: also where the answer that said `created` was lost with its connection.
 //!
 //! ```text
 //! open ─→ not alive ─ ping answered ─→ alive ─ no answer for a TTL ─→ not alive
-//!                                      └─ answer says `created` ─→ alive, next generation
+//!                                      └─ answer says `created`, or another number ─→ alive, next generation
 //! not alive ─ answer says that it is known ─→ alive, the same generation: a manager that was suspended, or away, has kept it
 //! ```
 
+use crate::boot_clock::{BootClock, BootInstant};
 use crate::client::{Channels, fresh_id};
 use crate::endpoint::Endpoint;
 use crate::panic::exit_on_panic;
@@ -40,7 +42,7 @@ pub struct Session {
     endpoint: Endpoint,
     ttl: Duration,
     state: watch::Receiver<SessionState>,
-    expires: watch::Receiver<Instant>,
+    belief: Belief,
     end: CancellationToken,
     task: Option<JoinHandle<()>>,
 }
@@ -52,10 +54,18 @@ pub struct SessionState {
     pub alive: bool,
     /// How often the manager made it; when it grows beyond 1, what the session owned and held is gone.
     pub generation: u64,
-    /// When it ran out here, if it was alive before and is not now.
+    /// When it was found to have run out here, if it was alive before and is not now.
     pub unheard_since: Option<Instant>,
     /// The manager knew it from before when it was pinged for the first time: it goes on with what it has there.
     pub found: bool,
+}
+
+/// Until when a client believes in its session: from its last answered ping on for its time to live, the time included in which the
+/// machine was suspended. A handle: clones share everything.
+#[derive(Debug, Clone)]
+pub(crate) struct Belief {
+    until: watch::Receiver<BootInstant>,
+    clock: BootClock,
 }
 
 /// No session within the deadline.
@@ -77,10 +87,25 @@ impl Session {
     /// As [`Session::open`], under an id of the caller's: that of a session whose client is gone goes on with it, if it still
     /// lives. Nobody else may have it.
     pub fn open_as(channels: &Channels, endpoint: &Endpoint, id: String, client: &str, ttl: Duration) -> Session {
+        Session::open_by(BootClock::default(), channels, endpoint, id, client, ttl)
+    }
+
+    /// As [`Session::open_as`], by another clock.
+    pub fn open_by(
+        clock: BootClock,
+        channels: &Channels,
+        endpoint: &Endpoint,
+        id: String,
+        client: &str,
+        ttl: Duration,
+    ) -> Session {
         let end = CancellationToken::new();
         let (tell, state) = watch::channel(SessionState::default());
-        let (expires, known) = watch::channel(Instant::now());
+        let (expires, until) = watch::channel(clock.now());
+        let belief = Belief { until, clock: clock.clone() };
         let keeper = Keeper {
+            clock,
+            number: None,
             channels: channels.clone(),
             endpoint: endpoint.clone(),
             id: id.clone(),
@@ -91,7 +116,7 @@ impl Session {
             end: end.clone(),
         };
         let task = Some(tokio::spawn(exit_on_panic("the task that keeps a session alive", keeper.keep())));
-        Session { id, endpoint: endpoint.clone(), ttl, state, expires: known, end, task }
+        Session { id, endpoint: endpoint.clone(), ttl, state, belief, end, task }
     }
 
     /// Its id.
@@ -102,6 +127,11 @@ impl Session {
     /// How it is, and every change of it.
     pub fn state(&self) -> watch::Receiver<SessionState> {
         self.state.clone()
+    }
+
+    /// Until when it is believed in.
+    pub(crate) fn belief(&self) -> Belief {
+        self.belief.clone()
     }
 
     /// Returns once it is alive.
@@ -157,17 +187,9 @@ impl Session {
     /// its leases may do.
     pub async fn nearly_lost(&self, margin: Duration) {
         let nearly = async {
-            let (mut state, mut expires) = (self.state.clone(), self.expires.clone());
-            if state.wait_for(|state| state.alive).await.is_err() {
-                return;
-            }
-            loop {
-                let at = expires.borrow_and_update().checked_sub(margin).unwrap_or_else(Instant::now);
-                tokio::select! {
-                    biased;
-                    changed = expires.changed() => if changed.is_err() { return },
-                    () = tokio::time::sleep_until(at) => return,
-                }
+            let mut state = self.state.clone();
+            if state.wait_for(|state| state.alive).await.is_ok() {
+                self.belief().nearly_ended(margin).await;
             }
         };
         tokio::select! {
@@ -193,6 +215,25 @@ impl Session {
     }
 }
 
+impl Belief {
+    /// Whether the session is believed in now. For those that cannot wait for a timer, which stands still while the machine is suspended.
+    pub(crate) fn holds(&self) -> bool {
+        self.clock.now() < *self.until.borrow()
+    }
+
+    /// Returns this long before it ends, unless it is renewed before.
+    async fn nearly_ended(mut self, margin: Duration) {
+        loop {
+            let at = self.until.borrow_and_update().saturating_sub(margin);
+            tokio::select! {
+                biased;
+                changed = self.until.changed() => if changed.is_err() { return },
+                () = self.clock.sleep_until(at) => return,
+            }
+        }
+    }
+}
+
 impl Drop for Session {
     fn drop(&mut self) {
         // The task says farewell, if the runtime still lets it.
@@ -206,9 +247,12 @@ struct Keeper {
     id: String,
     client: String,
     ttl: Duration,
-    expires: watch::Sender<Instant>,
+    clock: BootClock,
+    expires: watch::Sender<BootInstant>,
     tell: watch::Sender<SessionState>,
     end: CancellationToken,
+    /// Which session of the manager's this is, as its last answer said.
+    number: Option<u64>,
 }
 
 impl Keeper {
@@ -216,21 +260,27 @@ impl Keeper {
         let mut backoff = BACKOFF.0;
         loop {
             let before = self.tell.borrow().generation;
-            let end = self.end.clone();
+            let (end, mut state) = (self.end.clone(), self.tell.subscribe());
+            let belief = Belief { until: self.expires.subscribe(), clock: self.clock.clone() };
+            let ran_out = async {
+                // Once it is alive; the sender is in this task.
+                let _ = state.wait_for(|state| state.alive).await;
+                belief.clone().nearly_ended(Duration::ZERO).await;
+            };
             tokio::select! {
                 biased;
                 () = end.cancelled() => break,
+                () = ran_out => {}
                 () = self.stream() => {}
             }
-            if self.tell.borrow().generation != before || Instant::now() < *self.expires.borrow() {
+            if self.tell.borrow().generation != before || belief.holds() {
                 backoff = BACKOFF.0;
             }
-            let expires = *self.expires.borrow();
-            if Instant::now() >= expires {
+            if !belief.holds() {
                 self.tell.send_if_modified(|state| {
                     let ran_out = std::mem::take(&mut state.alive);
                     if ran_out {
-                        state.unheard_since = Some(expires);
+                        state.unheard_since = Some(Instant::now());
                     }
                     ran_out
                 });
@@ -252,7 +302,7 @@ impl Keeper {
     async fn stream(&mut self) {
         let Some(mut client) = self.connect() else { return };
         let (pings, outgoing) = mpsc::channel(1);
-        let mut asked = Instant::now();
+        let mut asked = self.clock.now();
         if pings.send(self.ping(self.ttl)).await.is_err() {
             return;
         }
@@ -267,13 +317,19 @@ impl Keeper {
             let ttl = Duration::from_millis(answer.ttl_ms);
             // Counted from the question, so that it never lives longer here than there.
             self.expires.send_replace(asked + ttl);
+            // A manager that does not number its sessions says 0 of each.
+            // An answer that was read long after its question, as after a suspension of the machine, promises nothing any more.
+            let holds = self.clock.now() < asked + ttl;
+            let is_another = self.number.replace(answer.number).is_some_and(|before| before != answer.number);
             self.tell.send_if_modified(|state| {
                 let before = *state;
                 // One that was not alive here was not there: the answer that said so may have been lost with its stream.
                 state.found |= before.generation == 0 && !answer.created;
-                state.generation += u64::from(answer.created || before.generation == 0);
-                state.alive = true;
-                state.unheard_since = None;
+                state.generation += u64::from(answer.created || is_another || before.generation == 0);
+                state.alive |= holds;
+                if holds {
+                    state.unheard_since = None;
+                }
                 *state != before
             });
             tokio::select! {
@@ -282,7 +338,7 @@ impl Keeper {
                 _ = answers.message() => return,
             }
             panic_point("session");
-            asked = Instant::now();
+            asked = self.clock.now();
             if pings.send(self.ping(self.ttl)).await.is_err() {
                 return;
             }
@@ -308,7 +364,7 @@ impl Keeper {
 
     /// How long an answer may take: until the session is over, once it is, a time to live.
     fn patience(&self) -> Duration {
-        let left = self.expires.borrow().saturating_duration_since(Instant::now());
+        let left = self.expires.borrow().saturating_duration_since(self.clock.now());
         if left.is_zero() { self.ttl } else { left }
     }
 }

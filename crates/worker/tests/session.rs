@@ -3,15 +3,17 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use futures::stream::{BoxStream, StreamExt};
+use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
 use ratn_proto::types::Resource;
 use ratn_proto::v1::resource_service_server::{ResourceService, ResourceServiceServer};
 use ratn_proto::v1::*;
 use ratn_worker::action::ActionServer;
+use ratn_worker::boot_clock::BootClock;
 use ratn_worker::client::Channels;
 use ratn_worker::endpoint::Endpoint;
-use ratn_worker::lease_watch::LeaseWatch;
+use ratn_worker::lease_watch::{Claim, LeaseWatch, ManagerLocation, Standing};
 use ratn_worker::protocol::{HEADER, NEWEST, OLDEST};
 use ratn_worker::provider::Provider;
 use ratn_worker::safety::{Brakes, Safety, SafetyState};
@@ -30,7 +32,18 @@ const TTL: Duration = Duration::from_millis(200);
 
 #[derive(Default)]
 struct Pool {
-    sessions: BTreeSet<String>,
+    /// Which of all sessions each is.
+    sessions: BTreeMap<String, u64>,
+    /// Sessions that were made.
+    made: u64,
+    /// So many creations are never answered, and change nothing.
+    unanswered: usize,
+    /// Pings that arrived.
+    pings: usize,
+    /// So many pings break their stream.
+    broken: usize,
+    /// So many answers that say that a session was made are lost with their stream.
+    lost_answers: usize,
     resources: BTreeMap<String, ratn_proto::v1::Resource>,
     /// Ids that another session has.
     taken: BTreeSet<String>,
@@ -42,6 +55,8 @@ struct Pool {
     watches: usize,
     /// Questions for one resource are refused so often: the manager is busy.
     busy: usize,
+    /// The youngest lease.
+    youngest: u64,
     /// So many confirmations of standstill are never answered.
     swallowed: usize,
     /// Confirmations of standstill that arrived.
@@ -60,8 +75,17 @@ struct Manager {
 impl ResourceService for Manager {
     async fn create(&self, request: Request<CreateRequest>) -> Result<Response<CreateResponse>, Status> {
         let request = request.into_inner();
+        let is_unanswered = {
+            let mut pool = self.pool.lock().unwrap();
+            let is_unanswered = pool.unanswered > 0;
+            pool.unanswered -= usize::from(is_unanswered);
+            is_unanswered
+        };
+        if is_unanswered {
+            return std::future::pending().await;
+        }
         let mut pool = self.pool.lock().unwrap();
-        if !pool.sessions.contains(&request.session_id) {
+        if !pool.sessions.contains_key(&request.session_id) {
             return Err(Status::failed_precondition("no such session"));
         }
         let resource = request.resource.unwrap();
@@ -101,15 +125,26 @@ impl ResourceService for Manager {
         let answers = request.into_inner().map(move |ping| {
             let ping = ping?;
             let mut pool = manager.pool.lock().unwrap();
-            let created = if ping.ttl_ms == 0 {
+            let created = ping.ttl_ms > 0 && !pool.sessions.contains_key(&ping.session_id);
+            if ping.ttl_ms == 0 {
                 pool.sessions.remove(&ping.session_id);
-                false
-            } else {
-                pool.sessions.insert(ping.session_id.clone())
-            };
+            } else if created {
+                pool.made += 1;
+                let number = pool.made;
+                pool.sessions.insert(ping.session_id.clone(), number);
+            }
+            let number = pool.sessions.get(&ping.session_id).copied().unwrap_or(0);
+            pool.pings += 1;
+            let is_lost = created && pool.lost_answers > 0;
+            pool.lost_answers -= usize::from(is_lost);
+            let breaks = pool.broken > 0;
+            pool.broken -= usize::from(breaks);
             drop(pool);
             manager.changed.send_replace(());
-            Ok(KeepAliveResponse { session_id: ping.session_id, ttl_ms: ping.ttl_ms, created, revision: 1 })
+            if is_lost || breaks {
+                return Err(Status::unavailable("the connection broke"));
+            }
+            Ok(KeepAliveResponse { session_id: ping.session_id, ttl_ms: ping.ttl_ms, created, revision: 1, number })
         });
         Ok(Response::new(answers.boxed()))
     }
@@ -235,8 +270,10 @@ impl ResourceService for Manager {
         manager.changed.send_replace(());
         let snapshot = async move {
             manager.until(|pool| pool.shows == Some(true)).await;
-            let resources = manager.pool.lock().unwrap().resources.values().cloned().collect();
-            let snapshot = ResourceSnapshot { revision: 1, resources, ..ResourceSnapshot::default() };
+            let pool = manager.pool.lock().unwrap();
+            let (resources, youngest_lease_id) = (pool.resources.values().cloned().collect(), pool.youngest);
+            let snapshot =
+                ResourceSnapshot { revision: 1, resources, youngest_lease_id, ..ResourceSnapshot::default() };
             Ok(ResourceServiceWatchResponse { kind: Some(resource_service_watch_response::Kind::Snapshot(snapshot)) })
         };
         Ok(Response::new(futures::stream::once(snapshot).chain(futures::stream::pending()).boxed()))
@@ -263,7 +300,8 @@ impl Manager {
     }
 
     fn forget_everything(&self) {
-        *self.pool.lock().unwrap() = Pool::default();
+        let mut pool = self.pool.lock().unwrap();
+        *pool = Pool { made: pool.made, ..Pool::default() };
     }
 }
 
@@ -280,7 +318,7 @@ async fn a_session_lives_until_it_is_closed() {
     let session = Session::open(&Channels::new(), &endpoint, "test", TTL);
     session.alive(LONG).await.unwrap();
     let id = session.id().to_owned();
-    manager.until(|pool| pool.sessions.contains(&id)).await;
+    manager.until(|pool| pool.sessions.contains_key(&id)).await;
     session.close().await;
     manager.until(|pool| pool.sessions.is_empty()).await;
     let spoken = Some(format!("{OLDEST}-{NEWEST} {}", env!("CARGO_PKG_VERSION")));
@@ -317,6 +355,152 @@ async fn a_lost_session_says_so_and_comes_back_with_its_resources() {
     let _serving = manager.serve(&endpoint).await;
     manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
     assert_eq!(session.state().borrow().generation, 2);
+}
+
+#[tokio::test]
+async fn a_session_that_was_made_anew_is_known_by_its_number_when_the_answer_that_said_so_was_lost() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let session = Session::open(&Channels::new(), &endpoint, "cell", LONG / 10);
+    session.alive(LONG).await.unwrap();
+    let first = *session.state().borrow();
+    // A connection that breaks changes nothing.
+    manager.pool.lock().unwrap().broken = 1;
+    manager.until(|pool| pool.broken == 0 && pool.protocols.len() == 2).await;
+    let pinged = manager.pool.lock().unwrap().pings;
+    manager.until(|pool| pool.pings > pinged + 1).await;
+    assert_eq!(*session.state().borrow(), first);
+
+    manager.forget_everything();
+    manager.pool.lock().unwrap().lost_answers = 1;
+    let mut state = session.state();
+    let anew = tokio::time::timeout(LONG, state.wait_for(|state| state.generation == 2)).await;
+    assert!(anew.expect("nobody noticed that the session was made anew").unwrap().alive);
+    let pool = manager.pool.lock().unwrap();
+    assert_eq!((pool.made, pool.lost_answers), (2, 0));
+}
+
+#[tokio::test]
+async fn a_creation_that_is_not_answered_is_asked_for_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    manager.pool.lock().unwrap().unanswered = 1;
+    let _serving = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open(&channels, &endpoint, "cell", LONG);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    let offered = tokio::time::timeout(LONG, provider.offer(arm())).await.expect("the creation is waited for for ever");
+    assert!(!offered.unwrap(), "not yet");
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    assert!(provider.withdraw("arm@sim").await.unwrap(), "and nobody is held up");
+}
+
+/// A manager at which session `cell` provides the arm, of which another one holds lease 7.
+fn with_lease() -> Manager {
+    let manager = Manager::new();
+    let holding = Holding { lease_id: 7, token: 70, units: 1.0, session_id: "run".to_owned(), ..Holding::default() };
+    let mut arm = ratn_proto::v1::Resource::from(arm());
+    (arm.session_id, arm.holdings) = ("cell".to_owned(), vec![holding]);
+    {
+        let mut pool = manager.pool.lock().unwrap();
+        (pool.shows, pool.youngest) = (Some(true), 7);
+        pool.resources.insert("arm@sim".to_owned(), arm);
+    }
+    manager
+}
+
+/// Waits until the watch has heard of the lease.
+async fn heard(leases: &LeaseWatch) {
+    let heard = async {
+        while !leases.is_heard() {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(LONG, heard).await.unwrap();
+}
+
+const CLAIM: Claim<'_> = Claim { resource: "arm@sim", lease: LeaseId(7), token: FencingToken(70), session: "run" };
+
+#[tokio::test]
+async fn a_driver_of_a_fixed_session_id_begins_nothing_before_it_has_said_that_it_is_at_rest() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    // What the process before this one has left: its session still lives, with the arm, which is held.
+    let manager = with_lease();
+    manager.pool.lock().unwrap().sessions.insert("cell".to_owned(), 1);
+    let _serving = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open_as(&channels, &endpoint, "cell".to_owned(), "cell", LONG);
+    let leases = LeaseWatch::of(["arm@sim"]);
+    tokio::spawn(leases.follow_session(&channels, &endpoint, &session, LONG).unwrap());
+    heard(&leases).await;
+    assert_eq!(leases.check(&CLAIM), Standing::NotAtRest);
+    leases.brought_to_rest();
+    assert_eq!(leases.check(&CLAIM), Standing::Confirmed);
+}
+
+#[tokio::test]
+async fn a_session_is_over_when_the_machine_wakes_up_after_its_time_to_live_and_goes_on_where_the_manager_knows_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    let (stop, serving) = manager.serve(&endpoint).await;
+    let clock = BootClock::suspendable();
+    let hour = Duration::from_secs(3_600);
+    let session = Session::open_by(clock.clone(), &Channels::new(), &endpoint, "cell".to_owned(), "cell", hour);
+    session.alive(LONG).await.unwrap();
+    stop.cancel();
+    serving.await.unwrap();
+    assert!(session.state().borrow().alive, "the manager may come back");
+    let nearly_lost = session.nearly_lost(Duration::ZERO);
+    clock.suspend(hour);
+    tokio::time::timeout(LONG, session.lost()).await.expect("it is believed in for another hour");
+    tokio::time::timeout(LONG, nearly_lost).await.expect("it is believed in for another hour");
+    let _serving = manager.serve(&endpoint).await;
+    session.alive(LONG).await.unwrap();
+    assert_eq!(session.state().borrow().generation, 1);
+}
+
+#[tokio::test]
+async fn a_lease_is_not_confirmed_when_the_machine_wakes_up_until_the_manager_is_heard_again() {
+    let hour = Duration::from_secs(3_600);
+    for by_session in [true, false] {
+        let directory = tempfile::tempdir().unwrap();
+        let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+        let manager = with_lease();
+        let _serving = manager.serve(&endpoint).await;
+        let (channels, clock) = (Channels::new(), BootClock::suspendable());
+        let leases = LeaseWatch::by(clock.clone(), ["arm@sim"]);
+        leases.brought_to_rest();
+        let session = Session::open_by(clock.clone(), &channels, &endpoint, "cell".to_owned(), "cell", hour);
+        let following = if by_session {
+            tokio::spawn(leases.follow_session(&channels, &endpoint, &session, hour).unwrap())
+        } else {
+            tokio::spawn(leases.follow_location(&channels, ManagerLocation::At(endpoint), hour))
+        };
+        heard(&leases).await;
+        assert_eq!(leases.check(&CLAIM), Standing::Confirmed);
+        // Nothing else has run when the next goal is looked at.
+        clock.suspend(hour);
+        assert!(matches!(leases.check(&CLAIM), Standing::Unheard(_)), "{by_session}");
+        let unheard = async {
+            while leases.is_heard() {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+        };
+        tokio::time::timeout(LONG, unheard).await.expect("what is under way goes on for another hour");
+        let again = async {
+            while leases.check(&CLAIM) != Standing::Confirmed {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+        };
+        tokio::time::timeout(LONG, again).await.expect("the lease lives, and the manager says so");
+        following.abort();
+    }
 }
 
 #[tokio::test]
@@ -430,7 +614,7 @@ async fn standstill_is_confirmed_when_the_driver_has_said_that_it_is_at_rest_and
         // What the process before this one has left: its session still lives, and a lease of the arm has ended.
         let mut pool = manager.pool.lock().unwrap();
         (pool.shows, pool.swallowed) = (Some(true), 1);
-        pool.sessions.insert("cell".to_owned());
+        pool.sessions.insert("cell".to_owned(), 1);
         let ending = EndingUnits { lease_id: 7, token: 70, units: 1.0, ..EndingUnits::default() };
         let mut arm = ratn_proto::v1::Resource::from(arm());
         (arm.session_id, arm.ending) = ("cell".to_owned(), vec![ending]);

@@ -2,7 +2,8 @@
 //!
 //! A thread of its own looks whether the writer's place is still held, every [`CONFIRM_INTERVAL`], and never waits for a sync. Before
 //! every answer the actor compares: the last look that found the place held began less than [`CONFIRMED_FOR`] (G) ago, or nothing
-//! leaves. A process that was suspended finds its confirmation too old, before anything else that it does.
+//! leaves. A process that was suspended finds its confirmation too old, before anything else that it does; so does one whose machine was
+//! suspended ([`BootClock`]).
 //!
 //! Where the state directory cannot be looked at (permissions, a file system that hangs) nothing is confirmed either. The actor is
 //! [`Speech::Held`] then, and its health says why until a look succeeds.
@@ -22,10 +23,11 @@
 
 use ratn_panic_point::panic_point;
 use ratn_storage::{Fault, Place};
+use ratn_worker::boot_clock::{BootClock, BootInstant};
 use ratn_worker::vitals::Vitals;
 use std::sync::mpsc;
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use tokio::sync::watch;
 
 /// G: a confirmation holds for so long.
@@ -39,7 +41,7 @@ enum Confirmed {
     /// No look has found it held.
     NotYet,
     /// It was held at a look that began then.
-    At(Instant),
+    At(BootInstant),
     /// Somebody else has it.
     Lost(Fault),
 }
@@ -66,22 +68,28 @@ pub(super) enum Speech {
 #[derive(Debug)]
 pub(super) struct MaySpeak {
     found: watch::Receiver<Found>,
+    clock: BootClock,
     _end: mpsc::Sender<()>,
 }
 
 impl MaySpeak {
     /// Looks at once, and from then on beside.
     pub(super) fn begin(place: Box<dyn Place>, vitals: Vitals) -> std::io::Result<MaySpeak> {
-        let first = match look(&*place) {
+        MaySpeak::begin_by(BootClock::default(), place, vitals)
+    }
+
+    fn begin_by(clock: BootClock, place: Box<dyn Place>, vitals: Vitals) -> std::io::Result<MaySpeak> {
+        let first = match look(&clock, &*place) {
             Ok(confirmed) => Found { confirmed, unseen: None },
             Err(fault) => Found { confirmed: Confirmed::NotYet, unseen: Some(fault) },
         };
         let (tell, found) = watch::channel(first);
         let (end, ended) = mpsc::channel::<()>();
+        let looking = clock.clone();
         let keep = move || {
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(CONFIRM_INTERVAL) {
                 panic_point("may-speak");
-                match look(&*place) {
+                match look(&looking, &*place) {
                     Ok(confirmed) => {
                         let over = matches!(confirmed, Confirmed::Lost(_));
                         tell.send_replace(Found { confirmed, unseen: None });
@@ -96,13 +104,13 @@ impl MaySpeak {
         thread::Builder::new()
             .name("may-speak".to_owned())
             .spawn(move || vitals.guard_blocking("the watch of its place", keep))?;
-        Ok(MaySpeak { found, _end: end })
+        Ok(MaySpeak { found, clock, _end: end })
     }
 
     pub(super) fn now(&self) -> Speech {
         let found = self.found.borrow();
         match &found.confirmed {
-            Confirmed::At(began) if began.elapsed() < CONFIRMED_FOR => Speech::Allowed,
+            Confirmed::At(began) if self.clock.now() < *began + CONFIRMED_FOR => Speech::Allowed,
             Confirmed::At(_) | Confirmed::NotYet => Speech::Held(found.unseen.clone()),
             Confirmed::Lost(fault) => Speech::Over(fault.clone()),
         }
@@ -117,8 +125,8 @@ impl MaySpeak {
 }
 
 /// Nothing is known where the look itself fails.
-fn look(place: &dyn Place) -> Result<Confirmed, Fault> {
-    let began = Instant::now();
+fn look(clock: &BootClock, place: &dyn Place) -> Result<Confirmed, Fault> {
+    let began = clock.now();
     match place.check() {
         Ok(()) => Ok(Confirmed::At(began)),
         Err(fault) if fault.is_lost_place() => Ok(Confirmed::Lost(fault)),
@@ -140,6 +148,22 @@ mod tests {
         fn check(&self) -> Result<(), Fault> {
             drop(self.0.lock().unwrap());
             Ok(())
+        }
+    }
+
+    #[tokio::test]
+    async fn a_machine_that_wakes_up_says_nothing_before_the_next_look() {
+        let (hangs, clock) = (Arc::new(Mutex::new(())), BootClock::suspendable());
+        let place = Box::new(HangingPlace(hangs.clone()));
+        let mut speech = MaySpeak::begin_by(clock.clone(), place, Vitals::default()).unwrap();
+        {
+            // No look ends before the machine sleeps, and `Instant` does not see that it did.
+            let _hanging = hangs.lock().unwrap();
+            clock.suspend(CONFIRMED_FOR);
+            assert!(matches!(speech.now(), Speech::Held(None)));
+        }
+        while !matches!(speech.now(), Speech::Allowed) {
+            speech.changed().await;
         }
     }
 

@@ -14,6 +14,9 @@ const RETRY_DELAY: Duration = Duration::from_millis(250);
 /// The word for programs of such a refusal.
 pub(crate) const MANAGER_UNHEARD: &str = "MANAGER_UNHEARD";
 
+/// The word for programs of a refusal because the driver has not said that it is at rest.
+pub(crate) const NOT_AT_REST: &str = "NOT_AT_REST";
+
 /// Who says whether a lease is one.
 #[derive(Debug, Default)]
 pub(super) enum Authority {
@@ -95,6 +98,13 @@ impl Authority {
                 Confirmation::Awaited(unheard("the resource manager is not heard just now"))
             }
             Standing::Unheard(why) => Confirmation::Awaited(unheard(&why)),
+            Standing::NotAtRest => {
+                let message = format!(
+                    "{resource} begins nothing yet: its driver has not said that nothing moves of what a process before it began; \
+                     nothing was begun, try again"
+                );
+                Confirmation::Awaited(retry_later(NOT_AT_REST, message))
+            }
         })
     }
 

@@ -24,7 +24,7 @@ mod service;
 mod stream;
 
 pub(crate) use admission::TOO_MANY_WAITING;
-pub(crate) use authority::MANAGER_UNHEARD;
+pub(crate) use authority::{MANAGER_UNHEARD, NOT_AT_REST};
 pub use context::{CallFailure, GoalContext, WorldFailure};
 pub use port::{InputError, Port};
 pub use ratn_proto::types::{Goal, GoalOutcome};

@@ -325,14 +325,14 @@ impl LeaseListener for Inner {
         let Some(watch) = self.authority.watch() else { return };
         let state = self.state();
         for goal in state.running().filter(|goal| goal.is_suspended()) {
-            let is_held = goal.lease.is_some_and(|(lease, token)| {
-                let claim = Claim { resource: &goal.resource, lease, token, session: &goal.session };
-                watch.check(&claim) == Standing::Confirmed
+            let standing = goal.lease.map(|(lease, token)| {
+                watch.check(&Claim { resource: &goal.resource, lease, token, session: &goal.session })
             });
-            if is_held {
-                goal.suspend(false);
-            } else {
-                goal.stop(StopCause::LeaseEnded("it ended while the resource manager was not heard".to_owned()));
+            match standing {
+                Some(Standing::Confirmed) => goal.suspend(false),
+                // The manager is not trusted any more already: what it says next decides.
+                Some(Standing::Unheard(_)) => {}
+                _ => goal.stop(StopCause::LeaseEnded("it ended while the resource manager was not heard".to_owned())),
             }
         }
     }

@@ -1,7 +1,7 @@
 //! How a call fails: refused by the one who was asked, or broken on the way.
 
 use super::chain;
-use crate::action::{MANAGER_UNHEARD, TOO_MANY_WAITING};
+use crate::action::{MANAGER_UNHEARD, NOT_AT_REST, TOO_MANY_WAITING};
 use crate::endpoint::Endpoint;
 use ratn_proto::convert::Malformed;
 use std::error::Error;
@@ -89,7 +89,7 @@ impl CallError {
 
 fn begins_nothing_yet(status: &Status) -> bool {
     let reason = status.get_details_error_info().map(|info| info.reason);
-    reason.is_some_and(|reason| reason == MANAGER_UNHEARD || reason == TOO_MANY_WAITING)
+    reason.is_some_and(|reason| [MANAGER_UNHEARD, NOT_AT_REST, TOO_MANY_WAITING].contains(&reason.as_str()))
 }
 
 /// What to do where a connection failed for TLS, as far as its error tells (those of rustls and h2).

@@ -45,6 +45,8 @@ pub enum Standing {
     Refuted(String),
     /// The manager is not heard, and why: nothing is known.
     Unheard(String),
+    /// It is so, but the driver has not said yet that nothing moves of what a process before it began.
+    NotAtRest,
 }
 
 /// A resource that a lease does not hold any more.

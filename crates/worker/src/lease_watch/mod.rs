@@ -10,7 +10,10 @@
 //! that can be suspended ([`crate::action::Action::can_be_suspended`]): they stand still until the manager is heard again, and end when it
 //! is given up. What the manager says first is compared with what is under way: a goal goes on only where its lease lives.
 //!
-//! Of what a lease has left of the provider's own resources when it ended, standstill is confirmed (`standstill.rs`).
+//! Of what a lease has left of the provider's own resources when it ended, standstill is confirmed (`standstill.rs`). A provider of its own
+//! resources begins nothing before it has said that it is at rest ([`LeaseWatch::brought_to_rest`]).
+//!
+//! How long the manager is trusted is measured by [`BootClock`]: also a machine that was suspended confirms nothing when it wakes up.
 
 mod holdings;
 mod location;
@@ -19,17 +22,19 @@ mod standstill;
 pub use holdings::{Claim, EndedHolding, Holdings, Standing};
 pub use location::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 
+use crate::boot_clock::{BootClock, BootInstant};
 use crate::client::{CallError, Channels, ResourceClient, ResourceWatch};
 use crate::endpoint::Endpoint;
-use crate::session::{GIVEN_UP_AFTER, Session, SessionState};
+use crate::session::{Belief, GIVEN_UP_AFTER, Session, SessionState};
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_panic_point::panic_point;
 use ratn_proto::types::ResourceUpdate;
 use std::future::{pending, ready};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 use tokio::sync::watch;
-use tokio::time::{Instant, sleep, sleep_until, timeout, timeout_at};
+use tokio::time::{Instant, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 /// A lease that has not been heard of is waited for so long: its grant reaches its holder and this provider at about the same time.
@@ -42,6 +47,8 @@ const QUESTIONS_PER_PATIENCE: u32 = 4;
 /// A goal is suspended for so many times the patience at the most: longer than a client believes that its session may live
 /// ([`Session::gone`]), so that its own end comes first.
 const SUSPENDED_FOR: u32 = GIVEN_UP_AFTER + 1;
+/// Why nothing is confirmed when the manager is not trusted any more, and that has not been told yet.
+const TOO_OLD: &str = "the last word of the resource manager is too old";
 /// How often it is said that there is no watch.
 const WARN_INTERVAL: Duration = Duration::from_secs(10);
 
@@ -78,12 +85,27 @@ struct Shared {
     listeners: Mutex<Vec<Weak<dyn LeaseListener>>>,
     /// The driver has said that nothing moves of what was begun before this process.
     is_brought_to_rest: watch::Sender<bool>,
+    /// Nothing begins before that: the provider offers these resources itself.
+    begins_at_rest: AtomicBool,
+    trust: Mutex<Trust>,
+    clock: BootClock,
+}
+
+/// How long the manager's word holds.
+#[derive(Debug)]
+enum Trust {
+    /// Until something else is told.
+    UntilTold,
+    /// As long as this session is believed in.
+    Session(Belief),
+    /// For so long after the last answer.
+    Answers(Arc<Answered>, Duration),
 }
 
 /// Where to listen.
 enum Source {
     /// To one manager, in which a session provides the resources.
-    Session { client: Box<ResourceClient>, state: watch::Receiver<SessionState>, id: String },
+    Session { client: Box<ResourceClient>, state: watch::Receiver<SessionState>, belief: Belief, id: String },
     /// To the manager of this location, wherever it is now.
     Location { channels: Channels, location: ManagerLocation },
 }
@@ -94,21 +116,30 @@ struct Following {
     client: ResourceClient,
     /// Of the session that was alive when it began.
     generation: u64,
-    answered: Answered,
+    answered: Arc<Answered>,
 }
 
 /// When the last question was asked that was answered.
-struct Answered(Mutex<Instant>);
+#[derive(Debug)]
+struct Answered(Mutex<BootInstant>);
 
 impl LeaseWatch {
     /// Of the resources of these ids; nothing is known of them before it follows a manager.
     pub fn of(resources: impl IntoIterator<Item = impl Into<String>>) -> LeaseWatch {
+        LeaseWatch::by(BootClock::default(), resources)
+    }
+
+    /// As [`LeaseWatch::of`], by another clock.
+    pub fn by(clock: BootClock, resources: impl IntoIterator<Item = impl Into<String>>) -> LeaseWatch {
         let shared = Shared {
             resources: resources.into_iter().map(Into::into).collect(),
             holdings: Mutex::default(),
             heard: watch::channel(0).0,
             listeners: Mutex::default(),
             is_brought_to_rest: watch::channel(false).0,
+            begins_at_rest: AtomicBool::new(false),
+            trust: Mutex::new(Trust::UntilTold),
+            clock,
         };
         LeaseWatch { shared: Arc::new(shared) }
     }
@@ -120,7 +151,12 @@ impl LeaseWatch {
 
     /// What the resource manager says of a claim, as of now.
     pub fn check(&self, claim: &Claim<'_>) -> Standing {
-        self.shared.holdings().check(claim)
+        let standing = self.shared.holdings().check(claim);
+        match standing {
+            Standing::Confirmed if !self.shared.is_trusted() => Standing::Unheard(TOO_OLD.to_owned()),
+            Standing::Confirmed if self.shared.awaits_rest() => Standing::NotAtRest,
+            standing => standing,
+        }
     }
 
     /// Who opened the session of a lease that holds a resource; empty where nobody knows.
@@ -134,10 +170,13 @@ impl LeaseWatch {
     }
 
     /// The driver says that nothing moves any more of what a process before this one may have begun. A driver that was killed knows nothing of
-    /// its motions when it starts again, and its session may still live. Until the driver says this, no standstill is confirmed and
-    /// [`crate::provider::Provider::start_at_rest`] offers nothing. [`crate::worker::Worker`] says it by itself.
+    /// its motions when it starts again, and its session may still live. Until the driver says this, no standstill is confirmed,
+    /// [`crate::provider::Provider::start_at_rest`] offers nothing, and where [`LeaseWatch::follow_session`] is used no goal begins.
+    /// [`crate::worker::Worker`] says it by itself.
     pub fn brought_to_rest(&self) {
         self.shared.is_brought_to_rest.send_replace(true);
+        // Goals that wait for this look again.
+        self.shared.heard.send_modify(|heard| *heard += 1);
     }
 
     /// Whether the driver has said [`LeaseWatch::brought_to_rest`], and no goal runs at a resource, also none that was told to stop.
@@ -148,7 +187,7 @@ impl LeaseWatch {
 
     /// Follows the manager of a session that provides the resources, for as long as the future is polled; leases are trusted as long
     /// as the session lives, and for `patience` after the watch broke. Standstill of what a lease has left is confirmed as soon as the
-    /// actions of its goals have returned, and not before [`LeaseWatch::brought_to_rest`]. Drop the future before the session is closed.
+    /// actions of its goals have returned, and not before [`LeaseWatch::brought_to_rest`]; nor does any goal begin before that. Drop the future before the session is closed.
     ///
     /// # Errors
     /// As [`Channels::get`].
@@ -161,7 +200,9 @@ impl LeaseWatch {
     ) -> Result<impl Future<Output = ()> + Send + use<>, CallError> {
         let client = ResourceClient::new(channels, manager, session.id())?;
         let confirming = self.clone().confirm_standstill(client.clone());
-        let source = Source::Session { client: Box::new(client), state: session.state(), id: session.id().to_owned() };
+        let (state, belief, id) = (session.state(), session.belief(), session.id().to_owned());
+        let source = Source::Session { client: Box::new(client), state, belief, id };
+        self.shared.begins_at_rest.store(true, Ordering::SeqCst);
         let following = self.clone().follow(source, patience);
         Ok(async move {
             tokio::select! {
@@ -235,7 +276,7 @@ impl LeaseWatch {
             self.interrupted();
             let generation = following.generation;
             let trusted_until = match source {
-                Source::Session { .. } => Instant::now() + patience,
+                Source::Session { .. } => self.shared.clock.now() + patience,
                 Source::Location { .. } => following.answered.last() + patience,
             };
             drop(following);
@@ -247,7 +288,7 @@ impl LeaseWatch {
                 biased;
                 () = ready(()), if is_lost => None,
                 () = source.is_over(generation) => None,
-                () = sleep_until(trusted_until) => None,
+                () = self.shared.clock.sleep_until(trusted_until) => None,
                 begun = again => Some(begun),
             };
             following = match begun {
@@ -277,14 +318,22 @@ impl LeaseWatch {
             return pending().await;
         };
         loop {
-            sleep(patience / QUESTIONS_PER_PATIENCE).await;
-            panic_point("lease-watch");
-            let (asked, trusted_until) = (Instant::now(), answered.last() + patience);
-            match timeout_at(trusted_until, client.get(resource)).await {
-                Ok(Err(error)) if error.is_crash() => tracing::debug!(%error, "the resource manager does not answer"),
-                // What it says does not matter.
-                Ok(_) => answered.at(asked),
-                Err(_) => return,
+            let clock = &self.shared.clock;
+            let trusted_until = answered.last() + patience;
+            let question = async {
+                sleep(patience / QUESTIONS_PER_PATIENCE).await;
+                panic_point("lease-watch");
+                let asked = clock.now();
+                (asked, client.get(resource).await)
+            };
+            tokio::select! {
+                biased;
+                () = clock.sleep_until(trusted_until) => return,
+                (asked, answer) = question => match answer {
+                    Err(error) if error.is_crash() => tracing::debug!(%error, "the resource manager does not answer"),
+                    // What it says does not matter.
+                    _ => answered.at(asked),
+                },
             }
         }
     }
@@ -293,7 +342,7 @@ impl LeaseWatch {
     async fn begin(&self, source: &Source, patience: Duration) -> Following {
         let mut warn_at = Instant::now() + patience;
         loop {
-            match timeout(patience, self.try_begin(source)).await {
+            match timeout(patience, self.try_begin(source, patience)).await {
                 Ok(Ok(following)) => return following,
                 Ok(Err(error)) if Instant::now() < warn_at => tracing::debug!(%error, "no watch of leases"),
                 failed => {
@@ -309,9 +358,9 @@ impl LeaseWatch {
         }
     }
 
-    async fn try_begin(&self, source: &Source) -> Result<Following, CallError> {
+    async fn try_begin(&self, source: &Source, patience: Duration) -> Result<Following, CallError> {
         let (client, owner, generation) = match source {
-            Source::Session { client, state, id } => {
+            Source::Session { client, state, id, .. } => {
                 // A session that is closed tells nothing more, and this watch ends with it.
                 let mut state = state.clone();
                 let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { pending().await };
@@ -322,10 +371,14 @@ impl LeaseWatch {
                 (ResourceClient::new(channels, &manager, "")?, None, 0)
             }
         };
-        let answered = Answered::new();
+        let answered = Arc::new(Answered(Mutex::new(self.shared.clock.now())));
         let mut stream = client.watch_resources(self.shared.resources.iter().cloned()).await?;
         let first = stream.next().await?;
         self.shared.holdings().begin(owner);
+        *self.shared.trust.lock().unwrap_or_else(PoisonError::into_inner) = match source {
+            Source::Session { belief, .. } => Trust::Session(belief.clone()),
+            Source::Location { .. } => Trust::Answers(Arc::clone(&answered), patience),
+        };
         if let Some(snapshot) = first {
             self.tell(&snapshot);
         }
@@ -345,15 +398,11 @@ impl LeaseWatch {
 }
 
 impl Answered {
-    fn new() -> Answered {
-        Answered(Mutex::new(Instant::now()))
-    }
-
-    fn last(&self) -> Instant {
+    fn last(&self) -> BootInstant {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn at(&self, asked: Instant) {
+    fn at(&self, asked: BootInstant) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = asked;
     }
 }
@@ -380,6 +429,20 @@ impl Source {
 impl Shared {
     fn holdings(&self) -> MutexGuard<'_, Holdings> {
         self.holdings.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether what the manager has said still holds. Asked where it is used: no timer runs while the machine is suspended.
+    fn is_trusted(&self) -> bool {
+        match &*self.trust.lock().unwrap_or_else(PoisonError::into_inner) {
+            Trust::UntilTold => true,
+            Trust::Session(belief) => belief.holds(),
+            Trust::Answers(answered, patience) => self.clock.now() < answered.last() + *patience,
+        }
+    }
+
+    /// Whether the driver still has to say that nothing moves of what a process before this one began.
+    fn awaits_rest(&self) -> bool {
+        self.begins_at_rest.load(Ordering::SeqCst) && !*self.is_brought_to_rest.borrow()
     }
 
     fn tell(&self, say: impl Fn(&dyn LeaseListener)) {

@@ -20,6 +20,7 @@ use tonic::Status;
 pub(in super::super) struct KeptAlive {
     pub(in super::super) ttl: Duration,
     pub(in super::super) created: bool,
+    pub(in super::super) number: u64,
     pub(in super::super) revision: Revision,
 }
 

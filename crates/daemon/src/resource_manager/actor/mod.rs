@@ -359,7 +359,8 @@ impl ResourceCore {
         if created {
             tracing::info!(%session, client, opened_by = %speaker.name, ttl_ms = ttl.as_millis(), "session opened");
         }
-        Ok(KeptAlive { ttl, created, revision: self.pool.revision() })
+        let number = self.pool.session_number(session).unwrap_or(0);
+        Ok(KeptAlive { ttl, created, number, revision: self.pool.revision() })
     }
 }
 

@@ -44,6 +44,7 @@ pub(super) async fn kept_alive(
         ttl_ms: u64::try_from(kept.ttl.as_millis()).unwrap_or(u64::MAX),
         created: kept.created,
         revision: kept.revision.0,
+        number: kept.number,
     })
 }
 
