@@ -5,6 +5,7 @@
 //!
 //! - [`scope`]: where names get their values
 //! - [`evaluate`]: expression → value; [`function`] holds the built-ins
+//! - [`comprehension`]: `filter`, `map`, `sort_by` and others, which ask something of every element of a list
 //! - [`bind`]: facts, effects and resources with their arguments evaluated; which facts an effect may write
 //! - [`parse`]: text → expression
 //! - [`query`]: conditions over facts, with variables
@@ -12,6 +13,7 @@
 //! - [`display`]: back to text, for messages
 
 pub mod bind;
+pub mod comprehension;
 pub mod display;
 pub mod evaluate;
 pub mod function;
@@ -21,6 +23,7 @@ pub mod scope;
 mod token;
 pub mod walk;
 
+pub use comprehension::Comprehension;
 pub use evaluate::EvaluateError;
 pub use scope::{Lookup, Scope};
 
@@ -55,6 +58,19 @@ pub enum Expr {
     Map(Vec<(String, Expr)>),
     /// A built-in pure function.
     Call(Function, Vec<Expr>),
+    /// `filter($x in list, …)`: something about every element of a list.
+    Each {
+        /// What is made of the list.
+        what: Comprehension,
+        /// The name of the element in the body, without `$`.
+        element: String,
+        /// The list.
+        list: Box<Expr>,
+        /// What is evaluated for every element.
+        body: Box<Expr>,
+    },
+    /// `$name` in the body of a comprehension: the element.
+    Element(String),
     /// `predicate(a, ?)`: the value of the first fact that matches, in the order of keys; null when none does.
     Fact(FactExpr),
     /// `exists predicate(a, ?)`: whether a fact matches.
@@ -113,6 +129,12 @@ pub enum Function {
     Max,
     /// `abs(x)`
     Abs,
+    /// `sqrt(x)`
+    Sqrt,
+    /// `floor(x)` → the greatest int that is not greater
+    Floor,
+    /// `sum(list)` of numbers; 0 of none
+    Sum,
     /// `if(condition, a, b)`; only the chosen one is evaluated
     If,
     /// `pose(x, y, z)` or `pose(x, y, z, roll, pitch, yaw)`: metres, radians
@@ -125,6 +147,10 @@ pub enum Function {
     Inverse,
     /// `between(a, b)`: b as seen from a, both in one reference frame
     Between,
+    /// `distance(a, b)` between two positions, metres
+    Distance,
+    /// `angle(a, b)` by which two orientations differ, radians, 0 to π
+    Angle,
     /// `grasp_pose({pose, size})` → list of poses of the gripper's tool frame that take the box from above, fingers
     /// across its shorter horizontal side: the two that differ by half a turn; with `class: Bowl` or `Plate`, those around its
     /// rim
@@ -138,6 +164,14 @@ pub enum Function {
     Repeat,
     /// `take(list, n)` → the first n elements, or all if there are fewer
     Take,
+    /// `sort(list)` of numbers or of strings, the least first
+    Sort,
+    /// `reverse(list)`
+    Reverse,
+    /// `unique(list)` → each element where it stands first
+    Unique,
+    /// `starts_with(text, prefix)` → bool
+    StartsWith,
 }
 
 /// Operators of one operand.

@@ -9,7 +9,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Rules that the folder must have a task for.
-const RULES: [&str; 39] = [
+const RULES: [&str; 40] = [
     "branch-may-not-have-written",
     "computes-actuates",
     "conflicting-annotations",
@@ -36,6 +36,7 @@ const RULES: [&str; 39] = [
     "type-mismatch",
     "unestablished-precondition",
     "unknown-action",
+    "unknown-fact",
     "unknown-function",
     "unknown-key",
     "unknown-library",
@@ -62,7 +63,7 @@ impl Files for Folder {
 }
 
 #[test]
-fn every_bad_task_is_refused_for_its_rule_with_a_line() {
+fn every_bad_task_is_refused_or_warned_of_for_its_rule_with_a_line() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/bad-tasks");
     let catalogue = Catalogue::standard();
     let mut seen = BTreeSet::new();
@@ -70,8 +71,15 @@ fn every_bad_task_is_refused_for_its_rule_with_a_line() {
         let path = entry.unwrap().path();
         let name = path.file_name().unwrap().to_string_lossy().into_owned();
         let source = std::fs::read_to_string(&path).unwrap();
-        let rule =
-            source.lines().next().unwrap().strip_prefix("# rule: ").expect("the first line names the rule").trim();
+        let first = source.lines().next().unwrap();
+        if let Some(rule) = first.strip_prefix("# warning: ") {
+            let loaded = load_with(&source, &name, &catalogue, &Folder);
+            let warnings = loaded.unwrap_or_else(|refused| panic!("{name}: {refused:#?}")).warnings;
+            assert!(!warnings.is_empty() && warnings.iter().all(|found| found.rule == rule), "{name}: {warnings:#?}");
+            seen.insert(rule.to_owned());
+            continue;
+        }
+        let rule = first.strip_prefix("# rule: ").expect("the first line names the rule").trim();
         assert!(name.starts_with(rule), "{name} is named after its rule, {rule}");
         let findings = load_with(&source, &name, &catalogue, &Folder)
             .map(|loaded| loaded.warnings)

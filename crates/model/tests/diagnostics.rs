@@ -203,6 +203,7 @@ fn what_is_no_yaml_is_said_with_its_place() {
 fn hierarchies_loops_and_conditions_see_what_they_should() {
     let source = "
 task: t
+world: ['arm_at(arm) = joints(0, 0, 0, 0, 0, 0, 0)']
 states:
   - look:
       action: detector/segment

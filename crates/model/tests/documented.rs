@@ -4,7 +4,7 @@
 
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
-use ratn_model::expression::Function;
+use ratn_model::expression::{Comprehension, Function};
 use ratn_model::load::load;
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -74,7 +74,7 @@ fn the_document_lists_the_rules_that_there_is_a_bad_task_for_and_no_others() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/bad-tasks");
     let rule = |entry: std::io::Result<std::fs::DirEntry>| {
         let text = std::fs::read_to_string(entry.unwrap().path()).unwrap();
-        text.lines().next().unwrap().strip_prefix("# rule: ").unwrap().trim().to_owned()
+        text.lines().next().unwrap().split_once(": ").unwrap().1.trim().to_owned()
     };
     let tested: BTreeSet<String> = std::fs::read_dir(folder).unwrap().map(rule).collect();
     assert_eq!(documented, tested);
@@ -84,6 +84,7 @@ fn the_document_lists_the_rules_that_there_is_a_bad_task_for_and_no_others() {
 fn the_document_lists_every_function_as_it_is_called() {
     let documented: BTreeSet<&str> = rows("Expressions").iter().flat_map(|cells| quoted(cells[0])).collect();
     let usages = Function::ALL.map(|function| function.usage().split(", an object").next().unwrap().to_owned());
-    let called: BTreeSet<&str> = usages.iter().flat_map(|usage| usage.split(" or ")).collect();
+    let comprehensions = Comprehension::ALL.map(Comprehension::usage);
+    let called: BTreeSet<&str> = usages.iter().flat_map(|usage| usage.split(" or ")).chain(comprehensions).collect();
     assert_eq!(documented, called);
 }

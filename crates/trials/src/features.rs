@@ -46,6 +46,8 @@ pub struct Features {
     pub blind: bool,
     /// What the safety theorem excludes: imprecise exceptions, unordered resources, regions that share facts.
     pub weak: bool,
+    /// Parts of expressions stand in comprehensions that come to the same.
+    pub lists: bool,
 }
 
 impl Features {
@@ -72,6 +74,7 @@ impl Features {
         long: false,
         blind: false,
         weak: false,
+        lists: false,
     };
 
     /// Sequences, hierarchies, loops over lists, conditions, routines and actions alone.
@@ -97,6 +100,7 @@ impl Features {
         long: false,
         blind: false,
         weak: false,
+        lists: false,
     };
 
     /// [`Features::ALL`], without those assumptions.
@@ -116,6 +120,9 @@ impl Features {
         long: true,
         ..Features::ALL
     };
+
+    /// [`Features::EVERYTHING`], said with comprehensions.
+    pub const LISTS: Features = Features { lists: true, ..Features::EVERYTHING };
 
     /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
     /// modes, whatever younger motions have done meanwhile.

@@ -19,7 +19,7 @@
 //! loader makes of one is made directly).
 
 use super::{
-    AGAIN, ARGUMENTS, Dice, EMPTY, FOUND, Features, PART, PREDICATES, TOOL, around, is_in_routine, is_preemptive,
+    AGAIN, ARGUMENTS, Dice, EMPTY, FOUND, Features, PART, PREDICATES, TOOL, around, is_in_routine, is_preemptive, lists,
 };
 use annotations::{block, resource, task_resource};
 use ratn_model::expression::{BinaryOperator, EffectExpr, Expr, FactExpr, Function, UnaryOperator};
@@ -116,6 +116,9 @@ pub fn program(seed: u64, features: &Features) -> Program {
     for id in around {
         // Blocks go to every state inside: regions that race must not wait for each other's workers.
         program.states[id.0 as usize].annotations.resources.retain(|r| r.operation != ResourceOperation::Block);
+    }
+    if features.lists {
+        lists::say_with_comprehensions(&mut program, &mut maker.dice);
     }
     program
 }

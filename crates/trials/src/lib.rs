@@ -32,6 +32,7 @@ mod features;
 mod generator;
 mod interrupt;
 mod listing;
+mod lists;
 mod oracle;
 mod outside;
 mod reference;

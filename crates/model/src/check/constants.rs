@@ -45,7 +45,14 @@ pub(crate) fn problem(expr: &Expr) -> Option<EvaluateError> {
 fn parts(expr: &Expr) -> Vec<&Expr> {
     use crate::expression::BinaryOperator::{And, Or};
     match expr {
-        Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } | Expr::Unknown(_) => Vec::new(),
+        Expr::Literal(_)
+        | Expr::Variable(_)
+        | Expr::Output(_)
+        | Expr::Port { .. }
+        | Expr::Unknown(_)
+        | Expr::Element(_) => Vec::new(),
+        // Its body is evaluated for no element of an empty list.
+        Expr::Each { list, .. } => vec![list],
         // What is not looked at when an earlier condition fails.
         Expr::Query(_) => Vec::new(),
         Expr::Field(of, _) | Expr::Unary(_, of) | Expr::Binary(And | Or, of, _) => vec![of],

@@ -1,10 +1,12 @@
 //! Functions that are not there. Predicates need no declaration, so `graps_pose($box)` reads as the value of a fact; where nothing in
-//! the task says that there is such a fact and a function is called almost so, it is meant.
+//! the task says that there is such a fact and a function is called almost so, it is meant; and a fact that nothing writes or declares
+//! is told of, since it is null wherever it is read.
 
 use super::{Subject, expressions, named};
 use crate::diagnostic::Findings;
-use crate::expression::{EffectExpr, Expr, Function};
+use crate::expression::{Comprehension, EffectExpr, Expr, Function};
 use crate::load::distance;
+use crate::slot::Slot;
 use std::collections::BTreeSet;
 
 /// So long a name may differ in two letters, a shorter one in one.
@@ -12,36 +14,101 @@ const LONG_NAME: usize = 8;
 /// So short a function's name is close to too many words to refuse one.
 const SHORT_NAME: usize = 3;
 
+/// Functions of other languages that people write: none of them is here, and no task has facts of such names unless it says so.
+const OF_OTHER_LANGUAGES: [&str; 32] = [
+    "acos",
+    "asin",
+    "atan",
+    "atan2",
+    "avg",
+    "bool",
+    "ceil",
+    "contains",
+    "cos",
+    "count",
+    "degrees",
+    "dist",
+    "enumerate",
+    "exp",
+    "float",
+    "int",
+    "keys",
+    "length",
+    "log",
+    "mean",
+    "norm",
+    "now",
+    "pow",
+    "radians",
+    "random",
+    "round",
+    "sin",
+    "size",
+    "str",
+    "tan",
+    "values",
+    "zip",
+];
+
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let program = subject.program;
     let known = predicates(subject);
+    let mut told = BTreeSet::new();
     for state in &program.states {
         for (slot, expr) in expressions(program, state) {
             for fact in expr.fact_expressions() {
-                if known.contains(fact.predicate.as_str()) || fact.arguments.iter().any(Option::is_none) {
+                let name = fact.predicate.as_str();
+                if known.contains(name) || fact.arguments.iter().any(Option::is_none) {
                     continue;
                 }
-                let Some((name, usage, takes)) = meant(&fact.predicate, fact.arguments.len()) else { continue };
                 let at = subject.place_of(state, slot);
                 let whole = named(program, &Expr::Fact(fact.clone()));
                 let message = format!("`{whole}` is read as a fact, and nothing in the task says that there is one");
-                let help = format!(
-                    "did you mean `{usage}`? If it is a fact, name it in `reads`, `world` or the effects of a state"
-                );
-                if takes && name.len() > SHORT_NAME {
-                    findings.error("unknown-function", at, &state.path, message, help);
-                } else {
-                    findings.warning("unknown-function", at, &state.path, message, help);
+                let declare = "name it in `reads`, `world` or the effects of a state";
+                let function = meant(name, fact.arguments.len());
+                let near = nearest(name, &known);
+                match (function, near) {
+                    (Some((function, usage, takes)), _) => {
+                        let help = format!("did you mean `{usage}`? If it is a fact, {declare}");
+                        if takes && function.len() > SHORT_NAME {
+                            findings.error("unknown-function", at, &state.path, message, help);
+                        } else {
+                            findings.warning("unknown-function", at, &state.path, message, help);
+                        }
+                    }
+                    (None, _) if OF_OTHER_LANGUAGES.contains(&name) => {
+                        let help = format!(
+                            "there is no function `{name}`; those that there are stand in docs/task-files.md. If it is a fact, {declare}"
+                        );
+                        findings.error("unknown-function", at, &state.path, message, help);
+                    }
+                    // `unestablished-precondition` says it.
+                    (None, None) if matches!(slot, Slot::Requires(_)) => {}
+                    // Once each: what nobody writes is null wherever it is read.
+                    (None, near) if told.insert(name.to_owned()) => {
+                        let meant = near.map(|near| format!("did you mean `{near}`? ")).unwrap_or_default();
+                        let help = format!("{meant}If the world that the task begins in has it, {declare}");
+                        findings.warning("unknown-fact", at, &state.path, message, help);
+                    }
+                    (None, _) => {}
                 }
             }
         }
     }
 }
 
+/// The predicate that a name is almost the name of.
+fn nearest<'a>(name: &str, known: &BTreeSet<&'a str>) -> Option<&'a str> {
+    let allowed = if name.len() >= LONG_NAME { 2 } else { 1 };
+    let near = known.iter().map(|other| (edits(name, other), *other)).min_by_key(|(edits, _)| *edits)?;
+    (near.0 <= allowed).then_some(near.1)
+}
+
 /// The function that a name is almost the name of, how it is called, and whether so many arguments fit.
 fn meant(predicate: &str, arguments: usize) -> Option<(&'static str, &'static str, bool)> {
     let functions = Function::ALL.into_iter().map(|f| (f.name(), f.usage(), f.takes(arguments)));
-    let all = functions.chain([("exists", "exists fact(…)", arguments == 1)]);
+    let comprehensions = Comprehension::ALL.into_iter().map(|c| (c.name(), c.usage(), arguments == 2));
+    let all = functions.chain(comprehensions).chain([("exists", "exists fact(…)", arguments == 1)]);
     let allowed = if predicate.len() >= LONG_NAME { 2 } else { 1 };
     let near = all.map(|function| (edits(predicate, function.0), function)).min_by_key(|(edits, _)| *edits)?;
     (near.0 <= allowed).then_some(near.1)
@@ -62,6 +129,7 @@ fn edits(a: &str, b: &str) -> usize {
 fn predicates<'a>(subject: &Subject<'a>) -> BTreeSet<&'a str> {
     let program = subject.program;
     let mut known = BTreeSet::new();
+    known.extend(program.ontology.iter().flat_map(|ontology| ontology.predicates()).map(|(name, _)| name));
     let written = |effect: &'a EffectExpr| effect.written().into_iter().map(|fact| fact.predicate.as_str());
     known.extend(program.initial.iter().flat_map(written));
     for state in &program.states {

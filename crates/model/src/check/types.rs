@@ -2,7 +2,7 @@
 
 use super::{Subject, Variables, constants, expressions, named};
 use crate::diagnostic::Findings;
-use crate::expression::{BinaryOperator, EffectExpr, Expr, Function, UnaryOperator};
+use crate::expression::{BinaryOperator, Comprehension, EffectExpr, Expr, Function, UnaryOperator};
 use crate::program::{Program, State, StateKind, TaskOutput};
 use crate::slot::Slot;
 use crate::value::{Type, Value};
@@ -14,7 +14,8 @@ const MAX_INDIRECTION: usize = 32;
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let program = subject.program;
     for state in &program.states {
-        let types = Types { program, state, variables: variables(subject, state), indirection: 0 };
+        let types =
+            Types { program, state, variables: variables(subject, state), elements: Variables::new(), indirection: 0 };
         let quantified = quantified(state);
         for (slot, expr) in expressions(program, state) {
             // Quantified effects bind variables of their own; their elements are checked at run time.
@@ -129,7 +130,13 @@ fn variables(subject: &Subject<'_>, state: &State) -> Variables {
             variables.insert(index.clone(), Type::Int);
         }
         if let StateKind::ForEach { variable, index, collection, .. } = &outer.kind {
-            let types = Types { program, state: outer, variables: variables.clone(), indirection: 0 };
+            let types = Types {
+                program,
+                state: outer,
+                variables: variables.clone(),
+                elements: Variables::new(),
+                indirection: 0,
+            };
             let element = match types.of(collection) {
                 Ok(Type::List(element)) => *element,
                 _ => Type::Any,
@@ -145,6 +152,8 @@ struct Types<'a> {
     program: &'a Program,
     state: &'a State,
     variables: Variables,
+    /// The elements of the comprehensions around.
+    elements: Variables,
     indirection: usize,
 }
 
@@ -210,6 +219,24 @@ impl Types<'_> {
                 Type::Bool
             }
             Expr::Unknown(_) => Type::Any,
+            Expr::Element(name) => self.elements.get(name).cloned().unwrap_or(Type::Any),
+            Expr::Each { what, element, list, body } => {
+                let of = match self.of(list)? {
+                    Type::List(of) => *of,
+                    Type::Any => Type::Any,
+                    other => return wrong(format!("expected a list, found {other}")),
+                };
+                let body = self.within(element, of.clone()).of(body)?;
+                if what.asks() && !Type::Bool.accepts_type(&body) {
+                    return wrong(format!("its condition is bool, found {body}"));
+                }
+                match what {
+                    Comprehension::Map => Type::List(Box::new(body)),
+                    Comprehension::Filter | Comprehension::SortBy => Type::List(Box::new(of)),
+                    Comprehension::MinBy | Comprehension::MaxBy => of,
+                    Comprehension::Any | Comprehension::All => Type::Bool,
+                }
+            }
             Expr::Unary(operator, operand) => {
                 let found = self.of(operand)?;
                 let wanted = match operator {
@@ -226,6 +253,13 @@ impl Types<'_> {
                 Err(message) => return wrong(message),
             },
         })
+    }
+
+    /// The same, in the body of a comprehension with such an element.
+    fn within(&self, element: &str, of: Type) -> Self {
+        let mut elements = self.elements.clone();
+        elements.insert(element.to_owned(), of);
+        Types { variables: self.variables.clone(), elements, ..*self }
     }
 
     fn port(&self, state: &State, port: &str) -> Type {
@@ -245,7 +279,9 @@ impl Types<'_> {
             return output.ty.clone();
         }
         let (program, variables, indirection) = (self.program, self.variables.clone(), self.indirection + 1);
-        Types { program, state, variables, indirection }.of(&output.value).unwrap_or(Type::Any)
+        Types { program, state, variables, elements: Variables::new(), indirection }
+            .of(&output.value)
+            .unwrap_or(Type::Any)
     }
 }
 
@@ -276,6 +312,33 @@ fn call(function: Function, arguments: &[Expr], types: &[Type]) -> Found {
         Function::Abs => {
             expect(0, Type::Float)?;
             types[0].clone()
+        }
+        Function::Sqrt => {
+            expect(0, Type::Float)?;
+            Type::Float
+        }
+        Function::Floor => {
+            expect(0, Type::Float)?;
+            Type::Int
+        }
+        Function::Sum => {
+            expect(0, Type::List(Box::new(Type::Float)))?;
+            match &types[0] {
+                Type::List(element) => element.as_ref().clone(),
+                _ => Type::Any,
+            }
+        }
+        Function::Distance | Function::Angle => {
+            all(Type::Pose)?;
+            Type::Float
+        }
+        Function::Sort | Function::Reverse | Function::Unique => {
+            expect(0, Type::List(Box::new(Type::Any)))?;
+            types[0].clone()
+        }
+        Function::StartsWith => {
+            all(Type::String)?;
+            Type::Bool
         }
         Function::If => {
             expect(0, Type::Bool)?;

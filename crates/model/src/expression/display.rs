@@ -92,6 +92,8 @@ impl Display for Expr {
                 separated(f, arguments)?;
                 f.write_str(")")
             }
+            Expr::Each { what, element, list, body } => write!(f, "{}(${element} in {list}, {body})", what.name()),
+            Expr::Element(name) => write!(f, "${name}"),
             Expr::Fact(fact) => write!(f, "{fact}"),
             Expr::Exists(fact) => write!(f, "exists {fact}"),
             Expr::Query(conditions) => {

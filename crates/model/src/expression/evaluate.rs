@@ -6,7 +6,7 @@
 
 use super::query::{self, Flow, RunError};
 use super::scope::{Lookup, Scope};
-use super::{BinaryOperator, Expr, Function, UnaryOperator, function};
+use super::{BinaryOperator, Expr, Function, UnaryOperator, comprehension, function};
 use crate::value::Value;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -96,6 +96,10 @@ impl Expr {
                 let values = arguments.iter().map(|a| a.evaluate(scope)).collect::<Result<Vec<_>, _>>()?;
                 Cow::Owned(function::call(*called, &values).map_err(|problem| self.wrong(problem))?)
             }
+            Expr::Each { what, element, list, body } => {
+                Cow::Owned(comprehension::evaluate(self, (*what, element), (list, body), scope)?)
+            }
+            Expr::Element(name) => known(scope.element(name))?,
             Expr::Fact(fact) => match scope.fact(&fact.bind(scope)?) {
                 Lookup::Holds(value) => value,
                 Lookup::Absent => Cow::Owned(Value::Null),
@@ -209,7 +213,7 @@ pub fn equal(a: &Value, b: &Value) -> bool {
     }
 }
 
-fn binary(operator: BinaryOperator, a: &Value, b: &Value) -> Result<Value, String> {
+pub(super) fn binary(operator: BinaryOperator, a: &Value, b: &Value) -> Result<Value, String> {
     use BinaryOperator as Op;
     Ok(match operator {
         Op::Equal => Value::Bool(equal(a, b)),

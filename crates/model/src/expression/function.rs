@@ -3,11 +3,12 @@
 //! What the two geometric ones know about a gripper is in [`crate::grasp`]. `place_pose` gives two poses that differ by half a turn
 //! about the vertical, because a box looks the same from both, unless it is told how many turns look the same.
 
-use super::Function;
-use super::evaluate::{MAX_LIST, described, number, order};
+use super::evaluate::{MAX_LIST, binary, described, equal, number, order};
+use super::{BinaryOperator, Function};
 use crate::grasp;
 use crate::pose::Pose;
 use crate::value::Value;
+use std::cmp::Ordering;
 use std::f64::consts::TAU;
 
 /// Classes that are wider than the fingers open, and open at the top.
@@ -16,28 +17,40 @@ const HELD_BY_THE_RIM: [&str; 2] = ["Bowl", "Plate"];
 /// Classes that are round, and narrower than the fingers open.
 const HELD_AROUND: [&str; 2] = ["Can", "Cup"];
 
+/// So many different elements `unique` finds: each is compared with all of them.
+const MAX_UNIQUE: usize = 1_000;
+
 /// As many alternatives as a planner takes.
 const MAX_TURNS: i64 = 64;
 
 impl Function {
     /// Every function.
-    pub const ALL: [Function; 16] = [
+    pub const ALL: [Function; 25] = [
         Function::Len,
         Function::Range,
         Function::Min,
         Function::Max,
         Function::Abs,
+        Function::Sqrt,
+        Function::Floor,
+        Function::Sum,
         Function::If,
         Function::Pose,
         Function::Joints,
         Function::Compose,
         Function::Inverse,
         Function::Between,
+        Function::Distance,
+        Function::Angle,
         Function::GraspPose,
         Function::PlacePose,
         Function::Concat,
         Function::Repeat,
         Function::Take,
+        Function::Sort,
+        Function::Reverse,
+        Function::Unique,
+        Function::StartsWith,
     ];
 
     /// Its name in an expression.
@@ -48,17 +61,26 @@ impl Function {
             Function::Min => "min",
             Function::Max => "max",
             Function::Abs => "abs",
+            Function::Sqrt => "sqrt",
+            Function::Floor => "floor",
+            Function::Sum => "sum",
             Function::If => "if",
             Function::Pose => "pose",
             Function::Joints => "joints",
             Function::Compose => "compose",
             Function::Inverse => "inverse",
             Function::Between => "between",
+            Function::Distance => "distance",
+            Function::Angle => "angle",
             Function::GraspPose => "grasp_pose",
             Function::PlacePose => "place_pose",
             Function::Concat => "concat",
             Function::Repeat => "repeat",
             Function::Take => "take",
+            Function::Sort => "sort",
+            Function::Reverse => "reverse",
+            Function::Unique => "unique",
+            Function::StartsWith => "starts_with",
         }
     }
 
@@ -75,12 +97,17 @@ impl Function {
             Function::Min => "min(a, b, …)",
             Function::Max => "max(a, b, …)",
             Function::Abs => "abs(x)",
+            Function::Sqrt => "sqrt(x)",
+            Function::Floor => "floor(x)",
+            Function::Sum => "sum(list)",
             Function::If => "if(condition, a, b)",
             Function::Pose => "pose(x, y, z) or pose(x, y, z, roll, pitch, yaw)",
             Function::Joints => "joints(a, b, …)",
             Function::Compose => "compose(pose, pose)",
             Function::Inverse => "inverse(pose)",
             Function::Between => "between(pose, pose)",
+            Function::Distance => "distance(pose, pose)",
+            Function::Angle => "angle(pose, pose)",
             Function::GraspPose => {
                 "grasp_pose(object), an object being {pose, size, class}, the class where it has one"
             }
@@ -88,15 +115,34 @@ impl Function {
             Function::Concat => "concat(a, b, …)",
             Function::Repeat => "repeat(value, n)",
             Function::Take => "take(list, n)",
+            Function::Sort => "sort(list)",
+            Function::Reverse => "reverse(list)",
+            Function::Unique => "unique(list)",
+            Function::StartsWith => "starts_with(text, prefix)",
         }
     }
 
     /// Whether it can be called with so many arguments.
     pub fn takes(self, arguments: usize) -> bool {
         match self {
-            Function::Len | Function::Abs | Function::Inverse | Function::GraspPose => arguments == 1,
+            Function::Len
+            | Function::Abs
+            | Function::Sqrt
+            | Function::Floor
+            | Function::Sum
+            | Function::Inverse
+            | Function::GraspPose
+            | Function::Sort
+            | Function::Reverse
+            | Function::Unique => arguments == 1,
             Function::Range => matches!(arguments, 1 | 2),
-            Function::Compose | Function::Between | Function::Repeat | Function::Take => arguments == 2,
+            Function::Compose
+            | Function::Between
+            | Function::Distance
+            | Function::Angle
+            | Function::Repeat
+            | Function::Take
+            | Function::StartsWith => arguments == 2,
             Function::PlacePose => matches!(arguments, 2 | 3),
             Function::If => arguments == 3,
             Function::Pose => matches!(arguments, 3 | 6),
@@ -122,6 +168,17 @@ pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, Str
         (Function::Max, _) => extreme(arguments, std::cmp::Ordering::Greater),
         (Function::Abs, [Value::Int(i)]) => i.checked_abs().map(Value::Int).ok_or_else(|| "too large".to_owned()),
         (Function::Abs, [x]) => Ok(Value::Float(number(x)?.abs())),
+        (Function::Sqrt, [x]) => match number(x)? {
+            x if x >= 0.0 => Ok(Value::Float(x.sqrt())),
+            x => Err(format!("{x} has no square root")),
+        },
+        (Function::Floor, [Value::Int(i)]) => Ok(Value::Int(*i)),
+        (Function::Floor, [x]) => match number(x)?.floor() {
+            // What lies between these is exactly an int.
+            x if (-9.2e18..=9.2e18).contains(&x) => Ok(Value::Int(x as i64)),
+            x => Err(format!("{x} is too large for an int")),
+        },
+        (Function::Sum, [Value::List(items)]) => sum(items),
         (Function::Pose, _) => {
             let n = arguments.iter().map(number).collect::<Result<Vec<f64>, _>>()?;
             let angle = |i: usize| n.get(i).copied().unwrap_or(0.0);
@@ -130,6 +187,8 @@ pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, Str
         (Function::Joints, _) => Ok(Value::Joints(arguments.iter().map(number).collect::<Result<_, _>>()?)),
         (Function::Compose, [a, b]) => Ok(Value::Pose(pose(a)?.compose(pose(b)?))),
         (Function::Between, [a, b]) => Ok(Value::Pose(pose(a)?.inverse().compose(pose(b)?))),
+        (Function::Distance, [a, b]) => Ok(Value::Float(pose(a)?.distance(pose(b)?))),
+        (Function::Angle, [a, b]) => Ok(Value::Float(pose(a)?.angle(pose(b)?))),
         (Function::Inverse, [a]) => Ok(Value::Pose(pose(a)?.inverse())),
         (Function::GraspPose, [object]) => grasp_poses(object),
         (Function::PlacePose, [target, in_gripper]) => Ok(place_poses(pose(target)?, pose(in_gripper)?, 2)),
@@ -157,8 +216,58 @@ pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, Str
             let count = usize::try_from(int(count)?).map_err(|_| "cannot take a negative number".to_owned())?;
             Ok(Value::List(items.iter().take(count).cloned().collect()))
         }
+        (Function::Sort, [Value::List(items)]) => {
+            let keyed = items.iter().map(|item| (item.clone(), item.clone())).collect();
+            Ok(Value::List(sorted(keyed)?))
+        }
+        (Function::Reverse, [Value::List(items)]) => Ok(Value::List(items.iter().rev().cloned().collect())),
+        (Function::Unique, [Value::List(items)]) => unique(items),
+        (Function::StartsWith, [Value::String(text), Value::String(prefix)]) => {
+            Ok(Value::Bool(text.starts_with(prefix.as_str())))
+        }
         _ => Err(format!("expected `{}`", function.usage())),
     }
+}
+
+/// The second of each pair, in the order of the first: numbers or strings. What is equal stays in its order.
+pub(super) fn sorted(mut keyed: Vec<(Value, Value)>) -> Result<Vec<Value>, String> {
+    // Every key is looked at once before, so that the comparison of two cannot fail.
+    if let Some((first, _)) = keyed.first() {
+        for (key, _) in &keyed {
+            order(first, key)?;
+        }
+    }
+    // Two large ints differ that equal the same float, which is no order: beside a float, all are compared as floats.
+    if keyed.iter().any(|(key, _)| matches!(key, Value::Float(_))) {
+        let real = |key: &Value| key.as_number().unwrap_or(0.0);
+        keyed.sort_by(|(a, _), (b, _)| real(a).total_cmp(&real(b)));
+    } else {
+        keyed.sort_by(|(a, _), (b, _)| order(a, b).unwrap_or(Ordering::Equal));
+    }
+    Ok(keyed.into_iter().map(|(_, value)| value).collect())
+}
+
+fn sum(items: &[Value]) -> Result<Value, String> {
+    items.iter().try_fold(Value::Int(0), |sum, item| binary(BinaryOperator::Add, &sum, item)).and_then(
+        |sum| match sum {
+            Value::Int(_) | Value::Float(_) => Ok(sum),
+            other => Err(format!("expected numbers, found {}", described(&other))),
+        },
+    )
+}
+
+/// The elements that no element before is equal to. So many comparisons that a list that differs everywhere has a bound of its own.
+fn unique(items: &[Value]) -> Result<Value, String> {
+    let mut found: Vec<Value> = Vec::new();
+    for item in items {
+        if !found.iter().any(|other| equal(other, item)) {
+            found.push(item.clone());
+        }
+        if found.len() > MAX_UNIQUE {
+            return Err(format!("it has more than {MAX_UNIQUE} different elements"));
+        }
+    }
+    Ok(Value::List(found))
 }
 
 fn length(n: usize) -> Value {

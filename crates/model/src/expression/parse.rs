@@ -10,6 +10,7 @@
 //! unary      = "-" unary | postfix
 //! postfix    = primary { "." name | "[" or "]" }
 //! primary    = number | text | "true" | "false" | "null" | "$"name | "(" or ")" | "[" list "]" | "{" name ":" or … "}"
+//!            | comprehension "(" "$"name "in" or "," or ")"
 //!            | "exists" ( fact | "(" query ")" ) | "?"name | function "(" list ")" | fact | state "." port | individual
 //! fact       = predicate "(" [ ("?" | or) { "," ("?" | or) } ] ")"
 //! query      = or { "," or }
@@ -22,7 +23,7 @@
 use super::display::KEYWORDS;
 use super::query::{PlanError, plan};
 use super::token::{Token, tokens};
-use super::{BinaryOperator, EffectExpr, Expr, FactExpr, Function, UnaryOperator};
+use super::{BinaryOperator, Comprehension, EffectExpr, Expr, FactExpr, Function, UnaryOperator};
 use crate::value::Value;
 
 /// The longest text of an expression, in characters.
@@ -126,7 +127,7 @@ fn parse<T>(
     if text.chars().nth(MAX_TEXT).is_some() {
         return Err(ParseError::syntax(0, format!("an expression has at most {MAX_TEXT} characters")));
     }
-    let mut parser = Parser { tokens: tokens(text)?, next: 0, nesting: 0, queries: 0, names };
+    let mut parser = Parser { tokens: tokens(text)?, next: 0, nesting: 0, queries: 0, elements: Vec::new(), names };
     let result = what(&mut parser)?;
     match parser.peek() {
         Token::End => Ok(result),
@@ -146,6 +147,8 @@ struct Parser<'a> {
     nesting: usize,
     /// How many queries are open.
     queries: usize,
+    /// The names of the elements of the comprehensions that are open.
+    elements: Vec<String>,
     names: &'a mut dyn Names,
 }
 
@@ -341,6 +344,9 @@ impl Parser<'_> {
             Token::Text(text) => self.literal(Value::String(text)),
             Token::Variable(name) => {
                 self.next += 1;
+                if self.elements.contains(&name) {
+                    return self.node(Expr::Element(name), 0);
+                }
                 let expr = self.names.variable(&name).map_err(|e| ParseError::name(at, e))?;
                 self.node(expr, 0)
             }
@@ -390,6 +396,9 @@ impl Parser<'_> {
             _ => {}
         }
         if matches!(self.peek_after(), Token::Symbol("(")) {
+            if let Some(what) = Comprehension::named(word) {
+                return self.comprehension(at, what);
+            }
             let Some(function) = Function::named(word) else {
                 let (fact, below) = self.fact()?;
                 return self.node(Expr::Fact(fact), below);
@@ -411,6 +420,31 @@ impl Parser<'_> {
             return self.node(expr, 0);
         }
         self.node(Expr::Literal(Value::String(word.to_owned())), 0)
+    }
+
+    fn comprehension(&mut self, at: usize, what: Comprehension) -> Parsed {
+        let expected = || ParseError::syntax(at, format!("expected `{}`", what.usage()));
+        self.next += 2;
+        let name_at = self.offset();
+        let Token::Variable(element) = self.advance() else { return Err(expected()) };
+        if self.elements.contains(&element) || self.names.variable(&element).is_ok() {
+            let message = format!("`${element}` has a meaning here already; give the element another name");
+            return Err(ParseError::syntax(name_at, message));
+        }
+        if !self.takes_word("in") {
+            return Err(expected());
+        }
+        let list = self.nested(Parser::or)?;
+        if !self.takes(",") {
+            return Err(expected());
+        }
+        self.elements.push(element);
+        let body = self.nested(Parser::or);
+        let element = self.elements.pop().unwrap_or_default();
+        let body = body?;
+        self.expects(")")?;
+        let below = list.height.max(body.height);
+        self.node(Expr::Each { what, element, list: Box::new(list.expr), body: Box::new(body.expr) }, below)
     }
 
     /// Expressions up to a closing bracket; the opening one is behind.
@@ -494,7 +528,8 @@ impl Parser<'_> {
     fn fact(&mut self) -> Result<(FactExpr, usize), ParseError> {
         let at = self.offset();
         let predicate = self.name("a fact `predicate(argument, …)`")?;
-        if Function::named(&predicate).is_some() || KEYWORDS.contains(&predicate.as_str()) {
+        let built_in = Function::named(&predicate).is_some() || Comprehension::named(&predicate).is_some();
+        if built_in || KEYWORDS.contains(&predicate.as_str()) {
             let message = format!("`{predicate}` is built in and cannot be a predicate");
             return Err(ParseError::syntax(at, message));
         }

@@ -25,7 +25,11 @@ pub trait Scope {
     fn unknown(&self, _: &str) -> Option<Cow<'_, Value>> {
         None
     }
-    /// How many facts the query around may still look at, with those within it.
+    /// `$name` in the body of a comprehension: the element that it is evaluated for.
+    fn element(&self, _: &str) -> Option<Cow<'_, Value>> {
+        None
+    }
+    /// How many facts the query around may still look at, with those within it. An element of a comprehension counts as several.
     fn budget(&self) -> Option<&Cell<u64>> {
         None
     }
@@ -126,7 +130,57 @@ impl Scope for WithVariable<'_> {
         self.outer.unknown(name)
     }
 
+    fn element(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer.element(name)
+    }
+
     fn budget(&self) -> Option<&Cell<u64>> {
         self.outer.budget()
+    }
+}
+
+/// Another scope with an element of a comprehension.
+pub struct WithElement<'a> {
+    /// The scope around it.
+    pub outer: &'a dyn Scope,
+    /// Its name in the body.
+    pub name: &'a str,
+    /// Its value.
+    pub value: &'a Value,
+    /// What the evaluation may still look at.
+    pub left: &'a Cell<u64>,
+}
+
+impl Scope for WithElement<'_> {
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer.variable(name)
+    }
+
+    fn output(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer.output(name)
+    }
+
+    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
+        self.outer.port(state, port)
+    }
+
+    fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
+        self.outer.fact(pattern)
+    }
+
+    fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
+        self.outer.each_fact(pattern, visit)
+    }
+
+    fn unknown(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer.unknown(name)
+    }
+
+    fn element(&self, name: &str) -> Option<Cow<'_, Value>> {
+        if name == self.name { Some(Cow::Borrowed(self.value)) } else { self.outer.element(name) }
+    }
+
+    fn budget(&self) -> Option<&Cell<u64>> {
+        Some(self.left)
     }
 }

@@ -14,8 +14,17 @@ impl Expr {
     /// Calls `visit` for every expression that it is directly made of.
     pub(crate) fn parts<'a>(&'a self, visit: &mut dyn FnMut(&'a Expr)) {
         match self {
-            Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } | Expr::Unknown(_) => {}
+            Expr::Literal(_)
+            | Expr::Variable(_)
+            | Expr::Output(_)
+            | Expr::Port { .. }
+            | Expr::Unknown(_)
+            | Expr::Element(_) => {}
             Expr::Field(of, _) | Expr::Unary(_, of) => visit(of),
+            Expr::Each { list, body, .. } => {
+                visit(list);
+                visit(body);
+            }
             Expr::Index(a, b) | Expr::Binary(_, a, b) => {
                 visit(a);
                 visit(b);
@@ -64,8 +73,17 @@ impl Expr {
     /// Calls `change` for every part of this expression, innermost first, and then for the expression itself.
     pub fn rewrite(&mut self, change: &mut dyn FnMut(&mut Expr)) {
         match self {
-            Expr::Literal(_) | Expr::Variable(_) | Expr::Output(_) | Expr::Port { .. } | Expr::Unknown(_) => {}
+            Expr::Literal(_)
+            | Expr::Variable(_)
+            | Expr::Output(_)
+            | Expr::Port { .. }
+            | Expr::Unknown(_)
+            | Expr::Element(_) => {}
             Expr::Field(of, _) | Expr::Unary(_, of) => of.rewrite(change),
+            Expr::Each { list, body, .. } => {
+                list.rewrite(change);
+                body.rewrite(change);
+            }
             Expr::Index(a, b) | Expr::Binary(_, a, b) => {
                 a.rewrite(change);
                 b.rewrite(change);

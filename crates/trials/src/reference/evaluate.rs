@@ -1,5 +1,6 @@
 //! Expressions, read at a place of the program.
 
+use super::comprehension;
 use super::facts::{Facts, fitting};
 use super::function;
 use super::query;
@@ -26,6 +27,8 @@ pub(super) struct Place<'a> {
     pub(super) variables: Vec<(String, Value)>,
     /// The outputs of the state itself.
     pub(super) own: Option<&'a Outputs>,
+    /// `$name`: the elements of the comprehensions around.
+    pub(super) elements: Vec<(String, Value)>,
     /// `?name`: what a query around has found.
     pub(super) row: Vec<(String, Value)>,
 }
@@ -123,6 +126,8 @@ impl Read for Expr {
                 let pattern = place.pattern(fact)?;
                 Ok(Value::Bool(fitting(place.facts, &pattern).next().is_some()))
             }
+            Expr::Element(name) => written(last(&place.elements, name)),
+            Expr::Each { what, element, list, body } => comprehension::read((*what, element), (list, body), place),
             Expr::Query(conditions) => Ok(Value::Bool(query::has_answer(conditions, place)?)),
             Expr::Unary(UnaryOperator::Not, of) => Ok(Value::Bool(!of.is_true(place)?)),
             Expr::Unary(UnaryOperator::Negate, of) => match of.read(place)? {
@@ -195,7 +200,7 @@ pub(super) fn number(value: &Value) -> Result<f64, Fail> {
     }
 }
 
-fn both(operator: BinaryOperator, a: &Value, b: &Value) -> Result<Value, Fail> {
+pub(super) fn both(operator: BinaryOperator, a: &Value, b: &Value) -> Result<Value, Fail> {
     use BinaryOperator as Op;
     let finite = |x: f64| if x.is_finite() { Ok(Value::Float(x)) } else { wrong("not a finite number") };
     let whole = |i: Option<i64>| i.map_or_else(|| wrong("too large"), |i| Ok(Value::Int(i)));

@@ -1,8 +1,9 @@
 //! The built-in functions but those that know a gripper.
 
 use super::Fail;
-use super::evaluate::{LONGEST_LIST, number, order, wrong};
-use ratn_model::expression::Function;
+use super::comprehension;
+use super::evaluate::{LONGEST_LIST, both, number, order, same, wrong};
+use ratn_model::expression::{BinaryOperator, Function};
 use ratn_model::pose::Pose;
 use ratn_model::value::Value;
 use std::cmp::Ordering;
@@ -23,6 +24,32 @@ pub(super) fn call(function: Function, arguments: &[Value]) -> Result<Value, Fai
         (Function::Max, items) => best(items, Ordering::Greater),
         (Function::Abs, [Value::Int(i)]) => i.checked_abs().map_or_else(|| wrong("too large"), |i| Ok(Value::Int(i))),
         (Function::Abs, [x]) => Ok(Value::Float(number(x)?.abs())),
+        (Function::Sqrt, [x]) if number(x)? >= 0.0 => Ok(Value::Float(number(x)?.sqrt())),
+        (Function::Floor, [Value::Int(i)]) => Ok(Value::Int(*i)),
+        (Function::Floor, [x]) if number(x)?.abs() <= 9.2e18 => Ok(Value::Int(number(x)?.floor() as i64)),
+        (Function::Sum, [Value::List(items)]) => {
+            let mut sum = Value::Int(0);
+            for item in items {
+                number(item)?;
+                sum = both(BinaryOperator::Add, &sum, item)?;
+            }
+            Ok(sum)
+        }
+        (Function::Distance, [Value::Pose(a), Value::Pose(b)]) => Ok(Value::Float(a.distance(b))),
+        (Function::Angle, [Value::Pose(a), Value::Pose(b)]) => Ok(Value::Float(a.angle(b))),
+        (Function::Sort, [Value::List(items)]) => {
+            let own = items.iter().map(|item| (item.clone(), item.clone())).collect();
+            Ok(Value::List(comprehension::ascending(own)?))
+        }
+        (Function::Reverse, [Value::List(items)]) => Ok(Value::List(items.iter().rev().cloned().collect())),
+        (Function::Unique, [Value::List(items)]) => {
+            let new = |i: &usize| !items[..*i].iter().any(|other| same(other, &items[*i]));
+            let found: Vec<Value> = (0..items.len()).filter(new).map(|i| items[i].clone()).collect();
+            if found.len() > 1_000 { wrong("too many different elements") } else { Ok(Value::List(found)) }
+        }
+        (Function::StartsWith, [Value::String(text), Value::String(prefix)]) => {
+            Ok(Value::Bool(text.get(..prefix.len()) == Some(prefix.as_str())))
+        }
         (Function::Pose, [x, y, z]) => Ok(Value::Pose(Pose::at(number(x)?, number(y)?, number(z)?))),
         (Function::Pose, [x, y, z, roll, pitch, yaw]) => {
             let at = [number(x)?, number(y)?, number(z)?];

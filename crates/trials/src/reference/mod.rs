@@ -21,6 +21,7 @@
 //! | what runs | `walk` (states that contain others), `goal` (one action), `shown` (what its provider sees), `resources` |
 
 mod compare;
+mod comprehension;
 mod effects;
 mod evaluate;
 mod facts;
@@ -173,6 +174,7 @@ impl Reference<'_> {
             regions: &self.regions,
             variables: variables.to_vec(),
             own,
+            elements: Vec::new(),
             row: Vec::new(),
         }
     }

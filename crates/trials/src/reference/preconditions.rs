@@ -46,8 +46,16 @@ pub(in super::super) fn unmet(program: &Program, run: &Run) -> Option<String> {
                 };
                 let variables: Vec<(String, Value)> = inputs.iter().filter_map(named).collect();
                 let row = Vec::new();
-                let place =
-                    Place { program, facts: &facts, outputs: &outputs, regions: &regions, variables, own: None, row };
+                let place = Place {
+                    program,
+                    facts: &facts,
+                    outputs: &outputs,
+                    regions: &regions,
+                    variables,
+                    own: None,
+                    elements: Vec::new(),
+                    row,
+                };
                 for required in &state.annotations.requires {
                     match required.is_true(&place) {
                         Ok(true) | Err(Fail::Unwritten(_) | Fail::NotMine(_)) => {}

@@ -61,7 +61,16 @@ impl Scope for Plain<'_> {
 fn read(program: &Program, expr: &Expr, facts: &Facts, v: &Value) -> Result<Value, Fail> {
     let (outputs, regions): (BTreeMap<StateId, Outputs>, _) = Default::default();
     let variables = vec![("v".to_owned(), v.clone())];
-    expr.read(&Place { program, facts, outputs: &outputs, regions: &regions, variables, own: None, row: Vec::new() })
+    expr.read(&Place {
+        program,
+        facts,
+        outputs: &outputs,
+        regions: &regions,
+        variables,
+        own: None,
+        elements: Vec::new(),
+        row: Vec::new(),
+    })
 }
 
 fn key(predicate: &str, arguments: &[Term]) -> FactKey {

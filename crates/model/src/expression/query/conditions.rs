@@ -139,7 +139,10 @@ impl TakeOut<'_> {
             | Expr::Variable(_)
             | Expr::Output(_)
             | Expr::Port { .. }
+            | Expr::Element(_)
             | Expr::Unknown(_) => {}
+            // Facts of its body are looked up for each element.
+            Expr::Each { list, .. } => self.strict(list),
             Expr::Call(Function::If, arguments) => arguments.iter_mut().take(1).for_each(|first| self.strict(first)),
             Expr::Field(of, _) | Expr::Unary(_, of) => self.strict(of),
             Expr::Index(a, b) | Expr::Binary(_, a, b) => {

@@ -248,6 +248,10 @@ impl Scope for WithRow<'_> {
         }
     }
 
+    fn element(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer.element(name)
+    }
+
     fn budget(&self) -> Option<&Cell<u64>> {
         Some(self.steps_left)
     }
