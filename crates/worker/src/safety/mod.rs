@@ -4,31 +4,36 @@
 //!   ready ──hold──▶ held ──go on──▶ ready
 //!     └────stop──────┴─▶ stopped ──clear──▶ ready
 //! ```
-//! A [`Safety`] is the state of one driver. Its [`Brakes`] make it true before anybody is told that it is; an
+//! A [`Safety`] is the state of one driver. A stop and a hold are in force at once, and confirmed to whoever asked when the driver's
+//! [`Brakes`] have made them true (`machine`, which is pure, decides all of that; here its commands are performed). An
 //! [`crate::action::ActionServer`] that is given one ends every goal `stopped` while a stop is in force, and an action pauses itself
 //! with [`crate::action::GoalContext::while_held`]. A stop that is kept in a file
 //! outlasts the process and a reboot. What it does not do: stop
 //! motors. An emergency stop of a real robot is a circuit; this is how its software learns of one, and asks for one.
 
+mod client;
 mod latch;
+mod machine;
+mod service;
 
+pub use client::SafetyClient;
+
+use crate::panic::exit_on_panic;
 use latch::Latch;
-use ratn_proto::convert::label;
-use ratn_proto::v1;
-use ratn_proto::v1::safety_service_client::SafetyServiceClient;
-use ratn_proto::v1::safety_service_server::{SafetyService, SafetyServiceServer};
+use machine::{Application, Call, Command, Event, Machine, Question};
+use ratn_proto::v1::safety_service_server::SafetyServiceServer;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::fmt;
 use std::io;
 use std::path::PathBuf;
-use std::sync::Arc;
-use tokio::sync::{Mutex, watch};
-use tonic::{Request, Response, Status};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use tokio::sync::{oneshot, watch};
+use tokio::task::AbortHandle;
+use tokio::time::Instant;
 
-use crate::access::Caller;
-use crate::audit::{self, Mutation, Pending};
-use crate::client::{CallError, Channels};
-use crate::endpoint::Endpoint;
+/// A part of the process, for its log.
+const PART: &str = "emergency stop and hold";
 
 /// What is in force at a driver.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -52,7 +57,10 @@ pub enum SafetyState {
 /// What makes a state true: pauses motors, ends motions, lets them go on.
 #[tonic::async_trait]
 pub trait Brakes: Send + Sync + 'static {
-    /// Returns when the state is true: for `Held` and `Stopped`, when nothing moves.
+    /// Returns when the state is true: for `Held` and `Stopped`, when nothing moves. It may be asked for a state that is true already, and
+    /// is asked again for one that it did not confirm. It does not matter whether a caller still waits. A stop or a hold
+    /// does not wait for an application before it: that one is dropped at the point where it waits, and may overlap with the
+    /// next one until it gets there; what was applied meanwhile is applied once more when it is over.
     ///
     /// # Errors
     /// Why it is not, or may not be.
@@ -73,13 +81,31 @@ impl Brakes for NoBrakes {
 /// The state of one driver. A handle: clones share it.
 #[derive(Clone)]
 pub struct Safety {
-    state: Arc<watch::Sender<SafetyState>>,
-    brakes: Arc<dyn Brakes>,
+    shared: Arc<Shared>,
     /// False where its actions look at the state themselves: then nobody knows when nothing moves.
     has_brakes: bool,
+}
+
+struct Shared {
+    state: watch::Sender<SafetyState>,
+    brakes: Arc<dyn Brakes>,
     latch: Option<Latch>,
-    /// One change at a time; whether a stop is on the disk, as far as that is asked for.
-    changing: Arc<Mutex<bool>>,
+    /// Never held across an `await`.
+    control: Mutex<Control>,
+}
+
+/// The machine, with what its names stand for.
+struct Control {
+    machine: Machine,
+    last_call: u64,
+    callers: BTreeMap<Call, oneshot::Sender<Result<SafetyState, SafetyError>>>,
+    applications: BTreeMap<Application, AbortHandle>,
+}
+
+/// A call that waits for its answer; dropped, it does not wait any more.
+struct WaitingCall<'a> {
+    shared: &'a Arc<Shared>,
+    call: Call,
 }
 
 /// A state that could not be made so.
@@ -91,6 +117,15 @@ pub enum SafetyError {
         /// Its reason.
         reason: String,
     },
+    /// Nothing is let go before the brakes, and the disk, have answered for what is in force.
+    #[error(
+        "{}, and not confirmed yet: it stays in force; ask for it again until it is confirmed, then end it",
+        in_force(state)
+    )]
+    NotConfirmed {
+        /// What is in force.
+        state: SafetyState,
+    },
     /// The brakes do not confirm.
     #[error("not confirmed, go and look: {0}")]
     Brakes(String),
@@ -101,17 +136,15 @@ pub enum SafetyError {
 
 impl Default for Safety {
     fn default() -> Safety {
-        let mut safety = Safety::new(NoBrakes);
-        safety.has_brakes = false;
-        safety
+        let safety = Safety::new(NoBrakes);
+        Safety { has_brakes: false, ..safety }
     }
 }
 
 impl Safety {
     /// Ready, with brakes.
     pub fn new(brakes: impl Brakes) -> Safety {
-        let state = Arc::new(watch::Sender::new(SafetyState::Ready));
-        Safety { state, brakes: Arc::new(brakes), has_brakes: true, latch: None, changing: Arc::default() }
+        Safety::of(brakes, None, Machine::new(false))
     }
 
     /// As [`Safety::new`]; a stop is kept in `file`, and one that is there already is in force from the beginning. The file belongs
@@ -121,105 +154,71 @@ impl Safety {
     /// Where the file is there and cannot be read, where its folder cannot be made, or where the brakes do not confirm.
     pub async fn kept_in(file: PathBuf, brakes: impl Brakes) -> io::Result<Safety> {
         let latch = Latch::at(file)?;
-        let reason = latch.read()?;
-        let safety =
-            Safety { latch: Some(latch), changing: Arc::new(Mutex::new(reason.is_some())), ..Safety::new(brakes) };
-        if let Some(reason) = reason {
-            safety.brakes.apply(&SafetyState::Stopped { reason: reason.clone() }).await.map_err(io::Error::other)?;
-            tracing::warn!(reason, "an emergency stop from before is in force until it is cleared");
-            safety.state.send_replace(SafetyState::Stopped { reason });
-        }
+        let Some(reason) = latch.read()? else {
+            return Ok(Safety::of(brakes, Some(latch), Machine::new(true)));
+        };
+        let safety = Safety::of(brakes, Some(latch), Machine::stopped_before(reason.clone()));
+        safety.shared.state.send_replace(SafetyState::Stopped { reason: reason.clone() });
+        safety.stop(&reason).await.map_err(io::Error::other)?;
+        tracing::warn!(reason, "an emergency stop from before is in force until it is cleared");
         Ok(safety)
+    }
+
+    fn of(brakes: impl Brakes, latch: Option<Latch>, machine: Machine) -> Safety {
+        let control = Control { machine, last_call: 0, callers: BTreeMap::new(), applications: BTreeMap::new() };
+        let state = watch::Sender::new(SafetyState::Ready);
+        let shared = Shared { state, brakes: Arc::new(brakes), latch, control: Mutex::new(control) };
+        Safety { shared: Arc::new(shared), has_brakes: true }
     }
 
     /// What is in force, and every change of it.
     pub fn watch(&self) -> watch::Receiver<SafetyState> {
-        self.state.subscribe()
+        self.shared.state.subscribe()
     }
 
     /// What is in force.
     pub fn state(&self) -> SafetyState {
-        self.state.borrow().clone()
+        self.shared.state.borrow().clone()
     }
 
-    /// Emergency stop, from whatever state. Returns when nothing moves and the stop is on the disk, where it is kept. The state is
-    /// `Stopped` afterwards also where that is not confirmed.
+    /// Emergency stop, from whatever state, and whatever the brakes are doing. In force at once. Returns when nothing moves and the stop is
+    /// on the disk, where it is kept. The state is `Stopped` also where that is not confirmed, or where the future is dropped; asked for
+    /// again, whatever is not confirmed is done again.
     ///
     /// # Errors
-    /// [`SafetyError::Brakes`], and [`SafetyError::Latch`]: asked for again, the stop is written again.
+    /// [`SafetyError::Brakes`], and [`SafetyError::Latch`].
     pub async fn stop(&self, reason: &str) -> Result<SafetyState, SafetyError> {
-        let mut on_disk = self.changing.lock().await;
-        if let SafetyState::Stopped { reason } = self.state() {
-            self.keep(&mut on_disk, &reason).await?;
-            return Ok(SafetyState::Stopped { reason });
-        }
-        let state = SafetyState::Stopped { reason: reason.to_owned() };
         tracing::warn!(reason, "emergency stop");
-        let confirmed = self.brakes.apply(&state).await;
-        self.state.send_replace(state.clone());
-        let kept = self.keep(&mut on_disk, reason).await;
-        confirmed.map_err(SafetyError::Brakes)?;
-        kept.map(|()| state)
-    }
-
-    /// Writes down that a stop is in force, unless that is on the disk already.
-    async fn keep(&self, on_disk: &mut bool, reason: &str) -> Result<(), SafetyError> {
-        if let Some(latch) = self.latch.as_ref().filter(|_| !*on_disk) {
-            latch.set(reason).await.map_err(|error| {
-                tracing::error!(error, "the stop is in force, and forgotten at a restart");
-                SafetyError::Latch(error)
-            })?;
-            *on_disk = true;
-        }
-        Ok(())
+        self.ask(Question::Stop { reason: reason.to_owned() }).await
     }
 
     /// Ends an emergency stop. What was stopped does not go on.
     ///
     /// # Errors
     /// [`SafetyError::Brakes`], and [`SafetyError::Latch`] where the file that keeps the stop cannot be removed: it stays in force then.
+    /// [`SafetyError::NotConfirmed`] while the brakes have not answered to the stop, and [`SafetyError::Stopped`] where another one is
+    /// asked for before the brakes have let go.
     pub async fn clear(&self) -> Result<SafetyState, SafetyError> {
-        let mut on_disk = self.changing.lock().await;
-        let state = self.state();
-        if !matches!(state, SafetyState::Stopped { .. }) {
-            return Ok(state);
-        }
-        if let Some(latch) = &self.latch {
-            // Removed and not synced it may be there again, or not.
-            *on_disk = false;
-            latch.clear().await.map_err(SafetyError::Latch)?;
-        }
-        self.become_ready().await
+        self.ask(Question::Clear).await
     }
 
-    /// Pauses what is under way and what is given until [`Safety::go_on`]. A stop stays a stop.
+    /// Pauses what is under way and what is given until [`Safety::go_on`]. In force at once. Returns when nothing moves; asked for again,
+    /// the brakes are asked again unless they have confirmed. A stop stays a stop.
     ///
     /// # Errors
-    /// [`SafetyError::Brakes`].
+    /// [`SafetyError::Brakes`]; while a stop is in force as [`Safety::stop`].
     pub async fn hold(&self, reason: &str) -> Result<SafetyState, SafetyError> {
-        let _one = self.changing.lock().await;
-        let state = self.state();
-        if state != SafetyState::Ready {
-            return Ok(state);
-        }
-        let state = SafetyState::Held { reason: reason.to_owned() };
         tracing::info!(reason, "hold");
-        self.state.send_replace(state.clone());
-        self.brakes.apply(&state).await.map_err(SafetyError::Brakes)?;
-        Ok(state)
+        self.ask(Question::Hold { reason: reason.to_owned() }).await
     }
 
     /// Ends a hold.
     ///
     /// # Errors
-    /// [`SafetyError::Stopped`] while a stop is in force, else [`SafetyError::Brakes`].
+    /// [`SafetyError::Stopped`] while a stop is in force, [`SafetyError::NotConfirmed`] while the brakes have not answered to the hold, or
+    /// where another one is asked for before they have let go; else [`SafetyError::Brakes`].
     pub async fn go_on(&self) -> Result<SafetyState, SafetyError> {
-        let _one = self.changing.lock().await;
-        match self.state() {
-            SafetyState::Stopped { reason } => Err(SafetyError::Stopped { reason }),
-            SafetyState::Ready => Ok(SafetyState::Ready),
-            SafetyState::Held { .. } => self.become_ready().await,
-        }
+        self.ask(Question::GoOn).await
     }
 
     /// Has the brakes end what a process before this one may have begun; then the state in force is made true again. False where there
@@ -228,18 +227,7 @@ impl Safety {
     /// # Errors
     /// [`SafetyError::Brakes`].
     pub(crate) async fn bring_to_rest(&self) -> Result<bool, SafetyError> {
-        let _one = self.changing.lock().await;
-        let starting = SafetyState::Held { reason: "the driver has started".to_owned() };
-        self.brakes.apply(&starting).await.map_err(SafetyError::Brakes)?;
-        self.brakes.apply(&self.state()).await.map_err(SafetyError::Brakes)?;
-        Ok(self.has_brakes)
-    }
-
-    async fn become_ready(&self) -> Result<SafetyState, SafetyError> {
-        tracing::info!("ready");
-        self.brakes.apply(&SafetyState::Ready).await.map_err(SafetyError::Brakes)?;
-        self.state.send_replace(SafetyState::Ready);
-        Ok(SafetyState::Ready)
+        self.ask(Question::Rest).await.map(|_| self.has_brakes)
     }
 
     /// Resolves when a stop is in force: its reason.
@@ -258,151 +246,119 @@ impl Safety {
     pub fn into_service(self) -> SafetyServiceServer<Safety> {
         SafetyServiceServer::new(self)
     }
+
+    async fn ask(&self, question: Question) -> Result<SafetyState, SafetyError> {
+        let (answer, answered) = oneshot::channel();
+        let call = {
+            let mut control = self.shared.control();
+            control.last_call += 1;
+            let call = Call(control.last_call);
+            control.callers.insert(call, answer);
+            self.shared.handle_in(&mut control, Event::Asked { call, question });
+            call
+        };
+        let _waiting = WaitingCall { shared: &self.shared, call };
+        // Every call that is waited for is answered.
+        answered.await.unwrap_or_else(|_| Err(SafetyError::Brakes("nobody answers for the brakes".to_owned())))
+    }
+}
+
+impl Shared {
+    fn control(&self) -> MutexGuard<'_, Control> {
+        self.control.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn handle_in(self: &Arc<Self>, control: &mut Control, event: Event) {
+        for command in control.machine.handle(Instant::now(), event) {
+            self.perform(control, command);
+        }
+    }
+
+    fn perform(self: &Arc<Self>, control: &mut Control, command: Command) {
+        match command {
+            Command::Show(state) => {
+                tracing::info!(state = in_force(&state), "in force");
+                self.state.send_replace(state);
+            }
+            Command::Apply { application, state } => {
+                let applying = self.clone().apply(application, state);
+                control.applications.insert(application, applying);
+            }
+            Command::Drop { application } => {
+                if let Some(applying) = control.applications.get(&application) {
+                    applying.abort();
+                }
+            }
+            Command::WriteLatch { reason } => {
+                self.keep(move |latch| async move { Event::Latched(latch.set(&reason).await) })
+            }
+            Command::RemoveLatch => self.keep(|latch| async move { Event::Unlatched(latch.clear().await) }),
+            Command::Answer { call, answer } => {
+                if let Some(caller) = control.callers.remove(&call) {
+                    // It may be gone.
+                    let _ = caller.send(answer);
+                }
+            }
+        }
+    }
+
+    /// In a task of its own: the brakes are not released halfway because a caller is gone.
+    fn apply(self: Arc<Self>, application: Application, state: SafetyState) -> AbortHandle {
+        let brakes = self.brakes.clone();
+        let applying = tokio::spawn(async move { brakes.apply(&state).await });
+        let abort = applying.abort_handle();
+        let answered = async move {
+            let result = applying.await.unwrap_or_else(|error| Err(format!("the brakes have ended: {error}")));
+            if let Err(error) = &result {
+                tracing::warn!(error, "the brakes have not confirmed");
+            }
+            let mut control = self.control();
+            control.applications.remove(&application);
+            self.handle_in(&mut control, Event::Braked { application, result });
+        };
+        tokio::spawn(exit_on_panic(PART, answered));
+        abort
+    }
+
+    /// Changes what is on the disk, also in a task of its own.
+    fn keep<F>(self: &Arc<Self>, work: impl FnOnce(Latch) -> F)
+    where
+        F: Future<Output = Event> + Send + 'static,
+    {
+        // The machine asks for this only where a stop is kept.
+        let Some(latch) = self.latch.clone() else { return };
+        let (shared, work) = (self.clone(), work(latch));
+        let kept = async move {
+            let done = work.await;
+            if let Event::Latched(Err(error)) | Event::Unlatched(Err(error)) = &done {
+                tracing::error!(error, "the stop is in force, but not as it is on the disk, which a restart goes by");
+            }
+            shared.handle_in(&mut shared.control(), done);
+        };
+        tokio::spawn(exit_on_panic(PART, kept));
+    }
+}
+
+impl Drop for WaitingCall<'_> {
+    fn drop(&mut self) {
+        let mut control = self.shared.control();
+        control.callers.remove(&self.call);
+        self.shared.handle_in(&mut control, Event::Left { call: self.call });
+    }
+}
+
+/// In words.
+fn in_force(state: &SafetyState) -> String {
+    match state {
+        SafetyState::Ready => "ready".to_owned(),
+        SafetyState::Held { reason } => format!("a hold is in force ({reason})"),
+        SafetyState::Stopped { reason } => format!("an emergency stop is in force ({reason})"),
+    }
 }
 
 impl fmt::Debug for Safety {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Safety").field("state", &self.state()).field("latch", &self.latch).finish()
-    }
-}
-
-#[tonic::async_trait]
-impl SafetyService for Safety {
-    async fn emergency_stop(
-        &self,
-        request: Request<v1::EmergencyStopRequest>,
-    ) -> Result<Response<v1::EmergencyStopResponse>, Status> {
-        let (caller, reason) = (Caller::of(&request), request.into_inner().reason);
-        label(&reason, "reason")?;
-        let pending = audit::begin(&caller, "", || Mutation::EmergencyStop { reason: reason.clone() });
-        let state = Some(audited(pending, self.stop(&reason).await)?);
-        Ok(Response::new(v1::EmergencyStopResponse { state }))
-    }
-
-    async fn clear_emergency_stop(
-        &self,
-        request: Request<v1::ClearEmergencyStopRequest>,
-    ) -> Result<Response<v1::ClearEmergencyStopResponse>, Status> {
-        let pending = audit::begin(&Caller::of(&request), "", || Mutation::ClearEmergencyStop);
-        let state = Some(audited(pending, self.clear().await)?);
-        Ok(Response::new(v1::ClearEmergencyStopResponse { state }))
-    }
-
-    async fn hold(&self, request: Request<v1::HoldRequest>) -> Result<Response<v1::HoldResponse>, Status> {
-        let (caller, reason) = (Caller::of(&request), request.into_inner().reason);
-        label(&reason, "reason")?;
-        let pending = audit::begin(&caller, "", || Mutation::Hold { reason: reason.clone() });
-        let state = Some(audited(pending, Safety::hold(self, &reason).await)?);
-        Ok(Response::new(v1::HoldResponse { state }))
-    }
-
-    async fn go_on(&self, request: Request<v1::GoOnRequest>) -> Result<Response<v1::GoOnResponse>, Status> {
-        let pending = audit::begin(&Caller::of(&request), "", || Mutation::GoOn);
-        let state = Some(audited(pending, Safety::go_on(self).await)?);
-        Ok(Response::new(v1::GoOnResponse { state }))
-    }
-
-    async fn get_safety(&self, _: Request<v1::GetSafetyRequest>) -> Result<Response<v1::GetSafetyResponse>, Status> {
-        Ok(Response::new(v1::GetSafetyResponse { state: Some(wire(self.state())) }))
-    }
-}
-
-impl From<SafetyError> for Status {
-    fn from(error: SafetyError) -> Status {
-        match error {
-            SafetyError::Stopped { .. } => Status::failed_precondition(error.to_string()),
-            SafetyError::Brakes(_) | SafetyError::Latch(_) => Status::internal(error.to_string()),
-        }
-    }
-}
-
-/// What came of a change, once it is written down.
-fn audited(pending: Pending, changed: Result<SafetyState, SafetyError>) -> Result<v1::SafetyState, Status> {
-    let changed = changed.map_err(Status::from);
-    pending.ended(&changed);
-    changed.map(wire)
-}
-
-fn wire(state: SafetyState) -> v1::SafetyState {
-    let (kind, reason) = match state {
-        SafetyState::Ready => (v1::SafetyKind::Ready, String::new()),
-        SafetyState::Held { reason } => (v1::SafetyKind::Held, reason),
-        SafetyState::Stopped { reason } => (v1::SafetyKind::Stopped, reason),
-    };
-    v1::SafetyState { kind: kind.into(), reason }
-}
-
-/// Asks drivers.
-#[derive(Debug, Clone)]
-pub struct SafetyClient {
-    client: SafetyServiceClient<crate::trace::Traced>,
-    endpoint: Endpoint,
-}
-
-impl SafetyClient {
-    /// Of the driver that is served there.
-    ///
-    /// # Errors
-    /// Where the endpoint is none.
-    pub fn new(channels: &Channels, endpoint: &Endpoint) -> Result<SafetyClient, CallError> {
-        let client = SafetyServiceClient::new(channels.get(endpoint)?);
-        Ok(SafetyClient { client, endpoint: endpoint.clone() })
-    }
-
-    /// Emergency stop; what is in force then.
-    ///
-    /// # Errors
-    /// [`CallError`]: it may move on.
-    pub async fn stop(&self, reason: &str) -> Result<SafetyState, CallError> {
-        let question = v1::EmergencyStopRequest { reason: reason.to_owned() };
-        self.state_of(self.client.clone().emergency_stop(question).await.map(|answer| answer.into_inner().state))
-    }
-
-    /// Ends an emergency stop; what is in force then.
-    ///
-    /// # Errors
-    /// [`CallError`].
-    pub async fn clear(&self) -> Result<SafetyState, CallError> {
-        let answer = self.client.clone().clear_emergency_stop(v1::ClearEmergencyStopRequest {}).await;
-        self.state_of(answer.map(|answer| answer.into_inner().state))
-    }
-
-    /// Pauses; what is in force then.
-    ///
-    /// # Errors
-    /// [`CallError`]: it may move on.
-    pub async fn hold(&self, reason: &str) -> Result<SafetyState, CallError> {
-        let question = v1::HoldRequest { reason: reason.to_owned() };
-        self.state_of(self.client.clone().hold(question).await.map(|answer| answer.into_inner().state))
-    }
-
-    /// Ends a pause; what is in force then.
-    ///
-    /// # Errors
-    /// [`CallError`].
-    pub async fn go_on(&self) -> Result<SafetyState, CallError> {
-        let answer = self.client.clone().go_on(v1::GoOnRequest {}).await;
-        self.state_of(answer.map(|answer| answer.into_inner().state))
-    }
-
-    /// What is in force.
-    ///
-    /// # Errors
-    /// [`CallError`].
-    pub async fn state(&self) -> Result<SafetyState, CallError> {
-        let answer = self.client.clone().get_safety(v1::GetSafetyRequest {}).await;
-        self.state_of(answer.map(|answer| answer.into_inner().state))
-    }
-
-    fn state_of(&self, answer: Result<Option<v1::SafetyState>, Status>) -> Result<SafetyState, CallError> {
-        let state = answer.map_err(|status| CallError::from_status(&self.endpoint, &status))?;
-        let v1::SafetyState { kind, reason } = state.unwrap_or_default();
-        match v1::SafetyKind::try_from(kind) {
-            Ok(v1::SafetyKind::Ready) => Ok(SafetyState::Ready),
-            Ok(v1::SafetyKind::Held) => Ok(SafetyState::Held { reason }),
-            Ok(v1::SafetyKind::Stopped) => Ok(SafetyState::Stopped { reason }),
-            _ => Err(CallError::malformed(&self.endpoint, ratn_proto::convert::Malformed::new("kind", "is not set"))),
-        }
+        f.debug_struct("Safety").field("state", &self.state()).field("latch", &self.shared.latch).finish()
     }
 }
 
@@ -481,6 +437,42 @@ mod tests {
         assert!(matches!(safety.clear().await, Err(SafetyError::Latch(_))));
         assert_eq!(safety.state(), SafetyState::Stopped { reason: "a hand".into() });
         assert!(Safety::kept_in(file, NoBrakes).await.is_err(), "nobody moves before it is known");
+    }
+
+    /// Hangs when it is to hold, and confirms everything else.
+    struct HangsInHold;
+
+    #[tonic::async_trait]
+    impl Brakes for HangsInHold {
+        async fn apply(&self, state: &SafetyState) -> Result<(), String> {
+            match state {
+                SafetyState::Held { .. } => std::future::pending().await,
+                _ => Ok(()),
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_stop_is_in_force_and_confirmed_though_the_brakes_hang_at_the_start() {
+        let safety = Safety::new(HangsInHold);
+        let mut start = Box::pin(safety.bring_to_rest());
+        assert!(futures::poll!(&mut start).is_pending());
+        assert_eq!(safety.stop("a hand").await, Ok(SafetyState::Stopped { reason: "a hand".into() }));
+        // Nothing moves, which the start waited for.
+        assert_eq!(start.await, Ok(true));
+        assert_eq!(safety.clear().await, Ok(SafetyState::Ready));
+    }
+
+    #[tokio::test]
+    async fn a_call_that_nobody_waits_for_leaves_nothing_behind() {
+        let safety = Safety::new(HangsInHold);
+        for _ in 0..3 {
+            let mut hold = Box::pin(safety.hold("a look"));
+            assert!(futures::poll!(&mut hold).is_pending());
+        }
+        assert!(safety.shared.control().callers.is_empty());
+        assert_eq!(safety.shared.control().applications.len(), 1);
+        assert!(matches!(safety.go_on().await, Err(SafetyError::NotConfirmed { .. })));
     }
 
     #[tokio::test]

@@ -1,0 +1,407 @@
+//! The state machine of emergency stop and hold. Pure: calls, answers of the brakes and of the disk in; commands out.
+//!
+//! ```text
+//!             stop, hold                                          clear, go on
+//!  ready ───────────────────▶ held, stopped: brakes applied ◀───▶ latch removed ─▶ brakes let go ─▶ ready
+//!                              │  ▲                                      │               │
+//!                              └──┘ asked again, not confirmed           └─ stop, hold ──┴─▶ brakes applied again
+//! ```
+//! - A stop or a hold is in force at once. The brakes, and the disk, follow; it is confirmed when both have done it.
+//! - A stop or a hold that is asked for again has done again whatever is not confirmed.
+//! - A stop or a hold ends whatever the brakes are doing for another state. Clearing and going on never do: they are refused until the
+//!   brakes have answered.
+//! - An application that was superseded may have worked until it was over. So what was applied meanwhile is applied once more after that,
+//!   and only then confirmed.
+//! - Nothing waits for its caller: what has begun goes on when the caller is gone.
+
+use super::{SafetyError, SafetyState};
+use std::collections::BTreeSet;
+use tokio::time::{Duration, Instant};
+
+/// Brakes that have not answered for so long are asked anew when a stop or a hold is asked for again.
+pub(super) const BRAKES_PATIENCE: Duration = Duration::from_secs(3);
+
+/// A caller who waits for an answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Call(pub(super) u64);
+
+/// One application of the brakes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Application(pub(super) u64);
+
+/// What a caller wants.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Question {
+    Stop {
+        reason: String,
+    },
+    Clear,
+    Hold {
+        reason: String,
+    },
+    GoOn,
+    /// That nothing moves any more of what a process before this one may have begun.
+    Rest,
+}
+
+#[derive(Debug)]
+pub(super) enum Event {
+    Asked {
+        call: Call,
+        question: Question,
+    },
+    /// The caller does not wait any more.
+    Left {
+        call: Call,
+    },
+    /// An application of the brakes is over. One that was dropped also comes to an end.
+    Braked {
+        application: Application,
+        result: Result<(), String>,
+    },
+    /// The stop is on the disk, or is not.
+    Latched(Result<(), String>),
+    /// The stop is gone from the disk, or may not be.
+    Unlatched(Result<(), String>),
+}
+
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Command {
+    /// This is in force.
+    Show(SafetyState),
+    Apply {
+        application: Application,
+        state: SafetyState,
+    },
+    /// Its result does not matter any more; that it is over does.
+    Drop {
+        application: Application,
+    },
+    WriteLatch {
+        reason: String,
+    },
+    RemoveLatch,
+    Answer {
+        call: Call,
+        answer: Result<SafetyState, SafetyError>,
+    },
+}
+
+/// See the module.
+#[derive(Debug, Clone)]
+pub(super) struct Machine {
+    /// What is in force.
+    state: SafetyState,
+    brakes: BrakesPhase,
+    /// `None` where a stop is kept nowhere.
+    latch: Option<LatchPhase>,
+    /// Applications that are not over.
+    running: BTreeSet<Application>,
+    last: u64,
+    calls: Vec<(Call, Question)>,
+}
+
+#[derive(Debug, Clone)]
+enum BrakesPhase {
+    /// The brakes have confirmed the state in force.
+    Confirmed,
+    /// They have not, and nothing is under way.
+    Failed { reason: String },
+    /// They are told the state in force. `alone`: nothing else was running when this began.
+    Applying { application: Application, since: Instant, alone: bool },
+    /// They have done so while an application before was not over.
+    Overlapped,
+    /// Nothing is asked of them before the stop is gone from the disk.
+    Unlatching,
+    /// They are told to let go. `rested`: after [`BrakesPhase::Resting`].
+    LettingGo { application: Application, rested: bool },
+    /// They end what a process before this one may have begun, while nothing is in force. Then they let go.
+    Resting { application: Application },
+}
+
+#[derive(Debug, Clone)]
+enum LatchPhase {
+    OnDisk,
+    NotOnDisk,
+    Writing,
+    Removing,
+    Failed { reason: String },
+}
+
+impl Machine {
+    /// Ready; a stop is kept on the disk where `is_kept`.
+    pub(super) fn new(is_kept: bool) -> Machine {
+        Machine {
+            state: SafetyState::Ready,
+            brakes: BrakesPhase::Confirmed,
+            latch: is_kept.then_some(LatchPhase::NotOnDisk),
+            running: BTreeSet::new(),
+            last: 0,
+            calls: Vec::new(),
+        }
+    }
+
+    /// Stopped, as the disk says; the brakes have not been told.
+    pub(super) fn stopped_before(reason: String) -> Machine {
+        let reason_of_brakes = "they have not been asked yet".to_owned();
+        Machine {
+            state: SafetyState::Stopped { reason },
+            brakes: BrakesPhase::Failed { reason: reason_of_brakes },
+            latch: Some(LatchPhase::OnDisk),
+            ..Machine::new(true)
+        }
+    }
+
+    /// What is in force.
+    #[cfg(test)]
+    pub(super) fn state(&self) -> &SafetyState {
+        &self.state
+    }
+
+    pub(super) fn handle(&mut self, now: Instant, event: Event) -> Vec<Command> {
+        let mut commands = Vec::new();
+        match event {
+            Event::Asked { call, question } => self.asked(now, call, question, &mut commands),
+            Event::Left { call } => self.calls.retain(|(waiting, _)| *waiting != call),
+            Event::Braked { application, result } => self.braked(now, application, result, &mut commands),
+            Event::Latched(result) => {
+                self.latch = Some(match result {
+                    Ok(()) => LatchPhase::OnDisk,
+                    Err(reason) => LatchPhase::Failed { reason },
+                });
+            }
+            Event::Unlatched(result) => self.unlatched(now, result, &mut commands),
+        }
+        self.answer_those_in_force(&mut commands);
+        commands
+    }
+
+    fn asked(&mut self, now: Instant, call: Call, question: Question, commands: &mut Vec<Command>) {
+        let wanted = match &question {
+            Question::Clear | Question::GoOn => return self.asked_to_release(call, question, commands),
+            Question::Stop { reason } => Some(SafetyState::Stopped { reason: reason.clone() }),
+            Question::Hold { reason } => Some(SafetyState::Held { reason: reason.clone() }),
+            Question::Rest => None,
+        };
+        self.calls.push((call, question));
+        match wanted.filter(|wanted| severity(wanted) > severity(&self.state)) {
+            Some(state) => {
+                self.state = state.clone();
+                commands.push(Command::Show(state));
+                self.apply(now, commands);
+            }
+            None if self.state == SafetyState::Ready => self.rest(commands),
+            None => self.insist(now, commands),
+        }
+        self.write_latch(commands);
+    }
+
+    /// Has done again whatever is not confirmed, and not under way.
+    fn insist(&mut self, now: Instant, commands: &mut Vec<Command>) {
+        match self.brakes {
+            BrakesPhase::Confirmed => {}
+            BrakesPhase::Applying { since, .. } if now.duration_since(since) < BRAKES_PATIENCE => {}
+            _ => self.apply(now, commands),
+        }
+    }
+
+    /// Has the brakes make the state in force true, whatever they are doing.
+    fn apply(&mut self, now: Instant, commands: &mut Vec<Command>) {
+        let alone = self.running.is_empty();
+        commands.extend(self.running.iter().map(|&application| Command::Drop { application }));
+        let application = self.begin(self.state.clone(), commands);
+        self.brakes = BrakesPhase::Applying { application, since: now, alone };
+        // Whoever wanted to let go does not get that.
+        let refused = match &self.state {
+            SafetyState::Stopped { reason } => SafetyError::Stopped { reason: reason.clone() },
+            state => SafetyError::NotConfirmed { state: state.clone() },
+        };
+        self.answer(&Err(refused), commands, |question| matches!(question, Question::Clear | Question::GoOn));
+    }
+
+    fn begin(&mut self, state: SafetyState, commands: &mut Vec<Command>) -> Application {
+        self.last += 1;
+        let application = Application(self.last);
+        self.running.insert(application);
+        commands.push(Command::Apply { application, state });
+        application
+    }
+
+    fn rest(&mut self, commands: &mut Vec<Command>) {
+        if let BrakesPhase::Confirmed | BrakesPhase::Failed { .. } = self.brakes {
+            let starting = SafetyState::Held { reason: "the driver has started".to_owned() };
+            self.brakes = BrakesPhase::Resting { application: self.begin(starting, commands) };
+        }
+    }
+
+    fn asked_to_release(&mut self, call: Call, question: Question, commands: &mut Vec<Command>) {
+        let refusal = match (&question, &self.state) {
+            // Nothing to release, unless the brakes did not let go after the start.
+            (_, SafetyState::Ready) if !matches!(self.brakes, BrakesPhase::Failed { .. }) => {
+                Some(Ok(SafetyState::Ready))
+            }
+            (Question::Clear, SafetyState::Held { .. }) => Some(Ok(self.state.clone())),
+            (Question::GoOn, SafetyState::Stopped { reason }) => {
+                Some(Err(SafetyError::Stopped { reason: reason.clone() }))
+            }
+            _ => None,
+        };
+        if let Some(answer) = refusal {
+            commands.push(Command::Answer { call, answer });
+            return;
+        }
+        let is_disk_busy = matches!(self.latch, Some(LatchPhase::Writing | LatchPhase::Removing));
+        match self.brakes {
+            // Another caller has begun it.
+            BrakesPhase::Unlatching | BrakesPhase::LettingGo { .. } => {}
+            BrakesPhase::Confirmed | BrakesPhase::Failed { .. } if self.running.is_empty() && !is_disk_busy => {
+                self.release(commands);
+            }
+            _ => {
+                let answer = Err(SafetyError::NotConfirmed { state: self.state.clone() });
+                commands.push(Command::Answer { call, answer });
+                return;
+            }
+        }
+        self.calls.push((call, question));
+    }
+
+    /// The stop is removed from the disk before anything may move.
+    fn release(&mut self, commands: &mut Vec<Command>) {
+        match &mut self.latch {
+            Some(latch) if matches!(self.state, SafetyState::Stopped { .. }) => {
+                *latch = LatchPhase::Removing;
+                self.brakes = BrakesPhase::Unlatching;
+                commands.push(Command::RemoveLatch);
+            }
+            _ => self.let_go(false, commands),
+        }
+    }
+
+    fn let_go(&mut self, rested: bool, commands: &mut Vec<Command>) {
+        self.brakes = BrakesPhase::LettingGo { application: self.begin(SafetyState::Ready, commands), rested };
+    }
+
+    fn braked(&mut self, now: Instant, over: Application, result: Result<(), String>, commands: &mut Vec<Command>) {
+        self.running.remove(&over);
+        let is_last = self.running.is_empty();
+        match self.brakes {
+            BrakesPhase::Applying { application, alone, .. } if application == over => match result {
+                Ok(()) if alone => self.brakes = BrakesPhase::Confirmed,
+                Ok(()) if is_last => self.apply(now, commands),
+                Ok(()) => self.brakes = BrakesPhase::Overlapped,
+                Err(reason) => self.brakes = BrakesPhase::Failed { reason },
+            },
+            BrakesPhase::Overlapped if is_last => self.apply(now, commands),
+            BrakesPhase::Resting { application } if application == over => match result {
+                Ok(()) => self.let_go(true, commands),
+                Err(reason) => self.rest_failed(reason, commands),
+            },
+            BrakesPhase::LettingGo { application, rested } if application == over => match result {
+                Ok(()) => self.released(rested, commands),
+                Err(reason) if self.state == SafetyState::Ready => self.rest_failed(reason, commands),
+                Err(reason) => {
+                    self.answer(&Err(SafetyError::Brakes(reason)), commands, is_release);
+                    // They may have let go halfway.
+                    self.apply(now, commands);
+                    self.write_latch(commands);
+                }
+            },
+            _ => {}
+        }
+    }
+
+    fn released(&mut self, rested: bool, commands: &mut Vec<Command>) {
+        self.brakes = BrakesPhase::Confirmed;
+        if self.state != SafetyState::Ready {
+            self.state = SafetyState::Ready;
+            commands.push(Command::Show(SafetyState::Ready));
+        }
+        self.answer(&Ok(SafetyState::Ready), commands, |question| rested || *question != Question::Rest);
+        if !self.calls.is_empty() {
+            self.rest(commands);
+        }
+    }
+
+    fn rest_failed(&mut self, reason: String, commands: &mut Vec<Command>) {
+        self.answer(&Err(SafetyError::Brakes(reason.clone())), commands, |_| true);
+        self.brakes = BrakesPhase::Failed { reason };
+    }
+
+    fn unlatched(&mut self, now: Instant, result: Result<(), String>, commands: &mut Vec<Command>) {
+        // Removed and not synced it may be there again, or not.
+        self.latch = Some(LatchPhase::NotOnDisk);
+        match (&self.brakes, result) {
+            (BrakesPhase::Unlatching, Ok(())) => self.let_go(false, commands),
+            (BrakesPhase::Unlatching, Err(reason)) => {
+                self.answer(&Err(SafetyError::Latch(reason)), commands, is_release);
+                self.apply(now, commands);
+                self.write_latch(commands);
+            }
+            // A stop came meanwhile.
+            _ => self.write_latch(commands),
+        }
+    }
+
+    /// Has a stop that is in force written to the disk, unless it is there, or on its way.
+    fn write_latch(&mut self, commands: &mut Vec<Command>) {
+        let is_being_released = matches!(self.brakes, BrakesPhase::Unlatching | BrakesPhase::LettingGo { .. });
+        if let (SafetyState::Stopped { reason }, Some(latch), false) = (&self.state, &mut self.latch, is_being_released)
+            && matches!(latch, LatchPhase::NotOnDisk | LatchPhase::Failed { .. })
+        {
+            *latch = LatchPhase::Writing;
+            commands.push(Command::WriteLatch { reason: reason.clone() });
+        }
+    }
+
+    /// Answers those who wait for what is in force, as far as that is decided.
+    fn answer_those_in_force(&mut self, commands: &mut Vec<Command>) {
+        if self.state == SafetyState::Ready {
+            return;
+        }
+        let brakes = match &self.brakes {
+            BrakesPhase::Confirmed => Ok(self.state.clone()),
+            BrakesPhase::Failed { reason } => {
+                let failed = Err(SafetyError::Brakes(reason.clone()));
+                return self.answer(&failed, commands, |_| true);
+            }
+            _ => return,
+        };
+        self.answer(&brakes, commands, |question| *question == Question::Rest);
+        let latch = match &self.latch {
+            Some(latch) if matches!(self.state, SafetyState::Stopped { .. }) => match latch {
+                LatchPhase::OnDisk => Ok(()),
+                LatchPhase::Failed { reason } => Err(SafetyError::Latch(reason.clone())),
+                LatchPhase::NotOnDisk | LatchPhase::Writing | LatchPhase::Removing => return,
+            },
+            _ => Ok(()),
+        };
+        let answer = brakes.and_then(|state| latch.map(|()| state));
+        self.answer(&answer, commands, |question| !is_release(question));
+    }
+
+    fn answer(
+        &mut self,
+        answer: &Result<SafetyState, SafetyError>,
+        commands: &mut Vec<Command>,
+        of: impl Fn(&Question) -> bool,
+    ) {
+        let answered = self.calls.extract_if(.., |(_, question)| of(question));
+        commands.extend(answered.map(|(call, _)| Command::Answer { call, answer: answer.clone() }));
+    }
+}
+
+fn severity(state: &SafetyState) -> u8 {
+    match state {
+        SafetyState::Ready => 0,
+        SafetyState::Held { .. } => 1,
+        SafetyState::Stopped { .. } => 2,
+    }
+}
+
+fn is_release(question: &Question) -> bool {
+    matches!(question, Question::Clear | Question::GoOn)
+}
+
+#[cfg(test)]
+mod tests;
