@@ -105,9 +105,11 @@ impl Pair {
         Ok(addresses.join(",").parse()?)
     }
 
-    async fn leader(&self) -> anyhow::Result<usize> {
+    async fn leader(&mut self) -> anyhow::Result<usize> {
         let begin = Instant::now();
         while begin.elapsed() < PATIENCE {
+            self.revive(0)?;
+            self.revive(1)?;
             for (number, manager) in self.managers.iter().enumerate() {
                 if wait_until_serving(&manager.itself, Duration::from_millis(300)).await.is_ok() {
                     return Ok(number);
@@ -133,6 +135,14 @@ impl Pair {
             tokio::time::sleep(AGAIN).await;
         };
         ensure!(code.is_none_or(|code| status.code() == Some(code)), "it ended with {status}: {}", process.said());
+        self.run(number)
+    }
+
+    /// Starts it again where it was got past, and has ended for that.
+    fn revive(&mut self, number: usize) -> anyhow::Result<()> {
+        let process = self.managers[number].process.as_mut().context("it was started")?;
+        let Some(status) = process.child.try_wait()? else { return Ok(()) };
+        ensure!(status.code() == Some(DEPOSED), "it ended with {status}: {}", process.said());
         self.run(number)
     }
 
@@ -169,7 +179,7 @@ impl Pair {
                 self.await_end(leader, Some(DEPOSED)).await
             }
             Fault::LoseAnswersOfEtcd => {
-                // Its renewals arrive: it keeps its place, and says nothing as long as nothing is confirmed.
+                // It says nothing as long as nothing is confirmed, and keeps its place no longer than that: then the other one leads.
                 self.managers[leader].to_etcd.iter().for_each(|proxy| proxy.lose_answers(true));
                 tokio::time::sleep(Duration::from_millis(200 + random.below(1_500))).await;
                 self.managers[leader].to_etcd.iter().for_each(|proxy| proxy.lose_answers(false));
@@ -192,9 +202,16 @@ impl Pair {
         }
     }
 
-    async fn await_other(&self, than: usize) -> anyhow::Result<()> {
-        let other = &self.managers[1 - than].itself;
-        wait_until_serving(other, PATIENCE).await.with_context(|| self.said())
+    async fn await_other(&mut self, than: usize) -> anyhow::Result<()> {
+        let (begin, other) = (Instant::now(), 1 - than);
+        loop {
+            self.revive(other)?;
+            match wait_until_serving(&self.managers[other].itself, Duration::from_millis(300)).await {
+                Err(error) if begin.elapsed() >= PATIENCE => return Err(error).with_context(|| self.said()),
+                Err(_) => {}
+                Ok(()) => return Ok(()),
+            }
+        }
     }
 }
 

@@ -53,6 +53,17 @@ pub enum ReadError {
         /// What it said, or that it said nothing.
         what: String,
     },
+    /// A copy that was interrupted, or is still being made.
+    #[error(
+        "{place} holds a part of a copy: `ratn state copy` was interrupted there, or is still at work; if it is not, empty the place ({how}) \
+         and copy again"
+    )]
+    Unfinished {
+        /// In what.
+        place: String,
+        /// How it is emptied.
+        how: String,
+    },
     /// Something that belongs to the log is not there.
     #[error("{place}: {what}; the log is incomplete: put back what was removed, or restore a backup")]
     Incomplete {

@@ -3,7 +3,7 @@
 //! Nothing here speaks of files: a log may as well be kept by a service of another host.
 
 use crate::durable::Durable;
-use crate::error::{AppendError, CompactError, Fault, OpenError, ReadError};
+use crate::error::{AppendError, CompactError, CopyError, Fault, OpenError, ReadError};
 use bytes::Bytes;
 use std::fmt;
 
@@ -73,6 +73,19 @@ pub trait Store: fmt::Debug + Send + Sync {
     /// # Errors
     /// Where what is there is damaged or of a newer format, or where reading fails.
     fn read(&self) -> Result<Recovered, ReadError>;
+
+    /// Says of a log that is open and empty that it will be a part of a copy for now: until [`Store::mark_whole`] nobody opens or reads it
+    /// ([`ReadError::Unfinished`]). Durable when this returns. Blocks.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    fn mark_unfinished(&self) -> Result<(), CopyError>;
+
+    /// The copy is whole. Blocks.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    fn mark_whole(&self) -> Result<(), CopyError>;
 
     /// Where it is, for people.
     fn place(&self) -> String;

@@ -9,6 +9,8 @@ const PLACEHOLDER: &[u8] = b"";
 /// Copies a log into one that is empty. Its records get positions of their own; what they say is the same. The source's place is taken
 /// meanwhile, so that nothing is written there that the copy lacks. Holds the whole log in memory. Blocks.
 ///
+/// The target is marked as unfinished first, and the mark is removed last: of a copy that was interrupted nobody opens the part that is there.
+///
 /// # Errors
 /// Where either has a writer, the source cannot be read, the target is not empty, or writing fails: then throw the target away.
 pub fn transfer(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
@@ -34,6 +36,7 @@ fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<Positio
     if there.last() != Position(0) {
         return Err(CopyError::NotEmpty { place: to.place() });
     }
+    to.mark_unfinished()?;
     let mut durable = writer.durable();
     if let Some(snapshot) = recovered.snapshot {
         let through = writer.append(PLACEHOLDER)?;
@@ -56,5 +59,7 @@ fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<Positio
         // One at a time: what waits is bounded.
         durable.wait_blocking(position)?;
     }
-    Ok(writer.close()?)
+    let last = writer.close()?;
+    to.mark_whole()?;
+    Ok(last)
 }

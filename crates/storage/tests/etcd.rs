@@ -54,6 +54,11 @@ fn a_log_is_a_vector() {
     with_logs(tiny(), |make| promises::a_log_is_a_vector(make, 8, 60, 500));
 }
 
+#[test]
+fn a_copy_that_was_interrupted_is_not_opened() {
+    with_logs(Bounds::default(), promises::a_copy_that_was_interrupted_is_not_opened);
+}
+
 /// Waits until this holds.
 fn until(what: &str, holds: impl Fn() -> bool) {
     let begin = Instant::now();
@@ -104,6 +109,24 @@ fn a_writer_that_says_nothing_for_a_second_is_got_past_and_writes_nothing_more()
 }
 
 #[test]
+fn a_writer_that_hears_no_answers_does_not_keep_the_place() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &[]);
+    let proxy = Proxy::to(&cluster.members[0].client);
+    let deaf = store(vec![proxy.address.clone()], "/test/deaf", "first");
+    let (_, mut old) = deaf.open().unwrap();
+    append_durably(&mut *old, b"old");
+    // All that it asks goes on arriving.
+    proxy.lose_answers(true);
+    let (_, mut new) = open(&store(cluster.endpoints(), "/test/deaf", "second"));
+    append_durably(&mut *new, b"new");
+    proxy.lose_answers(false);
+    until("it does not hear that it was got past", || matches!(old.place().check(), Err(Fault::Deposed { .. })));
+}
+
+#[test]
 fn a_transaction_whose_answer_is_lost_is_there_once() {
     if !is_there() {
         return;
@@ -132,12 +155,14 @@ fn copies_of_transactions_that_arrive_late_change_nothing() {
     if !is_there() {
         return;
     }
+    const LATEST: Duration = Duration::from_millis(550);
     let cluster = Cluster::start(3, &[]);
     // Every way is slow now and then, so that most transactions are asked for once more over another way, and arrive twice.
     let proxies: Vec<Proxy> = cluster.endpoints().iter().map(|member| Proxy::to(member)).collect();
     let addresses: Vec<String> = proxies.iter().map(|proxy| proxy.address.clone()).collect();
+    let direct = store(cluster.endpoints(), "/test/late", "reader");
     let mut model: Vec<Vec<u8>> = Vec::new();
-    for round in 0..2_u8 {
+    for (round, bursts) in [(0_u8, 4), (1, 1)] {
         // Small parts: a record needs several transactions.
         let bounds = Bounds { part: 400, ..Bounds::default() };
         let options = options(addresses.clone(), "/test/late", "test");
@@ -145,24 +170,28 @@ fn copies_of_transactions_that_arrive_late_change_nothing() {
         let (recovered, mut writer) = open(&log);
         let through = recovered.snapshot.as_ref().map_or(0, |snapshot| snapshot.through.0 as usize);
         assert_eq!(payloads(&recovered.records), model[through..], "round {round}");
-        proxies.iter().for_each(|proxy| proxy.delay(Duration::from_millis(550)));
-        for number in 0..4_u8 {
-            let record = vec![round * 8 + number; 10 + 200 * usize::from(number)];
-            append_durably(&mut *writer, &record);
-            model.push(record);
-            if number == 1 {
-                writer.compact(Position(model.len() as u64), Box::new(|| vec![1; 1_000].into())).unwrap();
+        for burst in 0..bursts {
+            proxies.iter().for_each(|proxy| proxy.delay(LATEST));
+            for number in 0..4_u8 {
+                let record = vec![round * 16 + burst * 4 + number; 10 + 150 * usize::from(number)];
+                append_durably(&mut *writer, &record);
+                model.push(record);
             }
+            let state = vec![burst; 1_000];
+            writer.compact(Position(model.len() as u64 - 2), Box::new(move || state.into())).unwrap();
+            assert!(common::compacted(&*writer).compaction_failure.is_none());
+            // Every copy has arrived, and nothing was done behind them that would hide what they did.
+            std::thread::sleep(2 * LATEST);
+            let read = direct.read().unwrap();
+            let snapshot = read.snapshot.unwrap();
+            assert_eq!(snapshot.payload, vec![burst; 1_000], "round {round}, burst {burst}");
+            let rest = &model[snapshot.through.0 as usize..];
+            assert_eq!(payloads(&read.records), rest, "round {round}, burst {burst}");
         }
-        assert!(common::compacted(&*writer).compaction_failure.is_none());
         proxies.iter().for_each(|proxy| proxy.delay(Duration::ZERO));
         append_durably(&mut *writer, b"after");
         model.push(b"after".to_vec());
         writer.close().unwrap();
-        let read = log.read().unwrap();
-        let snapshot = read.snapshot.unwrap();
-        assert_eq!(snapshot.payload, vec![1; 1_000]);
-        assert_eq!(payloads(&read.records), model[snapshot.through.0 as usize..], "round {round}");
     }
 }
 

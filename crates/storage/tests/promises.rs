@@ -37,3 +37,8 @@ fn a_waiter_hears_when_the_writer_is_gone() {
 fn a_log_is_a_vector() {
     with_logs(|make| promises::a_log_is_a_vector(make, 16, 60, 60));
 }
+
+#[test]
+fn a_copy_that_was_interrupted_is_not_opened() {
+    with_logs(promises::a_copy_that_was_interrupted_is_not_opened);
+}

@@ -1,9 +1,9 @@
 //! One of several servers leads, the others stand by: a connection to them is a connection to the one that leads, and moves with it.
 //!
 //! ```text
-//!   connect ── which of them says SERVING? ──▶ connection ── it says nothing for a second, or NOT_SERVING,
-//!      ▲                                           │          and another one says SERVING
-//!      └──────────── made anew ◀── broken ─────────┘
+//!   connect ── which of them says SERVING? ──▶ connection ◀── it says SERVING again ──┐
+//!      ▲                                        │    └── it says nothing, or NOT_SERVING ──▶ in doubt: the others are asked, too
+//!      └──────────── made anew ◀── broken ──────┴───────────── another one says SERVING ◀──┘
 //! ```
 //! Only gRPC health is asked: who stands by says NOT_SERVING. Whoever uses the connection sees what it sees of any connection that breaks.
 
@@ -32,23 +32,30 @@ use tonic_health::pb::health_client::HealthClient;
 /// One of them has to lead by then: before an attempt to connect is given up ([`crate::endpoint::CONNECT_TIMEOUT`]).
 const FIND_DEADLINE: Duration = Duration::from_millis(2_800);
 /// How often a server is asked whether it still leads.
-const ASK_INTERVAL: Duration = Duration::from_millis(250);
+const ASK_INTERVAL: Duration = Duration::from_millis(200);
 /// And how soon it has to answer.
 const ANSWER_DEADLINE: Duration = Duration::from_millis(500);
-/// A server that has not said for so long that it leads is left for one that does.
-const SILENCE: Duration = Duration::from_millis(1_000);
-/// The pause between two questions of a server that does not lead; grows from the first to the second.
-const LOOK_INTERVALS: (Duration, Duration) = (Duration::from_millis(25), Duration::from_millis(200));
+/// With an answer that takes longer than this it is in doubt.
+const PATIENCE: Duration = Duration::from_millis(300);
+/// A leader that was found is connected to without being asked again for so long.
+const FOUND_FOR: Duration = Duration::from_secs(1);
+/// The pause between two questions of a server that does not lead; grows from the first to the second. Short: these are asked only while
+/// no server is known to lead.
+const LOOK_INTERVALS: (Duration, Duration) = (Duration::from_millis(25), Duration::from_millis(100));
 
 /// Connects to whichever of several servers leads.
 #[derive(Debug, Clone)]
 pub(crate) struct LeaderConnector {
     members: Arc<[Endpoint]>,
+    found: Found,
 }
+
+/// Who was found to lead when the connection before was broken for it, and when: the next connection goes there without a question.
+type Found = Arc<Mutex<Option<(Endpoint, Instant)>>>;
 
 impl LeaderConnector {
     pub(crate) fn among(members: &[Endpoint]) -> LeaderConnector {
-        LeaderConnector { members: members.into() }
+        LeaderConnector { members: members.into(), found: Found::default() }
     }
 }
 
@@ -62,8 +69,15 @@ impl Service<Uri> for LeaderConnector {
     }
 
     fn call(&mut self, _: Uri) -> Self::Future {
-        let members = self.members.clone();
+        let (members, found) = (self.members.clone(), self.found.clone());
         Box::pin(async move {
+            let hint = found.lock().unwrap_or_else(PoisonError::into_inner).take();
+            if let Some((leader, at)) = hint
+                && at.elapsed() < FOUND_FOR
+                && let Ok(stream) = open(&leader).await
+            {
+                return Ok(watched(stream, members, leader, found));
+            }
             let said = Said::default();
             let leader = tokio::time::timeout(FIND_DEADLINE, find(&members, None, &said)).await;
             let leader = leader.map_err(|_| {
@@ -76,16 +90,17 @@ impl Service<Uri> for LeaderConnector {
                 io::Error::new(io::ErrorKind::NotConnected, format!("none of these leads: {}", members.join(", ")))
             })?;
             let stream = open(&leader).await?;
-            let (broken, watched) = (CancellationToken::new(), CancellationToken::new());
-            let watch = watch(members, leader, broken.clone());
-            tokio::spawn(watched.clone().run_until_cancelled_owned(watch));
-            Ok(TokioIo::new(ToLeader {
-                stream,
-                broken: Box::pin(broken.cancelled_owned()),
-                _watched: watched.drop_guard(),
-            }))
+            Ok(watched(stream, members, leader, found))
         })
     }
+}
+
+/// The connection, which breaks when another one leads.
+fn watched(stream: Box<dyn Stream>, members: Arc<[Endpoint]>, leader: Endpoint, found: Found) -> TokioIo<ToLeader> {
+    let (broken, watched) = (CancellationToken::new(), CancellationToken::new());
+    let watch = watch(members, leader, found, broken.clone());
+    tokio::spawn(watched.clone().run_until_cancelled_owned(watch));
+    TokioIo::new(ToLeader { stream, broken: Box::pin(broken.cancelled_owned()), _watched: watched.drop_guard() })
 }
 
 /// What each server that does not lead said last.
@@ -112,25 +127,25 @@ async fn find(members: &[Endpoint], apart_from: Option<&Endpoint>, said: &Said) 
     }
 }
 
-/// Breaks a connection when its server leads no more, and another one does.
-async fn watch(members: Arc<[Endpoint]>, leader: Endpoint, broken: CancellationToken) {
+/// Breaks a connection when its server leads no more, or says nothing, and another one leads.
+async fn watch(members: Arc<[Endpoint]>, leader: Endpoint, found: Found, broken: CancellationToken) {
     let mut asked = Asked { member: &leader, client: None };
-    let mut led = Instant::now();
     loop {
         tokio::time::sleep(ASK_INTERVAL).await;
         // A connection that has to be made anew takes no longer than an answer may.
-        if let Ok(Ok(())) = tokio::time::timeout(ANSWER_DEADLINE, asked.leads()).await {
-            led = Instant::now();
-        }
-        if led.elapsed() < SILENCE {
+        if let Ok(Ok(())) = tokio::time::timeout(PATIENCE, asked.leads()).await {
             continue;
         }
-        // Asked until one of them leads: the server itself may be the next.
-        let other = tokio::time::timeout(SILENCE, find(&members, Some(&leader), &Said::default())).await;
-        if let Ok(other) = other {
-            tracing::info!(from = %leader, to = %other, "another server leads");
-            broken.cancel();
-            return;
+        // In doubt. A leader that is only slow is not left: as long as it leads no other one says that it does.
+        let said = Said::default();
+        tokio::select! {
+            () = asked.leads_again() => {}
+            other = find(&members, Some(&leader), &said) => {
+                tracing::info!(from = %leader, to = %other, "another server leads");
+                *found.lock().unwrap_or_else(PoisonError::into_inner) = Some((other, Instant::now()));
+                broken.cancel();
+                return;
+            }
         }
     }
 }
@@ -141,8 +156,22 @@ struct Asked<'a> {
 }
 
 impl Asked<'_> {
+    /// Returns when it says so.
+    async fn leads_again(&mut self) {
+        while !matches!(tokio::time::timeout(ANSWER_DEADLINE, self.leads()).await, Ok(Ok(()))) {
+            tokio::time::sleep(ASK_INTERVAL).await;
+        }
+    }
+
     /// Whether it says so; else what it says.
     async fn leads(&mut self) -> Result<(), String> {
+        let had_one = self.client.is_some();
+        let asked = self.ask().await;
+        // The connections of a standby end when it begins to lead.
+        if had_one && self.client.is_none() { self.ask().await } else { asked }
+    }
+
+    async fn ask(&mut self) -> Result<(), String> {
         let mut client = match self.client.take() {
             Some(client) => client,
             None => HealthClient::new(connect_to_ask(self.member).await.map_err(|error| chain(&error))?),

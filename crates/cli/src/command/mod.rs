@@ -5,6 +5,7 @@ mod check;
 mod control;
 mod demo;
 pub(crate) mod doctor;
+mod leader;
 mod plan;
 pub(crate) mod pool;
 mod reload;

@@ -7,6 +7,7 @@
 
 use super::wire::kv_client::KvClient;
 use super::wire::{ResponseHeader, TxnRequest, TxnResponse};
+use std::collections::BTreeSet;
 use std::fmt;
 use std::future::Future;
 use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering};
@@ -24,6 +25,10 @@ pub type Connect = Arc<dyn Fn(&str) -> Result<Channel, String> + Send + Sync>;
 const ANSWER_BYTES: usize = 512 << 20;
 /// A member that has not answered for so long is not waited for alone.
 const HEDGE: Duration = Duration::from_millis(250);
+/// With every round of all members the next one waits twice as long, up to this.
+const LONGEST_HEDGE: Duration = Duration::from_millis(500);
+/// When one that was asked has failed, the next one is asked after so long.
+const FAILED_PAUSE: Duration = Duration::from_millis(50);
 
 /// Why there is no answer.
 #[derive(Debug, Clone)]
@@ -67,31 +72,61 @@ impl fmt::Display for CallError {
 
 /// A connection to every member.
 pub(super) struct Client {
-    members: Vec<Member>,
+    members: Arc<[Member]>,
     /// Who answered last.
     current: AtomicUsize,
     /// The highest revision of etcd that was seen.
     seen: AtomicI64,
     /// The revision that was seen, and the lower one that came after it.
     went_back: OnceLock<(i64, i64)>,
-    connect: Connect,
     /// Taken when the client is dropped.
     runtime: Option<Runtime>,
 }
 
 struct Member {
     address: String,
+    connect: Connect,
     channel: Mutex<Option<Channel>>,
+}
+
+/// How long a call waits for an answer, and of how many members it is asked at the most.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Patience {
+    pub(super) answer: Duration,
+    pub(super) asks: usize,
+}
+
+impl From<Duration> for Patience {
+    fn from(answer: Duration) -> Patience {
+        Patience { answer, asks: usize::MAX }
+    }
+}
+
+impl Member {
+    /// The connection of before, or a new one. Called within the client's runtime.
+    fn channel(&self) -> Result<Channel, String> {
+        let mut channel = self.channel.lock().unwrap_or_else(PoisonError::into_inner);
+        match &*channel {
+            Some(channel) => Ok(channel.clone()),
+            None => (self.connect)(&self.address).map(|new| channel.insert(new).clone()),
+        }
+    }
+
+    /// The next call makes a new connection: on this one no answer came, and a connection that lost an answer may never give another.
+    fn forget(&self) {
+        *self.channel.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
 }
 
 impl Client {
     pub(super) fn new(addresses: &[String], connect: Connect) -> std::io::Result<Client> {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(1).thread_name("etcd").enable_all().build()?;
-        let members =
-            addresses.iter().map(|address| Member { address: address.clone(), channel: Mutex::default() }).collect();
+        let member =
+            |address: &String| Member { address: address.clone(), connect: connect.clone(), channel: Mutex::default() };
+        let members = addresses.iter().map(member).collect();
         let (current, seen) = (AtomicUsize::new(0), AtomicI64::new(0));
-        Ok(Client { members, current, seen, went_back: OnceLock::new(), connect, runtime: Some(runtime) })
+        Ok(Client { members, current, seen, went_back: OnceLock::new(), runtime: Some(runtime) })
     }
 
     /// The cluster, for messages.
@@ -101,12 +136,12 @@ impl Client {
     }
 
     /// Performs a transaction, or says that nobody answered in time. Blocks.
-    pub(super) fn attempt(&self, request: TxnRequest, patience: Duration) -> Result<TxnResponse, CallError> {
+    pub(super) fn attempt(&self, request: TxnRequest, patience: impl Into<Patience>) -> Result<TxnResponse, CallError> {
         if let Some(error) = self.went_back() {
             return Err(error);
         }
         let known = self.seen.load(Ordering::SeqCst);
-        let answer = self.ask(request, patience)?;
+        let answer = self.ask(request, patience.into())?;
         let found = answer.header.as_ref().map_or(0, |header| header.revision);
         if found < known {
             let error = CallError::WentBack { known, found };
@@ -141,18 +176,13 @@ impl Client {
         }
     }
 
-    fn ask(&self, request: TxnRequest, patience: Duration) -> Result<TxnResponse, CallError> {
+    fn ask(&self, request: TxnRequest, patience: Patience) -> Result<TxnResponse, CallError> {
         let unknown = |what: String| Err(CallError::Unknown(what));
         let (Some(runtime), true) = (&self.runtime, !self.members.is_empty()) else {
             return unknown("no address of a member is given".to_owned());
         };
         let first = self.current.load(Ordering::SeqCst);
-        let order: Vec<usize> = (0..self.members.len()).map(|k| (first + k) % self.members.len()).collect();
-        let channels: Vec<(usize, String, Result<Channel, String>)> = {
-            let _within = runtime.enter();
-            order.into_iter().map(|index| (index, self.members[index].address.clone(), self.channel(index))).collect()
-        };
-        match blocking(runtime, hedged(channels, request, patience)) {
+        match blocking(runtime, hedged(self.members.clone(), first, request, patience)) {
             Some((by, answered)) => {
                 if let Some(by) = by {
                     self.current.store(by, Ordering::SeqCst);
@@ -162,61 +192,75 @@ impl Client {
             None => unknown("the client is ending".to_owned()),
         }
     }
-
-    fn channel(&self, index: usize) -> Result<Channel, String> {
-        let member = &self.members[index];
-        let mut channel = member.channel.lock().unwrap_or_else(PoisonError::into_inner);
-        match &*channel {
-            Some(channel) => Ok(channel.clone()),
-            None => (self.connect)(&member.address).map(|new| channel.insert(new).clone()),
-        }
-    }
 }
 
 /// Asks one after the other, round and round, each beside those that have not answered yet, and says who answered. A member whose own
 /// leader has just died may hold a transaction for seconds, and perform the next one at once.
 async fn hedged(
-    members: Vec<(usize, String, Result<Channel, String>)>,
+    members: Arc<[Member]>,
+    first: usize,
     request: TxnRequest,
-    patience: Duration,
+    patience: Patience,
 ) -> (Option<usize>, Result<TxnResponse, CallError>) {
-    let deadline = tokio::time::Instant::now() + patience;
-    let mut last = format!("nobody answered within {} ms", patience.as_millis());
-    let (mut asked, mut pause) = (JoinSet::new(), HEDGE);
-    for (number, (index, address, channel)) in members.iter().cycle().enumerate() {
-        match channel {
-            Ok(channel) => {
-                let (index, address, request) = (*index, address.clone(), request.clone());
-                let kv = KvClient::new(channel.clone());
-                let mut kv = kv.max_decoding_message_size(ANSWER_BYTES).max_encoding_message_size(ANSWER_BYTES);
-                asked.spawn(async move {
-                    let answered = kv.txn(request).await;
-                    (index, answered.map(tonic::Response::into_inner).map_err(|status| classify(&status, &address)))
-                });
+    let deadline = Instant::now() + patience.answer;
+    let mut last = format!("nobody answered within {} ms", patience.answer.as_millis());
+    let mut asked = JoinSet::new();
+    // Who was asked and has not answered.
+    let mut silent = BTreeSet::new();
+    let mut pause = HEDGE;
+    for number in 0.. {
+        let index = (first + number) % members.len();
+        if number < patience.asks {
+            if silent.contains(&index) {
+                members[index].forget();
             }
-            Err(what) => last = format!("{address}: {what}"),
+            match members[index].channel() {
+                Ok(channel) => {
+                    silent.insert(index);
+                    asked.spawn(ask_one(index, members[index].address.clone(), channel, request.clone()));
+                }
+                Err(what) => last = format!("{}: {what}", members[index].address),
+            }
         }
         if (number + 1) % members.len() == 0 {
-            pause *= 2;
+            pause = (2 * pause).min(LONGEST_HEDGE);
         }
-        // Until the next one is asked, too; at once where all that were asked have failed for the first time.
-        let until = deadline.min(tokio::time::Instant::now() + pause);
+        // Until the next one is asked, too; sooner where one that was asked has failed.
+        let mut until = deadline.min(Instant::now() + pause);
         while !asked.is_empty() {
-            match tokio::time::timeout_at(until, asked.join_next()).await {
-                Ok(Some(Ok((_, Err(CallError::Unknown(what)))))) => last = what,
+            match tokio::time::timeout_at(until.into(), asked.join_next()).await {
+                Ok(Some(Ok((index, Err(CallError::Unknown(what)))))) => {
+                    last = what;
+                    silent.remove(&index);
+                    let failed_pause = if number < members.len() { Duration::ZERO } else { FAILED_PAUSE };
+                    until = until.min(Instant::now() + failed_pause);
+                }
                 Ok(Some(Ok((index, answered)))) => return (Some(index), answered),
                 Ok(_) => {}
                 Err(_) => break,
             }
         }
         if asked.is_empty() && number >= members.len() {
-            tokio::time::sleep_until(until).await;
+            tokio::time::sleep_until(until.into()).await;
         }
-        if tokio::time::Instant::now() >= deadline {
+        if Instant::now() >= deadline || (asked.is_empty() && number + 1 >= patience.asks) {
             break;
         }
     }
+    silent.into_iter().for_each(|index| members[index].forget());
     (None, Err(CallError::Unknown(last)))
+}
+
+async fn ask_one(
+    index: usize,
+    address: String,
+    channel: Channel,
+    request: TxnRequest,
+) -> (usize, Result<TxnResponse, CallError>) {
+    let kv = KvClient::new(channel);
+    let mut kv = kv.max_decoding_message_size(ANSWER_BYTES).max_encoding_message_size(ANSWER_BYTES);
+    let answered = kv.txn(request).await;
+    (index, answered.map(tonic::Response::into_inner).map_err(|status| classify(&status, &address)))
 }
 
 /// Before a call is tried again, doubled every time up to [`LONGEST_PAUSE`].

@@ -1,4 +1,8 @@
 //! Reads a log: the snapshot that counts, and the frames behind it up to the head.
+//!
+//! Who stands by reads along ([`Known`]), so that who takes the place reads only what was written last. Records up to the head never
+//! change; whether they are still the same ones is seen by when the last of them was written. Where a snapshot has taken their place,
+//! everything is read anew.
 
 use super::client::{CallError, Client};
 use super::format::{Current, Frame, damaged, parse};
@@ -31,25 +35,97 @@ pub(super) struct Contents {
     pub(super) head: i64,
 }
 
-/// Everything as it was at a revision; at 0, as it is.
-pub(super) fn read(client: &Client, keys: &Keys, seen: &Seen, revision: i64) -> Result<Contents, ReadError> {
-    let epoch = Epoch(seen.leader.as_ref().map_or(0, |(_, leader)| leader.epoch));
-    let (head_revision, head) = seen.head.map_or((0, Position(0)), |(at, head)| (at, Position(head.position)));
-    let Some(meta) = &seen.meta else {
-        return Ok(Contents { recovered: Recovered { epoch, ..Recovered::default() }, frames: Vec::new(), head: 0 });
-    };
-    let snapshot = read_snapshot(client, keys, revision)?;
-    let mut last = snapshot.as_ref().map_or(Position(0), |snapshot| snapshot.through);
-    let mut reading = Reading { last, records: Vec::new(), frames: Vec::new(), frame: None };
-    let span = (keys.frames_from(Position(0)).0, keys.frames(Position(0), head.next()).1);
-    pages(client, span, revision, |kv| reading.add(meta.store, kv))?;
-    last = last.max(reading.last);
-    if reading.frame.is_some() || last < head {
-        let what = format!("its head is record {head}, and {last} is the last that is there");
-        return Err(ReadError::Incomplete { place: keys.prefix().to_owned(), what });
+/// What was read of a log at one time, to be read on from.
+#[derive(Debug)]
+pub(super) struct Known {
+    store: u64,
+    cluster: u64,
+    /// The revision of `head`, and the record that it says.
+    head: (i64, Position),
+    snapshot: Option<Snapshot>,
+    records: Vec<Record>,
+    frames: Vec<(Position, Position)>,
+    /// When the last frame was written: the revision of its first part.
+    written: i64,
+}
+
+impl Known {
+    fn through(&self) -> Option<u64> {
+        self.snapshot.as_ref().map(|snapshot| snapshot.through.0)
     }
-    let Reading { records, frames, .. } = reading;
-    Ok(Contents { recovered: Recovered { epoch, snapshot, records, torn: None }, frames, head: head_revision })
+
+    /// Whether nothing was written since.
+    fn is_all(&self, seen: &Seen) -> bool {
+        self.is_of(seen) && seen.head.is_some_and(|(at, head)| (at, Position(head.position)) == self.head)
+    }
+
+    fn is_of(&self, seen: &Seen) -> bool {
+        let same_log = seen.meta.as_ref().is_some_and(|meta| meta.store == self.store);
+        let grown = seen.head.is_some_and(|(at, head)| (at, Position(head.position)) >= self.head);
+        same_log && grown && seen.cluster == self.cluster && seen.through == self.through()
+    }
+}
+
+impl Contents {
+    /// What is known, in the epoch of who leads.
+    pub(super) fn of(known: Option<Known>, seen: &Seen) -> Contents {
+        let epoch = Epoch(seen.leader.as_ref().map_or(0, |(_, leader)| leader.epoch));
+        match known {
+            Some(Known { head, snapshot, records, frames, .. }) => {
+                Contents { recovered: Recovered { epoch, snapshot, records, torn: None }, frames, head: head.0 }
+            }
+            None => Contents { recovered: Recovered { epoch, ..Recovered::default() }, frames: Vec::new(), head: 0 },
+        }
+    }
+}
+
+/// Everything as it was at a revision; at 0, as it is. Nothing where there is no log.
+pub(super) fn read(
+    client: &Client,
+    keys: &Keys,
+    seen: &Seen,
+    revision: i64,
+    known: Option<Known>,
+) -> Result<Option<Known>, ReadError> {
+    let Some(meta) = &seen.meta else { return Ok(None) };
+    let known = known.filter(|known| revision == 0 && known.is_of(seen));
+    if known.as_ref().is_some_and(|known| known.is_all(seen)) {
+        return Ok(known);
+    }
+    if let Some(known) = known
+        && let Some(read) = read_on(client, keys, seen, known)?
+    {
+        return Ok(Some(read));
+    }
+    let snapshot = read_snapshot(client, keys, revision)?;
+    let last = snapshot.as_ref().map_or(Position(0), |snapshot| snapshot.through);
+    let head = seen.head.map_or((0, Position(0)), |(at, head)| (at, Position(head.position)));
+    let mut reading = Reading { last, records: Vec::new(), frames: Vec::new(), frame: None, written: 0 };
+    let span = (keys.frames_from(Position(0)).0, keys.frames(Position(0), head.1.next()).1);
+    pages(client, span, revision, |kv| reading.add(meta.store, kv))?;
+    let Reading { records, frames, written, .. } = reading.whole(keys, head.1)?;
+    Ok(Some(Known { store: meta.store, cluster: seen.cluster, head, snapshot, records, frames, written }))
+}
+
+/// What was written since. Nothing where what was known is not what is there.
+fn read_on(client: &Client, keys: &Keys, seen: &Seen, known: Known) -> Result<Option<Known>, ReadError> {
+    let (Some((at, head)), Some(&(first, last))) = (seen.head, known.frames.last()) else { return Ok(None) };
+    let head = (at, Position(head.position));
+    let (begin, behind) = (keys.frame(first, 0), keys.frames_from(last.next()).0);
+    let span = (begin.clone(), keys.frames(Position(0), head.1.next()).1);
+    let Known { store, cluster, snapshot, records, frames, written, .. } = known;
+    let mut reading = Reading { last, records, frames, frame: None, written };
+    let mut is_the_same = false;
+    pages(client, span, 0, |kv| {
+        is_the_same |= kv.key == begin && kv.mod_revision == written;
+        // The parts of the last frame that is known come once more.
+        if kv.key < behind || !is_the_same { Ok(()) } else { reading.add(store, kv) }
+    })?;
+    if !is_the_same {
+        return Ok(None);
+    }
+    let Reading { records, frames, written, .. } = reading.whole(keys, head.1)?;
+    Ok(Some(Known { store, cluster, head, snapshot, records, frames, written }))
 }
 
 struct Reading {
@@ -57,6 +133,8 @@ struct Reading {
     records: Vec<Record>,
     frames: Vec<(Position, Position)>,
     frame: Option<Frame>,
+    /// When the first part of the newest frame was written.
+    written: i64,
 }
 
 impl Reading {
@@ -64,7 +142,10 @@ impl Reading {
         let key = kv.key.clone();
         match &mut self.frame {
             Some(frame) => frame.add(&kv.value),
-            None => self.frame = Some(Frame::begin(kv.key, store, kv.value)?),
+            None => {
+                self.written = kv.mod_revision;
+                self.frame = Some(Frame::begin(kv.key, store, kv.value)?);
+            }
         }
         let Some(frame) = self.frame.take_if(|frame| frame.is_whole()) else { return Ok(()) };
         let first = frame.first();
@@ -78,6 +159,15 @@ impl Reading {
         self.records.extend(records.into_iter().filter(|record| record.position > self.last));
         self.last = self.last.max(end);
         Ok(())
+    }
+
+    /// With everything up to the head.
+    fn whole(self, keys: &Keys, head: Position) -> Result<Reading, ReadError> {
+        if self.frame.is_some() || self.last < head {
+            let what = format!("its head is record {head}, and {} is the last that is there", self.last);
+            return Err(ReadError::Incomplete { place: keys.prefix().to_owned(), what });
+        }
+        Ok(self)
     }
 }
 

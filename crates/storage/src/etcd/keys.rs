@@ -6,6 +6,7 @@
 //!   PREFIX/alive                      written again and again by who leads
 //!   PREFIX/head                       the last record that counts
 //!   PREFIX/step                       how often a snapshot, or what it replaces, was changed
+//!   PREFIX/unfinished                 as long as not all of a copy is there
 //!   PREFIX/log/POSITION/PART          a frame of records, by the first of them
 //!   PREFIX/snapshot/current           which snapshot counts
 //!   PREFIX/snapshot/THROUGH/PART      a snapshot
@@ -55,6 +56,10 @@ impl Keys {
 
     pub(super) fn step(&self) -> Bytes {
         self.key("step")
+    }
+
+    pub(super) fn unfinished(&self) -> Bytes {
+        self.key("unfinished")
     }
 
     pub(super) fn current(&self) -> Bytes {

@@ -31,19 +31,20 @@ pub use client::Connect;
 pub use format::Holder;
 pub use writer::Bounds;
 
-use crate::error::{Fault, OpenError, ReadError};
+use crate::error::{CopyError, Fault, OpenError, ReadError};
 use crate::store::{Position, Recovered, Store, Writer};
 use chain::Chain;
 use client::Client;
-use contents::Contents;
+use contents::{Contents, Known};
 use format::{Head, Step, text};
-use keys::{Keys, delete_span};
+use keys::{Keys, delete, delete_span, put, written_at};
 use mark::{Height, Mark};
 use std::fmt;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
-use term::{Seen, Silence, Term};
+use term::{Seen, Silence, Term, unreadable};
+use wire::TxnRequest;
 use writer::{EtcdWriter, Renewing, Shared};
 
 /// Where a log in etcd is, and who opens it.
@@ -72,7 +73,34 @@ pub struct Etcd {
     keys: Keys,
     client: Arc<Client>,
     mark: Mark,
-    silence: Mutex<Option<Silence>>,
+    standby: Mutex<Standby>,
+}
+
+/// What is known while somebody else has the place.
+#[derive(Debug, Default)]
+struct Standby {
+    silence: Option<Silence>,
+    /// As much of the log as was read.
+    known: Option<Known>,
+    /// When it could not be read.
+    failed: Option<Instant>,
+}
+
+impl Standby {
+    /// Reads on, so that little is left to be read when the place is taken.
+    fn follow(known: &mut Option<Known>, failed: &mut Option<Instant>, client: &Client, keys: &Keys, seen: &Seen) {
+        if failed.is_some_and(|at| at.elapsed() < FOLLOW_AGAIN) {
+            return;
+        }
+        match contents::read(client, keys, seen, 0, known.take()) {
+            Ok(read) => (*known, *failed) = (read, None),
+            Err(error) => {
+                // Read in the middle of a compaction, for one.
+                tracing::debug!(%error, "the log is not followed for now");
+                *failed = Some(Instant::now());
+            }
+        }
+    }
 }
 
 impl Etcd {
@@ -101,7 +129,7 @@ impl Etcd {
         })?;
         let keys = Keys::new(&options.prefix);
         let mark = Mark::new(options.mark.clone());
-        Ok(Etcd { options, keys, client: Arc::new(client), mark, silence: Mutex::default() })
+        Ok(Etcd { options, keys, client: Arc::new(client), mark, standby: Mutex::default() })
     }
 
     /// Who has the writer's place, as etcd says; it may have left without a word. Blocks.
@@ -115,9 +143,10 @@ impl Etcd {
 
 impl Etcd {
     /// Reads what is there, and throws away what predecessors had begun and nobody was told of.
-    fn begin(&self, term: &Arc<Term>) -> Result<(Recovered, Shared, Chain), OpenError> {
+    fn begin(&self, term: &Arc<Term>, known: Option<Known>) -> Result<(Recovered, Shared, Chain), OpenError> {
         let seen = Seen::look(&self.client, &self.keys)?;
-        let Contents { recovered, frames, head } = contents::read(&self.client, &self.keys, &seen, 0)?;
+        let known = contents::read(&self.client, &self.keys, &seen, 0, known)?;
+        let Contents { recovered, frames, head } = Contents::of(known, &seen);
         let last = recovered.last();
         let compacted = recovered.snapshot.as_ref().map_or(Position(0), |snapshot| snapshot.through);
         let until = Instant::now() + REACH;
@@ -140,6 +169,12 @@ impl Etcd {
         Ok((recovered, shared, chain))
     }
 
+    fn write_mark(&self, request: &TxnRequest) -> Result<(), CopyError> {
+        let answer = self.client.repeat(request, term::PATIENCE, Instant::now() + REACH);
+        let answer = answer.map_err(|error| unreadable(&self.client, &error))?;
+        if answer.succeeded { Ok(()) } else { Err(self.held("somebody who took it just now").into()) }
+    }
+
     fn held(&self, holder: &str) -> OpenError {
         OpenError::Held { place: self.keys.prefix().to_owned(), holder: holder.to_owned() }
     }
@@ -151,8 +186,16 @@ impl Etcd {
 
 impl Store for Etcd {
     fn open(&self) -> Result<(Recovered, Box<dyn Writer>), OpenError> {
-        let mut silence = self.silence.lock().unwrap_or_else(PoisonError::into_inner);
-        let vacant = term::await_vacancy(&self.client, &self.keys, &mut silence, &self.mark)?;
+        let mut standby = self.standby.lock().unwrap_or_else(PoisonError::into_inner);
+        let Standby { silence, known, failed } = &mut *standby;
+        // Who only asks once whether there is a writer reads nothing.
+        let stands_by = silence.is_some();
+        let vacant = term::await_vacancy(&self.client, &self.keys, silence, &self.mark, |seen| {
+            if stands_by {
+                Standby::follow(known, failed, &self.client, &self.keys, seen);
+            }
+        })?;
+        let vacant = vacant.whole(&self.keys)?;
         if self.mark.is_above(Height::of(&vacant)) && !self.options.accept_restored {
             return Err(OpenError::Restored { place: self.keys.prefix().to_owned() });
         }
@@ -164,7 +207,7 @@ impl Store for Etcd {
         let term = Arc::new(taken?);
         // From now on: what is there may take longer to read than the place waits.
         let renewing = Renewing::start(term.clone(), self.mark.clone()).map_err(|error| self.system(error))?;
-        let begun = self.begin(&term).map_err(|error| match term.renew() {
+        let begun = self.begin(&term, known.take()).map_err(|error| match term.renew() {
             // What was read in the middle of another one's changes means nothing.
             Err(Fault::Deposed { .. }) => self.held("somebody who took it just now"),
             _ => error,
@@ -177,13 +220,26 @@ impl Store for Etcd {
     fn read(&self) -> Result<Recovered, ReadError> {
         let mut attempt = 1;
         loop {
-            let seen = Seen::look(&self.client, &self.keys)?;
-            match contents::read(&self.client, &self.keys, &seen, seen.revision) {
+            let seen = Seen::look(&self.client, &self.keys)?.whole(&self.keys)?;
+            match contents::read(&self.client, &self.keys, &seen, seen.revision, None) {
                 // etcd may compact that revision away while it is read.
                 Err(ReadError::Remote { .. }) if attempt < READ_ATTEMPTS => attempt += 1,
-                read => return Ok(read?.recovered),
+                read => return Ok(Contents::of(read?, &seen).recovered),
             }
         }
+    }
+
+    fn mark_unfinished(&self) -> Result<(), CopyError> {
+        let seen = Seen::look(&self.client, &self.keys)?;
+        let leader = written_at(self.keys.leader(), seen.revision_of_leader());
+        // A copy of it that arrives when the place was given up does nothing.
+        let success = vec![put(self.keys.unfinished(), "a copy is being made")];
+        self.write_mark(&TxnRequest { compare: vec![leader], success, failure: Vec::new() })
+    }
+
+    fn mark_whole(&self) -> Result<(), CopyError> {
+        let success = vec![delete(self.keys.unfinished())];
+        self.write_mark(&TxnRequest { success, ..TxnRequest::default() })
     }
 
     fn place(&self) -> String {
@@ -193,6 +249,8 @@ impl Store for Etcd {
 
 /// How often a whole log is read at one revision of etcd before it is given up.
 const READ_ATTEMPTS: u32 = 3;
+/// A standby that could not read the log tries it again after so long.
+const FOLLOW_AGAIN: std::time::Duration = std::time::Duration::from_secs(1);
 /// Attempts of what is done once, when the log is opened.
 const REACH: std::time::Duration = std::time::Duration::from_secs(10);
 

@@ -9,9 +9,12 @@
 //! decides when somebody else may take it. Who takes it compares `alive`, too: so the last confirmation of its predecessor was asked for
 //! before the silence began. (While etcd has no space `alive` cannot be written, and the holder confirms itself by reading; nobody can take
 //! the place then either.)
+//!
+//! A holder that hears no answers may say nothing, so it must not keep the place either: it writes `alive` once, to two members at the most,
+//! and from then on only looks, until a look is answered.
 
-use super::client::{CallError, Client, cluster_of};
-use super::format::{Head, Holder, Leader, Meta, VERSION, parse, text};
+use super::client::{CallError, Client, Patience, cluster_of};
+use super::format::{Current, Head, Holder, Leader, Meta, VERSION, parse, text};
 use super::keys::{Keys, delete, found_one, get, look, put, written_at};
 use super::mark::{Height, Mark};
 use super::wire::{Compare, KeyValue, RequestOp, TxnRequest, TxnResponse};
@@ -30,6 +33,8 @@ const SILENCE: Duration = Duration::from_millis(1_050);
 const LONGEST_LOOK_PAUSE: Duration = Duration::from_millis(500);
 /// How often somebody looks who wants the place.
 const LOOK_INTERVAL: Duration = Duration::from_millis(50);
+/// A renewal is asked of so many members: one more would arrive when the first has been without an answer for too long.
+const RENEWAL_ASKS: usize = 2;
 /// A small transaction that takes longer comes too late.
 pub(super) const PATIENCE: Duration = Duration::from_millis(900);
 /// After so long without an answer of any member there is no etcd.
@@ -45,8 +50,12 @@ pub(super) struct Seen {
     pub(super) step: i64,
     /// When `alive` was written.
     alive: i64,
+    /// What the snapshot that counts stands for.
+    pub(super) through: Option<u64>,
+    /// It is a part of a copy.
+    unfinished: bool,
     /// etcd's number of its cluster.
-    cluster: u64,
+    pub(super) cluster: u64,
     /// etcd's revision.
     pub(super) revision: i64,
 }
@@ -71,11 +80,15 @@ pub(super) struct Term {
     leader: i64,
     draw: u64,
     lost: AtomicBool,
+    /// The last renewal was not answered.
+    unheard: AtomicBool,
 }
 
 impl Seen {
     pub(super) fn look(client: &Client, keys: &Keys) -> Result<Seen, ReadError> {
-        let request = look([keys.meta(), keys.leader(), keys.head(), keys.alive(), keys.step()].map(get).into());
+        let small =
+            [keys.meta(), keys.leader(), keys.head(), keys.alive(), keys.step(), keys.current(), keys.unfinished()];
+        let request = look(small.map(get).into());
         let answer = client.repeat(&request, PATIENCE, Instant::now() + REACH);
         let answer = answer.map_err(|error| unreadable(client, &error))?;
         Seen::of(keys, answer)
@@ -90,18 +103,33 @@ impl Seen {
         let leader = with_revision(next(), &keys.leader())?;
         let head = with_revision(next(), &keys.head())?;
         let [alive, step] = [(); 2].map(|()| next().map_or(0, |kv| kv.mod_revision));
+        let current: Option<Current> = next().map(|kv| parse(&keys.current(), &kv.value)).transpose()?;
+        let through = current.map(|current| current.through);
+        let unfinished = next().is_some();
         if let Some(newer) = meta.as_ref().filter(|meta| meta.version > VERSION) {
             let place = keys.prefix().to_owned();
             return Err(ReadError::Newer { place, found: newer.version, supported: VERSION });
         }
-        Ok(Seen { meta, leader, head, step, alive, cluster, revision })
+        Ok(Seen { meta, leader, head, step, alive, through, unfinished, cluster, revision })
+    }
+
+    /// Refuses a part of a copy.
+    pub(super) fn whole(self, keys: &Keys) -> Result<Seen, ReadError> {
+        let prefix = keys.prefix();
+        match self.unfinished {
+            true => {
+                let how = format!("etcdctl del --prefix {prefix}/");
+                Err(ReadError::Unfinished { place: format!("{prefix} in etcd"), how })
+            }
+            false => Ok(self),
+        }
     }
 
     fn holder(&self) -> Option<&Holder> {
         self.leader.as_ref().and_then(|(_, leader)| leader.holder.as_ref())
     }
 
-    fn revision_of_leader(&self) -> i64 {
+    pub(super) fn revision_of_leader(&self) -> i64 {
         self.leader.as_ref().map_or(0, |(revision, _)| *revision)
     }
 }
@@ -113,12 +141,13 @@ fn with_revision<T: serde::de::DeserializeOwned>(
     kv.map(|kv| parse(key, &kv.value).map(|value| (kv.mod_revision, value))).transpose()
 }
 
-/// Looks until the place can be taken, or somebody who has it says something.
+/// Looks until the place can be taken, or somebody who has it says something: then `held` is told of it.
 pub(super) fn await_vacancy(
     client: &Client,
     keys: &Keys,
     silence: &mut Option<Silence>,
     mark: &Mark,
+    held: impl FnOnce(&Seen),
 ) -> Result<Seen, OpenError> {
     loop {
         let seen = Seen::look(client, keys)?;
@@ -139,6 +168,7 @@ pub(super) fn await_vacancy(
                 if let Some(height) = Height::of(&seen).filter(|height| !mark.is_above(Some(*height))) {
                     mark.keep(height);
                 }
+                held(&seen);
                 return Err(OpenError::Held { place: keys.prefix().to_owned(), holder });
             }
             None => *silence = Some(Silence { leader, alive, since: now, looked: now }),
@@ -201,6 +231,7 @@ pub(super) fn take(
         leader: revision,
         draw: leader.draw,
         lost: AtomicBool::new(false),
+        unheard: AtomicBool::new(false),
     })
 }
 
@@ -208,7 +239,8 @@ impl Term {
     /// Held since a revision, for tests of what it guards.
     #[cfg(test)]
     pub(super) fn since(client: Arc<Client>, keys: Keys, leader: i64) -> Term {
-        Term { client, keys, epoch: Epoch(1), store: 1, leader, draw: 1, lost: AtomicBool::new(false) }
+        let (lost, unheard) = (AtomicBool::new(false), AtomicBool::new(false));
+        Term { client, keys, epoch: Epoch(1), store: 1, leader, draw: 1, lost, unheard }
     }
 
     /// Holds as long as the place is held.
@@ -236,12 +268,26 @@ impl Term {
         if self.lost.load(Ordering::SeqCst) {
             return Err(self.deposed());
         }
+        if self.unheard.load(Ordering::SeqCst) {
+            self.look()?;
+        }
         let alive = self.guarded(vec![put(self.keys.alive(), text(&self.epoch.0))]);
-        let answer = match self.client.attempt(alive, PATIENCE) {
+        let renewed = match self.client.attempt(alive, Patience { answer: PATIENCE, asks: RENEWAL_ASKS }) {
             // It cannot be said, but it can be seen; nor can anybody take the place meanwhile.
-            Err(CallError::NoSpace) => self.client.attempt(self.guarded(vec![get(self.keys.leader())]), PATIENCE),
-            answer => answer,
+            Err(CallError::NoSpace) => self.look(),
+            answer => self.held(answer),
         };
+        self.unheard.store(matches!(renewed, Err(Fault::Remote { .. })), Ordering::SeqCst);
+        renewed
+    }
+
+    /// Whether the place is still held. It does not keep it.
+    fn look(&self) -> Result<(), Fault> {
+        self.held(self.client.attempt(self.guarded(vec![get(self.keys.leader())]), PATIENCE))
+    }
+
+    /// What the answer to something guarded says.
+    fn held(&self, answer: Result<TxnResponse, CallError>) -> Result<(), Fault> {
         match answer {
             Ok(answer) if answer.succeeded => Ok(()),
             Ok(_) => Err(self.deposed()),

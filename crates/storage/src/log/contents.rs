@@ -73,6 +73,10 @@ fn read_once(directory: &Path) -> Result<Contents, ReadError> {
         place: directory.display().to_string(),
         source,
     })?;
+    if directory.join(directory::UNFINISHED_COPY).exists() {
+        let place = directory.display().to_string();
+        return Err(ReadError::Unfinished { how: format!("rm -r {place}"), place });
+    }
     let mut contents = Contents::default();
     if let Some(&through) = listing.snapshots.last() {
         let path = directory::snapshot(directory, through);

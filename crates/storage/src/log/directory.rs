@@ -4,6 +4,7 @@
 //!   writer.lock                         whose inode is locked by the writer
 //!   segment-00000000000000000001.log    by number
 //!   snapshot-00000000000000004711.snap  by the last position it stands for
+//!   unfinished-copy                     as long as not all of a copy is there
 //!   *.tmp                               not finished; the next writer removes it
 //! ```
 
@@ -12,6 +13,7 @@ use std::path::{Path, PathBuf};
 use std::{fs, io};
 
 pub(super) const LOCK: &str = "writer.lock";
+pub(super) const UNFINISHED_COPY: &str = "unfinished-copy";
 const TEMPORARY: &str = "tmp";
 
 /// What is there, in order.

@@ -194,7 +194,8 @@ impl Proxy {
         self.loses.answers.store(lose, Ordering::SeqCst);
     }
 
-    /// What is asked arrives up to so much later, now sooner and now later; what is answered, at once.
+    /// What is asked arrives up to so much later, now sooner and now later, also where nobody waits for its answer any more; what is
+    /// answered, at once.
     pub(crate) fn delay(&self, most: Duration) {
         self.loses.delay_ms.store(most.as_millis() as u64, Ordering::SeqCst);
     }
@@ -205,12 +206,68 @@ impl Proxy {
     }
 }
 
+/// What a client asks over HTTP/2 (RFC 9113, section 4), to leave out that it wants an answer no more: a copy of a request that is late on its
+/// way is performed all the same.
+#[derive(Default)]
+struct Asked {
+    preface: usize,
+    header: Vec<u8>,
+    /// What is still to come of a frame, and whether it is left out.
+    payload: usize,
+    left_out: bool,
+}
+
+impl Asked {
+    const PREFACE: usize = 24;
+    const HEADER: usize = 9;
+    const RST_STREAM: u8 = 3;
+
+    fn pass(&mut self, bytes: Vec<u8>, without_cancels: bool) -> Vec<u8> {
+        let (mut rest, mut kept) = (&bytes[..], Vec::with_capacity(bytes.len()));
+        while !rest.is_empty() {
+            let count = if self.preface < Asked::PREFACE {
+                let count = rest.len().min(Asked::PREFACE - self.preface);
+                self.preface += count;
+                kept.extend_from_slice(&rest[..count]);
+                count
+            } else if self.payload > 0 {
+                let count = rest.len().min(self.payload);
+                self.payload -= count;
+                if !self.left_out {
+                    kept.extend_from_slice(&rest[..count]);
+                }
+                count
+            } else {
+                let count = rest.len().min(Asked::HEADER - self.header.len());
+                self.header.extend_from_slice(&rest[..count]);
+                if self.header.len() == Asked::HEADER {
+                    let length = [0, self.header[0], self.header[1], self.header[2]];
+                    self.payload = u32::from_be_bytes(length) as usize;
+                    self.left_out = without_cancels && self.header[3] == Asked::RST_STREAM;
+                    if !self.left_out {
+                        kept.extend_from_slice(&self.header);
+                    }
+                    self.header.clear();
+                }
+                count
+            };
+            rest = &rest[count..];
+        }
+        kept
+    }
+}
+
 /// A connection that has lost bytes is broken as soon as it would pass some on again.
 fn pass(mut from: TcpStream, mut to: TcpStream, loses: Arc<Loses>, answers: bool) {
     thread::spawn(move || {
         let (mut bytes, mut has_lost, mut passed) = ([0; 16_384], false, 1_u64);
+        let mut asked = Asked::default();
         while let Ok(count @ 1..) = from.read(&mut bytes) {
             let most = loses.delay_ms.load(Ordering::SeqCst);
+            let mut kept = bytes[..count].to_vec();
+            if !answers {
+                kept = asked.pass(kept, most > 0);
+            }
             if most > 0 && !answers {
                 passed = (passed * 7_919 + 104_729) % 1_000_003;
                 thread::sleep(Duration::from_millis(passed % most));
@@ -222,7 +279,7 @@ fn pass(mut from: TcpStream, mut to: TcpStream, loses: Arc<Loses>, answers: bool
                 has_lost = true;
                 continue;
             }
-            if has_lost || to.write_all(&bytes[..count]).is_err() {
+            if has_lost || to.write_all(&kept).is_err() {
                 break;
             }
         }

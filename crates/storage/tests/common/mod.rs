@@ -3,6 +3,7 @@
 
 pub(crate) mod cluster;
 pub(crate) mod etcd;
+pub(crate) mod interrupted;
 pub(crate) mod promises;
 
 use ratn_storage::{Log, Options, Position, Progress, Record, Store, Writer};

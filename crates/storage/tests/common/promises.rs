@@ -1,10 +1,11 @@
 //! What [`Store`] and [`Writer`] promise, for every log there is: each function is a test, given how to make a log.
 
+use super::interrupted::Interrupted;
 use super::{append_durably, compacted, payloads};
 use bytes::Bytes;
 use proptest::prelude::*;
 use proptest::test_runner::{RngAlgorithm, TestRng, TestRunner};
-use ratn_storage::{OpenError, Position, Store, Writer};
+use ratn_storage::{OpenError, Position, ReadError, Store, Writer, transfer};
 
 /// Makes a log by its name: the same name, the same log.
 pub(crate) type Make<'a> = &'a dyn Fn(&str) -> Box<dyn Store>;
@@ -53,6 +54,26 @@ pub(crate) fn compaction_beside_appends_loses_nothing(make: Make<'_>) {
     let rest: u64 = read.records.iter().map(|record| u64::from_le_bytes(record.payload[..].try_into().unwrap())).sum();
     assert_eq!((state + rest, read.last()), (sum, Position(2_000)));
     assert_eq!(read.snapshot.unwrap().through, Position(2_000));
+}
+
+pub(crate) fn a_copy_that_was_interrupted_is_not_opened(make: Make<'_>) {
+    let (_, mut source) = make("source").open().unwrap();
+    for record in [b"1", b"2", b"3"] {
+        append_durably(&mut *source, record);
+    }
+    source.close().unwrap();
+    for after in 0..3 {
+        let name = format!("target-{after}");
+        assert!(transfer(&*make("source"), &Interrupted { store: make(&name), after }).is_err());
+        let unfinished = |error: &ReadError| matches!(error, ReadError::Unfinished { .. });
+        let refused = make(&name).open().map(drop).unwrap_err();
+        assert!(matches!(&refused, OpenError::Read(error) if unfinished(error)), "{refused}");
+        assert!(unfinished(&make(&name).read().unwrap_err()));
+        let again = transfer(&*make("source"), &*make(&name)).unwrap_err().to_string();
+        assert!(again.contains("part of a copy") && again.contains("copy again"), "{again}");
+    }
+    transfer(&*make("source"), &*make("target")).unwrap();
+    assert_eq!(payloads(&make("target").open().unwrap().0.records), [b"1", b"2", b"3"]);
 }
 
 pub(crate) fn a_waiter_hears_when_the_writer_is_gone(make: Make<'_>) {

@@ -55,6 +55,15 @@ impl Health {
         })
     }
 
+    /// Whether it says SERVING now.
+    ///
+    /// # Errors
+    /// Why there is no answer within `deadline`.
+    pub async fn is_serving(&mut self, deadline: Duration) -> Result<bool, String> {
+        let asked = tokio::time::timeout(deadline, self.ask()).await;
+        asked.unwrap_or_else(|_| Err(format!("no answer within {} ms", deadline.as_millis())))
+    }
+
     async fn ask(&mut self) -> Result<bool, String> {
         let client = match &mut self.client {
             Some(client) => client,

@@ -32,6 +32,8 @@ pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, direct
     let directory = RuntimeDirectory::at(directory);
     let mut manager = None;
     let kept = [(ROLES[0], &config.resource_manager.storage), (ROLES[1], &config.world_pool.storage)];
+    let kept_in_etcd: Vec<&str> =
+        kept.iter().filter(|(_, storage)| storage.engine == Engine::Etcd).map(|(role, _)| *role).collect();
     for (role, storage) in kept.into_iter().filter(|(_, storage)| storage.engine == Engine::Etcd) {
         leader(findings, role, storage.clone()).await;
     }
@@ -43,6 +45,9 @@ pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, direct
                     manager = Some(endpoint);
                 }
             }
+            // Who stands by publishes no endpoint.
+            Err(FindError::NotPublished { .. })
+                if kept_in_etcd.contains(&role) && stands_by(findings, role, &listen).await => {}
             Err(FindError::NotPublished { .. }) => free_port(findings, role, &listen),
             Err(error) => findings.problem(role, error.to_string(), "remove the file, and start the role again"),
         }
@@ -69,6 +74,15 @@ async fn leader(findings: &mut Findings, role: &'static str, storage: StorageCon
         }
         Err(error) => findings.problem(about, error.to_string(), "please report it"),
     }
+}
+
+/// Whether somebody answers there who does not lead: says so.
+async fn stands_by(findings: &mut Findings, role: &str, listen: &Endpoint) -> bool {
+    let stands_by = Health::of(listen.clone()).is_serving(PATIENCE).await == Ok(false);
+    if stands_by {
+        findings.ok(role, format!("stands by at {listen}"));
+    }
+    stands_by
 }
 
 async fn role_answers(findings: &mut Findings, role: &str, endpoint: &Endpoint) -> bool {

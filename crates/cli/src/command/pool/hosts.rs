@@ -41,15 +41,15 @@ pub(super) async fn find(arguments: &HostArguments) -> Result<Vec<Host>, Failure
     }
     let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
     let own = directory.find(process_manager::ROLE);
-    let known = match arguments.resource_manager.clone().map_or_else(|| directory.find(resource_manager::ROLE), Ok) {
-        Ok(endpoint) => registered(&channels, &endpoint).await.map_err(|error| {
+    let known = match resource_manager(arguments) {
+        Some(endpoint) => registered(&channels, &endpoint).await.map_err(|error| {
             let help = match &own {
                 Ok(own) => format!("; `--manager {own}` asks the process manager of this host alone"),
                 Err(_) => String::new(),
             };
             Failure::Refused(format!("ratn: which hosts there are is not known: {error}{help}"))
         })?,
-        Err(_) => Vec::new(),
+        None => Vec::new(),
     };
     let mut hosts = known.into_iter().map(|(name, at)| host(&name, at)).collect::<Result<Vec<_>, _>>()?;
     match own {
@@ -59,6 +59,15 @@ pub(super) async fn find(arguments: &HostArguments) -> Result<Vec<Host>, Failure
         _ => {}
     }
     Ok(hosts)
+}
+
+/// Where the resource manager is that knows the hosts.
+pub(super) fn resource_manager(arguments: &HostArguments) -> Option<Endpoint> {
+    if arguments.manager.is_some() {
+        return None;
+    }
+    let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
+    arguments.resource_manager.clone().or_else(|| directory.find(resource_manager::ROLE).ok())
 }
 
 async fn registered(channels: &Channels, manager: &Endpoint) -> Result<Vec<(String, Endpoint)>, CallError> {

@@ -4,12 +4,13 @@ mod hosts;
 mod logs;
 mod show;
 
-use super::blocking_on;
+use super::{blocking_on, leader};
 use crate::failure::Failure;
 use crate::output;
 use anyhow::Context;
 use clap::{Args, Subcommand};
 use hosts::Answered;
+use ratn_daemon::resource_manager;
 use ratn_proto::types::{HostPools, Scale};
 use ratn_worker::endpoint::Endpoint;
 use serde_json::json;
@@ -115,15 +116,32 @@ pub(crate) struct DrainArguments {
 /// Shows the workers of all hosts; fails where one does not answer.
 pub(super) fn ps(arguments: &HostArguments) -> Result<(), Failure> {
     asking(async {
-        let mut answered = hosts::ask_all(hosts::find(arguments).await?).await;
+        let managers = match hosts::resource_manager(arguments) {
+            Some(endpoint) => leader::ask(&endpoint).await,
+            None => Vec::new(),
+        };
+        let found = hosts::find(arguments).await.inspect_err(|_| {
+            if !managers.is_empty() {
+                output::progress(leader::line(resource_manager::ROLE, &managers));
+            }
+        });
+        let mut answered = hosts::ask_all(found?).await;
         answered.retain(|one| arguments.host.as_deref().is_none_or(|host| host == one.name()));
         if let Some(host) = arguments.host.as_deref().filter(|_| answered.is_empty()) {
             return Err(Failure::Refused(format!("ratn: there is no host `{host}`; `ratn ps` shows all")));
         }
         let pools: Vec<&HostPools> = answered.iter().filter_map(|one| one.pools.as_ref().ok()).collect();
-        match arguments.json {
-            true => output::result(show::in_json(&answered))?,
-            false => output::result(show::table(&pools))?,
+        if arguments.json {
+            let mut document = show::in_json(&answered);
+            if !managers.is_empty() {
+                document["resource_managers"] = leader::in_json(&managers);
+            }
+            output::result(document)?;
+        } else {
+            output::result(show::table(&pools))?;
+            if !managers.is_empty() {
+                output::result(leader::line(resource_manager::ROLE, &managers))?;
+            }
         }
         let problems: Vec<String> = answered.iter().filter_map(Answered::problem).collect();
         if problems.is_empty() { Ok(()) } else { Err(anyhow::anyhow!(problems.join("\nratn: ")).into()) }

@@ -11,7 +11,7 @@ mod watch;
 
 pub(crate) use arguments::ResourceArguments;
 
-use super::{blocking_on, unanswered};
+use super::{blocking_on, leader, unanswered};
 use crate::failure::Failure;
 use crate::output;
 use crate::system::public_directory;
@@ -49,6 +49,13 @@ pub(super) fn run(arguments: &ResourceArguments) -> Result<(), Failure> {
                 .find(ROLE)
                 .map_err(|error| Failure::Refused(format!("ratn: {error}")))?,
         };
+        // A document of JSON is all that a program gets.
+        if !arguments.json {
+            let managers = leader::ask(&endpoint).await;
+            if !managers.is_empty() {
+                output::progress(leader::line(ROLE, &managers));
+            }
+        }
         let channels = Channels::new();
         let client = ResourceClient::new(&channels, &endpoint, "")?;
         let asking = Asking { channels, endpoint, client, json: arguments.json };
