@@ -52,6 +52,21 @@ pub enum ChangeError {
         /// What it holds.
         value: Value,
     },
+    /// `increase` beyond what a number can hold.
+    #[error(
+        "{fact} is {value}: increased by {by} it is beyond the range of its numbers (whole numbers from {} to {}, others of finite size); set \
+         it to a number with a decimal point, or count from 0 again",
+        i64::MIN,
+        i64::MAX
+    )]
+    OutOfRange {
+        /// Which fact.
+        fact: FactKey,
+        /// What it holds; null where it holds nothing.
+        value: Value,
+        /// By how much it was to be increased.
+        by: f64,
+    },
 }
 
 impl World {
@@ -309,18 +324,31 @@ pub(crate) fn written(before: &World, changes: &[Change]) -> BTreeSet<FactKey> {
     keys
 }
 
-/// What `increase` makes of a value; an absent one counts as 0.
+/// What `increase` makes of a value; an absent one counts as 0. Whole numbers stay whole.
 ///
 /// # Errors
-/// [`ChangeError`] for what is no number.
+/// [`ChangeError`] for what is no number, and for what is beyond the range of numbers.
 pub fn increased(fact: &FactKey, old: Option<&Value>, by: f64) -> Result<Value, ChangeError> {
+    let beyond = || {
+        let value = old.cloned().unwrap_or(Value::Null);
+        ChangeError::OutOfRange { fact: fact.clone(), value, by }
+    };
+    let finite = |x: f64| if x.is_finite() { Ok(Value::Float(x)) } else { Err(beyond()) };
+    let whole = by.fract() == 0.0;
     match old {
-        None | Some(Value::Null) if by.fract() == 0.0 => Ok(Value::Int(by as i64)),
-        None | Some(Value::Null) => Ok(Value::Float(by)),
-        Some(Value::Int(i)) if by.fract() == 0.0 => Ok(Value::Int(i.saturating_add(by as i64))),
+        None | Some(Value::Null) if whole => as_whole(by).map(Value::Int).ok_or_else(beyond),
+        None | Some(Value::Null) => finite(by),
+        Some(Value::Int(i)) if whole => {
+            as_whole(by).and_then(|by| i.checked_add(by)).map(Value::Int).ok_or_else(beyond)
+        }
         Some(value) => match value.as_number() {
-            Some(x) => Ok(Value::Float(x + by)),
+            Some(x) => finite(x + by),
             None => Err(ChangeError::NotANumber { fact: fact.clone(), value: value.clone() }),
         },
     }
+}
+
+/// A whole number as one, where it is in range. The ends of the range are powers of two, so they are exact.
+fn as_whole(x: f64) -> Option<i64> {
+    (x >= i64::MIN as f64 && x < -(i64::MIN as f64)).then_some(x as i64)
 }

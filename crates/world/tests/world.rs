@@ -4,6 +4,7 @@
 
 use proptest::prelude::*;
 use ratn_model::fact::{Change, FactKey, FactPattern, Term};
+use ratn_model::id::Revision;
 use ratn_model::value::Value;
 use ratn_world::world::{ChangeError, OVERLAY_LIMIT, World};
 use std::collections::BTreeMap;
@@ -125,6 +126,40 @@ fn a_list_of_changes_applies_as_a_whole_or_not_at_all() {
     ]);
     assert!(matches!(result, Err(ChangeError::NotANumber { .. })));
     assert_eq!(world, before);
+}
+
+#[test]
+fn an_increase_beyond_the_range_of_numbers_is_refused_and_changes_nothing() {
+    let key = FactKey { predicate: "count".to_owned(), arguments: Vec::new() };
+    let largest = 9_007_199_254_740_992.0;
+    let check = |before: Option<Value>, by: f64, expect: Option<Value>| {
+        let mut world = World::from_facts(before.clone().map(|value| (key.clone(), value)), Revision(1));
+        let unchanged = world.clone();
+        let result = world.apply(&[Change::Increase { fact: key.clone(), by }]);
+        match expect {
+            Some(value) => {
+                assert_eq!((result, world.get(&key)), (Ok(Revision(2)), Some(&value)), "{before:?} and {by}")
+            }
+            None => {
+                let refused = result.unwrap_err();
+                assert!(matches!(refused, ChangeError::OutOfRange { .. }), "{before:?} and {by}: {refused}");
+                assert!(refused.to_string().contains("beyond the range of its numbers"), "{refused}");
+                assert_eq!(world, unchanged);
+            }
+        }
+    };
+    let int = |value| Some(Value::Int(value));
+    check(int(i64::MAX - 1), 1.0, int(i64::MAX));
+    check(int(i64::MAX), 1.0, None);
+    check(int(i64::MIN), -1.0, None);
+    check(int(i64::MIN + 1), -1.0, int(i64::MIN));
+    check(int(0), 9.3e18, None);
+    check(int(-1), 9_223_372_036_854_775_808.0, None);
+    check(None, 1e300, None);
+    check(None, -9_223_372_036_854_775_808.0, int(i64::MIN));
+    check(None, largest, int(9_007_199_254_740_992));
+    check(Some(Value::Float(f64::MAX)), f64::MAX, None);
+    check(Some(Value::Float(1.5)), 1e300, Some(Value::Float(1e300)));
 }
 
 #[test]

@@ -82,10 +82,14 @@ pub(super) fn applied(before: &Facts, changes: &[Change], ontology: Option<&Onto
             }
             Change::Increase { fact, by } => {
                 let whole = by.fract() == 0.0;
+                let sum = |old: i64| {
+                    let sum = i128::from(old).saturating_add(*by as i128);
+                    i64::try_from(sum).map_err(|_| Fail::Wrong(format!("{fact} = {sum} is out of range")))
+                };
                 let value = match facts.get(fact) {
-                    None | Some(Value::Null) if whole => Value::Int(*by as i64),
+                    None | Some(Value::Null) if whole => Value::Int(sum(0)?),
                     None | Some(Value::Null) => Value::Float(*by),
-                    Some(Value::Int(old)) if whole => Value::Int(old.saturating_add(*by as i64)),
+                    Some(Value::Int(old)) if whole => Value::Int(sum(*old)?),
                     Some(Value::Int(old)) => Value::Float(*old as f64 + by),
                     Some(Value::Float(old)) => Value::Float(old + by),
                     Some(other) => return Err(Fail::Wrong(format!("{fact} = {other} cannot be increased"))),
