@@ -32,6 +32,7 @@ mod functional;
 pub mod query;
 pub mod reads;
 pub mod scene;
+pub mod search;
 mod store;
 mod table;
 pub mod world;

@@ -143,7 +143,8 @@ impl World {
         self.merged(pattern).filter(|(key, _)| pattern.matches(key))
     }
 
-    fn merged<'a>(&'a self, pattern: &'a FactPattern) -> impl Iterator<Item = (&'a FactKey, &'a Fact)> {
+    /// The facts that match, in the order of keys, and what the index cannot tell from them.
+    pub(crate) fn merged<'a>(&'a self, pattern: &'a FactPattern) -> impl Iterator<Item = (&'a FactKey, &'a Fact)> {
         let first = first_of(pattern);
         let bound = first.arguments.len();
         let overlay = self

@@ -4,8 +4,9 @@
 //! refused from then on; what can be read, and projected from, is what is on the disk.
 
 use super::core::{HeldBy, ProjectError, ProjectRequest, WorldPool};
-use super::history::{Commit, Difference, History, Kept, Version};
+use super::history::{Between, Commit, History, Kept, Version};
 use super::leases::{Known, LiveLeases};
+use super::query::View;
 use super::{WorldPoolConfig, status};
 use crate::access::Caller;
 use crate::durable_actor::{self, Core, Desk, Journal, JournalError, floor};
@@ -17,7 +18,7 @@ use ratn_proto::types::Contradiction;
 use ratn_worker::vitals::Vitals;
 use ratn_world::digest::Digest;
 use ratn_world::scene::delta::SceneDelta;
-use ratn_world::world::{Fact, World};
+use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -32,9 +33,6 @@ const EXPIRY_INTERVAL: Duration = Duration::from_secs(1);
 
 /// When a watch that has ended may be asked for again.
 pub(super) const WATCH_AGAIN_AFTER: Duration = Duration::from_secs(1);
-
-/// Facts of one revision.
-pub(super) type Facts = (Vec<(FactKey, Fact)>, Revision);
 
 /// What the service asks of the actor.
 #[derive(Debug)]
@@ -51,7 +49,7 @@ pub(super) enum Message {
         projection: Option<ProjectionId>,
         at: Option<Revision>,
         patterns: Vec<FactPattern>,
-        answer: Answer<Facts>,
+        answer: Answer<View>,
     },
     Watch {
         /// Without a snapshot: the revisions after this.
@@ -62,7 +60,7 @@ pub(super) enum Message {
         from: Revision,
         /// Unset, the root as it is.
         to: Option<Revision>,
-        answer: Answer<(Vec<Difference>, Revision)>,
+        answer: Answer<(Between, Revision)>,
     },
     WatchProjection {
         projection: ProjectionId,
@@ -213,8 +211,8 @@ impl Core for WorldCore {
                 desk.reply(answer, projected);
             }
             Message::Query { projection, at, patterns, answer } => {
-                let found = self.pool.query(projection, at, &patterns).map_err(|error| status::of_query(&error));
-                desk.reply(answer, found);
+                let view = self.pool.view(projection, at, &patterns).map_err(|error| status::of_query(&error));
+                desk.reply(answer, view);
             }
             Message::Watch { after, answer } => {
                 let watch = self.watch(after, desk);
@@ -233,8 +231,8 @@ impl Core for WorldCore {
             }
             Message::Diff { from, to, answer } => {
                 let to = to.unwrap_or(self.pool.root().revision());
-                let differences = self.pool.history.diff(from, to).map_err(status::of_revision);
-                desk.reply(answer, differences.map(|differences| (differences, to)));
+                let between = self.pool.history.between(from, to).map_err(status::of_revision);
+                desk.reply(answer, between.map(|between| (between, to)));
             }
             Message::Versions { key, limit, answer } => {
                 let versions = self.pool.history.versions(&key, limit);

@@ -9,9 +9,10 @@ use super::expiry::Expiry;
 use super::fingerprint::Fingerprint;
 use super::history::{Commit, CommitError, History, RevisionError};
 use super::memory::{Memory, Reused};
+use super::query::View;
 use super::scenes::{Scenes, moves};
 use crate::access::Caller;
-use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
+use ratn_model::fact::{Change, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
 use ratn_model::ontology::Ontology;
 use ratn_model::time::Timestamp;
@@ -19,7 +20,7 @@ use ratn_model::tolerance::{Tolerance, Tolerances};
 use ratn_proto::types::Contradiction;
 use ratn_world::reads::{Effect, Live};
 use ratn_world::scene::SceneError;
-use ratn_world::world::{ChangeError, Fact, World};
+use ratn_world::world::{ChangeError, World};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
@@ -325,17 +326,17 @@ impl WorldPool {
         Ok(())
     }
 
-    /// What matches any of the patterns, in the order of keys, of the root (now or at a revision) or of a projection; without a pattern everything
-    /// that it shows.
-    pub(super) fn query(
+    /// What a query of these patterns looks at: the root (now or at a revision) or a projection, and what that shows.
+    pub(super) fn view(
         &self,
         id: Option<ProjectionId>,
         at: Option<Revision>,
         patterns: &[FactPattern],
-    ) -> Result<(Vec<(FactKey, Fact)>, Revision), QueryError> {
-        let (world, revision, shown) = match (id, at) {
-            (None, None) => (self.root(), self.root().revision(), &Footprint::Everything),
-            (None, Some(at)) => (self.history.at(at)?, at, &Footprint::Everything),
+    ) -> Result<View, QueryError> {
+        let of_root = |world: &World, revision| View { world: world.clone(), revision, shown: Footprint::Everything };
+        match (id, at) {
+            (None, None) => Ok(of_root(self.root(), self.root().revision())),
+            (None, Some(at)) => Ok(of_root(self.history.at(at)?, at)),
             (Some(id), _) => {
                 let projection = self.projections.get(&id).ok_or(QueryError::Unknown { id })?;
                 let hidden = |pattern: &&FactPattern| match &projection.reads {
@@ -345,16 +346,10 @@ impl WorldPool {
                 if let Some(pattern) = patterns.iter().find(hidden) {
                     return Err(QueryError::Hidden { id, pattern: pattern.clone() });
                 }
-                (&projection.world, projection.base, &projection.reads)
+                let (world, shown) = (projection.world.clone(), projection.reads.clone());
+                Ok(View { world, revision: projection.base, shown })
             }
-        };
-        let copy = |(key, fact): (&FactKey, &Fact)| (key.clone(), fact.clone());
-        if patterns.is_empty() {
-            let all = world.iter().filter(|(key, _)| shown.contains(key)).map(copy).collect();
-            return Ok((all, revision));
         }
-        let facts: BTreeMap<FactKey, Fact> = patterns.iter().flat_map(|p| world.matching(p)).map(copy).collect();
-        Ok((facts.into_iter().collect(), revision))
     }
 
     /// Ends a projection for a caller; false when it had ended before.

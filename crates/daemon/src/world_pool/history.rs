@@ -54,6 +54,25 @@ pub(super) struct Commit {
 /// A fact in two revisions.
 pub(super) type Difference = (Arc<FactKey>, Option<Arc<Fact>>, Option<Arc<Fact>>);
 
+/// Two revisions to be compared: that may take long, so it is done away from the actor's thread.
+#[derive(Debug)]
+pub(super) struct Between {
+    before: World,
+    after: World,
+    written: Vec<Arc<Kept>>,
+}
+
+impl Between {
+    /// The facts that differ, in the order of keys: what was written in between and is not as it was.
+    pub(super) fn differences(&self) -> impl Iterator<Item = Difference> {
+        let keys: BTreeSet<&Arc<FactKey>> = self.written.iter().flat_map(|kept| kept.written.keys()).collect();
+        let shared = |world: &World, key| world.fact(key).map(|fact| Arc::new(fact.clone()));
+        let both =
+            keys.into_iter().map(move |key| (Arc::clone(key), shared(&self.before, key), shared(&self.after, key)));
+        both.filter(|(_, before, after)| before != after)
+    }
+}
+
 /// A fact from one revision on: the revision, the commit's id, the fact.
 pub(super) type Version = (Revision, Arc<str>, Option<Arc<Fact>>);
 
@@ -249,14 +268,11 @@ impl History {
         Ok(known.skip_while(move |kept| kept.world.revision() <= revision))
     }
 
-    /// The facts that differ between two revisions, in the order of keys: what was written in between and is not as it was.
-    pub(super) fn diff(&self, from: Revision, to: Revision) -> Result<Vec<Difference>, RevisionError> {
-        let (before, after) = (self.at(from)?, self.at(to)?);
-        let between = self.after(from.min(to))?.take_while(|kept| kept.world.revision() <= from.max(to));
-        let keys: BTreeSet<&Arc<FactKey>> = between.flat_map(|kept| kept.written.keys()).collect();
-        let shared = |world: &World, key| world.fact(key).map(|fact| Arc::new(fact.clone()));
-        let both = keys.into_iter().map(|key| (Arc::clone(key), shared(before, key), shared(after, key)));
-        Ok(both.filter(|(_, before, after)| before != after).collect())
+    /// Two revisions, and what was written in between.
+    pub(super) fn between(&self, from: Revision, to: Revision) -> Result<Between, RevisionError> {
+        let (before, after) = (self.at(from)?.clone(), self.at(to)?.clone());
+        let written = self.after(from.min(to))?.take_while(|kept| kept.world.revision() <= from.max(to));
+        Ok(Between { written: written.map(Arc::clone).collect(), before, after })
     }
 
     /// What a fact was, the newest first, and the oldest revision that is kept.
@@ -459,7 +475,8 @@ mod tests {
                     prop_assert_eq!(history.at(revision).unwrap(), &worlds[revision.0 as usize]);
                     for (from, to) in [(revision, history.root().revision()), (history.root().revision(), revision)] {
                         let expected = difference(&worlds[from.0 as usize], &worlds[to.0 as usize]);
-                        prop_assert_eq!(history.diff(from, to).unwrap(), expected);
+                        let between = history.between(from, to).unwrap();
+                        prop_assert_eq!(between.differences().collect::<Vec<_>>(), expected);
                     }
                     let after: Vec<Revision> =
                         history.after(revision).unwrap().map(|kept| kept.world.revision()).collect();

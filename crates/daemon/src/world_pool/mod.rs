@@ -16,6 +16,7 @@ mod fingerprint;
 mod history;
 mod leases;
 mod memory;
+mod query;
 mod record;
 mod scenes;
 mod service;
@@ -107,9 +108,15 @@ pub async fn run_as(
     tokio::spawn(exit_on_panic("the watch of leases", following));
     let sizes = service::Sizes { fact: config.fact_bytes, commit: config.commit_bytes };
     let (actor, ended) = actor::start(config, ontology, kept, leases.clone(), serving.vitals.clone(), over.clone())?;
-    let service = WorldPoolServiceServer::new(service::Service { actor, leases, shutdown: shutdown.clone(), sizes })
-        .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
-        .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
+    let service = WorldPoolServiceServer::new(service::Service {
+        actor,
+        leases,
+        shutdown: shutdown.clone(),
+        sizes,
+        long_reads: service::LongReads::default(),
+    })
+    .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
+    .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
     let served = bound.serve_as(Services::new().with(service), serving, shutdown).await;

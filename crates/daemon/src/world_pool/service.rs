@@ -3,6 +3,7 @@
 use super::actor::{Handle, Message, NewProjection, Update, WATCH_AGAIN_AFTER};
 use super::history::Commit;
 use super::leases::{Known, LiveLeases};
+use super::query::{Found, View};
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
 use crate::details::{retry_later, status};
@@ -21,7 +22,7 @@ use ratn_world::digest::Digest;
 use ratn_world::world::Fact;
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Request, Response, Status};
 
@@ -30,6 +31,9 @@ const LEASE_PATIENCE: Duration = Duration::from_secs(1);
 
 /// Scenes that a client may say that it has.
 const MOST_BASES: usize = 16;
+
+/// A query looks at so many facts where it was called; one that takes more goes to a thread of its own.
+const AT_ONCE: usize = 4_096;
 
 /// Of a fact's history.
 const MOST_VERSIONS: usize = 1_000;
@@ -41,6 +45,55 @@ pub(super) struct Service {
     pub(super) leases: watch::Receiver<LiveLeases>,
     pub(super) shutdown: CancellationToken,
     pub(super) sizes: Sizes,
+    pub(super) long_reads: LongReads,
+}
+
+/// What takes long to read is read in threads of its own, a few at a time: the others are for everybody else.
+#[derive(Debug, Clone)]
+pub(super) struct LongReads(Arc<Semaphore>);
+
+impl Default for LongReads {
+    fn default() -> LongReads {
+        let threads = std::thread::available_parallelism().map_or(1, usize::from);
+        LongReads(Arc::new(Semaphore::new((threads / 2).max(1))))
+    }
+}
+
+impl LongReads {
+    async fn read<T: Send + 'static>(
+        &self,
+        read: impl FnOnce() -> Result<T, Status> + Send + 'static,
+    ) -> Result<T, Status> {
+        // A call that is dropped leaves the queue.
+        let permit = self.0.clone().acquire_owned().await;
+        let reading = tokio::task::spawn_blocking(move || {
+            let _permit = permit;
+            read()
+        });
+        reading.await.map_err(|error| status(Code::Internal, "BROKEN", format!("reading the world: {error}")))?
+    }
+}
+
+/// A page of the facts that a query finds behind those seen before, and whether there are more; nothing where that would look at more
+/// than `most` facts.
+fn page_of(
+    view: &View,
+    patterns: &[FactPattern],
+    seen: usize,
+    page: Page,
+    most: usize,
+) -> Result<Option<(Vec<v1::Fact>, bool)>, Status> {
+    let (mut filled, mut skipped, mut full) = (Filled::default(), 0, Ok(false));
+    let found = view.find(patterns, most, &mut |key, fact| {
+        if skipped < seen {
+            skipped += 1;
+            return true;
+        }
+        full = page.fill([v1::Fact::from(record((key.clone(), fact.clone())))], &mut filled);
+        matches!(full, Ok(false))
+    });
+    let more = full?;
+    Ok((found == Found::All).then_some((filled.items, more)))
 }
 
 /// What is accepted at the most, in bytes.
@@ -153,14 +206,24 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         if projection.is_some() && at.is_some() {
             return Err(Malformed::new("at_revision", "is of the root: not together with projection_id").into());
         }
-        let (facts, revision) =
-            self.actor.request(|answer| Message::Query { projection, at, patterns, answer }).await?;
-        let seen = place.map_or(0, |(_, seen)| seen);
-        let mut filled = Filled::default();
-        let rest = facts.into_iter().skip(seen).map(|fact| v1::Fact::from(record(fact)));
-        let more = page.fill(rest, &mut filled)?;
-        let next_page_token = paging::token(more, revision.0, seen + filled.items.len());
-        Ok(Response::new(v1::QueryResponse { facts: filled.items, revision: revision.0, next_page_token }))
+        let asked = patterns.clone();
+        let view = self.actor.request(|answer| Message::Query { projection, at, patterns: asked, answer }).await?;
+        let (revision, seen) = (view.revision, place.map_or(0, |(_, seen)| seen));
+        // Without a pattern a query looks at all that there is.
+        let few = !patterns.is_empty() || view.world.len() <= AT_ONCE;
+        let at_once = if few { page_of(&view, &patterns, seen, page, AT_ONCE)? } else { None };
+        let (facts, more) = match at_once {
+            Some(found) => found,
+            None => {
+                let read = move || {
+                    let found = page_of(&view, &patterns, seen, page, view.most())?;
+                    found.ok_or_else(|| super::status::of_too_much(&view.too_much()))
+                };
+                self.long_reads.read(read).await?
+            }
+        };
+        let next_page_token = paging::token(more, revision.0, seen + facts.len());
+        Ok(Response::new(v1::QueryResponse { facts, revision: revision.0, next_page_token }))
     }
 
     type WatchStream = BoxStream<'static, Result<v1::WorldPoolServiceWatchResponse, Status>>;
@@ -205,18 +268,22 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let place = paging::place(&request.page_token)?;
         let page = Page::of(request.page_bytes, &request.page_token);
         let to = place.map(|(to, _)| Revision(to)).or(request.to_revision.map(Revision));
-        let (differences, to) = self.actor.request(|answer| Message::Diff { from, to, answer }).await?;
-        let differences = differences.into_iter().filter(|(key, ..)| wanted(key, &patterns));
-        let differences = differences.map(|(key, before, after)| FactDifference {
-            before: before.map(|fact| record((key.as_ref().clone(), fact.as_ref().clone()))),
-            after: after.map(|fact| record((key.as_ref().clone(), fact.as_ref().clone()))),
-            key: key.as_ref().clone(),
-        });
+        let (between, to) = self.actor.request(|answer| Message::Diff { from, to, answer }).await?;
         let seen = place.map_or(0, |(_, seen)| seen);
-        let mut filled = Filled::default();
-        let more = page.fill(differences.skip(seen).map(v1::FactDifference::from), &mut filled)?;
-        let next_page_token = paging::token(more, to.0, seen + filled.items.len());
-        Ok(Response::new(v1::DiffResponse { differences: filled.items, to_revision: to.0, next_page_token }))
+        let read = move || {
+            let differences = between.differences().filter(|(key, ..)| wanted(key, &patterns));
+            let differences = differences.map(|(key, before, after)| FactDifference {
+                before: before.map(|fact| record((key.as_ref().clone(), fact.as_ref().clone()))),
+                after: after.map(|fact| record((key.as_ref().clone(), fact.as_ref().clone()))),
+                key: key.as_ref().clone(),
+            });
+            let mut filled = Filled::default();
+            let more = page.fill(differences.skip(seen).map(v1::FactDifference::from), &mut filled)?;
+            Ok((filled.items, more))
+        };
+        let (differences, more) = self.long_reads.read(read).await?;
+        let next_page_token = paging::token(more, to.0, seen + differences.len());
+        Ok(Response::new(v1::DiffResponse { differences, to_revision: to.0, next_page_token }))
     }
 
     async fn get_fact_history(

@@ -2,6 +2,7 @@
 
 use super::core::{MadeByAnother, ProjectError, QueryError};
 use super::history::{CommitError, RevisionError};
+use super::query::TooMuch;
 use crate::access::Caller;
 use crate::details::{retry_later, status, status_about};
 use ratn_model::id::LeaseId;
@@ -57,6 +58,10 @@ pub(super) fn of_query(error: &QueryError) -> Status {
         QueryError::Revision(error) => of_revision(*error),
         QueryError::Hidden { .. } => status(Code::PermissionDenied, "NOT_AMONG_READS", error.to_string()),
     }
+}
+
+pub(super) fn of_too_much(error: &TooMuch) -> Status {
+    status(Code::ResourceExhausted, "QUERY_TOO_LARGE", error.to_string())
 }
 
 pub(super) fn lease_ended(lease: LeaseId) -> Status {

@@ -3,9 +3,10 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 use super::*;
 use crate::access::Role;
-use ratn_model::fact::Term;
+use ratn_model::fact::{FactKey, Term};
 use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::value::Value;
+use ratn_world::world::Fact;
 
 fn key(name: &str) -> FactKey {
     FactKey { predicate: "at".to_owned(), arguments: vec![Term::Name(name.to_owned())] }
@@ -51,8 +52,22 @@ fn project(pool: &mut WorldPool, request: &str, base: u64, lease: u64) -> Result
     })
 }
 
+/// What a query finds.
+fn query(
+    pool: &WorldPool,
+    id: Option<ProjectionId>,
+    patterns: &[FactPattern],
+) -> Result<Vec<(FactKey, Fact)>, QueryError> {
+    let mut facts = Vec::new();
+    pool.view(id, None, patterns)?.find(patterns, usize::MAX, &mut |key, fact| {
+        facts.push((key.clone(), fact.clone()));
+        true
+    });
+    Ok(facts)
+}
+
 fn value(pool: &WorldPool, id: Option<ProjectionId>, name: &str) -> Result<Option<Value>, QueryError> {
-    let (facts, _) = pool.query(id, None, &[FactPattern::of(&key(name))])?;
+    let facts = query(pool, id, &[FactPattern::of(&key(name))])?;
     Ok(facts.into_iter().next().map(|(_, fact)| fact.value))
 }
 
@@ -104,8 +119,8 @@ fn a_projection_shows_its_declared_reads_and_nothing_else() {
         "projection-1 does not show at(cup): it is not among the reads declared for it; declare it (reads: […])"
     );
     let wider = FactPattern { predicate: "at".to_owned(), arguments: vec![None] };
-    assert!(matches!(pool.query(Some(id), None, &[wider]), Err(QueryError::Hidden { .. })));
-    let (all, _) = pool.query(Some(id), None, &[]).unwrap();
+    assert!(matches!(query(&pool, Some(id), &[wider]), Err(QueryError::Hidden { .. })));
+    let all = query(&pool, Some(id), &[]).unwrap();
     assert_eq!(all.iter().map(|(key, _)| key.to_string()).collect::<Vec<_>>(), ["at(box)"]);
 }
 
@@ -197,7 +212,7 @@ fn a_fact_says_who_wrote_it_and_what_measured_it() {
         ..Commit::default()
     };
     pool.commit(Timestamp(0), &commit).unwrap();
-    let (facts, _) = pool.query(None, None, &[]).unwrap();
+    let facts = query(&pool, None, &[]).unwrap();
     assert!(facts.iter().all(|(_, fact)| fact.writer.as_deref() == Some("detect[1]")));
     assert_eq!(facts[0].1.measured.as_deref(), Some(&measured));
     assert_eq!(facts[1].1.measured, None);
@@ -212,7 +227,7 @@ fn a_fact_says_who_wrote_it_and_what_measured_it() {
         held_by: HeldBy::Until(Timestamp(9)),
     };
     let id = pool.project(request).unwrap();
-    let (facts, _) = pool.query(Some(id), None, &[]).unwrap();
+    let facts = query(&pool, Some(id), &[]).unwrap();
     let writers: Vec<_> = facts.iter().map(|(_, fact)| fact.writer.as_deref()).collect();
     assert_eq!(writers, [Some("place[1]"), None]);
     assert!(facts.iter().all(|(_, fact)| fact.measured.is_none()), "it is predicted");
