@@ -21,26 +21,37 @@ fn main() {
     row("the same, of resources that it provides, beside 50,000 leases", consumed(true), close);
     row("5,000 selectors wait for a kind: 4,000 units of it are given back", selectors(5_000), give_back);
     row("the same: one unit of another kind is taken and given back", behind(selectors(5_000)), take_another);
+    row("end a task that consumed 50,000 resources, part by part", consumed(false), end_task);
     row("acquire 47,300 of a kind and 8,000 of those with an attribute", much(), more_than_all);
 }
 
-/// Does something, then lets the pool take turns until nothing is left to do.
-fn row(what: &str, mut pool: Pool, act: fn(&mut Pool)) {
+/// Does something, until it is done, then lets the pool take turns until nothing is left to do.
+fn row(what: &str, mut pool: Pool, act: fn(&mut Pool) -> bool) {
     drained(&mut pool);
     let (mut longest, mut turns) = (Duration::ZERO, 0);
     let began = Instant::now();
-    let mut turn = |pool: &mut Pool, act: fn(&mut Pool)| {
+    let mut turn = |pool: &mut Pool, act: &dyn Fn(&mut Pool) -> bool| {
         let began = Instant::now();
-        act(pool);
+        let done = act(pool);
         drained(pool);
         longest = longest.max(began.elapsed());
         turns += 1;
+        done
     };
-    turn(&mut pool, act);
+    while !turn(&mut pool, &act) {}
     while pool.next_deadline() == Some(Timestamp(0)) && began.elapsed() < Duration::from_secs(60) {
-        turn(&mut pool, |pool| pool.advance(Timestamp(0)));
+        turn(&mut pool, &on_time);
     }
     println!("{what:<72} {longest:>12.1?} {:>12.1?} {turns:>8}", began.elapsed());
+}
+
+fn end_task(pool: &mut Pool) -> bool {
+    pool.end_task(Timestamp(0), &SessionId::from("s")).unwrap()
+}
+
+fn on_time(pool: &mut Pool) -> bool {
+    pool.advance(Timestamp(0));
+    true
 }
 
 fn drained(pool: &mut Pool) {
@@ -78,8 +89,9 @@ fn acquire(pool: &mut Pool, request: AcquireRequest) {
     debug_assert!(granted.len() < 10_000 || matches!(granted[0], Notice::Granted { .. }));
 }
 
-fn close(pool: &mut Pool) {
+fn close(pool: &mut Pool) -> bool {
     pool.close_session(Timestamp(0), &SessionId::from("s")).unwrap();
+    true
 }
 
 fn leases_of_one_resource() -> Pool {
@@ -129,9 +141,10 @@ fn selectors(count: i64) -> Pool {
     pool
 }
 
-fn give_back(pool: &mut Pool) {
+fn give_back(pool: &mut Pool) -> bool {
     let lease = pool.leases()[0].id;
     pool.release(Timestamp(0), None, lease).unwrap();
+    true
 }
 
 fn behind(mut pool: Pool) -> Pool {
@@ -139,10 +152,11 @@ fn behind(mut pool: Pool) -> Pool {
     pool
 }
 
-fn take_another(pool: &mut Pool) {
+fn take_another(pool: &mut Pool) -> bool {
     acquire(pool, ask("other", ResourceOperation::Block, "Other", 1));
     let lease = pool.youngest_lease();
     let _ = pool.release(Timestamp(0), None, lease);
+    true
 }
 
 fn much() -> Pool {
@@ -153,10 +167,11 @@ fn much() -> Pool {
     pool
 }
 
-fn more_than_all(pool: &mut Pool) {
+fn more_than_all(pool: &mut Pool) -> bool {
     let mut request = ask("s", ResourceOperation::Block, "Tool", 47_300);
     let mut special = ask("s", ResourceOperation::Block, "Tool", 8_000).requirements.remove(0);
     special.attributes.insert("a".to_owned(), Value::Bool(true));
     request.requirements.push(special);
     acquire(pool, request);
+    true
 }

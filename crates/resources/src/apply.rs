@@ -17,7 +17,7 @@ use crate::session::Session;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Quantity;
 use ratn_model::time::Timestamp;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -147,17 +147,12 @@ impl Pool {
             }
             Effect::TaskEnded { session } => {
                 let slots = std::mem::take(&mut self.session_mut(session)?.consumed);
-                for lease in self.session_mut(session)?.leases.clone() {
-                    let known = self.leases.get_mut(&lease).ok_or_else(|| format!("{lease} is not there"))?;
-                    let (gone, left) = known.consumed.drain(..).partition(|(slot, _)| slots.contains(slot));
-                    known.consumed = left;
-                    self.not_undoable(lease, gone);
-                }
-                for slot in slots {
-                    self.change(slot, |resource| remove_from(&mut resource.consumers, session));
-                    self.updated(slot)?;
-                }
-                Ok(())
+                self.end_consumption(session, slots)
+            }
+            Effect::SomeReturned { session, resources } => {
+                let consumed = &mut self.session_mut(session)?.consumed;
+                let slots: BTreeSet<Slot> = (0..*resources).map_while(|_| consumed.pop_first()).collect();
+                self.end_consumption(session, slots)
             }
             Effect::Returned { session, slot, amount } => {
                 let left = self.change(*slot, |resource| {
@@ -223,6 +218,24 @@ impl Pool {
                 Ok(())
             }
         }
+    }
+
+    /// What a session has consumed of these returns, and no undone grant returns it again.
+    fn end_consumption(&mut self, session: &SessionId, slots: BTreeSet<Slot>) -> Result<(), Misfit> {
+        let of_session = |lease: &&LeaseId| self.leases.get(*lease).is_some_and(|known| known.session == *session);
+        let undoable = slots.iter().filter_map(|slot| self.undoable.get(slot)).flatten();
+        let leases: BTreeSet<LeaseId> = undoable.filter(of_session).copied().collect();
+        for lease in leases {
+            let known = self.leases.get_mut(&lease).ok_or_else(|| format!("{lease} is not there"))?;
+            let (gone, left) = known.consumed.drain(..).partition(|(slot, _)| slots.contains(slot));
+            known.consumed = left;
+            self.not_undoable(lease, gone);
+        }
+        for slot in slots {
+            self.change(slot, |resource| remove_from(&mut resource.consumers, session));
+            self.updated(slot)?;
+        }
+        Ok(())
     }
 
     fn begin_lease(&mut self, lease: LeaseId, granted: &LeaseRecord) -> Result<(), Misfit> {

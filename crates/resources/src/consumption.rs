@@ -9,6 +9,9 @@ use crate::resource::Units;
 use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 
+/// Resources of which something returns in one turn.
+const RETURNED_AT_ONCE: usize = 2_000;
+
 impl Pool {
     /// Uses something up for the rest of the session's task, now or not at all; what waiters have reserved is not taken.
     /// Returns the ids of the resources consumed from.
@@ -37,17 +40,25 @@ impl Pool {
         Ok(ids)
     }
 
-    /// The session's task is over: what it consumed of renewable resources returns.
+    /// The session's task is over: what it consumed of renewable resources returns. Where it is of many, some of it returns: as long as
+    /// the answer is false, call this again.
     ///
     /// # Errors
     /// An unknown or expired session.
-    pub fn end_task(&mut self, now: Timestamp, session: &SessionId) -> Result<(), PoolError> {
+    pub fn end_task(&mut self, now: Timestamp, session: &SessionId) -> Result<bool, PoolError> {
         self.begin(now);
-        if !self.session(session)?.consumed.is_empty() {
-            self.commit(Effect::TaskEnded { session: session.clone() });
-            self.schedule();
+        let consumed = self.session(session)?.consumed.len();
+        if consumed == 0 {
+            return Ok(true);
         }
-        Ok(())
+        let session = session.clone();
+        let all = consumed <= RETURNED_AT_ONCE;
+        self.commit(match all {
+            true => Effect::TaskEnded { session },
+            false => Effect::SomeReturned { session, resources: RETURNED_AT_ONCE },
+        });
+        self.schedule();
+        Ok(all)
     }
 
     pub(crate) fn commit_consumed(&mut self, session: &SessionId, taken: Units) {

@@ -78,12 +78,16 @@ impl Pool {
         let available = Available::FreeTo(&self.queue.reserved, &waiter.reserved);
         let free = Assignment::of(&self.resources, available, &requirements);
         let unreserved = Assignment::of(&self.resources, Available::Free(&Units::new()), &requirements);
-        let looked_at = ahead + free.looked_at + unreserved.looked_at;
+        let mut looked_at = ahead + free.looked_at + unreserved.looked_at;
         let obstacles = requirements
             .into_iter()
             .zip(free.missing.iter().zip(unreserved.missing))
             .filter(|(_, (missing, _))| !missing.is_zero())
-            .map(|(requirement, (_, without_queue))| self.obstacle(id, requirement, !without_queue.is_zero()))
+            .map(|(requirement, (_, without_queue))| {
+                // Twice all of the kind, or those who wait before it.
+                looked_at += 2 * self.resources.count(&requirement.kind) + ahead;
+                self.obstacle(id, requirement, !without_queue.is_zero())
+            })
             .collect();
         Some((Explanation { waiter: id, ahead, obstacles }, looked_at))
     }

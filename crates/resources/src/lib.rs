@@ -21,8 +21,8 @@
 //! later one never takes a unit that it waits for, and waiters for other kinds pass. It deliberately knows no socket,
 //! no clock, no file and no process; who starts what a waiter lacks is the providers' business.
 //!
-//! Waiters that select the same form a group (`group.rs`); a change of a resource touches the groups that it fits, and what
-//! became free goes to the first who lacks it (`schedule.rs`). `cargo bench -p ratn-resources`, medians on a busy machine with two
+//! Waiters that select the same form a group (`group.rs`); a change of a resource touches the groups that it fits (`selectors.rs`), and
+//! what became free goes to the first of those who lacks it (`schedule.rs`, `sharing.rs`). `cargo bench -p ratn-resources`, medians on a busy machine with two
 //! cores (compare them with each other):
 //!
 //! | call | empty pool | 100,000 resources | and 10,000 waiters |
@@ -53,16 +53,20 @@ mod invariants;
 mod kinds;
 mod lease;
 mod limits;
+mod look;
 mod memory;
 mod pace;
 mod pool;
 mod queue;
+mod ready;
 mod record;
 mod request;
 mod resource;
 mod resources;
 mod schedule;
+mod selectors;
 mod session;
+mod sharing;
 mod snapshot;
 mod validation;
 
@@ -76,6 +80,7 @@ pub use id::{SessionId, WaiterId};
 pub use kinds::{CyclicKinds, Kinds};
 pub use lease::LeaseView;
 pub use limits::Limits;
+pub use look::Search;
 pub use pool::Pool;
 pub use queue::AcquireRequest;
 pub use ratn_model::resource::Quantity;

@@ -165,6 +165,8 @@ impl Pool {
                 let remembered = match &reply {
                     // Remembered by the grant, which may be long after this or was within it.
                     Reply::Queued(_) | Reply::Granted(_) => return Ok(reply),
+                    // By its last part.
+                    Reply::Unfinished => return Ok(reply),
                     Reply::Created { id, revision } => Remembered::Created { id: id.clone(), revision: *revision },
                     Reply::Touched(ids) => Remembered::Touched(ids.clone()),
                     Reply::Done => Remembered::Done,
@@ -318,7 +320,13 @@ impl Pool {
                 let freed = self.confirm_standstill_as(now, speaker, session.as_ref(), lease, &resource)?;
                 Reply::Touched(freed.then_some(resource).into_iter().collect())
             }
-            Request::EndTask { session } => self.end_task(now, &session).map(|()| Reply::Done)?,
+            Request::EndTask { session } => {
+                if self.end_task(now, &session)? {
+                    Reply::Done
+                } else {
+                    Reply::Unfinished
+                }
+            }
         })
     }
 }

@@ -97,6 +97,8 @@ pub enum Reply {
     /// To a consume or a delete of units: the ids of the resources touched. To a confirmation of standstill: the resource, if units
     /// of it became free by it.
     Touched(Vec<String>),
+    /// To the end of a task with much to return: some of it has. The same request once more goes on with it.
+    Unfinished,
     /// To the rest.
     Done,
 }

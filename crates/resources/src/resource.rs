@@ -245,7 +245,7 @@ impl Description {
     }
 
     /// An attribute; `host` is where it is, unless it says so itself.
-    fn attribute(&self, name: &str) -> Option<Cow<'_, Value>> {
+    pub(crate) fn attribute(&self, name: &str) -> Option<Cow<'_, Value>> {
         let host = || (name == "host" && !self.host.is_empty()).then(|| Cow::Owned(Value::String(self.host.clone())));
         self.attributes.get(name).map(Cow::Borrowed).or_else(host)
     }

@@ -24,6 +24,13 @@ pub(crate) struct Resources {
     by_kind: BTreeMap<Box<str>, OfKind>,
 }
 
+/// A place among the resources of a kind and of those below it: which of the kinds, and which resource.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct OfKinds {
+    kind: usize,
+    slot: Slot,
+}
+
 /// The resources of one kind.
 #[derive(Debug, Clone, Default)]
 struct OfKind {
@@ -177,9 +184,31 @@ impl Resources {
         self.present(self.of(kind).flat_map(|of_kind| &of_kind.all))
     }
 
+    /// The same, behind a place.
+    pub(crate) fn all_of_after<'a>(
+        &'a self,
+        kind: &'a str,
+        after: Option<OfKinds>,
+    ) -> impl Iterator<Item = (OfKinds, &'a Resource)> + 'a {
+        let first = after.map_or(0, |after| after.kind);
+        let kinds = self.kinds.subclasses(kind).enumerate().skip(first);
+        kinds.flat_map(move |(kind, name)| {
+            let behind = after.filter(|after| after.kind == kind).map_or(Bound::Unbounded, |a| Bound::Excluded(a.slot));
+            let slots = self.by_kind.get(name).map(|of_kind| of_kind.all.range((behind, Bound::Unbounded)));
+            let slots = slots.into_iter().flatten();
+            slots.filter_map(move |slot| Some((OfKinds { kind, slot: *slot }, self.get(*slot)?)))
+        })
+    }
+
     /// Those of them of which something is free, in the order of [`Resources::free`].
     pub(crate) fn free_of<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = (Slot, &'a Resource)> + 'a {
         self.present(self.of(kind).flat_map(|of_kind| of_kind.free.iter().map(|(_, slot)| slot)))
+    }
+
+    /// Where a resource stands in the order of [`Resources::free_of`] a kind.
+    pub(crate) fn order_of(&self, kind: &str, slot: Slot, resource: &Resource) -> (usize, usize, Slot) {
+        let of_kind = self.kinds.subclasses(kind).position(|kind| *kind == *resource.description.kind);
+        (of_kind.unwrap_or(usize::MAX), special(resource), slot)
     }
 
     fn present<'a>(

@@ -258,22 +258,24 @@ impl Pool {
 
     /// Every session, in the order of ids.
     pub fn sessions(&self) -> Vec<SessionView> {
-        let ids = |slots: &BTreeSet<Slot>| {
-            let mut ids: Vec<String> = slots.iter().filter_map(|slot| self.id_of(*slot)).collect();
-            ids.sort_unstable();
-            ids
-        };
-        let view = |(id, session): (&SessionId, &Session)| SessionView {
+        self.sessions.iter().map(|(id, session)| self.session_view(id, session, usize::MAX)).collect()
+    }
+
+    /// With so many of its leases and resources at the most.
+    pub(crate) fn session_view(&self, id: &SessionId, session: &Session, named: usize) -> SessionView {
+        let provides = session.provides.iter().take(named).filter_map(|slot| self.id_of(*slot));
+        let mut provides: Vec<String> = provides.collect();
+        provides.sort_unstable();
+        SessionView {
             id: id.clone(),
             name: session.name.clone(),
             opened_by: session.opened_by.clone(),
             ttl: session.ttl,
             expires: session.expires,
-            leases: session.leases.iter().copied().collect(),
+            leases: session.leases.iter().take(named).copied().collect(),
             waiters: session.waiters.iter().copied().collect(),
-            provides: ids(&session.provides),
-        };
-        self.sessions.iter().map(view).collect()
+            provides,
+        }
     }
 
     /// Whether a session is there.

@@ -3,7 +3,9 @@
 
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
-use ratn_resources::{AcquireRequest, Limits, Pool, PoolError, ResourceSpec, SessionId, Snapshot, decode, encode};
+use ratn_resources::{
+    AcquireRequest, Limits, Pool, PoolError, Reply, Request, ResourceSpec, SessionId, Snapshot, decode, encode,
+};
 use std::time::Duration;
 
 const NOW: Timestamp = Timestamp(0);
@@ -147,6 +149,39 @@ fn what_a_session_consumed_returns_over_several_turns() {
     let left = missing(&pool);
     bounded(&turns(&mut pool, NOW, missing), left);
     pool.check_invariants().unwrap();
+}
+
+#[test]
+fn what_a_task_consumed_returns_over_several_calls_and_a_restart_in_between_goes_on_with_it() {
+    let mut pool = with_tools(None);
+    for _ in 0..MANY / 1_000 {
+        pool.acquire(NOW, ask("s", ResourceOperation::Consume, 1_000)).unwrap();
+    }
+    let consumed =
+        |pool: &Pool| pool.list().iter().map(|view| view.consumed.thousandths() / 1_000).sum::<u64>() as usize;
+    let end = |pool: &mut Pool| pool.handle(NOW, "end", Request::EndTask { session: session("s") }).unwrap();
+    let mut left = vec![consumed(&pool)];
+    let before = pool.snapshot();
+    pool.take_records();
+    assert_eq!(end(&mut pool), Reply::Unfinished);
+    let records = decode(&encode(&pool.take_records())).unwrap();
+    let mut again = Pool::restore(Limits { history: 10, ..Limits::default() }, NOW, Some(before), records).unwrap();
+    again.check_invariants().unwrap();
+    left.push(consumed(&again));
+    assert_eq!(left[1], consumed(&pool));
+    while end(&mut again) == Reply::Unfinished {
+        left.push(consumed(&again));
+        again.check_invariants().unwrap();
+    }
+    left.push(consumed(&again));
+    assert!(left.windows(2).all(|two| two[0] > two[1] && two[0] - two[1] <= IN_A_TURN), "{left:?}");
+    assert_eq!((left.last(), end(&mut again)), (Some(&0), Reply::Done));
+    // What returned stays so where the grants are taken back.
+    for lease in again.leases() {
+        again.undo_grant(NOW, lease.id).unwrap();
+    }
+    assert_eq!(again.exists(&Requirement::new(ResourceOperation::Exists, "Tool")), MANY);
+    again.check_invariants().unwrap();
 }
 
 #[test]

@@ -103,7 +103,7 @@ pub(super) fn passes(view: &ResourceView, filter: &ResourceFilter) -> bool {
 }
 
 /// Leases and resources of a session that are named.
-const NAMED: usize = 1_000;
+pub(super) const NAMED: usize = 1_000;
 
 pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
     SessionStatus {
@@ -111,9 +111,9 @@ pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
         client: view.name,
         ttl_ms: milliseconds(view.ttl),
         expires_in_ms: milliseconds(Duration::from_nanos(view.expires.0.saturating_sub(now.0))),
-        leases: view.leases.into_iter().take(NAMED).collect(),
+        leases: view.leases,
         waiting: u32::try_from(view.waiters.len()).unwrap_or(u32::MAX),
-        resources: view.provides.into_iter().take(NAMED).collect(),
+        resources: view.provides,
         opened_by: view.opened_by.to_string(),
     }
 }

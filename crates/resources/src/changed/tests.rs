@@ -88,7 +88,7 @@ fn perform(pool: &mut Pool, number: usize, step: &Step) {
             let Some((waiter, _)) = waiters.get(which % waiters.len().max(1)) else { return };
             pool.cancel(NOW, *waiter).unwrap();
         }
-        Step::EndTask => pool.end_task(NOW, &session).unwrap(),
+        Step::EndTask => assert!(pool.end_task(NOW, &session).unwrap()),
     }
 }
 
@@ -143,4 +143,75 @@ fn a_pool_that_is_behind_for_long_holds_what_always_holds_and_forgets_nobody() {
         Ok(())
     });
     outcome.unwrap();
+}
+
+/// So many units of a kind, each with a number; and so many who wait for one of them each, by its number, while all but those are held that
+/// nobody has.
+fn numbered(units: i64, waiters: i64) -> Pool {
+    let mut pool = Pool::new(Limits::default());
+    pool.keep_alive(NOW, &SessionId::from("s"), "s", Duration::from_secs(60)).unwrap();
+    for number in 0..units {
+        let spec = ResourceSpec::new(ResourceClass::Module, KINDS[0]).attribute("number", Value::Int(number));
+        pool.create(NOW, None, spec).unwrap();
+    }
+    let mut all = Requirement::new(ResourceOperation::Block, KINDS[0]);
+    all.count = Quantity::from(u32::try_from(units).unwrap());
+    pool.acquire(NOW, AcquireRequest::new(SessionId::from("s"), vec![all])).unwrap();
+    for number in 0..waiters {
+        let mut one = Requirement::new(ResourceOperation::Block, KINDS[0]);
+        one.attributes.insert("number".to_owned(), Value::Int(number));
+        pool.acquire(NOW, AcquireRequest::new(SessionId::from("s"), vec![one])).unwrap();
+    }
+    settled(&mut pool);
+    assert_eq!(pool.waiting() as i64, waiters);
+    pool
+}
+
+/// Takes turns until nothing is left to do; how much work each was.
+fn settled(pool: &mut Pool) -> Vec<usize> {
+    let mut work = vec![pool.worked];
+    while pool.next_deadline() == Some(NOW) {
+        pool.advance(NOW);
+        work.push(pool.worked);
+    }
+    pool.check_invariants().unwrap();
+    work
+}
+
+#[test]
+fn a_unit_given_back_concerns_those_who_wait_for_it_and_not_those_who_select_others() {
+    let mut pool = numbered(4, 1_000);
+    let before = pool.waiting();
+    // Of the four, one after the other is given back and taken by who waits for it.
+    let lease = pool.leases()[0].id;
+    pool.release(NOW, None, lease).unwrap();
+    let work: usize = settled(&mut pool).iter().sum();
+    assert_eq!(pool.waiting(), before - 4);
+    assert!(work < 1_000, "{work} for four units");
+    let lease = pool.leases()[0].id;
+    pool.release(NOW, None, lease).unwrap();
+    let work: usize = settled(&mut pool).iter().sum();
+    assert!(work < 250, "{work} for one unit that nobody waits for");
+}
+
+#[test]
+fn one_more_who_waits_is_looked_at_alone_and_not_with_all_who_wait() {
+    let mut pool = numbered(1_000, 1_000);
+    let mut again = Requirement::new(ResourceOperation::Block, KINDS[0]);
+    again.attributes.insert("number".to_owned(), Value::Int(7));
+    pool.acquire(NOW, AcquireRequest::new(SessionId::from("s"), vec![again])).unwrap();
+    // Of all that exists, whether it fits is looked at once, to see whether there is any hope.
+    let work: usize = settled(&mut pool).iter().sum();
+    assert!(work < 1_500, "{work}");
+}
+
+#[test]
+fn what_many_wait_for_by_different_selectors_is_shared_out_in_work_for_those_who_get_it() {
+    let mut pool = numbered(1_000, 1_200);
+    let lease = pool.leases()[0].id;
+    pool.release(NOW, None, lease).unwrap();
+    let work = settled(&mut pool);
+    assert_eq!(pool.waiting(), 200);
+    let (sum, longest) = (work.iter().sum::<usize>(), work.iter().max());
+    assert!(sum < 100_000, "{sum} in {} turns, the longest {longest:?}", work.len());
 }

@@ -1,23 +1,29 @@
-//! Who only looks: the sessions there are, and why an acquire waits.
+//! Who only looks: the sessions there are, and why an acquire waits. Each turn a part of it: the call asks for the next part.
 
 use super::{ResourceCore, ResourceDesk};
 use crate::details::status as status_with;
 use crate::resource_manager::wire;
 use ratn_proto::types::{SessionStatus, WaitingAcquire};
-use ratn_resources::WaiterId;
+use ratn_resources::{Explanation, WaiterId};
 use std::sync::Arc;
 use tonic::{Code, Status};
 
 /// Waiters that are explained together at the most.
 const EXPLAINED: usize = 100;
 
+/// Looks at resources and waiters for explanations in one turn.
+const LOOKS: usize = 20_000;
+/// What the sessions that are told of in one turn have beside them (leases, waiters, resources), together.
+const LISTED_AT_ONCE: usize = 4_096;
+
 impl ResourceCore {
-    pub(super) fn sessions(&self, desk: &ResourceDesk) -> Vec<SessionStatus> {
+    pub(super) fn sessions(&self, after: &str, desk: &ResourceDesk) -> Vec<SessionStatus> {
         let now = desk.now();
-        self.pool.sessions().into_iter().map(|session| wire::session(session, now)).collect()
+        let some = self.pool.sessions_after(after, LISTED_AT_ONCE, wire::NAMED);
+        some.into_iter().map(|session| wire::session(session, now)).collect()
     }
 
-    pub(super) fn explain(&self, caller: &Arc<str>, request_id: &str) -> Result<(Vec<WaitingAcquire>, usize), Status> {
+    pub(super) fn waiters(&self, caller: &Arc<str>, request_id: &str) -> Result<(Vec<WaiterId>, usize), Status> {
         let waiters = if request_id.is_empty() {
             self.pool.first_waiters(EXPLAINED)
         } else {
@@ -27,10 +33,15 @@ impl ResourceCore {
             })?;
             vec![waiter]
         };
-        let explained = |id: WaiterId| {
-            let (request_id, request) = self.pool.waiter(id)?;
-            Some(wire::waiting(request_id, request, &self.pool.explain(id)?))
+        Ok((waiters, self.pool.waiting()))
+    }
+
+    pub(super) fn explain(&self, waiters: &[WaiterId]) -> (Vec<WaitingAcquire>, usize) {
+        let (explanations, done) = self.pool.explain_some(waiters, LOOKS);
+        let explained = |why: &Explanation| {
+            let (request_id, request) = self.pool.waiter(why.waiter)?;
+            Some(wire::waiting(request_id, request, why))
         };
-        Ok((waiters.into_iter().filter_map(explained).collect(), self.pool.waiting()))
+        (explanations.iter().filter_map(explained).collect(), done)
     }
 }

@@ -6,9 +6,8 @@ use super::super::watch_filter::WatchFilter;
 use super::ResourceCore;
 use crate::resource_manager::Granted;
 use ratn_model::id::{LeaseId, Revision};
-use ratn_model::resource::Requirement;
 use ratn_proto::types::{Demand, SessionStatus, WaitingAcquire, WatchPosition};
-use ratn_resources::{AcquireRequest, Quantity, Reply, Request, ResourceView, SessionId, Speaker};
+use ratn_resources::{AcquireRequest, Reply, Request, ResourceView, Search, SessionId, Speaker, WaiterId};
 use std::cmp::Reverse;
 use std::sync::Arc;
 use std::time::Duration;
@@ -65,9 +64,11 @@ pub(in super::super) enum Message {
     Return {
         lease: LeaseId,
     },
-    Find {
-        requirement: Requirement,
-        answer: oneshot::Sender<(Quantity, Vec<String>)>,
+    /// Looks at so many more resources; whether it has looked at all.
+    Search {
+        search: Search,
+        resources: usize,
+        answer: oneshot::Sender<(Search, bool)>,
     },
     Get {
         id: String,
@@ -82,14 +83,21 @@ pub(in super::super) enum Message {
     Revision {
         answer: oneshot::Sender<Revision>,
     },
+    /// Some of those behind an id.
     Sessions {
+        after: String,
         answer: oneshot::Sender<Vec<SessionStatus>>,
     },
-    /// Why the acquire of a request id waits, the caller's own before those of others; or the first of the queue; and how many wait.
-    Explain {
+    /// The waiter of a request id, the caller's own before those of others; or the first of the queue; and how many wait.
+    Waiters {
         caller: Arc<str>,
         request_id: String,
-        answer: Answer<(Vec<WaitingAcquire>, usize)>,
+        answer: Answer<(Vec<WaiterId>, usize)>,
+    },
+    /// Why the first of these wait, and how many of them that is.
+    Explain {
+        waiters: Vec<WaiterId>,
+        answer: oneshot::Sender<(Vec<WaitingAcquire>, usize)>,
     },
     WatchDemand {
         speaker: Speaker,

@@ -208,10 +208,9 @@ impl Core for ResourceCore {
                 desk.reply(answer, withdrawn);
             }
             Message::Return { lease } => self.give_back(lease, desk),
-            Message::Find { requirement, answer } => {
-                let fitting = self.pool.fitting(&requirement);
-                let found = (self.pool.exists(&requirement), fitting);
-                desk.tell(answer, found);
+            Message::Search { mut search, resources, answer } => {
+                let finished = self.pool.go_on(&mut search, resources);
+                desk.tell(answer, (search, finished));
             }
             Message::Get { id, answer } => desk.tell(answer, self.pool.get(&id)),
             Message::List { after, most, answer } => {
@@ -219,7 +218,7 @@ impl Core for ResourceCore {
                 desk.tell(answer, listed);
             }
             Message::Revision { answer } => desk.tell(answer, self.pool.revision()),
-            Message::Sessions { answer } => desk.tell(answer, self.sessions(desk)),
+            Message::Sessions { after, answer } => desk.tell(answer, self.sessions(&after, desk)),
             Message::WatchDemand { speaker, session, provisions, answer } => {
                 let allowed = self.may_speak(now, &speaker, Some(&session));
                 let watch = allowed.and_then(|()| self.watch_demand(session, provisions));
@@ -235,10 +234,11 @@ impl Core for ResourceCore {
                 }
                 desk.reply(answer, reported);
             }
-            Message::Explain { caller, request_id, answer } => {
-                let explained = self.explain(&caller, &request_id);
-                desk.reply(answer, explained);
+            Message::Waiters { caller, request_id, answer } => {
+                let waiters = self.waiters(&caller, &request_id);
+                desk.reply(answer, waiters);
             }
+            Message::Explain { waiters, answer } => desk.tell(answer, self.explain(&waiters)),
             Message::Watch { after, filter, answer } => {
                 let watch = self.watch(after, filter, desk);
                 desk.reply(answer, watch);
@@ -373,11 +373,12 @@ fn refuse_change(message: Message, stopped: Status, desk: &mut ResourceDesk) -> 
         Message::WatchDemand { answer, .. } => desk.reply(answer, Err(stopped)),
         Message::ReportShortage { answer, .. } => desk.reply(answer, Err(stopped)),
         Message::Abandon { .. } | Message::Return { .. } => {}
-        read @ (Message::Find { .. }
+        read @ (Message::Search { .. }
         | Message::Get { .. }
         | Message::List { .. }
         | Message::Revision { .. }
         | Message::Sessions { .. }
+        | Message::Waiters { .. }
         | Message::Explain { .. }
         | Message::Watch { .. }) => return Some(read),
     }

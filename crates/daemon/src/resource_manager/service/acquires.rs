@@ -115,8 +115,16 @@ pub(super) async fn explain(
 ) -> Result<v1::ExplainResponse, Status> {
     let (caller, request_id) = (caller.name, request.request_id);
     label(&request_id, "request_id")?;
-    let explain = |answer| Message::Explain { caller, request_id, answer };
-    let (waiting, total) = requests.actor().request(explain).await?;
+    let asked = |answer| Message::Waiters { caller, request_id, answer };
+    let (mut waiters, total) = requests.actor().request(asked).await?;
+    let mut waiting = Vec::new();
+    while !waiters.is_empty() {
+        let rest = waiters.clone();
+        let explain = |answer| Message::Explain { waiters: rest, answer };
+        let (explained, done) = requests.actor().ask(explain).await?;
+        waiting.extend(explained);
+        waiters.drain(..done.clamp(1, waiters.len()));
+    }
     let total = u32::try_from(total).unwrap_or(u32::MAX);
     Ok(v1::ExplainResponse { waiting: paging::first(all(waiting)), total })
 }

@@ -69,8 +69,18 @@ impl Requests {
             _ => "operate",
         };
         let pending = audit::begin(caller, &request_id, || mutation::of(&request));
-        let message = |speaker, answer| Message::Perform { speaker, request_id, request, answer };
-        let (reply, revision) = self.change(operation, pending, caller, message).await?;
+        let speaker = speaker(caller);
+        let changed = loop {
+            let (speaker, request_id, request) = (speaker.clone(), request_id.clone(), request.clone());
+            let message = |answer| Message::Perform { speaker, request_id, request, answer };
+            match self.actor.request(message).await {
+                // Some of what the call asks for is done. It asks for the rest, behind those who asked meanwhile.
+                Ok((Reply::Unfinished, _)) => {}
+                changed => break changed,
+            }
+        };
+        pending.ended(&changed);
+        let (reply, revision) = self.counted(operation, changed)?;
         Ok((reply, revision.0))
     }
 }

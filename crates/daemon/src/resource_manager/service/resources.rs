@@ -10,11 +10,13 @@ use ratn_model::resource::{Requirement, ResourceClass};
 use ratn_proto::convert::{label, name, required};
 use ratn_proto::types::{ENDPOINT_ATTRIBUTE, Resource, ResourceFilter};
 use ratn_proto::v1;
-use ratn_resources::{Reply, Request, ResourceSpec};
+use ratn_resources::{Reply, Request, ResourceSpec, Search};
 use tonic::{Code, Status};
 
 /// Resources that are looked at in one turn for a list.
 const LISTED_AT_ONCE: usize = 4_096;
+/// Resources that are looked at in one turn to see whether they fit.
+const SEARCHED_AT_ONCE: usize = 10_000;
 /// Ids that an answer names.
 const MOST_IDS: usize = 1_000;
 
@@ -100,9 +102,15 @@ pub(super) async fn delete(
 pub(super) async fn exists(requests: &Requests, request: v1::ExistsRequest) -> Result<v1::ExistsResponse, Status> {
     let requirement: Requirement = required(request.requirement, "requirement")?;
     let wanted = requirement.count;
-    let (units, mut resource_ids) = requests.actor().ask(|answer| Message::Find { requirement, answer }).await?;
-    resource_ids.truncate(MOST_IDS);
-    Ok(v1::ExistsResponse { exists: units >= wanted, resource_ids })
+    let mut search = Search::new(requirement, MOST_IDS);
+    loop {
+        let go_on = |answer| Message::Search { search, resources: SEARCHED_AT_ONCE, answer };
+        let (found, finished) = requests.actor().ask(go_on).await?;
+        if finished {
+            return Ok(v1::ExistsResponse { exists: found.units() >= wanted, resource_ids: found.into_ids() });
+        }
+        search = found;
+    }
 }
 
 pub(super) async fn get(

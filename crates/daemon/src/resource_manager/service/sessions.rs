@@ -84,14 +84,24 @@ pub(super) async fn list(
 ) -> Result<v1::ListSessionsResponse, Status> {
     let v1::ListSessionsRequest { page_bytes, page_token } = request;
     label(&page_token, "page_token")?;
-    let sessions = requests.actor().ask(|answer| Message::Sessions { answer }).await?;
-    // The token is the id of the last on the page before.
-    let behind = sessions.into_iter().filter(|session| session.id > page_token).map(v1::SessionStatus::from);
+    let page = Page::of(page_bytes, &page_token);
     let mut filled = Filled::default();
-    let more = Page::of(page_bytes, &page_token).fill(behind, &mut filled)?;
-    let last = filled.items.last().filter(|_| more).map(|session| session.session_id.clone());
-    let next_page_token = last.unwrap_or_default();
-    Ok(v1::ListSessionsResponse { sessions: filled.items, next_page_token })
+    // The token is the id of the last on the page before.
+    let mut after = page_token;
+    loop {
+        let from = after.clone();
+        let sessions = requests.actor().ask(|answer| Message::Sessions { after: from, answer }).await?;
+        let last = sessions.last().map(|session| session.id.clone());
+        let full = page.fill(sessions.into_iter().map(v1::SessionStatus::from), &mut filled)?;
+        let told = filled.items.last().filter(|_| full).map(|session| session.session_id.clone());
+        match last {
+            Some(last) if !full => after = last,
+            _ => {
+                let next_page_token = told.unwrap_or_default();
+                return Ok(v1::ListSessionsResponse { sessions: filled.items, next_page_token });
+            }
+        }
+    }
 }
 
 pub(super) async fn end_task(
