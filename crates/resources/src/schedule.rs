@@ -28,7 +28,9 @@ use std::ops::Bound;
 use std::sync::Arc;
 
 /// To find a group, or who is first in it, takes as long as looking at so many resources.
-pub(crate) const WORK_PER_GROUP: usize = 8;
+pub(crate) const WORK_PER_GROUP: usize = 32;
+/// To reserve something for a waiter, or to grant it, takes as long as looking at so many of them, beside those that are looked at.
+const WORK_PER_WAITER: usize = 128;
 
 impl Pool {
     /// Grants whatever can be granted.
@@ -43,7 +45,8 @@ impl Pool {
             }
             let Some(waiter) = self.queue.get(id) else { return };
             let taken = waiter.reserved.clone();
-            self.ended(taken.iter().map(|units| units.len()).sum::<usize>().max(1));
+            self.ended(taken.iter().map(|units| units.len()).sum());
+            self.worked += WORK_PER_WAITER;
             self.grant(id, taken);
         }
     }
@@ -254,7 +257,7 @@ impl Pool {
         let kept = self.limits.overtaken == 0 || known.strict.last().is_some_and(|last| place <= *last);
         let passes = self.passes(place, family);
         let Some((indices, assignment)) = self.assigned(place, family) else { return };
-        self.worked += assignment.looked_at + WORK_PER_GROUP;
+        self.worked += assignment.looked_at + WORK_PER_WAITER;
         let complete = assignment.is_complete();
         if (complete && !passes) || (!complete && kept) {
             // What it has reserved again is nobody else's.
