@@ -108,8 +108,9 @@ impl Batch {
             for key in selectors.candidates(&seen.description) {
                 let changes = self.groups.entry(key.clone()).or_default();
                 if changes.last() != Some(&at) {
+                    // The group is found once for all that it is told.
+                    self.work += if changes.is_empty() { WORK_PER_GROUP } else { 1 };
                     changes.push(at);
-                    self.work += WORK_PER_GROUP;
                 }
             }
         }
