@@ -6,7 +6,7 @@
 
 use crate::aimm;
 use crate::arm::finger_around_held;
-use crate::collision::{distance, length};
+use crate::collision::length;
 use crate::connect::{Budget, ConnectError};
 use crate::drive::{Vehicle, drive_in, state, wrapped};
 use crate::exact::{Exact, Touch};
@@ -15,7 +15,7 @@ use crate::pace::Control;
 use crate::request::MIN_SPEED;
 use crate::robot::{Configuration, Joint, Joints, Robot, to_f32};
 use crate::space::{Obstacle, Space};
-use crate::timing::{Part, PhasePlane, timed};
+use crate::timing::{Part, timed};
 use crate::trajectory::{BaseTrajectory, Curve, TrajectoryError};
 use crate::validate::{Violation, check_limits, check_rest};
 use rand::{RngExt, SeedableRng};
@@ -46,8 +46,9 @@ const MAX_GOALS: usize = 64;
 /// Samples of the search.
 const ITERATIONS: usize = 30_000;
 
-/// How far any point of what drives moves between two checked places, in metres.
-const CHECK_STEP_M: f64 = 0.01;
+/// Room that a place is checked with roughly, and what may go unseen exactly, in metres.
+const ROOMY_M: f64 = 0.01;
+const RESOLUTION_M: f64 = 1e-3;
 
 /// Where to drive.
 #[derive(Debug, Clone, PartialEq)]
@@ -199,7 +200,7 @@ pub fn plan_drive(
     })?;
     let joints = limits(robot);
     let mut free = |from: &[f64; 3], to: &[f64; 3]| space.is_free_motion(&state(*from), &state(*to));
-    let trajectory = timed(&joints, &[Part::Free(path.clone())], request.speed, &PhasePlane, &mut free);
+    let trajectory = timed(&joints, &[Part::Free(path.clone())], request.speed, &mut free);
     let [x, y, heading] = trajectory.end();
     Ok(DrivePlan { trajectory: trajectory.named(&joints), end: [x, y, wrapped(heading)], length: length(&path) })
 }
@@ -227,35 +228,54 @@ pub fn check_drive(
     check_rest(&joints, &trajectory)?;
     check_limits(&joints, &trajectory)?;
     let (vehicle, obstacles) = Vehicle::of(robot, scene, configuration, riding, aimm::DRIVE_AREA, 0.0);
-    check_way(&vehicle, &obstacles, &trajectory)?;
+    let roomy = Vehicle { padding_m: ROOMY_M, ..vehicle.clone() };
+    check_way([&vehicle, &roomy], &obstacles, &trajectory)?;
     Ok(trajectory)
 }
 
-/// Looks at every place between which nothing moves farther than a step: roughly first, exactly where that finds something.
-fn check_way(vehicle: &Vehicle, obstacles: &[Obstacle], trajectory: &BaseTrajectory) -> Result<(), DriveViolation> {
-    let mechanism = vehicle.mechanism();
-    let mut space = Space::new(&mechanism, obstacles);
+/// Looks at the middle of a piece of the curve: with room for as far as anything moves from there within the piece, roughly; else
+/// exactly, in pieces that get shorter until nothing moves by more than [`RESOLUTION_M`].
+fn check_way(
+    [vehicle, roomy]: [&Vehicle; 2],
+    obstacles: &[Obstacle],
+    trajectory: &BaseTrajectory,
+) -> Result<(), DriveViolation> {
+    let (mechanism, padded) = (vehicle.mechanism(), roomy.mechanism());
+    let mut space = Space::new(&padded, obstacles);
     let exact = Exact::new(&mechanism, obstacles);
     let reach = vehicle.bodies.iter().map(|b| b.pose.position[0].hypot(b.pose.position[1]) + b.geometry.radius());
     let reach = reach.fold(0.0, f64::max);
-    let mut look = |time_s: f64, place: &[f64; 3]| match space.is_free(&state(*place)) {
-        true => Ok(()),
-        false => exact.touch(place).map_or(Ok(()), |touch| Err(DriveViolation::Touch { time_s, touch })),
+    let look = |time_s: f64, place: &[f64; 3]| match exact.touch(place) {
+        None => Ok(()),
+        Some(touch) => Err(DriveViolation::Touch { time_s, touch }),
     };
     let knots = trajectory.knots();
     look(0.0, &knots[0].positions)?;
-    for pair in knots.windows(2) {
-        let [a, b] = [&pair[0].positions, &pair[1].positions];
-        // A cubic between two knots is at most so much longer than its chord.
-        let way = 1.5 * (distance(&[a[0], a[1]], &[b[0], b[1]]) + reach * (b[2] - a[2]).abs());
-        let samples = (way / CHECK_STEP_M).ceil().max(1.0) as usize;
-        let duration = pair[1].time_s - pair[0].time_s;
-        for i in 1..=samples {
-            let time_s = pair[0].time_s + duration * i as f64 / samples as f64;
-            look(time_s, &trajectory.sample(time_s).positions)?;
+    for (i, pair) in knots.windows(2).enumerate() {
+        let cubics = trajectory.cubics(i);
+        // In order of time: the last is taken first.
+        let mut pieces = vec![[0.0, pair[1].time_s - pair[0].time_s]];
+        while let Some([from, to]) = pieces.pop() {
+            let middle = (from + to) / 2.0;
+            let place = cubics.map(|cubic| cubic.position_at(middle));
+            let [x, y, heading] = std::array::from_fn(|j| {
+                let [least, greatest] = cubics[j].range(from, to);
+                (place[j] - least).max(greatest - place[j])
+            });
+            let moves_m = x.hypot(y) + reach * heading;
+            if moves_m <= roomy.padding_m && space.is_free(&state(place)) {
+                continue;
+            }
+            if moves_m <= roomy.padding_m {
+                look(pair[0].time_s + middle, &place)?;
+            }
+            if moves_m > RESOLUTION_M {
+                pieces.extend([[middle, to], [from, middle]]);
+            }
         }
     }
-    Ok(())
+    let end = &knots[knots.len() - 1];
+    look(end.time_s, &end.positions)
 }
 
 /// The base's joints within the driving area; a heading has no limits.

@@ -285,6 +285,57 @@ impl<'a> Checker<'a> {
         Some(Collision { moving: self.moving[i].name.clone(), other, depth_m: depth })
     }
 
+    /// How far any point of the robot moves at the most when the joints turn by so much, in metres.
+    pub(crate) fn moves_m(&self, turns: &Joints) -> f64 {
+        (0..7).map(|j| turns[j].abs() * self.reach[j]).sum()
+    }
+
+    /// How far a posture is from touching what it may not, in metres, or `up_to` where that is less; or what it touches. For a checker
+    /// without padding.
+    pub(crate) fn room(&mut self, arm: &Joints, contact: Contact, up_to: f64) -> Result<f64, Collision> {
+        if let Some(collision) = self.collision(arm, contact) {
+            return Err(collision);
+        }
+        let mut room = up_to;
+        for i in 0..self.moving.len() {
+            for &o in &self.moving[i].obstacles {
+                room = room.min(self.room_between(i, Other::Obstacle(o), contact, room));
+            }
+        }
+        for &(i, j) in &self.pairs {
+            room = room.min(self.room_between(i, Other::Moving(j), contact, room));
+        }
+        Ok(room)
+    }
+
+    /// The same of one pair that does not touch, in the posture checked last; `up_to` if there is more.
+    fn room_between(&self, i: usize, other: Other, contact: Contact, up_to: f64) -> f64 {
+        let moving = &self.moving[i];
+        let (centre, radius, pose, shape) = match other {
+            Other::Obstacle(o) => {
+                let obstacle = &self.obstacles[o];
+                (obstacle.centre, obstacle.radius, &obstacle.pose, &obstacle.shape)
+            }
+            Other::Moving(j) => (self.centres[j], self.moving[j].radius, &self.placed[j], &self.moving[j].shape),
+        };
+        let reach = moving.radius + radius + up_to as f32;
+        if self.centres[i].distance_squared(centre) >= reach * reach {
+            return up_to;
+        }
+        let tolerance = match (contact, other) {
+            (Contact::Gripper(_), Other::Obstacle(o)) if moving.part == Part::Finger && self.obstacles[o].open => {
+                return up_to;
+            }
+            (Contact::Gripper(tolerance), _) if matches!(moving.part, Part::Finger | Part::Held) => tolerance,
+            _ => 0.0,
+        };
+        match query::contact(&self.placed[i], &*moving.shape, pose, &**shape, up_to as f32) {
+            Ok(None) => up_to,
+            Ok(Some(contact)) => (f64::from(contact.dist) + tolerance).clamp(0.0, up_to),
+            Err(_) => 0.0,
+        }
+    }
+
     /// Whether the straight motion from one posture to another touches nothing; `from` itself is not checked.
     pub fn edge_is_free(&mut self, from: &Joints, to: &Joints, contact: Contact) -> bool {
         if !self.is_free(to, contact) {
@@ -388,5 +439,23 @@ pub fn length<const N: usize>(path: &[[f64; N]]) -> f64 {
 
 /// Pairs that parry3d cannot decide count as touching; there are none among the primitives.
 fn intersects(pose_a: &Pose32, a: &SharedShape, pose_b: &Pose32, b: &SharedShape) -> bool {
-    query::intersection_test(pose_a, &**a, pose_b, &**b).is_ok_and(|r| r.intersecting)
+    !query::intersection_test(pose_a, &**a, pose_b, &**b).is_ok_and(|r| !r.intersecting)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use parry3d::shape::HalfSpace;
+
+    #[test]
+    fn a_pair_that_cannot_be_decided_touches() {
+        let floor = SharedShape::new(HalfSpace::new(Vector::new(0.0, 0.0, 1.0)));
+        let ball = SharedShape::ball(0.1);
+        let at = |z: f32| Pose32::from_translation(Vector::new(0.0, 0.0, z));
+        // parry3d says nothing about two half-spaces.
+        assert!(query::intersection_test(&at(1.0), &*floor, &at(0.0), &*floor).is_err());
+        assert!(intersects(&at(1.0), &floor, &at(0.0), &floor));
+        assert!(intersects(&at(0.05), &ball, &at(0.0), &floor));
+        assert!(!intersects(&at(0.2), &ball, &at(0.0), &floor));
+    }
 }

@@ -22,7 +22,7 @@ pub use crate::request::{Goal, MAX_GOALS, MAX_STRAIGHT_M, MIN_SPEED, Request};
 use crate::robot::{Configuration, Joints, Robot};
 use crate::simplify::{path_length, shortened};
 use crate::space::{Space, State};
-use crate::timing::{Part, PhasePlane, parameterise};
+use crate::timing::{Part, timed_while};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
@@ -239,13 +239,18 @@ pub fn plan(
     let length_rad = before + f64::from(path_length(&path)) + chosen.length_rad;
     let end = chosen.approach[chosen.approach.len() - 1];
     let free = planning.whole(&start, &path, &chosen);
-    // A path that keeps a constraint is followed as it is.
-    let free = if planning.constraint.is_some() { Part::Straight(free) } else { Part::Free(free) };
-    let parts = [Part::Straight(depart), free, Part::Straight(chosen.approach)];
-    let space = &mut planning.space;
-    let trajectory = parameterise(robot, &parts, request.speed, &PhasePlane, &mut |from, to| {
-        space.is_free_motion(&state(from), &state(to))
-    });
+    let parts = [Part::Straight(depart), Part::Free(free), Part::Straight(chosen.approach)];
+    let (space, constraint) = (&mut planning.space, &planning.constraint);
+    let mut is_free = |from: &Joints, to: &Joints| {
+        let (from, to) = (state(from), state(to));
+        constraint.as_ref().is_none_or(|c| c.holds_along(&from, &to)) && space.is_free_motion(&from, &to)
+    };
+    // To be timed is part of every plan, also when time is up.
+    let mut goes_on = || pace.answer() != Control::Cancelled;
+    let trajectory = timed_while(robot.arm_joints(), &parts, request.speed, &mut is_free, &mut goes_on).to_model(robot);
+    if pace.answer() == Control::Cancelled {
+        return Err(PlanError::Cancelled);
+    }
     let end_pose = robot.tool_pose(&Configuration { arm: end, ..Configuration::ZERO.with_base(&scene.base) });
     let (iterations, time_up) = (pace.iterations, improved.is_err());
     Ok(Plan { trajectory, end, end_pose, first_length_rad, length_rad, iterations, time_up })

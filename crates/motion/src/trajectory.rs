@@ -1,5 +1,6 @@
 //! A trajectory of the arm, or of the base, as a curve: cubic Hermite interpolation between its points.
 
+use crate::cubic::Cubic;
 use crate::robot::{Joint, Robot};
 use ratn_model::value::{Trajectory, TrajectoryPoint};
 
@@ -147,27 +148,9 @@ impl<const N: usize> Curve<N> {
         hermite(&self.knots[next - 1], &self.knots[next], time_s)
     }
 
-    /// Per segment the greatest absolute velocities and accelerations of each joint.
-    pub(crate) fn extremes(&self) -> impl Iterator<Item = ([f64; N], [f64; N])> {
-        self.knots.windows(2).map(|pair| {
-            let (a, b) = (&pair[0], &pair[1]);
-            let h = b.time_s - a.time_s;
-            let (mut velocities, mut accelerations) = ([0.0; N], [0.0; N]);
-            for j in 0..N {
-                let mean = (b.positions[j] - a.positions[j]) / h;
-                let (v0, v1) = (a.velocities[j], b.velocities[j]);
-                let (a0, a1) = ((6.0 * mean - 4.0 * v0 - 2.0 * v1) / h, (2.0 * v0 + 4.0 * v1 - 6.0 * mean) / h);
-                let mut fastest = v0.abs().max(v1.abs());
-                // The velocity's extreme lies where the acceleration, which is linear, is zero.
-                if a0 * a1 < 0.0 {
-                    let t = h * a0 / (a0 - a1);
-                    fastest = fastest.max((v0 + a0 * t / 2.0).abs());
-                }
-                velocities[j] = fastest;
-                accelerations[j] = a0.abs().max(a1.abs());
-            }
-            (velocities, accelerations)
-        })
+    /// What each joint does from knot `i` to the next.
+    pub(crate) fn cubics(&self, i: usize) -> [Cubic; N] {
+        std::array::from_fn(|j| Cubic::between(&self.knots[i], &self.knots[i + 1], j))
     }
 }
 

@@ -1,6 +1,7 @@
 //! Whether the arm may follow a trajectory: what a controller checks before it moves, against what it knows itself.
 
 use crate::collision::{Checker, Collision, Contact};
+use crate::cubic::Cubic;
 use crate::robot::{Joint, Joints, Robot};
 use crate::trajectory::{ArmTrajectory, Curve, Knot, TrajectoryError};
 use ratn_model::value::Trajectory;
@@ -12,8 +13,11 @@ pub const START_TOLERANCE_RAD: f64 = 0.01;
 /// How much a limit may be exceeded, as a fraction: rounding.
 const LIMIT_TOLERANCE: f64 = 0.01;
 
-/// Time between two checked postures at the most, in seconds.
-const CHECK_S: f64 = 0.02;
+/// How far a position may be beyond its limit, in radians or metres.
+const POSITION_TOLERANCE: f64 = 1e-3;
+
+/// What is touched by less than this may go unseen, in metres.
+const RESOLUTION_M: f64 = 5e-4;
 
 /// Why a trajectory may not be followed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -41,17 +45,29 @@ pub enum Violation {
         /// When.
         time_s: f64,
     },
-    /// A position, velocity or acceleration beyond the limit.
+    /// A position, velocity, acceleration or jerk beyond the limit.
     #[error("{joint} reaches {what} {value:.3} at {time_s:.3} s, its limit is {limit:.3}")]
     Limit {
         /// Which joint.
         joint: String,
-        /// Position, velocity or acceleration.
+        /// Position, velocity, acceleration or jerk.
         what: &'static str,
         /// How much.
         value: f64,
         /// What is allowed.
         limit: f64,
+        /// When.
+        time_s: f64,
+    },
+    /// The acceleration steps, so the jerk has no bound.
+    #[error(
+        "the acceleration of {joint} steps by {step:.3} at {time_s:.3} s: its jerk is limited, so it must be continuous"
+    )]
+    Step {
+        /// Which joint.
+        joint: String,
+        /// By how much.
+        step: f64,
         /// When.
         time_s: f64,
     },
@@ -115,52 +131,74 @@ pub(crate) fn check_rest<const N: usize>(joints: &[Joint], trajectory: &Curve<N>
     }
 }
 
-/// Positions, velocities and accelerations are within the limits.
+/// Positions, velocities, accelerations and jerks are within the limits, between the knots too: the extremes of the cubics, in closed
+/// form. Where the acceleration steps from one cubic to the next, or from rest, the jerk has no bound.
 pub(crate) fn check_limits<const N: usize>(joints: &[Joint], trajectory: &Curve<N>) -> Result<(), Violation> {
+    let knots = trajectory.knots();
     let exceeded = |j: usize, what, value: f64, limit: f64, time_s| {
         let joint = joints[j].name.clone();
         Err(Violation::Limit { joint, what, value, limit, time_s })
     };
-    for knot in trajectory.knots() {
-        for (j, joint) in joints.iter().enumerate() {
-            let position = knot.positions[j];
-            if position < joint.lower - 1e-3 {
-                return exceeded(j, "position", position, joint.lower, knot.time_s);
+    let mut before = [0.0; N];
+    for i in 0..knots.len() {
+        let is_last = i + 1 == knots.len();
+        let lasts_s = if is_last { 0.0 } else { knots[i + 1].time_s - knots[i].time_s };
+        let still = |j: usize| Cubic { position: knots[i].positions[j], ..Cubic::STILL };
+        let cubics = if is_last { std::array::from_fn(still) } else { trajectory.cubics(i) };
+        let time_s = knots[i].time_s;
+        for (j, (joint, cubic)) in joints.iter().zip(&cubics).enumerate() {
+            let [least, greatest] = cubic.range(0.0, lasts_s);
+            if least < joint.lower - POSITION_TOLERANCE {
+                return exceeded(j, "position", least, joint.lower, time_s);
             }
-            if position > joint.upper + 1e-3 {
-                return exceeded(j, "position", position, joint.upper, knot.time_s);
+            if greatest > joint.upper + POSITION_TOLERANCE {
+                return exceeded(j, "position", greatest, joint.upper, time_s);
             }
-        }
-    }
-    for (i, (velocities, accelerations)) in trajectory.extremes().enumerate() {
-        let time_s = trajectory.knots()[i].time_s;
-        for (j, joint) in joints.iter().enumerate() {
-            if velocities[j] > joint.velocity * (1.0 + LIMIT_TOLERANCE) {
-                return exceeded(j, "velocity", velocities[j], joint.velocity, time_s);
+            let step = (cubic.acceleration - before[j]).abs();
+            let used = [
+                ("velocity", cubic.greatest_velocity(), joint.velocity),
+                ("acceleration", cubic.greatest_acceleration(), joint.acceleration),
+                ("jerk", cubic.jerk.abs(), joint.jerk),
+            ];
+            for (what, value, limit) in used {
+                if value > limit * (1.0 + LIMIT_TOLERANCE) {
+                    return exceeded(j, what, value, limit, time_s);
+                }
             }
-            if accelerations[j] > joint.acceleration * (1.0 + LIMIT_TOLERANCE) {
-                return exceeded(j, "acceleration", accelerations[j], joint.acceleration, time_s);
+            if joint.jerk.is_finite() && step > joint.acceleration * LIMIT_TOLERANCE {
+                return Err(Violation::Step { joint: joint.name.clone(), step, time_s });
             }
+            before[j] = cubic.acceleration_at(lasts_s);
         }
     }
     Ok(())
 }
 
-/// Samples the curve as densely as the checker asks for.
+/// Looks at the middle of a piece of the curve: where there is more room than anything moves from there within the piece, the piece is
+/// free; else its halves are looked at, until they are so short that nothing moves by more than [`RESOLUTION_M`].
 fn check_collisions(checker: &mut Checker<'_>, trajectory: &ArmTrajectory, contact: Contact) -> Result<(), Violation> {
     let knots = trajectory.knots();
-    let at = |checker: &mut Checker<'_>, time_s: f64, posture: &Joints| match checker.collision(posture, contact) {
-        Some(collision) => Err(Violation::Collision { time_s, collision }),
-        None => Ok(()),
-    };
-    at(checker, 0.0, &knots[0].positions)?;
-    for pair in knots.windows(2) {
-        let duration = pair[1].time_s - pair[0].time_s;
-        let samples = checker.steps(&pair[0].positions, &pair[1].positions).max((duration / CHECK_S).ceil() as usize);
-        for i in 1..=samples {
-            let time_s = pair[0].time_s + duration * i as f64 / samples as f64;
-            at(checker, time_s, &trajectory.sample(time_s).positions)?;
+    let collides = |time_s| move |collision| Violation::Collision { time_s, collision };
+    checker.room(&knots[0].positions, contact, 0.0).map_err(collides(0.0))?;
+    for (i, pair) in knots.windows(2).enumerate() {
+        let cubics = trajectory.cubics(i);
+        // In order of time: the last is taken first.
+        let mut pieces = vec![[0.0, pair[1].time_s - pair[0].time_s]];
+        while let Some([from, to]) = pieces.pop() {
+            let middle = (from + to) / 2.0;
+            let posture = cubics.map(|cubic| cubic.position_at(middle));
+            let strays = std::array::from_fn(|j| {
+                let [least, greatest] = cubics[j].range(from, to);
+                (posture[j] - least).max(greatest - posture[j])
+            });
+            let moves_m = checker.moves_m(&strays);
+            let room = checker.room(&posture, contact, moves_m).map_err(collides(pair[0].time_s + middle))?;
+            if room < moves_m && moves_m > RESOLUTION_M {
+                pieces.extend([[middle, to], [from, middle]]);
+            }
         }
     }
+    let end = &knots[knots.len() - 1];
+    checker.room(&end.positions, contact, 0.0).map_err(collides(end.time_s))?;
     Ok(())
 }

@@ -46,7 +46,9 @@ fn the_base_drives_round_the_table_to_its_other_side_within_its_limits() {
     let plan = planned(&scene, &to([1.75, 0.0, PI])).unwrap();
     assert!((plan.end[0] - 1.75).abs() < 1e-5 && plan.end[1].abs() < 1e-5 && (plan.end[2].abs() - PI).abs() < 1e-5);
     let driven = check_drive(&robot, &scene, &STANDING, &[], &plan.trajectory).unwrap();
-    assert!(driven.duration_s() > plan.length / 0.8 / 0.5, "faster than half of 0.8 m/s");
+    for knot in driven.knots() {
+        assert!(knot.velocities.iter().all(|v| v.abs() <= 0.4 * 1.001), "faster than half of 0.8 m/s: {knot:?}");
+    }
     // 2 m of table and base are in between: it cannot go straight.
     assert!(driven.knots().iter().any(|k| k.positions[1].abs() > 0.8));
     assert_eq!(planned(&scene, &to([1.75, 0.0, PI])).unwrap(), plan, "the same request gives the same plan");

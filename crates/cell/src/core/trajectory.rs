@@ -5,7 +5,7 @@ use ratn_motion::base::check_drive;
 use ratn_motion::collision::Contact;
 use ratn_motion::plan::MIN_SPEED;
 use ratn_motion::robot::{Configuration, Joints, Robot};
-use ratn_motion::timing::{Part, PhasePlane, parameterise};
+use ratn_motion::timing::{Part, parameterise};
 use ratn_motion::trajectory::{ArmTrajectory, BaseTrajectory};
 use ratn_motion::validate::validate_trajectory;
 use ratn_world::scene::Scene;
@@ -66,5 +66,5 @@ pub(crate) fn straight(robot: &Robot, from: &Joints, to: &Joints, speed: f64) ->
         return Err(format!("a speed of {speed} is none: it is a fraction of the limits, from {MIN_SPEED} to 1"));
     }
     // A line without corners to round.
-    Ok(parameterise(robot, &[Part::Straight(vec![*from, *to])], speed, &PhasePlane, &mut |_, _| false))
+    Ok(parameterise(robot, &[Part::Straight(vec![*from, *to])], speed, &mut |_, _| false))
 }

@@ -1,0 +1,375 @@
+//! One path from rest to rest, followed as quickly as the limits allow: the knots of its trajectory.
+//!
+//! A straight line is a double S in closed form. Any other path is timed within velocity and acceleration first (`reachability`); where
+//! jerk is limited that gives the mesh for the third order (`third_order`). A cubic spline goes through the path at the points of
+//! the mesh, at their times. It is the trajectory itself, so its cubics are held against the limits in closed form: where one breaks
+//! a limit, that limit is drawn tighter there, and the path is timed again. What is left after that slows the whole path, by
+//! some thousandths.
+
+use super::cubics;
+use super::double_s::{self, double_s};
+use super::path::{Path, norm};
+use super::reachability::{Grid, squares};
+use super::third_order::{Limits, Mesh, quickest};
+use crate::cubic::Cubic;
+use crate::robot::Joint;
+use crate::trajectory::Knot;
+
+/// What the joints may do at the chosen speed.
+#[derive(Debug, Clone)]
+pub(crate) struct Bounds<const N: usize> {
+    pub(crate) velocities: [f64; N],
+    pub(crate) accelerations: [f64; N],
+    pub(crate) jerks: [f64; N],
+}
+
+/// Points of the grid of the second order on a path at least, how many on each of its segments, and how far the path turns from
+/// one to the next, in radians.
+const GRID: f64 = 240.0;
+const GRID_SEGMENT: f64 = 6.0;
+const GRID_TURN: f64 = 0.04;
+
+/// How much denser it becomes where limits are broken between its points.
+const DENSER: [f64; 3] = [2.0, 4.0, 8.0];
+
+/// The time between two knots, unless the path takes so long that there would be more of them than this.
+const KNOT_S: f64 = 0.018;
+const KNOTS: f64 = 170.0;
+
+/// How far the path turns in a cell of the mesh at the most, in radians, and how much of a segment one takes.
+const TURN: f64 = 0.25;
+const CELLS: f64 = 2.0;
+
+/// How much longer than the way since the start a cell may be at most; the same before the end.
+const GROWTH: f64 = 0.35;
+
+/// The first cell takes this share of the time in which the acceleration is reached.
+const FIRST: f64 = 0.35;
+
+/// Knots in the first cell and in the last.
+const FIRST_KNOTS: usize = 8;
+
+/// Rounds in which limits that the spline breaks are drawn tighter; by how much more than they are broken.
+const ROUNDS: usize = 3;
+const TIGHTER: f64 = 0.999;
+/// A limit that is broken by less is left to slowing down.
+const CLOSE: f64 = 1.003;
+
+impl<const N: usize> Bounds<N> {
+    /// The limits of joints; those of velocity and acceleration are multiplied by the speed.
+    pub(crate) fn new(joints: &[Joint], speed: f64) -> Bounds<N> {
+        Bounds {
+            velocities: std::array::from_fn(|j| joints[j].velocity * speed),
+            accelerations: std::array::from_fn(|j| joints[j].acceleration * speed),
+            jerks: std::array::from_fn(|j| joints[j].jerk),
+        }
+    }
+
+    /// The limits along a direction.
+    fn along(&self, direction: &[f64; N]) -> double_s::Limits {
+        let least = |limits: &[f64; N]| {
+            let of = |j: usize| limits[j] / direction[j].abs().max(1e-12);
+            (0..N).map(of).fold(f64::INFINITY, f64::min)
+        };
+        double_s::Limits {
+            velocity: least(&self.velocities),
+            acceleration: least(&self.accelerations),
+            jerk: least(&self.jerks),
+        }
+    }
+
+    fn limits_jerk(&self) -> bool {
+        self.jerks.iter().any(|j| j.is_finite())
+    }
+}
+
+/// The knots, the first at 0; none where `goes_on`, which is asked often, says no.
+pub(crate) fn follow<const N: usize>(
+    path: &Path<N>,
+    bounds: &Bounds<N>,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Option<Vec<Knot<N>>> {
+    if path.is_line() {
+        return Some(straight(path, bounds));
+    }
+    let second = Second::of(path, bounds, 1.0);
+    let knots = match bounds.limits_jerk() {
+        true => third(path, bounds, &second, goes_on),
+        false => Some(second_order(path, bounds, second)),
+    };
+    knots.map(|knots| slowed(knots, bounds))
+}
+
+/// About how long the path takes, for less than following it costs.
+pub(crate) fn estimate<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> f64 {
+    if path.is_line() {
+        let instants = double_s(path.length(), bounds.along(&path.segments()[0].at(0.0).first));
+        return instants[instants.len() - 1].time_s;
+    }
+    let second = Second::of(path, bounds, 1.0);
+    let limits = bounds.along(&path.segments()[0].at(0.0).first);
+    second.times[second.times.len() - 1]
+        + (limits.acceleration / limits.jerk).min((limits.velocity / limits.jerk).sqrt())
+}
+
+fn straight<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> Vec<Knot<N>> {
+    let line = &path.segments()[0];
+    let direction = line.at(0.0).first;
+    let instants = double_s(path.length(), bounds.along(&direction));
+    let knot = |i: &double_s::Instant| Knot {
+        time_s: i.time_s,
+        positions: line.at(i.way).position,
+        velocities: direction.map(|d| d * i.velocity),
+    };
+    instants.iter().map(knot).collect()
+}
+
+/// The path within limits of velocity and acceleration.
+struct Second<const N: usize> {
+    grid: Grid<N>,
+    squares: Vec<f64>,
+    times: Vec<f64>,
+}
+
+impl<const N: usize> Second<N> {
+    fn of(path: &Path<N>, bounds: &Bounds<N>, density: f64) -> Second<N> {
+        let mut grid = Grid { s: vec![0.0], points: vec![path.segments()[0].at(0.0)] };
+        for (segment, start) in path.segments().iter().zip(path.breaks()) {
+            let share = GRID * segment.length / path.length();
+            let turn = segment.length * segment.sharpest() / GRID_TURN;
+            let count = (share.max(GRID_SEGMENT).max(turn) * density).ceil();
+            for i in 1..=count as usize {
+                let along = segment.length * i as f64 / count;
+                grid.s.push(start + along);
+                grid.points.push(segment.at(along));
+            }
+        }
+        let squares = squares(&grid, &bounds.velocities, &bounds.accelerations);
+        let mut times = vec![0.0];
+        for (i, pair) in squares.windows(2).enumerate() {
+            let mean = (pair[0].sqrt() + pair[1].sqrt()).max(1e-9) / 2.0;
+            times.push(times[i] + (grid.s[i + 1] - grid.s[i]) / mean);
+        }
+        Second { grid, squares, times }
+    }
+
+    fn knots(&self) -> Vec<Knot<N>> {
+        let knot = |i: usize| Knot {
+            time_s: self.times[i],
+            positions: self.grid.points[i].position,
+            velocities: self.grid.points[i].first.map(|d| d * self.squares[i].sqrt()),
+        };
+        (0..self.times.len()).map(knot).collect()
+    }
+}
+
+/// The knots on a grid so dense that the limits hold between its points as well, but for little.
+fn second_order<const N: usize>(path: &Path<N>, bounds: &Bounds<N>, second: Second<N>) -> Vec<Knot<N>> {
+    let mut knots = second.knots();
+    let excess = |knots: &[Knot<N>]| knots.windows(2).map(|pair| slower(used(pair, bounds))).fold(1.0, f64::max);
+    for density in DENSER {
+        if excess(&knots) < CLOSE {
+            break;
+        }
+        let denser = Second::of(path, bounds, density).knots();
+        let lasts = |knots: &[Knot<N>]| knots[knots.len() - 1].time_s * excess(knots);
+        if lasts(&denser) < lasts(&knots) {
+            knots = denser;
+        }
+    }
+    knots
+}
+
+/// The path within limits of jerk, too; none where no profile was found.
+fn third<const N: usize>(
+    path: &Path<N>,
+    bounds: &Bounds<N>,
+    second: &Second<N>,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Option<Vec<Knot<N>>> {
+    let mesh = mesh(path, bounds, second);
+    let cells = mesh.s.len() - 1;
+    let mut limits = Limits {
+        velocities: vec![bounds.velocities; cells],
+        accelerations: vec![bounds.accelerations; cells],
+        jerks: vec![bounds.jerks; cells],
+    };
+    let mut best: Option<(f64, Vec<Knot<N>>)> = None;
+    let mut last = None;
+    for _ in 0..ROUNDS {
+        let Some(profile) = quickest(&mesh, &limits, last.as_ref(), goes_on) else { break };
+        let (times, positions) = timed(path, &mesh, &profile.x, &profile.u);
+        let knots = cubics::through(&times, &positions);
+        let excess = tighten(&knots, bounds, &mut limits);
+        let lasts = knots[knots.len() - 1].time_s * excess;
+        if best.as_ref().is_none_or(|(least, _)| lasts < *least) {
+            best = Some((lasts, knots));
+        }
+        if excess < CLOSE {
+            break;
+        }
+        last = Some(profile);
+    }
+    best.map(|(_, knots)| knots)
+}
+
+/// The points at which the third order is solved: close in time, close to each other near rest, and one wherever a segment ends.
+fn mesh<const N: usize>(path: &Path<N>, bounds: &Bounds<N>, second: &Second<N>) -> Mesh<N> {
+    let whole = path.length();
+    let lasts = second.times[second.times.len() - 1];
+    let step_s = KNOT_S.max(lasts / KNOTS);
+    let segments = path.segments();
+    let first_way = |slope: &[f64; N], room: f64| {
+        let limits = bounds.along(slope);
+        let by_way = (whole / (2.0 * limits.jerk)).cbrt();
+        let jerking = (limits.acceleration / limits.jerk).min(by_way).min((limits.velocity / limits.jerk).sqrt());
+        (limits.jerk * (FIRST * jerking).powi(3) / 6.0).min(room / 3.0)
+    };
+    let last = &segments[segments.len() - 1];
+    let first = first_way(&segments[0].at(0.0).first, segments[0].length);
+    let end = first_way(&last.at(last.length).first, last.length);
+    let mut s = vec![0.0];
+    let mut ends = vec![[segments[0].at(0.0), segments[0].at(first)]];
+    let mut index = 0;
+    let (squares, grid) = (&second.squares, &second.grid.s);
+    let mut velocity = |at: f64| {
+        while index + 2 < grid.len() && grid[index + 1] < at {
+            index += 1;
+        }
+        let share = (at - grid[index]) / (grid[index + 1] - grid[index]);
+        (squares[index] + share * (squares[index + 1] - squares[index])).max(0.0).sqrt()
+    };
+    for (i, (segment, start)) in segments.iter().zip(path.breaks()).enumerate() {
+        let from = if i == 0 { first } else { start };
+        let to = if i + 1 == segments.len() { whole - end } else { start + segment.length };
+        // How many cells there are up to each of many points.
+        let mut counted = vec![(from, 0.0)];
+        let (mut at, mut cells) = (from, 0.0);
+        while at < to {
+            let near = GROWTH * at.min((whole - at).max(end));
+            let here = segment.at(at - start);
+            let near = near.min(TURN * norm(&here.first) / norm(&here.second).max(1e-9));
+            let cell = near.min(velocity(at) * step_s).min(segment.length / CELLS).max(whole * 1e-5);
+            let step = (cell / 6.0).min(to - at).max(whole * 1e-9);
+            at = (at + step).min(to);
+            cells += step / cell;
+            counted.push((at, cells));
+        }
+        let count = cells.ceil().max(2.0) as usize;
+        let mut k = 0;
+        let mut before = from;
+        for c in 1..=count {
+            let wanted = cells * c as f64 / count as f64;
+            while k + 2 < counted.len() && counted[k + 1].1 < wanted {
+                k += 1;
+            }
+            let (a, b) = (counted[k], counted[k + 1]);
+            let here = if c == count { to } else { a.0 + (b.0 - a.0) * (wanted - a.1) / (b.1 - a.1) };
+            s.push(before);
+            ends.push([segment.at(before - start), segment.at(here - start)]);
+            before = here;
+        }
+    }
+    s.extend([whole - end, whole]);
+    ends.push([last.at(last.length - end), last.at(last.length)]);
+    Mesh { s, ends }
+}
+
+/// Times and positions of the knots: all points of the mesh, and more of them in the first and the last cell.
+fn timed<const N: usize>(path: &Path<N>, mesh: &Mesh<N>, x: &[f64], u: &[f64]) -> (Vec<f64>, Vec<[f64; N]>) {
+    let n = mesh.s.len() - 1;
+    let cell = |k: usize| mesh.s[k + 1] - mesh.s[k];
+    let (from_rest, to_rest) = ((6.0 * cell(0) / u[1]).sqrt(), (6.0 * cell(n - 1) / -u[n - 1]).sqrt());
+    let segments = path.segments();
+    let (first, last) = (&segments[0], &segments[segments.len() - 1]);
+    let (mut times, mut positions) = (Vec::with_capacity(n + 20), Vec::with_capacity(n + 20));
+    for i in 0..=FIRST_KNOTS {
+        let share = i as f64 / FIRST_KNOTS as f64;
+        times.push(from_rest * share);
+        positions.push(first.at(cell(0) * share.powi(3)).position);
+    }
+    for k in 1..n - 1 {
+        times.push(times[times.len() - 1] + lasts(cell(k), [x[k], x[k + 1]], [u[k], u[k + 1]]));
+        positions.push(mesh.ends[k][1].position);
+    }
+    let begins = times[times.len() - 1];
+    for i in 1..=FIRST_KNOTS {
+        let share = i as f64 / FIRST_KNOTS as f64;
+        times.push(begins + to_rest * share);
+        positions.push(last.at(last.length - cell(n - 1) * (1.0 - share).powi(3)).position);
+    }
+    (times, positions)
+}
+
+/// ∫ ds / √x over a cell in which x is a quadratic, by Gauss and Legendre's rule of five points.
+fn lasts(cell: f64, x: [f64; 2], u: [f64; 2]) -> f64 {
+    const RULE: [(f64, f64); 5] = [
+        (0.046_910_077_030_668, 0.118_463_442_528_095),
+        (0.230_765_344_947_158, 0.239_314_335_249_683),
+        (0.5, 0.284_444_444_444_444),
+        (0.769_234_655_052_842, 0.239_314_335_249_683),
+        (0.953_089_922_969_332, 0.118_463_442_528_095),
+    ];
+    let square = |share: f64| {
+        let way = share * cell;
+        x[0] + way * (2.0 * u[0] + share * (u[1] - u[0]))
+    };
+    cell * RULE.iter().map(|(share, weight)| weight / square(*share).sqrt()).sum::<f64>()
+}
+
+/// How much of its limits a cubic uses: by velocity, acceleration and jerk.
+fn used<const N: usize>(pair: &[Knot<N>], bounds: &Bounds<N>) -> [f64; 3] {
+    let mut used = [0.0_f64; 3];
+    for j in 0..N {
+        let cubic = Cubic::between(&pair[0], &pair[1], j);
+        used[0] = used[0].max(cubic.greatest_velocity() / bounds.velocities[j]);
+        used[1] = used[1].max(cubic.greatest_acceleration() / bounds.accelerations[j]);
+        used[2] = used[2].max(cubic.jerk.abs() / bounds.jerks[j]);
+    }
+    used
+}
+
+/// The factor of time that keeps what uses so much of the limits within them.
+fn slower([velocity, acceleration, jerk]: [f64; 3]) -> f64 {
+    velocity.max(acceleration.sqrt()).max(jerk.cbrt()).max(1.0)
+}
+
+/// Draws limits tighter in the cells where the knots break them; gives the factor of time that the knots would need.
+fn tighten<const N: usize>(knots: &[Knot<N>], bounds: &Bounds<N>, limits: &mut Limits<N>) -> f64 {
+    let cells = limits.jerks.len();
+    let mut excess = 1.0_f64;
+    let mut broken = vec![[1.0_f64; 3]; cells];
+    for (i, pair) in knots.windows(2).enumerate() {
+        let used = used(pair, bounds);
+        excess = excess.max(slower(used));
+        let cell = (i + 1).saturating_sub(FIRST_KNOTS).min(cells - 1);
+        for near in cell.saturating_sub(1)..=(cell + 1).min(cells - 1) {
+            for (most, used) in broken[near].iter_mut().zip(used) {
+                *most = most.max(used);
+            }
+        }
+    }
+    for (k, [velocity, acceleration, jerk]) in broken.into_iter().enumerate() {
+        let tighter = |limits: &mut [f64; N], used: f64| {
+            if used > 1.0 {
+                limits.iter_mut().for_each(|l| *l *= TIGHTER / used);
+            }
+        };
+        tighter(&mut limits.velocities[k], velocity);
+        tighter(&mut limits.accelerations[k], acceleration);
+        tighter(&mut limits.jerks[k], jerk);
+    }
+    excess
+}
+
+/// Slower by what its cubics break the limits by, if they do.
+fn slowed<const N: usize>(mut knots: Vec<Knot<N>>, bounds: &Bounds<N>) -> Vec<Knot<N>> {
+    let factor = knots.windows(2).map(|pair| slower(used(pair, bounds))).fold(1.0, f64::max);
+    if factor > 1.0 {
+        for knot in &mut knots {
+            knot.time_s *= factor * (1.0 + 1e-12);
+            knot.velocities = knot.velocities.map(|v| v / factor);
+        }
+    }
+    knots
+}

@@ -1,0 +1,135 @@
+//! A smooth path: polynomials of degree five at most, one after the other, along a parameter s that is about the way travelled.
+//!
+//! Value, first and second derivative are continuous; the third may jump where one polynomial ends. The first derivative is
+//! nowhere zero. A path says where to go, not when; it is followed from rest to rest.
+
+/// The coefficients of a polynomial: those of s⁰ to s⁵.
+const COEFFICIENTS: usize = 6;
+
+/// A path of `N` joints from rest to rest.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Path<const N: usize> {
+    segments: Vec<Segment<N>>,
+    /// Where each segment begins.
+    starts: Vec<f64>,
+    length: f64,
+}
+
+/// One polynomial, from s = 0 at its beginning.
+#[derive(Debug, Clone)]
+pub(crate) struct Segment<const N: usize> {
+    pub(crate) length: f64,
+    coefficients: [[f64; N]; COEFFICIENTS],
+}
+
+/// Position and three derivatives by s.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Derivatives<const N: usize> {
+    pub(crate) position: [f64; N],
+    pub(crate) first: [f64; N],
+    pub(crate) second: [f64; N],
+    pub(crate) third: [f64; N],
+}
+
+impl<const N: usize> Segment<N> {
+    /// A straight segment, parameterised by its length.
+    pub(crate) fn line(from: &[f64; N], to: &[f64; N]) -> Segment<N> {
+        let length = crate::collision::distance(from, to);
+        let mut coefficients = [[0.0; N]; COEFFICIENTS];
+        coefficients[0] = *from;
+        coefficients[1] = std::array::from_fn(|j| (to[j] - from[j]) / length);
+        Segment { length, coefficients }
+    }
+
+    /// A Bézier curve of degree five at most along a parameter from 0 to `length`.
+    pub(crate) fn bezier(controls: &[[f64; N]], length: f64) -> Segment<N> {
+        let degree = controls.len() - 1;
+        let mut coefficients = [[0.0; N]; COEFFICIENTS];
+        // The differences of the control points: Δ⁰, Δ¹, … of the first one.
+        let mut differences = controls.to_vec();
+        let mut factor = 1.0;
+        for (k, coefficient) in coefficients.iter_mut().enumerate().take(degree + 1) {
+            *coefficient = differences[0].map(|d| d * factor);
+            for i in 0..degree - k {
+                differences[i] = std::array::from_fn(|j| differences[i + 1][j] - differences[i][j]);
+            }
+            factor *= (degree - k) as f64 / ((k + 1) as f64 * length);
+        }
+        Segment { length, coefficients }
+    }
+
+    /// A cubic from its values and second derivatives at both ends.
+    pub(crate) fn cubic(from: &[f64; N], to: &[f64; N], bends: [&[f64; N]; 2], length: f64) -> Segment<N> {
+        let mut coefficients = [[0.0; N]; COEFFICIENTS];
+        for j in 0..N {
+            let [b0, b1] = bends.map(|b| b[j]);
+            coefficients[0][j] = from[j];
+            coefficients[1][j] = (to[j] - from[j]) / length - length * (2.0 * b0 + b1) / 6.0;
+            coefficients[2][j] = b0 / 2.0;
+            coefficients[3][j] = (b1 - b0) / (6.0 * length);
+        }
+        Segment { length, coefficients }
+    }
+
+    /// What it is at s, counted from its beginning.
+    pub(crate) fn at(&self, s: f64) -> Derivatives<N> {
+        let [c0, c1, c2, c3, c4, c5] = &self.coefficients;
+        let of = |f: &dyn Fn(usize) -> f64| std::array::from_fn(f);
+        Derivatives {
+            position: of(&|j| c0[j] + s * (c1[j] + s * (c2[j] + s * (c3[j] + s * (c4[j] + s * c5[j]))))),
+            first: of(&|j| c1[j] + s * (2.0 * c2[j] + s * (3.0 * c3[j] + s * (4.0 * c4[j] + s * 5.0 * c5[j])))),
+            second: of(&|j| 2.0 * c2[j] + s * (6.0 * c3[j] + s * (12.0 * c4[j] + s * 20.0 * c5[j]))),
+            third: of(&|j| 6.0 * c3[j] + s * (24.0 * c4[j] + s * 60.0 * c5[j])),
+        }
+    }
+
+    fn is_straight(&self) -> bool {
+        self.coefficients[2..].iter().all(|c| c.iter().all(|v| *v == 0.0))
+    }
+
+    /// About the greatest length of the second derivative.
+    pub(crate) fn sharpest(&self) -> f64 {
+        let samples = if self.is_straight() { 0 } else { 8 };
+        let bends = (0..=samples).map(|i| norm(&self.at(self.length * i as f64 / samples.max(1) as f64).second));
+        bends.fold(0.0, f64::max)
+    }
+
+    /// Points so close to each other that the chords between them are at most `sagitta` off the curve; both ends are among them.
+    pub(crate) fn points(&self, sagitta: f64) -> Vec<[f64; N]> {
+        let count = (self.length * (self.sharpest() / (8.0 * sagitta)).sqrt()).ceil().clamp(1.0, 64.0);
+        (0..=count as usize).map(|i| self.at(self.length * i as f64 / count).position).collect()
+    }
+}
+
+pub(crate) fn norm<const N: usize>(v: &[f64; N]) -> f64 {
+    v.iter().map(|x| x * x).sum::<f64>().sqrt()
+}
+
+impl<const N: usize> Path<N> {
+    /// Appends a segment that begins where the path ends, with the same first and second derivative.
+    pub(crate) fn push(&mut self, segment: Segment<N>) {
+        self.starts.push(self.length);
+        self.length += segment.length;
+        self.segments.push(segment);
+    }
+
+    /// The greatest s.
+    pub(crate) fn length(&self) -> f64 {
+        self.length
+    }
+
+    /// Where segments begin and end: s from 0 to the length.
+    pub(crate) fn breaks(&self) -> impl Iterator<Item = f64> + '_ {
+        self.starts.iter().copied().chain([self.length])
+    }
+
+    /// The segments in order.
+    pub(crate) fn segments(&self) -> &[Segment<N>] {
+        &self.segments
+    }
+
+    /// Whether it is one straight line.
+    pub(crate) fn is_line(&self) -> bool {
+        self.segments.len() == 1 && self.segments[0].is_straight()
+    }
+}

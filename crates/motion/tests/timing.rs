@@ -1,0 +1,231 @@
+//! What a trajectory is, between its knots too: within the limits, smooth, and no slower than it has to be; on any joints.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use ratn_motion::robot::Joint;
+use ratn_motion::timing::{Part, timed};
+use ratn_motion::trajectory::{Curve, Knot};
+
+fn joint(velocity: f64, acceleration: f64, jerk: f64) -> Joint {
+    Joint { name: "joint".to_owned(), lower: -9.0, upper: 9.0, velocity, acceleration, jerk }
+}
+
+fn free<const N: usize>(joints: &[Joint], path: &[[f64; N]], speed: f64) -> Curve<N> {
+    timed(joints, &[Part::Free(path.to_vec())], speed, &mut |_, _| true)
+}
+
+fn distance<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
+    (0..N).map(|j| (a[j] - b[j]).powi(2)).sum::<f64>().sqrt()
+}
+
+/// How far a posture is from the nearest motion of a path.
+fn off<const N: usize>(path: &[[f64; N]], posture: &[f64; N]) -> f64 {
+    let from_side = |pair: &[[f64; N]]| {
+        let dot = |a: &[f64; N], b: &[f64; N]| (0..N).map(|j| (a[j] - pair[0][j]) * (b[j] - pair[0][j])).sum::<f64>();
+        let along = (dot(posture, &pair[1]) / dot(&pair[1], &pair[1])).clamp(0.0, 1.0);
+        distance(posture, &std::array::from_fn(|j| pair[0][j] + (pair[1][j] - pair[0][j]) * along))
+    };
+    path.windows(2).map(from_side).fold(f64::INFINITY, f64::min)
+}
+
+/// Acceleration at the beginning and jerk of a joint's cubic between two knots.
+fn cubic<const N: usize>(a: &Knot<N>, b: &Knot<N>, j: usize) -> (f64, f64) {
+    let h = b.time_s - a.time_s;
+    let mean = (b.positions[j] - a.positions[j]) / h;
+    let (v0, v1) = (a.velocities[j], b.velocities[j]);
+    ((6.0 * mean - 4.0 * v0 - 2.0 * v1) / h, 6.0 * (v0 + v1 - 2.0 * mean) / (h * h))
+}
+
+/// From rest to rest, velocity, acceleration and jerk within limits a hundred times between any two knots, and acceleration
+/// without a step.
+fn assert_within<const N: usize>(joints: &[Joint], curve: &Curve<N>, speed: f64) {
+    let knots = curve.knots();
+    let mut before = [0.0; N];
+    for pair in knots.windows(2) {
+        let h = pair[1].time_s - pair[0].time_s;
+        for (j, joint) in joints.iter().enumerate() {
+            let (acceleration, jerk) = cubic(&pair[0], &pair[1], j);
+            let most = joint.acceleration * speed;
+            assert!((acceleration - before[j]).abs() <= 0.005 * most, "a step of {}", acceleration - before[j]);
+            assert!(jerk.abs() <= joint.jerk * 1.001, "jerk {jerk} of {} in {h} s", joint.jerk);
+            for i in 0..=100 {
+                let t = h * f64::from(i) / 100.0;
+                let (velocity, a) =
+                    (pair[0].velocities[j] + t * (acceleration + t * jerk / 2.0), acceleration + t * jerk);
+                assert!(velocity.abs() <= joint.velocity * speed * 1.001, "{velocity}");
+                assert!(a.abs() <= most * 1.001, "{a} of {most}");
+            }
+            before[j] = acceleration + h * jerk;
+        }
+    }
+    for (j, joint) in joints.iter().enumerate() {
+        assert!(before[j].abs() <= 0.005 * joint.acceleration * speed, "ends with {}", before[j]);
+    }
+    assert_eq!((knots[0].velocities, knots[knots.len() - 1].velocities), ([0.0; N], [0.0; N]));
+}
+
+#[test]
+fn a_corner_is_never_slower_than_stopping_at_it_however_little_room_there_is() {
+    let joints = [joint(2.0, 4.0, 80.0), joint(2.0, 4.0, 80.0)];
+    for degrees in [10.0_f64, 60.0, 120.0, 150.0, 170.0, 179.0, 180.0] {
+        let angle = degrees.to_radians();
+        let path = [[0.0, 0.0], [1.0, 0.0], [1.0 + angle.cos(), angle.sin()]];
+        // Each side is too short for the full velocity: 1 = v (v / 4 + 4 / 80). Along a diagonal it is faster.
+        let stops = timed(&joints, &[Part::Free(path.to_vec())], 1.0, &mut |_, _| false);
+        assert!(stops.duration_s() <= 2.1025, "{}", stops.duration_s());
+        let mut last = stops.duration_s();
+        for room in [0.001, 0.01, 0.05, 9.0] {
+            let mut is_free = |from: &[f64; 2], to: &[f64; 2]| off(&path, from).max(off(&path, to)) < room;
+            let curve = timed(&joints, &[Part::Free(path.to_vec())], 1.0, &mut is_free);
+            assert_within(&joints, &curve, 1.0);
+            assert!(
+                curve.duration_s() <= last + 0.01,
+                "{degrees}°, room {room}: {} s, {last} s with less",
+                curve.duration_s()
+            );
+            assert!(curve.duration_s() <= stops.duration_s(), "{degrees}°, room {room}: {} s", curve.duration_s());
+            last = curve.duration_s();
+        }
+        if degrees < 130.0 {
+            assert!(last < 0.97 * stops.duration_s(), "{degrees}°: {last} s, stopping {} s", stops.duration_s());
+        }
+    }
+}
+
+#[test]
+fn a_straight_motion_takes_the_time_of_the_double_s() {
+    // Way, velocity, acceleration and jerk, and the time by hand: with cruise; without; without full acceleration; short.
+    let with = |way: f64, v: f64, a: f64, j: f64| way / v + v / a + a / j;
+    let cases = [
+        (3.0, 1.0, 2.0, 8.0, with(3.0, 1.0, 2.0, 8.0)),
+        (1.0, 9.0, 2.0, 20.0, 2.0 * (((0.01_f64 + 4.0 / 2.0).sqrt() - 0.1) / 2.0 + 0.1)),
+        (0.5, 9.0, 90.0, 8.0, 4.0 * (0.5_f64 / 16.0).cbrt()),
+        (1e-4, 1.0, 2.0, 8.0, 4.0 * (1e-4_f64 / 16.0).cbrt()),
+    ];
+    for (way, v, a, j, expected) in cases {
+        let joints = [joint(v, a, j), joint(2.0 * v, 2.0 * a, 2.0 * j)];
+        // The other joint goes half as far; nothing changes along a diagonal on which it has twice the limits and goes twice as far.
+        for to in [[way, way / 2.0], [-way, 2.0 * way]] {
+            let curve = free(&joints, &[[0.0, 0.0], to], 1.0);
+            assert!((curve.duration_s() / expected - 1.0).abs() < 1e-3, "{} of {expected}", curve.duration_s());
+            assert_within(&joints, &curve, 1.0);
+            assert!(curve.knots().iter().all(|k| off(&[[0.0, 0.0], to], &k.positions) < 1e-9));
+        }
+    }
+}
+
+fn random_path<const N: usize>(random: &mut ChaCha8Rng, postures: usize) -> (Vec<Joint>, Vec<[f64; N]>) {
+    let joints = (0..N).map(|_| {
+        let acceleration = random.random_range(0.5..15.0);
+        let lasts = random.random_range(0.02..0.4);
+        joint(random.random_range(0.3..4.0), acceleration, acceleration / lasts)
+    });
+    let joints = joints.collect();
+    (joints, (0..postures).map(|_| std::array::from_fn(|_| random.random_range(-2.0..2.0))).collect())
+}
+
+fn check_random<const N: usize>(seeds: std::ops::Range<u64>) {
+    for seed in seeds {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let postures = random.random_range(2..7);
+        let (joints, path) = random_path::<N>(&mut random, postures);
+        let speed = random.random_range(0.1..=1.0);
+        let curve = free(&joints, &path, speed);
+        assert_within(&joints, &curve, speed);
+        assert_eq!((curve.knots()[0].positions, curve.end()), (path[0], path[path.len() - 1]));
+        let stops = timed(&joints, &[Part::Free(path.clone())], speed, &mut |_, _| false);
+        assert_within(&joints, &stops, speed);
+        assert!(curve.duration_s() <= stops.duration_s());
+    }
+}
+
+#[test]
+fn random_paths_of_any_number_of_joints_keep_within_all_limits_everywhere() {
+    check_random::<1>(0..6);
+    check_random::<2>(10..18);
+    check_random::<3>(20..28);
+    check_random::<7>(30..38);
+    check_random::<12>(40..44);
+}
+
+#[test]
+fn with_greater_limits_nothing_takes_longer() {
+    for seed in 0..4 {
+        let mut random = ChaCha8Rng::seed_from_u64(100 + seed);
+        let (joints, path) = random_path::<3>(&mut random, 4);
+        let times = |change: &dyn Fn(&mut Joint, f64)| {
+            [1.0, 1.3, 2.0, 4.0].map(|factor| {
+                let mut joints = joints.clone();
+                joints.iter_mut().for_each(|joint| change(joint, factor));
+                free(&joints, &path, 1.0).duration_s()
+            })
+        };
+        let all = [
+            times(&|joint, factor| joint.velocity *= factor),
+            times(&|joint, factor| joint.acceleration *= factor),
+            times(&|joint, factor| joint.jerk *= factor),
+        ];
+        for times in all {
+            assert!(times.is_sorted_by(|a, b| *b <= a * 1.005), "{seed}: {times:?}");
+        }
+    }
+}
+
+#[test]
+fn postures_along_a_curve_are_followed_as_they_are_and_kinks_are_stopped_at() {
+    let joints = [joint(1.0, 3.0, 40.0), joint(1.0, 3.0, 40.0)];
+    let arc: Vec<[f64; 2]> = (0..=60).map(|i| f64::from(i) * 0.02).map(|a| [a.sin(), 1.0 - a.cos()]).collect();
+    let curve = timed(&joints, &[Part::Straight(arc.clone())], 1.0, &mut |_, _| false);
+    assert_within(&joints, &curve, 1.0);
+    let steps = 500;
+    for i in 0..=steps {
+        let [x, y] = curve.sample(curve.duration_s() * f64::from(i) / f64::from(steps)).positions;
+        assert!((x.hypot(1.0 - y) - 1.0).abs() < 2e-4, "{x} {y}");
+    }
+    // A straight motion of this length takes 1.6 s.
+    assert!((1.3..1.6).contains(&curve.duration_s()), "{}", curve.duration_s());
+    let kinked = [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]];
+    let curve = timed(&joints, &[Part::Straight(kinked.to_vec())], 1.0, &mut |_, _| true);
+    assert_within(&joints, &curve, 1.0);
+    assert!(curve.knots().iter().any(|k| k.positions == kinked[1] && k.velocities == [0.0; 2]));
+}
+
+#[test]
+fn a_dense_path_with_kinks_is_rounded_and_not_stopped_at_each_of_them() {
+    let joints = [joint(1.0, 3.0, 40.0), joint(1.0, 3.0, 40.0)];
+    // As a search on a constraint leaves them: steps to and fro.
+    let path: Vec<[f64; 2]> = (0..=40).map(|i| [f64::from(i) * 0.06, if i % 2 == 0 { 0.0 } else { 0.02 }]).collect();
+    let mut is_free = |from: &[f64; 2], to: &[f64; 2]| off(&path, from).max(off(&path, to)) < 0.03;
+    let curve = timed(&joints, &[Part::Free(path.clone())], 1.0, &mut is_free);
+    assert_within(&joints, &curve, 1.0);
+    let stops = timed(&joints, &[Part::Free(path.clone())], 1.0, &mut |_, _| false);
+    assert!(curve.duration_s() < 3.2 && stops.duration_s() > 10.0, "{} {}", curve.duration_s(), stops.duration_s());
+    for i in 0..=1000 {
+        let at = curve.sample(curve.duration_s() * f64::from(i) / 1000.0).positions;
+        assert!(off(&path, &at) < 0.035);
+    }
+}
+
+#[test]
+fn a_path_that_is_no_way_at_all_and_repeated_postures_are_no_trouble() {
+    let joints = [joint(1.0, 3.0, 40.0), joint(1.0, 3.0, 40.0)];
+    let here = [0.3, 0.4];
+    for part in [
+        Part::Free(vec![here]),
+        Part::Straight(vec![here]),
+        Part::Free(vec![here, here]),
+        Part::Straight(vec![here; 3]),
+    ] {
+        let curve = timed(&joints, &[part], 1.0, &mut |_, _| true);
+        assert_eq!((curve.duration_s(), curve.end()), (0.0, here));
+    }
+    let there = [1.3, 0.4];
+    let curve = free(&joints, &[here, here, there, there], 1.0);
+    assert!((curve.duration_s() - free(&joints, &[here, there], 1.0).duration_s()).abs() < 1e-9);
+    let parts = [Part::Straight(vec![here]), Part::Free(vec![here, there]), Part::Straight(vec![there, here])];
+    let curve = timed(&joints, &parts, 1.0, &mut |_, _| true);
+    assert_eq!(curve.end(), here);
+    assert_within(&joints, &curve, 1.0);
+}
