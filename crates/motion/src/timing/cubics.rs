@@ -25,17 +25,19 @@ pub(crate) fn through<const N: usize>(times: &[f64], positions: &[[f64; N]]) -> 
     below[2] -= first * first / (6.0 * h[1]);
     on[n - 1] += last * last / (6.0 * h[n - 2]) + last / 6.0;
     above[n - 2] -= last * last / (6.0 * h[n - 2]);
-    for j in 0..N {
-        let q = |i: usize| match i {
-            1 => positions[0][j],
-            i if i == n - 1 => positions[n][j],
-            i => positions[i][j],
-        };
-        for i in 1..n {
-            let ahead = if i == n - 1 { 0.0 } else { (q(i + 1) - q(i)) / h[i] };
-            let behind = if i == 1 { 0.0 } else { (q(i) - q(i - 1)) / h[i - 1] };
-            right[i][j] = ahead - behind;
-        }
+    // Those of the two that give count as the ends beside them.
+    let fixed = |i: usize| match i {
+        1 => &positions[0],
+        i if i == n - 1 => &positions[n],
+        i => &positions[i],
+    };
+    let slope = |i: usize, j: usize| (fixed(i + 1)[j] - fixed(i)[j]) / h[i];
+    for (i, right) in right.iter_mut().enumerate().take(n).skip(1) {
+        *right = std::array::from_fn(|j| {
+            let ahead = if i == n - 1 { 0.0 } else { slope(i, j) };
+            let behind = if i == 1 { 0.0 } else { slope(i - 1, j) };
+            ahead - behind
+        });
     }
     for i in 2..n {
         let factor = below[i] / on[i - 1];

@@ -343,8 +343,8 @@ fn tighten<const N: usize>(knots: &[Knot<N>], bounds: &Bounds<N>, limits: &mut L
         let used = used(pair, bounds);
         excess = excess.max(slower(used));
         let cell = (i + 1).saturating_sub(FIRST_KNOTS).min(cells - 1);
-        for near in cell.saturating_sub(1)..=(cell + 1).min(cells - 1) {
-            for (most, used) in broken[near].iter_mut().zip(used) {
+        for near in &mut broken[cell.saturating_sub(1)..=(cell + 1).min(cells - 1)] {
+            for (most, used) in near.iter_mut().zip(used) {
                 *most = most.max(used);
             }
         }

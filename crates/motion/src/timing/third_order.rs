@@ -138,7 +138,7 @@ impl<const N: usize> Problem<N> {
             };
             let nodes = [node(k), node(k + 1)];
             let rise = std::array::from_fn(|c| (nodes[1].1[c] - nodes[0].1[c]) / cell(k));
-            for end in 0..2 {
+            for (end, (x, u)) in nodes.into_iter().enumerate() {
                 let path = &mesh.ends[k][end];
                 let mut greatest = f64::INFINITY;
                 for j in 0..N {
@@ -155,8 +155,8 @@ impl<const N: usize> Problem<N> {
                 }
                 places.push(Place {
                     first: k - 1,
-                    x: nodes[end].0,
-                    u: nodes[end].1,
+                    x,
+                    u,
                     rise,
                     path: [path.first, path.second, path.third],
                     greatest,
