@@ -42,15 +42,11 @@ pub(crate) fn through<const N: usize>(times: &[f64], positions: &[[f64; N]]) -> 
     for i in 2..n {
         let factor = below[i] / on[i - 1];
         on[i] -= factor * above[i - 1];
-        for j in 0..N {
-            right[i][j] -= factor * right[i - 1][j];
-        }
+        right[i] = std::array::from_fn(|j| right[i][j] - factor * right[i - 1][j]);
     }
     let mut accelerations = vec![[0.0; N]; n + 1];
     for i in (1..n).rev() {
-        for j in 0..N {
-            accelerations[i][j] = (right[i][j] - above[i] * accelerations[i + 1][j]) / on[i];
-        }
+        accelerations[i] = std::array::from_fn(|j| (right[i][j] - above[i] * accelerations[i + 1][j]) / on[i]);
     }
     let mut positions = positions.to_vec();
     for j in 0..N {
