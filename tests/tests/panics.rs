@@ -168,13 +168,16 @@ fn a_panic_of_the_cell_or_of_its_link_ends_it() -> anyhow::Result<()> {
 fn a_worker_whose_sdk_panics_ends_and_its_process_manager_starts_another_one() -> anyhow::Result<()> {
     let place = Place::new()?;
     let manager = Daemon::start(&place, "resource-manager", "")?;
-    let at = format!("unix:{}", place.path().join("run/resource-manager.sock").display());
+    // One of two servers leads, as far as the worker knows.
+    let socket = |name: &str| format!("unix:{}", place.path().join("run").join(name).display());
+    let at = format!("{},{}", socket("resource-manager.sock"), socket("nobody.sock"));
     let endpoint = place.path().join("alone.endpoint");
     let file = endpoint.display().to_string();
     let arguments = ["worker", "path-planner", "--id", "alone", "--kind", "PathPlanner", "--endpoint-file", &file];
     let arguments = arguments.into_iter().chain(["--resource-manager", &at]).map(str::to_owned).collect();
     let mut alone = Daemon::of(&place, "worker", arguments, endpoint)?;
     alone.panics_at("session", by_itself)?;
+    alone.panics_at("leader-watch", by_itself)?;
     alone.stops()?;
 
     let config = format!(

@@ -13,10 +13,12 @@ use crate::config::{Engine, StorageConfig};
 use crate::details::retry_later;
 use crate::durable_actor::{Journal, JournalError};
 use anyhow::Context;
+use ratn_panic_point::panic_point;
 use ratn_storage::etcd::{Connect, Holder};
 use ratn_storage::{Etcd, EtcdOptions, OpenError, ReadError, Store};
 use ratn_worker::endpoint::{Endpoint, connect_lazily};
 use ratn_worker::gate::{Gate, Identity};
+use ratn_worker::panic::{exit_on_panic, exit_on_panic_blocking};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Bound, Phase, Services, Serving, bind_as};
 use ratn_worker::trace::Traced;
@@ -82,7 +84,11 @@ impl Place<'_> {
         loop {
             let attempt = {
                 let (store, open) = (store.clone(), open.clone());
-                tokio::task::spawn_blocking(move || open(store))
+                let opening = move || {
+                    panic_point("open-state");
+                    open(store)
+                };
+                tokio::task::spawn_blocking(|| exit_on_panic_blocking("what opens the state", opening))
             };
             let opened = tokio::select! {
                 opened = attempt => opened.context("the state could not be opened")?,
@@ -122,11 +128,13 @@ impl Place<'_> {
         vitals.unwell("standing by");
         let serving = Serving { gate, vitals, phase: watch::Sender::new(Phase::Starting), ..self.serving.clone() };
         self.serving.phase.send_replace(Phase::StandingBy);
-        tokio::spawn(async move {
+        let refuse = async move {
+            panic_point("standby");
             if let Err(error) = bound.serve_as(Services::new(), serving, elected).await {
                 tracing::warn!(%error, "nobody is told any more who leads");
             }
-        });
+        };
+        tokio::spawn(exit_on_panic("the server of a standby", refuse));
         Ok(())
     }
 }

@@ -9,11 +9,13 @@
 
 use crate::client::chain;
 use crate::endpoint::{Endpoint, connect_to_ask};
+use crate::panic::exit_on_panic;
 use crate::tls::connect::Connector;
 use crate::trace::Traced;
 use futures::StreamExt;
 use futures::stream::FuturesUnordered;
 use hyper_util::rt::TokioIo;
+use ratn_panic_point::panic_point;
 use std::collections::BTreeMap;
 use std::future::Future;
 use std::io;
@@ -99,7 +101,8 @@ impl Service<Uri> for LeaderConnector {
 fn watched(stream: Box<dyn Stream>, members: Arc<[Endpoint]>, leader: Endpoint, found: Found) -> TokioIo<ToLeader> {
     let (broken, watched) = (CancellationToken::new(), CancellationToken::new());
     let watch = watch(members, leader, found, broken.clone());
-    tokio::spawn(watched.clone().run_until_cancelled_owned(watch));
+    let watching = watched.clone().run_until_cancelled_owned(watch);
+    tokio::spawn(exit_on_panic("the watch of which server leads", watching));
     TokioIo::new(ToLeader { stream, broken: Box::pin(broken.cancelled_owned()), _watched: watched.drop_guard() })
 }
 
@@ -132,6 +135,7 @@ async fn watch(members: Arc<[Endpoint]>, leader: Endpoint, found: Found, broken:
     let mut asked = Asked { member: &leader, client: None };
     loop {
         tokio::time::sleep(ASK_INTERVAL).await;
+        panic_point("leader-watch");
         // A connection that has to be made anew takes no longer than an answer may.
         if let Ok(Ok(())) = tokio::time::timeout(PATIENCE, asked.leads()).await {
             continue;

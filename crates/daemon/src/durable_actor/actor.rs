@@ -73,7 +73,7 @@ impl<C: Core> Actor<C> {
             let urgent_first = urgent_taken < URGENT_AT_ONCE || !room || inbox.messages.is_empty();
             tokio::select! {
                 biased;
-                () = over.cancelled() => return self.end(),
+                () = over.cancelled() => return self.end().await,
                 () = draining.cancelled(), if !self.drained => self.drain(),
                 // While nothing may be said its answers wait as all do, so it waits for room as well.
                 Some(urgent) = inbox.urgent.recv(), if urgent_first && (room || self.desk.may_speak()) => {
@@ -87,7 +87,7 @@ impl<C: Core> Actor<C> {
                 () = sleep_until(deadline) => self.core.advance(&mut self.desk),
                 count = inbox.messages.recv_many(&mut arrived, AT_ONCE), if room => {
                     if count == 0 {
-                        return self.end();
+                        return self.end().await;
                     }
                     urgent_taken = 0;
                     C::order(&mut arrived);
@@ -139,12 +139,23 @@ impl<C: Core> Actor<C> {
         self.collect();
     }
 
-    /// Lets out what is on the disk by now, and what the rest of it was waiting for.
-    fn end(mut self) {
+    /// Lets out what is on the disk by now, and what the rest of it was waiting for. A disk or an etcd that hangs does not keep it from
+    /// showing that it is alive: how long this may take is decided by the deadline of the process, not by a watchdog.
+    async fn end(mut self) {
         self.deliver();
-        match self.journal.close() {
-            Ok(()) => self.deliver(),
-            Err(fault) => self.stop(&fault),
+        tracing::info!("the state is closed when all of it is written");
+        let mut closing = self.journal.close();
+        let closed = loop {
+            tokio::select! {
+                closed = &mut closing => break closed,
+                () = tokio::time::sleep(TICK) => self.vitals.beat(),
+            }
+        };
+        match closed {
+            Ok(Ok(())) => self.deliver(),
+            Ok(Err(fault)) => self.stop(&fault),
+            // The runtime ends, and with it the process.
+            Err(error) => tracing::debug!(%error, "nobody waits for the state to be closed"),
         }
     }
 

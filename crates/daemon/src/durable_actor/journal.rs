@@ -15,11 +15,13 @@ use ratn_storage::{
     AppendError, CompactError, Durable, Fault, Log, MakeSnapshot, OpenError, Options, Position, Progress, ReadError,
     Recovered, Store, Writer,
 };
+use ratn_worker::panic::exit_on_panic_blocking;
 use ratn_worker::vitals::Vitals;
 use std::error::Error;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use tokio::task::JoinHandle;
 use tonic::{Code, Status};
 
 /// One entry holds what one turn of an actor changed; larger than any message that asks for it.
@@ -220,9 +222,11 @@ impl Journal {
         self.durable.changed().await
     }
 
-    /// Waits until everything is on the disk.
-    pub(crate) fn close(&mut self) -> Result<(), Fault> {
-        self.writer.take().map_or(Ok(()), |writer| writer.close().map(|_| ()))
+    /// Waits until everything is on the disk, which may take as long as that (or etcd) hangs; in a thread that may block.
+    pub(super) fn close(&mut self) -> JoinHandle<Result<(), Fault>> {
+        let writer = self.writer.take();
+        let close = move || writer.map_or(Ok(()), |writer| writer.close().map(|_| ()));
+        tokio::task::spawn_blocking(|| exit_on_panic_blocking("what closes the state", close))
     }
 
     /// A snapshot stands for all entries so far; it has to be of the state after the last of them.

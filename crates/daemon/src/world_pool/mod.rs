@@ -184,7 +184,7 @@ mod tests {
                 told = history.commit(&commit, None).unwrap();
                 assert_eq!(told.0, root.0 + 1);
                 journal.write(&mut history).unwrap();
-                journal.close().unwrap();
+                drop(journal);
             }
         }
     }

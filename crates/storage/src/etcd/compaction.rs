@@ -22,6 +22,7 @@ impl Compaction {
     pub(super) fn run(self, make: MakeSnapshot) {
         let _ended = Ended(self.shared.clone());
         let mut result = Reported { shared: &self.shared, result: Err(None) };
+        ratn_panic_point::panic_point("etcd-compaction");
         let payload = make();
         // The snapshot must not know of records that may never be there.
         if Durable::new(self.shared.pending.watch()).wait_blocking(self.through).is_err() {

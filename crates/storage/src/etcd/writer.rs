@@ -21,6 +21,7 @@ use crate::pending::{Batch, Pending, RECORD_HEADER};
 use crate::store::{MakeSnapshot, Place, Position, Writer};
 use std::collections::VecDeque;
 use std::io;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
@@ -117,7 +118,8 @@ impl Shared {
         let (client, began): (&Client, _) = (&self.term.client, Instant::now());
         let mut pause = FIRST_PAUSE;
         loop {
-            let patience = if self.is_closing() { CLOSE_PATIENCE } else { PATIENCE };
+            let patience =
+                self.closing_since().map_or(PATIENCE, |since| CLOSE_PATIENCE.saturating_sub(since.elapsed()));
             let error = match client.attempt(request.clone(), patience) {
                 Ok(answer) => {
                     self.pending.stalled(None);
@@ -148,10 +150,6 @@ impl Shared {
         *self.closing_since.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn is_closing(&self) -> bool {
-        self.closing_since().is_some()
-    }
-
     fn has_waited_to_close(&self) -> bool {
         self.closing_since().is_some_and(|since| since.elapsed() >= CLOSE_PATIENCE)
     }
@@ -177,7 +175,7 @@ pub(super) struct Ended(pub(super) Arc<Shared>);
 impl Drop for Ended {
     fn drop(&mut self) {
         if thread::panicking() {
-            self.0.pending.stop(&Fault::Ended { place: self.0.pending.place.clone() });
+            stop_ended(&self.0);
         }
     }
 }
@@ -189,6 +187,7 @@ impl Writing {
         let mut linger = Duration::ZERO;
         while let Some((batch, _)) = shared.pending.take(linger) {
             let began = Instant::now();
+            ratn_panic_point::panic_point("etcd-writer");
             if let Err(fault) = self.write(&batch) {
                 shared.pending.stop(&fault);
                 return;
@@ -258,6 +257,7 @@ pub(super) struct Renewing {
     term: Arc<Term>,
     /// Who hears that the place is lost, once there is a writer.
     writer: Arc<OnceLock<Arc<Shared>>>,
+    panicked: Arc<AtomicBool>,
     /// Ends the thread; nothing after the end.
     thread: Option<(mpsc::Sender<()>, JoinHandle<()>)>,
 }
@@ -267,8 +267,12 @@ impl Renewing {
         let (end, ended) = mpsc::channel::<()>();
         let writer = Arc::new(OnceLock::<Arc<Shared>>::new());
         let (renewed, tell, kept) = (term.clone(), writer.clone(), mark);
+        let panicked = Arc::new(AtomicBool::new(false));
+        let unrenewed = Unrenewed { writer: writer.clone(), panicked: panicked.clone() };
         let renew = move || {
+            let _unrenewed = unrenewed;
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(RENEW_INTERVAL) {
+                ratn_panic_point::panic_point("etcd-renewer");
                 // One that is found lost before there is a writer is found lost again.
                 if let (Err(fault @ Fault::Deposed { .. }), Some(writer)) = (renewed.renew(), tell.get()) {
                     writer.pending.stop(&fault);
@@ -279,11 +283,14 @@ impl Renewing {
             keep(&kept, &tell);
         };
         let thread = thread::Builder::new().name("etcd-renewer".to_owned()).spawn(renew)?;
-        Ok(Renewing { term, writer, thread: Some((end, thread)) })
+        Ok(Renewing { term, writer, panicked, thread: Some((end, thread)) })
     }
 
     fn watched_by(&self, writer: &Arc<Shared>) {
         let _ = self.writer.set(writer.clone());
+        if self.panicked.load(Ordering::SeqCst) {
+            stop_ended(writer);
+        }
     }
 
     fn end(&mut self) {
@@ -293,6 +300,27 @@ impl Renewing {
             self.term.give_up();
         }
     }
+}
+
+/// Says that nobody renews the place any more, where the thread that does ended by a panic. What is written without that is refused soon,
+/// but the process would stand there until it hears so.
+struct Unrenewed {
+    writer: Arc<OnceLock<Arc<Shared>>>,
+    panicked: Arc<AtomicBool>,
+}
+
+impl Drop for Unrenewed {
+    fn drop(&mut self) {
+        if thread::panicking() {
+            // A writer that comes later looks at this.
+            self.panicked.store(true, Ordering::SeqCst);
+            self.writer.get().into_iter().for_each(stop_ended);
+        }
+    }
+}
+
+fn stop_ended(shared: &Arc<Shared>) {
+    shared.pending.stop(&Fault::Ended { place: shared.pending.place.clone() });
 }
 
 /// What has become durable, for this host to know later.
