@@ -11,7 +11,7 @@ use cluster::{Cluster, Proxy};
 use nix::sys::signal::Signal;
 use ratn_worker::vitals::EXIT_CODE_PANICKED;
 use std::os::unix::net::UnixDatagram;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use support::{Place, Started, wait_for};
 
@@ -105,7 +105,7 @@ fn a_panic_in_a_thread_of_the_log_in_etcd_or_of_a_standby_ends_the_process() -> 
 struct Notified(Arc<Mutex<Vec<String>>>);
 
 impl Notified {
-    fn at(path: &PathBuf) -> anyhow::Result<Notified> {
+    fn at(path: &Path) -> anyhow::Result<Notified> {
         let socket = UnixDatagram::bind(path)?;
         let heard = Arc::new(Mutex::new(Vec::new()));
         let hears = heard.clone();

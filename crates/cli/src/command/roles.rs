@@ -240,6 +240,8 @@ fn daemon_on(
         let (listen, bounds_of) = (arguments.listen.clone(), bounds.subscribe());
         let host = Host { listen, directory, shutdown, bounds: bounds_of, serving, metrics };
         let reloading = Reloading { file: arguments.config.clone(), running, role, logs, tls, access, bounds };
+        // The service manager hears of the process until its state is closed, not only while it serves.
+        let phase = host.serving.phase.clone();
         let followed =
             supervisor.follow(host.serving.phase.subscribe(), host.serving.vitals.clone(), move || reloading.reload());
         let followed = tokio::spawn(exit_on_panic("the link to the service manager", followed));
@@ -260,6 +262,7 @@ fn daemon_on(
         if let Some(failure) = failure {
             core_ended(&failure);
         }
+        drop(phase);
         let _ = followed.await;
         ended.map_err(refused_if_not_started)
     })
