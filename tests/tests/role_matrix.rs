@@ -22,6 +22,7 @@ fn may(access: &str, roles: &[Role]) -> bool {
         }
         "ACCESS_CONSUME" | "ACCESS_ACQUIRE" | "ACCESS_PROJECT" | "ACCESS_COMMIT" => &[Task, Operator],
         "ACCESS_ADMINISTER" => &[Operator],
+        "ACCESS_PROVIDE" => &[Agent, Operator],
         other => panic!("who may {other}? Say it here"),
     };
     roles.iter().any(|role| who.contains(role))

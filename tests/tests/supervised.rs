@@ -91,7 +91,10 @@ fn a_reload_takes_over_bounds_roles_and_the_log_filter_and_names_what_it_does_no
     )?;
     ensure!(manager.create("f1")?.0 == Some(0));
     let (code, refused) = manager.create("f2")?;
-    ensure!(code == Some(1) && refused.contains("resources: the limit of 1 is reached"), "{code:?} {refused}");
+    ensure!(
+        code == Some(1) && refused.contains("resources of all callers: the limit of 1 is reached (limits.resources)"),
+        "{code:?} {refused}"
+    );
 
     // Taken over; and what is not is named, with no word about the sections of others.
     manager.reload(

@@ -1,5 +1,6 @@
 //! Configs from TOML: unknown keys are refused, and every error names the file and the place in it.
 
+use ratn_model::name::is_unseen;
 pub use ratn_storage::Durability;
 use ratn_storage::Store;
 use ratn_storage::etcd::Holder;
@@ -130,6 +131,10 @@ impl StorageConfig {
         }
     }
 
+    fn has_tls_everywhere(&self) -> bool {
+        self.endpoints.iter().all(|endpoint| matches!(endpoint, Endpoint::Tls { .. }))
+    }
+
     /// Where a role keeps its state.
     pub fn directory_of(&self, role: &str, runtime_directory: &Path) -> PathBuf {
         self.directory.clone().unwrap_or_else(|| state_directory(runtime_directory).join(role))
@@ -140,13 +145,30 @@ impl Check for StorageConfig {
     fn check(&self) -> Result<(), ConfigError> {
         rule("storage.compact_bytes", self.compact_bytes >= 1 << 16, "at least 65536")?;
         if self.engine == Engine::Log {
-            return rule("storage.endpoints", self.endpoints.is_empty(), "only with `engine = \"etcd\"`");
+            let beside = "only with `engine = \"etcd\"`: leave it out, or say that engine";
+            rule("storage.endpoints", self.endpoints.is_empty(), beside)?;
+            rule("storage.prefix", self.prefix.is_empty(), beside)?;
+            let files = [("storage.ca", &self.ca), ("storage.cert", &self.cert), ("storage.key", &self.key)];
+            return files.into_iter().try_for_each(|(key, file)| rule(key, file.is_none(), beside));
         }
         let member = |endpoint: &Endpoint| matches!(endpoint, Endpoint::Tcp { .. } | Endpoint::Tls { .. });
         let members = !self.endpoints.is_empty() && self.endpoints.iter().all(member);
         rule("storage.endpoints", members, "the addresses of etcd's members, as [\"https://a:2379\"]")?;
-        let named = self.prefix.starts_with('/') && !self.prefix.trim_matches('/').is_empty();
-        rule("storage.prefix", named, "begins with / and says more, as \"/ratn/cell-7\"")?;
+        let named = self.prefix.strip_prefix('/').is_some_and(|names| names.split('/').all(|name| !name.is_empty()));
+        rule(
+            "storage.prefix",
+            named,
+            "begins with /, and names stand between single ones, none at the end, as \"/ratn/cell-7\"",
+        )?;
+        let seen = !self.prefix.chars().any(|character| is_unseen(character) || character == ' ');
+        rule("storage.prefix", seen, "only characters that are seen, and no spaces, as \"/ratn/cell-7\"")?;
+        let one_of_tls = |given: &Option<PathBuf>| given.is_none() || self.has_tls_everywhere();
+        let everywhere =
+            "only where every member's address is https://: write https:// in storage.endpoints, or leave it out";
+        rule("storage.ca", one_of_tls(&self.ca), everywhere)?;
+        rule("storage.cert", one_of_tls(&self.cert), everywhere)?;
+        let beside = "only with `engine = \"log\"`: etcd keeps the state under storage.prefix, leave it out";
+        rule("storage.directory", self.directory.is_none(), beside)?;
         rule("storage.key", self.cert.is_some() == self.key.is_some(), "goes together with storage.cert")?;
         let durable = "group, with `engine = \"etcd\"`: etcd keeps what it has acknowledged";
         rule("storage.durability", self.durability == Durability::Group, durable)
@@ -175,4 +197,42 @@ pub fn load<C: DeserializeOwned + Check>(file: &Path) -> Result<C, ConfigError> 
 
 pub(crate) fn rule(key: impl Into<String>, holds: bool, rule: impl Into<String>) -> Result<(), ConfigError> {
     if holds { Ok(()) } else { Err(ConfigError::Rule { key: key.into(), rule: rule.into() }) }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    fn refused(text: &str) -> Option<String> {
+        let config: StorageConfig = toml::from_str(text).unwrap();
+        config.check().err().map(|error| error.to_string())
+    }
+
+    #[test]
+    fn of_etcd_only_what_means_something_is_taken_and_what_does_not_is_refused_with_what_to_write() {
+        let etcd = |more: &str| refused(&format!("engine = \"etcd\"\n{more}"));
+        let https = "endpoints = [\"https://a:2379\"]\nprefix = \"/ratn/cell-7\"\n";
+        let http = "endpoints = [\"https://a:2379\", \"http://b:2379\"]\nprefix = \"/ratn/cell-7\"\n";
+        assert_eq!(etcd(https), None);
+        assert_eq!(etcd(&format!("{https}ca = \"/ca.pem\"\ncert = \"/c.pem\"\nkey = \"/k.pem\"")), None);
+        assert_eq!(etcd(http), None);
+        let says = |said: Option<String>, key: &str, what: &str| {
+            let said = said.unwrap_or_default();
+            assert!(said.starts_with(key) && said.contains(what), "{key}: {said}");
+        };
+        says(etcd(&format!("{http}ca = \"/ca.pem\"")), "`storage.ca`", "write https://");
+        says(etcd(&format!("{http}cert = \"/c.pem\"\nkey = \"/k.pem\"")), "`storage.cert`", "write https://");
+        says(etcd(&format!("{https}directory = \"/state\"")), "`storage.directory`", "leave it out");
+        for prefix in
+            ["ratn", "", "/", "/ratn/", "//ratn", "/ratn//cell", "/ratn/\\u0007", "/ratn/a\\u200Bb", "/ratn/a b"]
+        {
+            let config = format!("endpoints = [\"https://a:2379\"]\nprefix = \"{prefix}\"");
+            says(etcd(&config), "`storage.prefix`", "as \"/ratn/cell-7\"");
+        }
+        for key in ["prefix = \"/ratn\"", "ca = \"/ca.pem\"", "cert = \"/c.pem\"", "key = \"/k.pem\""] {
+            let name = key.split_once(' ').unwrap().0;
+            says(refused(key), &format!("`storage.{name}`"), "only with `engine = \"etcd\"`");
+        }
+    }
 }

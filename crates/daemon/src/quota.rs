@@ -15,6 +15,7 @@ use crate::details::retry_later;
 use crate::metrics::Metrics;
 use ratn_worker::connections::ConnectionLimits;
 use ratn_worker::gate::Permit;
+use ratn_worker::token_bucket::TokenBucket;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -35,6 +36,8 @@ pub struct QuotaConfig {
     pub watches_of_all: usize,
     /// Connections at once: the one that has said nothing for longest gives way to a new one. Fewer than the process may open files.
     pub connections: usize,
+    /// Connections of one user of this machine, or from one host, in a second; as many as `connections` may come at once.
+    pub connections_per_s: u32,
     /// Connections of one caller with calls under way.
     pub connections_in_use: usize,
     /// Of `connections`: only operators' and new connections have them, for all others leave so many without calls under way. A sixth
@@ -51,6 +54,7 @@ impl QuotaConfig {
     pub(crate) fn connections(&self) -> ConnectionLimits {
         ConnectionLimits {
             connections: self.connections,
+            per_s: self.connections_per_s,
             of_one_caller: self.connections_in_use,
             for_operators: self.connections_for_operators.unwrap_or(self.connections / OPERATORS_PART).max(1),
             first_call: Duration::from_millis(self.first_call_ms),
@@ -67,6 +71,7 @@ impl Default for QuotaConfig {
             watches: 256,
             watches_of_all: 896,
             connections: 768,
+            connections_per_s: 200,
             connections_in_use: 512,
             connections_for_operators: None,
             first_call_ms: 10_000,
@@ -81,6 +86,7 @@ impl Check for QuotaConfig {
         rule("quotas.calls", self.calls >= 1, "at least 1")?;
         rule("quotas.watches", self.watches >= 1, "at least 1")?;
         rule("quotas.connections", self.connections >= 2, "at least 2")?;
+        rule("quotas.connections_per_s", self.connections_per_s >= 1, "at least 1")?;
         rule("quotas.connections_in_use", self.connections_in_use >= 1, "at least 1")?;
         let for_operators = 1..self.connections.max(2);
         let good = self.connections_for_operators.is_none_or(|share| for_operators.contains(&share));
@@ -117,35 +123,14 @@ struct UseOfOne {
     calls: usize,
     watches: usize,
     /// Calls that may begin now.
-    rate: Tokens,
+    rate: TokenBucket,
     /// Health checks beyond the quotas.
-    checks: Tokens,
+    checks: TokenBucket,
 }
 
-/// What may be taken at once, refilled with time.
-#[derive(Debug)]
-struct Tokens {
-    left: f64,
-    refilled: Instant,
-}
-
-impl Tokens {
-    /// As many as may come at once.
-    fn full(per_s: u32, now: Instant) -> Tokens {
-        Tokens { left: f64::from(per_s) * 2.0, refilled: now }
-    }
-
-    /// One of them, if there is one.
-    fn take(&mut self, per_s: u32, now: Instant) -> bool {
-        let passed = now.saturating_duration_since(self.refilled).as_secs_f64();
-        self.left = (self.left + passed * f64::from(per_s)).min(f64::from(per_s) * 2.0);
-        self.refilled = now;
-        let taken = self.left >= 1.0;
-        if taken {
-            self.left -= 1.0;
-        }
-        taken
-    }
+/// How many may come at once of so many a second.
+fn at_once(per_s: u32) -> u32 {
+    per_s.saturating_mul(2)
 }
 
 impl Quotas {
@@ -165,12 +150,12 @@ impl Quotas {
         let fresh = || UseOfOne {
             calls: 0,
             watches: 0,
-            rate: Tokens::full(rate, now),
-            checks: Tokens::full(HEALTH_CHECKS_PER_S, now),
+            rate: TokenBucket::full(at_once(rate), now),
+            checks: TokenBucket::full(at_once(HEALTH_CHECKS_PER_S), now),
         };
         let one = use_of.callers.entry(caller.name.clone()).or_insert_with(fresh);
         if let Err(beyond) = self.within(one, all_watches, is_watch, now) {
-            if path == HEALTH_CHECK && one.checks.take(HEALTH_CHECKS_PER_S, now) {
+            if path == HEALTH_CHECK && one.checks.take(HEALTH_CHECKS_PER_S, at_once(HEALTH_CHECKS_PER_S), now) {
                 return Ok(None);
             }
             self.metrics.refused("call", beyond.reason());
@@ -187,7 +172,7 @@ impl Quotas {
     fn within(&self, one: &mut UseOfOne, all_watches: usize, is_watch: bool, now: Instant) -> Result<(), Beyond> {
         let QuotaConfig { calls_per_s, calls, watches, watches_of_all, .. } = self.config;
         let beyond = |key, what, most| Err(Beyond { key, what, most });
-        if !one.rate.take(calls_per_s, now) {
+        if !one.rate.take(calls_per_s, at_once(calls_per_s), now) {
             return beyond("calls_per_s", "calls a second", calls_per_s as usize);
         }
         if one.calls >= calls {

@@ -20,6 +20,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use tokio::sync::watch;
 use tonic::codegen::http;
 use tonic::{Code, Status};
 
@@ -146,6 +147,14 @@ impl Gate for QuotaGate {
         // For the calls on a stream.
         extensions.insert(self.quotas.clone());
         Ok(())
+    }
+
+    fn changes(&self) -> Option<watch::Receiver<()>> {
+        self.roles.changes()
+    }
+
+    fn look_again(&self) {
+        self.roles.look_again();
     }
 
     fn answered(&self, path: &str, code: Code, took: Duration) {

@@ -259,3 +259,42 @@ async fn next_event(watch: &mut ResourceWatch) -> ResourceEvent {
         other => panic!("{other:?} is no event"),
     }
 }
+
+/// A resource of the kind of a provider, made by a task, is there first; who asks for what says where it is waits for the provider.
+#[tokio::test]
+async fn what_a_task_made_is_nobodys_performer_and_the_real_provider_is_asked() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
+    a.resources.create(Resource::new("fake", ResourceClass::Task, "PathPlanner")).await.unwrap();
+    let mut demand = b.resources.watch_demand(&[("PathPlanner".to_owned(), 1)].into(), &[].into()).await.unwrap();
+    let performer = Requirement { conditions: vec![Condition::has("endpoint")], ..block("PathPlanner") };
+    let provide = async {
+        let asked = loop {
+            let asked = demand.next().await.unwrap().unwrap();
+            if !asked.is_empty() {
+                break asked;
+            }
+        };
+        assert!(asked[0].requirement.conditions.is_empty(), "{asked:?}");
+        let real = Resource::new("real", ResourceClass::Process, "PathPlanner").with_endpoint("unix:/none");
+        b.resources.create(real).await.unwrap();
+    };
+    let acquire = a.resources.acquire(vec![performer], AcquireOptions::default());
+    let (lease, ()) = in_time(async { tokio::join!(acquire, provide) }).await;
+    assert_eq!(lease.unwrap().resource("PathPlanner").unwrap().id, "real");
+}
+
+#[tokio::test]
+async fn only_who_is_asked_for_a_kind_says_that_there_is_no_more_of_it() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    let refused = a.resources.report_shortage("PathPlanner", 0, "none left").await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::FailedPrecondition), "{refused}");
+    let watch = a.resources.watch_demand(&[("PathPlanner".to_owned(), 1)].into(), &[].into()).await.unwrap();
+    a.resources.report_shortage("PathPlanner", 0, "none left").await.unwrap();
+    a.resources.report_shortage("Arm", 0, "none left").await.unwrap_err();
+    drop(watch);
+    a.resources.report_shortage("PathPlanner", 0, "").await.unwrap();
+}

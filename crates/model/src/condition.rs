@@ -90,6 +90,11 @@ impl Comparison {
 }
 
 impl Condition {
+    /// That an attribute is there.
+    pub fn has(attribute: impl Into<String>) -> Condition {
+        Condition { attribute: attribute.into(), comparison: Comparison::Has, value: Value::Null }
+    }
+
     /// Whether an attribute of this value meets it.
     pub fn holds(&self, have: &Value) -> bool {
         match self.comparison.operator() {

@@ -14,6 +14,7 @@ pub mod grasp;
 pub mod id;
 pub mod load;
 pub mod measurement;
+pub mod name;
 pub mod ontology;
 pub mod parameters;
 pub mod pose;

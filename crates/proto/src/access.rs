@@ -27,6 +27,8 @@ pub enum Operation {
     Perform,
     /// Starting and stopping processes, resetting the cell, letting a robot move again.
     Administer,
+    /// Being asked for what is missing, and saying why there is no more of it.
+    Provide,
 }
 
 /// A method of this system.

@@ -1,7 +1,7 @@
 //! Acquire, and how one ends: granted, refused, withdrawn, released.
 
 use crate::caller::{Share, for_all};
-use crate::error::{PoolError, check_owner, malformed};
+use crate::error::{ALL, ALL_BUT_OPERATORS, PoolError, check_owner, malformed};
 use crate::event::{EndReason, Notice, Refusal};
 use crate::expiry::Timer;
 use crate::fingerprint::Fingerprint;
@@ -24,7 +24,7 @@ impl Pool {
     /// Asks for several resources, all or nothing. How it ends comes as a [`Notice`], at once where it can be granted.
     ///
     /// # Errors
-    /// An unknown session, other operations than block, consume and exists, a passed deadline, a full queue.
+    /// An unknown session, no requirement, other operations than block, consume and exists, a passed deadline, a full queue.
     pub fn acquire(&mut self, now: Timestamp, request: AcquireRequest) -> Result<WaiterId, PoolError> {
         self.begin(now);
         self.enqueue(request, RequestId::default(), Fingerprint::UNKNOWN)
@@ -156,6 +156,9 @@ impl Pool {
     ) -> Result<WaiterId, PoolError> {
         use ResourceOperation::{Block, Consume, Exists};
         let full = self.no_room(&request.session)?;
+        if request.requirements.is_empty() {
+            return Err(malformed("requirements of an acquire", "at least one: what needs nothing needs no lease"));
+        }
         self.check_requirements(&request.requirements, &[Block, Consume, Exists])?;
         if request.purpose.chars().count() > self.limits.name_length {
             return Err(malformed("purpose", &format!("at most {} characters", self.limits.name_length)));
@@ -218,10 +221,9 @@ impl Pool {
     fn check_selectors(&self, session: &Session, groups: &[Key]) -> Result<(), PoolError> {
         let share = Share {
             what: "different selectors waited for",
-            rest: "different selectors waited for (the rest is kept for operators)",
             there: self.queue.groups.len(),
-            limit: self.limits.selectors,
-            for_operators: self.limits.selectors_for_operators,
+            limit: ("selectors", self.limits.selectors),
+            for_operators: ("selectors_for_operators", self.limits.selectors_for_operators),
             of_caller: 0,
             quota: ("selectors_per_caller", usize::MAX),
         };
@@ -245,11 +247,13 @@ impl Pool {
             let (what, quota) = ("waiters", "waiters_per_caller");
             Some(PoolError::Quota { what, whose: caller.clone(), quota, limit: limits.waiters_per_caller })
         } else if of_session >= limits.waiters_per_session {
-            Some(PoolError::TooMany { what: "waiters of one session", limit: limits.waiters_per_session })
+            let (whose, key) = ("one session", "waiters_per_session");
+            Some(PoolError::TooMany { what: "waiters", whose, key, limit: limits.waiters_per_session })
         } else if self.queue.len() >= limits.waiters {
-            Some(PoolError::TooMany { what: "waiters", limit: limits.waiters })
+            Some(PoolError::TooMany { what: "waiters", whose: ALL, key: "waiters", limit: limits.waiters })
         } else if !known.is_operators() && self.queue.len() >= for_all {
-            Some(PoolError::TooMany { what: "waiters (the rest is kept for operators)", limit: for_all })
+            let (whose, key) = (ALL_BUT_OPERATORS, "waiters_for_operators");
+            Some(PoolError::TooMany { what: "waiters", whose, key, limit: for_all })
         } else {
             None
         })

@@ -1,7 +1,7 @@
 //! What each caller has in the pool: how many sessions it opened, what those provide and hold, how many of their acquires wait, and for
 //! how many selectors. Counted beside the sessions, which say whose they are; kept nowhere. Whether one may have more: [`Share`].
 
-use crate::error::PoolError;
+use crate::error::{ALL, ALL_BUT_OPERATORS, PoolError};
 use crate::group::Key;
 use crate::lease::EndingLeases;
 use crate::queue::Queue;
@@ -27,11 +27,11 @@ struct Has {
 /// Of something that has a bound, what there is, and what may be.
 pub(crate) struct Share {
     pub(crate) what: &'static str,
-    /// As [`Share::what`], of what is left for operators alone.
-    pub(crate) rest: &'static str,
     pub(crate) there: usize,
-    pub(crate) limit: usize,
-    pub(crate) for_operators: usize,
+    /// The name of the bound in all, and the bound.
+    pub(crate) limit: (&'static str, usize),
+    /// The name of what of it is kept for operators, and how many these are.
+    pub(crate) for_operators: (&'static str, usize),
     pub(crate) of_caller: usize,
     /// The name of this bound, and the bound.
     pub(crate) quota: (&'static str, usize),
@@ -40,9 +40,9 @@ pub(crate) struct Share {
 impl Share {
     /// Whether there may be so many more for a session.
     pub(crate) fn check(&self, more: usize, session: &Session) -> Result<(), PoolError> {
-        let Share { what, rest, there, limit, for_operators, of_caller, quota: (quota, most) } = *self;
+        let Share { what, there, limit: (key, limit), for_operators, of_caller, quota: (quota, most) } = *self;
         if there + more > limit {
-            return Err(PoolError::TooMany { what, limit });
+            return Err(PoolError::TooMany { what, whose: ALL, key, limit });
         }
         if session.is_operators() {
             return Ok(());
@@ -50,9 +50,10 @@ impl Share {
         if of_caller + more > most {
             return Err(PoolError::Quota { what, whose: session.opened_by.clone(), quota, limit: most });
         }
+        let (key, for_operators) = for_operators;
         let for_all = for_all(limit, for_operators);
         if there + more > for_all {
-            return Err(PoolError::TooMany { what: rest, limit: for_all });
+            return Err(PoolError::TooMany { what, whose: ALL_BUT_OPERATORS, key, limit: for_all });
         }
         Ok(())
     }

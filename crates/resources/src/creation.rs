@@ -1,7 +1,7 @@
 //! Create and delete: what is in the pool.
 
 use crate::caller::Share;
-use crate::error::{PoolError, check_owner, malformed};
+use crate::error::{ALL, PoolError, check_owner, malformed};
 use crate::event::EndReason;
 use crate::id::{SessionId, Slot};
 use crate::pool::Pool;
@@ -142,14 +142,14 @@ impl Pool {
         let limit = self.limits.resources;
         let Some(session) = session.map(|id| self.session(id)).transpose()? else {
             let room = self.resources.len() < limit;
-            return if room { Ok(()) } else { Err(PoolError::TooMany { what: "resources", limit }) };
+            let refused = || PoolError::TooMany { what: "resources", whose: ALL, key: "resources", limit };
+            return room.then_some(()).ok_or_else(refused);
         };
         let share = Share {
             what: "resources",
-            rest: "resources (the rest is kept for operators)",
             there: self.resources.len(),
-            limit,
-            for_operators: self.limits.resources_for_operators,
+            limit: ("resources", limit),
+            for_operators: ("resources_for_operators", self.limits.resources_for_operators),
             of_caller: self.callers.resources(&session.opened_by),
             quota: ("resources_per_caller", self.limits.resources_per_caller),
         };

@@ -83,10 +83,14 @@ pub enum PoolError {
         rule: String,
     },
     /// A bound of [`crate::Limits`] is reached.
-    #[error("{what}: the limit of {limit} is reached, try again later")]
+    #[error("{what} of {whose}: the limit of {limit} is reached (limits.{key}): try again later")]
     TooMany {
         /// Of what.
         what: &'static str,
+        /// Of whom together.
+        whose: &'static str,
+        /// Which, of [`crate::Limits`].
+        key: &'static str,
         /// The bound.
         limit: usize,
     },
@@ -117,6 +121,11 @@ fn owner_of(opened_by: &str) -> &str {
         opened_by
     }
 }
+
+/// Whose share a bound in all is.
+pub(crate) const ALL: &str = "all callers";
+/// Whose share it is without what is kept for operators.
+pub(crate) const ALL_BUT_OPERATORS: &str = "all who are no operators";
 
 pub(crate) fn check_owner(
     what: impl FnOnce() -> String,

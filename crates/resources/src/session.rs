@@ -1,7 +1,7 @@
 //! Sessions: everything that a client provides, holds, waits for or has consumed hangs on one.
 
 use crate::caller::for_all;
-use crate::error::{PoolError, malformed};
+use crate::error::{ALL, ALL_BUT_OPERATORS, PoolError, malformed};
 use crate::event::{EndReason, Refusal};
 use crate::expiry::Timer;
 use crate::id::{SessionId, Slot, WaiterId};
@@ -185,7 +185,7 @@ impl Pool {
     fn check_sessions(&self, speaker: &Speaker) -> Result<(), PoolError> {
         let Limits { sessions, sessions_per_caller, sessions_for_operators, .. } = self.limits;
         if self.sessions.len() >= sessions {
-            return Err(PoolError::TooMany { what: "sessions", limit: sessions });
+            return Err(PoolError::TooMany { what: "sessions", whose: ALL, key: "sessions", limit: sessions });
         }
         if speaker.for_anybody {
             return Ok(());
@@ -196,7 +196,8 @@ impl Pool {
         }
         let for_all = for_all(sessions, sessions_for_operators);
         if self.sessions.len() >= for_all {
-            return Err(PoolError::TooMany { what: "sessions (the rest is kept for operators)", limit: for_all });
+            let (whose, key) = (ALL_BUT_OPERATORS, "sessions_for_operators");
+            return Err(PoolError::TooMany { what: "sessions", whose, key, limit: for_all });
         }
         Ok(())
     }

@@ -4,6 +4,7 @@ use crate::assignment::selects_the_same;
 use crate::error::{PoolError, malformed};
 use crate::pool::Pool;
 use crate::resource::{ENDPOINT_ATTRIBUTE, ResourceSpec};
+use ratn_model::name::is_unseen;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use ratn_model::value::Value;
 use ratn_model::versioned;
@@ -98,8 +99,11 @@ impl Pool {
     }
 
     pub(crate) fn check_name(&self, what: &str, name: &str) -> Result<(), PoolError> {
-        if name.is_empty() || name.chars().count() > self.limits.name_length || name.chars().any(char::is_control) {
-            let rule = format!("1 to {} characters, none of them a control character", self.limits.name_length);
+        if name.is_empty() || name.chars().count() > self.limits.name_length || name.chars().any(is_unseen) {
+            let rule = format!(
+                "1 to {} characters, none of them a control character or one that is not seen",
+                self.limits.name_length
+            );
             let shown: String = name.chars().take(self.limits.name_length).flat_map(char::escape_debug).collect();
             return Err(malformed(&format!("{what} `{shown}`"), &rule));
         }

@@ -95,13 +95,13 @@ fn rows() -> Vec<(&'static str, Limits, Act, &'static str)> {
             "resources",
             Limits { resources: EDGE + 1, ..all() },
             |pool, _| create(pool, tool()),
-            "resources: the limit of 4 is reached",
+            "resources of all callers: the limit of 4 is reached (limits.resources)",
         ),
         (
             "sessions",
             Limits { sessions: EDGE + 1, ..all() },
             |pool, n| open(pool, &Speaker::trusted(), &format!("s{n}")),
-            "sessions: the limit of 4 is reached",
+            "sessions of all callers: the limit of 4 is reached (limits.sessions)",
         ),
         (
             "sessions_per_caller",
@@ -113,19 +113,19 @@ fn rows() -> Vec<(&'static str, Limits, Act, &'static str)> {
             "sessions_for_operators",
             Limits { sessions: EDGE + 2, sessions_for_operators: 1, ..all() },
             |pool, n| open(pool, &adam(), &format!("s{n}")),
-            "the rest is kept for operators",
+            "sessions of all who are no operators: the limit of 4 is reached (limits.sessions_for_operators)",
         ),
         (
             "waiters",
             Limits { waiters: EDGE, ..all() },
             |pool, _| acquire(pool, "s", vec![block("Nothing", 1)]),
-            "waiters: the limit of 3 is reached",
+            "waiters of all callers: the limit of 3 is reached (limits.waiters)",
         ),
         (
             "waiters_per_session",
             Limits { waiters_per_session: EDGE, ..all() },
             |pool, _| acquire(pool, "s", vec![block("Nothing", 1)]),
-            "waiters of one session: the limit of 3 is reached",
+            "waiters of one session: the limit of 3 is reached (limits.waiters_per_session)",
         ),
         (
             "waiters_per_caller",
@@ -140,7 +140,7 @@ fn rows() -> Vec<(&'static str, Limits, Act, &'static str)> {
             "selectors",
             Limits { selectors: EDGE, ..all() },
             |pool, n| acquire(pool, "s", vec![block(&format!("Nothing{n}"), 1)]),
-            "different selectors waited for: the limit of 3 is reached",
+            "different selectors waited for of all callers: the limit of 3 is reached (limits.selectors)",
         ),
         ("leases", Limits { leases: EDGE, ..all() }, |pool, _| one_more_lease(pool), "waits"),
         (
@@ -171,13 +171,13 @@ fn rows() -> Vec<(&'static str, Limits, Act, &'static str)> {
             "resources_for_operators",
             Limits { resources: EDGE + 2, resources_for_operators: 1, ..all() },
             |pool, _| adam_creates(pool),
-            "resources (the rest is kept for operators): the limit of 4",
+            "resources of all who are no operators: the limit of 4 is reached (limits.resources_for_operators)",
         ),
         (
             "waiters_for_operators",
             Limits { waiters: EDGE + 1, waiters_for_operators: 1, ..all() },
             |pool, _| adam_acquires(pool, block("Nothing", 1)),
-            "waiters (the rest is kept for operators): the limit of 3",
+            "waiters of all who are no operators: the limit of 3 is reached (limits.waiters_for_operators)",
         ),
         (
             "selectors_per_caller",
@@ -193,7 +193,7 @@ fn rows() -> Vec<(&'static str, Limits, Act, &'static str)> {
             "selectors_for_operators",
             Limits { selectors: EDGE + 1, selectors_for_operators: 1, ..all() },
             |pool, n| adam_acquires(pool, block(&format!("Nothing{n}"), 1)),
-            "different selectors waited for (the rest is kept for operators): the limit of 3",
+            "different selectors waited for of all who are no operators: the limit of 3 is reached (limits.selectors_for_operators)",
         ),
         ("holders", Limits { holders: EDGE, ..all() }, |pool, _| one_more_lease(pool), "waits"),
         (
@@ -420,5 +420,71 @@ fn a_bound_on_leases_that_is_lowered_holds_from_then_on() {
     pool.set_limits(Limits { leases: 4, ..Limits::default() });
     adam_acquires(&mut pool, block("Tool", 1)).unwrap_err();
     assert_eq!(pool.leases().len(), 3, "half of 4 is kept for operators, and what is there stays");
+    pool.check_invariants().unwrap();
+}
+
+/// Lowers every bound below what is there, as SIGHUP may: what is there stays, what is new is refused, and what ends makes no room
+/// before there is less than the bound.
+#[test]
+fn a_bound_that_is_lowered_below_what_is_there_takes_nothing_and_admits_nothing_more() {
+    let mut pool = Pool::new(Limits::default());
+    open(&mut pool, &adam(), "adam").unwrap();
+    open(&mut pool, &adam(), "s").unwrap();
+    create(&mut pool, tool()).unwrap();
+    pool.create(NOW, Some(&SessionId::from("adam")), tool().id("own")).unwrap();
+    for _ in 0..4 {
+        acquire(&mut pool, "s", vec![block("Tool", 1)]).unwrap();
+        acquire(&mut pool, "adam", vec![block("Nothing", 1)]).unwrap();
+    }
+    let leases = pool.leases();
+    let before = pool.amounts();
+    for bound in 0..2 {
+        let limits = Limits {
+            resources: bound,
+            resources_per_caller: bound,
+            resources_for_operators: bound,
+            sessions: bound,
+            sessions_per_caller: bound,
+            sessions_for_operators: bound,
+            waiters: bound,
+            waiters_per_caller: bound,
+            waiters_for_operators: bound,
+            waiters_per_session: bound,
+            selectors: bound,
+            selectors_per_caller: bound,
+            selectors_for_operators: bound,
+            leases: bound,
+            leases_per_caller: bound,
+            leases_for_operators: bound,
+            holders: bound,
+            remembered_requests: bound,
+            remembered_per_caller: bound,
+            remembered_bytes_per_caller: bound,
+            history: bound,
+            ..Limits::default()
+        };
+        pool.set_limits(limits);
+        pool.check_invariants().unwrap();
+        for refused in [
+            create(&mut pool, tool()),
+            adam_creates(&mut pool),
+            open(&mut pool, &adam(), "new"),
+            open(&mut pool, &Speaker::trusted(), "new"),
+            acquire(&mut pool, "s", vec![block("Tool", 1)]),
+            acquire(&mut pool, "adam", vec![block("Nothing", 1)]),
+        ] {
+            let refused = refused.unwrap_err();
+            assert!(refused.contains("is reached (limits."), "{refused}");
+        }
+        assert_eq!(pool.amounts(), before, "nothing is taken from anybody");
+        pool.check_invariants().unwrap();
+    }
+    pool.set_limits(Limits { leases_per_caller: 7, ..Limits::default() });
+    let refused = acquire(&mut pool, "s", vec![block("Tool", 1)]).unwrap_err();
+    assert!(refused.contains("the quota of 7 is reached (limits.leases_per_caller)"), "{refused}");
+    for lease in &leases[..2] {
+        pool.release(NOW, None, lease.id).unwrap();
+    }
+    acquire(&mut pool, "s", vec![block("Tool", 1)]).unwrap();
     pool.check_invariants().unwrap();
 }

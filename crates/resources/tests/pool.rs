@@ -686,10 +686,14 @@ fn requests_beyond_a_bound_are_refused() {
     pool.keep_alive(now, &session("a"), "a", Duration::from_secs(1)).unwrap();
     let ask = |kind: &str| AcquireRequest::new(session("a"), vec![block(kind)]);
     pool.acquire(now, ask("Arm")).unwrap();
-    assert_eq!(pool.acquire(now, ask("Arm")), Err(PoolError::TooMany { what: "waiters", limit: 1 }));
+    let refused = pool.acquire(now, ask("Arm")).unwrap_err().to_string();
+    assert_eq!(refused, "waiters of all callers: the limit of 1 is reached (limits.waiters): try again later");
     let spec = ResourceSpec::new(ResourceClass::Module, "Line\nfeed");
     let refused = pool.create(now, None, spec).unwrap_err().to_string();
-    assert_eq!(refused, "kind `Line\\nfee`: 1 to 8 characters, none of them a control character");
+    assert_eq!(
+        refused,
+        "kind `Line\\nfee`: 1 to 8 characters, none of them a control character or one that is not seen"
+    );
     assert!(matches!(
         pool.acquire(now, AcquireRequest::new(session("x"), vec![])),
         Err(PoolError::UnknownSession { .. })
@@ -699,11 +703,31 @@ fn requests_beyond_a_bound_are_refused() {
 }
 
 #[test]
+fn an_acquire_of_nothing_is_refused() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    bench.granted("a", &[block("Arm")]);
+    let refused = bench.pool.acquire(bench.now, AcquireRequest::new(session("a"), vec![])).unwrap_err();
+    assert!(refused.to_string().contains("at least one"), "{refused}");
+    assert_eq!(bench.pool.leases().len(), 1);
+}
+
+#[test]
+fn a_name_that_cannot_be_told_from_another_by_reading_it_is_refused() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    for id in ["a\u{200b}rm", "arm\u{a0}1", "\u{202e}mra"] {
+        let spec = ResourceSpec::new(ResourceClass::Module, "Arm").id(id);
+        let refused = bench.pool.create(bench.now, None, spec).unwrap_err().to_string();
+        assert!(refused.contains("one that is not seen") && refused.contains("\\u{"), "{refused}");
+    }
+}
+
+#[test]
 fn tokens_of_a_restarted_pool_are_above_those_of_the_old_one() {
     let mut pool = Pool::new(Limits::default()).above(1_000);
     let now = Timestamp(0);
     pool.keep_alive(now, &session("a"), "a", Duration::from_secs(1)).unwrap();
-    pool.acquire(now, AcquireRequest::new(session("a"), vec![])).unwrap();
+    pool.create(now, None, ResourceSpec::new(ResourceClass::Module, "Arm")).unwrap();
+    pool.acquire(now, AcquireRequest::new(session("a"), vec![block("Arm")])).unwrap();
     assert!(grants(&pool.take_notices())[0].1.token.0 > 1_000);
 }
 

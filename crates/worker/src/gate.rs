@@ -11,10 +11,10 @@
 //! answer is. Health and reflection are answered to the end, and nobody waits for them.
 
 use crate::access::{Caller, HEALTH_CHECK};
-use crate::connections::{InUse, Link, LinkInfo, OutOfConnections};
+use crate::connections::{Link, LinkInfo, OutOfConnections};
 use crate::protocol;
 use crate::trace::{self, TraceContext};
-use http_body::{Frame, SizeHint};
+use crate::under_way::{Answer, Held, Standing};
 use std::any::Any;
 use std::fmt;
 use std::future::Future;
@@ -22,6 +22,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tokio_util::task::task_tracker::TaskTrackerToken;
@@ -65,6 +66,14 @@ pub trait Gate: Send + Sync + 'static {
     /// # Errors
     /// The status that the caller gets instead.
     fn admit(&self, caller: &Caller, path: &str, extensions: &mut http::Extensions) -> Result<(), Status>;
+
+    /// Changes when [`Gate::caller`] may answer otherwise than before. Calls under way end whose caller has lost something by it.
+    fn changes(&self) -> Option<watch::Receiver<()>> {
+        None
+    }
+
+    /// Called about once a second, also where nobody calls.
+    fn look_again(&self) {}
 
     /// A call was answered (a stream: began to be).
     fn answered(&self, path: &str, code: Code, took: Duration);
@@ -165,39 +174,6 @@ fn is_counted(path: &str) -> bool {
     !path.starts_with("/grpc.")
 }
 
-/// The body of an answer whose call is under way until it has been sent, or nobody wants it any more.
-struct Answer {
-    body: Body,
-    _held: Held,
-}
-
-/// What lasts as long as a call is under way.
-struct Held {
-    _call: Option<TaskTrackerToken>,
-    _permit: Option<Permit>,
-    _in_use: Option<InUse>,
-}
-
-impl http_body::Body for Answer {
-    type Data = <Body as http_body::Body>::Data;
-    type Error = Status;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Self::Data>, Status>>> {
-        Pin::new(&mut self.body).poll_frame(context)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
-}
-
 #[derive(Clone)]
 pub(crate) struct Gated {
     pub(crate) gate: Arc<dyn Gate>,
@@ -236,8 +212,8 @@ where
         let began = Instant::now();
         let path = request.uri().clone();
         let Gated { gate, calls } = self.gated.clone();
-        let admitted = admit(&*gate, &calls, &mut request);
-        let held = match admitted {
+        let admitted = admit(&gate, &calls, &mut request);
+        let mut held = match admitted {
             Ok(held) => held,
             Err(status) => {
                 gate.answered(path.path(), status.code(), began.elapsed());
@@ -248,11 +224,17 @@ where
         request.extensions_mut().insert(Draining(calls.draining));
         let answer = self.inner.call(request);
         let answered = async move {
-            let answer = answer.await;
+            let answer = match held.until(answer).await {
+                Ok(answer) => answer,
+                Err(ended) => {
+                    gate.answered(path.path(), ended.code(), began.elapsed());
+                    return Ok(ended.into_http());
+                }
+            };
             if let Ok(answer) = &answer {
                 gate.answered(path.path(), code_of(answer), began.elapsed());
             }
-            answer.map(|answer| answer.map(|body| Body::new(Answer { body, _held: held })))
+            answer.map(|answer| answer.map(|body| Body::new(Answer { body, held: Some(held) })))
         };
         match context {
             None => Box::pin(answered),
@@ -265,13 +247,16 @@ where
 }
 
 /// What lasts as long as the call does, or why it may not begin.
-fn admit(gate: &dyn Gate, calls: &Calls, request: &mut http::Request<Body>) -> Result<Held, Status> {
+fn admit(gate: &Arc<dyn Gate>, calls: &Calls, request: &mut http::Request<Body>) -> Result<Held, Status> {
     let path = request.uri().clone();
     let counted = is_counted(path.path());
     if counted {
         protocol::check(request.headers())?;
     }
-    let caller = gate.caller(&identity_of(request.extensions()));
+    // First this: no change of the roles is missed.
+    let changes = gate.changes();
+    let identity = identity_of(request.extensions());
+    let caller = gate.caller(&identity);
     gate.admit(&caller, path.path(), request.extensions_mut())?;
     let permit = request.extensions_mut().remove::<Permit>();
     let in_use = match link_of(request.extensions()) {
@@ -286,8 +271,10 @@ fn admit(gate: &dyn Gate, calls: &Calls, request: &mut http::Request<Body>) -> R
         }
         None => None,
     };
+    let call = calls.begin(counted)?;
+    let standing = changes.map(|changes| Standing::new(gate.clone(), changes, identity, caller.clone(), path));
     request.extensions_mut().insert(caller);
-    Ok(Held { _call: calls.begin(counted)?, _permit: permit, _in_use: in_use })
+    Ok(Held { _call: call, _permit: permit, _in_use: in_use, standing })
 }
 
 /// The code of an answer that is only a status; a body may still end with another.

@@ -6,13 +6,15 @@
 //! ```
 
 use crate::access::RoleGate;
+use crate::connections::accepting::{Goodbye, accept_in_a_thread, say_goodbye};
 use crate::connections::{Connection, ConnectionLimits, Connections, OutOfConnections, Peer};
 use crate::endpoint::{Endpoint, KEEPALIVE_INTERVAL, KEEPALIVE_TIMEOUT};
-use crate::gate::{Calls, Gate, Gated, Identity};
+use crate::gate::{Calls, Gate, Gated};
 use crate::tls::accept::handshakes;
 use crate::tls::{LiveServerTls, TlsError};
 use crate::unix_socket::{self, SocketAccess};
 use crate::vitals::{CoreFailure, Vitals};
+use futures::FutureExt;
 use std::convert::Infallible;
 use std::io;
 use std::os::fd::AsFd;
@@ -20,22 +22,22 @@ use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
+use tokio::net::{TcpListener, UnixListener, UnixStream};
 use tokio::sync::watch;
 use tokio_stream::StreamExt;
-use tokio_stream::wrappers::UnixListenerStream;
 use tokio_util::sync::CancellationToken;
 use tonic::body::Body;
 use tonic::codegen::{Service, http};
 use tonic::server::NamedService;
 use tonic::service::Routes;
-use tonic::transport::server::TcpIncoming;
 use tonic_health::ServingStatus;
 
 /// Calls that have not ended this long after the shutdown began are dropped.
 pub const DRAIN_DEADLINE: Duration = Duration::from_millis(500);
 /// After the last call connections have this long to be closed in order.
 const CLOSE_PATIENCE: Duration = Duration::from_millis(100);
+/// How often a gate looks whether its callers have lost something, also where nobody calls.
+const LOOK_AGAIN: Duration = Duration::from_secs(1);
 /// The metadata of one call has at most this many bytes.
 const MAX_METADATA_BYTES: u32 = 16 * 1024;
 
@@ -151,6 +153,15 @@ pub enum ServeError {
         /// Why.
         #[source]
         source: tonic::transport::Error,
+    },
+    /// Nothing can be accepted.
+    #[error("cannot accept connections on {endpoint}")]
+    Accept {
+        /// Where.
+        endpoint: Endpoint,
+        /// Why.
+        #[source]
+        source: io::Error,
     },
     /// What is served has ended before its time.
     #[error(transparent)]
@@ -324,37 +335,42 @@ impl Bound {
             .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
             .add_routes(services.routes.add_service(health_service).add_service(reflection));
 
-        let first_call = serving.connections.first_call;
-        let connections = Connections::new(serving.connections);
-        let accepting = Accepting { connections: connections.clone(), gate: serving.gate };
+        let limits = serving.connections;
+        let first_call = limits.first_call;
+        let connections = Connections::new(limits.clone());
+        let (taking, gate) = (connections.clone(), serving.gate.clone());
+        let endpoint = self.endpoint;
+        let cannot_accept = |source| ServeError::Accept { endpoint: endpoint.clone(), source };
         let served = {
             let stop = closing.clone().cancelled_owned();
             // On the heap: it is large, and within the future of every daemon.
-            Box::pin(async move {
-                match self.listener {
-                    Listener::Tcp(listener) => {
-                        let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-                        let incoming = incoming.filter_map(move |stream| accepting.over_tcp(stream).transpose());
-                        match self.tls {
-                            Some(tls) => {
-                                let incoming = handshakes(incoming, tls, first_call);
-                                router.serve_with_incoming_shutdown(incoming, stop).await
-                            }
-                            None => router.serve_with_incoming_shutdown(incoming, stop).await,
+            match self.listener {
+                Listener::Tcp(listener) => {
+                    let speaks = self.tls.is_none();
+                    let incoming =
+                        accept_in_a_thread(listener, &limits, gate.clone(), speaks).map_err(cannot_accept)?;
+                    let incoming =
+                        incoming.filter_map(move |accepted| take_in(&taking, &*gate, accepted, speaks).transpose());
+                    match self.tls {
+                        Some(tls) => {
+                            let incoming = handshakes(incoming, tls, first_call);
+                            router.serve_with_incoming_shutdown(incoming, stop).boxed()
                         }
-                    }
-                    Listener::Unix(listener, file) => {
-                        let incoming = UnixListenerStream::new(listener);
-                        let incoming = incoming.filter_map(move |stream| accepting.over_unix(stream).transpose());
-                        // Removed while it is still listened on: afterwards the file may be a successor's.
-                        let stop = async {
-                            stop.await;
-                            drop(file);
-                        };
-                        router.serve_with_incoming_shutdown(incoming, stop).await
+                        None => router.serve_with_incoming_shutdown(incoming, stop).boxed(),
                     }
                 }
-            })
+                Listener::Unix(listener, file) => {
+                    let incoming = accept_in_a_thread(listener, &limits, gate.clone(), true).map_err(cannot_accept)?;
+                    let incoming =
+                        incoming.filter_map(move |accepted| take_in(&taking, &*gate, accepted, true).transpose());
+                    // Removed while it is still listened on: afterwards the file may be a successor's.
+                    let stop = async {
+                        stop.await;
+                        drop(file);
+                    };
+                    router.serve_with_incoming_shutdown(incoming, stop).boxed()
+                }
+            }
         };
         serving.phase.send_replace(Phase::Serving);
         let drained = async {
@@ -379,46 +395,44 @@ impl Bound {
             tokio::time::sleep(CLOSE_PATIENCE).await;
             connections.close_all();
         };
-        let endpoint = self.endpoint;
+        let gate = serving.gate;
         tokio::select! {
             biased;
             failure = serving.vitals.failed() => Err(failure.into()),
             served = served => served.map_err(|source| ServeError::Transport { endpoint, source }),
             () = drained => Ok(()),
             never = connections.sweep() => match never {},
+            never = look_again(&*gate) => match never {},
         }
     }
 }
 
-/// What takes in the connections that a listener gives.
-struct Accepting {
-    connections: Connections,
-    gate: Arc<dyn Gate>,
+/// A connection with its place among those of the server; nothing where there is none.
+fn take_in<S: Goodbye>(
+    connections: &Connections,
+    gate: &dyn Gate,
+    accepted: io::Result<(S, Peer)>,
+    speaks: bool,
+) -> io::Result<Option<Connection<S>>> {
+    let (stream, peer) = accepted?;
+    match connections.accept(stream, peer) {
+        Ok(connection) => Ok(Some(connection)),
+        Err(stream) => {
+            gate.out_of_connections(&OutOfConnections::All);
+            if speaks {
+                say_goodbye(&stream, &OutOfConnections::All);
+            }
+            Ok(None)
+        }
+    }
 }
 
-impl Accepting {
-    fn over_tcp(&self, accepted: io::Result<TcpStream>) -> io::Result<Option<Connection<TcpStream>>> {
-        let stream = accepted?;
-        let peer = Peer::of_host(stream.peer_addr().ok().map(|address| address.ip()));
-        Ok(self.accept(stream, peer))
-    }
-
-    fn over_unix(&self, accepted: io::Result<UnixStream>) -> io::Result<Option<Connection<UnixStream>>> {
-        let stream = accepted?;
-        let identity = match stream.peer_cred() {
-            Ok(peer) => Identity::User { uid: peer.uid(), pid: peer.pid() },
-            Err(_) => Identity::Anonymous,
-        };
-        let peer = Peer::of_user(&identity, self.gate.caller(&identity).is_operator());
-        Ok(self.accept(stream, peer))
-    }
-
-    fn accept<S>(&self, stream: S, peer: Peer) -> Option<Connection<S>> {
-        let accepted = self.connections.accept(stream, peer);
-        if accepted.is_none() {
-            self.gate.out_of_connections(&OutOfConnections::All);
-        }
-        accepted
+/// Tells the gate to look again, for as long as it is polled.
+async fn look_again(gate: &dyn Gate) -> Infallible {
+    let mut interval = tokio::time::interval(LOOK_AGAIN);
+    loop {
+        interval.tick().await;
+        gate.look_again();
     }
 }
 

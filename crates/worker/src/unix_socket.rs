@@ -14,8 +14,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use tokio::net::{UnixListener, UnixSocket};
 
-/// Connections that wait to be accepted.
-const BACKLOG: u32 = 1_024;
+/// Connections that wait to be accepted, where the kernel allows so many (`net.core.somaxconn`). Beyond them it refuses new ones.
+const BACKLOG: u32 = 4_096;
 
 /// Who may connect to a Unix socket, by the mode and the group of its file. What they may do then is said by their uid.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

@@ -41,7 +41,7 @@ async fn a_viewers_goal_is_refused_before_it_touches_the_fence() {
     assert_eq!(refused.code(), Some(Code::PermissionDenied), "{refused}");
     assert_eq!(runs.load(Ordering::SeqCst), 0);
     live.replace(only(&[Role::Task]));
-    // The younger token of the refused goal was not seen. Another client, as streams keep the roles that they began with.
+    // The younger token of the refused goal was not seen.
     let client = ActionClient::new(Channels::new());
     client.execute(&endpoint, goal("g2", "double", 1), |_, _| {}).await.unwrap();
     assert_eq!(runs.load(Ordering::SeqCst), 1);
@@ -126,4 +126,57 @@ async fn a_worker_whose_config_is_none_does_not_start() {
     let refused = Worker::new(options).without_leases().run().await.unwrap_err();
     let source = std::error::Error::source(&refused).unwrap().to_string();
     assert!(source.starts_with("no roles of callers from "), "{source}");
+}
+
+/// Whoever watches the health of `live`'s server.
+async fn watching(endpoint: &Endpoint) -> tonic::Streaming<tonic_health::pb::HealthCheckResponse> {
+    let channel = ratn_worker::endpoint::connect_lazily(endpoint).unwrap().into_channel();
+    let mut client = tonic_health::pb::health_client::HealthClient::new(channel);
+    let mut stream = client.watch(tonic_health::pb::HealthCheckRequest::default()).await.unwrap().into_inner();
+    assert!(stream.message().await.unwrap().is_some());
+    stream
+}
+
+#[tokio::test]
+async fn a_stream_ends_when_its_caller_loses_a_role_that_it_began_with() {
+    const AGES: Duration = Duration::from_secs(60);
+    let place = tempfile::tempdir().unwrap();
+    let bound = bind(&Endpoint::Unix(place.path().join("one.sock"))).await.unwrap();
+    let (endpoint, live) = (bound.endpoint().clone(), LiveAccess::new(only(&[Role::Task])));
+    let serving = Serving { gate: Arc::new(RoleGate::new(live.clone())), ..Serving::default() };
+    let shutdown = CancellationToken::new();
+    tokio::spawn(bound.serve_as(Services::new(), serving, shutdown.clone()));
+    for (now, code) in [(&[Role::Viewer] as &[Role], Code::Unavailable), (&[], Code::PermissionDenied)] {
+        live.replace(only(&[Role::Task]));
+        let mut stream = watching(&endpoint).await;
+        // More is nothing lost.
+        live.replace(only(&[Role::Task, Role::Agent]));
+        live.replace(only(now));
+        let ended = tokio::time::timeout(AGES, stream.message()).await.expect("the stream ends").unwrap_err();
+        assert_eq!(ended.code(), code, "{ended}");
+    }
+    shutdown.cancel();
+}
+
+#[tokio::test]
+async fn a_stream_of_a_server_that_follows_a_file_ends_though_nobody_calls() {
+    let place = tempfile::tempdir().unwrap();
+    let (file, uid) = (place.path().join("ratn.toml"), nix::unistd::geteuid());
+    let write = |roles: &str| {
+        // In one step: a file that is half written would keep the roles of before.
+        let new = place.path().join("new");
+        std::fs::write(&new, format!("[[service.access.user]]\nuid = {uid}\nroles = [{roles}]\n")).unwrap();
+        std::fs::rename(new, &file).unwrap();
+    };
+    write("\"viewer\"");
+    let bound = bind(&Endpoint::Unix(place.path().join("one.sock"))).await.unwrap();
+    let (endpoint, live) = (bound.endpoint().clone(), LiveAccess::of_file(&file).unwrap());
+    let serving = Serving { gate: Arc::new(RoleGate::new(live)), ..Serving::default() };
+    let shutdown = CancellationToken::new();
+    tokio::spawn(bound.serve_as(Services::new(), serving, shutdown.clone()));
+    let mut stream = watching(&endpoint).await;
+    write("");
+    let ended = tokio::time::timeout(Duration::from_secs(60), stream.message()).await.expect("the stream ends");
+    assert_eq!(ended.unwrap_err().code(), Code::PermissionDenied);
+    shutdown.cancel();
 }

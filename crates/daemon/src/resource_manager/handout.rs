@@ -5,7 +5,8 @@
 //!        ▲                                    │ no progress for too long, says that it has no room, or is gone
 //!        └───────────── the next one ◀────────┘
 //! ```
-//! What is asked of one stays its for as long as it has room for it. What is beyond all room is told to everybody who could ever meet
+//! First in the order are those that do what they are asked: who failed goes behind who did not, and who never provided anything counts as
+//! having failed once. What is asked of one stays its for as long as it has room for it. What is beyond all room is told to everybody who could ever meet
 //! it, so that who waits hears why there is no more. A pure state machine: what is asked of whom depends on nothing but what was said
 //! so far, and is the same as long as that is.
 
@@ -39,6 +40,22 @@ pub(super) struct Part {
 pub(super) struct HandOut {
     patience: Duration,
     turns: BTreeMap<(String, SessionId), Turn>,
+    standings: BTreeMap<SessionId, Standing>,
+}
+
+/// How a provider did, whatever it was asked for.
+#[derive(Debug, Clone, Copy, Default)]
+struct Standing {
+    /// It has provided something that was missing.
+    proven: bool,
+    /// How often it came no closer in its time, since it did last.
+    failed: u32,
+}
+
+impl Standing {
+    fn rank(self) -> u32 {
+        self.failed.saturating_add(u32::from(!self.proven))
+    }
 }
 
 /// What was asked of a provider.
@@ -56,12 +73,13 @@ struct Turn {
 impl HandOut {
     /// A provider has so long to come closer to what is asked of it.
     pub(super) fn new(patience: Duration) -> HandOut {
-        HandOut { patience, turns: BTreeMap::new() }
+        HandOut { patience, turns: BTreeMap::new(), standings: BTreeMap::new() }
     }
 
     /// How much of each demand (the second index) is asked of each provider now.
     pub(super) fn hand_out(&mut self, now: Timestamp, providers: &[SessionId], missing: &[Missing]) -> Vec<Vec<u32>> {
         let mut turns = BTreeMap::new();
+        self.standings.retain(|session, _| providers.contains(session));
         let mut asked = vec![vec![0; missing.len()]; providers.len()];
         for (at, demand) in missing.iter().enumerate() {
             let able = |(index, part): (usize, &Part)| {
@@ -69,7 +87,10 @@ impl HandOut {
                 Some((index, part.room?, turn))
             };
             let mut able: Vec<(usize, u32, Turn)> = demand.of.iter().enumerate().filter_map(able).collect();
-            able.sort_by_key(|(index, _, turn)| (turn.passed, *index));
+            able.sort_by_key(|(index, _, turn)| {
+                let standing = self.standings.get(&providers[*index]).copied().unwrap_or_default();
+                (standing.rank(), turn.passed, !standing.proven, *index)
+            });
             let mut left = demand.count;
             for (index, room, turn) in &able {
                 let stays = turn.asked.min(*room).min(left);
@@ -96,14 +117,18 @@ impl HandOut {
     }
 
     /// As it is after what has passed since.
-    fn turn(&self, now: Timestamp, selector: &str, session: &SessionId, provided: u32) -> Turn {
+    fn turn(&mut self, now: Timestamp, selector: &str, session: &SessionId, provided: u32) -> Turn {
         let key = (selector.to_owned(), session.clone());
+        let standing = self.standings.entry(session.clone()).or_default();
+        standing.proven |= provided > 0;
         let Some(turn) = self.turns.get(&key).copied() else {
             return Turn { asked: 0, provided, since: now, passed: 0 };
         };
         if provided > turn.provided {
+            standing.failed = 0;
             Turn { provided, since: now, ..turn }
         } else if turn.asked > 0 && turn.since + self.patience <= now {
+            standing.failed = standing.failed.saturating_add(1);
             Turn { asked: 0, passed: turn.passed + 1, ..turn }
         } else {
             turn
@@ -201,6 +226,38 @@ mod tests {
         assert_eq!(asked(&mut hand_out, 29.0, 1, [1, 0]), [0, 1]);
         assert_eq!(hand_out.deadline(), Some(at(44.0)));
         assert_eq!(asked(&mut hand_out, 44.0, 1, [1, 0]), [1, 0], "in turn");
+    }
+
+    /// Three that say they provide a kind and never do, and the real one behind them.
+    #[test]
+    fn who_fails_goes_to_the_end_and_who_never_provided_anything_comes_last() {
+        let mut hand_out = HandOut::new(PATIENCE);
+        let names = ["liar-1", "liar-2", "liar-3", "real"];
+        let mut first = |seconds: f64, names: &[&str], provided: u32| {
+            let part = |name: &&str| if *name == "real" { (provided, Some(3)) } else { (0, Some(3)) };
+            let of: Vec<_> = names.iter().map(part).collect();
+            let asked = hand_out.hand_out(at(seconds), &sessions(names), &missing(1, &of));
+            names[asked.iter().position(|asked| asked[0] == 1).unwrap_or_default()].to_owned()
+        };
+        for (seconds, asked) in [(0.0, "liar-1"), (15.0, "liar-2"), (30.0, "liar-3"), (45.0, "real")] {
+            assert_eq!(first(seconds, &names, 0), asked);
+        }
+        // It has provided: it is asked first from now on, also when new ones say that they provide as much.
+        assert_eq!(first(50.0, &names, 1), "real");
+        let more = ["liar-4", "liar-1", "liar-2", "liar-3", "real"];
+        assert_eq!(first(51.0, &more, 1), "real");
+        // It fails once: who never provided anything is asked in its place, once each.
+        assert_eq!(first(66.0, &more, 1), "liar-4");
+        assert_eq!(first(81.0, &more, 1), "real");
+    }
+
+    #[test]
+    fn a_demand_that_comes_again_is_not_asked_first_of_who_failed_the_last_time() {
+        let mut hand_out = HandOut::new(PATIENCE);
+        assert_eq!(asked(&mut hand_out, 0.0, 1, [0, 0]), [1, 0]);
+        assert_eq!(asked(&mut hand_out, 15.0, 1, [0, 0]), [0, 1]);
+        hand_out.hand_out(at(16.0), &sessions(&["a", "b"]), &[]);
+        assert_eq!(asked(&mut hand_out, 17.0, 1, [0, 0]), [0, 1]);
     }
 
     #[test]

@@ -1,10 +1,11 @@
 //! The providers that listen: each is told what is asked of it.
 
 use super::handout::{HandOut, Missing, Part};
+use ratn_model::condition::Condition;
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use ratn_proto::types::Demand;
+use ratn_proto::types::{Demand, ENDPOINT_ATTRIBUTE};
 use ratn_resources::{Pool, SessionId};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -75,6 +76,13 @@ impl Providers {
         Ok(told)
     }
 
+    /// Whether a session is asked for a kind.
+    pub(super) fn provides(&self, session: &SessionId, kind: &str) -> bool {
+        let is_asked =
+            |provider: &&Provider| !provider.listener.is_closed() && provider.provisions.kinds.contains_key(kind);
+        self.all.iter().filter(is_asked).any(|provider| provider.session == *session)
+    }
+
     /// Of this kind there can only be so many of a provider for now, or as many as it said at first.
     pub(super) fn bound(&mut self, session: &SessionId, kind: &str, most: Option<u32>) {
         for provider in self.all.iter_mut().filter(|provider| provider.session == *session) {
@@ -102,6 +110,7 @@ impl Providers {
     /// Tells each what of this is asked of it.
     pub(super) fn tell(&mut self, now: Timestamp, pool: &Pool, demands: &[ratn_resources::Demand]) {
         self.news = false;
+        let demands: &[ratn_resources::Demand] = &demands.iter().cloned().map(of_performers).collect::<Vec<_>>();
         self.all.retain(|provider| !provider.listener.is_closed() && pool.has_session(&provider.session));
         let part = |provider: &Provider, demand: &ratn_resources::Demand| {
             let provided = pool.provided(&provider.session, demand).units();
@@ -131,4 +140,10 @@ impl Providers {
             });
         }
     }
+}
+
+/// What a provider provides says where it is, once it is there: who asks for that is asked for like everybody else.
+fn of_performers(mut demand: ratn_resources::Demand) -> ratn_resources::Demand {
+    demand.requirement.conditions.retain(|condition| *condition != Condition::has(ENDPOINT_ATTRIBUTE));
+    demand
 }

@@ -13,6 +13,7 @@ mod world;
 
 use crate::MAX_PORTS_BYTES;
 use prost::Message as _;
+use ratn_model::name::is_unseen;
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -161,13 +162,18 @@ pub fn name(text: &str, field: &str) -> Result<(), Malformed> {
 /// As [`name`], but may be empty.
 ///
 /// # Errors
-/// [`Malformed`] when it is too long or holds control characters.
+/// [`Malformed`] when it is too long or holds characters that are not seen.
 pub fn label(text: &str, field: &str) -> Result<(), Malformed> {
     if text.len() > MAX_NAME_BYTES {
         return Err(Malformed::new(field, format!("has {} bytes: at most {MAX_NAME_BYTES} are allowed", text.len())));
     }
     if text.chars().any(char::is_control) {
         return Err(Malformed::new(field, "holds control characters"));
+    }
+    if let Some(unseen) = text.chars().find(|character| is_unseen(*character)) {
+        let rule =
+            format!("holds U+{:04X}, which is not seen: only characters that are, and plain spaces", u32::from(unseen));
+        return Err(Malformed::new(field, rule));
     }
     Ok(())
 }

@@ -143,6 +143,10 @@ impl TryFrom<v1::Condition> for Condition {
             Err(_) => return Err(Malformed::new("comparison", format!("{number} is no comparison"))),
         };
         let value = match comparison {
+            Comparison::Has if condition.value.is_some() => {
+                let rule = "is set: `has` asks whether the attribute is there and takes none";
+                return Err(Malformed::new("value", rule));
+            }
             Comparison::Has => Value::Null,
             _ => required(condition.value, "value")?,
         };

@@ -363,9 +363,19 @@ fn what_means_nothing_is_refused_with_its_path() {
     refused::<Goal, _>(v1::Goal::from(goal.clone()), "inputs[start][a][1].number: is NaN");
     refused::<Goal, _>(v1::Goal::from(Goal { action: String::new(), ..goal.clone() }), "action: is empty");
     refused::<Goal, _>(
-        v1::Goal::from(Goal { action: "a\u{7}".to_owned(), ..goal }),
+        v1::Goal::from(Goal { action: "a\u{7}".to_owned(), ..goal.clone() }),
         "action: holds control characters",
     );
+    refused::<Goal, _>(
+        v1::Goal::from(Goal { action: "a\u{200b}b".to_owned(), ..goal }),
+        "action: holds U+200B, which is not seen",
+    );
+    let has = v1::Condition {
+        attribute: "endpoint".to_owned(),
+        comparison: v1::Comparison::Has.into(),
+        value: Some(Value::Int(1).into()),
+    };
+    refused::<Condition, _>(has, "value: is set: `has` asks whether the attribute is there and takes none");
     refused::<Pose, _>(v1::Pose { position_m: vec![0.0; 2], quaternion_xyzw: vec![0.0, 0.0, 0.0, 1.0] }, "exactly 3");
     refused::<Pose, _>(v1::Pose { position_m: vec![0.0; 3], quaternion_xyzw: vec![0.0; 4] }, "has length 0");
     let point = |time_s| TrajectoryPoint { time_s, positions: vec![0.0], velocities: vec![] };

@@ -3,19 +3,21 @@
 //! The roles are a config's that a process was given ([`LiveAccess::new`], [`LiveAccess::replace`]), or those of a file that is read
 //! again when it changes: so the workers of a process manager, which names the file in [`ACCESS_VARIABLE`].
 
-use super::{AccessConfig, Caller};
+use super::refusals::{LOG_INTERVAL, Line, Refusals, Refused};
+use super::{AccessConfig, Caller, operation_of};
 use crate::gate::{Gate, Identity};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use std::time::{Duration, Instant, SystemTime};
+use tokio::sync::watch;
 use tonic::codegen::http;
 use tonic::{Code, Status};
 
 /// The environment variable with the system's config, of whose `[service.access]` a worker has the roles of its callers.
 pub const ACCESS_VARIABLE: &str = "RATN_ACCESS";
 
-/// A file is looked at again at the first call after this.
+/// A file is looked at again at the first call after this, and by a server that is asked nothing.
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
 
 /// Roles that cannot be had from a file.
@@ -33,6 +35,8 @@ pub struct AccessError {
 pub struct LiveAccess {
     access: Arc<RwLock<AccessConfig>>,
     file: Option<Arc<Followed>>,
+    /// Changes when the roles have.
+    changes: watch::Sender<()>,
 }
 
 /// A file of which the roles are.
@@ -59,7 +63,7 @@ struct ServiceSection {
 impl LiveAccess {
     /// As a config says.
     pub fn new(access: AccessConfig) -> LiveAccess {
-        LiveAccess { access: Arc::new(RwLock::new(access)), file: None }
+        LiveAccess { access: Arc::new(RwLock::new(access)), ..LiveAccess::default() }
     }
 
     /// As `[service.access]` of a system's config says, now and whenever that changes.
@@ -84,17 +88,26 @@ impl LiveAccess {
         }
     }
 
-    /// From the next call on, and the next stream of calls.
+    /// From now on; calls under way whose caller has lost something by it end.
     pub fn replace(&self, access: AccessConfig) {
-        *self.access.write().unwrap_or_else(PoisonError::into_inner) = access;
+        let before =
+            std::mem::replace(&mut *self.access.write().unwrap_or_else(PoisonError::into_inner), access.clone());
+        if before != access {
+            self.changes.send_replace(());
+        }
     }
 
     /// Who a connection's other end is to a server that runs as `own_uid`.
     pub fn caller(&self, identity: &Identity, own_uid: u32) -> Caller {
+        self.follow();
+        self.access.read().unwrap_or_else(PoisonError::into_inner).caller(identity, own_uid)
+    }
+
+    /// Reads the file again where it has changed.
+    fn follow(&self) {
         if let Some(file) = &self.file {
             self.look_again(file);
         }
-        self.access.read().unwrap_or_else(PoisonError::into_inner).caller(identity, own_uid)
     }
 
     fn look_again(&self, file: &Followed) {
@@ -134,12 +147,28 @@ fn read(path: &Path) -> Result<AccessConfig, AccessError> {
 pub struct RoleGate {
     access: LiveAccess,
     own_uid: u32,
+    refusals: Arc<Mutex<Refusals>>,
 }
 
 impl RoleGate {
     /// With these roles.
     pub fn new(access: LiveAccess) -> RoleGate {
-        RoleGate { access, own_uid: nix::unistd::geteuid().as_raw() }
+        RoleGate { access, own_uid: nix::unistd::geteuid().as_raw(), refusals: Arc::default() }
+    }
+
+    fn refusals(&self) -> MutexGuard<'_, Refusals> {
+        self.refusals.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn log(line: &Line, refused_now: bool) {
+    let Line { refused: Refused { who, what }, left_out } = line;
+    match (left_out, refused_now) {
+        (0, _) => tracing::warn!(%who, what, "refused"),
+        (_, true) => {
+            tracing::warn!(%who, what, left_out, within_s = LOG_INTERVAL.as_secs(), "refused, and before this")
+        }
+        (_, false) => tracing::warn!(%who, what, left_out, within_s = LOG_INTERVAL.as_secs(), "refused more often"),
     }
 }
 
@@ -155,7 +184,23 @@ impl Gate for RoleGate {
     }
 
     fn admit(&self, caller: &Caller, path: &str, _: &mut http::Extensions) -> Result<(), Status> {
-        caller.admit(path)
+        caller.admit(path).inspect_err(|_| {
+            // A path of the caller's own making would be a reason of its own each time.
+            let what =
+                operation_of(path).map_or_else(|| "a method without access".to_owned(), |what| format!("{what:?}"));
+            let line = self.refusals().refused(Instant::now(), Refused { who: caller.name.clone(), what });
+            line.iter().for_each(|line| log(line, true));
+        })
+    }
+
+    fn changes(&self) -> Option<watch::Receiver<()>> {
+        Some(self.access.changes.subscribe())
+    }
+
+    fn look_again(&self) {
+        self.access.follow();
+        let due = self.refusals().due(Instant::now());
+        due.iter().for_each(|line| log(line, false));
     }
 
     fn answered(&self, _: &str, _: Code, _: Duration) {}

@@ -9,6 +9,7 @@
 
 mod config;
 mod gate;
+mod refusals;
 
 pub use config::{AccessConfig, CertificateAccess, UserAccess};
 pub use gate::{ACCESS_VARIABLE, AccessError, LiveAccess, RoleGate};
@@ -36,11 +37,24 @@ pub enum Role {
     Operator,
 }
 
-use Operation::{Acquire, Administer, Ask, Commit, Consume, Create, Delete, Look, Perform, Project, Release, Session};
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Role::Viewer => "viewer",
+            Role::Task => "task",
+            Role::Agent => "agent",
+            Role::Operator => "operator",
+        })
+    }
+}
+
+use Operation::{
+    Acquire, Administer, Ask, Commit, Consume, Create, Delete, Look, Perform, Project, Provide, Release, Session,
+};
 use Role::{Agent, Operator, Task, Viewer};
 
 /// Every operation, and who may. Whoever may move a robot may stop it; that it moves again is an operator's.
-pub const TABLE: [(Operation, &[Role]); 12] = [
+pub const TABLE: [(Operation, &[Role]); 13] = [
     (Ask, &[Viewer, Task, Agent, Operator]),
     (Look, &[Viewer, Task, Agent, Operator]),
     (Session, &[Task, Agent, Operator]),
@@ -53,6 +67,7 @@ pub const TABLE: [(Operation, &[Role]); 12] = [
     (Commit, &[Task, Operator]),
     (Perform, &[Task, Agent, Operator]),
     (Administer, &[Operator]),
+    (Provide, &[Agent, Operator]),
 ];
 
 /// How a process is asked whether it serves.
@@ -106,19 +121,44 @@ impl Caller {
     /// `PERMISSION_DENIED`, which says what they are, or that nobody may.
     pub fn admit(&self, path: &str) -> Result<(), Status> {
         let Some(operation) = operation_of(path) else {
-            tracing::warn!(who = %self, path, "refused: the method says no access");
             let message = format!("nobody may call {path}: no method of this version, or its proto says no `(access)`");
             return Err(denied("METHOD_CLOSED", message));
         };
         if allowed(operation, &self.roles) {
             return Ok(());
         }
-        tracing::warn!(who = %self, ?operation, "refused");
         let message = format!(
-            "{self} may not {operation:?}: has the roles {:?}; an operator grants them in [service.access]",
-            self.roles
+            "{self} may not {operation:?}: has the roles {}; an operator grants them in [service.access]",
+            self.written_roles()
         );
         Err(denied("ROLE_MISSING", message))
+    }
+
+    /// Whether a call of theirs to `path` may go on that began when they were `then`. It may not where they have lost anything that
+    /// they were allowed then: the call may use it at any time.
+    ///
+    /// # Errors
+    /// `PERMISSION_DENIED` where they may not call the method any more, `UNAVAILABLE` where they may call it again as what they are now.
+    pub(crate) fn goes_on(&self, then: &Caller, path: &str) -> Result<(), Status> {
+        let lost = |(_, may): &(Operation, &[Role])| {
+            let may = |caller: &Caller| caller.roles.iter().any(|role| may.contains(role));
+            may(then) && !may(self)
+        };
+        if self.name == then.name && !TABLE.iter().any(lost) {
+            return Ok(());
+        }
+        self.admit(path)?;
+        let message = format!("{then} is {self} with the roles {} now: call again", self.written_roles());
+        Err(Status::with_error_details(
+            Code::Unavailable,
+            message,
+            ErrorDetails::with_error_info("ROLES_CHANGED", "ratn", []),
+        ))
+    }
+
+    /// As a config says them: `["viewer", "task"]`.
+    fn written_roles(&self) -> String {
+        format!("{:?}", self.roles.iter().map(ToString::to_string).collect::<Vec<_>>())
     }
 
     /// Whether what belongs to others is theirs to end.
@@ -171,7 +211,7 @@ mod tests {
     fn a_viewer_changes_nothing_and_an_operator_may_everything() {
         assert_eq!(may(Viewer), [Ask, Look]);
         assert_eq!(may(Operator).len(), TABLE.len());
-        assert_eq!(may(Agent), [Ask, Look, Session, Create, Delete, Release, Perform]);
+        assert_eq!(may(Agent), [Ask, Look, Session, Create, Delete, Release, Perform, Provide]);
         assert!(!may(Task).contains(&Administer));
         assert!(!allowed(Ask, &[]));
     }
@@ -187,7 +227,27 @@ mod tests {
         }
         one(Viewer).admit("/grpc.health.v1.Health/Check").unwrap();
         let refused = one(Viewer).admit("/ratn.v1.ActionService/Execute").unwrap_err();
-        assert!(refused.message().starts_with("x may not Perform: has the roles [Viewer]"), "{refused}");
+        assert!(
+            refused.message().starts_with("x may not Perform: has the roles [\"viewer\"]; an operator"),
+            "{refused}"
+        );
+    }
+
+    #[test]
+    fn a_call_goes_on_as_long_as_its_caller_may_do_what_it_could_when_it_began() {
+        const KEEP_ALIVE: &str = "/ratn.v1.ResourceService/KeepAlive";
+        let as_role = |then: &[Role], now: &[Role]| {
+            let caller = |roles: &[Role]| Caller { name: "x".into(), roles: roles.into() };
+            caller(now).goes_on(&caller(then), KEEP_ALIVE).map_err(|ended| ended.code())
+        };
+        assert_eq!(as_role(&[Task], &[Operator]), Ok(()));
+        assert_eq!(as_role(&[Viewer, Task], &[Task]), Ok(()), "a task may all that a viewer may");
+        assert_eq!(as_role(&[Task], &[Viewer]), Err(Code::PermissionDenied));
+        assert_eq!(as_role(&[Task], &[]), Err(Code::PermissionDenied));
+        assert_eq!(as_role(&[Task], &[Agent]), Err(Code::Unavailable), "its stream could acquire");
+        assert_eq!(as_role(&[Operator], &[Task]), Err(Code::Unavailable));
+        let renamed = Caller { name: "y".into(), ..one(Task) };
+        assert_eq!(renamed.goes_on(&one(Task), KEEP_ALIVE).unwrap_err().code(), Code::Unavailable);
     }
 
     #[test]

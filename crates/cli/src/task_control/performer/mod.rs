@@ -23,12 +23,13 @@ use goal::{Given, Performing};
 use handover::{Handover, Leases};
 use ratn_executive::protocol::{Command, Event, Goal};
 use ratn_model::catalogue::Catalogue;
+use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
-use ratn_model::resource::{LeasedResource, Requirement, ResourceClass};
+use ratn_model::resource::{LeasedResource, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use ratn_proto::types::{self, Resource, WorldChange};
+use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, Resource, WorldChange};
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
 use ratn_worker::client::{retry_unanswered, retry_until_answered};
 use ratn_worker::session::{DEFAULT_TTL, Session};
@@ -312,6 +313,7 @@ impl Performer {
             deadline: ACQUIRE_DEADLINE,
             holder: format!("{} {instance}", self.task),
         };
+        let requirements: Vec<Requirement> = requirements.into_iter().map(|one| self.of_performers(one)).collect();
         let (resources, events) = (self.resources.clone(), self.events.clone());
         let mut asking = Box::pin(trace::within(self.trace.child(), async move {
             let ask = || resources.acquire(requirements.clone(), options.clone());
@@ -438,6 +440,15 @@ impl Performer {
         };
         let ended = tokio::spawn(trace::within(self.trace.child(), performing.perform(given)));
         self.jobs.insert(instance, Job { attempt, lease, stop, ended });
+    }
+
+    /// What performs goals says where it is: a resource of that kind that does not is nobody's to give a goal to, whoever made it.
+    fn of_performers(&self, mut requirement: Requirement) -> Requirement {
+        let performs = self.catalogue.providers.values().any(|provider| provider.resource == requirement.kind);
+        if performs && requirement.operation == ResourceOperation::Block {
+            requirement.conditions.push(Condition::has(ENDPOINT_ATTRIBUTE));
+        }
+        requirement
     }
 
     /// The provider of a goal: the leased resource of its kind.

@@ -1,8 +1,10 @@
 //! What is missing, for those who can provide it.
 
 use super::super::providers::Provisions;
+use super::super::status::of_error;
 use super::{ResourceCore, ResourceDesk};
-use crate::details::retry_later;
+use crate::details::{retry_later, status};
+use ratn_model::time::Timestamp;
 use ratn_proto::types::Demand;
 use ratn_resources::SessionId;
 use std::time::Duration;
@@ -19,6 +21,26 @@ impl ResourceCore {
             let message = format!("{there} providers watch already");
             retry_later(Code::ResourceExhausted, "TOO_MANY", message, Duration::from_secs(1))
         })
+    }
+
+    /// Of a kind that a provider is asked for there are at most so many; an empty reason takes that back.
+    pub(super) fn report_shortage(
+        &mut self,
+        now: Timestamp,
+        session: &SessionId,
+        kind: &str,
+        most: u32,
+        reason: &str,
+    ) -> Result<(), Status> {
+        if !reason.is_empty() && !self.providers.provides(session, kind) {
+            let message = format!(
+                "{session} is not asked for `{kind}`: watch demand with it among the provisions, and report then"
+            );
+            return Err(status(Code::FailedPrecondition, "NOT_A_PROVIDER", message));
+        }
+        self.pool.report_shortage(now, session, kind, reason).map_err(|error| of_error(&error))?;
+        self.providers.bound(session, kind, (!reason.is_empty()).then_some(most));
+        Ok(())
     }
 
     /// Tells providers what is missing, where that may have changed.

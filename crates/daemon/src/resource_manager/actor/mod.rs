@@ -225,13 +225,8 @@ impl Core for ResourceCore {
                 desk.reply(answer, watch);
             }
             Message::ReportShortage { speaker, session, kind, most, reason, answer } => {
-                let reported = self.may_speak(now, &speaker, Some(&session)).and_then(|()| {
-                    let reported = self.pool.report_shortage(now, &session, &kind, &reason);
-                    reported.map_err(|error| status::of_error(&error))
-                });
-                if reported.is_ok() {
-                    self.providers.bound(&session, &kind, (!reason.is_empty()).then_some(most));
-                }
+                let allowed = self.may_speak(now, &speaker, Some(&session));
+                let reported = allowed.and_then(|()| self.report_shortage(now, &session, &kind, most, &reason));
                 desk.reply(answer, reported);
             }
             Message::Waiters { caller, request_id, answer } => {

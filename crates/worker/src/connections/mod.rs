@@ -1,0 +1,215 @@
+//! The connections of a server: how many there are, whose, and how long one may say nothing.
+//!
+//! ```text
+//!   accepted ── first call ──▶ in use ── no call under way ──▶ idle
+//!      │ none in FIRST_CALL_DEADLINE                             │ none in IDLE_DEADLINE
+//!      └──────────────────────────▶ closed ◀─────────────────────┘
+//! ```
+//! A handshake that does not end is a connection without a call. Connections are shared out in four ways:
+//!
+//! - One user or host gets so many in a second ([`rates`]); they are accepted in a thread of their own ([`accepting`]), so that who connects
+//!   all the time keeps nobody waiting who is connected.
+//! - Connections with calls under way are bounded for each caller, and for all callers that are no operators together. The rest
+//!   ([`ConnectionLimits::for_operators`]) is kept for operators, and for connections that have not had a call yet.
+//! - Where there are as many connections as may be, one without a call under way is closed for a new one (`State::gives_way`).
+//! - A connection without a call is closed at its deadline.
+
+pub(crate) mod accepting;
+mod limits;
+mod origin;
+mod rates;
+mod stream;
+#[cfg(test)]
+mod tests;
+
+pub use limits::{ConnectionLimits, OutOfConnections};
+pub use origin::Origin;
+pub(crate) use origin::Peer;
+pub(crate) use stream::{Connection, LinkInfo};
+
+use crate::access::Caller;
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+use std::convert::Infallible;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+use stream::Registered;
+use tokio_util::sync::CancellationToken;
+
+/// How often it is looked for connections whose time is over.
+const SWEEP_INTERVAL: Duration = Duration::from_millis(250);
+/// Those of one server. A handle: clones share everything.
+#[derive(Debug, Clone)]
+pub(crate) struct Connections {
+    limits: ConnectionLimits,
+    state: Arc<Mutex<State>>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    next: u64,
+    open: BTreeMap<u64, Open>,
+    /// Connections with calls under way, by the name of their caller.
+    in_use: BTreeMap<Arc<str>, usize>,
+    /// Connections with calls under way of callers that are no operators.
+    in_use_of_others: usize,
+}
+
+#[derive(Debug)]
+struct Open {
+    close: CancellationToken,
+    peer: Peer,
+    /// Since when no call is under way.
+    quiet_since: Instant,
+    had_a_call: bool,
+    calls: usize,
+    /// Whom it is counted for while it is in use.
+    caller: Option<Caller>,
+}
+
+impl Connections {
+    pub(crate) fn new(limits: ConnectionLimits) -> Connections {
+        Connections { limits, state: Arc::default() }
+    }
+
+    /// One more; where there are too many, one without a call under way is closed for it. What was given comes back where all have calls
+    /// under way.
+    pub(crate) fn accept<S>(&self, stream: S, peer: Peer) -> Result<Connection<S>, S> {
+        let mut state = self.state();
+        let there = state.open.values().filter(|open| !open.close.is_cancelled()).count();
+        if there >= self.limits.connections {
+            let Some(close) = state.gives_way(self.limits.for_operators) else { return Err(stream) };
+            tracing::debug!(connections = there, "a connection that says nothing is closed for a new one");
+            close.cancel();
+        }
+        let (id, close) = (state.next, CancellationToken::new());
+        state.next += 1;
+        let quiet_since = Instant::now();
+        let open = Open { close: close.clone(), peer, quiet_since, had_a_call: false, calls: 0, caller: None };
+        state.open.insert(id, open);
+        drop(state);
+        let link = Link { id, connections: self.clone() };
+        let closed = Box::pin(close.cancelled_owned());
+        Ok(Connection { stream, closed, registered: Registered(link) })
+    }
+
+    /// Closes all that are still open.
+    pub(crate) fn close_all(&self) {
+        self.state().open.values().for_each(|open| open.close.cancel());
+    }
+
+    /// Closes those whose time is over, for as long as it is polled.
+    pub(crate) async fn sweep(&self) -> Infallible {
+        let mut interval = tokio::time::interval(SWEEP_INTERVAL);
+        loop {
+            interval.tick().await;
+            let state = self.state();
+            for open in state.open.values().filter(|open| open.calls == 0) {
+                let patience = if open.had_a_call { self.limits.idle } else { self.limits.first_call };
+                if open.quiet_since.elapsed() >= patience {
+                    open.close.cancel();
+                }
+            }
+        }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    /// What closes the connection that gives way to a new one.
+    ///
+    /// Operators' connections are the last to give way. As long as fewer than `share` connections have not had a call yet, an idle
+    /// connection gives way, so that who connects has time to speak; otherwise one that has not had a call. Among equals it is one
+    /// of the user or host with most of them, and of those the one that has said nothing for longest.
+    fn gives_way(&self, share: usize) -> Option<CancellationToken> {
+        let quiet = || self.open.values().filter(|open| open.calls == 0 && !open.close.is_cancelled());
+        let mut of_origin = BTreeMap::<_, usize>::new();
+        for open in quiet() {
+            *of_origin.entry((open.had_a_call, open.peer.origin)).or_default() += 1;
+        }
+        let silent: usize = of_origin.iter().filter(|((had_a_call, _), _)| !had_a_call).map(|(_, count)| count).sum();
+        let idle_first = silent < share;
+        let order = |open: &&Open| {
+            let count = of_origin.get(&(open.had_a_call, open.peer.origin));
+            (open.peer.is_operator, open.had_a_call != idle_first, Reverse(count.copied()), open.quiet_since)
+        };
+        quiet().min_by_key(order).map(|open| open.close.clone())
+    }
+}
+
+/// Which connection a request came over; among its extensions.
+#[derive(Debug, Clone)]
+pub(crate) struct Link {
+    id: u64,
+    connections: Connections,
+}
+
+impl Link {
+    /// A call begins: the connection is in use until what is returned is dropped.
+    pub(crate) fn begin(&self, caller: &Caller) -> Result<InUse, OutOfConnections> {
+        let limits = &self.connections.limits;
+        let mut state = self.connections.state();
+        let State { open, in_use, in_use_of_others, .. } = &mut *state;
+        // One that is being closed: its calls end with it.
+        let Some(open) = open.get_mut(&self.id) else { return Ok(InUse(self.clone())) };
+        if open.calls == 0 {
+            let of_others = limits.connections.saturating_sub(limits.for_operators);
+            let of_this = in_use.get(&caller.name).copied().unwrap_or_default();
+            if of_this >= limits.of_one_caller {
+                return Err(OutOfConnections::OfOneCaller { caller: caller.name.clone(), most: limits.of_one_caller });
+            }
+            if !caller.is_operator() && *in_use_of_others >= of_others {
+                return Err(OutOfConnections::OfOthers { most: of_others });
+            }
+            in_use.insert(caller.name.clone(), of_this + 1);
+            *in_use_of_others += usize::from(!caller.is_operator());
+            open.peer.is_operator = caller.is_operator();
+            open.caller = Some(caller.clone());
+        }
+        open.calls += 1;
+        open.had_a_call = true;
+        Ok(InUse(self.clone()))
+    }
+
+    /// A call that takes no share of the connections: the connection counts as idle from now on.
+    pub(crate) fn touch(&self) {
+        if let Some(open) = self.connections.state().open.get_mut(&self.id) {
+            (open.quiet_since, open.had_a_call) = (Instant::now(), true);
+        }
+    }
+
+    fn end(&self, all: bool) {
+        let mut state = self.connections.state();
+        let State { open, in_use, in_use_of_others, .. } = &mut *state;
+        let Some(known) = open.get_mut(&self.id) else { return };
+        known.calls = if all { 0 } else { known.calls.saturating_sub(1) };
+        if known.calls == 0 {
+            known.quiet_since = Instant::now();
+            if let Some(caller) = known.caller.take() {
+                *in_use_of_others -= usize::from(!caller.is_operator());
+                if let Some(count) = in_use.get_mut(&caller.name) {
+                    *count = count.saturating_sub(1);
+                    if *count == 0 {
+                        in_use.remove(&caller.name);
+                    }
+                }
+            }
+        }
+        if all {
+            open.remove(&self.id);
+        }
+    }
+}
+
+/// A call is under way on a connection.
+#[derive(Debug)]
+pub(crate) struct InUse(Link);
+
+impl Drop for InUse {
+    fn drop(&mut self) {
+        self.0.end(false);
+    }
+}

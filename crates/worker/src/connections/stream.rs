@@ -1,0 +1,80 @@
+//! The bytes of a connection that is counted, and closed when its time is over.
+
+use super::Link;
+use std::io;
+use std::pin::Pin;
+use std::task::{Context, Poll};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio_util::sync::WaitForCancellationFutureOwned;
+use tonic::transport::server::Connected;
+
+/// A connection that ends when its time is over.
+#[derive(Debug)]
+pub(crate) struct Connection<S> {
+    pub(super) stream: S,
+    pub(super) closed: Pin<Box<WaitForCancellationFutureOwned>>,
+    pub(super) registered: Registered,
+}
+
+#[derive(Debug)]
+pub(super) struct Registered(pub(super) Link);
+
+impl Drop for Registered {
+    fn drop(&mut self) {
+        self.0.end(true);
+    }
+}
+
+/// What is known of a connection: what the system says, and which it is.
+#[derive(Debug, Clone)]
+pub(crate) struct LinkInfo<I> {
+    pub(crate) info: I,
+    pub(crate) link: Link,
+}
+
+impl<S: Connected> Connected for Connection<S> {
+    type ConnectInfo = LinkInfo<S::ConnectInfo>;
+
+    fn connect_info(&self) -> Self::ConnectInfo {
+        LinkInfo { info: self.stream.connect_info(), link: self.registered.0.clone() }
+    }
+}
+
+impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        if self.closed.as_mut().poll(context).is_ready() {
+            return Poll::Ready(Err(io::Error::new(io::ErrorKind::TimedOut, "nothing was asked for too long")));
+        }
+        Pin::new(&mut self.stream).poll_read(context, buffer)
+    }
+}
+
+impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write(context, bytes)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        parts: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write_vectored(context, parts)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+}
