@@ -30,6 +30,8 @@ pub(crate) type Wanted = BTreeMap<String, Resource>;
 pub(crate) enum OfferEvent {
     /// The resource manager has it.
     Offered(String),
+    /// The resource manager does not take it, and why; it may be asked again.
+    Refused(String, String),
     /// It was draining, and the resource manager does not have it any more.
     Withdrawn(String),
     /// It is draining, and somebody holds it: the withdrawal is tried again.
@@ -150,21 +152,31 @@ impl Link {
                 match done {
                     Ok(true) => {
                         offered.extend(resource);
-                        if let Some(lifecycle) = &self.lifecycle {
-                            let _ = lifecycle.events.send(OfferEvent::Offered(id)).await;
-                        }
+                        self.report(OfferEvent::Offered(id)).await;
                     }
                     // The provider goes on trying by itself. The link asks again to learn when it has succeeded.
-                    Ok(false) => settled = false,
+                    Ok(false) => {
+                        settled = false;
+                        if let Some(why) = provider.refusal(&id).await {
+                            self.report(OfferEvent::Refused(id, why)).await;
+                        }
+                    }
                     Err(error) => {
                         tracing::error!(id, %error, "the resource manager does not take the resource");
                         refused.extend(resource);
+                        self.report(OfferEvent::Refused(id, error.to_string())).await;
                     }
                 }
             }
             if !self.has_news(endpoint, settled).await {
                 return Ok(());
             }
+        }
+    }
+
+    async fn report(&self, event: OfferEvent) {
+        if let Some(lifecycle) = &self.lifecycle {
+            let _ = lifecycle.events.send(event).await;
         }
     }
 

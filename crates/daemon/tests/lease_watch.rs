@@ -3,19 +3,22 @@
 
 mod support;
 
-use ratn_worker::client::{Channels, wait_until_serving};
+use ratn_model::resource::ResourceClass;
+use ratn_proto::types::Resource;
+use ratn_worker::client::{AcquireOptions, Channels, wait_until_serving};
 use ratn_worker::endpoint::Endpoint;
-use ratn_worker::lease_watch::{LeaseWatch, ManagerLocation};
+use ratn_worker::lease_watch::{Claim, LeaseWatch, ManagerLocation, Standing};
 use ratn_worker::runtime_directory::wait_for_file;
 use ratn_worker::session::Session;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::path::Path;
 use std::time::{Duration, Instant};
-use support::{TestSystem, in_time};
+use support::{Client, TestSystem, block, in_time};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
+use tonic::Code;
 
 const PATIENCE: Duration = Duration::from_millis(600);
 /// Far less than a connection that hangs takes to break.
@@ -96,7 +99,12 @@ async fn a_manager_that_hangs_is_not_trusted_longer_than_a_lease_may_last() {
     let manager = system.resource_manager_at(Endpoint::Unix(place.path().join("rm.sock"))).await;
     let way = Way::to(&manager.endpoint, place.path());
     let leases = LeaseWatch::of(["planner-1@here"]);
-    let following = leases.follow_location(&Channels::new(), ManagerLocation::At(way.endpoint.clone()), PATIENCE);
+    let following = leases.follow_location(
+        &Channels::new(),
+        ManagerLocation::At(way.endpoint.clone()),
+        "a manager of processes",
+        PATIENCE,
+    );
     let following = tokio::spawn(following);
     until_heard(&leases, true).await;
     // Answers are asked for: nothing happens to the resource, and the manager is still heard after several times the patience.
@@ -108,6 +116,36 @@ async fn a_manager_that_hangs_is_not_trusted_longer_than_a_lease_may_last() {
     way.is(Line::Open);
     until_heard(&leases, true).await;
     following.abort();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_lookalike_of_a_pooled_worker_has_no_lease_of_the_worker() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let (pools, other) = (system.client(&manager, "pools").await, system.client(&manager, "other").await);
+    let id = "planner-3@here";
+    // Leases the resource, as soon as that is there, and follows the manager then: what a lease is, the first word says.
+    let said_of = async |provider: &Client| {
+        let planner = Resource::new(id, ResourceClass::Process, "PathPlanner");
+        provider.resources.create(planner).await.unwrap();
+        let lease = provider.resources.acquire(vec![block("PathPlanner")], AcquireOptions::default()).await.unwrap();
+        let leases = LeaseWatch::of([id]);
+        let location = ManagerLocation::At(manager.endpoint.clone());
+        let following = leases.follow_location(&Channels::new(), location, pools.session.id(), SOON);
+        let following = tokio::spawn(following);
+        until_heard(&leases, true).await;
+        let said = leases.check(&Claim { resource: id, lease: lease.id, token: lease.token, session: "" });
+        following.abort();
+        said
+    };
+    // Anybody who may create resources can guess the id of the next worker.
+    let said = said_of(&other).await;
+    assert!(matches!(&said, Standing::Refuted(why) if why.contains("no lease holds it")), "{said:?}");
+    let planner = Resource::new(id, ResourceClass::Process, "PathPlanner");
+    let refused = pools.resources.create(planner).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::AlreadyExists), "{refused}");
+    other.session.close().await;
+    assert_eq!(said_of(&pools).await, Standing::Confirmed);
 }
 
 #[tokio::test(flavor = "multi_thread")]

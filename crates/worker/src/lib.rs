@@ -42,6 +42,7 @@ mod leader;
 pub mod lease_watch;
 pub mod multiplex;
 pub mod panic;
+pub mod pooled;
 pub mod protocol;
 pub mod provider;
 pub mod robot_clock;

@@ -68,6 +68,8 @@ struct DesiredState {
     resource: Option<Resource>,
     /// Why the manager does not have this state yet, as the log has said.
     problem: String,
+    /// The manager's words, where another session has a resource of the id.
+    taken: Option<String>,
     /// The manager has confirmed that it has the resource.
     there: bool,
 }
@@ -188,6 +190,12 @@ impl Provider {
         asked.into_iter().next().map_or(Ok(true), |(_, done)| done)
     }
 
+    /// Why the manager has not got a resource that is offered: another session has one of its id. That session may end, so it is
+    /// offered again all the same.
+    pub async fn refusal(&self, id: &str) -> Option<String> {
+        self.shared.desired.lock().await.get(id).and_then(|entry| entry.taken.clone())
+    }
+
     /// What is offered, by id.
     pub async fn offered(&self) -> Vec<Resource> {
         self.shared.desired.lock().await.values().filter_map(|entry| entry.resource.clone()).collect()
@@ -291,6 +299,7 @@ impl DesiredState {
         match answer {
             Err(error) if self.resource.is_none() && error.code() == Some(Code::NotFound) => {}
             Err(error) if is_transient(&error) => {
+                self.taken = (error.code() == Some(Code::AlreadyExists)).then(|| error.to_string());
                 let problem = error.to_string();
                 if self.problem != problem {
                     tracing::warn!(resource = %id, "the resource manager will be asked again: {problem}");
@@ -302,6 +311,7 @@ impl DesiredState {
             Ok(()) => {}
         }
         self.problem.clear();
+        self.taken = None;
         self.there = self.resource.is_some();
         Ok(true)
     }

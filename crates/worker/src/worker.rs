@@ -2,15 +2,16 @@
 //!
 //! A pooled worker only serves: its process manager makes its resource once gRPC health says SERVING, and knows where it
 //! is by the socket that it named (`listen unix:…`) or by the endpoint file that the worker writes. A worker that stands
-//! alone is given the resource manager and offers its resource itself. Either performs goals only under leases that the resource
-//! manager confirms; a pooled one is told where that is by `RATN_RESOURCE_MANAGER`.
+//! alone is given the resource manager and offers its resource itself. Either performs goals only under leases of that very resource, which the
+//! resource manager confirms; a pooled one is told in its environment where that is, and which session offers it ([`crate::pooled`]).
 
 use crate::access::{AccessError, LiveAccess, RoleGate};
 use crate::action::{Action, ActionServer, ActionServerBuilder};
 use crate::client::{CallError, Channels};
-use crate::endpoint::{Endpoint, EndpointError};
-use crate::lease_watch::{LeaseWatch, ManagerLocation, RESOURCE_MANAGER_VARIABLE};
+use crate::endpoint::Endpoint;
+use crate::lease_watch::{LeaseWatch, RESOURCE_MANAGER_VARIABLE};
 use crate::panic::exit_on_panic;
+use crate::pooled::{PROVIDER_SESSION_VARIABLE, Pooled, PooledError};
 use crate::provider::{Provider, standstill_bound};
 use crate::runtime_directory::publish_file;
 use crate::safety::Safety;
@@ -106,9 +107,30 @@ pub enum WorkerError {
         "the worker moves something (it has a Safety), and asks for no lease: give it the id of its resource (WorkerOptions::id)"
     )]
     MovesWithoutLease,
-    /// What the environment says of the resource manager is no location.
-    #[error("{RESOURCE_MANAGER_VARIABLE}")]
-    Location(#[source] EndpointError),
+    /// Nobody says which session offers the worker's resource: anybody could offer a lookalike of the same id, and lease it.
+    #[error(
+        "goals of worker `{id}` need a lease, and nobody says which session offers its resource: set {PROVIDER_SESSION_VARIABLE} to that \
+         session's id, as a process manager does for its workers, or have the worker offer its resource itself \
+         (WorkerOptions::resource_manager)"
+    )]
+    NoProvider {
+        /// The worker's resource.
+        id: String,
+    },
+    /// It moves something, and its resource may be granted anew before that stands still.
+    #[error(
+        "worker `{id}` moves something (it has a Safety), stands still within {needed_ms} ms when a lease has ended, and is pooled without \
+         that bound: say `standstill_ms = {needed_ms}`, or more, in its template"
+    )]
+    MovesInPool {
+        /// The worker's resource.
+        id: String,
+        /// The least bound.
+        needed_ms: u128,
+    },
+    /// What the process manager has told it is nonsense.
+    #[error("the environment of the worker is not that of a pooled one")]
+    Pooled(#[from] PooledError),
     /// The resource manager does not want it.
     #[error("the worker's resource is refused")]
     Resource(#[from] CallError),
@@ -169,9 +191,10 @@ impl Worker {
     }
 
     /// The bound within which what it moves stands still when a lease has ended: the next lease of its resource is granted when the
-    /// actions of that one's goals have returned, and at the latest after this. For a worker that offers its resource itself; one with a
+    /// actions of that one's goals have returned, and at the latest after this. A worker with a
     /// [`Safety`] has [`standstill_bound`] unless given, one without has none: its resource is granted anew at once. A worker without
-    /// [`crate::safety::Brakes`] waits this long before it offers its resource: a process before it may have begun a motion.
+    /// [`crate::safety::Brakes`] that offers its resource itself waits this long before: a process before it may have begun a motion.
+    /// A pooled worker with a [`Safety`] starts only where its template's `standstill_ms` is at least this; its next lease is granted after that.
     #[must_use]
     pub fn standstill(mut self, bound: Duration) -> Worker {
         self.standstill = Some(bound);
@@ -225,20 +248,17 @@ impl Worker {
         resources.extend((!options.id.is_empty()).then(|| options.id.clone()));
         let leases = LeaseWatch::of(resources);
         let confirms = has_resource && asked != Leases::Believed;
-        let location = match !confirms || options.resource_manager.is_some() {
+        let pooled = match !confirms || options.resource_manager.is_some() {
             true => None,
-            false => match ManagerLocation::from_environment().map_err(WorkerError::Location)? {
-                Some(location) => Some(location),
-                None => return Err(WorkerError::NoManager { id: options.id }),
-            },
+            false => Some(pooled(&options.id, standstill.filter(|_| safety.is_some()))?),
         };
         actions = match asked {
             Leases::Believed => actions.dangerously_believe_every_lease(),
             Leases::Confirmed | Leases::NotAsked => actions.leases(&leases),
         };
-        let watching = location.map(|location| {
+        let watching = pooled.map(|Pooled { manager, provider_session, .. }| {
             let (leases, channels) = (leases.clone(), channels.clone());
-            let watch = async move { leases.follow_location(&channels, location, DEFAULT_TTL).await };
+            let watch = async move { leases.follow_location(&channels, manager, &provider_session, DEFAULT_TTL).await };
             AbortOnDropHandle::new(tokio::spawn(exit_on_panic(LEASES, watch)))
         });
         if let Some(safety) = &safety {
@@ -303,6 +323,19 @@ impl Worker {
             Ok(served) => Ok(served?),
             Err(error) => Err(WorkerError::System { what: "serve".to_owned(), source: io::Error::other(error) }),
         }
+    }
+}
+
+/// What the process manager of a pooled worker says; `moves_within` is the bound for the standstill of one that moves something.
+fn pooled(id: &str, moves_within: Option<Duration>) -> Result<Pooled, WorkerError> {
+    let id = id.to_owned();
+    let Some(pooled) = Pooled::from_environment()? else { return Err(WorkerError::NoManager { id }) };
+    if pooled.provider_session.is_empty() {
+        return Err(WorkerError::NoProvider { id });
+    }
+    match moves_within {
+        Some(needed) if !pooled.allows(needed) => Err(WorkerError::MovesInPool { id, needed_ms: needed.as_millis() }),
+        _ => Ok(pooled),
     }
 }
 

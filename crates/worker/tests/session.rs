@@ -480,7 +480,7 @@ async fn a_lease_is_not_confirmed_when_the_machine_wakes_up_until_the_manager_is
         let following = if by_session {
             tokio::spawn(leases.follow_session(&channels, &endpoint, &session, hour).unwrap())
         } else {
-            tokio::spawn(leases.follow_location(&channels, ManagerLocation::At(endpoint), hour))
+            tokio::spawn(leases.follow_location(&channels, ManagerLocation::At(endpoint), "cell", hour))
         };
         heard(&leases).await;
         assert_eq!(leases.check(&CLAIM), Standing::Confirmed);

@@ -6,7 +6,7 @@ use super::machine::Sample;
 use super::offered;
 use super::pools::{Command, Event, PoolError, Pools, Restart};
 use super::predecessor::Adopted;
-use super::processes::{ProcessEvents, Processes};
+use super::processes::{ProcessEvents, Processes, Told};
 use super::roster::Roster;
 use super::spawner::Outcome;
 use super::tracking::Tracker;
@@ -64,6 +64,8 @@ pub(super) struct Handle {
 pub(super) struct Parts {
     pub(super) config: ProcessManagerConfig,
     pub(super) directory: RuntimeDirectory,
+    /// What workers are told of the resource manager.
+    pub(super) told: Told,
     pub(super) roster: Roster,
     /// Knows which processes belong to which worker.
     pub(super) tracker: Tracker,
@@ -111,7 +113,7 @@ pub(super) fn start(
     let (inbox, messages) = mpsc::channel(INBOX);
     let (config, adopted) = (parts.config, parts.adopted);
     let (drained, tracking) = (Drained::of(&parts.directory), parts.tracker.mode());
-    let (processes, events) = Processes::start(&config, parts.directory, parts.roster, parts.tracker)?;
+    let (processes, events) = Processes::start(&config, parts.directory, parts.told, parts.roster, parts.tracker)?;
     let mut pools = Pools::new(&config.host, config.templates).with_labels(config.labels.clone());
     pools.go_on_after(&parts.before);
     let actor = Actor {
@@ -193,6 +195,7 @@ impl Actor {
                 }
                 Some(event) = inputs.offer_events.recv() => self.handle(match event {
                     OfferEvent::Offered(id) => Event::Offered { id },
+                    OfferEvent::Refused(id, why) => Event::Refused { id, why },
                     OfferEvent::Withdrawn(id) => Event::Withdrawn { id },
                     OfferEvent::StillHeld(id) => Event::Kept { id },
                 }),
@@ -356,7 +359,8 @@ impl Actor {
     }
 
     fn offer(&self, worker: &WorkerStatus, kind: &str) {
-        let resource = offered::worker(&self.host, &self.labels, worker, kind);
+        let standstill_ms = self.pools.template(&worker.template).and_then(|template| template.standstill_ms);
+        let resource = offered::worker(&self.host, &self.labels, worker, kind, standstill_ms);
         self.wanted.send_modify(|wanted| {
             wanted.insert(worker.id.clone(), resource);
         });

@@ -47,6 +47,7 @@ use crate::demand::{DemandLink, Shortages};
 use crate::link::{LINK, Link, Manager, OfferLifecycle, Wanted};
 use anyhow::Context;
 use machine::Machine;
+use processes::Told;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
 use ratn_worker::client::fresh_id;
 use ratn_worker::panic::exit_on_panic;
@@ -107,13 +108,15 @@ pub async fn run_as(
     // Before anything is offered: what the last process manager offered goes where it is not wanted any more.
     let before: Vec<String> =
         left.iter().map(|entry| &entry.id).chain(unknown.iter().map(|intent| &intent.id)).cloned().collect();
-    let manager = processes::manager_of(&config, &directory);
-    let adopted = predecessor::settle(left, unknown, &config.templates, &manager, &directory, &tracker).await;
+    let session = session_of(&directory).context("cannot keep the session's name")?;
+    let told = Told { manager: processes::manager_of(&config, &directory), session: session.clone() };
+    let adopted = predecessor::settle(left, unknown, &config.templates, &told, &directory, &tracker).await;
     roster.keep_only(&adopted.iter().map(|one| one.entry.id.as_str()).collect());
     let (wanted, to_offer) = watch::channel(Wanted::new());
-    let workers = adopted
-        .iter()
-        .map(|one| offered::worker(&config.host, &config.labels, &one.status(), &one.entry.template.kind));
+    let workers = adopted.iter().map(|one| {
+        let template = &one.entry.template;
+        offered::worker(&config.host, &config.labels, &one.status(), &template.kind, template.standstill_ms)
+    });
     let host = offered::host(&config, &endpoint);
     let offered = workers.chain([host.clone()]);
     wanted.send_modify(|wanted| wanted.extend(offered.map(|resource| (resource.id.clone(), resource))));
@@ -125,7 +128,7 @@ pub async fn run_as(
     let link = Link {
         manager: Manager { configured: config.resource_manager.clone(), directory: directory.clone() },
         client: format!("{ROLE}@{}", config.host),
-        session: Some(session_of(&directory).context("cannot keep the session's name")?),
+        session: Some(session),
         ttl: Duration::from_millis(config.session_ttl_ms),
         wanted: to_offer,
         lifecycle: Some(OfferLifecycle { events: report, draining }),
@@ -145,6 +148,7 @@ pub async fn run_as(
     let parts = actor::Parts {
         config,
         directory: directory.clone(),
+        told,
         roster,
         tracker,
         before,

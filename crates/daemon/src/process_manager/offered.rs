@@ -8,6 +8,7 @@ use ratn_model::value::Value;
 use ratn_proto::types::{Resource, WorkerStatus};
 use ratn_worker::endpoint::Endpoint;
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 const MIB: u64 = 1 << 20;
 
@@ -39,9 +40,19 @@ pub(super) fn battery(host: &str, level: f64) -> Resource {
     resource.with_attribute("level", rounded(level)).on_host(host)
 }
 
-/// A worker, as a resource of `kind`.
-pub(super) fn worker(host: &str, labels: &Labels, worker: &WorkerStatus, kind: &str) -> Resource {
+/// A worker, as a resource of `kind`; of what moves with the bound for its standstill.
+pub(super) fn worker(
+    host: &str,
+    labels: &Labels,
+    worker: &WorkerStatus,
+    kind: &str,
+    standstill_ms: Option<u64>,
+) -> Resource {
     let resource = of_host(worker.id.clone(), ResourceClass::Process, kind, host, labels);
+    let resource = match standstill_ms {
+        Some(bound) => resource.with_standstill(Duration::from_millis(bound)),
+        None => resource,
+    };
     // One that is no server has none.
     let resource = if worker.endpoint.is_empty() { resource } else { resource.with_endpoint(&worker.endpoint) };
     resource.with_attribute("pid", Value::Int(i64::from(worker.pid)))
@@ -59,4 +70,33 @@ fn of_host(id: String, class: ResourceClass, kind: &str, host: &str, labels: &La
 
 fn rounded(number: f64) -> Value {
     Value::Float((number * 100.0).round() / 100.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_proto::types::{STANDSTILL_ATTRIBUTE, WorkerState};
+
+    #[test]
+    fn a_worker_that_moves_something_is_offered_with_the_bound_for_its_standstill() {
+        let status = WorkerStatus {
+            id: "arm-1@compute".to_owned(),
+            template: "arm".to_owned(),
+            state: WorkerState::Starting,
+            pid: 7,
+            endpoint: "unix:/w".to_owned(),
+            reason: String::new(),
+            resident_bytes: 0,
+            cpu_millicores: 0,
+            limits: String::new(),
+            age_s: 0,
+            held: false,
+        };
+        let bound = |standstill_ms| {
+            let offered = worker("compute", &Labels::new(), &status, "Arm", standstill_ms);
+            offered.attributes.get(STANDSTILL_ATTRIBUTE).cloned()
+        };
+        assert_eq!(bound(Some(6_000)), Some(Value::Int(6_000)));
+        assert_eq!(bound(None), None);
+    }
 }

@@ -9,13 +9,13 @@
 
 use super::account;
 use super::limits::end_group;
+use super::processes::Told;
 use super::roster::{Entry, Intent};
 use super::spawner;
 use super::template::Template;
 use super::tracking::Tracker;
 use nix::sys::signal::Signal;
 use ratn_proto::types::{WorkerState, WorkerStatus};
-use ratn_worker::lease_watch::ManagerLocation;
 use ratn_worker::panic::exit_on_panic_blocking;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::os::fd::OwnedFd;
@@ -99,13 +99,13 @@ pub(super) async fn settle(
     left: Vec<Entry>,
     unknown: Vec<Intent>,
     templates: &[Template],
-    manager: &ManagerLocation,
+    told: &Told,
     directory: &RuntimeDirectory,
     tracker: &Tracker,
 ) -> Vec<Adopted> {
     let settled = left.into_iter().map(async |entry| {
         let adopted = match Exit::of(&entry) {
-            Some(exit) => match greet(&entry, exit, templates, manager, directory).await {
+            Some(exit) => match greet(&entry, exit, templates, told, directory).await {
                 Ok(adopted) => Some(adopted),
                 Err((exit, why)) => {
                     tracing::info!(
@@ -151,7 +151,7 @@ async fn greet(
     entry: &Entry,
     exit: Exit,
     templates: &[Template],
-    manager: &ManagerLocation,
+    told: &Told,
     directory: &RuntimeDirectory,
 ) -> Result<Adopted, (Exit, &'static str)> {
     let Some(template) = templates.iter().find(|template| template.name == entry.template.name) else {
@@ -166,7 +166,7 @@ async fn greet(
     let socket = adopt_socket(&account::directory_of(directory, &entry.template), &entry.id);
     match timeout(GREETING_PATIENCE, UnixStream::connect(socket)).await {
         Ok(Ok(parent_lives)) => {
-            let outdated = is_outdated(entry, template, manager);
+            let outdated = is_outdated(entry, template, told);
             tracing::info!(id = entry.id, pid = entry.pid, outdated, "a worker of the last process manager is adopted");
             Ok(Adopted { entry: entry.clone(), parent_lives, exit, outdated })
         }
@@ -174,10 +174,12 @@ async fn greet(
     }
 }
 
-/// Whether a worker of now would be another one: of another template, or told of another resource manager. One that asks a manager which
-/// is not that of the system confirms no lease of it.
-fn is_outdated(entry: &Entry, template: &Template, manager: &ManagerLocation) -> bool {
-    !template.starts_the_same_as(&entry.template) || entry.manager.as_ref() != Some(&manager.to_string())
+/// Whether a worker of now would be another one: of another template, or told of another resource manager or session. One that asks a manager
+/// which is not that of the system, or takes another session for the one that offers it, confirms no lease of it.
+fn is_outdated(entry: &Entry, template: &Template, told: &Told) -> bool {
+    let was_told_otherwise =
+        entry.manager.as_ref() != Some(&told.manager.to_string()) || entry.session.as_ref() != Some(&told.session);
+    was_told_otherwise || !template.starts_the_same_as(&entry.template)
 }
 
 async fn end(entry: &Entry, exit: &Exit) {
@@ -211,23 +213,27 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_worker_that_was_told_of_another_resource_manager_is_outdated() {
+    fn a_worker_that_was_told_of_another_resource_manager_or_session_is_outdated() {
         let template = Template::new("planner", "PathPlanner");
-        let outdated = |manager: Option<&str>| {
+        let told = Told { manager: "http://127.0.0.1:2".parse().unwrap(), session: "s-2".to_owned() };
+        let outdated = |manager: Option<&str>, session: Option<&str>| {
             let entry = Entry {
                 id: "planner-1".to_owned(),
                 pid: 42,
                 began: 7,
                 endpoint: None,
                 manager: manager.map(str::to_owned),
+                session: session.map(str::to_owned),
                 limits: String::new(),
                 groups: Vec::new(),
                 template: template.clone(),
             };
-            is_outdated(&entry, &template, &"http://127.0.0.1:2".parse().unwrap())
+            is_outdated(&entry, &template, &told)
         };
-        assert!(!outdated(Some("http://127.0.0.1:2")));
-        assert!(outdated(Some("http://127.0.0.1:1")));
-        assert!(outdated(None), "nobody knows");
+        let (manager, session) = (Some("http://127.0.0.1:2"), Some("s-2"));
+        assert!(!outdated(manager, session));
+        assert!(outdated(Some("http://127.0.0.1:1"), session));
+        assert!(outdated(manager, Some("s-1")));
+        assert!(outdated(None, session) && outdated(manager, None), "nobody knows");
     }
 }

@@ -19,8 +19,10 @@ use ratn_panic_point::panic_point;
 use ratn_worker::adoption;
 use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use ratn_worker::panic::{exit_on_panic, exit_on_panic_blocking};
+use ratn_worker::pooled::{PROVIDER_SESSION_VARIABLE, STANDSTILL_VARIABLE};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -67,8 +69,7 @@ pub(super) enum BeginError {
 
 pub(super) struct Processes {
     host: String,
-    /// Where workers find the resource manager, which confirms the leases of their goals.
-    manager: ManagerLocation,
+    told: Told,
     /// Variables in the environment of every worker.
     worker_environment: BTreeMap<&'static str, PathBuf>,
     max_log_bytes: u64,
@@ -106,6 +107,15 @@ struct Process {
     attended: Option<(AbortHandle, mpsc::Sender<Duration>)>,
 }
 
+/// What workers are told of the resource manager, which confirms the leases of their goals.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Told {
+    /// Where it is.
+    pub(super) manager: ManagerLocation,
+    /// The session that offers them there.
+    pub(super) session: String,
+}
+
 /// Where the workers of a process manager are told that the resource manager is.
 pub(super) fn manager_of(config: &ProcessManagerConfig, directory: &RuntimeDirectory) -> ManagerLocation {
     match &config.resource_manager {
@@ -119,22 +129,23 @@ impl Processes {
     pub(super) fn start(
         config: &ProcessManagerConfig,
         directory: RuntimeDirectory,
+        told: Told,
         roster: Roster,
         tracker: Tracker,
     ) -> io::Result<(Processes, ProcessEvents)> {
-        let (told, outcomes) = mpsc::channel(OUTCOMES);
+        let (outcome, outcomes) = mpsc::channel(OUTCOMES);
         let (serving, served) = mpsc::channel(OUTCOMES);
         let (health, answered) = mpsc::channel(OUTCOMES);
         let processes = Processes {
             host: config.host.clone(),
-            manager: manager_of(config, &directory),
+            told,
             worker_environment: config.worker_environment.clone(),
             max_log_bytes: config.max_log_bytes,
             groups: Groups { v2: config.cgroup.clone(), v1: config.cgroup_v1.clone(), tracking: tracker.groups() },
             directory,
             this_program: std::env::current_exe()?,
-            jobs: spawner::start(told.clone(), tracker.clone())?,
-            outcomes: told,
+            jobs: spawner::start(outcome.clone(), tracker.clone())?,
+            outcomes: outcome,
             roster,
             reaping: tracker.children().map(|children| {
                 AbortOnDropHandle::new(tokio::spawn(exit_on_panic("the reaper of orphans", reap(children))))
@@ -180,7 +191,11 @@ impl Processes {
         let mut env = environment::passed(std::env::vars_os(), &template.pass_env);
         // Inserted last: a template cannot change the marker.
         let marker = self.tracker.environment(id);
-        env.insert(RESOURCE_MANAGER_VARIABLE.into(), self.manager.to_string().into());
+        env.insert(RESOURCE_MANAGER_VARIABLE.into(), self.told.manager.to_string().into());
+        env.insert(PROVIDER_SESSION_VARIABLE.into(), self.told.session.clone().into());
+        // What this process has of it, if anything, is another's.
+        env.remove(OsStr::new(STANDSTILL_VARIABLE));
+        env.extend(template.standstill_ms.map(|bound| (STANDSTILL_VARIABLE.into(), bound.to_string().into())));
         env.extend(self.worker_environment.iter().map(|(name, file)| ((*name).into(), file.into())));
         env.extend(account.iter().flat_map(Account::environment));
         env.extend(template.env.iter().map(|(name, value)| (name.into(), fill(value).into())));
@@ -240,13 +255,15 @@ impl Processes {
         process.pid = pid;
         drop(process.known.take());
         if let (Some(template), Some(began)) = (process.template.take(), predecessor::began(pid)) {
-            let (limits, manager) = (limits.to_owned(), Some(self.manager.to_string()));
+            let limits = limits.to_owned();
+            let (manager, session) = (Some(self.told.manager.to_string()), Some(self.told.session.clone()));
             self.roster.began(Entry {
                 id: id.to_owned(),
                 pid,
                 began,
                 endpoint: None,
                 manager,
+                session,
                 limits,
                 groups,
                 template,

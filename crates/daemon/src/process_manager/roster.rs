@@ -27,6 +27,9 @@ pub(super) struct Entry {
     /// Where it was told that the resource manager is; nothing in what an older version wrote.
     #[serde(default)]
     pub(super) manager: Option<String>,
+    /// The session that it was told offers it; nothing in what an older version wrote.
+    #[serde(default)]
+    pub(super) session: Option<String>,
     /// What it may use of the machine, for people.
     pub(super) limits: String,
     /// Its groups of cgroups, if it has any.
@@ -229,6 +232,7 @@ mod tests {
             began: 7,
             endpoint: None,
             manager: Some("file:/run/resource-manager.endpoint".to_owned()),
+            session: Some("process-manager-1".to_owned()),
             limits: String::new(),
             groups: Vec::new(),
             template: Template::new("planner", "PathPlanner"),

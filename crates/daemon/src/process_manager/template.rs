@@ -13,6 +13,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+/// The resource manager waits no longer for standstill.
+const LONGEST_STANDSTILL_MS: u64 = 60_000;
 /// A pool has at most so many workers.
 const MAX_WORKERS: u32 = 1_000;
 
@@ -54,6 +56,10 @@ pub struct Template {
     /// What of the machine has to be free for one more than `min`; another host is asked where it is not.
     #[serde(default)]
     pub needs: Needs,
+    /// For workers that move something: when a lease of one has ended otherwise than by its holder's release, the next one is granted
+    /// after so long, in milliseconds. Such a worker does not start without it.
+    #[serde(default)]
+    pub standstill_ms: Option<u64>,
     /// When it is ready.
     #[serde(default)]
     pub readiness: Readiness,
@@ -176,6 +182,7 @@ impl Template {
             user: None,
             limits: Limits::default(),
             needs: Needs::default(),
+            standstill_ms: None,
             readiness: Readiness::default(),
             after: Vec::new(),
             min: one(),
@@ -233,6 +240,7 @@ impl Template {
             directory: template.directory.clone(),
             user: template.user.clone(),
             limits: template.limits,
+            standstill_ms: template.standstill_ms,
             readiness: template.readiness.clone(),
             adopt: template.adopt,
             adopt_grace_s: template.adopt_grace_s,
@@ -285,6 +293,8 @@ impl Template {
         ] {
             rule(key(name), (0.001..=86_400.0).contains(&seconds), "from 0.001 s to a day")?;
         }
+        let standstill = self.standstill_ms.is_none_or(|ms| (1..=LONGEST_STANDSTILL_MS).contains(&ms));
+        rule(key("standstill_ms"), standstill, format!("from 1 to {LONGEST_STANDSTILL_MS} ms"))?;
         rule(key("crash_limit"), self.crash_limit >= 1, "at least 1")?;
         rule(key("backoff_ms"), self.backoff_ms >= 1, "at least 1 ms")?;
         rule(key("max_backoff_ms"), self.max_backoff_ms >= self.backoff_ms, "at least backoff_ms")?;

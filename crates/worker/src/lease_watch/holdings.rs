@@ -70,7 +70,8 @@ pub struct Holdings {
     endings: Endings,
     /// The largest id heard of.
     youngest: LeaseId,
-    /// The session that provides the resources, where that is known: what another one provides under their ids is not this provider.
+    /// The session that provides the resources: what another one provides under their ids is not this provider. `None` before a manager is
+    /// followed, as in tests that tell everything themselves.
     owner: Option<String>,
     contact: Contact,
 }
@@ -146,9 +147,9 @@ impl Holdings {
         )
     }
 
-    /// A new watch begins, of resources that `owner` provides where that is known.
-    pub fn begin(&mut self, owner: Option<&str>) {
-        self.owner = owner.map(str::to_owned);
+    /// A new watch begins, of resources that the session `owner` provides.
+    pub fn begin(&mut self, owner: &str) {
+        self.owner = Some(owner.to_owned());
     }
 
     /// The watch tells something; what has ended with it.
@@ -388,10 +389,10 @@ mod tests {
     #[test]
     fn a_resource_that_another_session_provides_under_the_same_id_is_not_this_provider() {
         let mut holdings = Holdings::default();
-        holdings.begin(Some("another cell"));
+        holdings.begin("another cell");
         holdings.tell(&snapshot(&[arm(&[7])], 7));
         refuted(&holdings, claim(7), "no lease holds it");
-        holdings.begin(Some("cell"));
+        holdings.begin("cell");
         holdings.tell(&snapshot(&[arm(&[8])], 8));
         assert_eq!(holdings.check(&claim(8)), Standing::Confirmed);
     }

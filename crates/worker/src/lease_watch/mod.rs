@@ -106,8 +106,8 @@ enum Trust {
 enum Source {
     /// To one manager, in which a session provides the resources.
     Session { client: Box<ResourceClient>, state: watch::Receiver<SessionState>, belief: Belief, id: String },
-    /// To the manager of this location, wherever it is now.
-    Location { channels: Channels, location: ManagerLocation },
+    /// To the manager of this location, wherever it is now; this session provides the resources.
+    Location { channels: Channels, location: ManagerLocation, provider_session: String },
 }
 
 /// What is followed now.
@@ -213,14 +213,17 @@ impl LeaseWatch {
     }
 
     /// Follows the manager of a location, wherever it is, for as long as the future is polled; for a provider whose resources another
-    /// process offers. Leases are trusted for `patience` after the manager has answered something; it is asked four times within that.
+    /// process offers, in the session of this id. What any other session offers under their ids is not this provider. Leases are trusted for
+    /// `patience` after the manager has answered something; it is asked four times within that.
     pub fn follow_location(
         &self,
         channels: &Channels,
         location: ManagerLocation,
+        provider_session: &str,
         patience: Duration,
     ) -> impl Future<Output = ()> + Send + use<> {
-        self.clone().follow(Source::Location { channels: channels.clone(), location }, patience)
+        let provider_session = provider_session.to_owned();
+        self.clone().follow(Source::Location { channels: channels.clone(), location, provider_session }, patience)
     }
 
     /// Nothing is known any more: what is under way ends, and nothing begins until a manager is heard.
@@ -364,11 +367,11 @@ impl LeaseWatch {
                 // A session that is closed tells nothing more, and this watch ends with it.
                 let mut state = state.clone();
                 let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { pending().await };
-                (ResourceClient::clone(client), Some(id.as_str()), generation)
+                (ResourceClient::clone(client), id.as_str(), generation)
             }
-            Source::Location { channels, location } => {
+            Source::Location { channels, location, provider_session } => {
                 let manager = location.find().await;
-                (ResourceClient::new(channels, &manager, "")?, None, 0)
+                (ResourceClient::new(channels, &manager, "")?, provider_session.as_str(), 0)
             }
         };
         let answered = Arc::new(Answered(Mutex::new(self.shared.clock.now())));

@@ -30,6 +30,13 @@ pub enum Event {
         /// The worker's id.
         id: String,
     },
+    /// The resource manager does not take the worker's resource, or not yet.
+    Refused {
+        /// The worker's id.
+        id: String,
+        /// Its words.
+        why: String,
+    },
     /// A worker's process is gone, or could not be started.
     Exited {
         /// The worker's id.

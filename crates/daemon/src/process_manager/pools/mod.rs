@@ -79,6 +79,9 @@ impl Pools {
                 self.about(now, &id, &mut commands, |pool, number, c| pool.offered(now, number, c));
                 self.let_follow(now, &mut commands);
             }
+            Event::Refused { id, why } => {
+                self.about(now, &id, &mut commands, |pool, number, _| pool.refused(now, number, &why));
+            }
             Event::Exited { id, reason, last_words } => {
                 self.about(now, &id, &mut commands, |pool, number, commands| {
                     pool.exited(now, number, (&reason, &last_words), commands);

@@ -225,6 +225,13 @@ impl Pool {
         }
     }
 
+    /// A worker's resource is not taken.
+    pub(super) fn refused(&mut self, now: Timestamp, number: u64, why: &str) {
+        if let Some(worker) = self.workers.get_mut(&number) {
+            worker.refused(now + self.template.start_timeout(), why);
+        }
+    }
+
     /// So many more are asked for, also where it has failed; the ids.
     pub(super) fn spawn(
         &mut self,

@@ -26,6 +26,8 @@ pub(super) struct Worker {
     /// Since when nobody holds its resource; `None` while somebody does.
     idle_since: Option<Timestamp>,
     liveness: liveness::Liveness,
+    /// The resource manager does not take its resource: why, and until when that is waited for.
+    refused: Option<(Timestamp, String)>,
     /// Another one is to take its place.
     outdated: bool,
     pid: u32,
@@ -65,6 +67,7 @@ impl Worker {
             serves_since: None,
             idle_since: Some(now),
             liveness: liveness::Liveness::of(template),
+            refused: None,
             outdated: false,
             pid: 0,
             limits: String::new(),
@@ -105,8 +108,18 @@ impl Worker {
         self.liveness.ask_at_once(now);
     }
 
+    /// The resource manager does not take its resource. That may pass, as where a session of before still has one of its id: it is waited
+    /// for until then.
+    pub(super) fn refused(&mut self, until: Timestamp, why: &str) {
+        if self.phase == Phase::Serving {
+            let (_, words) = self.refused.get_or_insert_with(|| (until, String::new()));
+            why.clone_into(words);
+        }
+    }
+
     /// Its resource is there.
     pub(super) fn offered(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        self.refused = None;
         if self.phase == Phase::Serving {
             self.phase = Phase::Ready;
             self.idle_since = self.idle_since.and(Some(now));
@@ -205,6 +218,11 @@ impl Worker {
             Phase::Starting { until } if until <= now => {
                 self.fail(format!("not ready within {} s", template.start_timeout_s), commands);
             }
+            Phase::Serving if self.refused.as_ref().is_some_and(|(until, _)| *until <= now) => {
+                let why = self.refused.take().map(|(_, why)| why).unwrap_or_default();
+                commands.push(Command::Withdraw { id: self.id.clone() });
+                self.fail(format!("its resource is not taken: {why}"), commands);
+            }
             Phase::Leaving { until: Some(until) } if until <= now => {
                 self.stop(now + template.stop_timeout(), commands);
             }
@@ -232,7 +250,8 @@ impl Worker {
             Phase::Starting { until } => Some(until),
             Phase::Leaving { until } => until,
             Phase::Stopping { kill_at } => kill_at,
-            Phase::Serving | Phase::Ready | Phase::Failed { .. } => None,
+            Phase::Serving => self.refused.as_ref().map(|(until, _)| *until),
+            Phase::Ready | Phase::Failed { .. } => None,
         };
         let of_liveness = self.liveness.deadline().filter(|_| self.is_live());
         of_phase.into_iter().chain(of_liveness).min()
@@ -293,7 +312,7 @@ impl Worker {
             state,
             pid: self.pid,
             endpoint: self.endpoint.clone(),
-            reason: String::new(),
+            reason: self.refused.as_ref().map(|(_, why)| why.clone()).unwrap_or_default(),
             resident_bytes: 0,
             cpu_millicores: 0,
             limits: self.limits.clone(),
@@ -379,6 +398,30 @@ mod tests {
         // Its process came only now.
         assert_eq!(commands(|c| worker.spawned(4711, String::new(), c)), [Command::Kill { id: ID.into() }]);
         assert_eq!(worker.exited("killed by signal 9").reason, "not ready within 3 s");
+    }
+
+    #[test]
+    fn one_whose_resource_is_not_taken_is_killed_after_a_while_and_it_is_said_why() {
+        let mut worker = worker();
+        worker.serving(at(1.0), "unix:/w", "PathPlanner", &mut Vec::new());
+        worker.refused(at(4.0), "another session has it");
+        worker.refused(at(5.0), "another session has it");
+        assert_eq!((worker.status().reason.as_str(), worker.deadline()), ("another session has it", Some(at(4.0))));
+        assert!(commands(|c| worker.advance(at(3.9), &template(), c)).is_empty());
+        let killed = [Command::Withdraw { id: ID.into() }, Command::Kill { id: ID.into() }];
+        assert_eq!(commands(|c| worker.advance(at(4.0), &template(), c)), killed);
+        assert_eq!(worker.exited("killed by signal 9").reason, "its resource is not taken: another session has it");
+        assert!(!worker.is_stopping(), "its exit is a crash");
+    }
+
+    #[test]
+    fn one_whose_resource_is_taken_in_time_is_ready() {
+        let mut worker = worker();
+        worker.serving(at(1.0), "unix:/w", "PathPlanner", &mut Vec::new());
+        worker.refused(at(4.0), "a session of before has it");
+        worker.offered(at(2.0), &mut Vec::new());
+        assert!(commands(|c| worker.advance(at(9.0), &template(), c)).is_empty());
+        assert_eq!((worker.is_ready(), worker.status().reason.as_str()), (true, ""));
     }
 
     #[test]

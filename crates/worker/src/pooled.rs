@@ -1,0 +1,77 @@
+//! What a worker is told by the process manager that offers it, in its environment: where leases are confirmed, which session offers the
+//! worker's resource, and the bound for its standstill.
+
+use crate::endpoint::EndpointError;
+use crate::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
+use std::time::Duration;
+
+/// The environment variable with the id of the session that offers the worker's resource. What another session offers under the
+/// resource's id is not this worker, and its leases are none.
+pub const PROVIDER_SESSION_VARIABLE: &str = "RATN_PROVIDER_SESSION";
+
+/// The environment variable with the `standstill_ms` that the worker's resource is offered with.
+pub const STANDSTILL_VARIABLE: &str = "RATN_STANDSTILL_MS";
+
+/// See the module.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Pooled {
+    pub(crate) manager: ManagerLocation,
+    /// Empty where nobody has said it.
+    pub(crate) provider_session: String,
+    pub(crate) standstill: Option<Duration>,
+}
+
+/// The environment of a pooled worker says nonsense.
+#[derive(Debug, thiserror::Error)]
+pub enum PooledError {
+    /// What it says of the resource manager is no location.
+    #[error("{RESOURCE_MANAGER_VARIABLE}")]
+    Location(#[source] EndpointError),
+    /// What it says of the standstill is no time.
+    #[error(
+        "{STANDSTILL_VARIABLE} is `{said}`: it has to be a whole number of milliseconds, as `standstill_ms` of the worker's template is"
+    )]
+    Standstill {
+        /// What it says.
+        said: String,
+    },
+}
+
+impl Pooled {
+    /// What the environment says, if it names a resource manager.
+    pub(crate) fn from_environment() -> Result<Option<Pooled>, PooledError> {
+        let Some(manager) = ManagerLocation::from_environment().map_err(PooledError::Location)? else {
+            return Ok(None);
+        };
+        let said = |name| std::env::var(name).unwrap_or_default();
+        let standstill = standstill(&said(STANDSTILL_VARIABLE))?;
+        Ok(Some(Pooled { manager, provider_session: said(PROVIDER_SESSION_VARIABLE), standstill }))
+    }
+
+    /// Whether what moves stands still within the bound of its pool.
+    pub(crate) fn allows(&self, needed: Duration) -> bool {
+        self.standstill.is_some_and(|bound| bound >= needed)
+    }
+}
+
+fn standstill(said: &str) -> Result<Option<Duration>, PooledError> {
+    let milliseconds = (!said.is_empty()).then(|| said.parse().map(Duration::from_millis));
+    milliseconds.transpose().map_err(|_| PooledError::Standstill { said: said.to_owned() })
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn what_moves_is_pooled_only_within_a_bound_for_its_standstill() {
+        let needed = Duration::from_secs(6);
+        for (said, allowed) in [("", false), ("0", false), ("5999", false), ("6000", true), ("60000", true)] {
+            let (manager, provider_session) = ("http://127.0.0.1:1".parse().unwrap(), "session-1".to_owned());
+            let pooled = Pooled { manager, provider_session, standstill: standstill(said).unwrap() };
+            assert_eq!(pooled.allows(needed), allowed, "{said}");
+        }
+        assert!(standstill("6 s").unwrap_err().to_string().contains("`6 s`"));
+    }
+}
