@@ -1,22 +1,32 @@
 //! RRT-Connect: two trees, one from the start and one from the goals, each growing towards samples and then towards the other
 //! (Kuffner and LaValle, ICRA 2000), with the trees kept balanced (Kuffner and LaValle 2005) and nodes that only take samples
-//! near them once an extension failed (dynamic domain, Yershova et al., ICRA 2005).
+//! near them once an extension failed (dynamic domain, Yershova et al., ICRA 2005). A robot with several arms moves one after the
+//! other first ([`branches`](crate::branches)).
 //!
 //! The same space, ends, seed and budget give the same path. The caller is asked every `POLL` iterations whether to go on.
 
+use crate::branches::{together, with};
 use crate::ellipsoid;
-use crate::halton::Halton;
 use crate::pace::Control;
 use crate::reach::{Reach, Target};
+use crate::sobol::Sobol;
 use crate::space::{Space, State, between, difference, distance, length};
 use crate::tree::Tree;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use std::cell::Cell;
 
-/// How far a tree grows at once, in radians.
-const RANGE: f32 = 1.0;
+/// How far a tree grows at once, as a part of what two random postures differ by in a joint (in the root mean square), attempt by attempt:
+/// a search that does not end is begun anew, with shorter and longer motions in turn. For a Panda they are 1.0 and 0.5 radians.
+const RANGES: [f32; 2] = [0.5, 0.25];
 
-/// The dynamic domain: where it begins after a failure, its least size and how fast it changes.
+/// Samples of the first attempt; each further one has four times as many.
+const FIRST_ATTEMPT: usize = 32_768;
+
+/// As many for each branch of a robot that has several.
+const IN_TURN: usize = 4096;
+
+/// The dynamic domain: where it begins after a failure and its least size, as parts of the range, and how fast it changes.
 const DOMAIN: f32 = 4.0;
 const LEAST_DOMAIN: f32 = 1.0;
 const DOMAIN_CHANGE: f32 = 1e-4;
@@ -118,12 +128,96 @@ pub fn connect(
         }
     }
     let ends: Vec<State> = free.iter().map(|g| goals[*g]).collect();
-    let (lower, upper) = (*space.limits().0, *space.limits().1);
-    let mut samples = Halton::new(space.joints(), budget.seed);
-    let (path, iterations) = grow(space, start, &ends, budget.iterations, || samples.next(&lower, &upper), control)?;
+    let (path, iterations) = search(space, start, &ends, budget, control)?;
     let last = path[path.len() - 1];
     let goal = free.iter().copied().find(|g| goals[*g] == last).unwrap_or(free[0]);
     Ok(Route { path, goal, iterations })
+}
+
+/// Searches with the branches of the robot in turn, where it has several, and with all joints, with more samples each time.
+fn search(
+    space: &mut Space,
+    start: &State,
+    ends: &[State],
+    budget: Budget,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<(Vec<State>, usize), ConnectError> {
+    let branches = space.branches().to_vec();
+    let used = Cell::new(0);
+    let mut control = |iterations: usize| control(used.get() + iterations);
+    let mut samples = Sobol::new(budget.seed);
+    let mut share = if branches.len() > 1 { IN_TURN } else { FIRST_ATTEMPT };
+    let all: Vec<usize> = (0..space.joints()).collect();
+    for attempt in 0.. {
+        let range = range(space, RANGES[attempt % RANGES.len()]);
+        let effort = || (share.min(budget.iterations - used.get()), range);
+        for first in (0..branches.len()).filter(|_| branches.len() > 1) {
+            let order: Vec<&[usize]> =
+                branches.iter().cycle().skip(first).take(branches.len()).map(Vec::as_slice).collect();
+            match in_turn(space, start, &ends[0], &order, effort(), &mut samples, &mut control) {
+                Err(ConnectError::Exhausted { iterations }) => used.set(used.get() + iterations),
+                found => return found.map(|(path, iterations)| (path, used.get() + iterations)),
+            }
+        }
+        match grow_with(space, start, ends, &all, effort(), &mut samples, &mut control) {
+            Err(ConnectError::Exhausted { iterations }) => used.set(used.get() + iterations),
+            found => return found.map(|(path, iterations)| (path, used.get() + iterations)),
+        }
+        if used.get() >= budget.iterations {
+            break;
+        }
+        share *= 4;
+    }
+    Err(ConnectError::Exhausted { iterations: used.get() })
+}
+
+/// One branch after the other.
+fn in_turn(
+    space: &mut Space,
+    start: &State,
+    end: &State,
+    order: &[&[usize]],
+    (iterations, range): (usize, f32),
+    samples: &mut Sobol,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<(Vec<State>, usize), ConnectError> {
+    let mut postures = vec![*start];
+    for joints in order {
+        postures.push(with(&postures[postures.len() - 1], end, joints));
+    }
+    let between_free = postures[1..postures.len() - 1].iter().all(|posture| space.is_free(posture));
+    if !between_free {
+        return Err(ConnectError::Exhausted { iterations: 0 });
+    }
+    let (mut paths, mut used) = (Vec::new(), 0);
+    for (pair, joints) in postures.windows(2).zip(order) {
+        if space.is_free_motion(&pair[0], &pair[1]) {
+            paths.push(pair.to_vec());
+            continue;
+        }
+        let found = grow_with(space, &pair[0], &pair[1..], joints, (iterations - used, range), samples, control);
+        let (path, more) = found.map_err(|error| match error {
+            ConnectError::Exhausted { iterations } => ConnectError::Exhausted { iterations: used + iterations },
+            other => other,
+        })?;
+        used += more;
+        paths.push(path);
+    }
+    Ok((together(space, &paths), used))
+}
+
+/// As [`grow`], towards samples in which only some of the joints move.
+fn grow_with(
+    space: &mut Space,
+    start: &State,
+    ends: &[State],
+    joints: &[usize],
+    (iterations, range): (usize, f32),
+    samples: &mut Sobol,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<(Vec<State>, usize), ConnectError> {
+    let (lower, upper) = (with(start, space.limits().0, joints), with(start, space.limits().1, joints));
+    grow_by(space, start, ends, (iterations, range), || samples.next(&lower, &upper), control)
 }
 
 /// Searches a path from `start` to a posture that meets one of `targets`: several postures for each, all of them roots of one
@@ -216,12 +310,33 @@ fn detour(
     found.map(|(path, _)| path)
 }
 
-/// Grows a tree from the start and one from all ends, which are free, until they meet; gives the path and the iterations.
+/// How far a tree of this robot grows at once, for a part of [`RANGES`].
+fn range(space: &Space, part: f32) -> f32 {
+    let (lower, upper) = space.limits();
+    // Two even samples of a range differ by its sixth in the mean square.
+    let squares: f32 = difference(upper, lower).iter().map(|range| range * range / 6.0).sum();
+    part * (squares / space.joints().max(1) as f32).sqrt()
+}
+
+/// As [`grow_by`], by the range of a first attempt.
 pub(crate) fn grow(
     space: &mut Space,
     start: &State,
     ends: &[State],
     iterations: usize,
+    sample: impl FnMut() -> State,
+    control: &mut dyn FnMut(usize) -> Control,
+) -> Result<(Vec<State>, usize), ConnectError> {
+    let range = range(space, RANGES[0]);
+    grow_by(space, start, ends, (iterations, range), sample, control)
+}
+
+/// Grows a tree from the start and one from all ends, which are free, until they meet; gives the path and the iterations.
+fn grow_by(
+    space: &mut Space,
+    start: &State,
+    ends: &[State],
+    (iterations, range): (usize, f32),
     mut sample: impl FnMut() -> State,
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<(Vec<State>, usize), ConnectError> {
@@ -231,6 +346,7 @@ pub(crate) fn grow(
     for (i, end) in ends.iter().enumerate() {
         trees[1].push(*end, i);
     }
+    let (domain, least_domain) = (DOMAIN * range, LEAST_DOMAIN * range);
     // Which tree grows towards the sample.
     let mut growing = 1;
     // Where nothing may be left between postures, an iteration takes as long as many others.
@@ -251,10 +367,10 @@ pub(crate) fn grow(
             continue;
         }
         let from = tree.states[near];
-        let to = if far <= RANGE { sample } else { between(&from, &sample, RANGE / far) };
+        let to = if far <= range { sample } else { between(&from, &sample, range / far) };
         if !space.is_free_motion(&from, &to) {
             let radius = &mut tree.radii[near];
-            *radius = if radius.is_infinite() { DOMAIN } else { (*radius * (1.0 - DOMAIN_CHANGE)).max(LEAST_DOMAIN) };
+            *radius = if radius.is_infinite() { domain } else { (*radius * (1.0 - DOMAIN_CHANGE)).max(least_domain) };
             continue;
         }
         let mut node = tree.push(to, near);
@@ -263,7 +379,7 @@ pub(crate) fn grow(
         }
         let (meeting, gap) = other.nearest(&to);
         let goal = other.states[meeting];
-        let steps = (gap / RANGE).ceil().max(1.0) as usize;
+        let steps = (gap / range).ceil().max(1.0) as usize;
         let mut reached = to;
         let joined = (1..=steps).all(|step| {
             let next = if step == steps { goal } else { between(&to, &goal, step as f32 / steps as f32) };

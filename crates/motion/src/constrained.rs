@@ -7,10 +7,10 @@
 //! the tolerance, which leaves the other half for what is between them: tolerances below [`LEAST_TOLERANCE`] ask for too much.
 
 use crate::connect::{Budget, ConnectError, Route};
-use crate::halton::Halton;
 use crate::pace::Control;
 use crate::reach::{Positions, Reach, Target};
 use crate::simplify::path_length;
+use crate::sobol::Sobol;
 use crate::space::{Space, State, between, distance};
 use crate::tree::Tree;
 use rand::{RngExt, SeedableRng};
@@ -122,7 +122,7 @@ fn grow(
 ) -> Result<(Vec<State>, usize), ConnectError> {
     let joints = space.joints();
     let (lower, upper) = (*space.limits().0, *space.limits().1);
-    let mut samples = Halton::new(joints, budget.seed);
+    let mut samples = Sobol::new(budget.seed);
     let mut trees = [Tree::new(space.isa(), joints), Tree::new(space.isa(), joints)];
     trees[0].push(*start, 0);
     for (i, end) in ends.iter().enumerate() {

@@ -36,6 +36,8 @@ pub struct Exact<'a> {
     obstacles: Vec<Solid<'a>>,
     /// Per link.
     bodies: Vec<Vec<Shape>>,
+    /// Links that are to be kept apart.
+    pairs: Vec<(usize, usize)>,
 }
 
 /// What a link has: its pose there, its shape, and how near to it is as good as touching, in metres.
@@ -76,6 +78,7 @@ impl<'a> Exact<'a> {
             mechanism,
             obstacles: obstacles.iter().map(solid).collect(),
             bodies: mechanism.links.iter().map(bodies).collect(),
+            pairs: mechanism.pairs(),
         }
     }
 
@@ -125,17 +128,14 @@ impl<'a> Exact<'a> {
                         return;
                     }
                 }
-                for (second, others) in placed.iter().enumerate().skip(link + 1) {
-                    if !self.mechanism.is_checked(link, second) {
-                        continue;
-                    }
-                    for other in others {
-                        if let Some(depth_m) = depth(body, other)
-                            && !wants_more(Touch { link: name(link), other: name(second), depth_m })
-                        {
-                            return;
-                        }
-                    }
+            }
+        }
+        for &(link, second) in &self.pairs {
+            for (body, other) in placed[link].iter().flat_map(|body| placed[second].iter().map(move |o| (body, o))) {
+                if let Some(depth_m) = depth(body, other)
+                    && !wants_more(Touch { link: name(link), other: name(second), depth_m })
+                {
+                    return;
                 }
             }
         }

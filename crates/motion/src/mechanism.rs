@@ -245,6 +245,13 @@ impl Mechanism {
         next
     }
 
+    /// All pairs of links with shapes that are to be kept apart, the lower index first.
+    pub fn pairs(&self) -> Vec<(usize, usize)> {
+        let solid: Vec<usize> = (0..self.links.len()).filter(|l| !self.links[*l].spheres.is_empty()).collect();
+        let pairs = solid.iter().flat_map(|b| solid.iter().take_while(move |a| *a < b).map(move |a| (*a, *b)));
+        pairs.filter(|(a, b)| self.is_checked(*a, *b)).collect()
+    }
+
     /// Positions, of which those that are beyond a limit by no more than [`ROUNDED`] are at the limit, and which were.
     pub fn clamped(&self, positions: &[f64]) -> (Vec<f64>, Vec<Beyond>) {
         let mut beyond = Vec::new();

@@ -8,6 +8,7 @@ use crate::frame::compose;
 pub use crate::geometry::{Body, Geometry};
 use crate::urdf;
 pub use crate::urdf::RobotError;
+pub use crate::urdf_faults::UrdfFault;
 use parry3d::math::{Pose as Pose32, Rotation, Vector};
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;

@@ -5,6 +5,7 @@
 //! next one, and the parts where that is too much are cut finer, down to postures so close that what is between is noise.
 //! How far it can move is half of its step to the next posture, and what the curvature of its way allows beside that.
 
+use crate::branches;
 use crate::geometry::Geometry;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 pub use crate::simd::Isa;
@@ -46,6 +47,7 @@ pub struct Space {
     inflate: Vec<f32>,
     lower: State,
     upper: State,
+    branches: Vec<Vec<usize>>,
     /// A part that no joint moves stands in an obstacle.
     blocked: bool,
     swept: bool,
@@ -98,7 +100,7 @@ impl Space {
             group.near = order.chunks(isa.width()).map(|row| compile_row(row, obstacles)).collect();
         }
         compiled.obstacles = compiled_obstacles;
-        compiled.pairs = pairs(mechanism, &compiled.groups, &links);
+        compiled.pairs = pairs(mechanism, &links);
         let arms = compiled.groups.iter().map(|group| arm(&compiled, group)).collect();
         let (mut lower, mut upper) = ([0.0; MAX_JOINTS], [0.0; MAX_JOINTS]);
         for (j, joint) in mechanism.joints.iter().enumerate() {
@@ -106,7 +108,8 @@ impl Space {
         }
         let scratch = Scratch::new(&compiled);
         let inflate = vec![0.0; compiled.groups.len()];
-        Space { compiled, scratch, isa, arms, inflate, lower, upper, blocked, swept: false }
+        let branches = branches::branches(&parents(&compiled));
+        Space { compiled, scratch, isa, arms, inflate, lower, upper, branches, blocked, swept: false }
     }
 
     /// How many joints there are.
@@ -117,6 +120,11 @@ impl Space {
     /// Least and greatest positions.
     pub fn limits(&self) -> (&State, &State) {
         (&self.lower, &self.upper)
+    }
+
+    /// The joints that are moved by no joint of another arm ([`branches`](crate::branches)).
+    pub(crate) fn branches(&self) -> &[Vec<usize>] {
+        &self.branches
     }
 
     /// The instructions in use.
@@ -364,16 +372,29 @@ fn compile_robot(mechanism: &Mechanism, padding: f64) -> (Compiled, Vec<Shell>, 
     (compiled, shells, links)
 }
 
-fn pairs(mechanism: &Mechanism, groups: &[Group], links: &[usize]) -> Vec<SelfPair> {
-    let mut pairs = Vec::new();
-    for first in 0..groups.len() {
-        for second in first + 1..groups.len() {
-            if mechanism.is_checked(links[first], links[second]) {
-                pairs.push(SelfPair { first: first as u16, second: second as u16 });
-            }
-        }
+/// Pairs of groups, in the order of checking; `links` has the link of each group.
+fn pairs(mechanism: &Mechanism, links: &[usize]) -> Vec<SelfPair> {
+    let mut places = vec![0; mechanism.links.len()];
+    for (group, link) in links.iter().enumerate() {
+        places[*link] = group as u32;
     }
+    let pairs = mechanism.pairs().into_iter().map(|(a, b)| {
+        let (a, b) = (places[a], places[b]);
+        SelfPair { first: a.min(b), second: a.max(b) }
+    });
+    let mut pairs: Vec<SelfPair> = pairs.collect();
+    pairs.sort_by_key(|pair| (pair.first, pair.second));
     pairs
+}
+
+/// The joint next towards the root, for each joint.
+fn parents(compiled: &Compiled) -> Vec<Option<usize>> {
+    let mut parents = vec![None; compiled.joints];
+    for frame in &compiled.frames {
+        let parent = frame.parent.checked_sub(1).map(|p| compiled.frames[p].joint);
+        parents[frame.joint] = parents[frame.joint].or(parent.filter(|p| *p != frame.joint));
+    }
+    parents
 }
 
 fn arm(compiled: &Compiled, group: &Group) -> Arm {

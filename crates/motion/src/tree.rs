@@ -1,7 +1,7 @@
 //! A tree of free postures, laid out for the vector scan of `simd::nearest`.
 
 use crate::simd::{Block, Isa};
-use crate::space::State;
+use crate::space::{State, distance};
 
 #[derive(Debug)]
 pub(crate) struct Tree {
@@ -27,12 +27,14 @@ impl Tree {
     pub(crate) fn push(&mut self, state: State, parent: usize) -> usize {
         let index = self.states.len();
         if index.is_multiple_of(16) {
-            self.blocks.extend(std::iter::repeat_n(Block([f32::INFINITY; 16]), self.joints));
+            self.blocks.extend(std::iter::repeat_n(Block([0.0; 16]), self.joints));
+            self.blocks.push(Block([f32::INFINITY; 16]));
         }
-        let row = index / 16 * self.joints;
-        for (block, position) in self.blocks[row..].iter_mut().zip(&state) {
+        let row = index / 16 * (self.joints + 1);
+        for (block, position) in self.blocks[row..row + self.joints].iter_mut().zip(&state) {
             block.0[index % 16] = *position;
         }
+        self.blocks[row + self.joints].0[index % 16] = 0.5 * state.iter().map(|q| q * q).sum::<f32>();
         self.states.push(state);
         self.parents.push(parent as u32);
         self.radii.push(f32::INFINITY);
@@ -40,9 +42,10 @@ impl Tree {
     }
 
     /// The nearest node and its distance.
+    #[inline]
     pub(crate) fn nearest(&self, to: &State) -> (usize, f32) {
-        let (index, squared) = self.isa.nearest(&self.blocks, self.joints, self.states.len(), to);
-        (index, squared.sqrt())
+        let index = self.isa.nearest(&self.blocks, self.joints, self.states.len(), to);
+        (index, distance(&self.states[index], to))
     }
 
     /// From a node to its root.

@@ -4,7 +4,7 @@ use crate::geometry::{Body, Geometry};
 use crate::mesh::{Mesh, MeshError, Meshed};
 use crate::robot::{JOINT_NAMES, Joint, Link, Motion, jerk};
 use crate::urdf_faults;
-pub use crate::urdf_faults::UrdfFault;
+use crate::urdf_faults::UrdfFault;
 use ratn_model::pose::Pose;
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -612,3 +612,56 @@ fn a_robot_that_is_not_one_says_where_and_why() {
     let twice = [names[0].clone(), names[1].clone(), names[0].clone()];
     assert_eq!(refusal(&urdf, &twice), "the joint `j1` is named twice among those to be planned for");
 }
+
+/// Arms of seven joints beside each other.
+fn arms(count: usize) -> Mechanism {
+    let mut urdf = String::from("<robot name='arms'><link name='base'/>");
+    let mut names = Vec::new();
+    for arm in 0..count {
+        let (chain, joints) = chain(7);
+        let links = chain.replace("<robot name='chain'>", "").replace("</robot>", "");
+        urdf += &links.replace("='l", &format!("='arm{arm}_l")).replace("='j", &format!("='arm{arm}_j"));
+        urdf += &format!(
+            "<joint name='mount{arm}' type='fixed'><origin xyz='0 {} 0'/><parent link='base'/><child link='arm{arm}_l0'/></joint>",
+            arm as f64
+        );
+        names.extend(joints.iter().map(|joint| format!("arm{arm}_{joint}")));
+    }
+    Mechanism::read(&(urdf + "</robot>"), None, &names).unwrap()
+}
+
+#[test]
+fn two_arms_solve_what_one_arm_does() {
+    let (one, two) = (arms(1), arms(2));
+    assert_eq!((one.joints.len(), two.joints.len()), (7, 14));
+    let mut random = ChaCha8Rng::seed_from_u64(9);
+    let (mut tried, mut searched) = (0, 0);
+    while tried < 6 {
+        // The same things about each arm.
+        let things = clutter(&mut random, 10, 0.9);
+        let moved = |y: f64| {
+            let there = |o: &Obstacle| Obstacle { pose: Pose::at(0.0, y, 0.0).compose(&o.pose), ..o.clone() };
+            things.iter().map(there).collect::<Vec<_>>()
+        };
+        let both = [moved(0.0), moved(1.0)].concat();
+        let (mut alone, mut together) = (Space::new(&one, &both), Space::new(&two, &both));
+        let (start, goal) = (posture(&mut random, &two), posture(&mut random, &two));
+        if !together.is_free(&start) || !together.is_free(&goal) {
+            continue;
+        }
+        let first = |state: &State| std::array::from_fn(|j| if j < 7 { state[j] } else { 0.0 });
+        if connect(&mut alone, &first(&start), &[first(&goal)], BUDGET, &mut go_on).is_err() {
+            continue;
+        }
+        tried += 1;
+        let route =
+            connect(&mut together, &start, &[goal], Budget { iterations: 60_000, ..BUDGET }, &mut go_on).unwrap();
+        searched += usize::from(route.path.len() > 2);
+        let path = simplify(&mut together, &route.path, BUDGET, &mut go_on).unwrap();
+        assert_eq!((path[0], path[path.len() - 1]), (start, goal));
+        assert!(path_length(&path) <= path_length(&route.path) * 1.001);
+        let path: Vec<Vec<f64>> = path.iter().map(|state| positions(&two, state)).collect();
+        assert_eq!(Exact::new(&two, &both).touch_along(&path, 128.0), None);
+    }
+    assert!(searched >= 4, "{searched}");
+}

@@ -54,8 +54,8 @@ pub(crate) struct Row {
 /// Two groups that must not meet.
 #[derive(Debug, Clone)]
 pub(crate) struct SelfPair {
-    pub(crate) first: u16,
-    pub(crate) second: u16,
+    pub(crate) first: u32,
+    pub(crate) second: u32,
 }
 
 /// A box with rounded corners (a box, a sphere, a capsule), or a cylinder; z is the axis.
@@ -422,7 +422,7 @@ fn meet<V: Lanes>(a: [V; 3], b: [V; 3], reach: f32) -> u32 {
 #[inline(always)]
 fn in_itself<V: Lanes, const ALL: bool>(edge: &Edge<'_>, mut found: u32, scratch: &mut Scratch) -> u32 {
     for pair in &edge.compiled.pairs {
-        let (i, j) = (usize::from(pair.first), usize::from(pair.second));
+        let (i, j) = (pair.first as usize, pair.second as usize);
         let (a, b) = (&edge.compiled.groups[i], &edge.compiled.groups[j]);
         let more = scratch.grown[i] + scratch.grown[j];
         let (at_a, at_b) = (fetch::<V>(&scratch.coarse[i]), fetch::<V>(&scratch.coarse[j]));

@@ -129,7 +129,7 @@ impl Isa {
 
     /// See [`nearest::nearest`].
     #[inline]
-    pub(crate) fn nearest(self, blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> (usize, f32) {
+    pub(crate) fn nearest(self, blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> usize {
         match self.0 {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
@@ -137,7 +137,7 @@ impl Isa {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Kind::Avx2 => unsafe { nearest_avx2(blocks, dimensions, count, to) },
-            _ => nearest::nearest(blocks, dimensions, count, to),
+            _ => nearest::nearest::<false>(blocks, dimensions, count, to),
         }
     }
 }
@@ -167,15 +167,15 @@ fn touching_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
 }
 
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx2")]
-fn nearest_avx512(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> (usize, f32) {
-    nearest::nearest(blocks, dimensions, count, to)
+#[target_feature(enable = "avx512f,avx2,fma")]
+fn nearest_avx512(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> usize {
+    nearest::nearest::<true>(blocks, dimensions, count, to)
 }
 
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn nearest_avx2(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> (usize, f32) {
-    nearest::nearest(blocks, dimensions, count, to)
+#[target_feature(enable = "avx2,fma")]
+fn nearest_avx2(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> usize {
+    nearest::nearest::<true>(blocks, dimensions, count, to)
 }
 
 #[cfg(target_arch = "aarch64")]
