@@ -77,8 +77,9 @@ pub struct StorageConfig {
     pub cert: Option<PathBuf>,
     /// The file with its private key (PEM).
     pub key: Option<PathBuf>,
-    /// Starts also where an older state of etcd was restored: what was acknowledged since then is gone.
-    pub accept_restored: bool,
+    /// Leads also where an older state of etcd was restored, once: what was acknowledged since then is gone. The number that the daemon
+    /// says when it refuses it; it means nothing to the next restore.
+    pub accept_restored: Option<u64>,
     /// A directory of its own; `state/<role>` in the runtime directory unless given.
     pub directory: Option<PathBuf>,
     /// When an answer may leave: `none` at once, `group` when what it tells of is on the disk (many share a sync), `each` likewise,
@@ -97,7 +98,7 @@ impl Default for StorageConfig {
             ca: None,
             cert: None,
             key: None,
-            accept_restored: false,
+            accept_restored: None,
             directory: None,
             durability: Durability::default(),
             compact_bytes: 16 << 20,

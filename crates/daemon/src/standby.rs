@@ -107,13 +107,22 @@ impl Place<'_> {
                     tokio::time::sleep(AGAIN).await;
                     why
                 }
+                // Another host may accept it, for all.
+                Err(JournalError::Open { source: error @ OpenError::Restored { .. }, .. }) => {
+                    let why = error.to_string();
+                    if standby.as_ref().is_none_or(|standby| standby.says() != why) {
+                        tracing::error!(role = self.role, "{why}");
+                    }
+                    tokio::time::sleep(AGAIN).await;
+                    why
+                }
                 Err(error) => return Err(error.into()),
             };
             match &standby {
                 Some(gate) => gate.say(why),
                 None => {
                     tracing::info!(role = self.role, why, "standing by");
-                    let gate = Arc::new(NotTheLeader { role: self.role, why: Mutex::new(why) });
+                    let gate = Arc::new(NotTheLeader::new(self.role, why));
                     self.stand_by(bound, gate.clone(), elected.clone())?;
                     standby = Some(gate);
                 }
@@ -124,8 +133,7 @@ impl Place<'_> {
     /// Refuses everybody until `elected`.
     fn stand_by(&self, bound: &Bound, gate: Arc<NotTheLeader>, elected: CancellationToken) -> anyhow::Result<()> {
         let bound = bound.again().context("cannot listen while standing by")?;
-        let vitals = Vitals::default();
-        vitals.unwell("standing by");
+        let vitals = gate.vitals.clone();
         let serving = Serving { gate, vitals, phase: watch::Sender::new(Phase::Starting), ..self.serving.clone() };
         self.serving.phase.send_replace(Phase::StandingBy);
         let refuse = async move {
@@ -143,10 +151,18 @@ impl Place<'_> {
 struct NotTheLeader {
     role: &'static str,
     why: Mutex<String>,
+    vitals: Vitals,
 }
 
 impl NotTheLeader {
+    fn new(role: &'static str, why: String) -> NotTheLeader {
+        let gate = NotTheLeader { role, why: Mutex::default(), vitals: Vitals::default() };
+        gate.say(why);
+        gate
+    }
+
     fn say(&self, why: String) {
+        self.vitals.unwell(format!("standing by: {why}"));
         *self.why.lock().unwrap_or_else(PoisonError::into_inner) = why;
     }
 

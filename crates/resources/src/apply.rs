@@ -7,6 +7,7 @@ use crate::event::EndReason;
 use crate::event::{Change, Notice, WatchEvent};
 use crate::expiry::Timer;
 use crate::group::Seen;
+use crate::history::History;
 use crate::id::{SessionId, Slot};
 use crate::lease::{Bound, EndingLease, LeaseRecord};
 use crate::memory::RequestId;
@@ -64,6 +65,14 @@ impl Pool {
                 self.last_session = *number;
                 let expires = self.now + *ttl;
                 self.opened(session, Session::new(client.clone(), opened_by.clone(), *number, *ttl, expires))
+            }
+            Effect::RevisionsLeapt { revision } => {
+                if *revision <= self.revision {
+                    return Err(format!("revisions leap to {}, which is not ahead", revision.0));
+                }
+                self.revision = *revision;
+                self.history = History::default();
+                Ok(())
             }
             Effect::SessionEnded { session } => {
                 let known = self.sessions.remove(session).ok_or_else(|| format!("{session} is not there"))?;

@@ -103,8 +103,7 @@ impl Pool {
     #[must_use]
     pub fn with_revisions_above(mut self, floor: Revision) -> Pool {
         if floor > self.revision {
-            self.revision = floor;
-            self.history = History::default();
+            self.commit(Effect::RevisionsLeapt { revision: floor });
         }
         self
     }

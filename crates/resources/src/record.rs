@@ -11,7 +11,7 @@ use crate::id::{SessionId, Slot};
 use crate::lease::LeaseRecord;
 use crate::memory::{Forgotten, Remembered};
 use crate::resource::Description;
-use ratn_model::id::LeaseId;
+use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Quantity;
 use ratn_model::versioned::{self, DecodeError};
 use serde::{Deserialize, Serialize};
@@ -20,7 +20,7 @@ use std::time::Duration;
 
 /// The version that [`encode`] writes, its first byte. Every new variant at the end takes a new number, so that an older program
 /// refuses what it does not know by its version; records since [`OLDEST_FORMAT`] are read as they are.
-pub const FORMAT: u8 = 8;
+pub const FORMAT: u8 = 9;
 /// The oldest version that [`decode`] reads: it has no `Effect::SessionOpened`, as none before this one has `Effect::UnitsFreed`.
 pub const OLDEST_FORMAT: u8 = 2;
 /// The newest version whose fingerprints are of how requests were written then, which says nothing to a later one.
@@ -70,6 +70,8 @@ pub(crate) enum Effect {
     SessionNumbered { session: SessionId, client: String, ttl: Duration, opened_by: Arc<str>, number: u64 },
     /// Of what a session has consumed of what is renewable, so much returned as it has of the first so many resources.
     SomeReturned { session: SessionId, resources: usize },
+    /// Revisions go on from here: those before it may have meant something else.
+    RevisionsLeapt { revision: Revision },
 }
 
 /// What its bytes are, in messages.

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use proptest::prelude::*;
-use ratn_model::id::LeaseId;
+use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -227,6 +227,24 @@ fn tokens_grow_over_a_restart_and_a_repeated_request_is_not_performed_again() {
     again.handle(now, "q2", acquire).unwrap();
     assert!(again.leases()[1].token > first.token);
     assert_eq!(again.sessions()[0].expires, Timestamp(0) + Duration::from_secs(10));
+}
+
+#[test]
+fn revisions_that_have_leapt_stay_ahead_after_a_restart() {
+    let tool = || ResourceSpec::new(ResourceClass::Module, "Tool");
+    let mut pool = Pool::new(limits());
+    pool.create(Timestamp(0), None, tool()).unwrap();
+    let mut log = pool.take_records();
+    let mut pool = pool.with_revisions_above(Revision(1_000));
+    pool.create(Timestamp(0), None, tool()).unwrap();
+    log.extend(pool.take_records());
+    assert_eq!(pool.revision(), Revision(1_001));
+    let again = Pool::restore(limits(), Timestamp(0), None, log).unwrap();
+    assert_eq!(again.snapshot(), pool.snapshot());
+    assert!(again.changes_after(Revision(1)).is_err(), "who watched before begins anew");
+    assert_eq!(again.changes_after(Revision(1_000)).unwrap().len(), 1);
+    let same = pool.clone().with_revisions_above(Revision(7));
+    assert_eq!(same.revision(), pool.revision(), "it is behind");
 }
 
 #[test]

@@ -45,7 +45,7 @@ fn main() {
             holder: Holder::default(),
             bounds: Bounds::default(),
             mark: None,
-            accept_restored: false,
+            accept_restored: None,
         })
         .unwrap()
     };

@@ -101,12 +101,15 @@ pub enum OpenError {
     },
     /// The service that keeps the log has another one than before.
     #[error(
-        "{place} in etcd is older than what was seen there, or of another cluster: an older state of etcd was put in place, and what was \
-         acknowledged since then may be gone; see that no robot moves by it, then start once with `storage.accept_restored = true`"
+        "{place} in etcd is older than what this host has seen of it, or of another cluster: an older state of etcd was put in place, and \
+         what was acknowledged since then may be gone; see that no robot moves by it, then start one daemon with \
+         `storage.accept_restored = {generation}`"
     )]
     Restored {
         /// Which log.
         place: String,
+        /// The generation that accepting it begins.
+        generation: u64,
     },
     /// The options contradict each other.
     #[error("{what}")]

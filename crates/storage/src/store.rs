@@ -55,6 +55,8 @@ pub struct Recovered {
     pub records: Vec<Record>,
     /// Set where the last writer was stopped in the middle of a write.
     pub torn: Option<TornEnd>,
+    /// An older state was put in place of the log and accepted, and nothing was appended since: what was acknowledged may be missing.
+    pub restored: bool,
 }
 
 /// Makes the bytes of a snapshot; called where it does not hold up appends.

@@ -306,35 +306,103 @@ fn an_older_state_of_etcd_is_refused_unless_told() {
             other => break other.unwrap_err(),
         }
     };
-    assert!(matches!(error, OpenError::Restored { .. }), "{error}");
-    assert!(error.to_string().contains("accept_restored"), "{error}");
-    let marked = |name: &str, accept_restored: bool| {
+    assert!(matches!(error, OpenError::Restored { generation: 1, .. }), "{error}");
+    assert!(error.to_string().contains("accept_restored = 1"), "{error}");
+    let marked = |name: &str, accept_restored: Option<u64>| {
         let mark = Some(kept.path().join(name));
         let options = options(endpoints.clone(), "/test/restored", "test");
         Etcd::new(ratn_storage::EtcdOptions { mark, accept_restored, ..options }).unwrap()
     };
     let options = options(endpoints.clone(), "/test/restored", "test");
-    let told = Etcd::new(ratn_storage::EtcdOptions { accept_restored: true, ..options }).unwrap();
+    let told = Etcd::new(ratn_storage::EtcdOptions { accept_restored: Some(1), ..options }).unwrap();
     let (recovered, writer) = open(&told);
     assert_eq!(payloads(&recovered.records), [b"saved"]);
+    assert!(recovered.restored);
     drop(writer);
-    // Once is enough.
-    assert_eq!(open(&fresh).0.records.len(), 1);
+    // Once is enough. As long as nothing was written since, whoever opens it is told.
+    let (recovered, mut writer) = open(&fresh);
+    assert!(recovered.restored);
+    append_durably(&mut *writer, b"since");
+    drop(writer);
+    assert!(!open(&fresh).0.restored);
     // The same cluster by its number: a host that has seen more knows. So does one that has seen a log where there is none.
     assert!(cluster.ctl(&["snapshot", "save", &file]).status.success());
-    let (_, mut writer) = open(&marked("mark", false));
+    let (_, mut writer) = open(&marked("mark", None));
     append_durably(&mut *writer, b"gone again");
     drop(writer);
     assert!(!std::fs::read(kept.path().join("mark")).unwrap().is_empty());
     cluster.restore(&file);
-    assert!(matches!(marked("mark", false).open(), Err(OpenError::Restored { .. })));
-    let (recovered, writer) = open(&marked("no mark", false));
-    assert_eq!(payloads(&recovered.records), [b"saved"], "nobody knows of it there");
+    assert!(matches!(marked("mark", None).open(), Err(OpenError::Restored { generation: 2, .. })));
+    // What was accepted the last time and was left in the config is not enough.
+    assert!(matches!(marked("mark", Some(1)).open(), Err(OpenError::Restored { generation: 2, .. })));
+    let (recovered, writer) = open(&marked("no mark", None));
+    assert_eq!(payloads(&recovered.records), [&b"saved"[..], b"since"], "nobody knows of it there");
+    // Who stands by beside it knows, and says so.
+    let error = marked("mark", None).open().map(drop).unwrap_err();
+    assert!(matches!(error, OpenError::Restored { generation: 2, .. }), "{error}");
     drop(writer);
     assert!(cluster.ctl(&["del", "--prefix", "/test/restored"]).status.success());
-    assert!(matches!(marked("mark", false).open(), Err(OpenError::Restored { .. })));
-    drop(open(&marked("mark", true)));
-    drop(open(&marked("mark", false)));
+    assert!(matches!(marked("mark", None).open(), Err(OpenError::Restored { .. })));
+    let (recovered, writer) = open(&marked("mark", Some(2)));
+    assert!(recovered.restored, "it is empty, and was not");
+    drop(writer);
+    drop(open(&marked("mark", None)));
+}
+
+#[test]
+fn a_restored_etcd_is_accepted_by_one_host_for_all() {
+    if !is_there() {
+        return;
+    }
+    let kept = tempfile::tempdir().unwrap();
+    let file = kept.path().join("snapshot").display().to_string();
+    let mut cluster = Cluster::start(1, &[]);
+    let endpoints = cluster.endpoints();
+    let host = |name: &str, accept_restored: Option<u64>| {
+        let (mark, options) = (Some(kept.path().join(name)), options(endpoints.clone(), "/test/hosts", name));
+        Etcd::new(ratn_storage::EtcdOptions { mark, accept_restored, ..options }).unwrap()
+    };
+    let (first, second, third) = (host("first", None), host("second", None), host("third", None));
+    let told = host("first", Some(1));
+    let (_, mut writer) = first.open().unwrap();
+    append_durably(&mut *writer, b"saved");
+    assert!(cluster.ctl(&["snapshot", "save", &file]).status.success());
+    for _ in 0..20 {
+        append_durably(&mut *writer, b"acknowledged, and gone");
+    }
+    // They stand by, and see how far it is.
+    for standby in [&second, &third] {
+        for _ in 0..2 {
+            assert!(matches!(standby.open(), Err(OpenError::Held { .. })));
+        }
+    }
+    cluster.restore(&file);
+    drop(writer);
+    // One that stood by refuses it as one that starts, as often as they try it.
+    let refused = |log: &Etcd| {
+        let begin = Instant::now();
+        loop {
+            match log.open().map(drop) {
+                Err(OpenError::Restored { generation, .. }) => break assert_eq!(generation, 1),
+                other => assert!(begin.elapsed() < Duration::from_secs(10), "{other:?}"),
+            }
+        }
+    };
+    [&second, &second, &host("third", None), &third].into_iter().for_each(refused);
+    let (recovered, mut writer) = open(&told);
+    assert_eq!((recovered.records.len(), recovered.restored), (1, true));
+    append_durably(&mut *writer, b"since");
+    // It is accepted for those that stand by, too, and for one that is started again.
+    let restarted = host("third", None);
+    for standby in [&second, &restarted] {
+        assert!(matches!(standby.open(), Err(OpenError::Held { .. })));
+    }
+    drop(writer);
+    for next in [&second, &restarted] {
+        let (recovered, _writer) = open(next);
+        assert_eq!(payloads(&recovered.records), [&b"saved"[..], b"since"]);
+        assert!(!recovered.restored);
+    }
 }
 
 #[test]

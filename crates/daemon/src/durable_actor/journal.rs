@@ -51,6 +51,8 @@ pub(crate) struct Journal {
     /// Nothing after the end.
     writer: Option<Box<dyn Writer>>,
     durable: Durable,
+    /// An older state was put in place, and nothing was written since.
+    restored: bool,
     /// The last entry.
     last: Position,
     /// An entry for which there was no room yet; the next one in its place.
@@ -126,6 +128,7 @@ impl Journal {
             store,
             durable: writer.durable(),
             writer: Some(writer),
+            restored: recovered.restored,
             last: recovered.last(),
             unwritten: None,
             compact_bytes: config.compact_bytes,
@@ -183,6 +186,12 @@ impl Journal {
     #[must_use]
     pub(crate) fn counting(self, metrics: &JournalMetrics) -> Journal {
         Journal { metrics: metrics.clone(), ..self }
+    }
+
+    /// Whether an older state was put in place when it was opened, and nothing had been written since: revisions that somebody has heard of may
+    /// be missing.
+    pub(crate) fn is_restored(&self) -> bool {
+        self.restored
     }
 
     pub(super) fn metrics(&self) -> &JournalMetrics {
@@ -244,5 +253,25 @@ impl Journal {
                 Ok(())
             }
         }
+    }
+}
+
+/// A log that was put in place of a newer one, for tests.
+#[cfg(test)]
+#[derive(Debug)]
+pub(crate) struct PutInPlace(pub(crate) Log);
+
+#[cfg(test)]
+impl Store for PutInPlace {
+    fn open(&self) -> Result<(Recovered, Box<dyn Writer>), OpenError> {
+        self.0.open().map(|(recovered, writer)| (Recovered { restored: true, ..recovered }, writer))
+    }
+
+    fn read(&self) -> Result<Recovered, ReadError> {
+        self.0.read()
+    }
+
+    fn place(&self) -> String {
+        self.0.place()
     }
 }

@@ -12,7 +12,7 @@ mod actor;
 mod clock;
 mod desk;
 mod inbox;
-mod journal;
+pub(crate) mod journal;
 mod may_speak;
 mod outbox;
 #[cfg(test)]

@@ -32,7 +32,8 @@ impl Journaled for Pool {
     }
 }
 
-/// Takes the place of the one writer, and restores the pool. Without durability somebody may have heard of revisions that are lost.
+/// Takes the place of the one writer, and restores the pool. Without durability, and where an older state was put in place, somebody may
+/// have heard of revisions that are lost.
 pub(super) fn open(
     config: &StorageConfig,
     store: Arc<dyn Store>,
@@ -40,7 +41,7 @@ pub(super) fn open(
 ) -> Result<(Pool, Journal), JournalError> {
     let (pool, journal) = Journal::open(ROLE, config, store, |recovered| restore(recovered, limits))?;
     let may_have_lost = config.durability == Durability::None && pool.revision() > Revision(0);
-    let floor = if may_have_lost { floor() } else { 0 };
+    let floor = if may_have_lost || journal.is_restored() { floor() } else { 0 };
     // A predecessor that was got past may have promised more than it wrote down.
     Ok((pool.with_revisions_above(Revision(floor)).with_session_grace(CONFIRMED_FOR), journal))
 }
@@ -68,6 +69,7 @@ fn restore(recovered: Recovered, limits: Limits) -> Result<Pool, NoPool> {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use crate::durable_actor::journal::PutInPlace;
     use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
     use ratn_model::time::Timestamp;
     use ratn_resources::{AcquireRequest, ResourceSpec, SessionId};
@@ -106,6 +108,25 @@ mod tests {
             assert!(tokens.iter().all(|token| *token > highest), "life {life}: {} after {highest}", tokens[0]);
             highest = *tokens.last().unwrap();
         }
+    }
+
+    #[test]
+    fn where_an_older_state_was_put_in_place_revisions_begin_above_all_of_before_and_stay_there() {
+        let place = tempfile::tempdir().unwrap();
+        let config = StorageConfig::default();
+        let (mut pool, mut journal) = open_at(&config, place.path());
+        pool.create(Timestamp(0), None, ResourceSpec::new(ResourceClass::Module, "Tool")).unwrap();
+        journal.write(&mut pool).unwrap();
+        let told = pool.revision();
+        drop(journal);
+        let put_in_place = Arc::new(PutInPlace(Journal::log(&config, place.path())));
+        let (mut pool, mut journal) = open(&config, put_in_place, Limits::default()).unwrap();
+        let first = pool.revision();
+        assert!(first.0 > told.0 + 1_000_000, "{first:?}");
+        assert!(pool.changes_after(told).is_err());
+        journal.write(&mut pool).unwrap();
+        drop(journal);
+        assert_eq!(open_at(&config, place.path()).0.revision(), first, "the next one knows");
     }
 
     #[test]

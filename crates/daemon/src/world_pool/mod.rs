@@ -128,12 +128,13 @@ pub async fn run_as(
     Ok(served?)
 }
 
-/// Takes the place of the one writer, and restores the history. Without durability somebody may have heard of revisions that are lost.
+/// Takes the place of the one writer, and restores the history. Without durability, and where an older state was put in place, somebody
+/// may have heard of revisions that are lost.
 fn open(config: &WorldPoolConfig, store: Arc<dyn Store>) -> Result<(History, Journal), JournalError> {
     let restore = |recovered| History::restore(recovered, config);
     let (history, journal) = Journal::open(ROLE, &config.storage, store, restore)?;
     let may_have_lost = config.storage.durability == Durability::None && history.root().revision() > Revision(0);
-    let floor = if may_have_lost { floor() } else { 0 };
+    let floor = if may_have_lost || journal.is_restored() { floor() } else { 0 };
     Ok((history.with_revisions_above(Revision(floor)), journal))
 }
 
@@ -157,9 +158,33 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
     use crate::config::StorageConfig;
+    use crate::durable_actor::journal::PutInPlace;
     use history::Commit;
     use ratn_model::fact::{Change, FactKey};
     use ratn_model::value::Value;
+
+    #[test]
+    fn where_an_older_state_was_put_in_place_revisions_begin_above_all_of_before_and_stay_there() {
+        let place = tempfile::tempdir().unwrap();
+        let config = WorldPoolConfig::default();
+        let log = || Journal::log(&config.storage, place.path());
+        let fact = FactKey { predicate: "full".to_owned(), arguments: Vec::new() };
+        let commit = |history: &mut History, id: &str| {
+            let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
+            history.commit(&Commit { id: id.to_owned(), changes, ..Commit::default() }, None).unwrap()
+        };
+        let (mut history, mut journal) = open(&config, Arc::new(log())).unwrap();
+        let told = commit(&mut history, "before");
+        journal.write(&mut history).unwrap();
+        drop(journal);
+        let (mut history, mut journal) = open(&config, Arc::new(PutInPlace(log()))).unwrap();
+        let first = history.root().revision();
+        assert!(first.0 > told.0 + 1_000_000, "{first:?}");
+        assert!(history.at(told).is_err());
+        journal.write(&mut history).unwrap();
+        drop(journal);
+        assert_eq!(open(&config, Arc::new(log())).unwrap().0.root().revision(), first, "the next one knows");
+    }
 
     #[test]
     fn without_durability_a_revision_never_comes_again_after_a_restart() {

@@ -153,6 +153,11 @@ impl Client {
         Ok(answer)
     }
 
+    /// Whether etcd knows less than it did. It stays so for this client.
+    pub(super) fn has_gone_back(&self) -> bool {
+        self.went_back.get().is_some()
+    }
+
     fn went_back(&self) -> Option<CallError> {
         self.went_back.get().map(|(known, found)| CallError::WentBack { known: *known, found: *found })
     }

@@ -39,6 +39,7 @@ pub(super) struct Contents {
 #[derive(Debug)]
 pub(super) struct Known {
     store: u64,
+    generation: u64,
     cluster: u64,
     /// The revision of `head`, and the record that it says.
     head: (i64, Position),
@@ -60,7 +61,8 @@ impl Known {
     }
 
     fn is_of(&self, seen: &Seen) -> bool {
-        let same_log = seen.meta.as_ref().is_some_and(|meta| meta.store == self.store);
+        let same_log = seen.meta.as_ref();
+        let same_log = same_log.is_some_and(|meta| (meta.store, meta.generation) == (self.store, self.generation));
         let grown = seen.head.is_some_and(|(at, head)| (at, Position(head.position)) >= self.head);
         same_log && grown && seen.cluster == self.cluster && seen.through == self.through()
     }
@@ -71,9 +73,11 @@ impl Contents {
     pub(super) fn of(known: Option<Known>, seen: &Seen) -> Contents {
         let epoch = Epoch(seen.leader.as_ref().map_or(0, |(_, leader)| leader.epoch));
         match known {
-            Some(Known { head, snapshot, records, frames, .. }) => {
-                Contents { recovered: Recovered { epoch, snapshot, records, torn: None }, frames, head: head.0 }
-            }
+            Some(Known { head, snapshot, records, frames, .. }) => Contents {
+                recovered: Recovered { epoch, snapshot, records, ..Recovered::default() },
+                frames,
+                head: head.0,
+            },
             None => Contents { recovered: Recovered { epoch, ..Recovered::default() }, frames: Vec::new(), head: 0 },
         }
     }
@@ -104,7 +108,16 @@ pub(super) fn read(
     let span = (keys.frames_from(Position(0)).0, keys.frames(Position(0), head.1.next()).1);
     pages(client, span, revision, |kv| reading.add(meta.store, kv))?;
     let Reading { records, frames, written, .. } = reading.whole(keys, head.1)?;
-    Ok(Some(Known { store: meta.store, cluster: seen.cluster, head, snapshot, records, frames, written }))
+    Ok(Some(Known {
+        store: meta.store,
+        generation: meta.generation,
+        cluster: seen.cluster,
+        head,
+        snapshot,
+        records,
+        frames,
+        written,
+    }))
 }
 
 /// What was written since. Nothing where what was known is not what is there.
@@ -113,7 +126,7 @@ fn read_on(client: &Client, keys: &Keys, seen: &Seen, known: Known) -> Result<Op
     let head = (at, Position(head.position));
     let (begin, behind) = (keys.frame(first, 0), keys.frames_from(last.next()).0);
     let span = (begin.clone(), keys.frames(Position(0), head.1.next()).1);
-    let Known { store, cluster, snapshot, records, frames, written, .. } = known;
+    let Known { store, generation, cluster, snapshot, records, frames, written, .. } = known;
     let mut reading = Reading { last, records, frames, frame: None, written };
     let mut is_the_same = false;
     pages(client, span, 0, |kv| {
@@ -125,7 +138,7 @@ fn read_on(client: &Client, keys: &Keys, seen: &Seen, known: Known) -> Result<Op
         return Ok(None);
     }
     let Reading { records, frames, written, .. } = reading.whole(keys, head.1)?;
-    Ok(Some(Known { store, cluster, head, snapshot, records, frames, written }))
+    Ok(Some(Known { store, generation, cluster, head, snapshot, records, frames, written }))
 }
 
 struct Reading {

@@ -1,7 +1,8 @@
 //! Version 1 of what stands in etcd. What is small is JSON, for people with `etcdctl`; frames are bytes, their numbers little-endian.
 //!
 //! ```text
-//!   meta      {"version":1, "store":N, "cluster":N}   the log's number, and etcd's own of the cluster
+//!   meta      {"version":1, "store":N, "cluster":N, "generation":N, "accepted":N}
+//!             the log's number, etcd's own of the cluster, how often an older state was accepted, and behind which record the last time
 //!   leader    {"epoch":N, "holder":{…} or null, "draw":N}
 //!   head      {"position":N, "epoch":N, "step":N}
 //!   step      {"epoch":N, "step":N}
@@ -31,6 +32,12 @@ pub(super) struct Meta {
     pub(super) store: u64,
     /// etcd's number of its cluster: another one after a snapshot of etcd was restored.
     pub(super) cluster: u64,
+    /// Grows with every older state that was put in place and accepted.
+    #[serde(default)]
+    pub(super) generation: u64,
+    /// The last record that the state had when it was accepted.
+    #[serde(default)]
+    pub(super) accepted: Option<u64>,
 }
 
 /// Who has the writer's place.

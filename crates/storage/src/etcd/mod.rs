@@ -62,8 +62,9 @@ pub struct EtcdOptions {
     pub bounds: Bounds,
     /// Where this host keeps what it has seen of the log at the most; nothing is kept without.
     pub mark: Option<PathBuf>,
-    /// Opens the log also where an older state of etcd was restored: what was acknowledged since then is gone.
-    pub accept_restored: bool,
+    /// Opens the log also where an older state of etcd was restored, once: what was acknowledged since then is gone. The generation that
+    /// begins with it, as [`OpenError::Restored`] says.
+    pub accept_restored: Option<u64>,
 }
 
 /// A log in etcd.
@@ -71,7 +72,7 @@ pub struct EtcdOptions {
 pub struct Etcd {
     options: EtcdOptions,
     keys: Keys,
-    client: Arc<Client>,
+    client: Mutex<Arc<Client>>,
     mark: Mark,
     standby: Mutex<Standby>,
 }
@@ -121,15 +122,10 @@ impl Etcd {
         )?;
         rule(bounds.part > 2 * format::FRAME_HEADER, "a part has to have at least 73 bytes")?;
         rule(bounds.buffered > bounds.record, "what is buffered has to hold at least one record")?;
-        let client = Client::new(&options.endpoints, options.connect.clone());
-        let client = client.map_err(|source| OpenError::Io {
-            action: "start a thread for",
-            place: options.prefix.clone(),
-            source,
-        })?;
+        let client = Mutex::new(connected(&options)?);
         let keys = Keys::new(&options.prefix);
         let mark = Mark::new(options.mark.clone());
-        Ok(Etcd { options, keys, client: Arc::new(client), mark, standby: Mutex::default() })
+        Ok(Etcd { options, keys, client, mark, standby: Mutex::default() })
     }
 
     /// Who has the writer's place, as etcd says; it may have left without a word. Blocks.
@@ -137,25 +133,52 @@ impl Etcd {
     /// # Errors
     /// Where etcd does not answer.
     pub fn holder(&self) -> Result<Option<Holder>, ReadError> {
-        Ok(Seen::look(&self.client, &self.keys)?.leader.and_then(|(_, leader)| leader.holder))
+        Ok(Seen::look(&self.client(), &self.keys)?.leader.and_then(|(_, leader)| leader.holder))
     }
 }
 
 impl Etcd {
+    fn client(&self) -> Arc<Client> {
+        self.client.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Where etcd went back, whoever writes with the client of before never writes again. Who opens the log looks at what is there now.
+    fn client_of_now(&self, standby: &mut Standby) -> Result<Arc<Client>, OpenError> {
+        let mut client = self.client.lock().unwrap_or_else(PoisonError::into_inner);
+        if client.has_gone_back() {
+            self.mark.doubt();
+            *standby = Standby::default();
+            *client = connected(&self.options)?;
+        }
+        Ok(client.clone())
+    }
+
+    /// The generation that begins, where an older state was put in place and accepting it is asked for.
+    fn accepted(&self, vacant: &Seen) -> Result<Option<u64>, OpenError> {
+        if !vacant.is_restored(&self.mark) {
+            return Ok(None);
+        }
+        let next = self.mark.next_generation(Height::of(vacant));
+        match self.options.accept_restored {
+            Some(named) if named >= next => Ok(Some(named)),
+            _ => Err(vacant.refused(&self.keys, &self.mark)),
+        }
+    }
+
     /// Reads what is there, and throws away what predecessors had begun and nobody was told of.
     fn begin(&self, term: &Arc<Term>, known: Option<Known>) -> Result<(Recovered, Shared, Chain), OpenError> {
-        let seen = Seen::look(&self.client, &self.keys)?;
-        let known = contents::read(&self.client, &self.keys, &seen, 0, known)?;
+        let client = &term.client;
+        let seen = Seen::look(client, &self.keys)?;
+        let known = contents::read(client, &self.keys, &seen, 0, known)?;
         let Contents { recovered, frames, head } = Contents::of(known, &seen);
         let last = recovered.last();
         let compacted = recovered.snapshot.as_ref().map_or(Position(0), |snapshot| snapshot.through);
         let until = Instant::now() + REACH;
-        let perform = |request: &_| {
-            self.client.repeat(request, writer::PATIENCE, until).map_err(|error| term.fault("clear", &error))
-        };
+        let perform =
+            |request: &_| client.repeat(request, writer::PATIENCE, until).map_err(|error| term.fault("clear", &error));
         let failed = |fault: Fault| match fault {
             Fault::Deposed { .. } => self.held("somebody who took it just now"),
-            other => ReadError::Remote { place: self.client.place(), what: other.to_string() }.into(),
+            other => ReadError::Remote { place: client.place(), what: other.to_string() }.into(),
         };
         let mut chain = Chain::from(self.keys.head(), head);
         let value = text(&Head { position: last.0, epoch: term.epoch.0, step: 1 });
@@ -170,8 +193,9 @@ impl Etcd {
     }
 
     fn write_mark(&self, request: &TxnRequest) -> Result<(), CopyError> {
-        let answer = self.client.repeat(request, term::PATIENCE, Instant::now() + REACH);
-        let answer = answer.map_err(|error| unreadable(&self.client, &error))?;
+        let client = self.client();
+        let answer = client.repeat(request, term::PATIENCE, Instant::now() + REACH);
+        let answer = answer.map_err(|error| unreadable(&client, &error))?;
         if answer.succeeded { Ok(()) } else { Err(self.held("somebody who took it just now").into()) }
     }
 
@@ -187,24 +211,26 @@ impl Etcd {
 impl Store for Etcd {
     fn open(&self) -> Result<(Recovered, Box<dyn Writer>), OpenError> {
         let mut standby = self.standby.lock().unwrap_or_else(PoisonError::into_inner);
+        let client = self.client_of_now(&mut standby)?;
         let Standby { silence, known, failed } = &mut *standby;
         // Who only asks once whether there is a writer reads nothing.
         let stands_by = silence.is_some();
-        let vacant = term::await_vacancy(&self.client, &self.keys, silence, &self.mark, |seen| {
+        let vacant = term::await_vacancy(&client, &self.keys, silence, &self.mark, |seen| {
             if stands_by {
-                Standby::follow(known, failed, &self.client, &self.keys, seen);
+                Standby::follow(known, failed, &client, &self.keys, seen);
             }
         })?;
         let vacant = vacant.whole(&self.keys)?;
-        if self.mark.is_above(Height::of(&vacant)) && !self.options.accept_restored {
-            return Err(OpenError::Restored { place: self.keys.prefix().to_owned() });
-        }
-        let taken = term::take(&self.client, &self.keys, &vacant, &self.options.holder, self.options.accept_restored);
+        let accepts = self.accepted(&vacant)?;
+        let taken = term::take(&client, &self.keys, &vacant, &self.options.holder, accepts);
         if taken.is_err() {
             // The holder may not have been able to say that it is there, as we were not: silence counts from now on.
             *silence = None;
         }
         let term = Arc::new(taken?);
+        if accepts.is_some() {
+            self.mark.keep(Height { store: term.store, generation: term.generation, epoch: term.epoch.0, position: 0 });
+        }
         // From now on: what is there may take longer to read than the place waits.
         let renewing = Renewing::start(term.clone(), self.mark.clone()).map_err(|error| self.system(error))?;
         let begun = self.begin(&term, known.take()).map_err(|error| match term.renew() {
@@ -212,7 +238,8 @@ impl Store for Etcd {
             Err(Fault::Deposed { .. }) => self.held("somebody who took it just now"),
             _ => error,
         });
-        let (recovered, shared, chain) = begun?;
+        let (mut recovered, shared, chain) = begun?;
+        recovered.restored = term.accepted == Some(recovered.last().0);
         let writer = EtcdWriter::start(Arc::new(shared), chain, renewing).map_err(|error| self.system(error))?;
         Ok((recovered, Box::new(writer)))
     }
@@ -220,8 +247,9 @@ impl Store for Etcd {
     fn read(&self) -> Result<Recovered, ReadError> {
         let mut attempt = 1;
         loop {
-            let seen = Seen::look(&self.client, &self.keys)?.whole(&self.keys)?;
-            match contents::read(&self.client, &self.keys, &seen, seen.revision, None) {
+            let client = self.client();
+            let seen = Seen::look(&client, &self.keys)?.whole(&self.keys)?;
+            match contents::read(&client, &self.keys, &seen, seen.revision, None) {
                 // etcd may compact that revision away while it is read.
                 Err(ReadError::Remote { .. }) if attempt < READ_ATTEMPTS => attempt += 1,
                 read => return Ok(Contents::of(read?, &seen).recovered),
@@ -230,7 +258,7 @@ impl Store for Etcd {
     }
 
     fn mark_unfinished(&self) -> Result<(), CopyError> {
-        let seen = Seen::look(&self.client, &self.keys)?;
+        let seen = Seen::look(&self.client(), &self.keys)?;
         let leader = written_at(self.keys.leader(), seen.revision_of_leader());
         // A copy of it that arrives when the place was given up does nothing.
         let success = vec![put(self.keys.unfinished(), "a copy is being made")];
@@ -243,8 +271,14 @@ impl Store for Etcd {
     }
 
     fn place(&self) -> String {
-        format!("{} in etcd at {}", self.keys.prefix(), self.client.place())
+        format!("{} in etcd at {}", self.keys.prefix(), self.client().place())
     }
+}
+
+fn connected(options: &EtcdOptions) -> Result<Arc<Client>, OpenError> {
+    let client = Client::new(&options.endpoints, options.connect.clone());
+    let place = options.prefix.clone();
+    Ok(Arc::new(client.map_err(|source| OpenError::Io { action: "start a thread for", place, source })?))
 }
 
 /// How often a whole log is read at one revision of etcd before it is given up.

@@ -76,6 +76,9 @@ pub(super) struct Term {
     pub(super) keys: Keys,
     pub(super) epoch: Epoch,
     pub(super) store: u64,
+    pub(super) generation: u64,
+    /// Behind which record an older state was accepted.
+    pub(super) accepted: Option<u64>,
     /// The revision of `leader`: every write compares it.
     leader: i64,
     draw: u64,
@@ -125,6 +128,16 @@ impl Seen {
         }
     }
 
+    /// Whether an older state was put in place of what there was, as far as can be seen.
+    pub(super) fn is_restored(&self, mark: &Mark) -> bool {
+        mark.is_above(Height::of(self)) || self.meta.as_ref().is_some_and(|meta| meta.cluster != self.cluster)
+    }
+
+    pub(super) fn refused(&self, keys: &Keys, mark: &Mark) -> OpenError {
+        let generation = mark.next_generation(Height::of(self));
+        OpenError::Restored { place: keys.prefix().to_owned(), generation }
+    }
+
     fn holder(&self) -> Option<&Holder> {
         self.leader.as_ref().and_then(|(_, leader)| leader.holder.as_ref())
     }
@@ -165,9 +178,11 @@ pub(super) fn await_vacancy(
             Some(_) => {
                 *silence = Some(Silence { leader, alive, since: now, looked: now });
                 let holder = format!("{}, {}", holder.about, holder.address);
-                if let Some(height) = Height::of(&seen).filter(|height| !mark.is_above(Some(*height))) {
-                    mark.keep(height);
+                let height = Height::of(&seen);
+                if mark.is_above(height) {
+                    return Err(seen.refused(keys, mark));
                 }
+                height.into_iter().for_each(|height| mark.keep(height));
                 held(&seen);
                 return Err(OpenError::Held { place: keys.prefix().to_owned(), holder });
             }
@@ -177,13 +192,14 @@ pub(super) fn await_vacancy(
     }
 }
 
-/// Takes the place, if nobody has taken it or said something since it was looked at.
+/// Takes the place, if nobody has taken it or said something since it was looked at. `accepts`: the generation that begins, where an older
+/// state is accepted.
 pub(super) fn take(
     client: &Arc<Client>,
     keys: &Keys,
     seen: &Seen,
     holder: &Holder,
-    accept_restored: bool,
+    accepts: Option<u64>,
 ) -> Result<Term, OpenError> {
     let draw = || {
         crate::draw::number().map_err(|source| OpenError::Io {
@@ -192,13 +208,13 @@ pub(super) fn take(
             source,
         })
     };
-    let meta = match &seen.meta {
-        Some(meta) if meta.cluster != seen.cluster && !accept_restored => {
-            return Err(OpenError::Restored { place: keys.prefix().to_owned() });
-        }
+    let mut meta = match &seen.meta {
         Some(meta) => Meta { cluster: seen.cluster, ..meta.clone() },
-        None => Meta { version: VERSION, store: draw()?, cluster: seen.cluster },
+        None => Meta { version: VERSION, store: draw()?, cluster: seen.cluster, generation: 0, accepted: None },
     };
+    if let Some(generation) = accepts {
+        (meta.generation, meta.accepted) = (generation, Some(seen.head.map_or(0, |(_, head)| head.position)));
+    }
     let epoch = seen.leader.as_ref().map_or(0, |(_, leader)| leader.epoch) + 1;
     let leader = Leader { epoch, holder: Some(holder.clone()), draw: draw()? };
     let compare = vec![written_at(keys.leader(), seen.revision_of_leader()), written_at(keys.alive(), seen.alive)];
@@ -228,6 +244,8 @@ pub(super) fn take(
         keys: keys.clone(),
         epoch: leader.epoch(),
         store: meta.store,
+        generation: meta.generation,
+        accepted: meta.accepted,
         leader: revision,
         draw: leader.draw,
         lost: AtomicBool::new(false),
@@ -240,7 +258,7 @@ impl Term {
     #[cfg(test)]
     pub(super) fn since(client: Arc<Client>, keys: Keys, leader: i64) -> Term {
         let (lost, unheard) = (AtomicBool::new(false), AtomicBool::new(false));
-        Term { client, keys, epoch: Epoch(1), store: 1, leader, draw: 1, lost, unheard }
+        Term { client, keys, epoch: Epoch(1), store: 1, generation: 0, accepted: None, leader, draw: 1, lost, unheard }
     }
 
     /// Holds as long as the place is held.

@@ -327,7 +327,11 @@ fn stop_ended(shared: &Arc<Shared>) {
 fn keep(mark: &Mark, writer: &OnceLock<Arc<Shared>>) {
     if let Some(writer) = writer.get() {
         let position = writer.pending.watch().borrow().durable.0;
-        mark.keep(Height { store: writer.term.store, epoch: writer.term.epoch.0, position });
+        let Term { store, generation, epoch, .. } = &*writer.term;
+        mark.keep(Height { store: *store, generation: *generation, epoch: epoch.0, position });
+        if writer.term.client.has_gone_back() {
+            mark.doubt();
+        }
     }
 }
 

@@ -51,7 +51,7 @@ impl Contents {
             .cloned()
             .collect();
         let torn = self.segments.last().and_then(|segment| segment.torn.clone());
-        Recovered { epoch: self.epoch(), snapshot: self.snapshot.clone(), records, torn }
+        Recovered { epoch: self.epoch(), snapshot: self.snapshot.clone(), records, torn, restored: false }
     }
 }
 

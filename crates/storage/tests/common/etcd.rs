@@ -22,7 +22,7 @@ pub(crate) fn options(endpoints: Vec<String>, prefix: &str, about: &str) -> Etcd
         holder: Holder { address: format!("http://{about}"), about: about.to_owned() },
         bounds: Bounds::default(),
         mark: None,
-        accept_restored: false,
+        accept_restored: None,
     }
 }
 
