@@ -4,9 +4,13 @@
 //!   step N: { leader is mine, the key is as step N-1 left it?  operations, the key says N }
 //!      └── no answer: the same again; if the key says N already, it was performed
 //! ```
+//! A step that was given up without an answer may still be performed, until a later one is. The next step finds it so, by what the key says,
+//! and goes on from there.
+//!
 //! A copy of a step that arrives when a later one was performed finds another revision of the key, and does nothing. So nothing but such a
 //! chain changes what a log consists of: one chain over `head` for frames, one over `step` for snapshots and for what they replace.
 
+use super::format::{Step, parse};
 use super::keys::{found_one, get, put, written_at};
 use super::term::Term;
 use super::wire::{RequestOp, TxnRequest, TxnResponse};
@@ -19,49 +23,62 @@ pub(super) struct Chain {
     key: Bytes,
     /// When the key was written last; 0 where it is not there.
     revision: i64,
+    /// A step was given up: it may have been performed, or be performed later.
+    undecided: bool,
 }
 
 impl Chain {
     pub(super) fn from(key: Bytes, revision: i64) -> Chain {
-        Chain { key, revision }
+        Chain { key, revision, undecided: false }
     }
 
-    /// Performs operations, once. `value` is what the key says then: nothing that it has said before. `perform` asks etcd until
-    /// there is an answer.
+    /// Performs operations, once. `value` is what the key says then, with the [`Step`] that it is: nothing that it has said before. `perform`
+    /// asks etcd until there is an answer, or gives it up.
     pub(super) fn step(
         &mut self,
         term: &Term,
         mut operations: Vec<RequestOp>,
         value: Bytes,
-        perform: impl FnOnce(&TxnRequest) -> Result<TxnResponse, Fault>,
+        mut perform: impl FnMut(&TxnRequest) -> Result<TxnResponse, Fault>,
     ) -> Result<(), Fault> {
         operations.push(put(self.key.clone(), value.clone()));
-        let request = TxnRequest {
-            compare: vec![term.guard(), written_at(self.key.clone(), self.revision)],
-            success: operations,
-            failure: vec![get(term.keys.leader()), get(self.key.clone())],
-        };
-        let answer = perform(&request)?;
-        if answer.succeeded {
-            self.revision = answer.header.map_or(0, |header| header.revision);
-            return Ok(());
-        }
-        let mut found = answer.responses.into_iter();
-        if !term.is_since(found_one(found.next()).map_or(0, |kv| kv.mod_revision)) {
-            return Err(term.deposed());
-        }
-        match found_one(found.next()) {
-            // A copy was performed whose answer is still on its way, or lost.
-            Some(kv) if kv.value == value => {
-                self.revision = kv.mod_revision;
-                Ok(())
+        loop {
+            let request = TxnRequest {
+                compare: vec![term.guard(), written_at(self.key.clone(), self.revision)],
+                success: operations.clone(),
+                failure: vec![get(term.keys.leader()), get(self.key.clone())],
+            };
+            let answer = perform(&request).inspect_err(|_| self.undecided = true)?;
+            if answer.succeeded {
+                (self.revision, self.undecided) = (answer.header.map_or(0, |header| header.revision), false);
+                return Ok(());
             }
-            _ => {
-                let key = String::from_utf8_lossy(&self.key).into_owned();
-                let what = "somebody who is not its writer has written there".to_owned();
-                Err(Fault::Remote { action: "write to", place: key, what })
+            let mut found = answer.responses.into_iter();
+            if !term.is_since(found_one(found.next()).map_or(0, |kv| kv.mod_revision)) {
+                return Err(term.deposed());
+            }
+            match found_one(found.next()) {
+                // A copy was performed whose answer is still on its way, or lost.
+                Some(kv) if kv.value == value => {
+                    (self.revision, self.undecided) = (kv.mod_revision, false);
+                    return Ok(());
+                }
+                // An earlier step was performed after it had been given up.
+                Some(kv) if self.undecided && self.is_of(term, &kv.value) && kv.mod_revision > self.revision => {
+                    self.revision = kv.mod_revision;
+                }
+                _ => {
+                    let key = String::from_utf8_lossy(&self.key).into_owned();
+                    let what = "somebody who is not its writer has written there".to_owned();
+                    return Err(Fault::Remote { action: "write to", place: key, what });
+                }
             }
         }
+    }
+
+    /// Whether the writer of this term has written it.
+    fn is_of(&self, term: &Term, value: &[u8]) -> bool {
+        parse::<Step>(&self.key, value).is_ok_and(|step| step.epoch == term.epoch.0)
     }
 }
 
@@ -69,6 +86,7 @@ impl Chain {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::super::client::Client;
+    use super::super::format::text;
     use super::super::keys::{Keys, delete};
     use super::super::wire::{KeyValue, RangeResponse, ResponseHeader, ResponseOp};
     use super::super::wire::{compare, request_op, response_op};
@@ -123,6 +141,44 @@ mod tests {
         fn values(&self) -> Vec<(Bytes, Bytes)> {
             self.keys.iter().map(|(key, (value, _))| (key.clone(), value.clone())).collect()
         }
+    }
+
+    #[test]
+    fn a_step_that_was_given_up_and_performed_later_holds_up_no_later_one() {
+        let keys = Keys::new("/test");
+        let client = Arc::new(Client::new(&[], Arc::new(|_: &str| Err("nobody".to_owned()))).unwrap());
+        let mut etcd = Model { revision: 1, ..Model::default() };
+        etcd.keys.insert(keys.leader(), (Bytes::from_static(b"us"), 1));
+        let term = Term::since(client, keys.clone(), 1);
+        let mut chain = Chain::from(keys.step(), 0);
+        let value = |step: u64| text(&Step { epoch: 1, step });
+        let fault = || Fault::Remote { action: "write to", place: String::new(), what: "no answer".to_owned() };
+        // Two are given up; one of them, or none, arrives in the end.
+        for (round, arrives) in [None, Some(0), Some(1)].into_iter().enumerate() {
+            let begin = 3 * round as u64;
+            let mut given_up = Vec::new();
+            for step in 0..2_u8 {
+                let operation = put(Bytes::from(format!("part {step}")), vec![step]);
+                let performed = chain.step(&term, vec![operation], value(begin + u64::from(step)), |request| {
+                    given_up.push(request.clone());
+                    Err(fault())
+                });
+                assert!(performed.is_err());
+            }
+            if let Some(late) = arrives {
+                assert!(etcd.txn(&given_up[late]).succeeded);
+            }
+            let next = value(begin + 2);
+            chain.step(&term, Vec::new(), next.clone(), |request| Ok(etcd.txn(request))).unwrap();
+            assert_eq!(etcd.keys[&keys.step()].0, next, "{arrives:?}");
+            for late in &given_up {
+                assert!(!etcd.txn(late).succeeded, "{arrives:?}");
+            }
+        }
+        // Nobody else may have written there.
+        etcd.revision += 1;
+        etcd.keys.insert(keys.step(), (value(99), etcd.revision));
+        assert!(chain.step(&term, Vec::new(), value(9), |request| Ok(etcd.txn(request))).is_err());
     }
 
     #[test]

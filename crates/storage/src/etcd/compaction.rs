@@ -33,6 +33,10 @@ impl Compaction {
 
     fn write(&self, payload: &Bytes) -> Result<(), Fault> {
         let (keys, through) = (&self.shared.term.keys, self.through);
+        // An attempt whose last answer never came may have made it count.
+        if self.shared.counts(through)? {
+            return self.tidy_up();
+        }
         // Parts of an attempt that came to nothing.
         self.perform(delete_span(keys.snapshot(through)))?;
         let mut parts = 0;
@@ -43,6 +47,12 @@ impl Compaction {
         }
         let current = Current { through: through.0, parts, bytes: payload.len() as u64, crc: crc32c(payload) };
         self.perform(put(keys.current(), text(&current)))?;
+        self.tidy_up()
+    }
+
+    /// Takes away what the snapshot stands for.
+    fn tidy_up(&self) -> Result<(), Fault> {
+        let (keys, through) = (&self.shared.term.keys, self.through);
         self.perform(delete_span(keys.snapshots_before(through)))?;
         if let Some((from, before)) = self.shared.superfluous(through) {
             self.perform(delete_span(keys.frames(from, before)))?;

@@ -10,8 +10,8 @@
 use super::chain::Chain;
 use super::client::{CallError, Client, FIRST_PAUSE, LONGEST_PAUSE};
 use super::compaction::Compaction;
-use super::format::{Head, Step, encode_frame, text};
-use super::keys::put;
+use super::format::{Current, Head, Step, encode_frame, parse, text};
+use super::keys::{found_one, get, put};
 use super::mark::{Height, Mark};
 use super::term::{HeldPlace, RENEW_INTERVAL, Term};
 use super::wire::{RequestOp, TxnRequest};
@@ -100,6 +100,23 @@ impl Shared {
         *step += 1;
         let value = text(&Step { epoch: self.term.epoch.0, step: *step });
         chain.step(&self.term, operations, value, |request| self.perform(request))
+    }
+
+    /// Whether the snapshot that counts is the one through this position. What was given up before is not performed after this any more.
+    pub(super) fn counts(&self, through: Position) -> Result<bool, Fault> {
+        self.change_snapshots(Vec::new())?;
+        let keys = &self.term.keys;
+        let answer = self.perform(&self.term.guarded(vec![get(keys.current())]))?;
+        if !answer.succeeded {
+            return Err(self.term.deposed());
+        }
+        let Some(found) = found_one(answer.responses.into_iter().next()) else { return Ok(false) };
+        let current: Current = parse(&keys.current(), &found.value).map_err(|error| Fault::Remote {
+            action: "read from",
+            place: keys.prefix().to_owned(),
+            what: error.to_string(),
+        })?;
+        Ok(current.through == through.0)
     }
 
     /// Forgets the frames that hold nothing after this position; from which to which they begin.
