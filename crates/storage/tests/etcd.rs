@@ -254,6 +254,49 @@ fn without_space_appends_wait_and_say_why_and_go_on_when_there_is_space() {
 }
 
 #[test]
+fn when_there_is_space_again_nobody_takes_the_place_of_a_holder_that_has_just_confirmed_itself() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &["--quota-backend-bytes", "2097152"]);
+    let proxy = Proxy::to(&cluster.members[0].client);
+    let log = store(vec![proxy.address.clone()], "/test/confirmed", "first");
+    let (_, writer) = log.open().unwrap();
+    let value = "x".repeat(100 << 10);
+    assert!((0..100).any(|_| !cluster.ctl(&["put", "/other", &value]).status.success()));
+    // It is confirmed without a word to anybody, for longer than a silence.
+    let begin = Instant::now();
+    let other = store(cluster.endpoints(), "/test/confirmed", "second");
+    while begin.elapsed() < Duration::from_millis(1_500) {
+        writer.place().check().unwrap();
+        // Nobody can take the place meanwhile.
+        other.open().map(drop).unwrap_err();
+    }
+    let found = cluster.ctl(&["get", "/other", "-w", "json"]);
+    let found: serde_json::Value = serde_json::from_slice(&found.stdout).unwrap();
+    assert!(cluster.ctl(&["compact", &found["header"]["revision"].to_string()]).status.success());
+    assert!(cluster.ctl(&["defrag"]).status.success());
+    writer.place().check().unwrap();
+    let confirmed = Instant::now();
+    // Cut off from the very moment on: nobody hears it any more.
+    proxy.lose_all(true);
+    assert!(cluster.ctl(&["alarm", "disarm"]).status.success());
+    let begin = Instant::now();
+    let taken = loop {
+        match other.open() {
+            Ok((_, taken)) => break taken,
+            Err(OpenError::Held { .. } | OpenError::Read(ReadError::Remote { .. })) => {
+                assert!(begin.elapsed() < Duration::from_secs(30), "it stays held");
+            }
+            Err(error) => panic!("{error}"),
+        }
+    };
+    let after = confirmed.elapsed();
+    assert!(after >= Duration::from_secs(1), "the place was taken {after:?} after it was confirmed");
+    drop((taken, writer));
+}
+
+#[test]
 fn etcds_compaction_and_a_revoked_lease_change_nothing() {
     if !is_there() {
         return;

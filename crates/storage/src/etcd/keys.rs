@@ -4,6 +4,7 @@
 //!   PREFIX/meta                       which log this is, and of which format
 //!   PREFIX/leader                     who leads; written when somebody takes the place, and when it is given up
 //!   PREFIX/alive                      written again and again by who leads
+//!   PREFIX/writable                   there as long as who leads can write `alive`
 //!   PREFIX/head                       the last record that counts
 //!   PREFIX/step                       how often a snapshot, or what it replaces, was changed
 //!   PREFIX/unfinished                 as long as not all of a copy is there
@@ -48,6 +49,10 @@ impl Keys {
 
     pub(super) fn alive(&self) -> Bytes {
         self.key("alive")
+    }
+
+    pub(super) fn writable(&self) -> Bytes {
+        self.key("writable")
     }
 
     pub(super) fn head(&self) -> Bytes {

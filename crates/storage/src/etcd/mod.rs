@@ -18,6 +18,7 @@ mod contents;
 mod format;
 mod keys;
 mod mark;
+mod silence;
 mod term;
 mod writer;
 
@@ -39,11 +40,12 @@ use contents::{Contents, Known};
 use format::{Head, Step, text};
 use keys::{Keys, delete, delete_span, put, written_at};
 use mark::{Height, Mark};
+use silence::Silence;
 use std::fmt;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
-use term::{Seen, Silence, Term, unreadable};
+use term::{Seen, Term, unreadable};
 use wire::TxnRequest;
 use writer::{EtcdWriter, Renewing, Shared};
 

@@ -7,16 +7,20 @@
 //! ```
 //! Safety is in the guards, not in time: every write compares the revision of `leader`, which whoever takes the place changes. Time only
 //! decides when somebody else may take it. Who takes it compares `alive`, too: so the last confirmation of its predecessor was asked for
-//! before the silence began. (While etcd has no space `alive` cannot be written, and the holder confirms itself by reading; nobody can take
-//! the place then either.)
+//! before the silence began.
 //!
 //! A holder that hears no answers may say nothing, so it must not keep the place either: it writes `alive` once, to two members at the most,
 //! and from then on only looks, until a look is answered.
+//!
+//! While etcd has no space `alive` cannot be written, and nobody can take the place. The holder confirms itself by taking `writable` away,
+//! which needs no space. Who wants the place compares `writable` as well, and writes it where it is not there: silence begins with that, for
+//! the last confirmation may be as young.
 
 use super::client::{CallError, Client, Patience, cluster_of};
 use super::format::{Current, Head, Holder, Leader, Meta, VERSION, parse, text};
 use super::keys::{Keys, delete, found_one, get, look, put, written_at};
 use super::mark::{Height, Mark};
+use super::silence::{self, Signs, Silence, Verdict};
 use super::wire::{Compare, KeyValue, RequestOp, TxnRequest, TxnResponse};
 use crate::error::{Fault, OpenError, ReadError};
 use crate::store::{Epoch, Place};
@@ -27,10 +31,6 @@ use std::time::{Duration, Instant};
 
 /// Who has the place writes `alive` so often.
 pub(super) const RENEW_INTERVAL: Duration = Duration::from_millis(250);
-/// A holder that has not written for so long has left. Longer than what a confirmation holds for those who ask [`Place::check`].
-const SILENCE: Duration = Duration::from_millis(1_050);
-/// Silence counts only while etcd answers: with a longer pause between two looks it begins anew.
-const LONGEST_LOOK_PAUSE: Duration = Duration::from_millis(500);
 /// How often somebody looks who wants the place.
 const LOOK_INTERVAL: Duration = Duration::from_millis(50);
 /// A renewal is asked of so many members: one more would arrive when the first has been without an answer for too long.
@@ -48,25 +48,15 @@ pub(super) struct Seen {
     pub(super) head: Option<(i64, Head)>,
     /// When `step` was written.
     pub(super) step: i64,
-    /// When `alive` was written.
-    alive: i64,
     /// What the snapshot that counts stands for.
     pub(super) through: Option<u64>,
     /// It is a part of a copy.
     unfinished: bool,
+    signs: Signs,
     /// etcd's number of its cluster.
     pub(super) cluster: u64,
     /// etcd's revision.
     pub(super) revision: i64,
-}
-
-/// How long the same holder has said nothing, as far as was looked.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Silence {
-    leader: i64,
-    alive: i64,
-    since: Instant,
-    looked: Instant,
 }
 
 /// The place, held.
@@ -85,12 +75,22 @@ pub(super) struct Term {
     lost: AtomicBool,
     /// The last renewal was not answered.
     unheard: AtomicBool,
+    /// `writable` was taken away: etcd has no space.
+    unwritable: AtomicBool,
 }
 
 impl Seen {
     pub(super) fn look(client: &Client, keys: &Keys) -> Result<Seen, ReadError> {
-        let small =
-            [keys.meta(), keys.leader(), keys.head(), keys.alive(), keys.step(), keys.current(), keys.unfinished()];
+        let small = [
+            keys.meta(),
+            keys.leader(),
+            keys.head(),
+            keys.alive(),
+            keys.step(),
+            keys.writable(),
+            keys.current(),
+            keys.unfinished(),
+        ];
         let request = look(small.map(get).into());
         let answer = client.repeat(&request, PATIENCE, Instant::now() + REACH);
         let answer = answer.map_err(|error| unreadable(client, &error))?;
@@ -105,7 +105,8 @@ impl Seen {
         let meta: Option<Meta> = next().map(|kv| parse(&keys.meta(), &kv.value)).transpose()?;
         let leader = with_revision(next(), &keys.leader())?;
         let head = with_revision(next(), &keys.head())?;
-        let [alive, step] = [(); 2].map(|()| next().map_or(0, |kv| kv.mod_revision));
+        let [alive, step, writable] = [(); 3].map(|()| next().map_or(0, |kv| kv.mod_revision));
+        let signs = Signs { leader: leader.as_ref().map_or(0, |(revision, _)| *revision), alive, writable };
         let current: Option<Current> = next().map(|kv| parse(&keys.current(), &kv.value)).transpose()?;
         let through = current.map(|current| current.through);
         let unfinished = next().is_some();
@@ -113,7 +114,7 @@ impl Seen {
             let place = keys.prefix().to_owned();
             return Err(ReadError::Newer { place, found: newer.version, supported: VERSION });
         }
-        Ok(Seen { meta, leader, head, step, alive, through, unfinished, cluster, revision })
+        Ok(Seen { meta, leader, head, step, signs, through, unfinished, cluster, revision })
     }
 
     /// Refuses a part of a copy.
@@ -143,7 +144,13 @@ impl Seen {
     }
 
     pub(super) fn revision_of_leader(&self) -> i64 {
-        self.leader.as_ref().map_or(0, |(revision, _)| *revision)
+        self.signs.leader
+    }
+
+    /// Holds as long as nobody has said anything since.
+    fn unchanged(&self, keys: &Keys) -> Vec<Compare> {
+        let Signs { leader, alive, writable } = self.signs;
+        vec![written_at(keys.leader(), leader), written_at(keys.alive(), alive), written_at(keys.writable(), writable)]
     }
 }
 
@@ -165,18 +172,9 @@ pub(super) fn await_vacancy(
     loop {
         let seen = Seen::look(client, keys)?;
         let Some(holder) = seen.holder() else { return Ok(seen) };
-        let now = Instant::now();
-        let (leader, alive) = (seen.revision_of_leader(), seen.alive);
-        let before = silence.filter(|before| now - before.looked <= LONGEST_LOOK_PAUSE);
-        match before {
-            Some(before) if (before.leader, before.alive) == (leader, alive) => {
-                if now - before.since >= SILENCE {
-                    return Ok(seen);
-                }
-                *silence = Some(Silence { looked: now, ..before });
-            }
-            Some(_) => {
-                *silence = Some(Silence { leader, alive, since: now, looked: now });
+        match silence::look(silence, seen.signs, Instant::now()) {
+            Verdict::Over => return Ok(seen),
+            Verdict::Spoke => {
                 let holder = format!("{}, {}", holder.about, holder.address);
                 let height = Height::of(&seen);
                 if mark.is_above(height) {
@@ -186,7 +184,15 @@ pub(super) fn await_vacancy(
                 held(&seen);
                 return Err(OpenError::Held { place: keys.prefix().to_owned(), holder });
             }
-            None => *silence = Some(Silence { leader, alive, since: now, looked: now }),
+            Verdict::Unwritable => {
+                let success = vec![put(keys.writable(), text(&seen.signs.leader))];
+                let request = TxnRequest { compare: seen.unchanged(keys), success, failure: Vec::new() };
+                // Whether it is there, the next look shows.
+                if let Err(error) = client.attempt(request, PATIENCE) {
+                    return Err(unreadable(client, &error).into());
+                }
+            }
+            Verdict::Undecided => {}
         }
         std::thread::sleep(LOOK_INTERVAL);
     }
@@ -217,10 +223,13 @@ pub(super) fn take(
     }
     let epoch = seen.leader.as_ref().map_or(0, |(_, leader)| leader.epoch) + 1;
     let leader = Leader { epoch, holder: Some(holder.clone()), draw: draw()? };
-    let compare = vec![written_at(keys.leader(), seen.revision_of_leader()), written_at(keys.alive(), seen.alive)];
-    let success =
-        vec![put(keys.leader(), text(&leader)), put(keys.alive(), text(&epoch)), put(keys.meta(), text(&meta))];
-    let request = TxnRequest { compare, success, failure: vec![get(keys.leader())] };
+    let success = vec![
+        put(keys.leader(), text(&leader)),
+        put(keys.alive(), text(&epoch)),
+        put(keys.writable(), text(&epoch)),
+        put(keys.meta(), text(&meta)),
+    ];
+    let request = TxnRequest { compare: seen.unchanged(keys), success, failure: vec![get(keys.leader())] };
     // Repeated it finds what it wrote itself.
     let answer = client.repeat(&request, PATIENCE, Instant::now() + REACH);
     let answer = answer.map_err(|error| OpenError::Read(unreadable(client, &error)))?;
@@ -250,6 +259,7 @@ pub(super) fn take(
         draw: leader.draw,
         lost: AtomicBool::new(false),
         unheard: AtomicBool::new(false),
+        unwritable: AtomicBool::new(false),
     })
 }
 
@@ -257,8 +267,9 @@ impl Term {
     /// Held since a revision, for tests of what it guards.
     #[cfg(test)]
     pub(super) fn since(client: Arc<Client>, keys: Keys, leader: i64) -> Term {
-        let (lost, unheard) = (AtomicBool::new(false), AtomicBool::new(false));
-        Term { client, keys, epoch: Epoch(1), store: 1, generation: 0, accepted: None, leader, draw: 1, lost, unheard }
+        let [lost, unheard, unwritable] = [(); 3].map(|()| AtomicBool::new(false));
+        let (epoch, store, generation, accepted, draw) = (Epoch(1), 1, 0, None, 1);
+        Term { client, keys, epoch, store, generation, accepted, leader, draw, lost, unheard, unwritable }
     }
 
     /// Holds as long as the place is held.
@@ -289,11 +300,24 @@ impl Term {
         if self.unheard.load(Ordering::SeqCst) {
             self.look()?;
         }
-        let alive = self.guarded(vec![put(self.keys.alive(), text(&self.epoch.0))]);
-        let renewed = match self.client.attempt(alive, Patience { answer: PATIENCE, asks: RENEWAL_ASKS }) {
-            // It cannot be said, but it can be seen; nor can anybody take the place meanwhile.
-            Err(CallError::NoSpace) => self.look(),
-            answer => self.held(answer),
+        let mut alive = vec![put(self.keys.alive(), text(&self.epoch.0))];
+        let was_unwritable = self.unwritable.load(Ordering::SeqCst);
+        if was_unwritable {
+            alive.push(put(self.keys.writable(), text(&self.epoch.0)));
+        }
+        let patience = Patience { answer: PATIENCE, asks: RENEWAL_ASKS };
+        let renewed = match self.client.attempt(self.guarded(alive), patience) {
+            // It cannot be said, but whoever wants the place can be kept from taking it.
+            Err(CallError::NoSpace) => {
+                self.unwritable.store(true, Ordering::SeqCst);
+                self.held(self.client.attempt(self.guarded(vec![delete(self.keys.writable())]), PATIENCE))
+            }
+            answer => {
+                if was_unwritable && answer.is_ok() {
+                    self.unwritable.store(false, Ordering::SeqCst);
+                }
+                self.held(answer)
+            }
         };
         self.unheard.store(matches!(renewed, Err(Fault::Remote { .. })), Ordering::SeqCst);
         renewed

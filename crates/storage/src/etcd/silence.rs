@@ -1,0 +1,115 @@
+//! How long who has the place has said nothing, as far as somebody looked who wants it. Pure: looks and their times in, a verdict out.
+//!
+//! Silence counts only while etcd answers: what counts of a pause between two looks is bounded, and with a longer one it begins anew. That is
+//! for the sake of a holder that could not speak either. Whether the place may be taken is decided by the transaction that takes it: it
+//! compares all that was the same for so long.
+
+use std::time::{Duration, Instant};
+
+/// A holder that has not written for so long has left. Longer than what a confirmation holds for those who ask
+/// [`Place::check`](crate::Place::check).
+pub(super) const SILENCE: Duration = Duration::from_millis(1_050);
+/// No pause between two looks counts for more: less than [`SILENCE`], so that a holder has a moment when etcd is back.
+const MOST_COUNTED: Duration = Duration::from_millis(500);
+/// Longer than any look takes that is answered in time. With a longer pause silence begins anew.
+const LONGEST_PAUSE: Duration = Duration::from_millis(1_000);
+
+/// When the keys were written by which a holder is seen to be there; 0 for one that is not there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Signs {
+    pub(super) leader: i64,
+    pub(super) alive: i64,
+    /// Taken away by a holder that cannot write `alive`.
+    pub(super) writable: i64,
+}
+
+/// See the module.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Silence {
+    signs: Signs,
+    counted: Duration,
+    looked: Instant,
+}
+
+/// What a look has shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Verdict {
+    /// Nothing yet: look again.
+    Undecided,
+    /// The holder has said something since the look before.
+    Spoke,
+    /// It has said nothing for long enough, and would have been able to.
+    Over,
+    /// It has said nothing for long enough, and there may have been no space to say it: only what is written now shows that there is, and
+    /// silence begins with it.
+    Unwritable,
+}
+
+/// One more look at what a holder has written.
+pub(super) fn look(silence: &mut Option<Silence>, signs: Signs, now: Instant) -> Verdict {
+    let before = silence.filter(|before| now.saturating_duration_since(before.looked) <= LONGEST_PAUSE);
+    let counted = match before {
+        Some(before) if before.signs == signs => {
+            before.counted + now.saturating_duration_since(before.looked).min(MOST_COUNTED)
+        }
+        _ => Duration::ZERO,
+    };
+    *silence = Some(Silence { signs, counted, looked: now });
+    match before {
+        Some(before) if before.signs != signs => Verdict::Spoke,
+        _ if counted < SILENCE => Verdict::Undecided,
+        _ if signs.writable == 0 => Verdict::Unwritable,
+        _ => Verdict::Over,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIGNS: Signs = Signs { leader: 5, alive: 9, writable: 5 };
+
+    /// The verdicts of looks of which each comes so many milliseconds after the one before.
+    fn looks(looks: &[(u64, Signs)]) -> Vec<Verdict> {
+        let (mut silence, mut now) = (None, Instant::now());
+        let each = |(pause, signs): &(u64, Signs)| {
+            now += Duration::from_millis(*pause);
+            look(&mut silence, *signs, now)
+        };
+        looks.iter().map(each).collect()
+    }
+
+    #[test]
+    fn the_place_is_free_after_a_silence_however_slow_the_answers_are() {
+        use Verdict::{Over, Undecided};
+        // Every 50 ms: the first look, and 20 that are not enough.
+        let quick = looks(&vec![(50, SIGNS); 23]);
+        assert!(quick[..21].iter().all(|verdict| *verdict == Undecided) && quick[21] == Over, "{quick:?}");
+        // Answers take 0.55 or 0.95 s.
+        for pause in [550, 950] {
+            let slow = looks(&vec![(pause, SIGNS); 4]);
+            assert_eq!(slow, [Undecided, Undecided, Undecided, Over], "{pause}");
+        }
+        // etcd was away in between: who could not speak gets its time.
+        let away = looks(&[(0, SIGNS), (900, SIGNS), (1_100, SIGNS), (900, SIGNS), (900, SIGNS), (900, SIGNS)]);
+        assert_eq!(away, [Undecided, Undecided, Undecided, Undecided, Undecided, Over]);
+    }
+
+    #[test]
+    fn whoever_says_something_has_its_whole_time_again() {
+        let spoke = Signs { alive: 10, ..SIGNS };
+        let seen =
+            looks(&[(0, SIGNS), (500, SIGNS), (500, SIGNS), (50, spoke), (500, spoke), (500, spoke), (50, spoke)]);
+        assert_eq!(seen[3], Verdict::Spoke);
+        assert_eq!(seen[5..], [Verdict::Undecided, Verdict::Over]);
+    }
+
+    #[test]
+    fn a_silence_in_which_there_may_have_been_no_space_is_none() {
+        let full = Signs { writable: 0, ..SIGNS };
+        let seen = looks(&[(0, full), (500, full), (500, full), (50, full), (50, full), (50, SIGNS), (500, SIGNS)]);
+        assert_eq!(seen[2..5], [Verdict::Undecided, Verdict::Unwritable, Verdict::Unwritable]);
+        // Somebody has written: only now it counts.
+        assert_eq!(seen[5..], [Verdict::Spoke, Verdict::Undecided]);
+    }
+}
