@@ -448,6 +448,32 @@ fn a_restored_etcd_is_accepted_by_one_host_for_all() {
     }
 }
 
+/// A server that refuses every call.
+fn refusing() -> (tokio::runtime::Runtime, String) {
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+    let address = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    runtime.spawn(tonic::transport::Server::builder().add_routes(tonic::service::Routes::default()).serve(address));
+    until("it does not listen", || std::net::TcpStream::connect(address).is_ok());
+    (runtime, format!("http://{address}"))
+}
+
+#[test]
+fn a_member_that_refuses_is_passed_over_as_long_as_another_one_answers() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &[]);
+    let (_runtime, refusing) = refusing();
+    let log = store([vec![refusing.clone()], cluster.endpoints()].concat(), "/test/refusing", "test");
+    let (_, mut writer) = open(&log);
+    append_durably(&mut *writer, b"performed");
+    writer.place().check().unwrap();
+    writer.close().unwrap();
+    assert_eq!(payloads(&log.read().unwrap().records), [b"performed"]);
+    let error = store(vec![refusing.clone()], "/test/refusing", "test").open().map(drop).unwrap_err().to_string();
+    assert!(error.contains(&format!("etcd refuses: {refusing} says")), "{error}");
+}
+
 #[test]
 fn what_is_missing_or_wrong_in_etcd_is_refused_by_name() {
     if !is_there() {

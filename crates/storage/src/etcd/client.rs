@@ -7,7 +7,7 @@
 
 use super::wire::kv_client::KvClient;
 use super::wire::{ResponseHeader, TxnRequest, TxnResponse};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::future::Future;
 use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering};
@@ -212,10 +212,12 @@ async fn hedged(
     let mut asked = JoinSet::new();
     // Who was asked and has not answered.
     let mut silent = BTreeSet::new();
+    // One member may refuse what the others perform: it counts where nobody else answers.
+    let mut refused = BTreeMap::new();
     let mut pause = HEDGE;
     for number in 0.. {
         let index = (first + number) % members.len();
-        if number < patience.asks {
+        if number < patience.asks.saturating_add(refused.len()) && !refused.contains_key(&index) {
             if silent.contains(&index) {
                 members[index].forget();
             }
@@ -240,6 +242,11 @@ async fn hedged(
                     let failed_pause = if number < members.len() { Duration::ZERO } else { FAILED_PAUSE };
                     until = until.min(Instant::now() + failed_pause);
                 }
+                Ok(Some(Ok((index, Err(refusal @ (CallError::Refused(_) | CallError::TooLarge(_))))))) => {
+                    silent.remove(&index);
+                    refused.insert(index, refusal);
+                    until = until.min(Instant::now());
+                }
                 Ok(Some(Ok((index, answered)))) => return (Some(index), answered),
                 Ok(_) => {}
                 Err(_) => break,
@@ -248,12 +255,17 @@ async fn hedged(
         if asked.is_empty() && number >= members.len() {
             tokio::time::sleep_until(until.into()).await;
         }
-        if Instant::now() >= deadline || (asked.is_empty() && number + 1 >= patience.asks) {
+        let all_asked = number + 1 >= patience.asks.saturating_add(refused.len()) || refused.len() == members.len();
+        if Instant::now() >= deadline || (asked.is_empty() && all_asked) {
             break;
         }
     }
+    let answer = match refused.into_values().next() {
+        Some(refusal) if silent.is_empty() => refusal,
+        _ => CallError::Unknown(last),
+    };
     silent.into_iter().for_each(|index| members[index].forget());
-    (None, Err(CallError::Unknown(last)))
+    (None, Err(answer))
 }
 
 async fn ask_one(
