@@ -83,11 +83,11 @@ mod tests {
     fn the_place_is_free_after_a_silence_however_slow_the_answers_are() {
         use Verdict::{Over, Undecided};
         // Every 50 ms: the first look, and 20 that are not enough.
-        let quick = looks(&vec![(50, SIGNS); 23]);
+        let quick = looks(&[(50, SIGNS); 23]);
         assert!(quick[..21].iter().all(|verdict| *verdict == Undecided) && quick[21] == Over, "{quick:?}");
         // Answers take 0.55 or 0.95 s.
         for pause in [550, 950] {
-            let slow = looks(&vec![(pause, SIGNS); 4]);
+            let slow = looks(&[(pause, SIGNS); 4]);
             assert_eq!(slow, [Undecided, Undecided, Undecided, Over], "{pause}");
         }
         // etcd was away in between: who could not speak gets its time.
