@@ -281,7 +281,7 @@ async fn what_a_task_made_is_nobodys_performer_and_the_real_provider_is_asked() 
         b.resources.create(real).await.unwrap();
     };
     let acquire = a.resources.acquire(vec![performer], AcquireOptions::default());
-    let (lease, ()) = in_time(async { tokio::join!(acquire, provide) }).await;
+    let (lease, ()) = in_time(Box::pin(async { tokio::join!(acquire, provide) })).await;
     assert_eq!(lease.unwrap().resource("PathPlanner").unwrap().id, "real");
 }
 
