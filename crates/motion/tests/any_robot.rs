@@ -566,6 +566,7 @@ fn links_that_no_joint_moves_against_each_other_are_a_pair_for_neither_check() {
 }
 
 #[test]
+#[allow(clippy::approx_constant, reason = "the positions of a file, rounded to four digits")]
 fn a_position_that_is_rounded_beyond_a_limit_is_taken_as_the_limit_and_said() {
     let (urdf, names) = chain(4);
     let mechanism = Mechanism::read(&urdf.replace("2.5'", "3.14159265'"), None, &names).unwrap();
