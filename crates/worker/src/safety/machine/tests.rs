@@ -1,6 +1,8 @@
 //! The machine beside brakes and a disk that answer at any time, or not, and callers who leave: every sequence of a few steps, and random
 //! long ones. The oracle knows nothing of the machine but its commands: it works out when the brakes surely are in a state.
 
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
 use super::*;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};

@@ -1,4 +1,4 @@
-//! Measures planning in the cell: `cargo run --release -p ratn-motion --example measure`.
+//! Measures planning in the cell: `cargo run --release -p ratn-motion --example cell`.
 
 #![allow(clippy::print_stdout, clippy::unwrap_used, clippy::disallowed_methods, reason = "a measurement")]
 
