@@ -17,7 +17,6 @@ use crate::resources::Resources;
 use flow::Flow;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use std::cell::Cell;
-use std::collections::BTreeSet;
 use std::iter::Peekable;
 
 /// How far the requirements of one request can be served.
@@ -49,21 +48,11 @@ impl Assignment {
 
     /// The maximum assignment of what is available to the requirements.
     pub(crate) fn of(resources: &Resources, available: Available<'_>, requirements: &[&Requirement]) -> Assignment {
-        Assignment::within(resources, available, requirements, &[])
-    }
-
-    /// The same of what is free, where it is known of some requirements among which resources that is which they fit.
-    pub(crate) fn within(
-        resources: &Resources,
-        available: Available<'_>,
-        requirements: &[&Requirement],
-        known: &[Option<&BTreeSet<Slot>>],
-    ) -> Assignment {
         let looked_at = Cell::new(0);
         let mut search = Search {
             resources,
             available,
-            classes: classes(requirements, known),
+            classes: classes(requirements),
             taken: vec![Units::new(); requirements.len()],
             missing: vec![Quantity::ZERO; requirements.len()],
             looked_at: &looked_at,
@@ -85,8 +74,6 @@ impl Assignment {
 struct Class<'a> {
     selector: &'a Requirement,
     grain: Quantity,
-    /// What is free of what they fit is among these; where nothing is known, among all of the kind.
-    known: Option<&'a BTreeSet<Slot>>,
     /// The requirements, by index.
     members: Vec<usize>,
 }
@@ -222,7 +209,6 @@ impl<'a> Search<'a> {
             Available::Free(_) | Available::FreeTo(..) => Box::new(self.resources.free_of(kind)),
         };
         let (looked_at, selector) = (self.looked_at, class.selector);
-        let of_kind = self.few_known(class).unwrap_or(of_kind);
         let of_kind = of_kind.inspect(|_| looked_at.update(|sum| sum + 1));
         let fitting = Box::new(of_kind.filter(|(_, resource)| resource.description.fits(selector)));
         if class.grain == Quantity::ONE {
@@ -232,36 +218,15 @@ impl<'a> Search<'a> {
     }
 }
 
-impl<'a> Search<'a> {
-    /// What is free of what is known to fit, where that is little beside all of the kind; in the order in which it is given away.
-    fn few_known(&self, class: &Class<'a>) -> Option<Candidates<'a>> {
-        let (kind, resources) = (&class.selector.kind, self.resources);
-        let known = class.known.filter(|known| known.len() < resources.count(kind) / FEW)?;
-        let free = known.iter().filter_map(|slot| {
-            let resource = resources.get(*slot).filter(|resource| !resource.free().is_zero())?;
-            Some((resources.order_of(kind, *slot, resource), resource))
-        });
-        let mut free: Vec<_> = free.collect();
-        free.sort_unstable_by_key(|(order, _)| *order);
-        Some(Box::new(free.into_iter().map(|((_, _, slot), resource)| (slot, resource))))
-    }
-}
-
-/// What is known to fit is put in order where it is less than this part of a kind.
-const FEW: usize = 8;
-
 /// The requirements that take something, by what they select.
-fn classes<'a>(requirements: &[&'a Requirement], known: &[Option<&'a BTreeSet<Slot>>]) -> Vec<Class<'a>> {
+fn classes<'a>(requirements: &[&'a Requirement]) -> Vec<Class<'a>> {
     let mut classes: Vec<Class<'a>> = Vec::new();
     for (index, requirement) in requirements.iter().enumerate().filter(|(_, requirement)| takes(requirement)) {
         let grain = grain(requirement);
         let same = |class: &&mut Class<'a>| class.grain == grain && selects_the_same(class.selector, requirement);
         match classes.iter_mut().find(same) {
             Some(class) => class.members.push(index),
-            None => {
-                let known = known.get(index).copied().flatten();
-                classes.push(Class { selector: requirement, grain, known, members: vec![index] });
-            }
+            None => classes.push(Class { selector: requirement, grain, members: vec![index] }),
         }
     }
     classes

@@ -1,22 +1,18 @@
 //! What changes of resources mean for those who wait.
 //!
 //! Each group of a family knows how much exists for it and what of that is free. A change of a resource concerns every group that
-//! the resource fits (`selectors.rs` finds those that it may fit), and that may be thousands. So a change is only noted; turns settle
-//! what was noted: a few resources of one family at a time with their groups, as far as a turn's share goes, the families in turn. A
-//! family of which something is noted is not shared out, and nobody in it is served, until that is settled. Only groups for which
-//! more is free are shared out to then (`sharing.rs`).
+//! the resource fits, and a family may have thousands of groups. So a change is only noted; turns settle what was noted: a few
+//! resources of one family with all groups of the family at a time, as far as a turn's share goes, the families in turn. A family
+//! of which something is noted is not shared out, and nobody in it is served, until that is settled.
 //!
 //! Not noted is what a grant takes: nobody gains by that, and a group finds out itself that a resource has nothing left
 //! ([`Group::exhausted`]).
 
-use crate::group::{Family, Group, Key, Seen};
+use crate::group::{Family, Group, Seen};
 use crate::id::{Slot, WaiterId};
 use crate::pool::Pool;
 use crate::queue::{Place, Queue, Waiter};
 use crate::resources::Resources;
-use crate::schedule::WORK_PER_GROUP;
-use crate::selectors::Selectors;
-use crate::sharing::FIRST;
 use ratn_model::resource::Quantity;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
@@ -30,7 +26,9 @@ pub(crate) struct Touched {
     settled: Option<Arc<str>>,
 }
 
-/// A resource, what groups know of it, and what it is now.
+/// A resource, and what groups know of it.
+type Noted = (Slot, Option<Seen>);
+/// The same, and what it is now.
 type Change = (Slot, Option<Seen>, Option<Seen>);
 
 /// Behind every place.
@@ -59,61 +57,20 @@ impl Touched {
         }
     }
 
-    /// Some changes of the next family, as many as take `work` with the groups that they may concern, and one at the least.
-    fn next(
-        &mut self,
-        families: &BTreeMap<Arc<str>, Family>,
-        resources: &Resources,
-        work: usize,
-    ) -> Option<(Arc<str>, Batch)> {
+    /// Some resources of the next family, so many at the most that they take `work` with its groups, and one at the least.
+    fn next(&mut self, families: &BTreeMap<Arc<str>, Family>, work: usize) -> Option<(Arc<str>, Vec<Noted>)> {
         let behind = self.settled.as_ref().map_or(Bound::Unbounded, Bound::Excluded);
         let mut next = self.families.range::<Arc<str>, _>((behind, Bound::Unbounded));
         let family = next.next().map(|(family, _)| family).or_else(|| self.families.keys().next())?.clone();
-        let now = |slot: &Slot| {
-            let known = resources.get(*slot);
-            known.filter(|known| resources.family(&known.description.kind) == &*family).map(Seen::of)
-        };
-        let selectors = families.get(&family).map(|family| &family.selectors);
+        let groups = families.get(&family).map_or(0, |family| family.groups.len());
+        let most = (work / groups.max(1)).max(1);
         let slots = self.families.get_mut(&family)?;
-        let mut batch = Batch::default();
-        while batch.work < work.max(1)
-            && let Some((slot, before)) = slots.pop_first()
-        {
-            let after = now(&slot);
-            batch.add((slot, before, after), selectors);
-        }
+        let some = (0..most).map_while(|_| slots.pop_first()).collect();
         if slots.is_empty() {
             self.families.remove(&family);
         }
         self.settled = Some(family.clone());
-        Some((family, batch))
-    }
-}
-
-/// Changes of one family, and which of them each group is told.
-#[derive(Default)]
-struct Batch {
-    changes: Vec<Change>,
-    groups: BTreeMap<Key, Vec<usize>>,
-    work: usize,
-}
-
-impl Batch {
-    fn add(&mut self, change: Change, selectors: Option<&Selectors>) {
-        let at = self.changes.len();
-        self.changes.push(change);
-        self.work += 1;
-        let (Some((_, before, after)), Some(selectors)) = (self.changes.last(), selectors) else { return };
-        for seen in [before, after].into_iter().flatten() {
-            for key in selectors.candidates(&seen.description) {
-                let changes = self.groups.entry(key.clone()).or_default();
-                if changes.last() != Some(&at) {
-                    // The group is found once for all that it is told.
-                    self.work += if changes.is_empty() { WORK_PER_GROUP } else { 1 };
-                    changes.push(at);
-                }
-            }
-        }
+        Some((family, some))
     }
 }
 
@@ -159,7 +116,7 @@ impl Queue {
         let (free_before, free) = (before.map_or(Quantity::ZERO, |b| b.free), after.map_or(Quantity::ZERO, |a| a.free));
         // Who has reserved it may have to do with something else.
         if reserved > free || (!same && !reserved.is_zero()) {
-            self.mark(&name, true);
+            self.changed.insert(name.clone(), true);
         }
         let quantity = |seen: Option<&Seen>| seen.map(|seen| seen.quantity);
         if !same || quantity(before) != quantity(after) || free > free_before {
@@ -172,20 +129,24 @@ impl Pool {
     /// Tells the groups of one family of some of the resources that changed; false where nothing is left to tell.
     pub(crate) fn settle(&mut self) -> bool {
         let queue = &mut self.queue;
-        let next = queue.touched.next(&queue.families, &self.resources, self.enough / 8);
-        let Some((name, Batch { changes, groups, work })) = next else { return false };
-        self.worked += work;
+        let Some((name, slots)) = queue.touched.next(&queue.families, self.enough / 8) else { return false };
+        let Some(family) = queue.families.get(&name) else { return true };
+        self.worked += slots.len() * family.groups.len();
+        let now = |slot: &Slot| {
+            let known = self.resources.get(*slot);
+            known.filter(|known| self.resources.family(&known.description.kind) == &*name).map(Seen::of)
+        };
+        let changes: Vec<Change> = slots.into_iter().map(|(slot, before)| (slot, before, now(&slot))).collect();
         let mut told = Told::default();
-        for (key, of_group) in &groups {
+        for key in &family.groups {
             let Some(group) = queue.groups.get_mut(key) else { continue };
-            let of_group = of_group.iter().filter_map(|at| changes.get(*at));
-            if told.tell(&self.resources, &queue.waiters, group, of_group) {
-                queue.mark_group(&name, key, FIRST);
-            }
+            told.tell(&self.resources, &queue.waiters, group, &changes);
         }
         queue.demand_changed |= told.other && !queue.hopeless.is_empty();
-        self.worked += told.concerned.len();
         told.concerned.into_iter().for_each(|place| queue.doubt(place));
+        if told.more_is_free {
+            queue.mark(&name, false);
+        }
         true
     }
 }
@@ -193,6 +154,8 @@ impl Pool {
 /// What groups found when they were told of changes.
 #[derive(Default)]
 struct Told {
+    /// Something that fits one of them has more free.
+    more_is_free: bool,
     /// There is more or less of something that fits one of them.
     other: bool,
     /// Who may be hopeful now and was not, or the other way.
@@ -200,34 +163,33 @@ struct Told {
 }
 
 impl Told {
-    /// Tells a group; whether something that fits it has more free.
-    fn tell<'a>(
+    fn tell(
         &mut self,
         resources: &Resources,
         waiters: &BTreeMap<WaiterId, Waiter>,
         group: &mut Group,
-        changes: impl Iterator<Item = &'a Change>,
-    ) -> bool {
+        changes: &[Change],
+    ) {
         let was = group.existing;
-        let (mut other, mut parts, mut more_is_free) = (false, false, false);
+        let (mut other, mut parts) = (false, false);
         for (slot, before, after) in changes {
             let step = Step::of(resources, group, before.as_ref(), after.as_ref());
             step.count(*slot, group);
-            more_is_free |= step.free.1 > step.free.0;
+            self.more_is_free |= step.free.1 > step.free.0;
             if step.quantity.0 != step.quantity.1 {
                 other = true;
                 parts |= [before, after].into_iter().flatten().any(|seen| seen.description.divisible);
             }
         }
         if !other {
-            return more_is_free;
+            return;
         }
         self.other = true;
         // For those with several requirements in the family, and for parts of units, it is not enough to count.
         self.concerned.extend(&group.several);
         if parts {
             self.concerned.extend(group.by_amount.iter().map(|(_, place)| *place));
-            return more_is_free;
+            return;
         }
         let (low, high) = (was.min(group.existing), was.max(group.existing));
         let between = group.by_amount.range((Bound::Excluded((low, LAST)), Bound::Included((high, LAST))));
@@ -235,7 +197,6 @@ impl Told {
         let hopeful = was > group.existing;
         let matters = |place: &Place| waiters.get(&place.1).is_some_and(|waiter| waiter.hopeful == hopeful);
         self.concerned.extend(between.map(|(_, place)| *place).filter(matters));
-        more_is_free
     }
 }
 

@@ -6,10 +6,9 @@ use crate::pool::Pool;
 use crate::queue::{Place, Waiter};
 use crate::resource::{Description, Resource, Units};
 use crate::resources::Resources;
-use crate::selectors::{self, Selectors};
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use ratn_model::versioned;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// What a requirement selects, in bytes.
@@ -20,8 +19,6 @@ pub(crate) type Key = Arc<[u8]>;
 pub(crate) struct Group {
     selector: Requirement,
     pub(crate) family: Arc<str>,
-    /// Where the family has filed it.
-    filed: selectors::Place,
     /// Hopeful ones that lack something of the family.
     pub(crate) wanting: BTreeSet<Place>,
     /// Everybody in it, by how much they want.
@@ -40,12 +37,6 @@ pub(crate) struct Group {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Family {
     pub(crate) groups: BTreeSet<Key>,
-    /// The same, by what they want of resources.
-    pub(crate) selectors: Selectors,
-    /// Those of the groups in which somebody wants something.
-    pub(crate) wanted: BTreeSet<Key>,
-    /// Who wants something, and in how many groups.
-    pub(crate) wanting: BTreeMap<Place, usize>,
     /// Hopeful ones that take something of it.
     pub(crate) takers: BTreeSet<Place>,
     /// Those of them that have reserved some.
@@ -80,13 +71,13 @@ impl Seen {
 }
 
 impl Group {
-    fn new(resources: &Resources, requirement: &Requirement, family: Arc<str>, filed: selectors::Place) -> Group {
+    fn new(resources: &Resources, requirement: &Requirement, family: Arc<str>) -> Group {
         let selector = requirement.clone();
         let free = (!resources.fits_every(&selector))
             .then(|| resources.free(&selector).map(|(slot, _)| slot).collect::<BTreeSet<Slot>>());
         let existing = resources.quantity(&selector);
         let (wanting, by_amount, several) = Default::default();
-        Group { selector, family, filed, wanting, by_amount, several, members: 0, existing, free }
+        Group { selector, family, wanting, by_amount, several, members: 0, existing, free }
     }
 
     pub(crate) fn fits(&self, resources: &Resources, description: &Description) -> bool {
@@ -135,12 +126,10 @@ impl Pool {
                     let name = self.resources.family(&requirement.kind);
                     let known = self.queue.families.get_key_value(name);
                     let name = known.map_or_else(|| name.into(), |(name, _)| name.clone());
-                    let family = self.queue.families.entry(name.clone()).or_default();
-                    family.groups.insert(key.clone());
-                    let filed = family.selectors.insert(key, requirement);
-                    let mut group = Group::new(&self.resources, requirement, Arc::clone(&name), filed);
+                    let mut group = Group::new(&self.resources, requirement, Arc::clone(&name));
                     self.queue.touched.as_before(&self.resources, &mut group);
                     self.queue.groups.insert(key.clone(), group);
+                    self.queue.families.entry(name.clone()).or_default().groups.insert(key.clone());
                     name
                 }
             };
@@ -164,9 +153,9 @@ impl Pool {
         self.stop_wanting(id, granted);
         let place = self.queue.get(id)?.place(id);
         self.queue.doubt_no_more(place);
-        self.queue.is_not_ready(place);
         let waiter = self.queue.waiters.remove(&id)?;
         self.queue.order.remove(&place);
+        self.queue.ready.remove(&place);
         self.queue.demand_changed |= self.queue.hopeless.remove(&place);
         for (requirement, key) in waiter.request.requirements.iter().zip(&waiter.groups) {
             let Some(group) = self.queue.groups.get_mut(key) else { continue };
@@ -179,11 +168,11 @@ impl Pool {
             let Some(group) = self.queue.groups.remove(key) else { continue };
             if let Some(family) = self.queue.families.get_mut(&group.family) {
                 family.groups.remove(key);
-                family.selectors.remove(key, &group.filed);
                 if family.groups.is_empty() {
                     self.queue.families.remove(&group.family);
                     self.queue.touched.forget(&group.family);
                     self.queue.changed.remove(&group.family);
+                    self.queue.shared_until.remove(&group.family);
                 }
             }
         }
@@ -201,29 +190,22 @@ impl Pool {
         let reserved: Vec<Units> = waiter.reserved.iter_mut().map(std::mem::take).collect();
         waiter.hopeful = false;
         let groups = waiter.groups.clone();
-        self.queue.is_not_ready(place);
+        self.queue.ready.remove(&place);
         for (key, units) in groups.iter().zip(reserved) {
-            let wanted = self.queue.want_no_more(key, place);
-            let Some(group) = self.queue.groups.get(key) else { continue };
+            let Some(group) = self.queue.groups.get_mut(key) else { continue };
+            let wanted = group.wanting.remove(&place);
             let family = group.family.clone();
             if let Some(family) = self.queue.families.get_mut(&family) {
                 family.takers.remove(&place);
                 family.reserving.remove(&place);
                 family.strict.remove(&place);
             }
-            units.iter().for_each(|(slot, amount)| self.queue.unreserve(*slot, *amount));
             // Without one who lacked it, others may reserve what is free.
-            if (wanted || granted) && self.limits.overtaken > 0 {
+            let freed = !units.is_empty() && !granted;
+            if freed || ((wanted || granted) && self.limits.overtaken > 0) {
                 self.queue.mark(&family, false);
-            } else if !granted {
-                self.freed(&family, units.keys());
             }
+            units.into_iter().for_each(|(slot, amount)| self.queue.unreserve(slot, amount));
         }
-    }
-
-    /// Some of these is not reserved any more.
-    pub(crate) fn freed<'a>(&mut self, family: &Arc<str>, slots: impl Iterator<Item = &'a Slot>) {
-        let resources = slots.filter_map(|slot| self.resources.get(*slot));
-        self.worked += self.queue.mark_fitting(family, resources.map(|resource| &*resource.description));
     }
 }

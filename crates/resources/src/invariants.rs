@@ -70,7 +70,7 @@ impl Pool {
         self.groups_agree()?;
         for (slot, amount) in &self.queue.reserved {
             let free = self.resources.get(*slot).map(|resource| resource.free()).unwrap_or_default();
-            let shared_out_anew = self.queue.changed.values().any(|share| share.anew);
+            let shared_out_anew = self.queue.changed.values().any(|anew| *anew);
             ensure(free >= *amount || shared_out_anew, || {
                 format!("{slot}: {amount} is reserved and only {free} free")
             })?;

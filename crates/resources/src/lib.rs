@@ -58,15 +58,12 @@ mod memory;
 mod pace;
 mod pool;
 mod queue;
-mod ready;
 mod record;
 mod request;
 mod resource;
 mod resources;
 mod schedule;
-mod selectors;
 mod session;
-mod sharing;
 mod snapshot;
 mod validation;
 

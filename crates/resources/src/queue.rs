@@ -4,9 +4,7 @@ use crate::changed::Touched;
 use crate::group::{Family, Group, Key};
 use crate::id::{SessionId, Slot, WaiterId};
 use crate::memory::RequestId;
-use crate::ready::Ready;
-use crate::resource::{Description, Units};
-use crate::sharing::{FIRST, ToShare};
+use crate::resource::Units;
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -64,13 +62,15 @@ pub(crate) struct Queue {
     /// What all waiters together have reserved.
     pub(crate) reserved: Units,
     /// Those that lack nothing.
-    pub(crate) ready: Ready,
+    pub(crate) ready: BTreeSet<Place>,
     /// Resources that changed, of which the groups of their family do not know yet.
     pub(crate) touched: Touched,
-    /// Families in which something became free, and whom of them that may concern.
-    pub(crate) changed: BTreeMap<Arc<str>, ToShare>,
+    /// Families in which something became free; true where what is reserved has to be shared out anew.
+    pub(crate) changed: BTreeMap<Arc<str>, bool>,
     /// The family that was shared out last: the one behind it is next, so that each has its turn.
     pub(crate) shared: Option<Arc<str>>,
+    /// Where sharing out was interrupted in a family: those behind are still to be looked at.
+    pub(crate) shared_until: BTreeMap<Arc<str>, Place>,
     /// Those of whom it is to be found out anew whether what exists would do.
     doubtful: BTreeSet<Place>,
     /// The last of them that was looked at, while there are more: the one behind it is next, so that each has its turn.
@@ -147,65 +147,9 @@ impl Queue {
     /// Whether what a waiter has reserved is free, and all else that it asks for is there. Where much has changed, that is known later.
     pub(crate) fn is_certain(&self, place: Place) -> bool {
         let Some(waiter) = self.waiters.get(&place.1) else { return false };
+        let settled = |family: &str| !self.touched.is_in(family) && self.changed.get(family) != Some(&true);
         let families = waiter.groups.iter().filter_map(|key| self.groups.get(key)).map(|group| &*group.family);
-        !self.doubtful.contains(&place) && families.into_iter().all(|family| self.is_settled(family))
-    }
-
-    /// Whether nothing of a family is to be told, or shared out anew.
-    pub(crate) fn is_settled(&self, family: &str) -> bool {
-        !self.touched.is_in(family) && self.changed.get(family).is_none_or(|share| !share.anew)
-    }
-
-    /// The family under which a waiter is ready: of several the first.
-    pub(crate) fn home(&self, waiter: &Waiter) -> Arc<str> {
-        let first = waiter.groups.first().and_then(|key| self.groups.get(key));
-        first.map_or_else(|| Arc::from(""), |group| group.family.clone())
-    }
-
-    /// A waiter lacks nothing.
-    pub(crate) fn is_ready(&mut self, place: Place) {
-        let Some(waiter) = self.waiters.get(&place.1) else { return };
-        let home = self.home(waiter);
-        self.ready.insert(&home, place);
-    }
-
-    /// It lacks something, or has left.
-    pub(crate) fn is_not_ready(&mut self, place: Place) {
-        let Some(waiter) = self.waiters.get(&place.1) else { return };
-        let home = self.home(waiter);
-        self.ready.remove(&home, place);
-    }
-
-    /// A waiter lacks something that a group selects.
-    pub(crate) fn want(&mut self, key: &Key, place: Place) {
-        let Some(group) = self.groups.get_mut(key) else { return };
-        if !group.wanting.insert(place) {
-            return;
-        }
-        let Some(family) = self.families.get_mut(&group.family) else { return };
-        *family.wanting.entry(place).or_default() += 1;
-        if group.wanting.len() == 1 {
-            family.wanted.insert(key.clone());
-        }
-    }
-
-    /// It does not, any more; whether it did.
-    pub(crate) fn want_no_more(&mut self, key: &Key, place: Place) -> bool {
-        let Some(group) = self.groups.get_mut(key) else { return false };
-        if !group.wanting.remove(&place) {
-            return false;
-        }
-        let Some(family) = self.families.get_mut(&group.family) else { return true };
-        if let Some(groups) = family.wanting.get_mut(&place) {
-            *groups -= 1;
-            if *groups == 0 {
-                family.wanting.remove(&place);
-            }
-        }
-        if group.wanting.is_empty() {
-            family.wanted.remove(key);
-        }
-        true
+        !self.doubtful.contains(&place) && families.into_iter().all(settled)
     }
 
     /// Of this one it is to be found out anew whether what exists would do.
@@ -238,45 +182,9 @@ impl Queue {
         Some(next)
     }
 
-    /// Something may be had that could not be before, by anybody in a family; where it was reserved in another order, by sharing out
-    /// all of it anew.
     pub(crate) fn mark(&mut self, family: &Arc<str>, anew: bool) {
-        let share = self.changed.entry(family.clone()).or_default();
-        share.anew |= anew;
-        share.add_all();
-    }
-
-    /// The same, by a group from a waiter on.
-    pub(crate) fn mark_group(&mut self, family: &Arc<str>, key: &Key, from: Place) {
-        let share = self.changed.entry(family.clone()).or_default();
-        if !share.all {
-            share.add(key, from);
-        }
-    }
-
-    /// The same, by those who lack something like these resources. How many groups were looked at.
-    pub(crate) fn mark_fitting<'a>(
-        &mut self,
-        family: &Arc<str>,
-        freed: impl Iterator<Item = &'a Description>,
-    ) -> usize {
-        let Some(known) = self.families.get(family) else { return 0 };
-        let (mut keys, mut looked_at) = (BTreeSet::new(), 0);
-        for description in freed {
-            for key in known.selectors.candidates(description) {
-                looked_at += 1;
-                if known.wanted.contains(key) {
-                    keys.insert(key.clone());
-                }
-            }
-            // Those who lack anything are no more than these.
-            if looked_at > known.wanted.len() {
-                self.mark(family, false);
-                return looked_at;
-            }
-        }
-        keys.iter().for_each(|key| self.mark_group(family, key, FIRST));
-        looked_at
+        *self.changed.entry(family.clone()).or_default() |= anew;
+        self.shared_until.remove(family);
     }
 
     /// Whether the indices say the same as the waiters do.
@@ -294,23 +202,13 @@ impl Queue {
             }
             ensure(waiter.hopeful || waiter.reserved.iter().all(BTreeMap::is_empty), "a hopeless waiter reserves")?;
             let ready = waiter.hopeful && waiter.lacks.is_empty();
-            ensure(self.ready.contains(&self.home(waiter), place) == ready, "who is ready is not among them")?;
+            ensure(self.ready.contains(&place) == ready, "who is ready is not among them")?;
             let known = self.hopeless.contains(&place) != waiter.hopeful || self.doubtful.contains(&place);
             ensure(known, "who is hopeless is not among them")?;
         }
         ensure(self.hopeless.len() <= self.waiters.len(), "somebody hopeless has left")?;
         ensure(reserved == self.reserved, "what is reserved is not what waiters have reserved")?;
         ensure(self.groups.values().map(|group| group.members).sum::<usize>() == members, "a group miscounts")?;
-        for family in self.families.values() {
-            let mut wanting = BTreeMap::<Place, usize>::new();
-            for key in &family.groups {
-                let places = self.groups.get(key).map(|group| &group.wanting);
-                let wanted = places.is_some_and(|places| !places.is_empty());
-                ensure(family.wanted.contains(key) == wanted, "a family does not know what is wanted of it")?;
-                places.into_iter().flatten().for_each(|place| *wanting.entry(*place).or_default() += 1);
-            }
-            ensure(wanting == family.wanting, "a family does not know who wants something of it")?;
-        }
         ensure(self.groups.is_empty() == self.families.is_empty(), "a family without a group")
     }
 }

@@ -205,12 +205,6 @@ impl Resources {
         self.present(self.of(kind).flat_map(|of_kind| of_kind.free.iter().map(|(_, slot)| slot)))
     }
 
-    /// Where a resource stands in the order of [`Resources::free_of`] a kind.
-    pub(crate) fn order_of(&self, kind: &str, slot: Slot, resource: &Resource) -> (usize, usize, Slot) {
-        let of_kind = self.kinds.subclasses(kind).position(|kind| *kind == *resource.description.kind);
-        (of_kind.unwrap_or(usize::MAX), special(resource), slot)
-    }
-
     fn present<'a>(
         &'a self,
         slots: impl Iterator<Item = &'a Slot> + 'a,

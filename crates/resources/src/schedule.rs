@@ -17,20 +17,14 @@
 
 use crate::assignment::{Assignment, Available};
 use crate::group::{Key, takes};
-use crate::id::{Slot, WaiterId};
+use crate::id::WaiterId;
 use crate::pool::Pool;
 use crate::queue::Place;
 use crate::resource::Units;
-use crate::sharing::{FIRST, ToShare};
 use ratn_model::resource::Requirement;
 use std::collections::BTreeSet;
 use std::ops::Bound;
 use std::sync::Arc;
-
-/// To find a group, or who is first in it, takes as long as looking at so many resources.
-pub(crate) const WORK_PER_GROUP: usize = 32;
-/// To reserve something for a waiter, or to grant it, takes as long as looking at so many of them, beside those that are looked at.
-const WORK_PER_WAITER: usize = 128;
 
 impl Pool {
     /// Grants whatever can be granted.
@@ -45,8 +39,7 @@ impl Pool {
             }
             let Some(waiter) = self.queue.get(id) else { return };
             let taken = waiter.reserved.clone();
-            self.ended(taken.iter().map(|units| units.len()).sum());
-            self.worked += WORK_PER_WAITER;
+            self.ended(taken.iter().map(|units| units.len()).sum::<usize>().max(1));
             self.grant(id, taken);
         }
     }
@@ -61,43 +54,41 @@ impl Pool {
             self.reconsider(place);
         }
         while !self.has_done_enough()
-            && let Some((family, share)) = self.next_changed()
+            && let Some((family, anew)) = self.next_changed()
         {
-            self.share_out(&family, share);
+            self.share_out(&family, anew);
         }
     }
 
     /// The next family in which something became free of which all is known.
-    fn next_changed(&mut self) -> Option<(Arc<str>, ToShare)> {
+    fn next_changed(&mut self) -> Option<(Arc<str>, bool)> {
         let behind = self.queue.shared.clone().map_or(Bound::Unbounded, Bound::Excluded);
         let changed = &self.queue.changed;
         let mut looked_at = 0;
-        let mut known = |(family, _): &(&Arc<str>, &ToShare)| {
+        let mut known = |(family, _): &(&Arc<str>, &bool)| {
             looked_at += 1;
             let doubtful = self.queue.families.get(*family).is_some_and(|family| family.doubtful > 0);
             !doubtful && !self.queue.touched.is_in(family)
         };
         let next = changed.range::<Arc<str>, _>((behind, Bound::Unbounded)).find(&mut known);
-        let next = next.or_else(|| changed.iter().find(&mut known)).map(|(family, _)| family.clone());
+        let next = next.or_else(|| changed.iter().find(&mut known)).map(|(family, anew)| (family.clone(), *anew));
         self.worked += looked_at;
-        let family = next?;
-        let share = self.queue.changed.remove(&family)?;
+        let (family, anew) = next?;
+        self.queue.changed.remove(&family);
         self.queue.shared = Some(family.clone());
-        Some((family, share))
+        Some((family, anew))
     }
 
     /// The first that lacks nothing and may have it now.
-    fn next_served(&mut self) -> Option<WaiterId> {
+    fn next_served(&self) -> Option<WaiterId> {
         if !self.may_grant() {
             return None;
         }
-        let may_have = |place: Place| {
+        let may_have = |place: &&Place| {
             let session = self.queue.get(place.1).and_then(|waiter| self.sessions.get(&waiter.request.session));
-            session.is_some_and(|session| self.may_grant_to(session)) && self.queue.is_certain(place)
+            session.is_some_and(|session| self.may_grant_to(session)) && self.queue.is_certain(**place)
         };
-        let (first, looked_at) = self.queue.ready.first(|family| self.queue.is_settled(family), may_have);
-        self.worked += looked_at;
-        first.map(|(_, id)| id)
+        self.queue.ready.iter().find(may_have).map(|(_, id)| *id)
     }
 
     /// What a request can have at once: all of it, or `None`. Nobody waits before it for any of it.
@@ -142,36 +133,34 @@ impl Pool {
         let strict = self.limits.overtaken > 0 && waiter.overtaken >= self.limits.overtaken;
         let mut lacks = BTreeSet::new();
         for (key, _) in groups.iter().zip(taken).filter(|(_, takes)| *takes) {
-            self.queue.want(key, place);
-            let Some(name) = self.queue.groups.get(key).map(|group| group.family.clone()) else { continue };
+            let Some(group) = self.queue.groups.get_mut(key) else { continue };
+            group.wanting.insert(place);
+            let name = group.family.clone();
             if let Some(family) = self.queue.families.get_mut(&name) {
                 family.takers.insert(place);
                 if strict {
                     family.strict.insert(place);
                 }
                 let disturbs = family.reserving.last().is_some_and(|behind| *behind > place);
-                match disturbs {
-                    true => self.queue.mark(&name, true),
-                    false => self.queue.mark_group(&name, key, place),
-                }
+                self.queue.mark(&name, disturbs);
             }
             lacks.insert(name);
         }
         if lacks.is_empty() {
-            self.queue.is_ready(place);
+            self.queue.ready.insert(place);
         }
         if let Some(waiter) = self.queue.waiters.get_mut(&place.1) {
             (waiter.hopeful, waiter.lacks) = (true, lacks);
         }
     }
 
-    /// Gives what is free in a family to those who lack it, in order, as far as a share of the turn goes: what is left of `share` is
-    /// for later.
-    fn share_out(&mut self, family: &Arc<str>, mut share: ToShare) {
+    /// Gives what is free in a family to those who lack it, in order; on from where an earlier turn stopped.
+    fn share_out(&mut self, family: &Arc<str>, anew: bool) {
         let Some(known) = self.queue.families.get_mut(family) else { return };
-        if std::mem::take(&mut share.anew) {
+        let stopped_at = self.queue.shared_until.remove(family).filter(|_| !anew);
+        if anew {
             for place in std::mem::take(&mut known.reserving) {
-                self.worked += WORK_PER_GROUP;
+                self.worked += 1;
                 self.take_back(place, family);
                 if self.limits.overtaken > 0 {
                     self.take_back_elsewhere(place, family);
@@ -179,34 +168,30 @@ impl Pool {
             }
         }
         let Some(known) = self.queue.families.get(family) else { return };
-        if std::mem::take(&mut share.all) {
-            known.wanted.iter().for_each(|key| share.add(key, FIRST));
-            self.worked += known.wanted.len();
-        }
+        let behind = stopped_at.map_or(Bound::Unbounded, Bound::Included);
+        let first = |key: &Key| {
+            let next = self.queue.groups.get(key)?.wanting.range((behind, Bound::Unbounded)).next();
+            next.map(|place| (*place, key.clone()))
+        };
+        let mut heads: BTreeSet<(Place, Key)> = known.groups.iter().filter_map(first).collect();
+        self.worked += known.groups.len();
         // Somebody gets on each time, and other families have their turn.
         let most = self.enough.min(self.worked + self.enough / 8);
-        let (mut before, mut looked) = (None, false);
-        while let Some((from, key)) = share.pop_first() {
-            if self.worked >= most && looked && before != Some(from) {
-                share.add(&key, from);
-                self.queue.changed.entry(family.clone()).or_default().merge(share);
+        let mut before = None;
+        while let Some((place, key)) = heads.pop_first() {
+            if self.worked >= most && before.is_some() && before != Some(place) {
+                self.queue.mark(family, false);
+                self.queue.shared_until.insert(family.clone(), place);
                 return;
             }
-            looked = true;
             let Some(group) = self.queue.groups.get_mut(&key) else { continue };
-            let mut places = group.wanting.range(from..).copied();
-            let (Some(place), next) = (places.next(), places.next()) else { continue };
-            self.worked += WORK_PER_GROUP;
-            if place != from {
-                share.add(&key, place);
-                continue;
-            }
             let (exhausted, looked_at) = group.exhausted(&self.resources, &self.queue.reserved);
-            self.worked += looked_at;
+            self.worked += 1 + looked_at;
             if exhausted {
                 continue;
             }
-            next.into_iter().for_each(|next| share.add(&key, next));
+            let next = group.wanting.range((Bound::Excluded(place), Bound::Unbounded)).next();
+            heads.extend(next.map(|next| (*next, key)));
             if before != Some(place) {
                 self.attempt(place, family);
                 before = Some(place);
@@ -228,49 +213,34 @@ impl Pool {
         }
     }
 
-    /// What a waiter had reserved in a family is anybody's, and it lacks it. What that was.
-    fn take_back(&mut self, place: Place, family: &Arc<str>) -> Units {
-        let mut freed = Units::new();
-        let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return freed };
-        let mut wants = Vec::new();
+    /// What a waiter had reserved in a family is anybody's, and it lacks it.
+    fn take_back(&mut self, place: Place, family: &Arc<str>) {
+        let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
+        let mut freed = Vec::new();
         for (index, key) in waiter.groups.iter().enumerate() {
-            let of_family = self.queue.groups.get(key).is_some_and(|group| group.family == *family);
-            if of_family && takes(&waiter.request.requirements[index]) {
-                wants.push(key.clone());
-                for (slot, amount) in std::mem::take(&mut waiter.reserved[index]) {
-                    *freed.entry(slot).or_default() += amount;
-                }
+            let Some(group) = self.queue.groups.get_mut(key).filter(|group| group.family == *family) else { continue };
+            if takes(&waiter.request.requirements[index]) {
+                group.wanting.insert(place);
+                freed.extend(std::mem::take(&mut waiter.reserved[index]));
             }
         }
         waiter.lacks.insert(family.clone());
-        self.queue.is_not_ready(place);
-        wants.iter().for_each(|key| self.queue.want(key, place));
-        freed.iter().for_each(|(slot, amount)| self.queue.unreserve(*slot, *amount));
-        freed
+        self.queue.ready.remove(&place);
+        freed.into_iter().for_each(|(slot, amount)| self.queue.unreserve(slot, amount));
     }
 
     /// Reserves for a waiter what it lacks in a family, as far as that is free and nobody before it is passed for long.
     fn attempt(&mut self, place: Place, family: &Arc<str>) {
-        let mut had = self.take_back(place, family);
+        self.take_back(place, family);
         let Some(known) = self.queue.families.get_mut(family) else { return };
         known.reserving.remove(&place);
         let kept = self.limits.overtaken == 0 || known.strict.last().is_some_and(|last| place <= *last);
         let passes = self.passes(place, family);
         let Some((indices, assignment)) = self.assigned(place, family) else { return };
-        self.worked += assignment.looked_at + WORK_PER_WAITER;
+        self.worked += assignment.looked_at;
         let complete = assignment.is_complete();
         if (complete && !passes) || (!complete && kept) {
-            // What it has reserved again is nobody else's.
-            for (slot, amount) in assignment.taken.iter().flatten() {
-                if let Some(left) = had.get_mut(slot) {
-                    *left = left.saturating_sub(*amount);
-                }
-            }
-            had.retain(|_, left| !left.is_zero());
             self.reserve(place, family, &indices, assignment);
-        }
-        if !had.is_empty() {
-            self.freed(family, had.keys());
         }
         if complete && self.limits.overtaken > 0 {
             self.reserve_all(place);
@@ -286,7 +256,8 @@ impl Pool {
         }
         let Some(family) = self.queue.families.get(family) else { return false };
         let from = family.strict.last().map_or(Bound::Unbounded, |last| Bound::Excluded(*last));
-        family.wanting.range((from, Bound::Unbounded)).next().is_some_and(|(other, _)| *other < place)
+        let between = |key: &Key| self.queue.groups.get(key)?.wanting.range((from, Bound::Unbounded)).next();
+        family.groups.iter().filter_map(between).any(|other| *other < place)
     }
 
     /// Reserves what a waiter lacks in every family, if all of it is free.
@@ -319,26 +290,22 @@ impl Pool {
         let requirements: Vec<&Requirement> =
             indices.iter().map(|index| &waiter.request.requirements[*index]).collect();
         let available = Available::Free(&self.queue.reserved);
-        // What is free is known where nothing is to be told of the family.
-        let is_known = !self.queue.touched.is_in(family);
-        let free = |index: &usize| self.queue.groups.get(&waiter.groups[*index])?.free.as_ref().filter(|_| is_known);
-        let known: Vec<Option<&BTreeSet<Slot>>> = indices.iter().map(free).collect();
-        let assignment = Assignment::within(&self.resources, available, &requirements, &known);
+        let assignment = Assignment::of(&self.resources, available, &requirements);
         Some((indices, assignment))
     }
 
     fn reserve(&mut self, place: Place, family: &Arc<str>, indices: &[usize], assignment: Assignment) {
         let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
         let complete = assignment.is_complete();
-        let (mut some, mut wants_no_more) = (false, Vec::new());
+        let mut some = false;
         for (index, units) in indices.iter().zip(assignment.taken) {
             for (slot, amount) in &units {
                 *self.queue.reserved.entry(*slot).or_default() += *amount;
                 some = true;
             }
             waiter.reserved[*index] = units;
-            if complete {
-                wants_no_more.push(waiter.groups[*index].clone());
+            if complete && let Some(group) = self.queue.groups.get_mut(&waiter.groups[*index]) {
+                group.wanting.remove(&place);
             }
         }
         if some && let Some(family) = self.queue.families.get_mut(family) {
@@ -346,12 +313,8 @@ impl Pool {
         }
         if complete {
             waiter.lacks.remove(family);
-            let ready = waiter.lacks.is_empty();
-            for key in &wants_no_more {
-                self.queue.want_no_more(key, place);
-            }
-            if ready {
-                self.queue.is_ready(place);
+            if waiter.lacks.is_empty() {
+                self.queue.ready.insert(place);
             }
         }
     }
@@ -365,10 +328,8 @@ impl Pool {
         let mut passed = BTreeSet::new();
         for slot in taken.iter().flat_map(|units| units.keys()) {
             let Some(resource) = self.resources.get(*slot) else { continue };
-            let family = self.queue.families.get(self.resources.family(&resource.description.kind));
-            let candidates = family.into_iter().flat_map(|family| family.selectors.candidates(&resource.description));
-            for key in candidates {
-                self.worked += WORK_PER_GROUP;
+            let family = self.resources.family(&resource.description.kind);
+            for key in self.queue.families.get(family).into_iter().flat_map(|family| &family.groups) {
                 let Some(group) = self.queue.groups.get(key) else { continue };
                 if group.fits(&self.resources, &resource.description) {
                     passed.extend(group.wanting.range(..place).copied());
@@ -381,10 +342,11 @@ impl Pool {
             if waiter.overtaken < self.limits.overtaken {
                 continue;
             }
-            for key in waiter.groups.clone() {
-                let Some(name) = self.queue.groups.get(&key).map(|group| group.family.clone()) else { continue };
-                if self.queue.families.get_mut(&name).is_some_and(|family| family.strict.insert(place)) {
-                    self.queue.mark(&name, true);
+            for key in &waiter.groups {
+                let Some(group) = self.queue.groups.get(key) else { continue };
+                let Some(family) = self.queue.families.get_mut(&group.family) else { continue };
+                if family.strict.insert(place) {
+                    self.queue.changed.insert(group.family.clone(), true);
                 }
             }
         }

@@ -300,6 +300,8 @@ proptest! {
                         .filter(|kind| units[*kind] > 0)
                         .map(|kind| requirement(operation, kind, units[kind]))
                         .collect();
+                    // Who asks for nothing is refused.
+                    let asks = !requirements.is_empty();
                     let mut request = AcquireRequest::new(names[session].clone(), requirements).priority(priority);
                     request.deadline = patience.map(|time| moment(now + time));
                     let result = pool.acquire(at, request);
@@ -314,7 +316,7 @@ proptest! {
                         model.queue.push(waiter.clone());
                         !model.grant(&[]).contains(&id)
                     };
-                    let welcome = model.expires[session].is_some() && !(full && waits());
+                    let welcome = asks && model.expires[session].is_some() && !(full && waits());
                     prop_assert_eq!(result.is_ok(), welcome, "full: {}", full);
                     if let Ok(id) = result {
                         model.queue.push(ModelWaiter { id, ..waiter });
