@@ -472,7 +472,7 @@ async fn a_lease_is_not_confirmed_when_the_machine_wakes_up_until_the_manager_is
         let directory = tempfile::tempdir().unwrap();
         let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
         let manager = with_lease();
-        let _serving = manager.serve(&endpoint).await;
+        let (stop, serving) = manager.serve(&endpoint).await;
         let (channels, clock) = (Channels::new(), BootClock::suspendable());
         let leases = LeaseWatch::by(clock.clone(), ["arm@sim"]);
         leases.brought_to_rest();
@@ -480,10 +480,13 @@ async fn a_lease_is_not_confirmed_when_the_machine_wakes_up_until_the_manager_is
         let following = if by_session {
             tokio::spawn(leases.follow_session(&channels, &endpoint, &session, hour).unwrap())
         } else {
-            tokio::spawn(leases.follow_location(&channels, ManagerLocation::At(endpoint), "cell", hour))
+            tokio::spawn(leases.follow_location(&channels, ManagerLocation::At(endpoint.clone()), "cell", hour))
         };
         heard(&leases).await;
         assert_eq!(leases.check(&CLAIM), Standing::Confirmed);
+        stop.cancel();
+        serving.await.unwrap();
+        assert_eq!(leases.check(&CLAIM), Standing::Confirmed, "the manager may come back");
         // Nothing else has run when the next goal is looked at.
         clock.suspend(hour);
         assert!(matches!(leases.check(&CLAIM), Standing::Unheard(_)), "{by_session}");
@@ -493,6 +496,7 @@ async fn a_lease_is_not_confirmed_when_the_machine_wakes_up_until_the_manager_is
             }
         };
         tokio::time::timeout(LONG, unheard).await.expect("what is under way goes on for another hour");
+        let _serving = manager.serve(&endpoint).await;
         let again = async {
             while leases.check(&CLAIM) != Standing::Confirmed {
                 tokio::time::sleep(Duration::from_millis(1)).await;
