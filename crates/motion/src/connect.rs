@@ -1,7 +1,7 @@
 //! RRT-Connect: two trees, one from the start and one from the goals, each growing towards samples and then towards the other
 //! (Kuffner and LaValle, ICRA 2000), with the trees kept balanced (Kuffner and LaValle 2005) and nodes that only take samples
 //! near them once an extension failed (dynamic domain, Yershova et al., ICRA 2005). A robot with several arms moves one after the
-//! other first ([`branches`](crate::branches)).
+//! other first (`branches`).
 //!
 //! The same space, ends, seed and budget give the same path. The caller is asked every `POLL` iterations whether to go on.
 

@@ -1,5 +1,5 @@
 //! Offers resources under a session, and withdraws them. A resource that the resource manager has forgotten is offered again. While the
-//! manager cannot be reached, offers and withdrawals wait; one that is not answered within [`ANSWERED_WITHIN`] is asked again.
+//! manager cannot be reached, offers and withdrawals wait; one that is not answered within `ANSWERED_WITHIN` is asked again.
 //!
 //! A provider watches its resources at the manager. When somebody else has deleted one, the provider logs that and offers it again. What
 //! a new watch shows first is compared with what was offered: a session may have ended and been made anew unnoticed, when the answer of

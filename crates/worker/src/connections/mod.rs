@@ -7,7 +7,7 @@
 //! ```
 //! A handshake that does not end is a connection without a call. Connections are shared out in four ways:
 //!
-//! - One user or host gets so many in a second ([`rates`]); they are accepted in a thread of their own ([`accepting`]), so that who connects
+//! - One user or host gets so many in a second (`rates`); they are accepted in a thread of their own (`accepting`), so that who connects
 //!   all the time keeps nobody waiting who is connected.
 //! - Connections with calls under way are bounded for each caller, and for all callers that are no operators together. The rest
 //!   ([`ConnectionLimits::for_operators`]) is kept for operators, and for connections that have not had a call yet.
