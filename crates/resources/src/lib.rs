@@ -21,8 +21,8 @@
 //! later one never takes a unit that it waits for, and waiters for other kinds pass. It deliberately knows no socket,
 //! no clock, no file and no process; who starts what a waiter lacks is the providers' business.
 //!
-//! Waiters that select the same form a group (`group.rs`); a change of a resource touches the groups that it fits (`selectors.rs`), and
-//! what became free goes to the first of those who lacks it (`schedule.rs`, `sharing.rs`). `cargo bench -p ratn-resources`, medians on a busy machine with two
+//! Waiters that select the same form a group (`group.rs`); a change of a resource touches the groups that it fits, and what became free
+//! goes to the first who lacks it (`schedule.rs`). `cargo bench -p ratn-resources`, medians on a busy machine with two
 //! cores (compare them with each other):
 //!
 //! | call | empty pool | 100,000 resources | and 10,000 waiters |

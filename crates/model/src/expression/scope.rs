@@ -9,29 +9,44 @@ use std::borrow::Cow;
 use std::cell::Cell;
 use std::collections::BTreeMap;
 
-/// Gives names their values. `None` and [`Lookup::Unknown`] mean not known *yet*: a scope never guesses.
+/// Gives names their values. `None` and [`Lookup::Unknown`] mean not known *yet*: a scope never guesses. What a scope does not say
+/// itself is what the scope around it says.
 pub trait Scope {
-    /// `$name`: a loop variable or a task parameter.
-    fn variable(&self, name: &str) -> Option<Cow<'_, Value>>;
-    /// An output of the state itself (only its effects may name it).
-    fn output(&self, name: &str) -> Option<Cow<'_, Value>>;
-    /// An output of another state.
-    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>>;
-    /// The first fact that matches, in the order of keys.
-    fn fact(&self, pattern: &FactPattern) -> Lookup<'_>;
-    /// Visits the facts that match, in the order of keys, until told to stop; others may be among them. Whether they are known.
-    fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool;
-    /// `?name`: what a query around has bound.
-    fn unknown(&self, _: &str) -> Option<Cow<'_, Value>> {
+    /// The scope around this one, if there is one.
+    fn outer(&self) -> Option<&dyn Scope> {
         None
     }
+    /// `$name`: a loop variable or a task parameter.
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer()?.variable(name)
+    }
+    /// An output of the state itself (only its effects may name it).
+    fn output(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer()?.output(name)
+    }
+    /// An output of another state.
+    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
+        self.outer()?.port(state, port)
+    }
+    /// The first fact that matches, in the order of keys.
+    fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
+        self.outer().map_or(Lookup::Unknown, |outer| outer.fact(pattern))
+    }
+    /// Visits the facts that match, in the order of keys, until told to stop; others may be among them. Whether they are known.
+    fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
+        self.outer().is_some_and(|outer| outer.each_fact(pattern, visit))
+    }
+    /// `?name`: what a query around has bound.
+    fn unknown(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer()?.unknown(name)
+    }
     /// `$name` in the body of a comprehension: the element that it is evaluated for.
-    fn element(&self, _: &str) -> Option<Cow<'_, Value>> {
-        None
+    fn element(&self, name: &str) -> Option<Cow<'_, Value>> {
+        self.outer()?.element(name)
     }
     /// How many facts the query around may still look at, with those within it. An element of a comprehension counts as several.
     fn budget(&self) -> Option<&Cell<u64>> {
-        None
+        self.outer()?.budget()
     }
 }
 
@@ -50,48 +65,12 @@ pub enum Lookup<'a> {
 #[derive(Debug, Clone, Copy, Default)]
 pub struct NothingKnown;
 
-impl Scope for NothingKnown {
-    fn variable(&self, _: &str) -> Option<Cow<'_, Value>> {
-        None
-    }
-
-    fn output(&self, _: &str) -> Option<Cow<'_, Value>> {
-        None
-    }
-
-    fn port(&self, _: StateId, _: &str) -> Option<Cow<'_, Value>> {
-        None
-    }
-
-    fn fact(&self, _: &FactPattern) -> Lookup<'_> {
-        Lookup::Unknown
-    }
-
-    fn each_fact(&self, _: &FactPattern, _: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
-        false
-    }
-}
+impl Scope for NothingKnown {}
 
 /// The scope in which only these variables are known.
 impl Scope for BTreeMap<String, Value> {
     fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
         self.get(name).map(Cow::Borrowed)
-    }
-
-    fn output(&self, _: &str) -> Option<Cow<'_, Value>> {
-        None
-    }
-
-    fn port(&self, _: StateId, _: &str) -> Option<Cow<'_, Value>> {
-        None
-    }
-
-    fn fact(&self, _: &FactPattern) -> Lookup<'_> {
-        Lookup::Unknown
-    }
-
-    fn each_fact(&self, _: &FactPattern, _: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
-        false
     }
 }
 
@@ -106,36 +85,12 @@ pub struct WithVariable<'a> {
 }
 
 impl Scope for WithVariable<'_> {
+    fn outer(&self) -> Option<&dyn Scope> {
+        Some(self.outer)
+    }
+
     fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
         if name == self.name { self.value.map(Cow::Borrowed) } else { self.outer.variable(name) }
-    }
-
-    fn output(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.outer.output(name)
-    }
-
-    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
-        self.outer.port(state, port)
-    }
-
-    fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
-        self.outer.fact(pattern)
-    }
-
-    fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
-        self.outer.each_fact(pattern, visit)
-    }
-
-    fn unknown(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.outer.unknown(name)
-    }
-
-    fn element(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.outer.element(name)
-    }
-
-    fn budget(&self) -> Option<&Cell<u64>> {
-        self.outer.budget()
     }
 }
 
@@ -152,28 +107,8 @@ pub struct WithElement<'a> {
 }
 
 impl Scope for WithElement<'_> {
-    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.outer.variable(name)
-    }
-
-    fn output(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.outer.output(name)
-    }
-
-    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
-        self.outer.port(state, port)
-    }
-
-    fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
-        self.outer.fact(pattern)
-    }
-
-    fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
-        self.outer.each_fact(pattern, visit)
-    }
-
-    fn unknown(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.outer.unknown(name)
+    fn outer(&self) -> Option<&dyn Scope> {
+        Some(self.outer)
     }
 
     fn element(&self, name: &str) -> Option<Cow<'_, Value>> {

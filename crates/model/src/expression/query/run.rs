@@ -221,24 +221,8 @@ struct WithRow<'a> {
 }
 
 impl Scope for WithRow<'_> {
-    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.outer.variable(name)
-    }
-
-    fn output(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.outer.output(name)
-    }
-
-    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
-        self.outer.port(state, port)
-    }
-
-    fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
-        self.outer.fact(pattern)
-    }
-
-    fn each_fact(&self, pattern: &FactPattern, visit: &mut dyn FnMut(&FactKey, &Value) -> bool) -> bool {
-        self.outer.each_fact(pattern, visit)
+    fn outer(&self) -> Option<&dyn Scope> {
+        Some(self.outer)
     }
 
     fn unknown(&self, name: &str) -> Option<Cow<'_, Value>> {
@@ -246,10 +230,6 @@ impl Scope for WithRow<'_> {
             Some(at) => self.row[at].as_ref().map(Cow::Borrowed),
             None => self.outer.unknown(name),
         }
-    }
-
-    fn element(&self, name: &str) -> Option<Cow<'_, Value>> {
-        self.outer.element(name)
     }
 
     fn budget(&self) -> Option<&Cell<u64>> {
