@@ -7,17 +7,18 @@ use crate::id::{SessionId, Slot};
 use crate::pool::Pool;
 use crate::record::Effect;
 use crate::resource::{Description, LONGEST_STANDSTILL_MS, Resource, ResourceSpec, ResourceView, STANDSTILL_ATTRIBUTE};
-use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
+use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use std::sync::Arc;
 
 impl Pool {
     /// Adds a resource, bound to a session if one is given. A resource of the same id and owner is updated: the kind
-    /// stays, its attributes and capacity are replaced (holders keep what they hold).
+    /// stays, its attributes and capacity are replaced (holders keep what they hold). One of the id that a task has made gives way to a
+    /// provider's: it is deleted, and who holds it loses it.
     ///
     /// # Errors
-    /// An unknown session, an id that another owner's resource has, a malformed or too large description.
+    /// An unknown session, an id that another owner's resource has and that does not give way, a malformed or too large description.
     pub fn create(
         &mut self,
         now: Timestamp,
@@ -35,6 +36,11 @@ impl Pool {
         let known = self.resources.find(&id);
         let before = known.and_then(|slot| Some((slot, self.resources.get(slot)?)));
         match before {
+            Some((slot, resource)) if resource.owner.as_ref() != session && self.gives_way(resource, spec.class) => {
+                self.check_room(session, 1)?;
+                self.commit(Effect::ResourceDeleted { slot, reason: EndReason::Displaced });
+                self.add(session, spec, id.clone(), numbered);
+            }
             Some((_, resource)) if resource.owner.as_ref() != session || resource.description.kind != spec.kind => {
                 let owner = resource.owner.as_ref().map_or_else(|| "no session".to_owned(), ToString::to_string);
                 return Err(PoolError::ResourceTaken { id, owner });
@@ -44,14 +50,27 @@ impl Pool {
                 self.commit(Effect::ResourceUpdated { slot, description });
             }
             None => {
-                self.check_room(session)?;
-                let (slot, owner) = (self.resources.next_slot(), session.cloned());
-                let description = Arc::new(spec.described(id.clone()));
-                self.commit(Effect::ResourceCreated { slot, description, owner, numbered });
+                self.check_room(session, 0)?;
+                self.add(session, spec, id.clone(), numbered);
             }
         }
         self.schedule();
         self.get(&id).ok_or(PoolError::UnknownResource { id })
+    }
+
+    fn add(&mut self, session: Option<&SessionId>, spec: ResourceSpec, id: String, numbered: u64) {
+        let (slot, owner) = (self.resources.next_slot(), session.cloned());
+        let description = Arc::new(spec.described(id));
+        self.commit(Effect::ResourceCreated { slot, description, owner, numbered });
+    }
+
+    /// Whether a resource is a task's, and gives its id to another of this class: who may create others than a task's is a provider. Nothing
+    /// moves for what a task has made, so that no standstill is lost with it. An operator's stays.
+    fn gives_way(&self, resource: &Resource, class: ResourceClass) -> bool {
+        let owner = resource.owner.as_ref().and_then(|owner| self.sessions.get(owner));
+        resource.description.class == ResourceClass::Task
+            && class != ResourceClass::Task
+            && owner.is_some_and(|owner| !owner.is_operators())
     }
 
     /// Removes a resource; holders hear [`crate::Change::ResourceLost`]. `None` as session may delete anything.
@@ -137,17 +156,17 @@ impl Pool {
         }
     }
 
-    /// Whether there may be one more resource of a session; without one it is an operator's.
-    fn check_room(&self, session: Option<&SessionId>) -> Result<(), PoolError> {
-        let limit = self.limits.resources;
+    /// Whether there may be one more resource of a session when so many have gone; without a session it is an operator's.
+    fn check_room(&self, session: Option<&SessionId>, gone: usize) -> Result<(), PoolError> {
+        let (limit, there) = (self.limits.resources, self.resources.len() - gone);
         let Some(session) = session.map(|id| self.session(id)).transpose()? else {
-            let room = self.resources.len() < limit;
+            let room = there < limit;
             let refused = || PoolError::TooMany { what: "resources", whose: ALL, key: "resources", limit };
             return room.then_some(()).ok_or_else(refused);
         };
         let share = Share {
             what: "resources",
-            there: self.resources.len(),
+            there,
             limit: ("resources", limit),
             for_operators: ("resources_for_operators", self.limits.resources_for_operators),
             of_caller: self.callers.resources(&session.opened_by),

@@ -145,6 +145,8 @@ pub enum EndReason {
     Undelivered,
     /// Somebody else than its holder ended it.
     Revoked,
+    /// A provider offers its own resource under the id that a task had given to one.
+    Displaced,
 }
 
 impl EndReason {
@@ -164,6 +166,7 @@ impl fmt::Display for EndReason {
             EndReason::UsedUp => "used up",
             EndReason::Undelivered => "undelivered",
             EndReason::Revoked => "revoked",
+            EndReason::Displaced => "displaced by a provider's resource of its id",
         })
     }
 }
