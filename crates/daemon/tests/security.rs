@@ -20,6 +20,7 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity};
+use tonic_types::StatusExt;
 
 type Raw = ResourceServiceClient<Traced>;
 
@@ -202,10 +203,45 @@ async fn who_opened_a_session_is_known_after_a_restart_and_nobody_takes_it_over(
     let sessions =
         in_time(opener.list_sessions(v1::ListSessionsRequest::default())).await.unwrap().into_inner().sessions;
     assert_eq!(sessions[0].opened_by, "first (certificate)");
-    // When it has ended, its name is anybody's.
+    // When it has ended, its id is still the opener's, also after another restart.
     in_time(ping(&mut opener, "s", 0)).await.unwrap();
-    assert!(in_time(ping(&mut stranger, "s", 60_000)).await.unwrap().created);
-    after.end().await;
+    let mut running = after;
+    for _ in 0..2 {
+        let refused = in_time(ping(&mut authority.client(&running.endpoint, Some(&second)), "s", 60_000)).await;
+        let refused = refused.unwrap_err();
+        let reason = refused.get_details_error_info().unwrap().reason;
+        assert_eq!((refused.code(), reason.as_str()), (Code::PermissionDenied, "NOT_YOURS"));
+        assert!(refused.message().contains("its id is kept for first (certificate)"), "{refused}");
+        running.end().await;
+        running = start(&system, "localhost:0".parse().unwrap(), &service).await;
+    }
+    let mut opener = authority.client(&running.endpoint, Some(&first));
+    assert!(in_time(ping(&mut opener, "s", 60_000)).await.unwrap().created);
+    running.end().await;
+}
+
+#[tokio::test]
+async fn a_provider_has_its_resource_also_where_a_task_took_the_id_while_it_was_away() {
+    let (system, files, authority) = (TestSystem::new(), tempfile::tempdir().unwrap(), Authority::new());
+    let (own, task, cell) = (authority.sign(), authority.sign(), authority.sign());
+    let mut service = known_by_certificate(&authority, &own, files.path(), &[(&task, "task"), (&cell, "cell")]);
+    service.access.certificates[1].roles = vec![Role::Agent];
+    let running = start(&system, "localhost:0".parse().unwrap(), &service).await;
+    let arm = |session: &str, class: v1::ResourceClass| {
+        let mut create = create(session, class);
+        create.resource.as_mut().unwrap().id = "arm@sim".into();
+        create
+    };
+    let mut task = authority.client(&running.endpoint, Some(&task));
+    let mut cell = authority.client(&running.endpoint, Some(&cell));
+    in_time(ping(&mut task, "t", 60_000)).await.unwrap();
+    in_time(ping(&mut cell, "c", 60_000)).await.unwrap();
+    in_time(task.create(arm("t", v1::ResourceClass::Task))).await.unwrap();
+    let made = in_time(cell.create(arm("c", v1::ResourceClass::Module))).await.unwrap().into_inner().resource.unwrap();
+    assert_eq!((made.id.as_str(), made.session_id.as_str()), ("arm@sim", "c"));
+    let refused = in_time(task.create(arm("t", v1::ResourceClass::Task))).await.unwrap_err();
+    assert_eq!(refused.code(), Code::AlreadyExists, "{refused}");
+    running.end().await;
 }
 
 #[tokio::test]

@@ -49,6 +49,7 @@ impl Pool {
                 } else {
                     let new = Session::new(client.clone(), Arc::default(), 0, *ttl, expires);
                     self.callers.opened(&new.opened_by);
+                    self.kept_ids.give_up(session);
                     self.sessions.insert(session.clone(), new);
                 }
                 self.start_session_timer(session, expires);
@@ -79,6 +80,7 @@ impl Pool {
                 self.stop_timer(known.expires, Timer::Session(session.clone()));
                 self.resources.closed(session);
                 self.callers.closed(&known.opened_by);
+                self.kept_ids.keep(session, &known.opened_by, self.now, &self.limits);
                 Ok(())
             }
             Effect::ResourceCreated { slot, description, owner, numbered } => {
@@ -322,6 +324,7 @@ impl Pool {
             return Err(format!("{id} is there already"));
         }
         self.callers.opened(&opened_by);
+        self.kept_ids.give_up(id);
         self.timers.insert((expires, Timer::Session(id.clone())));
         Ok(())
     }

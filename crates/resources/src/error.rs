@@ -66,6 +66,19 @@ pub enum PoolError {
         /// Who spoke.
         speaker: Arc<str>,
     },
+    /// Somebody speaks for a session that has ended, whose id is kept for who opened it.
+    #[error(
+        "session `{}` has ended, and its id is kept for {opened_by}, who opened it: {speaker} has to open a session with another id",
+        session.as_str()
+    )]
+    SessionIdKept {
+        /// Which.
+        session: SessionId,
+        /// For whom.
+        opened_by: Arc<str>,
+        /// Who spoke.
+        speaker: Arc<str>,
+    },
     /// Fewer resources match than the operation takes.
     #[error("{wanted} wanted, but {found} units of it are free")]
     NotEnough {

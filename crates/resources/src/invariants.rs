@@ -102,6 +102,10 @@ impl Pool {
         let ending = |id: &SessionId| self.sessions.get(id).is_some_and(|session| session.ending.is_some());
         let overdue = |timer: &Timer| !matches!(timer, Timer::Session(id) if !ending(id));
         ensure(self.overdue.iter().all(overdue), || "a session that lives is overdue".to_owned())?;
+        let of_living = |(id, _): (&SessionId, _)| self.sessions.contains_key(id);
+        ensure(self.kept_ids.agree() && !self.kept_ids.iter().any(of_living), || {
+            "the ids that are kept do not agree, or one of a session that lives is kept".to_owned()
+        })?;
         let unwritten = self.sessions.values().any(|session| session.ending.is_some() != session.ttl.is_zero());
         ensure(!unwritten, || "that a session ends is not written down".to_owned())?;
         let timers = self.timers.iter().map(|(_, timer)| timer).chain(&self.overdue).cloned().collect::<BTreeSet<_>>();

@@ -50,6 +50,7 @@ mod group;
 mod history;
 mod id;
 mod invariants;
+mod kept_ids;
 mod kinds;
 mod lease;
 mod limits;

@@ -19,6 +19,12 @@ pub struct Limits {
     pub sessions_per_caller: usize,
     /// Of all sessions, so many are only for operators.
     pub sessions_for_operators: usize,
+    /// Ids of sessions that have ended, which are kept for their openers: of the caller with the most, the oldest is given up first.
+    pub kept_session_ids: usize,
+    /// Of these, those of one caller: the caller's own oldest is given up first.
+    pub kept_session_ids_per_caller: usize,
+    /// And for so long at the most, in milliseconds. Then anybody may open a session of that id.
+    pub keep_session_ids_for_ms: u64,
     /// Queued acquires in all. Who can be served at once does not queue, and is not refused for this.
     pub waiters: usize,
     /// Queued acquires of all sessions that one caller opened.
@@ -84,6 +90,9 @@ impl Default for Limits {
             sessions: 10_000,
             sessions_per_caller: 2_500,
             sessions_for_operators: 500,
+            kept_session_ids: 10_000,
+            kept_session_ids_per_caller: 2_500,
+            keep_session_ids_for_ms: 604_800_000,
             waiters: 10_000,
             waiters_per_caller: 4_500,
             waiters_for_operators: 500,

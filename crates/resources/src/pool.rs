@@ -8,6 +8,7 @@ use crate::expiry::{Timer, Work};
 use crate::fingerprint::Fingerprint;
 use crate::history::{Compacted, History};
 use crate::id::{SessionId, Slot, WaiterId};
+use crate::kept_ids::KeptIds;
 use crate::kinds::Kinds;
 use crate::lease::{EndingLeases, LeaseView, Leases};
 use crate::limits::Limits;
@@ -33,6 +34,8 @@ pub struct Pool {
     // What is durable; changed in `apply.rs` only.
     pub(crate) resources: Resources,
     pub(crate) sessions: Sessions,
+    /// For whom the ids of sessions that have ended are kept.
+    pub(crate) kept_ids: KeptIds,
     pub(crate) leases: Leases,
     /// What leases that have ended have left.
     pub(crate) ending: EndingLeases,

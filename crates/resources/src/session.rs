@@ -123,11 +123,11 @@ impl Pool {
     }
 
     /// The session lives for `ttl` from now. An unknown or expired one is opened (anew: nothing of an earlier one is left) by the
-    /// speaker, whose it is from then on, and the answer is true. `client` says who that is, for people. Only a new session or
+    /// speaker, whose it is from then on, also after its end (see [`Pool::check_speaker`]), and the answer is true. `client` says who that is, for people. Only a new session or
     /// another `ttl` is written down.
     ///
     /// # Errors
-    /// A session that another opened or that is still ending, a malformed name, no time to live, or too many sessions.
+    /// A session that another opened, or opened last, or that is still ending, a malformed name, no time to live, or too many sessions.
     pub fn keep_alive_as(
         &mut self,
         now: Timestamp,
@@ -202,22 +202,27 @@ impl Pool {
         Ok(())
     }
 
-    /// Whether the speaker may speak for a session. One that is not there is nobody's.
+    /// Whether the speaker may speak for a session. One that has ended is still its opener's, as long as its id is kept
+    /// ([`Limits::kept_session_ids`]); any other one that is not there is nobody's.
     ///
     /// # Errors
-    /// A session that another opened.
+    /// A session that another opened, or the id of one.
     pub fn check_speaker(&mut self, now: Timestamp, speaker: &Speaker, id: &SessionId) -> Result<(), PoolError> {
         self.begin(now);
-        match self.sessions.get(id) {
-            Some(session) if !speaker.for_anybody && session.opened_by != speaker.name => {
-                Err(PoolError::SessionOfAnother {
-                    session: id.clone(),
-                    opened_by: session.opened_by.clone(),
-                    speaker: speaker.name.clone(),
-                })
-            }
-            _ => Ok(()),
+        if speaker.for_anybody {
+            return Ok(());
         }
+        let (session, speaker) = (id.clone(), speaker.name.clone());
+        let Some(known) = self.sessions.get(id) else {
+            let kept_for = self.kept_ids.opener(id, self.now, &self.limits).filter(|opener| **opener != speaker);
+            let refused =
+                |opener: &Arc<str>| Err(PoolError::SessionIdKept { session, opened_by: opener.clone(), speaker });
+            return kept_for.map_or(Ok(()), refused);
+        };
+        if known.opened_by != speaker {
+            return Err(PoolError::SessionOfAnother { session, opened_by: known.opened_by.clone(), speaker });
+        }
+        Ok(())
     }
 
     /// The same pool, in which every session expires so much later, unless it is pinged before: what a predecessor of this pool's owner

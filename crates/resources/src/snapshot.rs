@@ -24,8 +24,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The last versions without numbers of sessions, without callers of answers and openers of leases that end, without leases that end, and
+/// The last versions without ids that are kept, without numbers of sessions, without callers of answers and openers of leases that end, without leases that end, and
 /// without openers of sessions.
+const WITHOUT_KEPT_IDS: u8 = 9;
 const WITHOUT_NUMBERS: u8 = 6;
 const WITHOUT_CALLERS: u8 = 5;
 const WITHOUT_ENDING: u8 = 4;
@@ -56,6 +57,8 @@ pub struct Snapshot {
     /// The numbers of the sessions, in their order; 0 where they are not here.
     numbers: Vec<u64>,
     last_session: u64,
+    /// For whom the ids of sessions that have ended are kept, the oldest first.
+    kept_ids: Vec<(SessionId, Arc<str>)>,
 }
 
 /// A snapshot or a record that does not fit: the log has a gap, or is of another pool.
@@ -97,9 +100,10 @@ impl Snapshot {
         let missing = without(WITHOUT_OPENERS, 1)
             + without(WITHOUT_ENDING, 1)
             + without(WITHOUT_CALLERS, 2)
-            + without(WITHOUT_NUMBERS, 2);
+            + without(WITHOUT_NUMBERS, 2)
+            + without(WITHOUT_KEPT_IDS, 1);
         // An empty list, or 0, for each that is missing, as postcard writes it.
-        let mut snapshot: Snapshot = versioned::decode(version, SNAPSHOT, &[bytes, &[0; 6][..missing]].concat())?;
+        let mut snapshot: Snapshot = versioned::decode(version, SNAPSHOT, &[bytes, &[0; 7][..missing]].concat())?;
         if !knows_fingerprints(version) {
             snapshot.answers.iter_mut().for_each(|(_, fingerprint, _)| *fingerprint = Fingerprint::UNKNOWN);
         }
@@ -134,6 +138,7 @@ impl Pool {
             ended: self.ending.values().map(|ending| ending.opened_by.clone()).collect(),
             numbers: self.sessions.values().map(|session| session.number).collect(),
             last_session: self.last_session,
+            kept_ids: self.kept_ids.iter().map(|(id, opened_by)| (id.clone(), opened_by.clone())).collect(),
         }
     }
 
@@ -174,6 +179,9 @@ impl Pool {
             let expires = self.now + ttl;
             self.sessions.insert(id.clone(), Session::new(client, opened_by, number, ttl, expires));
             self.start_session_timer(&id, expires);
+        }
+        for (id, opened_by) in &snapshot.kept_ids {
+            self.kept_ids.keep(id, opened_by, self.now, &self.limits);
         }
         for (slot, resource) in snapshot.resources {
             let consumers = resource.consumers.iter().map(|(session, _)| (session, false));

@@ -84,6 +84,16 @@ fn still_remembers_the_first(pool: &mut Pool, n: usize) -> Result<(), String> {
     if id(ask(pool, 1)) == "Tool-2" { Ok(()) } else { Err("performed twice".to_owned()) }
 }
 
+/// Adam opens a session and closes it, the nth; the id of his first one is still kept for him.
+fn keeps_the_first_of_adam(pool: &mut Pool, now: Timestamp, n: usize) -> Result<(), String> {
+    let id = SessionId::from(format!("k{n}").as_str());
+    pool.keep_alive_as(now, &adam(), &id, "test", TTL).unwrap();
+    pool.close_session(now, &id).unwrap();
+    let eve = Speaker { name: "eve".into(), for_anybody: false };
+    let refused = pool.clone().keep_alive_as(now, &eve, &SessionId::from("k1"), "test", TTL);
+    refused.map_or(Ok(()), |_| Err("session k1 is opened by another".to_owned()))
+}
+
 /// Does something for the nth time.
 type Act = fn(&mut Pool, usize) -> Result<(), String>;
 
@@ -114,6 +124,24 @@ fn rows() -> Vec<(&'static str, Limits, Act, &'static str)> {
             Limits { sessions: EDGE + 2, sessions_for_operators: 1, ..all() },
             |pool, n| open(pool, &adam(), &format!("s{n}")),
             "sessions of all who are no operators: the limit of 4 is reached (limits.sessions_for_operators)",
+        ),
+        (
+            "kept_session_ids",
+            Limits { kept_session_ids: EDGE, ..all() },
+            |pool, n| keeps_the_first_of_adam(pool, NOW, n),
+            "session k1 is opened by another",
+        ),
+        (
+            "kept_session_ids_per_caller",
+            Limits { kept_session_ids_per_caller: EDGE, ..all() },
+            |pool, n| keeps_the_first_of_adam(pool, NOW, n),
+            "session k1 is opened by another",
+        ),
+        (
+            "keep_session_ids_for_ms",
+            Limits { keep_session_ids_for_ms: EDGE as u64, ..all() },
+            |pool, n| keeps_the_first_of_adam(pool, Timestamp((n as u64 - 1) * 1_000_000), n),
+            "session k1 is opened by another",
         ),
         (
             "waiters",
@@ -294,6 +322,9 @@ fn every_bound_at_its_edge_and_one_past_it() {
         sessions: _,
         sessions_per_caller: _,
         sessions_for_operators: _,
+        kept_session_ids: _,
+        kept_session_ids_per_caller: _,
+        keep_session_ids_for_ms: _,
         waiters: _,
         waiters_per_caller: _,
         waiters_for_operators: _,
@@ -446,6 +477,8 @@ fn a_bound_that_is_lowered_below_what_is_there_takes_nothing_and_admits_nothing_
             sessions: bound,
             sessions_per_caller: bound,
             sessions_for_operators: bound,
+            kept_session_ids: bound,
+            kept_session_ids_per_caller: bound,
             waiters: bound,
             waiters_per_caller: bound,
             waiters_for_operators: bound,

@@ -379,8 +379,8 @@ fn answers_that_an_earlier_version_remembers_for_nobody_knows_whom_are_given_to_
     assert_eq!(again, Ok(ratn_resources::Reply::Done));
 }
 
-/// The numbers of sessions in a snapshot, where one was opened, and the last number given.
-const ONE_NUMBERED: [u8; 3] = [1, 1, 1];
+/// The numbers of sessions in a snapshot, where one was opened, the last number given, and that no id is kept.
+const ONE_NUMBERED: [u8; 4] = [1, 1, 1, 0];
 
 #[test]
 fn a_session_that_is_opened_anew_has_another_number_from_records_from_a_snapshot_and_where_everything_was_lost() {

@@ -228,7 +228,7 @@ fn standstill_of_what_no_session_provides_is_confirmed_by_the_opener_of_the_lost
     let opened = |pool: &mut Pool, name: &str| {
         pool.keep_alive_as(at(100), &speaker(name), &session("a"), name, Duration::from_secs(60)).unwrap();
     };
-    let mut pool = Pool::new(Limits::default());
+    let mut pool = Pool::new(Limits { kept_session_ids: 0, ..Limits::default() });
     pool.keep_alive_as(at(0), &speaker("adam"), &session("a"), "a", Duration::from_millis(50)).unwrap();
     pool.create(at(0), None, arm().standstill(BOUND)).unwrap();
     let block = Requirement::new(ResourceOperation::Block, "Arm");
@@ -237,8 +237,10 @@ fn standstill_of_what_no_session_provides_is_confirmed_by_the_opener_of_the_lost
     pool.advance(at(100));
     let entry = encode(&pool.take_records());
     let snapshot = Snapshot::decode(&pool.snapshot().encode()).unwrap();
-    let of_records = Pool::restore(Limits::default(), at(100), None, decode(&entry).unwrap()).unwrap();
-    let of_snapshot = Pool::restore(Limits::default(), at(100), Some(snapshot), []).unwrap();
+    // Its id is anybody's again, so that another can open it.
+    let limits = Limits { kept_session_ids: 0, ..Limits::default() };
+    let of_records = Pool::restore(limits.clone(), at(100), None, decode(&entry).unwrap()).unwrap();
+    let of_snapshot = Pool::restore(limits, at(100), Some(snapshot), []).unwrap();
     for pool in [pool, of_records, of_snapshot] {
         let confirm = |pool: &mut Pool, name: &str| {
             let confirm = Request::ConfirmStandstill { session: Some(session("a")), lease, resource: "arm".to_owned() };

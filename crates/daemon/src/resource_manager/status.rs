@@ -15,7 +15,9 @@ pub(super) fn of_error(error: &PoolError) -> Status {
         PoolError::UnknownWaiter { .. } => (Code::NotFound, "WAITER_UNKNOWN"),
         PoolError::UnknownResource { .. } => (Code::NotFound, "RESOURCE_UNKNOWN"),
         PoolError::ResourceTaken { .. } => (Code::AlreadyExists, "RESOURCE_TAKEN"),
-        PoolError::NotYours { .. } | PoolError::SessionOfAnother { .. } => (Code::PermissionDenied, "NOT_YOURS"),
+        PoolError::NotYours { .. } | PoolError::SessionOfAnother { .. } | PoolError::SessionIdKept { .. } => {
+            (Code::PermissionDenied, "NOT_YOURS")
+        }
         PoolError::NotEnough { .. } => (Code::FailedPrecondition, "NOT_ENOUGH"),
         PoolError::Malformed { .. } => (Code::InvalidArgument, "MALFORMED"),
         PoolError::RequestIdReused { .. } => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
