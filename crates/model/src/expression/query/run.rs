@@ -3,9 +3,8 @@
 use super::MAX_STEPS;
 use super::plan::{Found, Plan, Slot, Step};
 use crate::expression::evaluate::{EvaluateError, equal};
-use crate::expression::{Lookup, Scope, bind};
+use crate::expression::{Scope, bind};
 use crate::fact::{FactKey, FactPattern, Term};
-use crate::id::StateId;
 use crate::value::Value;
 use std::borrow::Cow;
 use std::cell::Cell;
