@@ -12,7 +12,7 @@ use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
 /// A part of a daemon, for its log.
@@ -46,6 +46,14 @@ pub(crate) struct OfferLifecycle {
     pub(crate) draining: watch::Receiver<BTreeSet<String>>,
 }
 
+/// A session whose id is kept, so that the next process goes on with it.
+#[derive(Debug)]
+pub(crate) struct LastingSession {
+    pub(crate) id: String,
+    /// Makes another id where this one is another caller's. It is answered once everybody who has to know it does.
+    pub(crate) renewals: mpsc::Sender<oneshot::Sender<String>>,
+}
+
 /// How the resource manager is found.
 #[derive(Debug, Clone)]
 pub(crate) struct Manager {
@@ -58,8 +66,8 @@ pub(crate) struct Link {
     pub(crate) manager: Manager,
     /// The name of the provider, for people.
     pub(crate) client: String,
-    /// The id of the session; `None` for a new id with every manager.
-    pub(crate) session: Option<String>,
+    /// The session that outlasts this process; `None` for one of a new id with every manager.
+    pub(crate) session: Option<LastingSession>,
     pub(crate) ttl: Duration,
     pub(crate) wanted: watch::Receiver<Wanted>,
     /// For a provider whose resources come and go.
@@ -91,6 +99,19 @@ impl Manager {
     }
 }
 
+impl LastingSession {
+    async fn renew(&mut self) {
+        let (answer, renewed) = oneshot::channel();
+        if self.renewals.send(answer).await.is_ok()
+            && let Ok(id) = renewed.await
+        {
+            self.id = id;
+        } else {
+            tokio::time::sleep(LOOK_INTERVAL).await;
+        }
+    }
+}
+
 impl Link {
     /// Keeps the link up until `shutdown`. Then it closes the session, and with the session every resource is gone.
     pub(crate) async fn keep(mut self, shutdown: CancellationToken) {
@@ -101,11 +122,15 @@ impl Link {
                 endpoint = self.manager.find() => endpoint,
                 () = shutdown.cancelled() => return,
             };
-            let session = match self.session.clone() {
-                Some(id) => Session::open_as(&channels, &endpoint, id, &self.client, self.ttl),
+            let session = match &self.session {
+                Some(known) => Session::open_as(&channels, &endpoint, known.id.clone(), &self.client, self.ttl),
                 None => Session::open(&channels, &endpoint, &self.client, self.ttl),
             };
             tokio::select! {
+                () = session.taken() => match &mut self.session {
+                    Some(known) => known.renew().await,
+                    None => tokio::time::sleep(LOOK_INTERVAL).await,
+                },
                 kept = self.keep_at(&channels, &endpoint, &session) => if let Err(error) = kept {
                     tracing::error!(%endpoint, "no link to the resource manager: {error}");
                     tokio::time::sleep(LOOK_INTERVAL).await;

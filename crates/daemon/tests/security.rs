@@ -4,7 +4,9 @@
 mod support;
 
 use ratn_daemon::access::{AccessConfig, CertificateAccess, Role, UserAccess};
+use ratn_daemon::config::state_directory;
 use ratn_daemon::metrics::Metrics;
+use ratn_daemon::process_manager::Template;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::service::ServiceConfig;
 use ratn_proto::v1;
@@ -15,12 +17,16 @@ use ratn_worker::trace::Traced;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, ExtendedKeyUsagePurpose, IsCa, KeyPair};
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Duration;
 use support::{TestSystem, in_time};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity};
 use tonic_types::StatusExt;
+
+/// The pause between two looks at what a daemon has done.
+const LOOK_INTERVAL: Duration = Duration::from_millis(20);
 
 type Raw = ResourceServiceClient<Traced>;
 
@@ -347,4 +353,76 @@ async fn names_with_control_characters_and_without_end_are_refused() {
     }
     let large = v1::ListRequest { kinds: vec!["x".repeat(32 * 1024 * 1024)], ..Default::default() };
     assert_eq!(in_time(client.list(large)).await.unwrap_err().code(), Code::OutOfRange);
+}
+
+/// A manager of this user, who is no operator there.
+async fn manager_without_operator(system: &TestSystem) -> Started {
+    let (uid, roles) = (nix::unistd::geteuid().as_raw(), vec![Role::Viewer, Role::Task, Role::Agent]);
+    let access = AccessConfig { users: vec![UserAccess { uid, roles }], ..AccessConfig::default() };
+    start(system, Endpoint::local(), &ServiceConfig { access, ..ServiceConfig::default() }).await
+}
+
+/// The state in which a session of this id is that of somebody who proves nothing, for an hour.
+async fn state_with_a_session_of_another(id: &str) -> TestSystem {
+    let elsewhere = TestSystem::new();
+    let manager = start(&elsewhere, Endpoint::loopback(), &ServiceConfig::default()).await;
+    in_time(ping(&mut Raw::new(elsewhere.channels.get(&manager.endpoint).unwrap()), id, 3_600_000)).await.unwrap();
+    manager.end().await;
+    elsewhere
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_process_manager_whose_session_id_is_anothers_goes_on_with_another_id_and_other_workers() {
+    let system = TestSystem::new();
+    let template = Template {
+        program: Some(env!("CARGO_BIN_EXE_ratn-test-worker").into()),
+        args: ["serve", "{id}", "{kind}", "{endpoint_file}"].map(str::to_owned).to_vec(),
+        min: 2,
+        max: Some(2),
+        ..Template::new("planner", "PathPlanner")
+    };
+    let manager = manager_without_operator(&system).await;
+    let processes = system.process_manager(vec![template]).await;
+    let before = ["planner-1@compute", "planner-2@compute"];
+    // Two workers that a session offers, those of before or others.
+    let offers = async |session: &str, those_of_before: bool| {
+        let endpoint = system.directory.find(resource_manager::ROLE).unwrap();
+        let mut client = Raw::new(system.channels.get(&endpoint).unwrap());
+        let kinds = vec!["PathPlanner".to_owned()];
+        let own = v1::ListRequest { session_id: session.into(), kinds, ..Default::default() };
+        in_time(async {
+            loop {
+                let listed = client.list(own.clone()).await.map(|listed| listed.into_inner().resources);
+                let listed = listed.unwrap_or_default();
+                let is_of_before = |resource: &v1::Resource| before.contains(&resource.id.as_str());
+                if listed.len() == 2 && listed.iter().all(|one| is_of_before(one) == those_of_before) {
+                    return;
+                }
+                tokio::time::sleep(LOOK_INTERVAL).await;
+            }
+        })
+        .await;
+    };
+    let file = system.directory.path().join("process-manager.session");
+    let first = std::fs::read_to_string(&file).unwrap();
+    offers(&first, true).await;
+    manager.end().await;
+
+    // The manager comes back with a state in which somebody else has the id.
+    let elsewhere = state_with_a_session_of_another(&first).await;
+    let state = |system: &TestSystem| state_directory(system.directory.path()).join(resource_manager::ROLE);
+    std::fs::remove_dir_all(state(&system)).unwrap();
+    std::fs::rename(state(&elsewhere), state(&system)).unwrap();
+    let manager = manager_without_operator(&system).await;
+    in_time(async {
+        while std::fs::read_to_string(&file).unwrap() == first {
+            tokio::time::sleep(LOOK_INTERVAL).await;
+        }
+    })
+    .await;
+    let second = std::fs::read_to_string(&file).unwrap();
+    // Those of before were told of another session, and confirm no lease of what this one offers.
+    offers(&second, false).await;
+    processes.end().await;
+    manager.end().await;
 }

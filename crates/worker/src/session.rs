@@ -7,6 +7,7 @@
 //!                                      └─ answer says `created`, or another number ─→ alive, next generation
 //! not alive ─ answer says that it is known ─→ alive, the same generation: a manager that was suspended, or away, has kept it
 //! ```
+//! A session whose id is another caller's does not come back ([`Session::taken`]): its client goes on with a session of another id.
 
 use crate::boot_clock::{BootClock, BootInstant};
 use crate::client::{Channels, fresh_id};
@@ -22,6 +23,8 @@ use tokio::task::JoinHandle;
 use tokio::time::{Instant, timeout};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
+use tonic::Status;
+use tonic_types::StatusExt;
 
 /// How long a session lives without a ping unless said otherwise.
 pub const DEFAULT_TTL: Duration = Duration::from_secs(3);
@@ -32,6 +35,8 @@ pub const GIVEN_UP_AFTER: u32 = 3;
 const PINGS_PER_TTL: u32 = 4;
 /// The pause before a reconnect; grows from the first to the second.
 const BACKOFF: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
+/// The reason of a refusal to speak for a session of another caller.
+const NOT_YOURS: &str = "NOT_YOURS";
 /// The last ping, which ends the session, is given this long.
 const FAREWELL: Duration = Duration::from_millis(200);
 
@@ -58,6 +63,8 @@ pub struct SessionState {
     pub unheard_since: Option<Instant>,
     /// The manager knew it from before when it was pinged for the first time: it goes on with what it has there.
     pub found: bool,
+    /// The manager has said last that the id is another caller's, who has a session of it or had the last one ([`Session::taken`]).
+    pub taken: bool,
 }
 
 /// Until when a client believes in its session: from its last answered ping on for its time to live, the time included in which the
@@ -70,12 +77,25 @@ pub(crate) struct Belief {
 
 /// No session within the deadline.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("the resource manager at {endpoint} opened no session within {waited_s:.1} s; is it running?")]
+#[error("the resource manager at {endpoint} opened no session within {waited_s:.1} s; {}", self.next())]
 pub struct SessionError {
     /// Where it was asked for.
     pub endpoint: Endpoint,
+    /// The id, where it is another caller's.
+    pub taken: Option<String>,
     /// How long was waited, in seconds.
     pub waited_s: f64,
+}
+
+impl SessionError {
+    fn next(&self) -> String {
+        match &self.taken {
+            Some(id) => {
+                format!("the id `{id}` is another caller's: ask as that caller, as an operator, or for another id")
+            }
+            None => "is it running?".to_owned(),
+        }
+    }
 }
 
 impl Session {
@@ -144,7 +164,8 @@ impl Session {
         if matches!(alive, Ok(Ok(_))) {
             return Ok(());
         }
-        Err(SessionError { endpoint: self.endpoint.clone(), waited_s: deadline.as_secs_f64() })
+        let taken = self.state.borrow().taken.then(|| self.id.clone());
+        Err(SessionError { endpoint: self.endpoint.clone(), taken, waited_s: deadline.as_secs_f64() })
     }
 
     /// Returns once what the session owned or held may be another's: it was not answered for its time to live, or the manager made
@@ -180,6 +201,17 @@ impl Session {
                 },
                 () = given_up => return,
             }
+        }
+    }
+
+    /// Returns once the manager says that the session's id is another caller's, who has a session of it or had the last one. What the
+    /// session owned or held is gone, or ends there with its time to live, and asking again does not help. For clients that can go on with a
+    /// session of another id. For one that provides something nothing is at rest because of that: start its provider anew
+    /// ([`crate::provider::Provider::start_at_rest`]).
+    pub async fn taken(&self) {
+        if self.state.clone().wait_for(|state| state.taken).await.is_err() {
+            // It has been closed.
+            std::future::pending().await
         }
     }
 
@@ -309,11 +341,15 @@ impl Keeper {
         let opening = timeout(self.patience(), client.keep_alive(ReceiverStream::new(outgoing))).await;
         let mut answers = match opening {
             Ok(Ok(answer)) => answer.into_inner(),
-            Ok(Err(status)) => return tracing::debug!(endpoint = %self.endpoint, %status, "no session yet"),
+            Ok(Err(status)) => return self.refused(&status),
             Err(_) => return,
         };
         loop {
-            let Ok(Ok(Some(answer))) = timeout(self.patience(), answers.message()).await else { return };
+            let answer = match timeout(self.patience(), answers.message()).await {
+                Ok(Ok(Some(answer))) => answer,
+                Ok(Err(status)) => return self.refused(&status),
+                Ok(Ok(None)) | Err(_) => return,
+            };
             let ttl = Duration::from_millis(answer.ttl_ms);
             // Counted from the question, so that it never lives longer here than there.
             self.expires.send_replace(asked + ttl);
@@ -327,6 +363,7 @@ impl Keeper {
                 state.found |= before.generation == 0 && !answer.created;
                 state.generation += u64::from(answer.created || is_another || before.generation == 0);
                 state.alive |= holds;
+                state.taken = false;
                 if holds {
                     state.unheard_since = None;
                 }
@@ -342,6 +379,16 @@ impl Keeper {
             if pings.send(self.ping(self.ttl)).await.is_err() {
                 return;
             }
+        }
+    }
+
+    fn refused(&self, status: &Status) {
+        let is_anothers = status.get_details_error_info().is_some_and(|info| info.reason == NOT_YOURS);
+        if !is_anothers {
+            return tracing::debug!(endpoint = %self.endpoint, %status, "no session yet");
+        }
+        if self.tell.send_if_modified(|state| !std::mem::replace(&mut state.taken, true)) {
+            tracing::warn!(endpoint = %self.endpoint, reason = status.message(), "the session's id is another caller's");
         }
     }
 

@@ -32,6 +32,9 @@ use tokio_util::task::AbortOnDropHandle;
 /// The pause before the brakes are asked again.
 const BRAKES_AGAIN: Duration = Duration::from_secs(1);
 
+/// The pause before a resource that was refused is offered again, in another session.
+const OFFER_AGAIN: Duration = Duration::from_secs(1);
+
 /// A part of the process, for its log.
 const LEASES: &str = "the watch of leases";
 
@@ -297,12 +300,25 @@ impl Worker {
             ),
             None => None,
         };
-        let offered = match &options.resource_manager {
+        let mut offered = match &options.resource_manager {
             Some(manager) => Some(offer(&channels, manager, &options, &endpoint, &leases, standstill).await?),
             None => None,
         };
         tracing::info!(id = %options.id, %endpoint, "serving");
 
+        while let Some(manager) = &options.resource_manager
+            && shutdown.run_until_cancelled(taken(offered.as_ref())).await.is_some()
+        {
+            // What was held of it is another's to give, or nobody's.
+            leases.lost("the id of the worker's session is another caller's");
+            drop(offered.take());
+            let again = offer(&channels, manager, &options, &endpoint, &leases, standstill);
+            match shutdown.run_until_cancelled(again).await {
+                Some(Ok(next)) => offered = Some(next),
+                Some(Err(error)) => tracing::warn!(id = %options.id, %error, "the worker's resource is refused"),
+                None => break,
+            }
+        }
         shutdown.cancelled().await;
         drop(published);
         // What the goals move stays this worker's until nothing moves any more.
@@ -374,6 +390,14 @@ struct Offered {
     session: Session,
     provider: Provider,
     watching: AbortOnDropHandle<()>,
+}
+
+/// Returns when it is to be offered in a session of another id: that of its session is another caller's, or there is none.
+async fn taken(offered: Option<&Offered>) {
+    match offered {
+        Some(offered) => offered.session.taken().await,
+        None => tokio::time::sleep(OFFER_AGAIN).await,
+    }
 }
 
 async fn offer(

@@ -25,7 +25,8 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
-use tonic::{Request, Response, Status, Streaming};
+use tonic::{Code, Request, Response, Status, Streaming};
+use tonic_types::{ErrorDetails, StatusExt};
 
 const LONG: Duration = Duration::from_secs(20);
 const TTL: Duration = Duration::from_millis(200);
@@ -45,8 +46,10 @@ struct Pool {
     /// So many answers that say that a session was made are lost with their stream.
     lost_answers: usize,
     resources: BTreeMap<String, ratn_proto::v1::Resource>,
-    /// Ids that another session has.
+    /// Ids of resources that another session has.
     taken: BTreeSet<String>,
+    /// Ids of sessions that another caller has.
+    anothers: BTreeSet<String>,
     /// So many creations end with their session before they are answered.
     short_lived: usize,
     /// Resources are watched, from now on or once more is known.
@@ -125,6 +128,10 @@ impl ResourceService for Manager {
         let answers = request.into_inner().map(move |ping| {
             let ping = ping?;
             let mut pool = manager.pool.lock().unwrap();
+            if pool.anothers.contains(&ping.session_id) {
+                let details = ErrorDetails::with_error_info("NOT_YOURS", "ratn", []);
+                return Err(Status::with_error_details(Code::PermissionDenied, "another's", details));
+            }
             let created = ping.ttl_ms > 0 && !pool.sessions.contains_key(&ping.session_id);
             if ping.ttl_ms == 0 {
                 pool.sessions.remove(&ping.session_id);
@@ -332,6 +339,74 @@ async fn a_session_without_its_manager_is_not_alive() {
     let session = Session::open(&Channels::new(), &endpoint, "test", TTL);
     let error = session.alive(Duration::from_millis(1)).await.unwrap_err().to_string();
     assert!(error.contains("rm.sock") && error.contains("is it running?"), "{error}");
+}
+
+#[tokio::test]
+async fn a_session_whose_id_is_another_callers_says_so_and_is_itself_again_when_it_is_not() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let session = Session::open_as(&Channels::new(), &endpoint, "mine".to_owned(), "test", TTL);
+    session.alive(LONG).await.unwrap();
+    assert!(!session.state().borrow().taken);
+    {
+        // It has ended, and another opened the next one of its id.
+        let mut pool = manager.pool.lock().unwrap();
+        pool.sessions.remove("mine");
+        pool.anothers.insert("mine".to_owned());
+    }
+    tokio::time::timeout(LONG, session.taken()).await.expect("nobody says so");
+    tokio::time::timeout(LONG, session.lost()).await.expect("it is believed in");
+    let refused = session.alive(TTL).await.unwrap_err().to_string();
+    assert!(refused.contains("the id `mine` is another caller's"), "{refused}");
+    manager.pool.lock().unwrap().anothers.clear();
+    session.alive(LONG).await.unwrap();
+    let state = *session.state().borrow();
+    assert_eq!((state.taken, state.generation), (false, 2));
+}
+
+/// A worker that stands alone and moves something: its session's id is another caller's from one moment on.
+#[tokio::test]
+async fn a_worker_whose_session_id_is_taken_goes_on_with_another_one_and_offers_nothing_before_it_is_at_rest() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    manager.pool.lock().unwrap().shows = Some(true);
+    let _serving = manager.serve(&endpoint).await;
+    let stands = Arc::new(Semaphore::new(0));
+    let options = WorkerOptions {
+        id: "arm@sim".to_owned(),
+        kind: "Arm".to_owned(),
+        listen: Endpoint::Unix(directory.path().join("arm.sock")),
+        resource_manager: Some(endpoint),
+        ..WorkerOptions::default()
+    };
+    let shutdown = CancellationToken::new();
+    let worker = Worker::new(options).safety(Safety::new(SlowBrakes(Arc::clone(&stands)))).shutdown(shutdown.clone());
+    let running = tokio::spawn(worker.run());
+    let take = |pool: &mut Pool| {
+        let ids: Vec<String> = std::mem::take(&mut pool.sessions).into_keys().collect();
+        pool.resources.clear();
+        pool.anothers.extend(ids);
+    };
+    manager.until(|pool| pool.watches > 1).await;
+    take(&mut manager.pool.lock().unwrap());
+    // A session of another id, and still nobody has said that nothing moves.
+    manager.until(|pool| pool.sessions.len() == 1 && pool.watches > 3).await;
+    tokio::time::sleep(3 * TTL).await;
+    assert!(manager.pool.lock().unwrap().resources.is_empty());
+    stands.add_permits(1);
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    take(&mut manager.pool.lock().unwrap());
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    {
+        let pool = manager.pool.lock().unwrap();
+        assert!(pool.sessions.contains_key(&pool.resources["arm@sim"].session_id));
+        assert_eq!(pool.anothers.len(), 2, "each time another id");
+    }
+    shutdown.cancel();
+    running.await.unwrap().unwrap();
 }
 
 #[tokio::test]

@@ -119,6 +119,8 @@ impl Link {
         tokio::select! {
             offered = offering => offered,
             () = watching => Ok(()),
+            // The next one has another id.
+            () = session.taken() => Ok(()),
         }
     }
 

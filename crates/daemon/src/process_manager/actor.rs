@@ -8,6 +8,7 @@ use super::pools::{Command, Event, PoolError, Pools, Restart};
 use super::predecessor::Adopted;
 use super::processes::{ProcessEvents, Processes, Told};
 use super::roster::Roster;
+use super::session_file::SessionFile;
 use super::spawner::Outcome;
 use super::tracking::Tracker;
 use super::usage::Usage;
@@ -87,6 +88,10 @@ pub(super) struct Parts {
     pub(super) short: watch::Sender<Shortages>,
     /// Measurements of the machine.
     pub(super) looks: mpsc::Receiver<Sample>,
+    /// Has the id of the session that offers the workers.
+    pub(super) session_file: SessionFile,
+    /// The link asks for another id: that of now is another caller's.
+    pub(super) renewals: mpsc::Receiver<oneshot::Sender<String>>,
 }
 
 struct Actor {
@@ -102,6 +107,7 @@ struct Actor {
     watchers: Vec<mpsc::Sender<WorkerStatus>>,
     usage: Usage,
     drained: Drained,
+    session_file: SessionFile,
 }
 
 /// Starts the actor; it ends with the token, once every worker has.
@@ -129,6 +135,7 @@ pub(super) fn start(
         watchers: Vec::new(),
         usage: Usage::new(),
         drained,
+        session_file: parts.session_file,
     };
     let inputs = Inputs {
         messages,
@@ -137,6 +144,7 @@ pub(super) fn start(
         uses: parts.uses,
         demand: parts.demand,
         looks: parts.looks,
+        renewals: parts.renewals,
     };
     let running = async move {
         let _ = vitals.guard("the actor of the pools", actor.run(adopted, inputs, &vitals, shutdown)).await;
@@ -159,6 +167,7 @@ struct Inputs {
     uses: mpsc::Receiver<Use>,
     demand: mpsc::Receiver<Vec<Demand>>,
     looks: mpsc::Receiver<Sample>,
+    renewals: mpsc::Receiver<oneshot::Sender<String>>,
 }
 
 impl Actor {
@@ -202,6 +211,7 @@ impl Actor {
                 Some(Use { id, held }) = inputs.uses.recv() => self.handle(Event::Used { id, held }),
                 Some(demand) = inputs.demand.recv() => self.handle(Event::Demanded(demand)),
                 Some(sample) = inputs.looks.recv() => self.handle(Event::Looked(sample)),
+                Some(answer) = inputs.renewals.recv() => self.renew_session(answer),
                 Some(message) = inputs.messages.recv() => self.receive(message),
                 _ = tick.tick() => {}
                 () = sleep_until(deadline) => self.handle(Event::Time),
@@ -216,6 +226,28 @@ impl Actor {
         let Some(commands) = self.pools.adopt(self.now(), &worker, outdated) else { return };
         self.processes.adopt(adopted);
         self.perform(commands);
+    }
+
+    /// The session that offers the workers has another id from now on. Those that were told of the one before confirm no lease of what this
+    /// one offers: none of them is offered, and others take their places.
+    fn renew_session(&mut self, answer: oneshot::Sender<String>) {
+        let id = match self.session_file.renew() {
+            Ok(id) => id,
+            Err(error) => return tracing::error!(%error, "the session gets no other id, and nothing is offered"),
+        };
+        tracing::warn!(session = id, "the session has another id now: every worker is replaced");
+        self.processes.offered_by(&id);
+        let pools = self.pools.status();
+        let known: BTreeSet<&str> =
+            pools.iter().flat_map(|pool| &pool.workers).map(|worker| worker.id.as_str()).collect();
+        self.wanted.send_modify(|wanted| wanted.retain(|id, _| !known.contains(id.as_str())));
+        let _ = answer.send(id);
+        for pool in &pools {
+            // On a host that is drained they end without a successor.
+            if let Ok((_, commands)) = self.pools.restart(self.now(), &Restart::Template(pool.template.clone())) {
+                self.perform(commands);
+            }
+        }
     }
 
     /// Ends every worker, whatever it takes.

@@ -28,6 +28,7 @@ mod processes;
 mod readiness;
 mod roster;
 mod service;
+mod session_file;
 mod spawner;
 mod status;
 mod template;
@@ -44,16 +45,16 @@ pub use template::{Liveness, Needs, Template};
 pub use tracking::Tracking;
 
 use crate::demand::{DemandLink, Shortages};
-use crate::link::{LINK, Link, Manager, OfferLifecycle, Wanted};
+use crate::link::{LINK, LastingSession, Link, Manager, OfferLifecycle, Wanted};
 use anyhow::Context;
 use machine::Machine;
 use processes::Told;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
-use ratn_worker::client::fresh_id;
 use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
 use roster::Roster;
+use session_file::SessionFile;
 use std::collections::BTreeSet;
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
@@ -108,7 +109,8 @@ pub async fn run_as(
     // Before anything is offered: what the last process manager offered goes where it is not wanted any more.
     let before: Vec<String> =
         left.iter().map(|entry| &entry.id).chain(unknown.iter().map(|intent| &intent.id)).cloned().collect();
-    let session = session_of(&directory).context("cannot keep the session's name")?;
+    let session_file = SessionFile::of(&directory);
+    let session = session_file.id().context("cannot keep the session's name")?;
     let told = Told { manager: processes::manager_of(&config, &directory), session: session.clone() };
     let adopted = predecessor::settle(left, unknown, &config.templates, &told, &directory, &tracker).await;
     roster.keep_only(&adopted.iter().map(|one| one.entry.id.as_str()).collect());
@@ -125,10 +127,11 @@ pub async fn run_as(
     let (used, uses) = mpsc::channel(OFFER_EVENTS);
     let (heard, demand) = mpsc::channel(DEMANDS);
     let (short, shortages) = watch::channel(Shortages::new());
+    let (renewals, renewed) = mpsc::channel(1);
     let link = Link {
         manager: Manager { configured: config.resource_manager.clone(), directory: directory.clone() },
         client: format!("{ROLE}@{}", config.host),
-        session: Some(session),
+        session: Some(LastingSession { id: session, renewals }),
         ttl: Duration::from_millis(config.session_ttl_ms),
         wanted: to_offer,
         lifecycle: Some(OfferLifecycle { events: report, draining }),
@@ -160,6 +163,8 @@ pub async fn run_as(
         demand,
         short,
         looks,
+        session_file,
+        renewals: renewed,
     };
     let (actor, ended) =
         actor::start(parts, serving.vitals.clone(), shutdown.clone()).context("cannot start workers")?;
@@ -171,18 +176,4 @@ pub async fn run_as(
     shutdown.cancel();
     let _ = tokio::join!(linked, ended);
     Ok(served?)
-}
-
-/// The name of the session of a runtime directory's process manager: a successor of one that was killed goes on with it, so that
-/// leases of workers that it adopts hold.
-fn session_of(directory: &RuntimeDirectory) -> std::io::Result<String> {
-    let file = directory.path().join("process-manager.session");
-    match std::fs::read_to_string(&file) {
-        Ok(known) if !known.trim().is_empty() => Ok(known.trim().to_owned()),
-        _ => {
-            let fresh = fresh_id(ROLE);
-            std::fs::write(&file, &fresh)?;
-            Ok(fresh)
-        }
-    }
 }

@@ -100,8 +100,8 @@ struct Process {
     /// The directory of the worker's files.
     directory: RuntimeDirectory,
     pid: u32,
-    /// The template that the worker was started from, until the roster has it.
-    template: Option<Template>,
+    /// The template that the worker was started from, and the session that it was told offers it, until the roster has them.
+    started: Option<(Template, String)>,
     /// Dropped when the process is known; the readiness check waits for that.
     known: Option<oneshot::Sender<()>>,
     attended: Option<(AbortHandle, mpsc::Sender<Duration>)>,
@@ -156,6 +156,11 @@ impl Processes {
             ended_logs: EndedLogs::default(),
         };
         Ok((processes, ProcessEvents { outcomes, serving: served, health: answered }))
+    }
+
+    /// Workers that are started from now on are told that this session offers them.
+    pub(super) fn offered_by(&mut self, session: &str) {
+        session.clone_into(&mut self.told.session);
     }
 
     /// Starts a worker of a template.
@@ -244,7 +249,8 @@ impl Processes {
             self.senders.clone(),
         );
         let attended = Some((tokio::spawn(exit_on_panic(HEALTH_OF_WORKER, attended)).abort_handle(), ask));
-        let process = Process { directory, pid: 0, template: Some(template.clone()), known: Some(known), attended };
+        let started = Some((template.clone(), self.told.session.clone()));
+        let process = Process { directory, pid: 0, started, known: Some(known), attended };
         self.by_id.insert(id.to_owned(), process);
         Ok(())
     }
@@ -254,9 +260,9 @@ impl Processes {
         let Some(process) = self.by_id.get_mut(id) else { return };
         process.pid = pid;
         drop(process.known.take());
-        if let (Some(template), Some(began)) = (process.template.take(), predecessor::began(pid)) {
+        if let (Some((template, session)), Some(began)) = (process.started.take(), predecessor::began(pid)) {
             let limits = limits.to_owned();
-            let (manager, session) = (Some(self.told.manager.to_string()), Some(self.told.session.clone()));
+            let (manager, session) = (Some(self.told.manager.to_string()), Some(session));
             self.roster.began(Entry {
                 id: id.to_owned(),
                 pid,
@@ -294,7 +300,7 @@ impl Processes {
             let answered = answer(health_check, id.clone(), questions, self.senders.health.clone());
             (tokio::spawn(exit_on_panic(HEALTH_OF_WORKER, answered)).abort_handle(), ask)
         });
-        let process = Process { directory, pid: entry.pid, template: None, known: None, attended };
+        let process = Process { directory, pid: entry.pid, started: None, known: None, attended };
         self.by_id.insert(id.clone(), process);
         self.roster.began(entry);
         let tracker = self.tracker.clone();
