@@ -9,7 +9,7 @@ mod support;
 use anyhow::{Context, ensure};
 use cluster::{Cluster, Proxy};
 use nix::sys::signal::Signal;
-use ratn_worker::vitals::EXIT_CODE_PANICKED;
+use ratn_worker::vitals::{EXIT_CODE_DEPOSED, EXIT_CODE_PANICKED};
 use std::os::unix::net::UnixDatagram;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -84,7 +84,7 @@ fn a_panic_in_a_thread_of_the_log_in_etcd_or_of_a_standby_ends_the_process() -> 
         place.ratn(&["resource", "create", "Fixture", "--id", id, "--attribute", &note]).output()?;
         Ok(())
     };
-    for (point, changes) in [("etcd-renewer", 0), ("etcd-writer", 1), ("etcd-compaction", 40)] {
+    for (point, changes) in [("etcd-client", 0), ("etcd-renewer", 0), ("etcd-writer", 1), ("etcd-compaction", 40)] {
         let leader = Manager::start(&place, "leader", &etcd, &[])?;
         leader.serves()?;
         ask("leader", point)?;
@@ -99,6 +99,30 @@ fn a_panic_in_a_thread_of_the_log_in_etcd_or_of_a_standby_ends_the_process() -> 
     std::fs::create_dir_all(points(&place, "standby"))?;
     ask("standby", "standby")?;
     Manager::start(&place, "standby", &etcd, &[])?.panicked_at("standby")
+}
+
+#[test]
+#[cfg_attr(not(debug_assertions), ignore = "a release has no places to hang at")]
+fn a_leader_whose_core_hangs_is_got_past_and_ends_without_a_watchdog() -> anyhow::Result<()> {
+    if !cluster::is_there() {
+        return Ok(());
+    }
+    let (place, cluster) = (Place::new()?, Cluster::start(1, &[]));
+    let etcd = cluster.endpoints().remove(0);
+    let mut leader = Manager::start(&place, "leader", &etcd, &[])?;
+    leader.serves()?;
+    let standby = Manager::start(&place, "standby", &etcd, &[])?;
+    let stands_by = || Ok(standby.process.said().contains("standing by").then_some(()));
+    wait_for("the standby", stands_by).with_context(|| standby.process.said())?;
+    // In one step: a file that says nothing yet asks for a panic.
+    let point = points(&place, "leader").join("durable-actor");
+    std::fs::write(point.with_extension("new"), ratn_panic_point::HANG)?;
+    std::fs::rename(point.with_extension("new"), point)?;
+    standby.serves()?;
+    let (code, _, said) = leader.process.finish()?;
+    ensure!(code == Some(i32::from(EXIT_CODE_DEPOSED)), "{code:?} {said}");
+    ensure!(said.contains("it does not keep its place"), "{said}");
+    Ok(())
 }
 
 /// What a process says to its service manager.

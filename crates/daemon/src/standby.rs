@@ -20,13 +20,14 @@ use ratn_worker::endpoint::{Endpoint, connect_lazily};
 use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::panic::{exit_on_panic, exit_on_panic_blocking};
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::server::{Bound, Phase, Services, Serving, bind_as};
+use ratn_worker::server::{Bound, Phase, ServeError, Services, Serving, bind_as};
 use ratn_worker::trace::Traced;
 use ratn_worker::vitals::Vitals;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::sync::watch;
+use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::codegen::http;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity as Shown};
@@ -80,7 +81,10 @@ impl Place<'_> {
         let elected = CancellationToken::new();
         // However this ends, nobody is refused any more.
         let _elected = elected.clone().drop_guard();
-        let mut standby: Option<Arc<NotTheLeader>> = None;
+        let mut standby: Option<(Arc<NotTheLeader>, JoinHandle<()>)> = None;
+        let news = |standby: &Option<(Arc<NotTheLeader>, _)>, why: &String| {
+            standby.as_ref().is_none_or(|(gate, _)| gate.says() != *why)
+        };
         loop {
             let attempt = {
                 let (store, open) = (store.clone(), open.clone());
@@ -96,12 +100,19 @@ impl Place<'_> {
                 () = shutdown.cancelled() => return Ok(None),
             };
             let why = match opened {
-                Ok(kept) => return Ok(Some(kept)),
+                Ok(kept) => {
+                    elected.cancel();
+                    // Nobody who connects from now on is told by it that this process stands by.
+                    if let Some((_, refusing)) = standby {
+                        let _ = refusing.await;
+                    }
+                    return Ok(Some(kept));
+                }
                 Err(JournalError::Open { source: OpenError::Held { holder, .. }, .. }) => format!("{holder} leads"),
                 // etcd comes and goes; who stands by waits for it.
                 Err(JournalError::Open { source: OpenError::Read(error @ ReadError::Remote { .. }), .. }) => {
                     let why = format!("nobody is known to lead: {error}");
-                    if standby.as_ref().is_none_or(|standby| standby.says() != why) {
+                    if news(&standby, &why) {
                         tracing::warn!(role = self.role, "{why}");
                     }
                     tokio::time::sleep(AGAIN).await;
@@ -110,7 +121,7 @@ impl Place<'_> {
                 // Another host may accept it, for all.
                 Err(JournalError::Open { source: error @ OpenError::Restored { .. }, .. }) => {
                     let why = error.to_string();
-                    if standby.as_ref().is_none_or(|standby| standby.says() != why) {
+                    if news(&standby, &why) {
                         tracing::error!(role = self.role, "{why}");
                     }
                     tokio::time::sleep(AGAIN).await;
@@ -119,22 +130,28 @@ impl Place<'_> {
                 Err(error) => return Err(error.into()),
             };
             match &standby {
-                Some(gate) => gate.say(why),
+                Some((gate, _)) => gate.say(why),
                 None => {
                     tracing::info!(role = self.role, why, "standing by");
                     let gate = Arc::new(NotTheLeader::new(self.role, why));
-                    self.stand_by(bound, gate.clone(), elected.clone())?;
-                    standby = Some(gate);
+                    let refusing = self.stand_by(bound, gate.clone(), elected.clone())?;
+                    standby = Some((gate, refusing));
                 }
             }
         }
     }
 
-    /// Refuses everybody until `elected`.
-    fn stand_by(&self, bound: &Bound, gate: Arc<NotTheLeader>, elected: CancellationToken) -> anyhow::Result<()> {
+    /// Refuses everybody until `elected`, and then closes every connection.
+    fn stand_by(
+        &self,
+        bound: &Bound,
+        gate: Arc<NotTheLeader>,
+        elected: CancellationToken,
+    ) -> anyhow::Result<JoinHandle<()>> {
         let bound = bound.again().context("cannot listen while standing by")?;
         let vitals = gate.vitals.clone();
-        let serving = Serving { gate, vitals, phase: watch::Sender::new(Phase::Starting), ..self.serving.clone() };
+        let (phase, drain) = (watch::Sender::new(Phase::Starting), Duration::ZERO);
+        let serving = Serving { gate, vitals, phase, drain, ..self.serving.clone() };
         self.serving.phase.send_replace(Phase::StandingBy);
         let refuse = async move {
             panic_point("standby");
@@ -142,9 +159,33 @@ impl Place<'_> {
                 tracing::warn!(%error, "nobody is told any more who leads");
             }
         };
-        tokio::spawn(exit_on_panic("the server of a standby", refuse));
-        Ok(())
+        Ok(tokio::spawn(exit_on_panic("the server of a standby", refuse)))
     }
+}
+
+/// Serves until `shutdown`. `over` is cancelled as soon as no call is under way any more: a successor need not wait until every connection
+/// is closed.
+pub(crate) async fn serve(
+    bound: Bound,
+    services: Services,
+    serving: Serving,
+    shutdown: CancellationToken,
+    over: &CancellationToken,
+) -> Result<(), ServeError> {
+    let mut phase = serving.phase.subscribe();
+    let drained = async move {
+        if phase.wait_for(|phase| *phase == Phase::Drained).await.is_err() {
+            std::future::pending::<()>().await;
+        }
+    };
+    // On the heap: it is large.
+    let mut served = Box::pin(bound.serve_as(services, serving, shutdown));
+    tokio::select! {
+        biased;
+        served = &mut served => return served,
+        () = drained => over.cancel(),
+    }
+    served.await
 }
 
 /// Lets nobody in, and says who leads.

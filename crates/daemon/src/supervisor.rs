@@ -72,7 +72,8 @@ impl Supervisor {
                         Phase::Starting => {}
                         Phase::StandingBy => say(&[NotifyState::Ready, NotifyState::Status("standing by")]),
                         Phase::Serving => say(&[NotifyState::Ready, NotifyState::Status("serving")]),
-                        Phase::Draining => say(&[NotifyState::Stopping, NotifyState::Status("draining")]),
+                        // One soon after the other is all that is seen.
+                        Phase::Draining | Phase::Drained => say(&[NotifyState::Stopping, NotifyState::Status("draining")]),
                     }
                 }
                 Some(()) = self.hangups.recv(), if *phase.borrow() == Phase::Serving => {

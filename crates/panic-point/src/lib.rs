@@ -1,4 +1,5 @@
-//! Places in the code where a test can make a running process panic, to see that the process then ends and that another one takes its place.
+//! Places in the code where a test can make a running process panic, to see that the process then ends and that another one takes its place;
+//! or hang, where the file says [`HANG`].
 //!
 //! Each place has a name and calls [`panic_point`]. A process that was started with [`VARIABLE`] panics at a place once the folder that the
 //! variable names has a file of the place's name. The place removes the file first, so the process that is started next goes on.
@@ -8,7 +9,10 @@
 /// The environment variable with the folder.
 pub const VARIABLE: &str = "RATN_PANIC_POINTS";
 
-/// Panics if a test asks for it; see the module.
+/// What a file says by which a thread hangs at its place instead of panicking.
+pub const HANG: &str = "hang";
+
+/// Panics, or never returns, if a test asks for it; see the module.
 ///
 /// # Panics
 /// In a build with debug assertions, where the folder of [`VARIABLE`] has a file of this name.
@@ -29,14 +33,22 @@ mod in_debug_builds {
 
     pub(super) fn panic_point(name: &str) {
         let folder = FOLDER.get_or_init(|| std::env::var_os(super::VARIABLE).map(PathBuf::from));
-        if folder.as_deref().is_some_and(|folder| is_asked_for(folder, name)) {
+        let asked = folder.as_deref().and_then(|folder| asked_for(folder, name));
+        if asked.as_deref() == Some(super::HANG) {
+            loop {
+                std::thread::park();
+            }
+        }
+        if asked.is_some() {
             panic!("a test asked for a panic at `{name}`");
         }
     }
 
-    /// Once for each file.
-    pub(super) fn is_asked_for(folder: &Path, name: &str) -> bool {
-        std::fs::remove_file(folder.join(name)).is_ok()
+    /// What the file says, once for each file.
+    pub(super) fn asked_for(folder: &Path, name: &str) -> Option<String> {
+        let file = folder.join(name);
+        let says = std::fs::read_to_string(&file).ok()?;
+        std::fs::remove_file(file).is_ok().then_some(says)
     }
 }
 
@@ -48,12 +60,12 @@ mod tests {
     #[cfg(debug_assertions)]
     fn a_file_asks_for_one_panic_at_the_place_of_its_name() {
         let folder = tempfile::tempdir().unwrap();
-        let is_asked_for = |name| super::in_debug_builds::is_asked_for(folder.path(), name);
-        assert!(!is_asked_for("spawner"));
-        std::fs::write(folder.path().join("spawner"), "").unwrap();
-        assert!(!is_asked_for("session"), "another place");
-        assert!(is_asked_for("spawner"));
-        assert!(!is_asked_for("spawner"), "once");
+        let asked_for = |name| super::in_debug_builds::asked_for(folder.path(), name);
+        assert_eq!(asked_for("spawner"), None);
+        std::fs::write(folder.path().join("spawner"), super::HANG).unwrap();
+        assert_eq!(asked_for("session"), None, "another place");
+        assert_eq!(asked_for("spawner").as_deref(), Some(super::HANG));
+        assert_eq!(asked_for("spawner"), None, "once");
         super::panic_point("spawner");
     }
 }

@@ -64,6 +64,19 @@ pub enum ReadError {
         /// How it is emptied.
         how: String,
     },
+    /// All of it is somewhere else.
+    #[error(
+        "{place} was moved to {to} by `ratn state copy`, and has nothing of what was written since: use a config that names the other place; \
+         to go back, stop what writes there and copy it back to an empty place; only if nothing was written there, take the mark away ({how})"
+    )]
+    Moved {
+        /// What.
+        place: String,
+        /// Where to.
+        to: String,
+        /// How the mark is taken away.
+        how: String,
+    },
     /// Something that belongs to the log is not there.
     #[error("{place}: {what}; the log is incomplete: put back what was removed, or restore a backup")]
     Incomplete {
@@ -266,6 +279,11 @@ pub enum CopyError {
         /// Where one was looked for.
         place: String,
     },
+    /// What was copied may have been written by another one meanwhile.
+    #[error(
+        "while it was copied the source was taken by another writer, or may have been: throw the copy away, and see who writes there"
+    )]
+    SourceLost(#[source] Fault),
     /// Nothing is overwritten.
     #[error("{place} is not empty: nothing is overwritten, choose one that is empty or not there yet")]
     NotEmpty {

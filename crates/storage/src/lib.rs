@@ -68,5 +68,5 @@ pub use durable::{Durable, Progress};
 pub use error::{AppendError, CompactError, CompactionFailure, CopyError, Fault, OpenError, ReadError};
 pub use etcd::{Etcd, EtcdOptions};
 pub use log::{Copied, Disk, Durability, Files, Log, LogFile, Options, backup, restore};
-pub use store::{Epoch, MakeSnapshot, Place, Position, Record, Recovered, Snapshot, Store, TornEnd, Writer};
+pub use store::{Epoch, MakeSnapshot, Place, Position, Record, Recovered, Snapshot, Store, TornEnd, Turns, Writer};
 pub use transfer::{transfer, transfer_running};

@@ -6,6 +6,7 @@ use crate::durable::Durable;
 use crate::error::{AppendError, CompactError, CopyError, Fault, OpenError, ReadError};
 use bytes::Bytes;
 use std::fmt;
+use std::sync::Arc;
 
 /// Where a record stands in its log: 1 for the first ever appended, then without gaps. 0 is before the first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
@@ -62,6 +63,9 @@ pub struct Recovered {
 /// Makes the bytes of a snapshot; called where it does not hold up appends.
 pub type MakeSnapshot = Box<dyn FnOnce() -> Bytes + Send>;
 
+/// Says how many turns the owner of a writer has taken: it grows as long as the owner is at work. Nothing before its first turn.
+pub type Turns = Arc<dyn Fn() -> Option<u64> + Send + Sync>;
+
 /// A durable log.
 pub trait Store: fmt::Debug + Send + Sync {
     /// Takes the writer's place, and reads what is there. Blocks.
@@ -114,6 +118,19 @@ pub trait Writer: fmt::Debug + Send {
 
     /// The writer's place. It is free again when the writer is dropped or closed, whoever still has this.
     fn place(&self) -> Box<dyn Place>;
+
+    /// From now on the place is kept only as long as the owner takes turns, where another process may take it: an owner that hangs is got
+    /// past. Where nobody stands by for the place this says nothing.
+    fn attend(&mut self, turns: Turns) {
+        drop(turns);
+    }
+
+    /// Says of the log that all of it was moved: nobody opens or reads it any more ([`ReadError::Moved`]). Only where the place is still
+    /// this writer's, and durable when this returns. Blocks.
+    ///
+    /// # Errors
+    /// [`CopyError::SourceLost`] where another writer has the place, or may have it; otherwise where it cannot be written.
+    fn mark_moved(&mut self, to: &str) -> Result<(), CopyError>;
 
     /// How many bytes wait to be written; [`AppendError::Full`] is about them.
     fn waiting_bytes(&self) -> usize;

@@ -10,14 +10,16 @@ const PLACEHOLDER: &[u8] = b"";
 /// meanwhile, so that nothing is written there that the copy lacks. Holds the whole log in memory. Blocks.
 ///
 /// The target is marked as unfinished first, and the mark is removed last: of a copy that was interrupted nobody opens the part that is there.
+/// Before that the source is marked as moved ([`Writer::mark_moved`](crate::Writer::mark_moved)), so that nobody goes on with it: there are never two that can be opened.
 ///
 /// # Errors
 /// Where either has a writer, the source cannot be read, the target is not empty, or writing fails: then throw the target away.
 pub fn transfer(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
-    let (recovered, held) = from.open()?;
-    let copied = put(recovered, from, to);
-    drop(held);
-    copied
+    let (recovered, mut held) = from.open()?;
+    let last = put(recovered, from, to)?;
+    held.mark_moved(&to.place())?;
+    to.mark_whole()?;
+    Ok(last)
 }
 
 /// As [`transfer`], of a log that may be written meanwhile: the copy is what it was at one moment. For backups.
@@ -25,9 +27,12 @@ pub fn transfer(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError>
 /// # Errors
 /// As [`transfer`].
 pub fn transfer_running(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
-    put(from.read()?, from, to)
+    let last = put(from.read()?, from, to)?;
+    to.mark_whole()?;
+    Ok(last)
 }
 
+/// All of it, still marked as unfinished.
 fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
     if recovered.last() == Position(0) {
         return Err(CopyError::Nothing { place: from.place() });
@@ -59,7 +64,5 @@ fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<Positio
         // One at a time: what waits is bounded.
         durable.wait_blocking(position)?;
     }
-    let last = writer.close()?;
-    to.mark_whole()?;
-    Ok(last)
+    Ok(writer.close()?)
 }

@@ -8,6 +8,8 @@ use common::etcd::{options, store};
 use common::{append_durably, payloads, promises};
 use ratn_storage::etcd::Bounds;
 use ratn_storage::{Etcd, Fault, OpenError, Position, ReadError, Store, Writer, transfer, transfer_running};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 /// A log of these bounds for each name.
@@ -57,6 +59,111 @@ fn a_log_is_a_vector() {
 #[test]
 fn a_copy_that_was_interrupted_is_not_opened() {
     with_logs(Bounds::default(), promises::a_copy_that_was_interrupted_is_not_opened);
+}
+
+#[test]
+fn what_was_moved_is_opened_only_where_it_is_now() {
+    with_logs(Bounds::default(), promises::what_was_moved_is_opened_only_where_it_is_now);
+}
+
+#[test]
+fn a_copy_of_what_another_writer_has_taken_meanwhile_is_not_opened() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &[]);
+    let make =
+        |name: &str| -> Box<dyn Store> { Box::new(store(cluster.endpoints(), &format!("/test/{name}"), "test")) };
+    // Somebody else has had the place, and has left.
+    let take = |name: &str| assert!(cluster.ctl(&["del", &format!("/test/{name}/leader")]).status.success());
+    promises::a_copy_of_what_another_writer_has_taken_meanwhile_is_not_opened(&make, &take);
+}
+
+#[test]
+fn a_member_that_was_made_anew_as_a_cluster_of_its_own_begins_no_second_log() {
+    if !is_there() {
+        return;
+    }
+    let (mut ours, other) = (Cluster::start(1, &[]), Cluster::start(1, &[]));
+    let anew = other.endpoints().remove(0);
+    let proxy = Proxy::to(&ours.members[0].client);
+    let nobody = "http://127.0.0.1:1".to_owned();
+    let refused = |endpoints: &[&String], why: &str| {
+        let log = store(endpoints.iter().map(|&endpoint| endpoint.clone()).collect(), "/test/anew", "refused");
+        let error = log.open().map(drop).unwrap_err();
+        assert!(matches!(error, OpenError::Read(ReadError::Remote { .. })), "{error}");
+        assert!(error.to_string().contains(why), "{error}");
+    };
+    // Nobody can say whose log it would be.
+    refused(&[&anew, &proxy.address], "several clusters");
+    // Most of them say nothing.
+    refused(&[&anew, &nobody, &nobody], "only 1 of 3 members answer");
+    let (_, mut writer) = store(ours.endpoints(), "/test/anew", "first").open().unwrap();
+    append_durably(&mut *writer, b"ours");
+    writer.close().unwrap();
+    // The one that has the log counts, whoever is asked first.
+    let log = store(vec![anew.clone(), proxy.address.clone()], "/test/anew", "second");
+    let (recovered, mut writer) = log.open().unwrap();
+    assert_eq!(payloads(&recovered.records), [b"ours"]);
+    // Where only the other one answers, nothing is known, and nothing is lost.
+    proxy.lose_all(true);
+    for _ in 0..3 {
+        assert!(matches!(writer.place().check(), Err(Fault::Remote { .. })));
+    }
+    proxy.lose_all(false);
+    until("it does not find its cluster again", || writer.place().check().is_ok());
+    append_durably(&mut *writer, b"more");
+    writer.close().unwrap();
+    // Nor does one that stood by begin another log there.
+    let (_, writer) = log.open().unwrap();
+    let standby = store(vec![anew.clone(), proxy.address.clone(), nobody.clone()], "/test/anew", "standby");
+    assert!(matches!(standby.open(), Err(OpenError::Held { .. })));
+    drop(writer);
+    ours.kill(0);
+    for _ in 0..3 {
+        let error = standby.open().map(drop).unwrap_err();
+        assert!(matches!(error, OpenError::Read(ReadError::Remote { .. }) | OpenError::Restored { .. }), "{error:?}");
+    }
+    ours.run(0);
+    ours.await_health();
+    let begin = Instant::now();
+    let (recovered, writer) = loop {
+        match standby.open() {
+            Ok(opened) => break opened,
+            Err(error) => assert!(begin.elapsed() < Duration::from_secs(30), "{error}"),
+        }
+    };
+    assert_eq!(payloads(&recovered.records), [&b"ours"[..], b"more"]);
+    drop(writer);
+    let keys = other.ctl(&["get", "--prefix", "/test/anew", "--keys-only"]);
+    assert!(keys.stdout.is_empty(), "something was written there: {keys:?}");
+}
+
+#[test]
+fn a_writer_whose_owner_hangs_loses_the_place_and_one_whose_owner_takes_turns_keeps_it() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &[]);
+    let (taken, hangs) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicBool::new(false)));
+    let (_, mut old) = store(cluster.endpoints(), "/test/hangs", "first").open().unwrap();
+    let (turns, hung) = (taken.clone(), hangs.clone());
+    old.attend(Arc::new(move || {
+        let hangs = hung.load(Ordering::SeqCst);
+        Some(turns.fetch_add(u64::from(!hangs), Ordering::SeqCst)).filter(|taken| *taken > 0)
+    }));
+    let next = store(cluster.endpoints(), "/test/hangs", "second");
+    let begin = Instant::now();
+    while begin.elapsed() < Duration::from_secs(3) {
+        assert!(matches!(next.open(), Err(OpenError::Held { .. })), "it takes its turns");
+    }
+    hangs.store(true, Ordering::SeqCst);
+    let hung = Instant::now();
+    let (_, _new) = open(&next);
+    assert!(hung.elapsed() >= Duration::from_secs(2), "a turn may be long: {:?}", hung.elapsed());
+    // It goes on taking turns, and hears what has become of the place.
+    hangs.store(false, Ordering::SeqCst);
+    until("it does not hear that it was got past", || matches!(old.place().check(), Err(Fault::Deposed { .. })));
 }
 
 /// Waits until this holds.
@@ -264,36 +371,44 @@ fn when_there_is_space_again_nobody_takes_the_place_of_a_holder_that_has_just_co
     let (_, writer) = log.open().unwrap();
     let value = "x".repeat(100 << 10);
     assert!((0..100).any(|_| !cluster.ctl(&["put", "/other", &value]).status.success()));
-    // It is confirmed without a word to anybody, for longer than a silence.
-    let begin = Instant::now();
+    // Another one wants the place all the time, and cannot take it: every attempt ends, and the silence that it counts begins anew.
     let other = store(cluster.endpoints(), "/test/confirmed", "second");
-    while begin.elapsed() < Duration::from_millis(1_500) {
-        writer.place().check().unwrap();
-        // Nobody can take the place meanwhile.
-        other.open().map(drop).unwrap_err();
-    }
+    let (failed, fails) = std::sync::mpsc::channel();
+    let standing_by = std::thread::spawn(move || {
+        loop {
+            match other.open() {
+                Ok((_, taken)) => break (Instant::now(), taken),
+                Err(OpenError::Held { .. } | OpenError::Read(ReadError::Remote { .. })) => {
+                    let _ = failed.send(Instant::now());
+                }
+                Err(error) => panic!("{error}"),
+            }
+        }
+    });
     let found = cluster.ctl(&["get", "/other", "-w", "json"]);
     let found: serde_json::Value = serde_json::from_slice(&found.stdout).unwrap();
     assert!(cluster.ctl(&["compact", &found["header"]["revision"].to_string()]).status.success());
     assert!(cluster.ctl(&["defrag"]).status.success());
+    // It is confirmed without a word to anybody, for longer than a silence, until there is space again in the middle of what the other one
+    // takes for one.
+    let begin = Instant::now();
+    let mut last = begin;
+    let (shortest, longest) = (Duration::from_secs(2), Duration::from_secs(4));
+    while begin.elapsed() < shortest || (last.elapsed() < Duration::from_millis(600) && begin.elapsed() < longest) {
+        writer.place().check().unwrap();
+        last = fails.try_iter().last().unwrap_or(last);
+    }
+    assert!(last > begin, "no attempt has ended");
     writer.place().check().unwrap();
     let confirmed = Instant::now();
     // Cut off from the very moment on: nobody hears it any more.
     proxy.lose_all(true);
     assert!(cluster.ctl(&["alarm", "disarm"]).status.success());
-    let begin = Instant::now();
-    let taken = loop {
-        match other.open() {
-            Ok((_, taken)) => break taken,
-            Err(OpenError::Held { .. } | OpenError::Read(ReadError::Remote { .. })) => {
-                assert!(begin.elapsed() < Duration::from_secs(30), "it stays held");
-            }
-            Err(error) => panic!("{error}"),
-        }
-    };
-    let after = confirmed.elapsed();
+    until("it stays held", || standing_by.is_finished());
+    let (taken, _held) = standing_by.join().unwrap();
+    let after = taken - confirmed;
     assert!(after >= Duration::from_secs(1), "the place was taken {after:?} after it was confirmed");
-    drop((taken, writer));
+    drop(writer);
 }
 
 #[test]
@@ -522,8 +637,9 @@ fn a_log_goes_from_files_to_etcd_and_back_and_never_over_another() {
     common::compacted(&*writer);
     assert!(transfer(&in_files("first"), &in_etcd).is_err(), "it is being written");
     writer.close().unwrap();
+    transfer_running(&in_files("first"), &in_files("second")).unwrap();
     transfer(&in_files("first"), &in_etcd).unwrap();
-    let error = transfer(&in_files("first"), &in_etcd).unwrap_err();
+    let error = transfer(&in_files("second"), &in_etcd).unwrap_err();
     assert!(error.to_string().contains("nothing is overwritten"), "{error}");
     let is_the_same = |log: &dyn Store| {
         let read = log.read().unwrap();
@@ -533,6 +649,9 @@ fn a_log_goes_from_files_to_etcd_and_back_and_never_over_another() {
     is_the_same(&in_etcd);
     transfer(&in_etcd, &in_files("back")).unwrap();
     is_the_same(&in_files("back"));
+    assert!(matches!(in_etcd.open(), Err(OpenError::Read(ReadError::Moved { .. }))));
+    // As the message says: nothing was written since.
+    assert!(cluster.ctl(&["del", "/test/copy/moved"]).status.success());
     let (_, _writer) = in_etcd.open().unwrap();
     assert!(transfer(&in_etcd, &in_files("again")).is_err());
     transfer_running(&in_etcd, &in_files("backup")).unwrap();

@@ -39,6 +39,19 @@ fn a_log_is_a_vector() {
 }
 
 #[test]
+fn what_was_moved_is_opened_only_where_it_is_now() {
+    with_logs(promises::what_was_moved_is_opened_only_where_it_is_now);
+}
+
+#[test]
+fn a_copy_of_what_another_writer_has_taken_meanwhile_is_not_opened() {
+    let place = tempfile::tempdir().unwrap();
+    let make = |name: &str| -> Box<dyn Store> { Box::new(Log::new(place.path().join(name), Options::default())) };
+    let take = |name: &str| std::fs::remove_file(place.path().join(name).join("writer.lock")).unwrap();
+    promises::a_copy_of_what_another_writer_has_taken_meanwhile_is_not_opened(&make, &take);
+}
+
+#[test]
 fn a_copy_that_was_interrupted_is_not_opened() {
     with_logs(promises::a_copy_that_was_interrupted_is_not_opened);
 }

@@ -55,7 +55,7 @@ pub struct Serving {
     pub gate: Arc<dyn Gate>,
     /// How many connections, and how long one may say nothing.
     pub connections: ConnectionLimits,
-    /// Instead of [`DRAIN_DEADLINE`].
+    /// Instead of [`DRAIN_DEADLINE`]. With none at all every connection is closed at once, as is right for who only refuses.
     pub drain: Duration,
     /// Says how far it is.
     pub phase: watch::Sender<Phase>,
@@ -74,6 +74,8 @@ pub enum Phase {
     Serving,
     /// Only what is under way.
     Draining,
+    /// No call is under way any more. Connections are closed; what was served may be given to a successor.
+    Drained,
 }
 
 /// A listener that nobody is served on yet.
@@ -386,13 +388,14 @@ impl Bound {
             }
             serving.phase.send_replace(Phase::Draining);
             say(ServingStatus::NotServing).await;
-            if tokio::time::timeout(serving.drain, calls.ended()).await.is_err() {
+            if tokio::time::timeout(serving.drain, calls.ended()).await.is_err() && !serving.drain.is_zero() {
                 let drain_ms = u64::try_from(serving.drain.as_millis()).unwrap_or(u64::MAX);
                 tracing::warn!(drain_ms, "calls were still under way at the end of the drain: they are dropped");
             }
+            serving.phase.send_replace(Phase::Drained);
             closing.cancel();
             // Who watches health would keep a connection open for ever.
-            tokio::time::sleep(CLOSE_PATIENCE).await;
+            tokio::time::sleep(CLOSE_PATIENCE.min(serving.drain)).await;
             connections.close_all();
         };
         let gate = serving.gate;

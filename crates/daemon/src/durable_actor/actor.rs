@@ -3,7 +3,7 @@
 use super::clock::TICK;
 use super::desk::{Desk, Outgoing, Stopped};
 use super::inbox::Inbox;
-use super::may_speak::{MaySpeak, Speech};
+use super::may_speak::{MaySpeak, Speech, failure_of};
 use super::outbox::Outbox;
 use super::{Core, Journal};
 use crate::details::of_fault;
@@ -147,13 +147,22 @@ impl<C: Core> Actor<C> {
         let mut closing = self.journal.close();
         let closed = loop {
             tokio::select! {
+                biased;
                 closed = &mut closing => break closed,
-                () = tokio::time::sleep(TICK) => self.vitals.beat(),
+                // What is on the disk leaves before the place is given up.
+                Ok(Progress { fault: None, .. }) = self.journal.changed() => self.hand_out_durable(),
+                () = tokio::time::sleep(TICK) => {}
             }
+            self.vitals.beat();
         };
         match closed {
             Ok(Ok(())) => self.deliver(),
-            Ok(Err(fault)) => self.stop(&fault),
+            // It is the end of a process that was told to end. Nobody was told of anything that is lost.
+            Ok(Err(fault)) if self.journal.is_written() => {
+                tracing::info!(%fault, "all was written before");
+                self.outbox.take_all();
+            }
+            Ok(Err(fault)) => drop(self.refuse_changes(&fault)),
             // The runtime ends, and with it the process.
             Err(error) => tracing::debug!(%error, "nobody waits for the state to be closed"),
         }
@@ -189,6 +198,12 @@ impl<C: Core> Actor<C> {
                 return;
             }
             let Some(outgoing) = self.take_durable() else { return };
+            self.hand_out(outgoing);
+        }
+    }
+
+    fn hand_out_durable(&mut self) {
+        while let Some(outgoing) = self.take_durable().filter(|_| self.desk.may_speak()) {
             self.hand_out(outgoing);
         }
     }
@@ -254,14 +269,25 @@ impl<C: Core> Actor<C> {
         self.desk.take_outgoing();
         self.desk.watchers.clear();
         let what = fault.to_string();
-        self.vitals.fail(match fault {
-            Fault::Deposed { .. } => CoreFailure::Deposed { what },
-            _ => CoreFailure::Fenced { what },
-        });
+        if self.drained && self.journal.is_written() {
+            return tracing::warn!(what, "it was to end anyhow, and all was written");
+        }
+        self.vitals.fail(failure_of(fault));
     }
 
-    /// Nothing changes any more. What was not on the disk has not happened.
+    /// Nothing changes any more. What was not on the disk has not happened, and is not shown either.
     fn stop(&mut self, fault: &(dyn std::error::Error + 'static)) {
+        if self.refuse_changes(fault)
+            && let Err(error) = self.core.restore(&self.journal, &self.desk)
+        {
+            let error = anyhow::Error::new(error);
+            tracing::error!(error = format!("{error:#}"), "what is on the disk cannot be read either");
+            self.desk.set_unreadable();
+        }
+    }
+
+    /// Nothing changes any more. Whether what is on the disk may still be shown.
+    fn refuse_changes(&mut self, fault: &(dyn std::error::Error + 'static)) -> bool {
         let status = of_fault(fault);
         match fault_of(fault) {
             Some(Fault::Ended { .. }) => {
@@ -271,16 +297,15 @@ impl<C: Core> Actor<C> {
             Some(Fault::Remote { .. }) => self.vitals.fail(CoreFailure::Deposed { what: fault.to_string() }),
             Some(fenced) if fenced.is_lost_place() => {
                 self.desk.stop(Stopped { status, unreadable: true });
-                return self.fenced(fenced);
+                self.fenced(fenced);
+                return false;
             }
             _ => {}
         }
         self.vitals.unwell(storage_failed(&status));
         tracing::error!(fault = status.message(), "changes are refused from now on");
         self.journal.metrics().failed.set(1);
-        while let Some(outgoing) = self.take_durable().filter(|_| self.desk.may_speak()) {
-            self.hand_out(outgoing);
-        }
+        self.hand_out_durable();
         let mut refused = self.outbox.take_all();
         refused.extend(self.desk.take_outgoing());
         for outgoing in refused {
@@ -291,11 +316,7 @@ impl<C: Core> Actor<C> {
         // They find a state that may be behind the one they saw coming, and watch again.
         self.desk.watchers.clear();
         self.desk.stop(Stopped { status, unreadable: false });
-        if let Err(error) = self.core.restore(&self.journal, &self.desk) {
-            let error = anyhow::Error::new(error);
-            tracing::error!(error = format!("{error:#}"), "what is on the disk cannot be read either");
-            self.desk.set_unreadable();
-        }
+        true
     }
 }
 

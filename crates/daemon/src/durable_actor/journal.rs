@@ -214,16 +214,23 @@ impl Journal {
         Some(retry_later(Code::ResourceExhausted, "STORAGE_BEHIND", message, BEHIND_RETRY))
     }
 
-    /// Begins to look whether the place is still this writer's.
-    pub(super) fn may_speak(&self, vitals: Vitals) -> Result<MaySpeak, JournalError> {
+    /// Begins to look whether the place is still this writer's. It is kept only as long as the core takes its turns.
+    pub(super) fn may_speak(&mut self, vitals: Vitals) -> Result<MaySpeak, JournalError> {
         let role = self.role;
-        let Some(writer) = &self.writer else { return Err(JournalError::Closed { role }) };
+        let Some(writer) = &mut self.writer else { return Err(JournalError::Closed { role }) };
+        let turns = vitals.clone();
+        writer.attend(Arc::new(move || turns.beats()));
         MaySpeak::begin(writer.place(), vitals).map_err(|source| JournalError::Thread { role, source })
     }
 
     /// Whether everything through this entry is on the disk.
     pub(crate) fn reached(&self, position: Position) -> bool {
         matches!(self.durable.reached(position), Ok(true))
+    }
+
+    /// Whether every entry is on the disk.
+    pub(super) fn is_written(&self) -> bool {
+        self.unwritten.is_none() && self.reached(self.last)
     }
 
     /// Returns when more is on the disk, or something went wrong.

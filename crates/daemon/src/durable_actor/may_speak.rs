@@ -24,7 +24,7 @@
 use ratn_panic_point::panic_point;
 use ratn_storage::{Fault, Place};
 use ratn_worker::boot_clock::{BootClock, BootInstant};
-use ratn_worker::vitals::Vitals;
+use ratn_worker::vitals::{CoreFailure, Vitals};
 use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
@@ -34,6 +34,9 @@ use tokio::sync::watch;
 pub(crate) const CONFIRMED_FOR: Duration = Duration::from_secs(1);
 /// The place is looked at so often.
 const CONFIRM_INTERVAL: Duration = Duration::from_millis(250);
+
+/// An actor that does not end for so long when its place is lost hangs: then its process ends without it.
+const END_PATIENCE: Duration = Duration::from_secs(1);
 
 /// What is known of the place.
 #[derive(Debug, Clone)]
@@ -85,17 +88,29 @@ impl MaySpeak {
         };
         let (tell, found) = watch::channel(first);
         let (end, ended) = mpsc::channel::<()>();
-        let looking = clock.clone();
+        let (looking, failing) = (clock.clone(), vitals.clone());
         let keep = move || {
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(CONFIRM_INTERVAL) {
                 panic_point("may-speak");
                 match look(&looking, &*place) {
                     Ok(confirmed) => {
-                        let over = matches!(confirmed, Confirmed::Lost(_));
+                        let lost = match &confirmed {
+                            Confirmed::Lost(fault) => Some(fault.clone()),
+                            Confirmed::NotYet | Confirmed::At(_) => None,
+                        };
                         tell.send_replace(Found { confirmed, unseen: None });
-                        if over {
-                            return;
+                        let Some(lost) = lost else { continue };
+                        // An actor that takes its turns ends by itself.
+                        let hangs = || matches!(ended.recv_timeout(END_PATIENCE), Err(mpsc::RecvTimeoutError::Timeout));
+                        if hangs() {
+                            let failure = failure_of(&lost);
+                            failing.fail(failure.clone());
+                            // With the actor its runtime may hang, and with that everything that could end the process.
+                            if hangs() {
+                                std::process::exit(failure.exit_code().into());
+                            }
                         }
+                        return;
                     }
                     Err(fault) => tell.send_modify(|found| found.unseen = Some(fault)),
                 }
@@ -121,6 +136,15 @@ impl MaySpeak {
         if self.found.changed().await.is_err() && !matches!(self.now(), Speech::Over(_)) {
             std::future::pending::<()>().await;
         }
+    }
+}
+
+/// The end of a core whose place is lost.
+pub(super) fn failure_of(lost: &Fault) -> CoreFailure {
+    let what = lost.to_string();
+    match lost {
+        Fault::Deposed { .. } => CoreFailure::Deposed { what },
+        _ => CoreFailure::Fenced { what },
     }
 }
 

@@ -104,7 +104,7 @@ pub(crate) trait Core: Sized + Send + 'static {
 /// Where the thread cannot be started that watches the writer's place.
 pub(crate) fn start<C: Core>(
     core: C,
-    journal: Journal,
+    mut journal: Journal,
     signals: watch::Receiver<C::Signal>,
     vitals: Vitals,
     draining: CancellationToken,

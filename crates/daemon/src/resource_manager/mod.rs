@@ -23,7 +23,7 @@ mod wire;
 pub use config::ResourceManagerConfig;
 
 use crate::metrics::Metrics;
-use crate::standby::Place;
+use crate::standby::{self, Place};
 use anyhow::Context;
 use ratn_model::resource::Lease;
 use ratn_proto::v1::resource_service_server::ResourceServiceServer;
@@ -85,7 +85,7 @@ pub async fn run_as(
         .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
-    let served = bound.serve_as(Services::new().with(service), serving, shutdown).await;
+    let served = standby::serve(bound, Services::new().with(service), serving, shutdown, &over).await;
     drop(published);
     // What was still to be written is on the disk when this has ended.
     over.cancel();

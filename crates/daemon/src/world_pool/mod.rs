@@ -28,7 +28,7 @@ use crate::config::Durability;
 use crate::durable_actor::{Journal, JournalError, floor};
 use crate::link::{LINK, Link, Manager};
 use crate::metrics::Metrics;
-use crate::standby::Place;
+use crate::standby::{self, Place};
 use anyhow::Context;
 use history::History;
 use ratn_model::id::Revision;
@@ -119,7 +119,7 @@ pub async fn run_as(
     .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
     let published = directory.publish(ROLE, &endpoint).context("cannot publish the endpoint")?;
     tracing::info!(%endpoint, "{ROLE} is ready");
-    let served = bound.serve_as(Services::new().with(service), serving, shutdown).await;
+    let served = standby::serve(bound, Services::new().with(service), serving, shutdown, &over).await;
     drop(published);
     // What was still to be written is on the disk when this has ended.
     over.cancel();

@@ -3,18 +3,23 @@
 //! A transaction without an answer may have been performed, may be performed later, or never, and one with an answer may be performed
 //! once more: a copy may be late. So every transaction that writes is guarded such that it has no effect twice ([`super::chain`]).
 //!
-//! The client has a thread of its own; callers block.
+//! A client is of one cluster: the first that answers it, or the one it is told of ([`Client::pin`]). A member that answers for another
+//! cluster was made anew, or belongs to somebody else: it counts as one that refuses.
+//!
+//! The client has a thread of its own; callers block. A panic in one of its tasks is one of the caller.
 
 use super::wire::kv_client::KvClient;
 use super::wire::{ResponseHeader, TxnRequest, TxnResponse};
+use ratn_panic_point::panic_point;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::future::Future;
-use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering};
+use std::panic::resume_unwind;
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
 use std::time::{Duration, Instant};
 use tokio::runtime::Runtime;
-use tokio::task::JoinSet;
+use tokio::task::{JoinError, JoinSet};
 use tonic::transport::Channel;
 use tonic::{Code, Status};
 
@@ -41,6 +46,8 @@ pub(super) enum CallError {
     Refused(String),
     /// It is larger than etcd takes.
     TooLarge(String),
+    /// Whoever answered is of another cluster.
+    OtherCluster { address: String, known: u64, found: u64 },
     /// etcd knows less than it did: an old state was put in place of what it had.
     WentBack { known: i64, found: i64 },
 }
@@ -61,6 +68,11 @@ impl fmt::Display for CallError {
                     "etcd refuses ({what}): its --max-request-bytes has to be above a MiB, as its default of 1.5 MiB is"
                 )
             }
+            CallError::OtherCluster { address, known, found } => write!(
+                f,
+                "{address} is of the cluster {found:x} of etcd, and all was of {known:x}: an older state of etcd was put in place, or this \
+                 member was made anew as a cluster of its own"
+            ),
             CallError::WentBack { known, found } => write!(
                 f,
                 "etcd was at revision {known} and now is at {found}: an older state of etcd was put in place, and what was acknowledged \
@@ -75,6 +87,10 @@ pub(super) struct Client {
     members: Arc<[Member]>,
     /// Who answered last.
     current: AtomicUsize,
+    /// etcd's number of the cluster; 0 before the first answer.
+    cluster: Arc<AtomicU64>,
+    /// Nobody but members of another cluster answered.
+    met_others: AtomicBool,
     /// The highest revision of etcd that was seen.
     seen: AtomicI64,
     /// The revision that was seen, and the lower one that came after it.
@@ -126,7 +142,48 @@ impl Client {
             |address: &String| Member { address: address.clone(), connect: connect.clone(), channel: Mutex::default() };
         let members = addresses.iter().map(member).collect();
         let (current, seen) = (AtomicUsize::new(0), AtomicI64::new(0));
-        Ok(Client { members, current, seen, went_back: OnceLock::new(), runtime: Some(runtime) })
+        let (cluster, met_others) = (Arc::default(), AtomicBool::new(false));
+        Ok(Client { members, current, cluster, met_others, seen, went_back: OnceLock::new(), runtime: Some(runtime) })
+    }
+
+    /// etcd's number of the cluster that counts; nothing before the first answer.
+    pub(super) fn cluster(&self) -> Option<u64> {
+        Some(self.cluster.load(Ordering::SeqCst)).filter(|cluster| *cluster != 0)
+    }
+
+    /// From now on only this cluster counts, if none does yet.
+    pub(super) fn pin(&self, cluster: u64) {
+        let _ = self.cluster.compare_exchange(0, cluster, Ordering::SeqCst, Ordering::SeqCst);
+    }
+
+    /// Whether the last call was answered by another cluster alone.
+    pub(super) fn has_met_others(&self) -> bool {
+        self.met_others.load(Ordering::SeqCst)
+    }
+
+    /// What each member says by itself, of whichever cluster it is, with its address. Blocks for so long at the most.
+    pub(super) fn survey(&self, request: &TxnRequest, patience: Duration) -> Vec<(String, Option<TxnResponse>)> {
+        let addresses = || self.members.iter().map(|member| member.address.clone());
+        let (Some(runtime), members) = (&self.runtime, self.members.clone()) else { return Vec::new() };
+        let request = request.clone();
+        let asking = async move {
+            let mut asked = JoinSet::new();
+            for (index, member) in members.iter().enumerate() {
+                if let Ok(channel) = member.channel() {
+                    let (any, address) = (Arc::default(), member.address.clone());
+                    asked.spawn(tokio::time::timeout(patience, ask_one(index, address, channel, request.clone(), any)));
+                }
+            }
+            let mut answers = BTreeMap::new();
+            while let Some(ended) = asked.join_next().await {
+                if let Some(Ok((index, Ok(answer)))) = unless_panicked(ended) {
+                    answers.insert(index, answer);
+                }
+            }
+            answers
+        };
+        let mut answers = blocking(runtime, asking).unwrap_or_default();
+        addresses().enumerate().map(|(index, address)| (address, answers.remove(&index))).collect()
     }
 
     /// The cluster, for messages.
@@ -141,7 +198,9 @@ impl Client {
             return Err(error);
         }
         let known = self.seen.load(Ordering::SeqCst);
-        let answer = self.ask(request, patience.into())?;
+        let answer = self.ask(request, patience.into());
+        self.met_others.store(matches!(answer, Err(CallError::OtherCluster { .. })), Ordering::SeqCst);
+        let answer = answer?;
         let found = answer.header.as_ref().map_or(0, |header| header.revision);
         if found < known {
             let error = CallError::WentBack { known, found };
@@ -187,7 +246,7 @@ impl Client {
             return unknown("no address of a member is given".to_owned());
         };
         let first = self.current.load(Ordering::SeqCst);
-        match blocking(runtime, hedged(self.members.clone(), first, request, patience)) {
+        match blocking(runtime, hedged(self.members.clone(), self.cluster.clone(), first, request, patience)) {
             Some((by, answered)) => {
                 if let Some(by) = by {
                     self.current.store(by, Ordering::SeqCst);
@@ -203,6 +262,7 @@ impl Client {
 /// leader has just died may hold a transaction for seconds, and perform the next one at once.
 async fn hedged(
     members: Arc<[Member]>,
+    cluster: Arc<AtomicU64>,
     first: usize,
     request: TxnRequest,
     patience: Patience,
@@ -224,7 +284,8 @@ async fn hedged(
             match members[index].channel() {
                 Ok(channel) => {
                     silent.insert(index);
-                    asked.spawn(ask_one(index, members[index].address.clone(), channel, request.clone()));
+                    let address = members[index].address.clone();
+                    asked.spawn(ask_one(index, address, channel, request.clone(), cluster.clone()));
                 }
                 Err(what) => last = format!("{}: {what}", members[index].address),
             }
@@ -235,21 +296,30 @@ async fn hedged(
         // Until the next one is asked, too; sooner where one that was asked has failed.
         let mut until = deadline.min(Instant::now() + pause);
         while !asked.is_empty() {
-            match tokio::time::timeout_at(until.into(), asked.join_next()).await {
-                Ok(Some(Ok((index, Err(CallError::Unknown(what)))))) => {
+            let ended = match tokio::time::timeout_at(until.into(), asked.join_next()).await {
+                Ok(Some(ended)) => unless_panicked(ended),
+                Ok(None) => None,
+                Err(_) => break,
+            };
+            match ended {
+                Some((index, Err(CallError::Unknown(what)))) => {
                     last = what;
                     silent.remove(&index);
                     let failed_pause = if number < members.len() { Duration::ZERO } else { FAILED_PAUSE };
                     until = until.min(Instant::now() + failed_pause);
                 }
-                Ok(Some(Ok((index, Err(refusal @ (CallError::Refused(_) | CallError::TooLarge(_))))))) => {
+                Some((index, Err(refusal)))
+                    if matches!(
+                        refusal,
+                        CallError::Refused(_) | CallError::TooLarge(_) | CallError::OtherCluster { .. }
+                    ) =>
+                {
                     silent.remove(&index);
                     refused.insert(index, refusal);
                     until = until.min(Instant::now());
                 }
-                Ok(Some(Ok((index, answered)))) => return (Some(index), answered),
-                Ok(_) => {}
-                Err(_) => break,
+                Some((index, answered)) => return (Some(index), answered),
+                None => {}
             }
         }
         if asked.is_empty() && number >= members.len() {
@@ -273,24 +343,46 @@ async fn ask_one(
     address: String,
     channel: Channel,
     request: TxnRequest,
+    cluster: Arc<AtomicU64>,
 ) -> (usize, Result<TxnResponse, CallError>) {
+    panic_point("etcd-client");
     let kv = KvClient::new(channel);
     let mut kv = kv.max_decoding_message_size(ANSWER_BYTES).max_encoding_message_size(ANSWER_BYTES);
     let answered = kv.txn(request).await;
-    (index, answered.map(tonic::Response::into_inner).map_err(|status| classify(&status, &address)))
+    let answered = answered.map(tonic::Response::into_inner).map_err(|status| classify(&status, &address));
+    (index, answered.and_then(|answer| of_cluster(answer, &cluster, address)))
+}
+
+/// Refuses what another cluster answered than the one that counts; the first counts.
+fn of_cluster(answer: TxnResponse, cluster: &AtomicU64, address: String) -> Result<TxnResponse, CallError> {
+    let found = cluster_of(answer.header.as_ref());
+    match cluster.compare_exchange(0, found, Ordering::SeqCst, Ordering::SeqCst) {
+        Err(known) if known != found => Err(CallError::OtherCluster { address, known, found }),
+        _ => Ok(answer),
+    }
+}
+
+/// What a task has come to; nothing where the runtime ends. Its panic goes on in whoever waited for it.
+fn unless_panicked<T>(ended: Result<T, JoinError>) -> Option<T> {
+    match ended.map_err(JoinError::try_into_panic) {
+        Ok(done) => Some(done),
+        Err(Ok(panic)) => resume_unwind(panic),
+        Err(Err(_)) => None,
+    }
 }
 
 /// Before a call is tried again, doubled every time up to [`LONGEST_PAUSE`].
 pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(10);
 pub(super) const LONGEST_PAUSE: Duration = Duration::from_millis(250);
 
-/// Performs a future in a runtime, and waits for it in this thread, whatever runs there.
+/// Performs a future in a runtime, and waits for it in this thread, whatever runs there. Nothing where the runtime ends.
 fn blocking<T: Send + 'static>(runtime: &Runtime, future: impl Future<Output = T> + Send + 'static) -> Option<T> {
     let (done, result) = mpsc::sync_channel(1);
+    let performed = runtime.spawn(future);
     runtime.spawn(async move {
-        let _ = done.send(future.await);
+        let _ = done.send(performed.await);
     });
-    result.recv().ok()
+    result.recv().ok().and_then(unless_panicked)
 }
 
 fn classify(status: &Status, address: &str) -> CallError {

@@ -8,6 +8,7 @@
 //!   PREFIX/head                       the last record that counts
 //!   PREFIX/step                       how often a snapshot, or what it replaces, was changed
 //!   PREFIX/unfinished                 as long as not all of a copy is there
+//!   PREFIX/moved                      where all of it was moved to
 //!   PREFIX/log/POSITION/PART          a frame of records, by the first of them
 //!   PREFIX/snapshot/current           which snapshot counts
 //!   PREFIX/snapshot/THROUGH/PART      a snapshot
@@ -65,6 +66,10 @@ impl Keys {
 
     pub(super) fn unfinished(&self) -> Bytes {
         self.key("unfinished")
+    }
+
+    pub(super) fn moved(&self) -> Bytes {
+        self.key("moved")
     }
 
     pub(super) fn current(&self) -> Bytes {

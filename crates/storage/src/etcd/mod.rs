@@ -13,11 +13,13 @@
 
 mod chain;
 mod client;
+mod cluster;
 mod compaction;
 mod contents;
 mod format;
 mod keys;
 mod mark;
+mod owner;
 mod silence;
 mod term;
 mod writer;
@@ -87,6 +89,8 @@ struct Standby {
     known: Option<Known>,
     /// When it could not be read.
     failed: Option<Instant>,
+    /// What was found is not the log that there was, or may not be: it is looked anew which cluster has it.
+    refused: bool,
 }
 
 impl Standby {
@@ -135,24 +139,31 @@ impl Etcd {
     /// # Errors
     /// Where etcd does not answer.
     pub fn holder(&self) -> Result<Option<Holder>, ReadError> {
-        Ok(Seen::look(&self.client(), &self.keys)?.leader.and_then(|(_, leader)| leader.holder))
+        Ok(Seen::look(&*self.client()?, &self.keys)?.leader.and_then(|(_, leader)| leader.holder))
     }
 }
 
 impl Etcd {
-    fn client(&self) -> Arc<Client> {
-        self.client.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    /// That knows its cluster, as far as anybody answers.
+    fn client(&self) -> Result<Arc<Client>, ReadError> {
+        let client = self.client.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        cluster::recognise(&client, &self.keys)?;
+        Ok(client)
     }
 
-    /// Where etcd went back, whoever writes with the client of before never writes again. Who opens the log looks at what is there now.
+    /// Where etcd went back, or is another cluster, whoever writes with the client of before never writes again. Who opens the log looks at what is there now.
     fn client_of_now(&self, standby: &mut Standby) -> Result<Arc<Client>, OpenError> {
         let mut client = self.client.lock().unwrap_or_else(PoisonError::into_inner);
         if client.has_gone_back() {
             self.mark.doubt();
+        }
+        if client.has_gone_back() || client.has_met_others() || standby.refused {
             *standby = Standby::default();
             *client = connected(&self.options)?;
         }
-        Ok(client.clone())
+        let client = client.clone();
+        cluster::recognise(&client, &self.keys)?;
+        Ok(client)
     }
 
     /// The generation that begins, where an older state was put in place and accepting it is asked for.
@@ -195,7 +206,7 @@ impl Etcd {
     }
 
     fn write_mark(&self, request: &TxnRequest) -> Result<(), CopyError> {
-        let client = self.client();
+        let client = self.client()?;
         let answer = client.repeat(request, term::PATIENCE, Instant::now() + REACH);
         let answer = answer.map_err(|error| unreadable(&client, &error))?;
         if answer.succeeded { Ok(()) } else { Err(self.held("somebody who took it just now").into()) }
@@ -214,16 +225,20 @@ impl Store for Etcd {
     fn open(&self) -> Result<(Recovered, Box<dyn Writer>), OpenError> {
         let mut standby = self.standby.lock().unwrap_or_else(PoisonError::into_inner);
         let client = self.client_of_now(&mut standby)?;
-        let Standby { silence, known, failed } = &mut *standby;
+        let Standby { silence, known, failed, refused } = &mut *standby;
         // Who only asks once whether there is a writer reads nothing.
         let stands_by = silence.is_some();
         let vacant = term::await_vacancy(&client, &self.keys, silence, &self.mark, |seen| {
             if stands_by {
                 Standby::follow(known, failed, &client, &self.keys, seen);
             }
-        })?;
+        });
+        let vacant = vacant.inspect_err(|error| *refused = matches!(error, OpenError::Restored { .. }))?;
         let vacant = vacant.whole(&self.keys)?;
-        let accepts = self.accepted(&vacant)?;
+        let accepts = self.accepted(&vacant).inspect_err(|_| *refused = true)?;
+        if vacant.meta.is_none() {
+            cluster::may_begin(&client, &self.keys).inspect_err(|_| *refused = true)?;
+        }
         let taken = term::take(&client, &self.keys, &vacant, &self.options.holder, accepts);
         if taken.is_err() {
             // The holder may not have been able to say that it is there, as we were not: silence counts from now on.
@@ -249,7 +264,7 @@ impl Store for Etcd {
     fn read(&self) -> Result<Recovered, ReadError> {
         let mut attempt = 1;
         loop {
-            let client = self.client();
+            let client = self.client()?;
             let seen = Seen::look(&client, &self.keys)?.whole(&self.keys)?;
             match contents::read(&client, &self.keys, &seen, seen.revision, None) {
                 // etcd may compact that revision away while it is read.
@@ -260,7 +275,7 @@ impl Store for Etcd {
     }
 
     fn mark_unfinished(&self) -> Result<(), CopyError> {
-        let seen = Seen::look(&self.client(), &self.keys)?;
+        let seen = Seen::look(&*self.client()?, &self.keys)?;
         let leader = written_at(self.keys.leader(), seen.revision_of_leader());
         // A copy of it that arrives when the place was given up does nothing.
         let success = vec![put(self.keys.unfinished(), "a copy is being made")];
@@ -273,7 +288,7 @@ impl Store for Etcd {
     }
 
     fn place(&self) -> String {
-        format!("{} in etcd at {}", self.keys.prefix(), self.client().place())
+        format!("{} in etcd at {}", self.keys.prefix(), self.options.endpoints.join(", "))
     }
 }
 

@@ -12,6 +12,8 @@
 //! A holder that hears no answers may say nothing, so it must not keep the place either: it writes `alive` once, to two members at the most,
 //! and from then on only looks, until a look is answered.
 //!
+//! Nor must a holder keep the place whose owner takes no turns (`owner.rs`): it only looks, and confirms nothing, until the owner takes one.
+//!
 //! While etcd has no space `alive` cannot be written, and nobody can take the place. The holder confirms itself by taking `writable` away,
 //! which needs no space. Who wants the place compares `writable` as well, and writes it where it is not there: silence begins with that, for
 //! the last confirmation may be as young.
@@ -20,6 +22,7 @@ use super::client::{CallError, Client, Patience, cluster_of};
 use super::format::{Current, Head, Holder, Leader, Meta, VERSION, parse, text};
 use super::keys::{Keys, delete, found_one, get, look, put, written_at};
 use super::mark::{Height, Mark};
+use super::owner::LONGEST_TURN;
 use super::silence::{self, Signs, Silence, Verdict};
 use super::wire::{Compare, KeyValue, RequestOp, TxnRequest, TxnResponse};
 use crate::error::{Fault, OpenError, ReadError};
@@ -52,6 +55,8 @@ pub(super) struct Seen {
     pub(super) through: Option<u64>,
     /// It is a part of a copy.
     unfinished: bool,
+    /// It was moved, where to.
+    moved: Option<String>,
     signs: Signs,
     /// etcd's number of its cluster.
     pub(super) cluster: u64,
@@ -77,6 +82,8 @@ pub(super) struct Term {
     unheard: AtomicBool,
     /// `writable` was taken away: etcd has no space.
     unwritable: AtomicBool,
+    /// Whom the writer belongs to takes no turns.
+    owner_hangs: AtomicBool,
 }
 
 impl Seen {
@@ -90,6 +97,7 @@ impl Seen {
             keys.writable(),
             keys.current(),
             keys.unfinished(),
+            keys.moved(),
         ];
         let request = look(small.map(get).into());
         let answer = client.repeat(&request, PATIENCE, Instant::now() + REACH);
@@ -110,22 +118,27 @@ impl Seen {
         let current: Option<Current> = next().map(|kv| parse(&keys.current(), &kv.value)).transpose()?;
         let through = current.map(|current| current.through);
         let unfinished = next().is_some();
+        let moved = next().map(|kv| String::from_utf8_lossy(&kv.value).into_owned());
         if let Some(newer) = meta.as_ref().filter(|meta| meta.version > VERSION) {
             let place = keys.prefix().to_owned();
             return Err(ReadError::Newer { place, found: newer.version, supported: VERSION });
         }
-        Ok(Seen { meta, leader, head, step, signs, through, unfinished, cluster, revision })
+        Ok(Seen { meta, leader, head, step, signs, through, unfinished, moved, cluster, revision })
     }
 
-    /// Refuses a part of a copy.
+    /// Refuses a part of a copy, and what was moved.
     pub(super) fn whole(self, keys: &Keys) -> Result<Seen, ReadError> {
         let prefix = keys.prefix();
-        match self.unfinished {
-            true => {
-                let how = format!("etcdctl del --prefix {prefix}/");
-                Err(ReadError::Unfinished { place: format!("{prefix} in etcd"), how })
+        let place = format!("{prefix} in etcd");
+        match &self.moved {
+            _ if self.unfinished => {
+                Err(ReadError::Unfinished { place, how: format!("etcdctl del --prefix {prefix}/") })
             }
-            false => Ok(self),
+            Some(to) => {
+                let how = format!("etcdctl del {}", String::from_utf8_lossy(&keys.moved()));
+                Err(ReadError::Moved { place, to: to.clone(), how })
+            }
+            None => Ok(self),
         }
     }
 
@@ -260,6 +273,7 @@ pub(super) fn take(
         lost: AtomicBool::new(false),
         unheard: AtomicBool::new(false),
         unwritable: AtomicBool::new(false),
+        owner_hangs: AtomicBool::new(false),
     })
 }
 
@@ -267,9 +281,9 @@ impl Term {
     /// Held since a revision, for tests of what it guards.
     #[cfg(test)]
     pub(super) fn since(client: Arc<Client>, keys: Keys, leader: i64) -> Term {
-        let [lost, unheard, unwritable] = [(); 3].map(|()| AtomicBool::new(false));
+        let [lost, unheard, unwritable, owner_hangs] = [(); 4].map(|()| AtomicBool::new(false));
         let (epoch, store, generation, accepted, draw) = (Epoch(1), 1, 0, None, 1);
-        Term { client, keys, epoch, store, generation, accepted, leader, draw, lost, unheard, unwritable }
+        Term { client, keys, epoch, store, generation, accepted, leader, draw, lost, unheard, unwritable, owner_hangs }
     }
 
     /// Holds as long as the place is held.
@@ -297,8 +311,17 @@ impl Term {
         if self.lost.load(Ordering::SeqCst) {
             return Err(self.deposed());
         }
-        if self.unheard.load(Ordering::SeqCst) {
+        let owner_hangs = self.owner_hangs.load(Ordering::SeqCst);
+        if self.unheard.load(Ordering::SeqCst) || owner_hangs {
             self.look()?;
+        }
+        if owner_hangs {
+            let what = format!("its process has taken no turn for {} s", LONGEST_TURN.as_secs());
+            return Err(Fault::Remote { action: "keep", place: self.keys.prefix().to_owned(), what });
+        }
+        // Given up meanwhile.
+        if self.lost.load(Ordering::SeqCst) {
+            return Err(self.deposed());
         }
         let mut alive = vec![put(self.keys.alive(), text(&self.epoch.0))];
         let was_unwritable = self.unwritable.load(Ordering::SeqCst);
@@ -323,6 +346,17 @@ impl Term {
         renewed
     }
 
+    /// Whether whom the writer belongs to hangs. While it does, nothing is confirmed, and the place is not kept.
+    pub(super) fn owner_hangs(&self, hangs: bool) {
+        if self.owner_hangs.swap(hangs, Ordering::SeqCst) != hangs {
+            let place = self.keys.prefix();
+            match hangs {
+                true => tracing::error!(place, "this process takes no turns: it does not keep its place"),
+                false => tracing::warn!(place, "this process takes its turns again"),
+            }
+        }
+    }
+
     /// Whether the place is still held. It does not keep it.
     fn look(&self) -> Result<(), Fault> {
         self.held(self.client.attempt(self.guarded(vec![get(self.keys.leader())]), PATIENCE))
@@ -341,8 +375,8 @@ impl Term {
     pub(super) fn give_up(&self) {
         let vacant = Leader { epoch: self.epoch.0, holder: None, draw: self.draw };
         let request = self.guarded(vec![put(self.keys.leader(), text(&vacant)), delete(self.keys.alive())]);
-        let _ = self.client.attempt(request, PATIENCE);
         self.lost.store(true, Ordering::SeqCst);
+        let _ = self.client.attempt(request, PATIENCE);
     }
 
     pub(super) fn fault(&self, action: &'static str, error: &CallError) -> Fault {

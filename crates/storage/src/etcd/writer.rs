@@ -13,13 +13,15 @@ use super::compaction::Compaction;
 use super::format::{Current, Head, Step, encode_frame, parse, text};
 use super::keys::{found_one, get, put};
 use super::mark::{Height, Mark};
+use super::owner::Owner;
 use super::term::{HeldPlace, RENEW_INTERVAL, Term};
 use super::wire::{RequestOp, TxnRequest};
 use crate::durable::Durable;
-use crate::error::{AppendError, CompactError, CompactionFailure, Fault};
+use crate::error::{AppendError, CompactError, CompactionFailure, CopyError, Fault};
 use crate::pending::{Batch, Pending, RECORD_HEADER};
-use crate::store::{MakeSnapshot, Place, Position, Writer};
+use crate::store::{MakeSnapshot, Place, Position, Turns, Writer};
 use std::collections::VecDeque;
+use std::fmt;
 use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
@@ -93,8 +95,11 @@ impl Shared {
         Shared { term, pending, bounds, frames, snapshots, closing_since: Mutex::default() }
     }
 
-    /// Changes a snapshot, or what one replaces.
+    /// Changes a snapshot, or what one replaces. Nobody waits for that who closes the log.
     pub(super) fn change_snapshots(&self, operations: Vec<RequestOp>) -> Result<(), Fault> {
+        if self.pending.is_closing() {
+            return Err(Fault::Closed);
+        }
         let mut snapshots = self.snapshots.lock().unwrap_or_else(PoisonError::into_inner);
         let (chain, step) = &mut *snapshots;
         *step += 1;
@@ -149,7 +154,7 @@ impl Shared {
             }
             let over = match &error {
                 CallError::Unknown(_) | CallError::NoSpace => false,
-                CallError::Refused(_) => began.elapsed() >= REFUSED_PATIENCE,
+                CallError::Refused(_) | CallError::OtherCluster { .. } => began.elapsed() >= REFUSED_PATIENCE,
                 CallError::TooLarge(_) | CallError::WentBack { .. } => true,
             };
             if over || self.has_waited_to_close() {
@@ -269,12 +274,13 @@ impl Writing {
 
 /// Says that the place is held, from the moment it was taken: reading a long log may take longer than a silence. Gives the place up in
 /// the end.
-#[derive(Debug)]
 pub(super) struct Renewing {
     term: Arc<Term>,
     /// Who hears that the place is lost, once there is a writer.
     writer: Arc<OnceLock<Arc<Shared>>>,
     panicked: Arc<AtomicBool>,
+    /// How many turns the owner has taken, where it says so.
+    turns: Arc<OnceLock<Turns>>,
     /// Ends the thread; nothing after the end.
     thread: Option<(mpsc::Sender<()>, JoinHandle<()>)>,
 }
@@ -284,12 +290,15 @@ impl Renewing {
         let (end, ended) = mpsc::channel::<()>();
         let writer = Arc::new(OnceLock::<Arc<Shared>>::new());
         let (renewed, tell, kept) = (term.clone(), writer.clone(), mark);
+        let turns = Arc::new(OnceLock::<Turns>::new());
+        let (taken, mut owner) = (turns.clone(), Owner::since(Instant::now()));
         let panicked = Arc::new(AtomicBool::new(false));
         let unrenewed = Unrenewed { writer: writer.clone(), panicked: panicked.clone() };
         let renew = move || {
             let _unrenewed = unrenewed;
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(RENEW_INTERVAL) {
                 ratn_panic_point::panic_point("etcd-renewer");
+                renewed.owner_hangs(owner.hangs(taken.get().and_then(|taken| taken()), Instant::now()));
                 // One that is found lost before there is a writer is found lost again.
                 if let (Err(fault @ Fault::Deposed { .. }), Some(writer)) = (renewed.renew(), tell.get()) {
                     writer.pending.stop(&fault);
@@ -300,7 +309,7 @@ impl Renewing {
             keep(&kept, &tell);
         };
         let thread = thread::Builder::new().name("etcd-renewer".to_owned()).spawn(renew)?;
-        Ok(Renewing { term, writer, panicked, thread: Some((end, thread)) })
+        Ok(Renewing { term, writer, panicked, turns, thread: Some((end, thread)) })
     }
 
     fn watched_by(&self, writer: &Arc<Shared>) {
@@ -313,8 +322,9 @@ impl Renewing {
     fn end(&mut self) {
         if let Some((end, thread)) = self.thread.take() {
             drop(end);
-            let _ = thread.join();
+            // Whatever the thread is still asking: it is refused from now on.
             self.term.give_up();
+            let _ = thread.join();
         }
     }
 }
@@ -352,6 +362,12 @@ fn keep(mark: &Mark, writer: &OnceLock<Arc<Shared>>) {
     }
 }
 
+impl fmt::Debug for Renewing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Renewing").field("term", &self.term).finish_non_exhaustive()
+    }
+}
+
 impl Drop for Renewing {
     fn drop(&mut self) {
         self.end();
@@ -368,14 +384,13 @@ impl EtcdWriter {
         Ok(EtcdWriter { shared, writing: Some(writing), compaction: None, renewing })
     }
 
-    /// Writes what waits, gives up the place, and ends every thread.
+    /// Writes what waits, gives up the place, and ends every thread. A compaction is given up: the next writer makes another one.
     fn end(&mut self) {
         self.shared.close();
-        for thread in [self.writing.take(), self.compaction.take()].into_iter().flatten() {
-            // Its panic has stopped the log already, with a fault.
-            let _ = thread.join();
-        }
+        // A panic of these has stopped the log already, with a fault.
+        let _ = self.writing.take().map(JoinHandle::join);
         self.renewing.end();
+        let _ = self.compaction.take().map(JoinHandle::join);
         self.shared.pending.stop(&Fault::Closed);
     }
 }
@@ -415,6 +430,20 @@ impl Writer for EtcdWriter {
 
     fn place(&self) -> Box<dyn Place> {
         Box::new(HeldPlace(self.shared.term.clone()))
+    }
+
+    fn attend(&mut self, turns: Turns) {
+        let _ = self.renewing.turns.set(turns);
+    }
+
+    fn mark_moved(&mut self, to: &str) -> Result<(), CopyError> {
+        let term = &self.shared.term;
+        let answer = self.shared.perform(&term.guarded(vec![put(term.keys.moved(), to.to_owned())]));
+        match answer {
+            Ok(answer) if answer.succeeded => Ok(()),
+            Ok(_) => Err(CopyError::SourceLost(term.deposed())),
+            Err(fault) => Err(CopyError::SourceLost(fault)),
+        }
     }
 
     fn waiting_bytes(&self) -> usize {

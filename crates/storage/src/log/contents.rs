@@ -77,6 +77,15 @@ fn read_once(directory: &Path) -> Result<Contents, ReadError> {
         let place = directory.display().to_string();
         return Err(ReadError::Unfinished { how: format!("rm -r {place}"), place });
     }
+    let moved = directory.join(directory::MOVED);
+    match std::fs::read_to_string(&moved) {
+        Ok(to) => {
+            let (place, how) = (directory.display().to_string(), format!("rm {}", moved.display()));
+            return Err(ReadError::Moved { place, to, how });
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+        Err(source) => return Err(ReadError::Io { action: "read", place: moved.display().to_string(), source }),
+    }
     let mut contents = Contents::default();
     if let Some(&through) = listing.snapshots.last() {
         let path = directory::snapshot(directory, through);

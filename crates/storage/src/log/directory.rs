@@ -5,6 +5,7 @@
 //!   segment-00000000000000000001.log    by number
 //!   snapshot-00000000000000004711.snap  by the last position it stands for
 //!   unfinished-copy                     as long as not all of a copy is there
+//!   moved-to                            says where all of it was moved to
 //!   *.tmp                               not finished; the next writer removes it
 //! ```
 
@@ -14,6 +15,7 @@ use std::{fs, io};
 
 pub(super) const LOCK: &str = "writer.lock";
 pub(super) const UNFINISHED_COPY: &str = "unfinished-copy";
+pub(super) const MOVED: &str = "moved-to";
 const TEMPORARY: &str = "tmp";
 
 /// What is there, in order.

@@ -1,6 +1,7 @@
 //! The writer's side of a log in files.
 
 use super::compaction::Compaction;
+use super::directory;
 use super::files::Files;
 use super::format::StoreId;
 use super::lock::HeldPlace;
@@ -8,7 +9,7 @@ use super::shared::Shared;
 use super::syncer::Syncer;
 use super::{Durability, Options};
 use crate::durable::Durable;
-use crate::error::{AppendError, CompactError, Fault};
+use crate::error::{AppendError, CompactError, CopyError, Fault};
 use crate::store::{MakeSnapshot, Place, Position, Writer};
 use std::io;
 use std::sync::Arc;
@@ -83,6 +84,17 @@ impl Writer for LogWriter {
 
     fn place(&self) -> Box<dyn Place> {
         Box::new(self.place.clone())
+    }
+
+    fn mark_moved(&mut self, to: &str) -> Result<(), CopyError> {
+        self.place.check().map_err(CopyError::SourceLost)?;
+        let mark = self.shared.directory.join(directory::MOVED);
+        let temporary = directory::temporary(&mark);
+        let written =
+            self.files.create(&temporary).and_then(|mut file| file.write(to.as_bytes()).and_then(|()| file.sync()));
+        let marked = written.and_then(|()| self.files.rename(&temporary, &mark));
+        let marked = marked.and_then(|()| self.files.sync_directory(&self.shared.directory));
+        marked.map_err(|source| CopyError::Io { action: "make", place: mark.display().to_string(), source })
     }
 
     fn waiting_bytes(&self) -> usize {

@@ -58,6 +58,10 @@ impl Writer for Ends {
         self.writer.place()
     }
 
+    fn mark_moved(&mut self, to: &str) -> Result<(), CopyError> {
+        self.writer.mark_moved(to)
+    }
+
     fn waiting_bytes(&self) -> usize {
         self.writer.waiting_bytes()
     }

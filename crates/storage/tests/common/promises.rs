@@ -5,7 +5,7 @@ use super::{append_durably, compacted, payloads};
 use bytes::Bytes;
 use proptest::prelude::*;
 use proptest::test_runner::{RngAlgorithm, TestRng, TestRunner};
-use ratn_storage::{OpenError, Position, ReadError, Store, Writer, transfer};
+use ratn_storage::{CopyError, OpenError, Position, ReadError, Recovered, Store, Writer, transfer, transfer_running};
 
 /// Makes a log by its name: the same name, the same log.
 pub(crate) type Make<'a> = &'a dyn Fn(&str) -> Box<dyn Store>;
@@ -74,6 +74,83 @@ pub(crate) fn a_copy_that_was_interrupted_is_not_opened(make: Make<'_>) {
     }
     transfer(&*make("source"), &*make("target")).unwrap();
     assert_eq!(payloads(&make("target").open().unwrap().0.records), [b"1", b"2", b"3"]);
+}
+
+pub(crate) fn what_was_moved_is_opened_only_where_it_is_now(make: Make<'_>) {
+    let (_, mut source) = make("here").open().unwrap();
+    for record in [b"1", b"2", b"3"] {
+        append_durably(&mut *source, record);
+    }
+    source.close().unwrap();
+    transfer_running(&*make("here"), &*make("backup")).unwrap();
+    let goes_on = |name: &str| assert_eq!(payloads(&make(name).open().unwrap().0.records), [b"1", b"2", b"3"]);
+    goes_on("here");
+    transfer(&*make("here"), &*make("there")).unwrap();
+    let moved = |name: &str, to: &str| {
+        let error = make(name).open().map(drop).unwrap_err();
+        let says = error.to_string();
+        assert!(matches!(&error, OpenError::Read(ReadError::Moved { .. })), "{error:?}");
+        assert!(says.contains(&make(to).place()) && says.contains("to go back"), "{says}");
+        assert!(matches!(make(name).read(), Err(ReadError::Moved { .. })));
+        for copy in [transfer, transfer_running] {
+            assert!(copy(&*make(name), &*make("other")).unwrap_err().to_string().contains("was moved to"));
+        }
+    };
+    moved("here", "there");
+    goes_on("there");
+    transfer(&*make("there"), &*make("back")).unwrap();
+    moved("there", "back");
+    goes_on("back");
+    goes_on("backup");
+}
+
+pub(crate) fn a_copy_of_what_another_writer_has_taken_meanwhile_is_not_opened(
+    make: Make<'_>,
+    take: &(dyn Fn(&str) + Sync),
+) {
+    let (_, mut source) = make("taken").open().unwrap();
+    append_durably(&mut *source, b"1");
+    source.close().unwrap();
+    let target = Meanwhile { store: make("copy"), what: &|| take("taken") };
+    let error = transfer(&*make("taken"), &target).unwrap_err();
+    assert!(matches!(error, CopyError::SourceLost(_)), "{error:?}");
+    assert!(matches!(make("copy").open(), Err(OpenError::Read(ReadError::Unfinished { .. }))));
+    assert_eq!(payloads(&make("taken").open().unwrap().0.records), [b"1"]);
+}
+
+/// While it is opened something else happens.
+struct Meanwhile<'a> {
+    store: Box<dyn Store>,
+    what: &'a (dyn Fn() + Sync),
+}
+
+impl std::fmt::Debug for Meanwhile<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.store.fmt(f)
+    }
+}
+
+impl Store for Meanwhile<'_> {
+    fn open(&self) -> Result<(Recovered, Box<dyn Writer>), OpenError> {
+        (self.what)();
+        self.store.open()
+    }
+
+    fn read(&self) -> Result<Recovered, ReadError> {
+        self.store.read()
+    }
+
+    fn mark_unfinished(&self) -> Result<(), CopyError> {
+        self.store.mark_unfinished()
+    }
+
+    fn mark_whole(&self) -> Result<(), CopyError> {
+        self.store.mark_whole()
+    }
+
+    fn place(&self) -> String {
+        self.store.place()
+    }
 }
 
 pub(crate) fn a_waiter_hears_when_the_writer_is_gone(make: Make<'_>) {
