@@ -78,6 +78,7 @@ fn a_box_on_the_deck_rides_round_the_table_and_is_still_delivered() {
     println!("in {:.1} s it slid by {:.2} mm", bench.now.since(start).as_secs_f64(), slid * 1e3);
     assert!(rode.on_base && rode.on == "base", "{rode:?}");
     assert!(slid < 0.01, "it slid by {:.1} mm on the deck", slid * 1e3);
+    assert_eq!(bench.cell.unintended_contacts(), []);
 }
 
 #[test]
@@ -93,6 +94,7 @@ fn the_arm_grasps_from_wherever_the_base_stands() {
     bench.reach_for(0);
     let Product::Grasped { .. } = bench.done(grasp()) else { panic!() };
     assert!(bench.cell.ground_truth()[0].held);
+    assert_eq!(bench.cell.unintended_contacts(), []);
 }
 
 #[test]

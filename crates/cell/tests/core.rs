@@ -260,6 +260,7 @@ fn believing_only_what_the_camera_sees_the_robot_delivers_every_box() {
         }
         let truth = bench.cell.ground_truth();
         assert!(truth.iter().all(|b| b.on_base), "seed {seed}: {truth:#?}");
+        assert_eq!(bench.cell.unintended_contacts(), [], "seed {seed}");
         let stow = bench.plan(&believed, vec![Goal::Joints(aimm::STOWED)], 0.0, 0.0);
         bench.done(Request::Follow { trajectory: stow });
         bench.done(Request::LookAt { target: [-0.37, 0.0, 0.60] });

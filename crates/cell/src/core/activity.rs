@@ -41,7 +41,7 @@ pub(crate) struct Activity {
 pub(crate) enum Kind {
     Drive(Motion<3>),
     Follow(Motion<7>),
-    Close { from: f64, object: String, expected: Option<Pose> },
+    Close { from: f64, to: f64, object: String, expected: Option<Pose> },
     Open { from: f64, to: f64 },
     Look { from: [f64; 2], to: [f64; 2] },
     SenseBase,
@@ -107,8 +107,7 @@ impl Activity {
     pub(crate) fn finger(&self, now: Timestamp) -> Option<f64> {
         let fraction = self.fraction(now);
         match &self.kind {
-            Kind::Close { from, .. } => Some(from * (1.0 - fraction)),
-            Kind::Open { from, to } => Some(from + (to - from) * fraction),
+            Kind::Close { from, to, .. } | Kind::Open { from, to } => Some(from + (to - from) * fraction),
             _ => None,
         }
     }

@@ -10,6 +10,7 @@
 
 use super::activity::{Activity, Kind, seconds};
 use super::battery::Battery;
+use super::contacts::{Contact, Contacts};
 use super::deviations::LOST;
 use super::environment::Environment;
 use super::faults::Faults;
@@ -47,6 +48,7 @@ pub struct Cell {
     /// How far each object leaned at the most while it was held, in radians.
     pub(super) tilts: Vec<f64>,
     pub(super) held: Option<Held>,
+    pub(super) contacts: Contacts,
     pub(super) faults: Faults,
     /// Until when the camera is blind.
     pub(super) blind_until: Timestamp,
@@ -87,6 +89,7 @@ impl Cell {
             tilts: vec![0.0; ids.len()],
             ids,
             held: None,
+            contacts: Contacts::default(),
             faults: Faults::new(&config.faults, config.seed),
             blind_until: now,
             lost_until: now,
@@ -125,6 +128,7 @@ impl Cell {
             Event::PutBack { snapshot } => self.put_back(&snapshot, &mut out),
             Event::Tick => {}
         }
+        out.extend(self.contacts.tell().into_iter().map(|contact| Command::Touched { contact }));
         out
     }
 
@@ -175,6 +179,11 @@ impl Cell {
             TrueObject { id, kind, size, pose, on_base, in_place, greatest_tilt_rad, held, on }
         };
         (0..self.ids.len()).map(truth).collect()
+    }
+
+    /// What touched that should not have, since the scene was laid: the first [`super::contacts::MAX_CONTACTS`].
+    pub fn unintended_contacts(&self) -> Vec<Contact> {
+        self.contacts.unintended()
     }
 
     /// How full the battery is, 0 to 1.
@@ -289,12 +298,13 @@ impl Cell {
             Kind::Follow(motion) => {
                 let (end, broken) = motion.end();
                 self.resting.arm = end;
+                self.contacts.arrived();
                 match broken {
                     Some(reason) => Ending::Aborted(reason.to_owned()),
                     None => Ending::Done(Product::Moved { end, tracking: followed }),
                 }
             }
-            Kind::Close { from, object, expected } => self.close(from, object, expected.as_ref()),
+            Kind::Close { from, object, expected, .. } => self.close(from, object, expected.as_ref()),
             Kind::Open { to, .. } => {
                 self.resting.finger = to;
                 Ending::Done(Product::Released)
@@ -342,6 +352,7 @@ impl Cell {
         // The request was checked before it became an event; a table that cannot be laid is an empty one.
         let objects = placement::objects(&self.robot, self.config.scene, goods, seed).unwrap_or_default();
         self.held = None;
+        self.contacts = Contacts::default();
         self.tilts = vec![0.0; objects.len()];
         (self.environment, self.ids) = environment(&self.robot, &self.resting, self.config.scene, &objects);
         self.environment.skip_until(self.now);

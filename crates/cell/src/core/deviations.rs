@@ -123,6 +123,7 @@ impl Cell {
             free.then(|| Pose::from_rpy([x, y, height], 0.0, 0.0, yaw))
         });
         if let Some(pose) = place {
+            self.contacts.put(object);
             self.environment.put(object, &pose);
         }
     }

@@ -71,6 +71,17 @@ pub enum NotGrasped {
     },
 }
 
+impl NotGrasped {
+    /// The object that the fingers closed at; of several, the first.
+    pub fn object(&self) -> Option<&str> {
+        match self {
+            NotGrasped::Nothing => None,
+            NotGrasped::Askew { id, .. } | NotGrasped::Beyond { id, .. } | NotGrasped::Edge { id, .. } => Some(id),
+            NotGrasped::Several { first, .. } => Some(first),
+        }
+    }
+}
+
 /// How far a cuboid may be turned away from the closing direction.
 pub const MAX_ASKEW_DEGREES: f64 = 15.0;
 /// How much of it the pads must hold, along x and along z.

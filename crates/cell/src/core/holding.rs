@@ -3,6 +3,7 @@
 use super::cell::Cell;
 use super::environment::{GRAVITY, Grip, Hold, Kind, Load, Model, STEP, Slip, Support};
 use super::faults::Kind as Fault;
+use super::grasping::{Grip as GripOf, NotGrasped};
 use super::objects::ON_BASE;
 use super::protocol::{Ending, Product};
 use ratn_model::pose::Pose;
@@ -21,6 +22,9 @@ pub(super) struct Held {
     /// The tool stood still and it did not slip.
     steady: bool,
 }
+
+/// A part of an object, in the object's frame, and its edges in metres.
+type Cuboid = (Pose, [f64; 3]);
 
 /// How far something may lean and still stand as it was made to.
 const MAX_LEAN_RAD: f64 = 0.2;
@@ -50,15 +54,33 @@ impl Held {
 }
 
 impl Cell {
+    /// How far each finger is from the middle when something between them stops them, if something does.
+    pub(super) fn closes_to(&self, from: f64) -> f64 {
+        let tool = self.robot.tool_pose(&self.configuration());
+        self.between(from, &tool).1.map_or(0.0, |grip| grip.width / 2.0)
+    }
+
+    /// Of every object the part that fingers could close around, and what they hold when they close from `from`.
+    fn between(&self, from: f64, tool: &Pose) -> (Vec<Cuboid>, Result<GripOf, NotGrasped>) {
+        let parts: Vec<Cuboid> =
+            (0..self.ids.len()).map(|i| self.grip_part(i, &tool.inverse().compose(&self.pose_of(i, tool)))).collect();
+        let there: Vec<(String, Pose, [f64; 3])> = (parts.iter().enumerate())
+            .map(|(i, (part, size))| (self.ids[i].clone(), self.pose_of(i, tool).compose(part), *size))
+            .collect();
+        let closed = self.pads.close(tool, from, &there);
+        (parts, closed)
+    }
+
     /// The fingers have closed from `from` metres on each side of the middle.
     pub(super) fn close(&mut self, from: f64, object: String, expected: Option<&Pose>) -> Ending {
         let tool = self.robot.tool_pose(&self.configuration());
-        let parts: Vec<(Pose, [f64; 3])> =
-            (0..self.ids.len()).map(|i| self.grip_part(i, &tool.inverse().compose(&self.pose_of(i, &tool)))).collect();
-        let there: Vec<(String, Pose, [f64; 3])> = (parts.iter().enumerate())
-            .map(|(i, (part, size))| (self.ids[i].clone(), self.pose_of(i, &tool).compose(part), *size))
-            .collect();
-        let grip = match self.pads.close(&tool, from, &there) {
+        let (parts, closed) = self.between(from, &tool);
+        let around = match &closed {
+            Ok(grip) => Some(grip.index),
+            Err(reason) => reason.object().and_then(|id| self.ids.iter().position(|known| known == id)),
+        };
+        self.contacts.closed(around);
+        let grip = match closed {
             Ok(grip) => grip,
             Err(reason) => {
                 // Something stopped the fingers, or nothing did: either way they hold nothing.
@@ -90,6 +112,7 @@ impl Cell {
     /// The fingers open: what they held is left to itself.
     pub(super) fn let_go(&mut self) {
         let Some(held) = self.held.take() else { return };
+        self.contacts.let_go(held.object, true);
         let tool = self.robot.tool_pose(&self.configuration());
         self.environment.let_go(held.object, &tool.compose(&held.in_tool), [0.0; 3]);
     }
@@ -132,6 +155,7 @@ impl Cell {
         let slid = tool.rotate([held.slip.along[0], 0.0, held.slip.along[1]]);
         self.environment.let_go(held.object, &pose, std::array::from_fn(|i| velocity[i] + slid[i]));
         self.held = None;
+        self.contacts.let_go(held.object, false);
         // Nothing is left to stop the fingers.
         self.resting.finger = 0.0;
         Some(held.object)

@@ -1,6 +1,7 @@
 //! The cell as a pure machine: events in, commands out, time as an argument.
 
 pub mod cell;
+pub mod contacts;
 pub mod environment;
 pub mod faults;
 pub mod grasping;

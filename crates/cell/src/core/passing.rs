@@ -2,6 +2,7 @@
 
 use super::activity::{Activity, Kind};
 use super::cell::Cell;
+use super::contacts::Doing;
 use super::protocol::{Command, Ending, Module};
 use ratn_model::time::Timestamp;
 
@@ -32,8 +33,17 @@ impl Cell {
             self.hold(moves, |_| Ending::Aborted(reason.clone()), out);
         }
         let open = self.config.gripper.opening_m / 2.0 - configuration.finger < OPEN_M;
-        self.environment.set_fingers_solid(open);
+        // Closed around something, they stand at its faces.
+        let solid = open || self.held.is_some();
+        self.environment.set_fingers_solid(solid);
         self.environment.step(&self.robot, &configuration);
+        let doing = Doing {
+            now: self.environment.now(),
+            held: self.held.map(|held| held.object),
+            moves: self.is_active(Module::Arm) || self.is_active(Module::Base),
+            fingers_solid: solid,
+        };
+        self.contacts.observe(&self.environment.touches(), doing, &self.environment, &self.ids);
     }
 
     /// Whether something may move that the environment does not know of: the robot, or what it holds.

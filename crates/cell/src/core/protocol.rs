@@ -1,6 +1,7 @@
 //! What goes into the cell's core and comes out of it.
 
 pub use super::activity::{Module, Ticket};
+use super::contacts::Contact;
 use super::faults::Fault;
 pub use super::motion::Tracking;
 use super::picture::Exposure;
@@ -123,6 +124,11 @@ pub enum Command {
     Saved {
         /// All of it.
         snapshot: Box<Snapshot>,
+    },
+    /// Two bodies touched that should not have.
+    Touched {
+        /// Which, and how.
+        contact: Contact,
     },
 }
 

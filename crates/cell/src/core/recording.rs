@@ -4,12 +4,14 @@
 //! {"form":2,"config":{…}}                                  first: how the cell was made
 //! {"at":…,"event":{…}}                                     what came in, in the robot's nanoseconds
 //! {"at":…,"ended":…,"how":"done"}                          what a goal came to
+//! {"at":…,"contact":{…}}                                    what touched that should not have
 //! {"at":…,"world":"…"}                                     after each event: the digest of the environment
 //! ```
 //! The core is a function of its events, so a recording is replayed by giving them again; the endings and the digests say whether the
 //! same came of it. Ticks are left out: nothing depends on when the core is asked.
 
 use super::cell::Cell;
+use super::contacts::Contact;
 use super::placement::PlacementError;
 use super::protocol::{Command, Ending, Event, Ticket, Tracking};
 use crate::config::CellConfig;
@@ -53,6 +55,13 @@ pub enum Line {
         /// How well it followed its trajectory, where it followed one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         tracking: Option<Tracking>,
+    },
+    /// Two bodies touched that should not have.
+    Contact {
+        /// When it was told.
+        at: Timestamp,
+        /// Which, and how.
+        contact: Contact,
     },
     /// The environment after an event.
     World {
@@ -130,8 +139,12 @@ impl Line {
                 tracking: tracking(command),
             })
         });
+        let touched = commands.iter().filter_map(|command| match command {
+            Command::Touched { contact } => Some(Line::Contact { at, contact: contact.clone() }),
+            _ => None,
+        });
         let world = (!is_tick).then(|| Line::World { at, world: cell.environment.digest().to_string() });
-        begin.into_iter().chain(ended).chain(world).collect()
+        begin.into_iter().chain(ended).chain(touched).chain(world).collect()
     }
 }
 
@@ -181,6 +194,8 @@ pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replaye
                 }
                 replayed.goals += 1;
             }
+            // What is made of the same world by the same rules is the same.
+            Line::Contact { .. } => {}
             Line::World { world, .. } => {
                 let now = cell.environment.digest().to_string();
                 if now != world {

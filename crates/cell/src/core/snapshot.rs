@@ -1,10 +1,11 @@
 //! The cell's state as a value: what it can be put back to, or made of in another process.
 //!
 //! No goal is part of it: who gave one is not there any more when it is restored, so every joint is where it had come to and holds.
-//! The emergency stop is not part of it either: it is about the world outside.
+//! The emergency stop is not part of it either: it is about the world outside. Nor is what has touched: that is judged from there anew.
 
 use super::battery::Battery;
 use super::cell::Cell;
+use super::contacts::Contacts;
 use super::environment::{Environment, Saved};
 use super::faults::{Fault, Faults};
 use super::holding::Held;
@@ -135,6 +136,7 @@ impl Cell {
             Environment::restore(&self.robot, &self.resting, &furniture(self.config.scene), &snapshot.environment);
         self.environment.set_time(self.now);
         self.held = snapshot.held.as_ref().map(|held| Held::new(held.object, held.in_tool, held.friction));
+        self.contacts = Contacts::default();
         self.ids.clone_from(&snapshot.ids);
         self.tilts.clone_from(&snapshot.tilts);
         self.seed = snapshot.seed;

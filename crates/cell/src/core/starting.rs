@@ -57,7 +57,9 @@ impl Cell {
                 if let Some(held) = self.held {
                     return Err(format!("the gripper holds {} already", self.ids[held.object]));
                 }
-                (Kind::Close { from: here.finger, object, expected }, self.config.gripper.close_s)
+                self.contacts.closing();
+                let to = self.closes_to(here.finger);
+                (Kind::Close { from: here.finger, to, object, expected }, self.config.gripper.close_s)
             }
             Request::Release => {
                 self.no_motion_of(Module::Base)?;
@@ -90,6 +92,9 @@ impl Cell {
                 (kind, period * f64::from(frames))
             }
         };
+        if matches!(kind, Kind::Follow(_) | Kind::Drive(_)) {
+            self.contacts.sets_out();
+        }
         let (started, ends) = (self.motion_time, self.motion_time + seconds(lasts_s));
         self.activities.insert(module, Activity { ticket, started, ends, kind });
         Ok(())

@@ -5,6 +5,7 @@
 use super::recorder::Recorder;
 use crate::config::Goods;
 use crate::core::cell::Cell;
+use crate::core::contacts::Contact;
 use crate::core::faults::{Fault, MAX_FAULTS};
 use crate::core::picture::{Exposure, develop};
 use crate::core::protocol::{Command, Ending, Event, Request, Ticket};
@@ -45,6 +46,8 @@ pub(crate) struct State {
     pub(crate) base: Pose,
     pub(crate) now: Timestamp,
     pub(crate) seed: u64,
+    /// What touched that should not have.
+    pub(crate) contacts: Vec<Contact>,
 }
 
 /// Sends messages to the keeper. Clones share it; it ends with the last of them.
@@ -314,6 +317,7 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
                         let _ = saving.send(snapshot);
                     }
                 }
+                Command::Touched { contact } => tracing::warn!(%contact, "bodies touched that should not have"),
             }
         }
         if let Some(applied) = safety {
@@ -333,6 +337,7 @@ fn state_of(cell: &Cell, now: Timestamp) -> State {
         base: cell.base_pose(),
         now,
         seed: cell.seed(),
+        contacts: cell.unintended_contacts(),
     }
 }
 

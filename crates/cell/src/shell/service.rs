@@ -2,6 +2,7 @@
 
 use super::keeper::{Keeper, KeeperError, State};
 use crate::config::{Goods, MAX_BOXES, MAX_TABLEWARE, Setting};
+use crate::core::contacts::Contact;
 use crate::core::faults::{Fault, FaultError, MAX_FAULTS};
 use crate::core::objects::TrueObject;
 use crate::core::protocol::Event;
@@ -86,6 +87,7 @@ impl CellService for Service {
             arm: Some(v1::Joints { positions: state.arm.to_vec() }),
             time_s: state.now.seconds(),
             seed: state.seed,
+            unintended_contacts: state.contacts.iter().map(contact).collect(),
             objects: objects(state),
         }))
     }
@@ -138,6 +140,19 @@ fn objects(state: State) -> Vec<v1::TrueObject> {
         greatest_tilt_rad: object.greatest_tilt_rad,
     };
     state.objects.into_iter().map(wire).collect()
+}
+
+fn contact(contact: &Contact) -> v1::UnintendedContact {
+    v1::UnintendedContact {
+        began_s: contact.began.seconds(),
+        ended_s: contact.ended.seconds(),
+        bodies: contact.bodies.to_vec(),
+        depth_m: contact.depth_m,
+        pushed_m: contact.pushed_m,
+        at_m: contact.at.to_vec(),
+        speed_m_s: contact.speed_m_s,
+        meant: contact.meant.map_or_else(String::new, |purpose| purpose.name().to_owned()),
+    }
 }
 
 fn pose(pose: &Pose) -> v1::Pose {

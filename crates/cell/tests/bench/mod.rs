@@ -47,8 +47,10 @@ impl Bench {
     }
 
     fn handle(&mut self, event: Event) -> Vec<Command> {
-        let commands = self.cell.handle(self.now, event.clone());
+        let mut commands = self.cell.handle(self.now, event.clone());
         self.lines.extend(Line::of_step(self.now, event, &commands, &self.cell));
+        // They stay with the cell.
+        commands.retain(|command| !matches!(command, Command::Touched { .. }));
         commands
     }
 

@@ -12,8 +12,8 @@ use crate::interrupt::Interrupt;
 use crate::output;
 use crate::report::gantt;
 use crate::report::timeline::Timeline;
-use crate::system::System;
 use crate::system::config::SystemConfig;
+use crate::system::{Judgement, System};
 use crate::task_control::log;
 use crate::task_control::shell::Run;
 use anyhow::{Context, anyhow, bail};
@@ -21,6 +21,7 @@ use ratn_cell::config::Setting;
 use ratn_executive::protocol::Mode;
 use ratn_model::load::Files;
 use ratn_model::program::{Program, SUCCESS};
+use ratn_proto::v1::UnintendedContact;
 use result::{Demonstration, Outcome, Plan};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -68,6 +69,9 @@ pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
             let outcome = Box::pin(run).await;
             let outcome = outcome.with_context(|| plan.name())?;
             let (end, delivered, tilt_rad) = (outcome.end.clone(), outcome.delivered, outcome.greatest_tilt_rad);
+            if let Some(touched) = said(&outcome.unintended_contacts) {
+                output::progress(format_args!("{}: {touched}", plan.name()));
+            }
             demonstration.outcomes.push(outcome);
             if interrupt.asked() {
                 return Err(anyhow!("interrupted").into());
@@ -158,8 +162,8 @@ async fn one_run(
         checkpoint_every: 0,
     };
     let system = starting(Box::pin(System::start_private(config)), interrupt).await?;
-    let (ended, (delivered, greatest_tilt_rad)) =
-        on_system(run, system, interrupt, async |system| system.in_place().await).await?;
+    let (ended, judgement) = on_system(run, system, interrupt, async |system| system.judgement().await).await?;
+    let Judgement { delivered, greatest_tilt_rad, unintended_contacts } = judgement;
     let timeline = Timeline::of(&log::read(&log_file)?.lines);
     if timeline.outcome.as_deref() != Some(ended.outcome.as_str()) {
         bail!("the event log {} does not end as the run did", log_file.display());
@@ -170,7 +174,23 @@ async fn one_run(
         format!("the task ended with {}: {}", ended.outcome, ended.reason)
     };
     let chart = directory.join(format!("{}.html", plan.file_stem()));
-    Ok(Outcome { plan: *plan, timeline, delivered, greatest_tilt_rad, end, log: log_file, chart })
+    let plan = *plan;
+    Ok(Outcome { plan, timeline, delivered, greatest_tilt_rad, unintended_contacts, end, log: log_file, chart })
+}
+
+/// What touched that should not have, as a sentence.
+fn said(contacts: &[UnintendedContact]) -> Option<String> {
+    let one = |contact: &UnintendedContact| {
+        format!(
+            "{} at {:.2} s, {:.1} mm deep, pushed by {:.1} mm",
+            contact.bodies.join(" touches "),
+            contact.began_s,
+            contact.depth_m * 1e3,
+            contact.pushed_m * 1e3
+        )
+    };
+    let all: Vec<String> = contacts.iter().map(one).collect();
+    (!all.is_empty()).then(|| format!("what touched that should not have: {}", all.join("; ")))
 }
 
 fn out_directory(arguments: &DemoArguments) -> anyhow::Result<PathBuf> {

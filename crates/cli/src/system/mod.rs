@@ -11,8 +11,8 @@ use config::SystemConfig;
 use launch::Processes;
 use ratn_daemon::config::{Durability, state_directory};
 use ratn_model::resource::Quantity;
-use ratn_proto::v1::GetGroundTruthRequest;
 use ratn_proto::v1::cell_service_client::CellServiceClient;
+use ratn_proto::v1::{GetGroundTruthRequest, UnintendedContact};
 use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -27,6 +27,18 @@ const CONFIG_FILE: &str = "system.toml";
 const CELL: &str = "cell";
 /// The kinds of objects that have to be carried upright.
 const UPRIGHT: [&str; 2] = ["bowl", "cup"];
+
+/// What really came of a task, by the cell's ground truth.
+#[derive(Debug)]
+pub(crate) struct Judgement {
+    /// How many objects are where the task was to bring them.
+    pub(crate) delivered: usize,
+    /// How far a bowl or a cup leaned at the most while it was held, in radians.
+    pub(crate) greatest_tilt_rad: f64,
+    /// What touched that should not have.
+    pub(crate) unintended_contacts: Vec<UnintendedContact>,
+}
+
 /// The roles of a system on one machine, in the order in which they are started.
 const ROLES: [&str; 4] = ["resource-manager", "world-pool", CELL, "process-manager"];
 
@@ -118,15 +130,17 @@ impl System {
         self.processes.one_ended().await
     }
 
-    /// How many objects are really where the task was to bring them, as only the cell knows, and how far a bowl or a cup leaned at the most
-    /// while it was held, in radians.
-    pub(crate) async fn in_place(&self) -> anyhow::Result<(usize, f64)> {
+    /// What really came of a task, as only the cell knows.
+    pub(crate) async fn judgement(&self) -> anyhow::Result<Judgement> {
         let channel = Channels::new().get(&self.directory.find(CELL)?)?;
         let truth = CellServiceClient::new(channel).get_ground_truth(GetGroundTruthRequest {}).await;
         let truth = truth.context("the cell does not say where its objects are")?.into_inner();
-        let count = truth.objects.iter().filter(|one| one.in_place && !one.held).count();
         let upright = truth.objects.iter().filter(|one| UPRIGHT.contains(&one.kind.as_str()));
-        Ok((count, upright.map(|one| one.greatest_tilt_rad).fold(0.0, f64::max)))
+        Ok(Judgement {
+            delivered: truth.objects.iter().filter(|one| one.in_place && !one.held).count(),
+            greatest_tilt_rad: upright.map(|one| one.greatest_tilt_rad).fold(0.0, f64::max),
+            unintended_contacts: truth.unintended_contacts,
+        })
     }
 
     /// Ends what was started for it.

@@ -1,14 +1,17 @@
 //! The environment's physics: rigid bodies, friction, a fixed step.
 //!
 //! rapier3d moves what can be moved; floor and furniture stand still, and the robot's links go where its joints are, whatever is
-//! in their way. `grip` says what the fingers can hold, `riding` what goes along with a base that drives. Nothing here reads a clock: the step is fixed, time is the number of steps,
+//! in their way. `grip` says what the fingers can hold, `riding` what goes along with a base that drives, `touch`
+//! what touches what, planned or not. Nothing here reads a clock: the step is fixed, time is the number of steps,
 //! and the same steps with the same joints give the same world to the last bit on one machine ([`Environment::digest`]).
 
 mod grip;
 mod object;
 mod riding;
+mod touch;
 mod world;
 
 pub use grip::{Grip, Hold, Load, Slip};
 pub use object::{Kind, Model};
+pub use touch::{NEAR_M, Thing, Touch};
 pub use world::{Environment, FLOOR, Furniture, GRAVITY, ObjectState, STEP, Saved, Support};

@@ -2,10 +2,11 @@
 
 use super::object::{Kind, Model};
 use super::riding::Riding;
+use super::touch::{Joined, Speed};
 use rapier3d::math::{Pose as Pose32, Vector};
 use rapier3d::parry::query::contact;
 use rapier3d::prelude::{
-    BroadPhaseBvh, CCDSolver, ColliderBuilder, ColliderHandle, ColliderSet, Group, ImpulseJointSet,
+    BroadPhaseBvh, CCDSolver, Collider, ColliderBuilder, ColliderHandle, ColliderSet, Group, ImpulseJointSet,
     IntegrationParameters, InteractionGroups, InteractionTestMode, IslandManager, MultibodyJointSet, NarrowPhase,
     PhysicsPipeline, RigidBody, RigidBodyBuilder, RigidBodyHandle, RigidBodySet, RigidBodyType, SoftBodySet,
 };
@@ -105,6 +106,11 @@ pub struct Environment {
     fingers_solid: bool,
     objects: Vec<Body>,
     pub(super) riding: Riding,
+    /// The names of the robot's links, and which of them are made to touch.
+    link_names: Vec<String>,
+    joined: Joined,
+    /// How what is left to itself moved before the last step.
+    pub(super) speeds_before: Vec<(RigidBodyHandle, Speed)>,
 }
 
 /// One body of a robot's link.
@@ -155,6 +161,16 @@ impl Environment {
         furniture: &[Furniture],
         saved: &Saved,
     ) -> Environment {
+        Environment::made(robot, configuration, furniture, saved, Joined::of(robot))
+    }
+
+    fn made(
+        robot: &Robot,
+        configuration: &Configuration,
+        furniture: &[Furniture],
+        saved: &Saved,
+        joined: Joined,
+    ) -> Environment {
         let parameters = IntegrationParameters {
             dt: STEP.as_secs_f32(),
             length_unit: LENGTH_UNIT_M,
@@ -181,6 +197,9 @@ impl Environment {
             fingers_solid: true,
             objects: Vec::new(),
             riding: Riding::restored(riders(saved)),
+            link_names: robot.links.iter().map(|link| link.name.clone()).collect(),
+            joined,
+            speeds_before: Vec::new(),
         };
         environment.furnish();
         environment.add_robot(robot, configuration);
@@ -204,8 +223,8 @@ impl Environment {
 
     /// What stands there becomes what was saved; nothing else of it changes.
     pub(super) fn make_again(&mut self, robot: &Robot, configuration: &Configuration, saved: &Saved) {
-        let solid = self.fingers_solid;
-        *self = Environment::restore(robot, configuration, &self.furniture, saved);
+        let (solid, joined) = (self.fingers_solid, std::mem::take(&mut self.joined));
+        *self = Environment::made(robot, configuration, &self.furniture, saved, joined);
         self.set_fingers_solid(solid);
     }
 
@@ -256,6 +275,9 @@ impl Environment {
             }
             (link.at, link.stands) = (pose, stands);
         }
+        let left = self.objects.iter().map(|object| (object.body, &self.bodies[object.body]));
+        self.speeds_before =
+            left.filter(|(_, body)| body.is_dynamic()).map(|(handle, body)| (handle, Speed::of(body))).collect();
         self.pipeline.step(
             self.gravity,
             &self.parameters,
@@ -401,8 +423,40 @@ impl Environment {
         digester.finish()
     }
 
+    /// The colliders of the robot, and of which link each is.
+    pub(super) fn link_colliders(&self) -> impl Iterator<Item = (usize, ColliderHandle)> + '_ {
+        self.links.iter().map(|link| (link.link, link.collider))
+    }
+
+    /// The colliders of floor and furniture, with their names.
+    pub(super) fn fixed_colliders(&self) -> impl Iterator<Item = (&str, ColliderHandle)> + '_ {
+        let fixed = self.supports.iter().filter(|(_, name)| name == FLOOR || !self.is_of_robot(name));
+        fixed.map(|(collider, name)| (name.as_str(), *collider))
+    }
+
+    /// An object's colliders.
+    pub(super) fn object_colliders(&self, object: usize) -> impl Iterator<Item = ColliderHandle> + '_ {
+        self.objects[object].parts.iter().copied()
+    }
+
+    /// The name of a link.
+    pub(super) fn link_name(&self, link: usize) -> &str {
+        &self.link_names[link]
+    }
+
+    /// Which links are made to touch.
+    pub(super) fn joined(&self) -> &Joined {
+        &self.joined
+    }
+
+    /// A collider, its body, and its place.
+    pub(super) fn placed(&self, collider: ColliderHandle) -> (&Collider, Option<&RigidBody>, Pose32) {
+        let collider = &self.colliders[collider];
+        (collider, collider.parent().map(|body| &self.bodies[body]), self.place(collider))
+    }
+
     /// A collider's place; its body's, since the last step, may be newer than its own.
-    fn place(&self, collider: &rapier3d::prelude::Collider) -> Pose32 {
+    fn place(&self, collider: &Collider) -> Pose32 {
         let parent = collider.parent().map(|body| *self.bodies[body].position());
         parent.map_or(*collider.position(), |body| {
             body * collider.position_wrt_parent().copied().unwrap_or(Pose32::IDENTITY)

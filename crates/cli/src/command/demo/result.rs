@@ -8,6 +8,7 @@ use crate::report::timeline::Timeline;
 use ratn_cell::config::Setting;
 use ratn_executive::protocol::Mode;
 use ratn_model::program::SUCCESS;
+use ratn_proto::v1::UnintendedContact;
 use serde_json::{Value, json};
 use std::fmt;
 use std::path::PathBuf;
@@ -48,6 +49,8 @@ pub(super) struct Outcome {
     pub(super) delivered: usize,
     /// How far a bowl or a cup leaned at the most while it was held.
     pub(super) greatest_tilt_rad: f64,
+    /// What touched that should not have, by the cell's physics.
+    pub(super) unintended_contacts: Vec<UnintendedContact>,
     /// How the task ended, as a sentence.
     pub(super) end: String,
     pub(super) log: PathBuf,
@@ -136,6 +139,7 @@ impl Demonstration {
                 "budget": budget_name(o.plan.budget),
                 "delivered": o.delivered,
                 "greatest_tilt_rad": (o.greatest_tilt_rad * 1000.0).round() / 1000.0,
+                "contacts": o.unintended_contacts.iter().map(contact_json).collect::<Vec<_>>(),
                 "log": o.log,
                 "chart": o.chart,
                 "statistics": Statistics::of(&o.timeline),
@@ -162,10 +166,24 @@ impl Demonstration {
             // What each of the runs delivered, at the least.
             "delivered": delivered.iter().min().copied().unwrap_or(0),
             "delivered_per_run": delivered,
+            "unintended_contacts": outcomes.iter().map(|o| o.unintended_contacts.len()).sum::<usize>(),
             "logs": outcomes.iter().map(|o| &o.log).collect::<Vec<_>>(),
             "charts": outcomes.iter().map(|o| &o.chart).collect::<Vec<_>>(),
         })
     }
+}
+
+fn contact_json(contact: &UnintendedContact) -> Value {
+    json!({
+        "began_s": contact.began_s,
+        "ended_s": contact.ended_s,
+        "bodies": contact.bodies,
+        "depth_m": contact.depth_m,
+        "pushed_m": contact.pushed_m,
+        "at_m": contact.at_m,
+        "speed_m_s": contact.speed_m_s,
+        "meant": contact.meant,
+    })
 }
 
 impl Goods {
@@ -383,6 +401,7 @@ mod tests {
             timeline,
             delivered: 1,
             greatest_tilt_rad: 0.0,
+            unintended_contacts: Vec::new(),
             end: String::new(),
             log: PathBuf::new(),
             chart: PathBuf::new(),

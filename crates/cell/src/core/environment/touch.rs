@@ -1,0 +1,219 @@
+//! What touches what: every pair of bodies, the robot's links among each other and against furniture included.
+//!
+//! The bodies are those that the physics moves, where it has put them; depth, place and speed are the answers of its own contact query
+//! on their shapes. Nothing of a planner is asked. Two kinds of pairs are left out: those of which neither is a link or is carried, because the
+//! robot does not decide what objects do to each other; and those that the robot is built to have in contact: links that hang on each
+//! other, what touches in its home posture (a capsule's end reaches into the next link, the base stands on the floor), and links between
+//! which a single joint decides (the flange and the link before the wrist): its limits keep them apart, not who plans.
+//! What is shared with the planner: the reader of the robot's description and its forward kinematics.
+
+use super::world::{Environment, FLOOR};
+use rapier3d::math::{Pose as Pose32, Vector};
+use rapier3d::parry::bounding_volume::{Aabb, BoundingVolume};
+use rapier3d::parry::query::contact;
+use rapier3d::prelude::{Collider, ColliderHandle, RigidBody, RigidBodyHandle};
+use ratn_motion::aimm;
+use ratn_motion::robot::{Configuration, Geometry, Motion, Robot};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
+
+/// A body that can touch another.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Thing {
+    /// A link of the robot.
+    Link(String),
+    /// The floor, or a piece of furniture.
+    Fixed(String),
+    /// An object.
+    Object(usize),
+}
+
+/// Two bodies that touch, or are about to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Touch {
+    /// Which; links before furniture before objects.
+    pub things: [Thing; 2],
+    /// How deep they are in each other, in metres; negative: how far apart, at most [`NEAR_M`].
+    pub depth_m: f64,
+    /// Where, in the world frame.
+    pub at: [f64; 3],
+    /// From the first to the second, where the first is pushed out: a unit vector of the world frame.
+    pub normal: [f64; 3],
+    /// How fast one moved as seen from the other there before they touched, in metres per second.
+    pub speed_m_s: f64,
+}
+
+/// What is nearer than this is looked at, in metres.
+pub const NEAR_M: f64 = 5e-4;
+
+/// What counts as on an axis, in metres and as a sine.
+const ALIGNED: f64 = 1e-9;
+
+/// Which links may not be looked at together, by their indices in [`Robot::links`], and which stand on the floor.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Joined {
+    links: BTreeSet<[usize; 2]>,
+    on_floor: BTreeSet<usize>,
+}
+
+impl Joined {
+    /// Links that hang on each other, and what touches in the home posture.
+    pub(super) fn of(robot: &Robot) -> Joined {
+        let home = Configuration { arm: aimm::HOME, finger: robot.finger().upper, ..Configuration::ZERO };
+        let shapes = robot.shapes(&home);
+        let mut joined = Joined::default();
+        for (i, (a, pose_a, shape_a)) in shapes.iter().enumerate() {
+            for (b, pose_b, shape_b) in &shapes[..i] {
+                let touch = contact(pose_a, &**shape_a, pose_b, &**shape_b, 0.0).ok().flatten();
+                if a == b || above(robot, *a) == Some(*b) || touch.is_some() {
+                    joined.links.insert([*b.min(a), *b.max(a)]);
+                }
+            }
+            let next = above(robot, *a).and_then(|between| above(robot, between));
+            if let Some(next) = next.filter(|_| turns_in_itself(robot, *a)) {
+                joined.links.insert([next, *a]);
+            }
+            if shape_a.compute_aabb(pose_a).mins.z <= NEAR_M as f32 {
+                joined.on_floor.insert(*a);
+            }
+        }
+        joined
+    }
+
+    fn has(&self, a: usize, b: usize) -> bool {
+        a == b || self.links.contains(&[a.min(b), a.max(b)])
+    }
+}
+
+/// The next link with a shape above another.
+fn above(robot: &Robot, link: usize) -> Option<usize> {
+    let mut parents = std::iter::successors(robot.links[link].parent, |parent| robot.links[*parent].parent);
+    parents.find(|parent| !robot.links[*parent].bodies.is_empty())
+}
+
+/// Whether the joint of a link only turns it about its own axis: seen from elsewhere, it is where it was.
+fn turns_in_itself(robot: &Robot, link: usize) -> bool {
+    let Motion::Turn { axis, .. } = robot.links[link].motion else { return false };
+    let off = |v: [f64; 3]| {
+        let along: f64 = (0..3).map(|i| v[i] * axis[i]).sum();
+        (0..3).map(|i| (v[i] - along * axis[i]).powi(2)).sum::<f64>().sqrt() < ALIGNED
+    };
+    robot.links[link].bodies.iter().all(|body| {
+        let round = match body.geometry {
+            Geometry::Box { .. } => false,
+            Geometry::Cylinder { .. } => off(body.pose.rotate([0.0, 1.0, 0.0])),
+            Geometry::Capsule { .. } => off(body.pose.rotate([0.0, 0.0, 1.0])),
+            Geometry::Sphere { .. } => true,
+        };
+        round && off(body.pose.position)
+    })
+}
+
+/// How a body moves.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Speed {
+    middle: Vector,
+    along: Vector,
+    about: Vector,
+}
+
+impl Speed {
+    /// Of a body, now.
+    pub(super) fn of(body: &RigidBody) -> Speed {
+        Speed { middle: body.center_of_mass(), along: body.linvel(), about: body.angvel() }
+    }
+
+    fn at(&self, point: Vector) -> Vector {
+        self.along + self.about.cross(point - self.middle)
+    }
+}
+
+/// A collider as one of the pair.
+struct Part<'a> {
+    collider: &'a Collider,
+    speed: Speed,
+    place: Pose32,
+    aabb: Aabb,
+}
+
+impl Environment {
+    /// What touches what, after the last step: all pairs of a link, or of a carried object, with anything else, but those that the robot
+    /// is built to have in contact. Of two bodies the deepest place.
+    pub fn touches(&self) -> Vec<Touch> {
+        let links: Vec<(usize, Part<'_>)> = self.link_colliders().map(|(link, c)| (link, self.part(c))).collect();
+        let fixed: Vec<(&str, Part<'_>)> = self.fixed_colliders().map(|(name, c)| (name, self.part(c))).collect();
+        let objects: Vec<Vec<Part<'_>>> =
+            (0..self.len()).map(|i| self.object_colliders(i).map(|c| self.part(c)).collect()).collect();
+        let around = |parts: &[Part<'_>]| parts.iter().map(|part| part.aabb).reduce(|a, b| a.merged(&b));
+        let around: Vec<Option<Aabb>> = objects.iter().map(|parts| around(parts)).collect();
+        let near = |part: &Part<'_>, object: usize| around[object].is_some_and(|aabb| aabb.intersects(&part.aabb));
+
+        let mut found = Vec::new();
+        let mut look = |a: &Part<'_>, b: &Part<'_>, things: &dyn Fn() -> [Thing; 2]| {
+            if a.aabb.intersects(&b.aabb) {
+                found.extend(touch(a, b).map(|touch| Touch { things: things(), ..touch }));
+            }
+        };
+        for (i, (link, part)) in links.iter().enumerate() {
+            let name = || Thing::Link(self.link_name(*link).to_owned());
+            for (other, its) in &links[..i] {
+                if !self.joined().has(*link, *other) {
+                    look(its, part, &|| [Thing::Link(self.link_name(*other).to_owned()), name()]);
+                }
+            }
+            for (other, its) in &fixed {
+                if *other != FLOOR || !self.joined().on_floor.contains(link) {
+                    look(part, its, &|| [name(), Thing::Fixed((*other).to_owned())]);
+                }
+            }
+            for (object, parts) in objects.iter().enumerate().filter(|(object, _)| near(part, *object)) {
+                parts.iter().for_each(|its| look(part, its, &|| [name(), Thing::Object(object)]));
+            }
+        }
+        for (carried, parts) in objects.iter().enumerate().filter(|(object, _)| self.state(*object).carried) {
+            for part in parts {
+                for (other, its) in &fixed {
+                    look(its, part, &|| [Thing::Fixed((*other).to_owned()), Thing::Object(carried)]);
+                }
+                for (other, its) in objects.iter().enumerate().filter(|(other, _)| *other != carried) {
+                    if near(part, other) {
+                        its.iter().for_each(|one| look(one, part, &|| [Thing::Object(other), Thing::Object(carried)]));
+                    }
+                }
+            }
+        }
+        deepest(found)
+    }
+
+    fn part<'a>(&'a self, collider: ColliderHandle) -> Part<'a> {
+        let (collider, body, place) = self.placed(collider);
+        // What the step did to an object is what the contact did to it.
+        let of_it = |(body, _): &&(RigidBodyHandle, Speed)| collider.parent() == Some(*body);
+        let before = self.speeds_before.iter().find(of_it).map(|(_, speed)| *speed);
+        let speed = before.or(body.map(Speed::of)).unwrap_or_default();
+        let aabb = collider.shape().compute_aabb(&place).loosened(NEAR_M as f32);
+        Part { collider, speed, place, aabb }
+    }
+}
+
+/// Where two parts touch.
+fn touch(a: &Part<'_>, b: &Part<'_>) -> Option<Touch> {
+    let found = contact(&a.place, a.collider.shape(), &b.place, b.collider.shape(), NEAR_M as f32).ok().flatten()?;
+    let at = (found.point1 + found.point2) * 0.5;
+    let [va, vb] = [a, b].map(|part| part.speed.at(at));
+    Some(Touch {
+        things: [Thing::Object(0), Thing::Object(0)],
+        depth_m: f64::from(-found.dist),
+        at: at.to_array().map(f64::from),
+        normal: found.normal1.to_array().map(f64::from),
+        speed_m_s: f64::from((va - vb).length()),
+    })
+}
+
+/// One touch of each two things.
+fn deepest(mut found: Vec<Touch>) -> Vec<Touch> {
+    found.sort_by(|a, b| a.things.cmp(&b.things).then(b.depth_m.total_cmp(&a.depth_m)));
+    found.dedup_by(|later, first| later.things == first.things);
+    found
+}

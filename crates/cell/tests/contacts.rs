@@ -1,0 +1,151 @@
+//! Which contacts the physics sees, and which of them were meant. No planner's checker is asked here.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_cell::config::Setting;
+use ratn_cell::core::contacts::{PRESS_M, TOLERANCE_M};
+use ratn_cell::core::environment::{Environment, Furniture, Kind, Model, Thing, Touch};
+use ratn_cell::core::placement::furniture;
+use ratn_cell::core::protocol::{Event, Request};
+use ratn_cell::core::recording::Line;
+use ratn_model::pose::Pose;
+use ratn_motion::aimm;
+use ratn_motion::plan::Goal;
+use ratn_motion::robot::{Configuration, Robot};
+use std::f64::consts::FRAC_PI_2;
+
+mod bench;
+use bench::{Bench, grasp};
+
+fn at(x: f64, arm: [f64; 7]) -> Configuration {
+    Configuration { base: [x, 0.0, 0.0], arm, finger: 0.055, ..Configuration::ZERO }
+}
+
+/// What touches once a robot has come there.
+fn touches(configuration: Configuration, furniture: &[Furniture]) -> Vec<Touch> {
+    let robot = Robot::aimm();
+    let mut environment = Environment::new(&robot, &configuration, furniture, &[]);
+    environment.step(&robot, &configuration);
+    environment.touches()
+}
+
+#[test]
+fn a_robot_in_its_usual_postures_touches_nothing() {
+    for arm in [aimm::HOME, aimm::OBSERVATION, aimm::STOWED] {
+        assert_eq!(touches(at(0.0, arm), &furniture(Setting::Boxes)), [], "{arm:?}");
+    }
+}
+
+#[test]
+fn a_base_that_stands_in_a_wall_is_as_deep_in_it_as_it_is() {
+    let wall = Furniture { name: "wall".to_owned(), parts: vec![(Pose::at(1.0, 0.0, 0.2), [0.2, 2.0, 0.4])] };
+    // The front of the base is 0.35 m before its middle.
+    for depth_m in [0.002, 0.02] {
+        let found = touches(at(0.9 - 0.35 + depth_m, aimm::STOWED), std::slice::from_ref(&wall));
+        let [touch] = &found[..] else { panic!("{found:?}") };
+        assert_eq!(touch.things, [Thing::Link("base".to_owned()), Thing::Fixed("wall".to_owned())]);
+        assert!((touch.depth_m - depth_m).abs() < 1e-4, "{touch:?}");
+        assert!((touch.at[0] - 0.9).abs() < 0.03 && touch.normal[0] > 0.9, "{touch:?}");
+    }
+}
+
+#[test]
+fn an_arm_that_is_folded_into_its_own_base_touches_it() {
+    // Stretched out backwards and down into the deck: joint 1 turns it there, joint 2 bends it by 115°.
+    let found = touches(at(0.0, [FRAC_PI_2, -2.0, 0.0, 0.0, 0.0, 0.0, 0.0]), &[]);
+    let of_robot = |touch: &&Touch| touch.things.iter().all(|thing| matches!(thing, Thing::Link(_)));
+    assert!(found.iter().find(of_robot).is_some_and(|touch| touch.depth_m > TOLERANCE_M), "{found:?}");
+}
+
+#[test]
+fn links_meet_loose_objects_with_the_speed_that_they_have() {
+    let robot = Robot::aimm();
+    let model = Model { kind: Kind::Box, size: [0.1, 0.1, 0.2] };
+    let stands = Pose::at(0.42, 0.0, 0.1);
+    let mut environment = Environment::new(&robot, &at(0.0, aimm::STOWED), &[], &[(model, stands)]);
+    let met = (1..60).find_map(|step| {
+        environment.step(&robot, &at(0.001 * f64::from(step), aimm::STOWED));
+        environment.touches().into_iter().next()
+    });
+    let met = met.unwrap();
+    assert_eq!(met.things, [Thing::Link("base".to_owned()), Thing::Object(0)]);
+    assert!((met.speed_m_s - 0.25).abs() < 0.05, "{met:?}");
+}
+
+#[test]
+fn a_box_that_is_fetched_touches_only_what_it_should() {
+    let mut bench = Bench::new(3, 4);
+    bench.reach_for(0);
+    bench.done(grasp());
+    bench.carry();
+    bench.done(Request::Release);
+    bench.go(vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
+    bench.pass(1.0);
+    assert_eq!(bench.cell.unintended_contacts(), []);
+}
+
+/// Lifts the first box, puts it down deeper than it stood by so much, and lifts it again, or lets it go there.
+fn pressed(deeper_m: f64, lets_go: bool) -> Bench {
+    let mut bench = Bench::new(1, 4);
+    bench.reach_for(0);
+    bench.done(grasp());
+    let stood = bench.cell.robot().tool_pose(&bench.cell.configuration());
+    let raised = |by: f64| Pose { position: [stood.position[0], stood.position[1], stood.position[2] + by], ..stood };
+    bench.go(vec![Goal::Pose(raised(0.15))], 0.10, 0.0);
+    assert_eq!(bench.cell.unintended_contacts(), []);
+    bench.go(vec![Goal::Pose(raised(-deeper_m))], 0.0, 0.10);
+    if lets_go {
+        bench.done(Request::Release);
+    }
+    bench.go(vec![Goal::Pose(raised(0.15))], 0.10, 0.0);
+    bench.pass(1.0);
+    bench
+}
+
+#[test]
+fn what_is_held_may_press_where_it_is_let_go_and_nowhere_else() {
+    let bench = pressed(0.006, true);
+    assert_eq!(bench.cell.unintended_contacts(), []);
+    let bench = pressed(0.006, false);
+    let [contact] = &bench.cell.unintended_contacts()[..] else { panic!() };
+    assert_eq!(contact.bodies, ["table".to_owned(), "slc_1".to_owned()]);
+    assert!((contact.depth_m - 0.006).abs() < TOLERANCE_M, "{contact}");
+    assert!(contact.ended > contact.began && contact.meant.is_none(), "{contact}");
+    // It is in the recording, too.
+    let recorded = bench.lines.iter().filter(|line| matches!(line, Line::Contact { contact: c, .. } if c == contact));
+    assert_eq!(recorded.count(), 1);
+}
+
+#[test]
+fn a_finger_may_push_what_it_closes_around_and_nothing_else() {
+    for grasps in [true, false] {
+        let mut bench = Bench::new(1, 4);
+        let truth = bench.cell.ground_truth()[0].clone();
+        // One finger comes down 3 mm beyond the edge of the box.
+        let aside = 0.055 - truth.size[1] / 2.0 + 0.003;
+        let goals = aimm::grasp_poses(&truth.pose, truth.size).map(|tool| {
+            let tool = tool.compose(&Pose::at(0.0, aside, 0.0));
+            Goal::Pose(tool)
+        });
+        bench.go(goals.to_vec(), 0.0, 0.10);
+        let moved = bench.cell.ground_truth()[0].pose.distance(&truth.pose);
+        assert!((0.002..PRESS_M).contains(&moved), "{moved}");
+        if grasps {
+            bench.done(grasp());
+            bench.carry();
+            bench.done(Request::Release);
+        }
+        bench.go(vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
+        bench.go(vec![Goal::Joints(aimm::OBSERVATION)], 0.0, 0.0);
+        let found = bench.cell.unintended_contacts();
+        if grasps {
+            assert_eq!(found, []);
+        } else {
+            let [contact] = &found[..] else { panic!("{found:?}") };
+            assert!(contact.bodies[0].starts_with("finger") && contact.pushed_m > 0.002, "{contact}");
+        }
+        // A new scene is judged anew.
+        bench.cell.handle(bench.now, Event::Reset { seed: 5, goods: bench.cell.config().goods() });
+        assert_eq!(bench.cell.unintended_contacts(), []);
+    }
+}
