@@ -12,6 +12,7 @@ use ratn_storage::etcd::Holder;
 use ratn_worker::client::{Channels, Health, NOT_SERVING, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::{FindError, RuntimeDirectory};
+use std::collections::BTreeMap;
 use std::io::ErrorKind;
 use std::net::TcpListener;
 use std::path::Path;
@@ -32,13 +33,17 @@ pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, direct
     let directory = RuntimeDirectory::at(directory);
     let mut manager = None;
     let kept = [(ROLES[0], &config.resource_manager.storage), (ROLES[1], &config.world_pool.storage)];
-    let kept_in_etcd: Vec<&str> =
-        kept.iter().filter(|(_, storage)| storage.engine == Engine::Etcd).map(|(role, _)| *role).collect();
+    let mut leaders = BTreeMap::new();
     for (role, storage) in kept.into_iter().filter(|(_, storage)| storage.engine == Engine::Etcd) {
-        leader(findings, role, storage.clone()).await;
+        leaders.insert(role, leader(findings, role, storage.clone()).await);
     }
     for (role, listen) in listens(config) {
+        let leads = leaders.get(role);
         match directory.find(role) {
+            // One that led and was killed has left its endpoint.
+            Ok(endpoint)
+                if leads.is_some_and(|leads| leads.as_ref().is_some_and(|leads| *leads != endpoint.to_string()))
+                    && stands_by(findings, role, &endpoint).await => {}
             Ok(endpoint) => {
                 let answers = role_answers(findings, role, &endpoint).await;
                 if answers && role == resource_manager::ROLE {
@@ -46,8 +51,7 @@ pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, direct
                 }
             }
             // Who stands by publishes no endpoint.
-            Err(FindError::NotPublished { .. })
-                if kept_in_etcd.contains(&role) && stands_by(findings, role, &listen).await => {}
+            Err(FindError::NotPublished { .. }) if leads.is_some() && stands_by(findings, role, &listen).await => {}
             Err(FindError::NotPublished { .. }) => free_port(findings, role, &listen),
             Err(error) => findings.problem(role, error.to_string(), "remove the file, and start the role again"),
         }
@@ -58,13 +62,14 @@ pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, direct
     }
 }
 
-/// Who leads where several stand by for one another.
-async fn leader(findings: &mut Findings, role: &'static str, storage: StorageConfig) {
+/// Who leads where several stand by for one another: its address.
+async fn leader(findings: &mut Findings, role: &'static str, storage: StorageConfig) -> Option<String> {
     let place = storage.prefix.clone();
     let about = format!("{role}, leader");
     match tokio::task::spawn_blocking(move || storage.leader(role)).await {
         Ok(Ok(Some(Holder { address, about: what }))) => {
-            findings.ok(about, format!("{address} ({what}), by {place} in etcd"))
+            findings.ok(about, format!("{address} ({what}), by {place} in etcd"));
+            return Some(address);
         }
         Ok(Ok(None)) => {
             findings.problem(about, format!("nobody leads, by {place} in etcd"), format!("start `ratn {role}`"))
@@ -74,6 +79,7 @@ async fn leader(findings: &mut Findings, role: &'static str, storage: StorageCon
         }
         Err(error) => findings.problem(about, error.to_string(), "please report it"),
     }
+    None
 }
 
 /// Whether somebody answers there who does not lead: says so.
