@@ -205,7 +205,7 @@ impl Pool {
             if freed || ((wanted || granted) && self.limits.overtaken > 0) {
                 self.queue.mark(&family, false);
             }
-            units.into_iter().for_each(|(slot, amount)| self.queue.unreserve(slot, amount));
+            self.unreserve(units, &family);
         }
     }
 }

@@ -111,9 +111,14 @@ impl Pool {
         self
     }
 
-    /// From now on other bounds hold; what is there beyond them stays.
+    /// From now on other bounds hold; what is there beyond them stays. Who may be served with wider ones is, by the next
+    /// [`Pool::advance`].
     pub fn set_limits(&mut self, limits: Limits) {
         self.resources.set_max_holders(limits.holders);
+        if limits.holders > self.limits.holders {
+            let families: Vec<Arc<str>> = self.queue.families.keys().cloned().collect();
+            families.iter().for_each(|family| self.queue.mark(family, false));
+        }
         self.limits = limits;
     }
 

@@ -66,8 +66,16 @@ impl Resources {
 
     /// Whether nobody can have more of a resource: as many leases hold some of it as may, or its provider ends.
     pub(crate) fn is_kept_back(&self, resource: &Resource) -> bool {
-        self.max_holders.is_some_and(|most| resource.holders.len() >= most)
-            || (!self.closing.is_empty() && resource.owner.as_ref().is_some_and(|owner| self.closing.contains(owner)))
+        self.max_holders.is_some_and(|most| resource.holders.len() >= most) || self.is_closing(resource)
+    }
+
+    /// Whether the provider of one of these ends.
+    pub(crate) fn is_any_closing<'a>(&self, mut slots: impl Iterator<Item = &'a Slot>) -> bool {
+        !self.closing.is_empty() && slots.any(|slot| self.get(*slot).is_some_and(|resource| self.is_closing(resource)))
+    }
+
+    fn is_closing(&self, resource: &Resource) -> bool {
+        !self.closing.is_empty() && resource.owner.as_ref().is_some_and(|owner| self.closing.contains(owner))
     }
 
     pub(crate) fn len(&self) -> usize {

@@ -17,11 +17,11 @@
 
 use crate::assignment::{Assignment, Available};
 use crate::group::{Key, takes};
-use crate::id::WaiterId;
+use crate::id::{Slot, WaiterId};
 use crate::pool::Pool;
 use crate::queue::Place;
 use crate::resource::Units;
-use ratn_model::resource::Requirement;
+use ratn_model::resource::{Quantity, Requirement};
 use std::collections::BTreeSet;
 use std::ops::Bound;
 use std::sync::Arc;
@@ -85,8 +85,12 @@ impl Pool {
             return None;
         }
         let may_have = |place: &&Place| {
-            let session = self.queue.get(place.1).and_then(|waiter| self.sessions.get(&waiter.request.session));
-            session.is_some_and(|session| self.may_grant_to(session)) && self.queue.is_certain(**place)
+            let Some(waiter) = self.queue.get(place.1) else { return false };
+            let session = self.sessions.get(&waiter.request.session);
+            session.is_some_and(|session| self.may_grant_to(session))
+                && self.queue.is_certain(**place)
+                // What goes with its provider was reserved before that ended.
+                && !self.resources.is_any_closing(waiter.reserved.iter().flat_map(|units| units.keys()))
         };
         self.queue.ready.iter().find(may_have).map(|(_, id)| *id)
     }
@@ -226,7 +230,20 @@ impl Pool {
         }
         waiter.lacks.insert(family.clone());
         self.queue.ready.remove(&place);
-        freed.into_iter().for_each(|(slot, amount)| self.queue.unreserve(slot, amount));
+        self.unreserve(freed, family);
+    }
+
+    /// What was reserved in a family is anybody's. In the slot of a deleted resource there may be one of another family by now, which the
+    /// reservation has hidden from those who wait for it: they are looked at.
+    pub(crate) fn unreserve(&mut self, units: impl IntoIterator<Item = (Slot, Quantity)>, family: &str) {
+        for (slot, amount) in units {
+            self.queue.unreserve(slot, amount);
+            let of = self.resources.get(slot).map(|resource| self.resources.family(&resource.description.kind));
+            let other = of.filter(|of| *of != family).and_then(|of| self.queue.families.get_key_value(of));
+            if let Some(other) = other.map(|(name, _)| name.clone()) {
+                self.queue.mark(&other, false);
+            }
+        }
     }
 
     /// Reserves for a waiter what it lacks in a family, as far as that is free and nobody before it is passed for long.

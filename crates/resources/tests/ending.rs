@@ -136,6 +136,33 @@ fn what_an_ending_session_provides_is_given_to_nobody() {
     pool.check_invariants().unwrap();
 }
 
+/// It was reserved before the session began to end, for one who could not be served then.
+#[test]
+fn what_an_ending_session_provides_is_not_given_to_whom_it_was_reserved_for() {
+    let mut pool = with_tools(Some("s"));
+    pool.set_limits(Limits { leases: 1, leases_for_operators: 0, ..Limits::default() });
+    let single = |kind| ResourceSpec::new(ResourceClass::Module, kind).id(kind);
+    let ask_for = |kind| AcquireRequest::new(session("other"), vec![Requirement::new(ResourceOperation::Block, kind)]);
+    pool.create(NOW, Some(&session("s")), single("Arm")).unwrap();
+    pool.create(NOW, None, single("Camera")).unwrap();
+    pool.acquire(NOW, ask_for("Camera")).unwrap();
+    let camera = pool.leases()[0].id;
+    pool.acquire(NOW, ask_for("Arm")).unwrap();
+    assert_eq!((pool.leases().len(), pool.waiting()), (1, 1), "there may be one lease");
+    pool.close_session(NOW, &session("s")).unwrap();
+    assert!(pool.get("Arm").is_some(), "it goes in a later turn");
+    pool.release(NOW, None, camera).unwrap();
+    assert_eq!((pool.leases().len(), pool.waiting()), (0, 1), "its provider has ended");
+    let left = pool.list().len();
+    let went = turns(&mut pool, NOW, |pool| pool.list().len());
+    assert_eq!(went.iter().sum::<usize>(), left - 1, "all but the camera");
+    assert_eq!((pool.leases().len(), pool.waiting()), (0, 1));
+    pool.check_invariants().unwrap();
+    pool.create(NOW, None, single("Arm")).unwrap();
+    assert_eq!((pool.leases().len(), pool.waiting()), (1, 0));
+    pool.check_invariants().unwrap();
+}
+
 #[test]
 fn what_a_session_consumed_returns_over_several_turns() {
     let mut pool = with_tools(None);

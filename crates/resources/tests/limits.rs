@@ -386,6 +386,24 @@ fn a_crowded_resource_has_room_again_when_a_lease_of_it_ends() {
     pool.check_invariants().unwrap();
 }
 
+#[test]
+fn who_waits_for_room_in_a_crowded_resource_is_served_when_a_wider_bound_makes_some() {
+    for overtaken in [0, 2] {
+        let limits = |holders| Limits { holders, overtaken, ..Limits::default() };
+        let mut pool = Pool::new(limits(1));
+        pool.keep_alive(NOW, &session(), "test", TTL).unwrap();
+        create(&mut pool, tool()).unwrap();
+        one_more_lease(&mut pool).unwrap();
+        one_more_lease(&mut pool).unwrap_err();
+        assert_eq!((pool.leases().len(), pool.waiting()), (1, 1));
+        // As at SIGHUP.
+        pool.set_limits(limits(2));
+        pool.advance(NOW);
+        assert_eq!((pool.leases().len(), pool.waiting()), (2, 0));
+        pool.check_invariants().unwrap();
+    }
+}
+
 /// The largest text that is accepted, and the refusal of one letter more.
 fn largest(mut act: impl FnMut(String) -> Result<(), String>) -> String {
     (1..1_000).find_map(|bytes| act("x".repeat(bytes)).err()).expect("some are too large")

@@ -144,3 +144,42 @@ fn a_pool_that_is_behind_for_long_holds_what_always_holds_and_forgets_nobody() {
     });
     outcome.unwrap();
 }
+
+/// Somebody has reserved one of three tools and waits for another; it is deleted, and a camera is in its slot before that is settled.
+#[test]
+fn what_was_reserved_of_a_deleted_resource_does_not_hide_the_next_one_in_its_slot() {
+    let of = |kind: &str, count: u32| {
+        let requirement = Requirement { count: count.into(), ..Requirement::new(ResourceOperation::Block, kind) };
+        AcquireRequest { purpose: kind.to_owned(), ..AcquireRequest::new(SessionId::from("s"), vec![requirement]) }
+    };
+    let resource = |kind: &str, id: &str| ResourceSpec::new(ResourceClass::Module, kind).id(id);
+    for gives_up in [false, true] {
+        let mut pool = Pool::new(Limits::default());
+        pool.keep_alive(NOW, &SessionId::from("s"), "s", Duration::from_secs(60)).unwrap();
+        for id in ["reserved", "held", "held too"] {
+            pool.create(NOW, None, resource("Tool", id)).unwrap();
+        }
+        pool.acquire(NOW, of("Tool", 2)).unwrap();
+        let held = pool.leases().remove(0).resources;
+        let left = ["reserved", "held", "held too"].into_iter().find(|id| !held.contains(&(*id).to_owned())).unwrap();
+        let waiter = pool.acquire(NOW, of("Tool", 2)).unwrap();
+        // Too little is done in each call for what is known of tools to be settled.
+        pool.work = Work { per_turn: 9, per_call: 3 };
+        pool.delete(NOW, None, left).unwrap();
+        pool.create(NOW, None, resource("Camera", "camera")).unwrap();
+        pool.acquire(NOW, of("Camera", 1)).unwrap();
+        assert_eq!(granted(&pool), ["Tool"], "it is behind");
+        pool.work = Work { per_turn: 9, per_call: 9 };
+        if gives_up {
+            pool.cancel(NOW, waiter).unwrap();
+        }
+        let mut turns = 0;
+        while pool.next_deadline() == Some(NOW) {
+            pool.advance(NOW);
+            pool.check_invariants().unwrap();
+            turns += 1;
+            assert!(turns < 1_000);
+        }
+        assert_eq!(granted(&pool), ["Camera", "Tool"], "the waiter for tools gives up: {gives_up}");
+    }
+}
