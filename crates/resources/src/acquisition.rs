@@ -195,8 +195,8 @@ impl Pool {
             self.memory.wait(&request_id, fingerprint, id);
         }
         let reserved = vec![Units::new(); request.requirements.len()];
-        let (hopeful, lacks, overtaken) = Default::default();
-        self.join(id, Waiter { request, request_id, groups, hopeful, reserved, lacks, overtaken });
+        let (hopeful, lacks, overtaken, missing) = Default::default();
+        self.join(id, Waiter { request, request_id, groups, hopeful, reserved, lacks, overtaken, missing });
         self.schedule();
         match full {
             Some(full) if self.queue.get(id).is_some() => {

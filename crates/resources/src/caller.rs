@@ -101,6 +101,11 @@ impl Callers {
         self.0.get(caller).map_or(0, |has| has.selectors.len())
     }
 
+    /// What each caller waits for, by selector.
+    pub(crate) fn waited_for(&self) -> impl Iterator<Item = impl Iterator<Item = &Key>> {
+        self.0.values().map(|has| has.selectors.keys())
+    }
+
     /// How many of these a caller does not wait for yet.
     pub(crate) fn new_selectors(&self, caller: &str, groups: &[Key]) -> usize {
         let mut groups: Vec<&Key> = groups.iter().collect();

@@ -79,6 +79,7 @@ impl Touched {
 struct Step {
     free: (Quantity, Quantity),
     quantity: (Quantity, Quantity),
+    divisible: (bool, bool),
 }
 
 impl Step {
@@ -90,12 +91,15 @@ impl Step {
         let fitting = (fitting, if same { after.filter(|_| fitting.is_some()) } else { after.filter(fits) });
         let amounts =
             |seen: Option<&Seen>| seen.map_or((Quantity::ZERO, Quantity::ZERO), |seen| (seen.free, seen.quantity));
+        let divisible = |seen: Option<&Seen>| seen.is_some_and(|seen| seen.description.divisible);
+        let divisible = (divisible(fitting.0), divisible(fitting.1));
         let (before, after) = (amounts(fitting.0), amounts(fitting.1));
-        Step { free: (before.0, after.0), quantity: (before.1, after.1) }
+        Step { free: (before.0, after.0), quantity: (before.1, after.1), divisible }
     }
 
     fn count(self, slot: Slot, group: &mut Group) {
         group.existing = group.existing.saturating_sub(self.quantity.0) + self.quantity.1;
+        group.divisible = (group.divisible + usize::from(self.divisible.1)).saturating_sub(self.divisible.0.into());
         if let Some(slots) = &mut group.free {
             if self.free.1.is_zero() {
                 slots.remove(&slot);
@@ -171,21 +175,19 @@ impl Told {
         changes: &[Change],
     ) {
         let was = group.existing;
-        let (mut other, mut parts) = (false, false);
+        let (mut other, mut parts) = (false, group.divisible > 0);
         for (slot, before, after) in changes {
             let step = Step::of(resources, group, before.as_ref(), after.as_ref());
             step.count(*slot, group);
             self.more_is_free |= step.free.1 > step.free.0;
-            if step.quantity.0 != step.quantity.1 {
-                other = true;
-                parts |= [before, after].into_iter().flatten().any(|seen| seen.description.divisible);
-            }
+            other |= step.quantity.0 != step.quantity.1 || step.divisible.0 != step.divisible.1;
         }
+        parts |= group.divisible > 0;
         if !other {
             return;
         }
         self.other = true;
-        // For those with several requirements in the family, and for parts of units, it is not enough to count.
+        // For those with several requirements in the family, and where there are parts of units, it is not enough to count.
         self.concerned.extend(&group.several);
         if parts {
             self.concerned.extend(group.by_amount.iter().map(|(_, place)| *place));

@@ -3,21 +3,21 @@
 //! Demand is of now: it goes when its waiters do, or when what they want is there. It is not written down, nor is what providers
 //! say of it; both are said again after a restart.
 
-use crate::assignment::{Assignment, Available};
 use crate::error::{PoolError, malformed};
-use crate::group::Key;
+use crate::group::{Group, Key};
 use crate::id::SessionId;
 use crate::pool::Pool;
+use crate::queue::Place;
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
-/// Waiters that are looked at, the first of the queue: who is behind them comes up when they have gone.
-const LOOKED_AT: usize = 256;
-/// Resources that are looked at for them: of who is behind, it is found out when those before have gone.
-const RESOURCES_LOOKED_AT: usize = 100_000;
+/// Selectors that providers are told of: those who wait for others come up when what these lack is there. Callers have them in turn.
+const SELECTORS: usize = 256;
 /// Bytes of what they ask for that providers are told of.
 const DEMAND_BYTES: usize = 1 << 20;
+/// Waiters of one selector that are looked at where it is not enough to count, the most urgent ones.
+const LOOKED_AT: usize = 64;
 /// Kinds of which one session may say that it cannot provide them.
 const SHORTAGES: usize = 64;
 /// Characters of a reason; the rest is cut off.
@@ -33,32 +33,69 @@ pub struct Demand {
 }
 
 impl Pool {
-    /// What is missing now, where that may be something else than at the last call.
-    pub fn take_demand(&mut self) -> Option<Vec<Demand>> {
+    /// What is missing now of what these kinds would do for, where that may be something else than at the last call.
+    pub fn take_demand(&mut self, provided: &BTreeSet<String>) -> Option<Vec<Demand>> {
+        if self.queue.provided != *provided {
+            self.queue.provided.clone_from(provided);
+            self.queue.demand_changed = true;
+        }
         if !std::mem::take(&mut self.queue.demand_changed) {
             return None;
         }
-        let mut missing = BTreeMap::<&Key, (&Requirement, Quantity)>::new();
-        let (mut looked_at, mut bytes) = (0, 0);
-        for (_, id) in self.queue.hopeless.iter().take(LOOKED_AT) {
-            if looked_at >= RESOURCES_LOOKED_AT || bytes >= DEMAND_BYTES {
-                break;
-            }
-            let Some(waiter) = self.queue.get(*id) else { continue };
-            let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
-            bytes += waiter.groups.iter().map(|key| key.len()).sum::<usize>();
-            let assignment = Assignment::of(&self.resources, Available::Existing, &requirements);
-            looked_at += assignment.looked_at;
-            for (index, amount) in assignment.missing.into_iter().enumerate().filter(|(_, amount)| !amount.is_zero()) {
-                let (_, most) = missing.entry(&waiter.groups[index]).or_insert((requirements[index], amount));
-                *most = amount.max(*most);
-            }
+        let mut turns: Vec<_> =
+            self.callers.waited_for().map(|selectors| self.lacking(selectors).into_iter()).collect();
+        let (mut told, mut missing, mut bytes) = (BTreeSet::new(), Vec::new(), 0);
+        while missing.len() < SELECTORS && bytes < DEMAND_BYTES && !turns.is_empty() {
+            turns.retain_mut(|selectors| {
+                // Of several callers who lack the same, one has had their turn for it.
+                let next = selectors.find(|(_, key, _)| told.insert(Key::clone(key)));
+                let Some((_, key, amount)) = next.filter(|_| missing.len() < SELECTORS) else { return false };
+                bytes += key.len();
+                missing.extend(self.queue.groups.get(key).map(|group| self.demand(group, amount)));
+                true
+            });
         }
-        let demand = |(requirement, amount): (&Requirement, Quantity)| Demand {
-            kinds: self.resources.kinds().subclasses(&requirement.kind).map(str::to_owned).collect(),
-            requirement: Requirement { count: amount, ..requirement.clone() },
+        Some(missing)
+    }
+
+    /// Which of these selectors lack something that is provided, and how much; as many as are told of, the most urgent first.
+    fn lacking<'a>(&'a self, selectors: impl Iterator<Item = &'a Key>) -> Vec<(Place, &'a Key, Quantity)> {
+        let kinds = self.resources.kinds();
+        let lacking = selectors.filter_map(|key| {
+            let group = self.queue.groups.get(key)?;
+            let first = group.hopeless.first()?;
+            let is_provided = kinds.subclasses(&group.selector.kind).any(|kind| self.queue.provided.contains(kind));
+            let amount = if is_provided { self.missing(key, group) } else { Quantity::ZERO };
+            (!amount.is_zero()).then_some((*first, key, amount))
+        });
+        let mut lacking: Vec<_> = lacking.collect();
+        if lacking.len() > SELECTORS {
+            lacking.select_nth_unstable(SELECTORS);
+            lacking.truncate(SELECTORS);
+        }
+        lacking.sort_unstable();
+        lacking
+    }
+
+    /// How much more there would have to be for the waiter of a group that lacks most.
+    fn missing(&self, key: &Key, group: &Group) -> Quantity {
+        let counts = |(_, place): &&(Quantity, Place)| !group.several.contains(place);
+        let counted =
+            if group.divisible == 0 { group.by_amount.iter().rev().take(LOOKED_AT).find(counts) } else { None };
+        let counted = counted.map(|(amount, _)| amount.saturating_sub(group.existing)).unwrap_or_default();
+        let found = |place: &Place| {
+            let waiter = self.queue.get(place.1)?;
+            let of_group = waiter.groups.iter().zip(&waiter.missing).filter(|(other, _)| *other == key);
+            of_group.map(|(_, amount)| *amount).max()
         };
-        Some(missing.into_values().map(demand).collect())
+        let to_look_at = if group.divisible == 0 { &group.several } else { &group.hopeless };
+        let looked_at = to_look_at.iter().filter(|place| group.hopeless.contains(*place)).take(LOOKED_AT);
+        looked_at.filter_map(found).max().unwrap_or_default().max(counted)
+    }
+
+    fn demand(&self, group: &Group, amount: Quantity) -> Demand {
+        let kinds = self.resources.kinds().subclasses(&group.selector.kind).map(str::to_owned).collect();
+        Demand { requirement: Requirement { count: amount, ..group.selector.clone() }, kinds }
     }
 
     /// How much of what a demand selects a session provides already.

@@ -17,18 +17,22 @@ pub(crate) type Key = Arc<[u8]>;
 /// Waiters that want the same.
 #[derive(Debug, Clone)]
 pub(crate) struct Group {
-    selector: Requirement,
+    pub(crate) selector: Requirement,
     pub(crate) family: Arc<str>,
     /// Hopeful ones that lack something of the family.
     pub(crate) wanting: BTreeSet<Place>,
     /// Everybody in it, by how much they want.
     pub(crate) by_amount: BTreeSet<(Quantity, Place)>,
-    /// Those of them with several requirements in the family: for these it is not enough to count.
+    /// Those of them with several requirements in the family, and those who want parts of units: for these it is not enough to count.
     pub(crate) several: BTreeSet<Place>,
+    /// Those of them for whom what exists would not do.
+    pub(crate) hopeless: BTreeSet<Place>,
     /// Requirements in it.
     pub(crate) members: usize,
     /// How much there is, held or not.
     pub(crate) existing: Quantity,
+    /// How many of the resources that fit are divisible. With some it is enough to count for nobody: parts of two are no whole unit.
+    pub(crate) divisible: usize,
     /// Those of which something is free, and some that were, where not simply every resource of the kind fits.
     pub(crate) free: Option<BTreeSet<Slot>>,
 }
@@ -75,9 +79,9 @@ impl Group {
         let selector = requirement.clone();
         let free = (!resources.fits_every(&selector))
             .then(|| resources.free(&selector).map(|(slot, _)| slot).collect::<BTreeSet<Slot>>());
-        let existing = resources.quantity(&selector);
-        let (wanting, by_amount, several) = Default::default();
-        Group { selector, family, wanting, by_amount, several, members: 0, existing, free }
+        let (existing, divisible) = (resources.quantity(&selector), resources.divisible(&selector));
+        let (wanting, by_amount, several, hopeless) = Default::default();
+        Group { selector, family, wanting, by_amount, several, hopeless, members: 0, existing, divisible, free }
     }
 
     pub(crate) fn fits(&self, resources: &Resources, description: &Description) -> bool {
@@ -87,7 +91,9 @@ impl Group {
     /// Whether it knows how much exists for it, and everything of which something is free.
     pub(crate) fn knows(&self, resources: &Resources) -> bool {
         let known = |(slot, _)| self.free.as_ref().is_none_or(|free| free.contains(&slot));
-        self.existing == resources.quantity(&self.selector) && resources.free(&self.selector).all(known)
+        self.existing == resources.quantity(&self.selector)
+            && self.divisible == resources.divisible(&self.selector)
+            && resources.free(&self.selector).all(known)
     }
 
     /// Whether there is nothing left of what fits, beside what is reserved; and how many resources were looked at.
@@ -139,7 +145,8 @@ impl Pool {
             let Some(group) = self.queue.groups.get_mut(key) else { continue };
             group.members += 1;
             group.by_amount.insert((requirement.count, place));
-            if families.iter().filter(|family| **family == families[index]).count() > 1 {
+            let in_family = families.iter().filter(|family| **family == families[index]).count();
+            if in_family > 1 || !requirement.count.is_whole() {
                 group.several.insert(place);
             }
         }
@@ -153,10 +160,10 @@ impl Pool {
         self.stop_wanting(id, granted);
         let place = self.queue.get(id)?.place(id);
         self.queue.doubt_no_more(place);
+        self.queue.demand_changed |= self.queue.set_hopeless(place, false);
         let waiter = self.queue.waiters.remove(&id)?;
         self.queue.order.remove(&place);
         self.queue.ready.remove(&place);
-        self.queue.demand_changed |= self.queue.hopeless.remove(&place);
         for (requirement, key) in waiter.request.requirements.iter().zip(&waiter.groups) {
             let Some(group) = self.queue.groups.get_mut(key) else { continue };
             group.by_amount.remove(&(requirement.count, place));

@@ -50,6 +50,8 @@ pub(crate) struct Waiter {
     pub(crate) lacks: BTreeSet<Arc<str>>,
     /// How many times a later one was served with what this one waits for.
     pub(crate) overtaken: u32,
+    /// Per requirement, what was missing when what exists would last not have done.
+    pub(crate) missing: Vec<Quantity>,
 }
 
 /// Waiters in the order in which they are served, and by what they wait for.
@@ -79,6 +81,8 @@ pub(crate) struct Queue {
     pub(crate) hopeless: BTreeSet<Place>,
     /// What they lack may be something else.
     pub(crate) demand_changed: bool,
+    /// The kinds of which somebody wants to know that.
+    pub(crate) provided: BTreeSet<String>,
     /// Whether somebody could be served for whom a turn had no time left.
     pub(crate) unserved: bool,
 }
@@ -182,6 +186,22 @@ impl Queue {
         Some(next)
     }
 
+    /// Whether what exists would do for this one is known; whether that is otherwise than before.
+    pub(crate) fn set_hopeless(&mut self, place: Place, hopeless: bool) -> bool {
+        let changed = if hopeless { self.hopeless.insert(place) } else { self.hopeless.remove(&place) };
+        if changed {
+            for key in self.waiters.get(&place.1).into_iter().flat_map(|waiter| &waiter.groups) {
+                let Some(group) = self.groups.get_mut(key) else { continue };
+                if hopeless {
+                    group.hopeless.insert(place)
+                } else {
+                    group.hopeless.remove(&place)
+                };
+            }
+        }
+        changed
+    }
+
     pub(crate) fn mark(&mut self, family: &Arc<str>, anew: bool) {
         *self.changed.entry(family.clone()).or_default() |= anew;
         self.shared_until.remove(family);
@@ -205,10 +225,16 @@ impl Queue {
             ensure(self.ready.contains(&place) == ready, "who is ready is not among them")?;
             let known = self.hopeless.contains(&place) != waiter.hopeful || self.doubtful.contains(&place);
             ensure(known, "who is hopeless is not among them")?;
+            let groups = waiter.groups.iter().filter_map(|key| self.groups.get(key));
+            let hopeless = self.hopeless.contains(&place);
+            let agrees = groups.clone().all(|group| group.hopeless.contains(&place) == hopeless);
+            ensure(agrees, "a group has somebody hopeless who is not, or not one who is")?;
         }
         ensure(self.hopeless.len() <= self.waiters.len(), "somebody hopeless has left")?;
         ensure(reserved == self.reserved, "what is reserved is not what waiters have reserved")?;
         ensure(self.groups.values().map(|group| group.members).sum::<usize>() == members, "a group miscounts")?;
+        let known = self.groups.values().all(|group| group.hopeless.is_subset(&self.hopeless));
+        ensure(known, "somebody hopeless has left, and not the group")?;
         ensure(self.groups.is_empty() == self.families.is_empty(), "a family without a group")
     }
 }

@@ -39,6 +39,8 @@ struct OfKind {
     free: BTreeSet<(usize, Slot)>,
     /// How much of them there is, held or not.
     quantity: Quantity,
+    /// How many of them are divisible.
+    divisible: usize,
 }
 
 impl Resources {
@@ -113,6 +115,7 @@ impl Resources {
         if let Some(of_kind) = self.by_kind.get_mut(kind) {
             of_kind.all.insert(slot);
             of_kind.quantity += resource.quantity();
+            of_kind.divisible += usize::from(resource.description.divisible);
             if !resource.free().is_zero() {
                 of_kind.free.insert((special(&resource), slot));
             }
@@ -129,6 +132,7 @@ impl Resources {
         if let Some(of_kind) = self.by_kind.get_mut(kind) {
             of_kind.all.remove(&slot);
             of_kind.quantity = of_kind.quantity.saturating_sub(resource.quantity());
+            of_kind.divisible -= usize::from(resource.description.divisible);
             of_kind.free.remove(&(special(&resource), slot));
             if of_kind.all.is_empty() {
                 self.by_kind.remove(kind);
@@ -141,13 +145,15 @@ impl Resources {
     pub(crate) fn change<T>(&mut self, slot: Slot, change: impl FnOnce(&mut Resource) -> T) -> Option<T> {
         let resource = self.slots.get_mut(slot.index())?.as_mut()?;
         let key = |resource: &Resource| (!resource.free().is_zero()).then(|| (special(resource), slot));
-        let (before, was) = (key(resource), resource.quantity());
+        let amount = |resource: &Resource| (resource.quantity(), usize::from(resource.description.divisible));
+        let (before, was) = (key(resource), amount(resource));
         let changed = change(resource);
-        let (after, is) = (key(resource), resource.quantity());
+        let (after, is) = (key(resource), amount(resource));
         if (before != after || was != is)
             && let Some(of_kind) = self.by_kind.get_mut(resource.description.kind.as_str())
         {
-            of_kind.quantity = of_kind.quantity.saturating_sub(was) + is;
+            of_kind.quantity = of_kind.quantity.saturating_sub(was.0) + is.0;
+            of_kind.divisible = of_kind.divisible - was.1 + is.1;
             before.map(|key| of_kind.free.remove(&key));
             of_kind.free.extend(after);
         }
@@ -248,6 +254,14 @@ impl Resources {
         self.fitting(requirement).map(|(_, resource)| resource.quantity()).sum()
     }
 
+    /// How many of what fits are divisible.
+    pub(crate) fn divisible(&self, requirement: &Requirement) -> usize {
+        if self.fits_every(requirement) {
+            return self.of(&requirement.kind).map(|of_kind| of_kind.divisible).sum();
+        }
+        self.fitting(requirement).filter(|(_, resource)| resource.description.divisible).count()
+    }
+
     /// Whether the indices say the same as the resources do.
     pub(crate) fn index_agrees(&self) -> bool {
         let indexed: usize = self.by_kind.values().map(|of_kind| of_kind.all.len()).sum();
@@ -257,6 +271,10 @@ impl Resources {
         let quantity: Quantity = self.by_kind.values().map(|of_kind| of_kind.quantity).sum();
         present == self.by_id.len()
             && quantity == self.slots.iter().flatten().map(Resource::quantity).sum::<Quantity>()
+            && self.by_kind.values().all(|of_kind| {
+                let divisible = of_kind.all.iter().filter_map(|slot| self.get(*slot));
+                of_kind.divisible == divisible.filter(|resource| resource.description.divisible).count()
+            })
             && present == indexed
             && free == really_free
             && self.vacant.len() + present == self.slots.len()

@@ -117,13 +117,13 @@ impl Pool {
 
     /// Whether what exists would do for a waiter.
     fn reconsider(&mut self, place: Place) {
-        let Some(waiter) = self.queue.waiters.get(&place.1) else { return };
+        let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
         let requirements: Vec<&Requirement> = waiter.request.requirements.iter().collect();
         let assignment = Assignment::of(&self.resources, Available::Existing, &requirements);
         self.worked += 1 + assignment.looked_at;
         let hopeful = assignment.is_complete();
-        let known = if hopeful { self.queue.hopeless.remove(&place) } else { self.queue.hopeless.insert(place) };
-        self.queue.demand_changed |= known || !hopeful;
+        waiter.missing = if hopeful { Vec::new() } else { assignment.missing };
+        self.queue.demand_changed |= self.queue.set_hopeless(place, !hopeful) || !hopeful;
         let Some(waiter) = self.queue.waiters.get(&place.1) else { return };
         if hopeful == waiter.hopeful {
             return;

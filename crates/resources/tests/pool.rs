@@ -422,8 +422,9 @@ fn what_fits_fewer_other_requests_is_given_away_first() {
 #[test]
 fn what_waits_for_more_than_exists_is_in_demand_until_it_does_not_and_is_told_why_there_is_no_more() {
     let mut bench = Bench::new();
+    let provided = || std::collections::BTreeSet::from(["PathPlanner".to_owned()]);
     let told = |pool: &mut Pool| {
-        let demand = pool.take_demand()?;
+        let demand = pool.take_demand(&provided())?;
         Some(
             demand
                 .iter()
@@ -432,6 +433,7 @@ fn what_waits_for_more_than_exists_is_in_demand_until_it_does_not_and_is_told_wh
         )
     };
     let planners = |count| requirement(ResourceOperation::Block, "PathPlanner", count);
+    assert_eq!(told(&mut bench.pool), Some(vec![]), "it is asked for the first time");
     assert_eq!(told(&mut bench.pool), None);
     let two = bench.acquire("b", &[planners(2)]);
     let three = bench.acquire("b", &[planners(3)]);
@@ -445,7 +447,7 @@ fn what_waits_for_more_than_exists_is_in_demand_until_it_does_not_and_is_told_wh
     bench.create("a", ResourceSpec::new(ResourceClass::Process, "PathPlanner"));
     let (waiter, lease) = grants(&bench.notices()).remove(0);
     assert_eq!(waiter, two);
-    let left = bench.pool.take_demand().unwrap();
+    let left = bench.pool.take_demand(&provided()).unwrap();
     let provided = bench.pool.provided(&session("a"), &left[0]);
     assert_eq!((left[0].requirement.count, provided), (Quantity::ONE, Quantity::whole(2)));
     // Held or not: what exists is not in demand.

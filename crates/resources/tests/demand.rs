@@ -1,0 +1,142 @@
+//! What waiters lack, for those who could provide it, however many wait for something else.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
+use ratn_resources::{AcquireRequest, Limits, Pool, ResourceSpec, SessionId, Speaker};
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+const NOW: Timestamp = Timestamp(0);
+
+/// With a session of each of two callers.
+fn pool() -> Pool {
+    let mut pool = Pool::new(Limits::default());
+    for name in ["adam", "eve"] {
+        let speaker = Speaker { name: name.into(), for_anybody: false };
+        pool.keep_alive_as(NOW, &speaker, &SessionId::from(name), name, Duration::from_secs(60)).unwrap();
+    }
+    pool
+}
+
+/// All kinds that anybody here waits for.
+fn everything() -> BTreeSet<String> {
+    let ghosts = (0..300).map(|number| format!("Ghost-{number}"));
+    ["Planner", "Arm", "Ghost"].map(str::to_owned).into_iter().chain(ghosts).collect()
+}
+
+fn block(kind: &str, count: impl Into<Quantity>) -> Requirement {
+    Requirement { count: count.into(), ..Requirement::new(ResourceOperation::Block, kind) }
+}
+
+fn ask(pool: &mut Pool, session: &str, priority: i64, requirements: Vec<Requirement>) {
+    pool.acquire(NOW, AcquireRequest::new(SessionId::from(session), requirements).priority(priority)).unwrap();
+    while pool.next_deadline() == Some(NOW) {
+        pool.advance(NOW);
+    }
+}
+
+fn create(pool: &mut Pool, spec: ResourceSpec) {
+    pool.create(NOW, None, spec).unwrap();
+    pool.check_invariants().unwrap();
+}
+
+fn planner() -> ResourceSpec {
+    ResourceSpec::new(ResourceClass::Process, "Planner")
+}
+
+/// How much of each kind is missing, where that may have changed.
+fn missing(pool: &mut Pool) -> Option<BTreeMap<String, Quantity>> {
+    let demand = pool.take_demand(&everything())?;
+    Some(demand.into_iter().map(|demand| (demand.requirement.kind, demand.requirement.count)).collect())
+}
+
+fn one(kind: &str, count: impl Into<Quantity>) -> Option<BTreeMap<String, Quantity>> {
+    Some([(kind.to_owned(), count.into())].into())
+}
+
+#[test]
+fn what_hundreds_of_urgent_waiters_of_one_caller_lack_hides_nothing_of_what_another_lacks() {
+    let mut pool = pool();
+    for number in 0..300 {
+        ask(&mut pool, "eve", 1_000, vec![block(&format!("Ghost-{number}"), 1)]);
+    }
+    ask(&mut pool, "adam", 0, vec![block("Planner", 2)]);
+    pool.check_invariants().unwrap();
+    let missing = missing(&mut pool).unwrap();
+    assert_eq!(missing.get("Planner"), Some(&Quantity::whole(2)));
+    assert!((2..300).contains(&missing.len()), "{}: not more than providers can be told", missing.len());
+}
+
+#[test]
+fn hundreds_of_waiters_of_one_selector_hide_no_other_selector_of_their_caller() {
+    let mut pool = pool();
+    for number in 0..300 {
+        ask(&mut pool, "eve", 1_000, vec![block("Ghost", 1 + number % 7)]);
+    }
+    ask(&mut pool, "eve", 0, vec![block("Planner", 2)]);
+    let expected = [("Ghost".to_owned(), Quantity::whole(7)), ("Planner".to_owned(), Quantity::whole(2))];
+    assert_eq!(missing(&mut pool), Some(expected.into()));
+    pool.check_invariants().unwrap();
+}
+
+#[test]
+fn what_is_missing_is_what_is_missing_now_however_it_is_asked_for() {
+    let mut pool = pool();
+    let fast = |count: u32| Requirement {
+        attributes: [("fast".to_owned(), Value::Bool(true))].into(),
+        ..block("Planner", count)
+    };
+    // Two requirements that may take the same planners: four in all, of which two are fast ones.
+    ask(&mut pool, "adam", 0, vec![block("Planner", 2), fast(2)]);
+    let sum = |pool: &mut Pool| missing_sum(pool);
+    assert_eq!(sum(&mut pool), Some(4));
+    create(&mut pool, planner());
+    assert_eq!(sum(&mut pool), Some(3));
+    create(&mut pool, planner().attribute("fast", Value::Bool(true)));
+    assert_eq!(sum(&mut pool), Some(2));
+    // One who lacks nothing of planners asks for more of them than he lacks of anything.
+    ask(&mut pool, "eve", 9, vec![block("Planner", 2), block("Arm", 1)]);
+    assert_eq!(sum(&mut pool), Some(3), "an arm, too");
+}
+
+fn missing_sum(pool: &mut Pool) -> Option<u32> {
+    let demand = pool.take_demand(&everything())?;
+    Some(demand.iter().map(|demand| demand.requirement.count.units()).sum())
+}
+
+#[test]
+fn who_waits_for_a_whole_unit_is_served_with_one_beside_parts_of_others() {
+    let mut pool = pool();
+    let half = || planner().capacity(Quantity::from_thousandths(500)).divisible();
+    create(&mut pool, half());
+    create(&mut pool, half());
+    ask(&mut pool, "adam", 0, vec![block("Planner", 1)]);
+    assert_eq!(pool.waiting(), 1, "two halves are no whole one");
+    assert_eq!(missing(&mut pool), one("Planner", 1));
+    create(&mut pool, planner());
+    while pool.next_deadline() == Some(NOW) {
+        pool.advance(NOW);
+    }
+    assert_eq!((pool.waiting(), pool.leases().len()), (0, 1));
+    assert_eq!(missing(&mut pool), Some(BTreeMap::new()));
+    pool.check_invariants().unwrap();
+}
+
+#[test]
+fn what_nobody_provides_takes_no_room_from_what_somebody_does() {
+    let mut pool = pool();
+    for number in 0..300 {
+        ask(&mut pool, "eve", 1_000, vec![block(&format!("Ghost-{number}"), 1)]);
+    }
+    ask(&mut pool, "eve", 0, vec![block("Planner", 2)]);
+    let told = |pool: &mut Pool, kinds: &[&str]| {
+        let demand = pool.take_demand(&kinds.iter().map(|&kind| kind.to_owned()).collect())?;
+        Some(demand.into_iter().map(|demand| demand.requirement.kind).collect::<Vec<_>>())
+    };
+    assert_eq!(told(&mut pool, &["Planner", "Arm"]), Some(vec!["Planner".to_owned()]));
+    assert_eq!(told(&mut pool, &["Planner", "Arm"]), None, "nothing has changed");
+    assert_eq!(told(&mut pool, &["Planner", "Ghost-7"]), Some(vec!["Ghost-7".to_owned(), "Planner".to_owned()]));
+    assert_eq!(told(&mut pool, &[]), Some(vec![]));
+}
