@@ -43,14 +43,16 @@ impl Pool {
     }
 
     /// Undoes an acquire by its request id: takes it out of the queue, or ends the lease that it was granted. The same request id once
-    /// more acquires anew. False when there is nothing to undo.
+    /// more acquires anew. False when there is nothing to undo: an acquire of an id that nobody has asked with may be on its way, and is
+    /// refused when it arrives ([`PoolError::Withdrawn`]), for as long as answers are remembered.
     ///
     /// # Errors
     /// An acquire of another session.
     pub fn withdraw(&mut self, now: Timestamp, caller: &SessionId, request_id: &str) -> Result<bool, PoolError> {
         self.begin(now);
         let Some(session) = self.sessions.get(caller) else { return Ok(false) };
-        match self.memory.reply(&RequestId::new(&session.opened_by, request_id)) {
+        let id = RequestId::new(&session.opened_by, request_id);
+        match self.memory.reply(&id) {
             Some(Recalled::Waiting(id)) => {
                 let Some(waiter) = self.queue.get(id) else { return Ok(false) };
                 check_owner(|| id.to_string(), &waiter.request.session, caller)?;
@@ -62,7 +64,11 @@ impl Pool {
                 self.return_consumed(lease);
                 self.commit(Effect::LeaseEnded { lease, reason: EndReason::Undelivered });
             }
-            _ => return Ok(false),
+            Some(Recalled::Answered(_)) => return Ok(false),
+            None => {
+                self.withdrawals.withdrawn(self.now, &self.limits, id);
+                return Ok(false);
+            }
         }
         self.schedule();
         Ok(true)
@@ -342,6 +348,9 @@ impl Pool {
             self.callers.waits_no_more(&session.opened_by, &waiter.groups);
         }
         let fingerprint = self.memory.waited(&waiter.request_id).unwrap_or_default();
+        if !granted {
+            self.withdrawals.heard_of(self.now, &self.limits, waiter.request_id.clone());
+        }
         Some((waiter, fingerprint))
     }
 }

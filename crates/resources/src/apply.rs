@@ -196,7 +196,8 @@ impl Pool {
                 self.session_mut(&record.session)?.leases.remove(lease);
                 self.callers.holds_no_more(&record.opened_by);
                 if *reason == EndReason::Undelivered {
-                    self.memory.forget_grant(*lease);
+                    let undone = self.memory.forget_grant(*lease);
+                    undone.into_iter().for_each(|id| self.withdrawals.heard_of(self.now, &self.limits, id));
                 }
                 let resources = self.views(&slots)?;
                 let (token, session) = (record.token, record.session);

@@ -11,6 +11,7 @@ use crate::queue::Place;
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 /// Selectors that providers are told of: those who wait for others come up when what these lack is there. Callers have them in turn.
 const SELECTORS: usize = 256;
@@ -34,9 +35,9 @@ pub struct Demand {
 
 impl Pool {
     /// What is missing now of what these kinds would do for, where that may be something else than at the last call.
-    pub fn take_demand(&mut self, provided: &BTreeSet<String>) -> Option<Vec<Demand>> {
-        if self.queue.provided != *provided {
-            self.queue.provided.clone_from(provided);
+    pub fn take_demand(&mut self, provided: &Arc<BTreeSet<String>>) -> Option<Vec<Demand>> {
+        if !Arc::ptr_eq(&self.queue.provided, provided) && self.queue.provided != *provided {
+            self.queue.provided = Arc::clone(provided);
             self.queue.demand_changed = true;
         }
         if !std::mem::take(&mut self.queue.demand_changed) {
@@ -96,12 +97,6 @@ impl Pool {
     fn demand(&self, group: &Group, amount: Quantity) -> Demand {
         let kinds = self.resources.kinds().subclasses(&group.selector.kind).map(str::to_owned).collect();
         Demand { requirement: Requirement { count: amount, ..group.selector.clone() }, kinds }
-    }
-
-    /// How much of what a demand selects a session provides already.
-    pub fn provided(&self, session: &SessionId, demand: &Demand) -> Quantity {
-        let fitting = self.resources.fitting(&demand.requirement).map(|(_, resource)| resource);
-        fitting.filter(|resource| resource.owner.as_ref() == Some(session)).map(|r| r.quantity()).sum()
     }
 
     /// A provider says why there are no more of a kind, to those who wait for it; an empty reason takes that back. It goes with the

@@ -119,6 +119,12 @@ pub enum PoolError {
         /// The bound.
         limit: usize,
     },
+    /// An acquire whose request id was withdrawn before it arrived.
+    #[error("request id `{id}` was withdrawn before its acquire arrived: to acquire anew, ask with another one")]
+    Withdrawn {
+        /// Which.
+        id: String,
+    },
     /// A request id that was used for something else before.
     #[error("request id `{id}` was used for another request before")]
     RequestIdReused {

@@ -67,6 +67,7 @@ mod schedule;
 mod session;
 mod snapshot;
 mod validation;
+mod withdrawals;
 
 pub use crowd::Holders;
 pub use demand::Demand;
@@ -78,7 +79,7 @@ pub use id::{SessionId, WaiterId};
 pub use kinds::{CyclicKinds, Kinds};
 pub use lease::LeaseView;
 pub use limits::Limits;
-pub use look::Search;
+pub use look::{ProvidedCount, Search};
 pub use pool::Pool;
 pub use queue::AcquireRequest;
 pub use ratn_model::resource::Quantity;

@@ -8,7 +8,7 @@ use crate::pool::Pool;
 use crate::resources::OfKinds;
 use crate::session::SessionView;
 use ratn_model::resource::{Quantity, Requirement};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
 
 /// Looks for what a requirement can be met with: how much of it exists, and the first ids.
@@ -50,7 +50,41 @@ impl Search {
     }
 }
 
+/// Counts how much of what a requirement selects each session provides.
+#[derive(Debug, Clone)]
+pub struct ProvidedCount {
+    requirement: Requirement,
+    of_sessions: BTreeMap<SessionId, Quantity>,
+    /// The last that was looked at.
+    at: Option<OfKinds>,
+}
+
+impl ProvidedCount {
+    /// Nothing counted yet.
+    pub fn new(requirement: Requirement) -> ProvidedCount {
+        ProvidedCount { requirement, of_sessions: BTreeMap::new(), at: None }
+    }
+
+    /// How much a session provides, held or not.
+    pub fn of(&self, session: &SessionId) -> Quantity {
+        self.of_sessions.get(session).copied().unwrap_or_default()
+    }
+}
+
 impl Pool {
+    /// Looks at so many more resources of the kinds at the most; how many that was, less where it has looked at all.
+    pub fn count_provided(&self, count: &mut ProvidedCount, resources: usize) -> usize {
+        let mut looked_at = 0;
+        for (at, resource) in self.resources.all_of_after(&count.requirement.kind, count.at).take(resources) {
+            looked_at += 1;
+            count.at = Some(at);
+            if let Some(owner) = resource.owner.as_ref().filter(|_| resource.description.fits(&count.requirement)) {
+                *count.of_sessions.entry(owner.clone()).or_default() += resource.quantity();
+            }
+        }
+        looked_at
+    }
+
     /// Looks at so many more resources of the kinds; whether it has looked at all. Of a kind without anything else all units are counted at
     /// once, by the first call.
     pub fn go_on(&self, search: &mut Search, resources: usize) -> bool {
@@ -163,6 +197,17 @@ mod tests {
         }
         while !pool.go_on(&mut search, 100) {}
         assert_eq!(search.units(), Quantity::from(MANY as u32 / 2 - 1), "what was there when it was looked at");
+    }
+
+    #[test]
+    fn what_sessions_provide_is_counted_in_parts() {
+        let mut pool = pool();
+        pool.create(NOW, Some(&SessionId::from("a")), ResourceSpec::new(ResourceClass::Module, "Tool")).unwrap();
+        let mut count = ProvidedCount::new(tools(Some(true)));
+        let parts: Vec<usize> = std::iter::repeat_with(|| pool.count_provided(&mut count, 70)).take(5).collect();
+        assert_eq!(parts, [70, 70, 70, 70, 21]);
+        let provided = ["a", "b", "c"].map(|name| count.of(&SessionId::from(name)));
+        assert_eq!(provided, [Quantity::ZERO, Quantity::whole(MANY as u32 / 2), Quantity::ZERO]);
     }
 
     #[test]

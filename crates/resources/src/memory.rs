@@ -202,7 +202,7 @@ impl RequestMemory {
         for (caller, count) in forgotten {
             let oldest = self.callers.get(caller).map(|known| known.answers.keys().take(*count).copied().collect());
             let oldest: Vec<u64> = oldest.unwrap_or_default();
-            oldest.into_iter().for_each(|number| self.remove(caller, number));
+            oldest.into_iter().for_each(|number| drop(self.remove(caller, number)));
         }
     }
 
@@ -219,22 +219,24 @@ impl RequestMemory {
         self.callers.entry(id.caller).or_default().insert(number, Answer { id: id.id, fingerprint, reply });
     }
 
-    /// The request that led to this lease is as if it had never been asked.
-    pub(crate) fn forget_grant(&mut self, lease: LeaseId) {
-        if let Some((caller, number)) = self.grants.get(&lease).cloned() {
-            self.remove(&caller, number);
-        }
+    /// The request that led to this lease is as if it had never been asked; its id.
+    pub(crate) fn forget_grant(&mut self, lease: LeaseId) -> Option<RequestId> {
+        let (caller, number) = self.grants.get(&lease).cloned()?;
+        let id = self.remove(&caller, number)?;
+        Some(RequestId { id, caller })
     }
 
-    fn remove(&mut self, caller: &Arc<str>, number: u64) {
+    fn remove(&mut self, caller: &Arc<str>, number: u64) -> Option<Arc<str>> {
         self.order.remove(&number);
-        let Some(known) = self.callers.get_mut(caller) else { return };
-        if let Some(Answer { reply: Remembered::Granted(lease), .. }) = known.remove(number) {
-            self.grants.remove(&lease);
+        let known = self.callers.get_mut(caller)?;
+        let answer = known.remove(number);
+        if let Some(Answer { reply: Remembered::Granted(lease), .. }) = &answer {
+            self.grants.remove(lease);
         }
         if known.answers.is_empty() {
             self.callers.remove(caller);
         }
+        answer.map(|answer| answer.id)
     }
 
     fn answer(&self, id: &RequestId) -> Option<&Answer> {

@@ -20,6 +20,7 @@ use crate::request::{Reply, Request};
 use crate::resource::{Resource, ResourceView};
 use crate::resources::Resources;
 use crate::session::{Sessions, Speaker};
+use crate::withdrawals::Withdrawals;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
@@ -53,6 +54,8 @@ pub struct Pool {
     pub(crate) history: History,
     // What is not.
     pub(crate) queue: Queue,
+    /// Request ids whose acquires may arrive after they were withdrawn.
+    pub(crate) withdrawals: Withdrawals,
     /// What providers cannot provide, by kind, and why.
     pub(crate) shortages: BTreeMap<SessionId, BTreeMap<String, String>>,
     pub(crate) timers: BTreeSet<(Timestamp, Timer)>,
@@ -167,6 +170,9 @@ impl Pool {
             Some(Recalled::Answered(Remembered::Created { id, revision })) => Ok(Reply::Created { id, revision }),
             Some(Recalled::Answered(Remembered::Touched(ids))) => Ok(Reply::Touched(ids)),
             Some(Recalled::Answered(Remembered::Done)) => Ok(Reply::Done),
+            None if matches!(request, Request::Acquire(_)) && self.withdrawals.is_withdrawn(&id) => {
+                Err(PoolError::Withdrawn { id: request_id.to_owned() })
+            }
             None => {
                 let reply = self.perform(now, speaker, id.clone(), fingerprint, request)?;
                 let remembered = match &reply {

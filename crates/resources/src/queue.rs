@@ -82,7 +82,7 @@ pub(crate) struct Queue {
     /// What they lack may be something else.
     pub(crate) demand_changed: bool,
     /// The kinds of which somebody wants to know that.
-    pub(crate) provided: BTreeSet<String>,
+    pub(crate) provided: Arc<BTreeSet<String>>,
     /// Whether somebody could be served for whom a turn had no time left.
     pub(crate) unserved: bool,
 }

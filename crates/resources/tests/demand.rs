@@ -6,6 +6,7 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_resources::{AcquireRequest, Limits, Pool, ResourceSpec, SessionId, Speaker};
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 const NOW: Timestamp = Timestamp(0);
@@ -21,9 +22,9 @@ fn pool() -> Pool {
 }
 
 /// All kinds that anybody here waits for.
-fn everything() -> BTreeSet<String> {
+fn everything() -> Arc<BTreeSet<String>> {
     let ghosts = (0..300).map(|number| format!("Ghost-{number}"));
-    ["Planner", "Arm", "Ghost"].map(str::to_owned).into_iter().chain(ghosts).collect()
+    ["Planner", "Arm", "Ghost"].map(str::to_owned).into_iter().chain(ghosts).collect::<BTreeSet<String>>().into()
 }
 
 fn block(kind: &str, count: impl Into<Quantity>) -> Requirement {
@@ -132,7 +133,7 @@ fn what_nobody_provides_takes_no_room_from_what_somebody_does() {
     }
     ask(&mut pool, "eve", 0, vec![block("Planner", 2)]);
     let told = |pool: &mut Pool, kinds: &[&str]| {
-        let demand = pool.take_demand(&kinds.iter().map(|&kind| kind.to_owned()).collect())?;
+        let demand = pool.take_demand(&Arc::new(kinds.iter().map(|&kind| kind.to_owned()).collect()))?;
         Some(demand.into_iter().map(|demand| demand.requirement.kind).collect::<Vec<_>>())
     };
     assert_eq!(told(&mut pool, &["Planner", "Arm"]), Some(vec!["Planner".to_owned()]));

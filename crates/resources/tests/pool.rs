@@ -7,8 +7,8 @@ use ratn_model::resource::{Lease, Quantity, Requirement, ResourceClass, Resource
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_resources::{
-    AcquireRequest, Change, EndReason, Kinds, Limits, Notice, Obstacle, Pool, PoolError, Refusal, Reply, Request,
-    ResourceSpec, SessionId, WaiterId,
+    AcquireRequest, Change, EndReason, Kinds, Limits, Notice, Obstacle, Pool, PoolError, ProvidedCount, Refusal, Reply,
+    Request, ResourceSpec, SessionId, WaiterId,
 };
 use std::time::Duration;
 
@@ -422,7 +422,7 @@ fn what_fits_fewer_other_requests_is_given_away_first() {
 #[test]
 fn what_waits_for_more_than_exists_is_in_demand_until_it_does_not_and_is_told_why_there_is_no_more() {
     let mut bench = Bench::new();
-    let provided = || std::collections::BTreeSet::from(["PathPlanner".to_owned()]);
+    let provided = || std::sync::Arc::new(["PathPlanner".to_owned()].into());
     let told = |pool: &mut Pool| {
         let demand = pool.take_demand(&provided())?;
         Some(
@@ -448,8 +448,9 @@ fn what_waits_for_more_than_exists_is_in_demand_until_it_does_not_and_is_told_wh
     let (waiter, lease) = grants(&bench.notices()).remove(0);
     assert_eq!(waiter, two);
     let left = bench.pool.take_demand(&provided()).unwrap();
-    let provided = bench.pool.provided(&session("a"), &left[0]);
-    assert_eq!((left[0].requirement.count, provided), (Quantity::ONE, Quantity::whole(2)));
+    let mut count = ProvidedCount::new(left[0].requirement.clone());
+    bench.pool.count_provided(&mut count, 10);
+    assert_eq!((left[0].requirement.count, count.of(&session("a"))), (Quantity::ONE, Quantity::whole(2)));
     // Held or not: what exists is not in demand.
     bench.acquire("b", &[planners(1)]);
     assert_eq!(told(&mut bench.pool), None);
@@ -619,6 +620,34 @@ fn a_cancelled_acquire_may_be_asked_again_with_its_request_id() {
     bench.pool.cancel(bench.now, first).unwrap();
     let Ok(Reply::Queued(second)) = bench.pool.handle(bench.now, "q", acquire) else { panic!() };
     assert_ne!(first, second);
+}
+
+#[test]
+fn an_acquire_that_arrives_after_its_withdrawal_is_refused() {
+    let mut bench = Bench::with(&[("Arm", 1)]);
+    let ask = |bench: &mut Bench, owner: &str, id: &str| {
+        let request = AcquireRequest::new(session(owner), vec![block("Arm")]);
+        bench.pool.handle(bench.now, id, Request::Acquire(request))
+    };
+    assert_eq!(bench.pool.withdraw(bench.now, &session("b"), "late"), Ok(false));
+    for _ in 0..2 {
+        let refused = ask(&mut bench, "b", "late");
+        assert_eq!(refused, Err(PoolError::Withdrawn { id: "late".into() }), "as often as it arrives");
+    }
+    assert!(bench.pool.leases().is_empty());
+    // One that was heard of is acquired anew.
+    for _ in 0..2 {
+        ask(&mut bench, "b", "known").unwrap();
+        assert_eq!(bench.pool.withdraw(bench.now, &session("b"), "known"), Ok(true));
+    }
+    assert!(matches!(ask(&mut bench, "b", "known"), Ok(Reply::Queued(_))));
+    // As long as answers are remembered.
+    bench.at(3_601.0);
+    for name in ["a", "b"] {
+        bench.pool.keep_alive(bench.now, &session(name), name, Duration::from_secs(10)).unwrap();
+    }
+    bench.pool.withdraw(bench.now, &session("b"), "another").unwrap();
+    assert!(matches!(ask(&mut bench, "b", "late"), Ok(Reply::Queued(_))));
 }
 
 #[test]

@@ -198,6 +198,10 @@ proptest! {
             for (step, id) in next.iter().filter(|(step, _)| !(holds && matches!(step, Step::Wait(_)))) {
                 let later = if let Step::Wait(time) = step { now + time } else { now };
                 let (answer, answer_again) = (perform(&mut pool, later, step, *id), perform(&mut again, later, step, *id));
+                // What was withdrawn before it was heard of is not kept: it does not arrive after a restart.
+                if answer.contains("Err(Withdrawn") != answer_again.contains("Err(Withdrawn") {
+                    break;
+                }
                 // Waiters are numbered anew.
                 if !answer.contains("Queued") && !answer.contains("waiter-") {
                     prop_assert_eq!(answer, answer_again);

@@ -19,6 +19,7 @@ pub(super) fn of_error(error: &PoolError) -> Status {
             (Code::PermissionDenied, "NOT_YOURS")
         }
         PoolError::NotEnough { .. } => (Code::FailedPrecondition, "NOT_ENOUGH"),
+        PoolError::Withdrawn { .. } => (Code::Cancelled, "WITHDRAWN"),
         PoolError::Malformed { .. } => (Code::InvalidArgument, "MALFORMED"),
         PoolError::RequestIdReused { .. } => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
         PoolError::SessionEnding { .. } => {
