@@ -1,11 +1,11 @@
 //! The part of a provider's link that hears what is missing and what is held, and says why there is no more of it.
 
 use ratn_model::value::Value;
-use ratn_proto::types::{Demand, ResourceEventKind, ResourceUpdate};
+use ratn_proto::types::{Demand, Resource, ResourceEventKind, ResourceUpdate};
 use ratn_worker::client::{CallError, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::Session;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 
@@ -36,6 +36,15 @@ pub(crate) struct Use {
 
 /// What goes from and to the provider.
 pub(crate) struct DemandLink {
+    pub(crate) wanted: WantedLink,
+    /// Hears who of its kinds is held, its own and those of others.
+    pub(crate) used: mpsc::Sender<Use>,
+    /// What of that it has heard.
+    pub(crate) uses: Uses,
+}
+
+/// The part of it about what is missing.
+pub(crate) struct WantedLink {
     /// What it can provide: kinds, and how many of each at the most.
     pub(crate) kinds: BTreeMap<String, u32>,
     /// What all of it has in common.
@@ -43,18 +52,16 @@ pub(crate) struct DemandLink {
     /// Hears what is missing.
     pub(crate) heard: mpsc::Sender<Vec<Demand>>,
     pub(crate) shortages: watch::Receiver<Shortages>,
-    /// Hears who of its kinds is held, its own and those of others.
-    pub(crate) used: mpsc::Sender<Use>,
 }
 
 impl DemandLink {
     /// Goes on for as long as it is polled. What was missing counts until it is heard that it is not.
     pub(crate) async fn follow(&mut self, channels: &Channels, endpoint: &Endpoint, session: &Session) {
-        let kinds: Vec<String> = self.kinds.keys().cloned().collect();
-        let used = self.used.clone();
+        let DemandLink { wanted, used, uses } = self;
+        let kinds: Vec<String> = wanted.kinds.keys().cloned().collect();
         let uses = async {
             loop {
-                if let Err(error) = follow_uses(channels, endpoint, &kinds, &used).await {
+                if let Err(error) = follow_uses(channels, endpoint, &kinds, uses, used).await {
                     tracing::debug!(%endpoint, %error, "who holds what is not heard now");
                 }
                 tokio::time::sleep(AGAIN_AFTER).await;
@@ -63,7 +70,7 @@ impl DemandLink {
         let demand = async {
             loop {
                 if session.alive(AGAIN_AFTER).await.is_ok()
-                    && let Err(error) = self.follow_once(channels, endpoint, session).await
+                    && let Err(error) = wanted.follow_once(channels, endpoint, session).await
                 {
                     tracing::debug!(%endpoint, %error, "the demand is not heard now");
                 }
@@ -72,7 +79,9 @@ impl DemandLink {
         };
         tokio::join!(uses, demand);
     }
+}
 
+impl WantedLink {
     async fn follow_once(
         &mut self,
         channels: &Channels,
@@ -107,6 +116,7 @@ async fn follow_uses(
     channels: &Channels,
     endpoint: &Endpoint,
     kinds: &[String],
+    uses: &mut Uses,
     used: &mpsc::Sender<Use>,
 ) -> Result<(), CallError> {
     if kinds.is_empty() {
@@ -115,16 +125,8 @@ async fn follow_uses(
     let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
     let mut watch = ResourceClient::new(channels, endpoint, "")?.watch(&kinds).await?;
     while let Some(update) = watch.next().await? {
-        let changed = match update {
-            ResourceUpdate::Snapshot { resources, .. } => resources,
-            ResourceUpdate::Event(event) => match event.kind {
-                ResourceEventKind::Leased | ResourceEventKind::Released => vec![event.resource],
-                _ => continue,
-            },
-        };
-        for resource in changed {
-            let held = !resource.holdings.is_empty();
-            if used.send(Use { id: resource.id, held }).await.is_err() {
+        for changed in uses.heard(update) {
+            if used.send(changed).await.is_err() {
                 return Ok(());
             }
         }
@@ -132,7 +134,114 @@ async fn follow_uses(
     Ok(())
 }
 
+/// Who is held, as far as it was heard. Pure.
+#[derive(Debug, Default)]
+pub(crate) struct Uses {
+    held: BTreeSet<String>,
+}
+
+impl Uses {
+    /// What an update of the watch says of who is held. What is not there any more is held by nobody, also where it went while nobody
+    /// watched.
+    fn heard(&mut self, update: ResourceUpdate) -> Vec<Use> {
+        let is_held = |resource: &Resource| !resource.holdings.is_empty();
+        let changed: Vec<Use> = match update {
+            ResourceUpdate::Snapshot { resources, .. } => {
+                let there: BTreeSet<&str> = resources.iter().map(|resource| resource.id.as_str()).collect();
+                let gone = self.held.iter().filter(|id| !there.contains(id.as_str()));
+                let gone = gone.map(|id| Use { id: id.clone(), held: false });
+                gone.chain(resources.iter().map(|one| Use { id: one.id.clone(), held: is_held(one) })).collect()
+            }
+            ResourceUpdate::Event(event) => match event.kind {
+                ResourceEventKind::Leased | ResourceEventKind::Released => {
+                    vec![Use { held: is_held(&event.resource), id: event.resource.id }]
+                }
+                ResourceEventKind::Deleted => vec![Use { held: false, id: event.resource.id }],
+                ResourceEventKind::Created | ResourceEventKind::Updated => vec![],
+            },
+        };
+        for Use { id, held } in &changed {
+            if *held {
+                self.held.insert(id.clone())
+            } else {
+                self.held.remove(id)
+            };
+        }
+        changed
+    }
+}
+
 /// Last words of a worker may have many.
 fn in_one_line(reason: &str) -> String {
     reason.chars().map(|c| if c.is_control() { ' ' } else { c }).take(REASON_LENGTH).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_model::id::{FencingToken, LeaseId, Revision};
+    use ratn_model::resource::{Quantity, ResourceClass};
+    use ratn_proto::types::{Holding, ResourceEvent};
+
+    fn planner(id: &str, held: bool) -> Resource {
+        let mut resource = Resource::new(id, ResourceClass::Process, "Planner");
+        let holding = || Holding {
+            lease: LeaseId(1),
+            token: FencingToken(1),
+            units: Quantity::ONE,
+            session: String::new(),
+            holder: String::new(),
+            opened_by: String::new(),
+        };
+        resource.holdings.extend(held.then(holding));
+        resource
+    }
+
+    fn event(kind: ResourceEventKind, resource: Resource) -> ResourceUpdate {
+        ResourceUpdate::Event(ResourceEvent {
+            revision: Revision(1),
+            kind,
+            resource,
+            lease: None,
+            reason: String::new(),
+            part: 0,
+        })
+    }
+
+    fn snapshot(resources: Vec<Resource>) -> ResourceUpdate {
+        ResourceUpdate::Snapshot { revision: Revision(1), resources, youngest: LeaseId(1) }
+    }
+
+    fn heard(uses: &mut Uses, update: ResourceUpdate) -> Vec<(String, bool)> {
+        uses.heard(update).into_iter().map(|changed| (changed.id, changed.held)).collect()
+    }
+
+    #[test]
+    fn one_whose_resource_vanishes_while_it_is_held_is_held_by_nobody() {
+        use ResourceEventKind::{Created, Deleted, Leased, Released};
+        let mut uses = Uses::default();
+        assert_eq!(heard(&mut uses, snapshot(vec![planner("p1", true)])), [("p1".to_owned(), true)]);
+        assert_eq!(
+            heard(&mut uses, event(Released, planner("p1", true))),
+            [("p1".to_owned(), true)],
+            "the lease lost it"
+        );
+        assert_eq!(heard(&mut uses, event(Deleted, planner("p1", true))), [("p1".to_owned(), false)]);
+        // It is offered again, and leased again.
+        assert!(heard(&mut uses, event(Created, planner("p1", false))).iter().all(|(_, held)| !held));
+        assert_eq!(heard(&mut uses, event(Leased, planner("p1", true))), [("p1".to_owned(), true)]);
+    }
+
+    #[test]
+    fn one_whose_resource_vanished_while_nobody_watched_is_held_by_nobody() {
+        let mut uses = Uses::default();
+        heard(&mut uses, snapshot(vec![planner("p1", true), planner("p2", true), planner("p3", false)]));
+        heard(&mut uses, event(ResourceEventKind::Leased, planner("p3", true)));
+        let told = heard(&mut uses, snapshot(vec![planner("p2", true)]));
+        let expected = [("p1", false), ("p2", true), ("p3", false)];
+        let mut told: Vec<(&str, bool)> = told.iter().map(|(id, held)| (id.as_str(), *held)).collect();
+        told.sort_unstable();
+        assert_eq!(told, expected);
+        assert_eq!(heard(&mut uses, snapshot(vec![planner("p2", true)])), [("p2".to_owned(), true)], "it is said once");
+    }
 }

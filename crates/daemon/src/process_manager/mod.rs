@@ -44,7 +44,7 @@ pub use roster::RosterError;
 pub use template::{Liveness, Needs, Template};
 pub use tracking::Tracking;
 
-use crate::demand::{DemandLink, Shortages};
+use crate::demand::{DemandLink, Shortages, Uses, WantedLink};
 use crate::link::{LINK, LastingSession, Link, Manager, OfferLifecycle, Wanted};
 use anyhow::Context;
 use machine::Machine;
@@ -136,11 +136,14 @@ pub async fn run_as(
         wanted: to_offer,
         lifecycle: Some(OfferLifecycle { events: report, draining }),
         demand: Some(DemandLink {
-            kinds: config.kinds(),
-            attributes: offered::attributes(&config.host, &config.labels),
-            heard,
-            shortages,
+            wanted: WantedLink {
+                kinds: config.kinds(),
+                attributes: offered::attributes(&config.host, &config.labels),
+                heard,
+                shortages,
+            },
             used,
+            uses: Uses::default(),
         }),
     };
     let linked = tokio::spawn(exit_on_panic(LINK, link.keep(shutdown.clone())));

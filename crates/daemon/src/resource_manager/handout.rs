@@ -12,14 +12,15 @@
 
 use ratn_model::time::Timestamp;
 use ratn_resources::SessionId;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 /// What is missing.
 #[derive(Debug, Clone)]
 pub(super) struct Missing {
     /// The same for the same selector.
-    pub(super) selector: String,
+    pub(super) selector: Arc<str>,
     /// How much.
     pub(super) count: u32,
     /// What each provider can do about it.
@@ -39,7 +40,9 @@ pub(super) struct Part {
 #[derive(Debug)]
 pub(super) struct HandOut {
     patience: Duration,
-    turns: BTreeMap<(String, SessionId), Turn>,
+    turns: BTreeMap<(Arc<str>, SessionId), Turn>,
+    /// As they are after the round that is under way.
+    next: BTreeMap<(Arc<str>, SessionId), Turn>,
     standings: BTreeMap<SessionId, Standing>,
 }
 
@@ -73,52 +76,59 @@ struct Turn {
 impl HandOut {
     /// A provider has so long to come closer to what is asked of it.
     pub(super) fn new(patience: Duration) -> HandOut {
-        HandOut { patience, turns: BTreeMap::new(), standings: BTreeMap::new() }
+        HandOut { patience, turns: BTreeMap::new(), next: BTreeMap::new(), standings: BTreeMap::new() }
     }
 
-    /// How much of each demand (the second index) is asked of each provider now.
-    pub(super) fn hand_out(&mut self, now: Timestamp, providers: &[SessionId], missing: &[Missing]) -> Vec<Vec<u32>> {
-        let mut turns = BTreeMap::new();
+    /// A round begins, in which all that is missing is handed out to these.
+    pub(super) fn begin(&mut self, providers: &[SessionId]) {
+        let providers: BTreeSet<&SessionId> = providers.iter().collect();
         self.standings.retain(|session, _| providers.contains(session));
-        let mut asked = vec![vec![0; missing.len()]; providers.len()];
-        for (at, demand) in missing.iter().enumerate() {
-            let able = |(index, part): (usize, &Part)| {
-                let turn = self.turn(now, &demand.selector, &providers[index], part.provided);
-                Some((index, part.room?, turn))
-            };
-            let mut able: Vec<(usize, u32, Turn)> = demand.of.iter().enumerate().filter_map(able).collect();
-            able.sort_by_key(|(index, _, turn)| {
-                let standing = self.standings.get(&providers[*index]).copied().unwrap_or_default();
-                (standing.rank(), turn.passed, !standing.proven, *index)
-            });
-            let mut left = demand.count;
-            for (index, room, turn) in &able {
-                let stays = turn.asked.min(*room).min(left);
-                left -= stays;
-                asked[*index][at] = stays;
-            }
-            for (index, room, mut turn) in able.iter().copied() {
-                let share = &mut asked[index][at];
-                let more = (room - *share).min(left);
-                left -= more;
-                *share += more;
-                if turn.asked == 0 {
-                    (turn.since, turn.provided) = (now, demand.of[index].provided);
-                }
-                turn.asked = *share;
-                turns.insert((demand.selector.clone(), providers[index].clone()), turn);
-            }
-            for (index, ..) in able {
-                asked[index][at] += left;
-            }
+        self.next.clear();
+    }
+
+    /// How much of a demand is asked of each of the round's providers now.
+    pub(super) fn hand_out(&mut self, now: Timestamp, providers: &[SessionId], demand: &Missing) -> Vec<u32> {
+        let mut asked = vec![0; providers.len()];
+        let able = |(index, part): (usize, &Part)| {
+            let room = part.room?;
+            Some((index, room, self.turn(now, &demand.selector, &providers[index], part.provided)))
+        };
+        let mut able: Vec<(usize, u32, Turn)> = demand.of.iter().enumerate().filter_map(able).collect();
+        able.sort_by_key(|(index, _, turn)| {
+            let standing = self.standings.get(&providers[*index]).copied().unwrap_or_default();
+            (standing.rank(), turn.passed, !standing.proven, *index)
+        });
+        let mut left = demand.count;
+        for (index, room, turn) in &able {
+            let stays = turn.asked.min(*room).min(left);
+            left -= stays;
+            asked[*index] = stays;
         }
-        self.turns = turns;
+        for (index, room, mut turn) in able.iter().copied() {
+            let share = &mut asked[index];
+            let more = (room - *share).min(left);
+            left -= more;
+            *share += more;
+            if turn.asked == 0 {
+                (turn.since, turn.provided) = (now, demand.of[index].provided);
+            }
+            turn.asked = *share;
+            self.next.insert((Arc::clone(&demand.selector), providers[index].clone()), turn);
+        }
+        for (index, ..) in able {
+            asked[index] += left;
+        }
         asked
     }
 
+    /// The round is over: what was not handed out in it is not missing any more.
+    pub(super) fn end(&mut self) {
+        self.turns = std::mem::take(&mut self.next);
+    }
+
     /// As it is after what has passed since.
-    fn turn(&mut self, now: Timestamp, selector: &str, session: &SessionId, provided: u32) -> Turn {
-        let key = (selector.to_owned(), session.clone());
+    fn turn(&mut self, now: Timestamp, selector: &Arc<str>, session: &SessionId, provided: u32) -> Turn {
+        let key = (Arc::clone(selector), session.clone());
         let standing = self.standings.entry(session.clone()).or_default();
         standing.proven |= provided > 0;
         let Some(turn) = self.turns.get(&key).copied() else {
@@ -153,16 +163,24 @@ mod tests {
 
     fn missing(count: u32, of: &[(u32, Option<u32>)]) -> [Missing; 1] {
         let of = of.iter().map(|&(provided, room)| Part { provided, room }).collect();
-        [Missing { selector: "block Planner".to_owned(), count, of }]
+        [Missing { selector: "block Planner".into(), count, of }]
     }
 
     fn at(seconds: f64) -> Timestamp {
         Timestamp::from_seconds(seconds)
     }
 
+    /// What is asked in a round, by provider and demand.
+    fn round(hand_out: &mut HandOut, now: Timestamp, providers: &[SessionId], missing: &[Missing]) -> Vec<Vec<u32>> {
+        hand_out.begin(providers);
+        let asked: Vec<_> = missing.iter().map(|demand| hand_out.hand_out(now, providers, demand)).collect();
+        hand_out.end();
+        (0..providers.len()).map(|index| asked.iter().map(|of| of[index]).collect()).collect()
+    }
+
     /// What is asked of each of two providers that have room for so many more.
     fn asked_with_room(hand_out: &mut HandOut, seconds: f64, count: u32, of: [(u32, Option<u32>); 2]) -> [u32; 2] {
-        let asked = hand_out.hand_out(at(seconds), &sessions(&["a", "b"]), &missing(count, &of));
+        let asked = round(hand_out, at(seconds), &sessions(&["a", "b"]), &missing(count, &of));
         [asked[0][0], asked[1][0]]
     }
 
@@ -204,7 +222,7 @@ mod tests {
     fn of_one_that_has_no_room_nothing_is_asked_that_another_can_provide() {
         let mut hand_out = HandOut::new(PATIENCE);
         assert_eq!(asked_with_room(&mut hand_out, 0.0, 2, [(0, Some(0)), (0, Some(3))]), [0, 2]);
-        let alone = hand_out.hand_out(at(1.0), &sessions(&["a"]), &missing(2, &[(0, Some(0))]));
+        let alone = round(&mut hand_out, at(1.0), &sessions(&["a"]), &missing(2, &[(0, Some(0))]));
         assert_eq!(alone, [[2]], "and of whom else");
     }
 
@@ -236,7 +254,7 @@ mod tests {
         let mut first = |seconds: f64, names: &[&str], provided: u32| {
             let part = |name: &&str| if *name == "real" { (provided, Some(3)) } else { (0, Some(3)) };
             let of: Vec<_> = names.iter().map(part).collect();
-            let asked = hand_out.hand_out(at(seconds), &sessions(names), &missing(1, &of));
+            let asked = round(&mut hand_out, at(seconds), &sessions(names), &missing(1, &of));
             names[asked.iter().position(|asked| asked[0] == 1).unwrap_or_default()].to_owned()
         };
         for (seconds, asked) in [(0.0, "liar-1"), (15.0, "liar-2"), (30.0, "liar-3"), (45.0, "real")] {
@@ -256,7 +274,7 @@ mod tests {
         let mut hand_out = HandOut::new(PATIENCE);
         assert_eq!(asked(&mut hand_out, 0.0, 1, [0, 0]), [1, 0]);
         assert_eq!(asked(&mut hand_out, 15.0, 1, [0, 0]), [0, 1]);
-        hand_out.hand_out(at(16.0), &sessions(&["a", "b"]), &[]);
+        round(&mut hand_out, at(16.0), &sessions(&["a", "b"]), &[]);
         assert_eq!(asked(&mut hand_out, 17.0, 1, [0, 0]), [0, 1]);
     }
 
@@ -264,9 +282,9 @@ mod tests {
     fn of_one_that_is_gone_nothing_is_asked_and_a_demand_that_went_is_forgotten() {
         let mut hand_out = HandOut::new(PATIENCE);
         asked(&mut hand_out, 0.0, 2, [0, 0]);
-        let left = hand_out.hand_out(at(1.0), &sessions(&["b"]), &missing(2, &[(0, Some(3))]));
+        let left = round(&mut hand_out, at(1.0), &sessions(&["b"]), &missing(2, &[(0, Some(3))]));
         assert_eq!(left, [[2]]);
-        hand_out.hand_out(at(2.0), &sessions(&["b"]), &[]);
+        round(&mut hand_out, at(2.0), &sessions(&["b"]), &[]);
         assert_eq!(hand_out.deadline(), None);
     }
 }

@@ -13,6 +13,7 @@ mod config;
 mod handout;
 mod journal;
 mod providers;
+mod round;
 mod service;
 mod status;
 mod stream;

@@ -1,16 +1,21 @@
 //! The providers that listen: each is told what is asked of it.
 
-use super::handout::{HandOut, Missing, Part};
-use ratn_model::condition::Condition;
-use ratn_model::resource::{Quantity, Requirement};
+use super::handout::HandOut;
+use super::round::Round;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use ratn_proto::types::{Demand, ENDPOINT_ATTRIBUTE};
+use ratn_proto::types::Demand;
 use ratn_resources::{Pool, SessionId};
 use std::borrow::Cow;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
+
+/// Looks at resources and providers in one turn: a millisecond or two.
+const LOOKS: usize = 10_000;
+/// When there is more to tell, others have their turn for so long.
+const A_MOMENT: Duration = Duration::from_millis(1);
 
 /// What somebody can provide.
 #[derive(Debug, Default)]
@@ -23,8 +28,8 @@ pub(super) struct Provisions {
 
 /// Who can provide.
 #[derive(Debug)]
-struct Provider {
-    session: SessionId,
+pub(super) struct Provider {
+    pub(super) session: SessionId,
     provisions: Provisions,
     /// Kinds of which there can only be so many for now.
     bounds: BTreeMap<String, u32>,
@@ -33,13 +38,22 @@ struct Provider {
 
 impl Provider {
     /// Of how many more it can be asked; nothing where none that it has would do.
-    fn room(&self, demand: &ratn_resources::Demand, provided: u32) -> Option<u32> {
+    pub(super) fn room(&self, demand: &ratn_resources::Demand, provided: u32) -> Option<u32> {
         if !demand.requirement.accepts(|name| self.provisions.attributes.get(name).map(Cow::Borrowed)) {
             return None;
         }
         let kinds = demand.kinds.iter().filter_map(|kind| Some((kind, *self.provisions.kinds.get(kind)?)));
         let most = |(kind, most): (&String, u32)| self.bounds.get(kind).map_or(most, |bound| most.min(*bound));
         kinds.map(most).reduce(u32::saturating_add).map(|most| most.saturating_sub(provided))
+    }
+
+    /// What is asked of it, if that is something else than before.
+    pub(super) fn tell(&self, told: Vec<Demand>) {
+        self.listener.send_if_modified(|before| {
+            let changed = *before != told;
+            *before = told;
+            changed
+        });
     }
 }
 
@@ -49,6 +63,10 @@ pub(super) struct Providers {
     /// The first to come is asked first.
     all: Vec<Provider>,
     hand_out: HandOut,
+    /// In which they are being told.
+    round: Option<Round>,
+    /// What any of them can provide.
+    kinds: Arc<BTreeSet<String>>,
     /// Something is to be told that nobody was told yet.
     news: bool,
 }
@@ -56,7 +74,8 @@ pub(super) struct Providers {
 impl Providers {
     /// Nobody yet; each has so long to come closer to what is asked of it.
     pub(super) fn new(patience: Duration) -> Providers {
-        Providers { all: Vec::new(), hand_out: HandOut::new(patience), news: false }
+        let (round, kinds) = Default::default();
+        Providers { all: Vec::new(), hand_out: HandOut::new(patience), round, kinds, news: false }
     }
 
     /// One more listens; how many there are where that is `most` already.
@@ -66,9 +85,13 @@ impl Providers {
         provisions: Provisions,
         most: usize,
     ) -> Result<watch::Receiver<Vec<Demand>>, usize> {
-        self.all.retain(|provider| !provider.listener.is_closed());
-        if self.all.len() >= most {
-            return Err(self.all.len());
+        // Those that are gone are forgotten with the next round.
+        let there = self.all.iter().filter(|provider| !provider.listener.is_closed()).count();
+        if there >= most {
+            return Err(there);
+        }
+        if provisions.kinds.keys().any(|kind| !self.kinds.contains(kind)) {
+            Arc::make_mut(&mut self.kinds).extend(provisions.kinds.keys().cloned());
         }
         let (listener, told) = watch::channel(Vec::new());
         self.all.push(Provider { session, provisions, bounds: BTreeMap::new(), listener });
@@ -94,56 +117,139 @@ impl Providers {
         self.news = true;
     }
 
-    /// When something changes by time alone.
-    pub(super) fn deadline(&self) -> Option<Timestamp> {
-        self.hand_out.deadline()
+    /// The kinds that anybody may be asked for.
+    pub(super) fn kinds(&self) -> &Arc<BTreeSet<String>> {
+        &self.kinds
+    }
+
+    /// When something changes by time alone, or there is more to tell than a turn could.
+    pub(super) fn deadline(&self, now: Timestamp) -> Option<Timestamp> {
+        self.round.as_ref().map(|_| now + A_MOMENT).or_else(|| self.hand_out.deadline())
     }
 
     /// Whether something is to be told though nothing else is missing than before.
-    pub(super) fn are_due(&self, now: Timestamp) -> bool {
-        let somebody_is_asked = || self.deadline().is_some();
+    fn are_due(&self, now: Timestamp) -> bool {
+        let deadline = self.hand_out.deadline();
         self.news
-            || self.deadline().is_some_and(|at| at <= now)
-            || (somebody_is_asked() && self.all.iter().any(|provider| provider.listener.is_closed()))
+            || deadline.is_some_and(|at| at <= now)
+            || (deadline.is_some() && self.all.iter().any(|provider| provider.listener.is_closed()))
     }
 
-    /// Tells each what of this is asked of it.
+    /// Something else is missing than before: everybody is told.
+    pub(super) fn are_to_be_told(&mut self) {
+        self.news = true;
+    }
+
+    /// Tells each what of this is asked of it, where there is something to tell: as much as goes into a turn.
     pub(super) fn tell(&mut self, now: Timestamp, pool: &Pool, demands: &[ratn_resources::Demand]) {
-        self.news = false;
-        let demands: &[ratn_resources::Demand] = &demands.iter().cloned().map(of_performers).collect::<Vec<_>>();
-        self.all.retain(|provider| !provider.listener.is_closed() && pool.has_session(&provider.session));
-        let part = |provider: &Provider, demand: &ratn_resources::Demand| {
-            let provided = pool.provided(&provider.session, demand).units();
-            Part { provided, room: provider.room(demand, provided) }
-        };
-        let missing = |demand: &ratn_resources::Demand| Missing {
-            selector: format!("{:?}", Requirement { count: Quantity::ONE, ..demand.requirement.clone() }),
-            // Whole resources are provided, also for parts of them.
-            count: demand.requirement.count.units_up(),
-            of: self.all.iter().map(|provider| part(provider, demand)).collect(),
-        };
-        let missing: Vec<Missing> = demands.iter().map(missing).collect();
-        let sessions: Vec<SessionId> = self.all.iter().map(|provider| provider.session.clone()).collect();
-        let asked = self.hand_out.hand_out(now, &sessions, &missing);
-        for (index, provider) in self.all.iter().enumerate() {
-            let of_it = demands.iter().enumerate().filter(|(at, _)| asked[index][*at] > 0);
-            let demand = |(at, demand): (usize, &ratn_resources::Demand)| Demand {
-                requirement: Requirement { count: asked[index][at].into(), ..demand.requirement.clone() },
-                kinds: demand.kinds.clone(),
-                provided: missing[at].of[index].provided.into(),
-            };
-            let told: Vec<Demand> = of_it.map(demand).collect();
-            provider.listener.send_if_modified(|before| {
-                let changed = *before != told;
-                *before = told;
-                changed
-            });
+        if self.round.is_none() {
+            if !self.are_due(now) {
+                return;
+            }
+            self.news = false;
+            let there = self.all.len();
+            self.all.retain(|provider| !provider.listener.is_closed() && pool.has_session(&provider.session));
+            if self.all.len() < there {
+                let kinds = self.all.iter().flat_map(|provider| provider.provisions.kinds.keys());
+                self.kinds = Arc::new(kinds.cloned().collect());
+            }
+            self.round = Some(Round::begin(&self.all, demands, &mut self.hand_out));
+        }
+        if let Some(round) = &mut self.round
+            && round.go_on(now, pool, &self.all, &mut self.hand_out, LOOKS)
+        {
+            self.round = None;
         }
     }
 }
 
-/// What a provider provides says where it is, once it is there: who asks for that is asked for like everybody else.
-fn of_performers(mut demand: ratn_resources::Demand) -> ratn_resources::Demand {
-    demand.requirement.conditions.retain(|condition| *condition != Condition::has(ENDPOINT_ATTRIBUTE));
-    demand
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+    use ratn_resources::{Limits, ResourceSpec};
+
+    const NOW: Timestamp = Timestamp(0);
+
+    /// Sessions `0`, `1`, ... that each provide so many planners on a host of their own, and listen.
+    fn providers(count: usize, planners: usize) -> (Pool, Providers, Vec<watch::Receiver<Vec<Demand>>>) {
+        let mut pool = Pool::new(Limits::default());
+        let mut providers = Providers::new(Duration::from_secs(15));
+        let mut told = Vec::new();
+        for number in 0..count {
+            let session = SessionId::from(number.to_string().as_str());
+            pool.keep_alive(NOW, &session, "provider", Duration::from_secs(60)).unwrap();
+            let spec =
+                || ResourceSpec::new(ResourceClass::Process, "Planner").attribute("host", Value::Int(number as i64));
+            (0..planners).for_each(|_| drop(pool.create(NOW, Some(&session), spec()).unwrap()));
+            let attributes = (0..64).map(|size| (format!("size-{size}"), Value::Bool(true))).collect();
+            let provisions = Provisions { kinds: [("Planner".to_owned(), 100_000)].into(), attributes };
+            told.push(providers.join(session, provisions, count).unwrap());
+        }
+        (pool, providers, told)
+    }
+
+    /// So many selectors of planners, each of which lacks one.
+    fn demands(count: usize) -> Vec<ratn_resources::Demand> {
+        let demand = |number: usize| {
+            let mut requirement = Requirement::new(ResourceOperation::Block, "Planner");
+            requirement.attributes.insert(format!("size-{number}"), Value::Bool(true));
+            ratn_resources::Demand { requirement, kinds: vec!["Planner".to_owned()] }
+        };
+        (0..count).map(demand).collect()
+    }
+
+    /// What each is told in the end, and how many turns that takes.
+    fn turns(pool: &Pool, providers: &mut Providers, demands: &[ratn_resources::Demand]) -> usize {
+        providers.are_to_be_told();
+        let mut turns = 0;
+        while turns == 0 || providers.deadline(NOW) == Some(NOW + A_MOMENT) {
+            providers.tell(NOW, pool, demands);
+            turns += 1;
+        }
+        turns
+    }
+
+    #[test]
+    fn what_many_providers_are_told_of_many_selectors_is_told_over_several_turns() {
+        let (pool, mut providers, told) = providers(64, 64);
+        let demands = demands(64);
+        // 64 selectors times 4,096 resources, which are looked at once for all providers.
+        let turns = turns(&pool, &mut providers, &demands);
+        assert!((64 * 4_096 / LOOKS..64 * 4_096 / LOOKS + 20).contains(&turns), "{turns}");
+        let asked: Vec<usize> = told.iter().map(|told| told.borrow().len()).collect();
+        assert_eq!((asked[0], asked[1..].iter().sum::<usize>()), (64, 0), "the first has room for all of it");
+        assert!(told[0].borrow().iter().all(|demand| demand.requirement.count.units() == 1));
+        let again = self::turns(&pool, &mut providers, &demands);
+        assert_eq!(again, turns);
+    }
+
+    #[test]
+    fn one_that_comes_while_others_are_told_is_told_in_the_next_round() {
+        let (mut pool, mut providers, told) = providers(2, 3_000);
+        let demands = demands(4);
+        providers.are_to_be_told();
+        providers.tell(NOW, &pool, &demands);
+        assert!(told[0].borrow().is_empty(), "it is not all counted yet");
+        let session = SessionId::from("late");
+        pool.keep_alive(NOW, &session, "provider", Duration::from_secs(60)).unwrap();
+        let provisions = Provisions { kinds: [("Arm".to_owned(), 1)].into(), attributes: BTreeMap::new() };
+        let late = providers.join(session, provisions, 10).unwrap();
+        assert!(providers.kinds().contains("Arm"));
+        while providers.deadline(NOW) == Some(NOW + A_MOMENT) {
+            providers.tell(NOW, &pool, &demands);
+        }
+        assert_eq!((told[0].borrow().len(), late.borrow().len()), (4, 0));
+        let arm = ratn_resources::Demand {
+            requirement: Requirement::new(ResourceOperation::Block, "Arm"),
+            kinds: vec!["Arm".to_owned()],
+        };
+        turns(&pool, &mut providers, &[arm]);
+        assert_eq!((told[0].borrow().len(), late.borrow().len()), (0, 1));
+        // One that has gone is not asked any more, and its kinds are not provided.
+        drop(late);
+        turns(&pool, &mut providers, &demands);
+        assert!(!providers.kinds().contains("Arm"));
+    }
 }

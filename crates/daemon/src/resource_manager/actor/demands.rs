@@ -45,12 +45,10 @@ impl ResourceCore {
 
     /// Tells providers what is missing, where that may have changed.
     pub(super) fn spread_demand(&mut self, desk: &ResourceDesk) {
-        let now = desk.now();
-        let changed = self.pool.take_demand();
-        if changed.is_none() && !self.providers.are_due(now) {
-            return;
+        if let Some(demand) = self.pool.take_demand(self.providers.kinds()) {
+            self.demand = demand;
+            self.providers.are_to_be_told();
         }
-        self.demand = changed.unwrap_or_else(|| std::mem::take(&mut self.demand));
-        self.providers.tell(now, &self.pool, &self.demand);
+        self.providers.tell(desk.now(), &self.pool, &self.demand);
     }
 }

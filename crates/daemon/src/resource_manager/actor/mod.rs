@@ -129,7 +129,7 @@ impl Core for ResourceCore {
     }
 
     fn next_deadline(&self, desk: &ResourceDesk) -> Option<Timestamp> {
-        let deadlines = self.pool.next_deadline().into_iter().chain(self.providers.deadline());
+        let deadlines = self.pool.next_deadline().into_iter().chain(self.providers.deadline(desk.now()));
         deadlines.min().filter(|_| desk.stopped().is_none())
     }
 
