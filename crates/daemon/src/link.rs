@@ -117,6 +117,8 @@ impl Link {
     pub(crate) async fn keep(mut self, shutdown: CancellationToken) {
         let channels = Channels::new();
         let mut demand = self.demand.take();
+        // What is wanted from the beginning on, an earlier process may have offered.
+        let mut before = self.wanted.borrow().clone();
         loop {
             let endpoint = tokio::select! {
                 endpoint = self.manager.find() => endpoint,
@@ -131,7 +133,7 @@ impl Link {
                     Some(known) => known.renew().await,
                     None => tokio::time::sleep(LOOK_INTERVAL).await,
                 },
-                kept = self.keep_at(&channels, &endpoint, &session) => if let Err(error) = kept {
+                kept = self.keep_at(&channels, &endpoint, &session, &before) => if let Err(error) = kept {
                     tracing::error!(%endpoint, "no link to the resource manager: {error}");
                     tokio::time::sleep(LOOK_INTERVAL).await;
                 },
@@ -141,20 +143,29 @@ impl Link {
                     return;
                 }
             }
+            before.clone_from(&self.wanted.borrow());
         }
     }
 
-    /// Returns when the manager has another address.
-    async fn keep_at(&mut self, channels: &Channels, endpoint: &Endpoint, session: &Session) -> Result<(), CallError> {
+    /// Returns when the manager has another address. Some of what is offered may have been offered before, and leased.
+    async fn keep_at(
+        &mut self,
+        channels: &Channels,
+        endpoint: &Endpoint,
+        session: &Session,
+        before: &Wanted,
+    ) -> Result<(), CallError> {
         while session.alive(LOOK_INTERVAL).await.is_err() {
             if self.manager.has_moved_from(endpoint) {
                 return Ok(());
             }
         }
         let provider = Provider::start(channels, endpoint, session)?;
-        if session.state().borrow().found {
-            self.withdraw_left(&provider, session.id()).await?;
-        }
+        let found = session.state().borrow().found;
+        let left = if found { self.withdraw_left(&provider, session.id()).await? } else { BTreeSet::new() };
+        // Who held something that the manager has lost may not have heard that yet.
+        let lost = before.values().filter(|resource| !left.contains(&resource.id));
+        provider.may_move(&lost.cloned().collect::<Vec<_>>()).await;
         let mut offered = Wanted::new();
         let mut refused = Wanted::new();
         loop {
@@ -222,15 +233,18 @@ impl Link {
         }
     }
 
-    /// Withdraws resources that an earlier process offered in the same session and that this one does not want.
-    async fn withdraw_left(&mut self, provider: &Provider, session: &str) -> Result<(), CallError> {
+    /// Withdraws resources that an earlier process offered in the same session and that this one does not want; the ids of the others.
+    async fn withdraw_left(&mut self, provider: &Provider, session: &str) -> Result<BTreeSet<String>, CallError> {
         let own = ResourceFilter { session: session.to_owned(), ..ResourceFilter::default() };
+        let mut wanted = BTreeSet::new();
         for left in provider.client().list_where(own).await? {
-            if !self.wanted.borrow().contains_key(&left.id) {
+            if self.wanted.borrow().contains_key(&left.id) {
+                wanted.insert(left.id);
+            } else {
                 provider.withdraw(&left.id).await?;
             }
         }
-        Ok(())
+        Ok(wanted)
     }
 
     /// Withdraws the draining resources that nobody holds; returns all that are draining.

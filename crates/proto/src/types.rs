@@ -129,6 +129,14 @@ impl Resource {
         self.with_attribute(STANDSTILL_ATTRIBUTE, Value::Int(bound))
     }
 
+    /// Within which its provider confirms that nothing moves any more for a lease that has ended; nothing where nothing moves.
+    pub fn standstill(&self) -> Option<Duration> {
+        match self.attributes.get(STANDSTILL_ATTRIBUTE) {
+            Some(Value::Int(ms)) => u64::try_from(*ms).ok().filter(|ms| *ms > 0).map(Duration::from_millis),
+            _ => None,
+        }
+    }
+
     /// With its action service at `endpoint`.
     #[must_use]
     pub fn with_endpoint(self, endpoint: impl ToString) -> Resource {

@@ -5,7 +5,8 @@
 //! a new watch shows first is compared with what was offered: a session may have ended and been made anew unnoticed, when the answer of
 //! the manager that said so was lost.
 //! One of what moves ([`Provider::start_at_rest`]) offers nothing at which an earlier goal still runs, and nothing before its driver has said
-//! that it is at rest.
+//! that it is at rest. One that does not follow the leases of what moves (a process manager's, of its pooled drivers) offers what it has
+//! offered before, and the manager has lost, when the resource's bound for standstill has passed: those who held it may not have heard yet.
 
 use crate::action::STOP_GRACE;
 use crate::client::{CallError, Channels, ResourceClient};
@@ -18,9 +19,10 @@ use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_proto::types::{Resource, ResourceEventKind, ResourceUpdate};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use tokio::sync::{Mutex, Notify, watch};
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::Code;
 
@@ -57,6 +59,8 @@ struct Shared {
     missing: Notify,
     /// Of the resources that are offered only where nothing moves.
     leases: Option<LeaseWatch>,
+    /// How often the session was made, as far as that is taken into account in what is desired; of the first nothing was there before.
+    generation: AtomicU64,
     /// Of what is offered: what is watched.
     kinds: watch::Sender<BTreeSet<String>>,
 }
@@ -72,6 +76,8 @@ struct DesiredState {
     taken: Option<String>,
     /// The manager has confirmed that it has the resource.
     there: bool,
+    /// Something may move of it until then, for who held it before the manager lost it.
+    at_rest_from: Option<Instant>,
 }
 
 impl Provider {
@@ -111,6 +117,7 @@ impl Provider {
             desired: Mutex::default(),
             missing: Notify::new(),
             leases,
+            generation: AtomicU64::new(1),
             kinds: watch::Sender::default(),
         });
         let end = CancellationToken::new();
@@ -144,6 +151,15 @@ impl Provider {
             entry.resource = Some(resource);
         }
         self.shared.ask(&mut desired, &ids).await
+    }
+
+    /// These were offered by an earlier session or process, and what that was leased to may still move: each is offered when its bound for
+    /// standstill has passed from now on.
+    pub async fn may_move(&self, resources: &[Resource]) {
+        let mut desired = self.shared.desired.lock().await;
+        for resource in resources.iter().filter(|resource| resource.standstill().is_some()) {
+            desired.entry(resource.id.clone()).or_default().lost(resource.standstill());
+        }
     }
 
     /// Withdraws a resource; who holds a lease of it loses it. True once it is gone; false when the manager cannot be asked
@@ -221,7 +237,7 @@ impl Shared {
     async fn vanished(&self, id: &str, reason: &str) {
         let mut desired = self.desired.lock().await;
         let Some(entry) = desired.get_mut(id).filter(|entry| entry.there && entry.resource.is_some()) else { return };
-        entry.there = false;
+        entry.gone();
         if self.state.borrow().alive {
             tracing::warn!(
                 resource = id,
@@ -243,13 +259,14 @@ impl Shared {
             self.missing.notify_one();
             return ids.iter().map(|id| (id.clone(), Ok(false))).collect();
         }
+        self.look_at_session(desired);
         let (moving, ids): (BTreeSet<&String>, BTreeSet<&String>) = ids.iter().partition(|id| self.moves(desired, id));
         let wished = ids.iter().filter_map(|&id| Some((id.clone(), desired.get(id)?.resource.clone())));
         let asked: Vec<_> = wished.map(|(id, resource)| ask(self.client.clone(), id, resource)).collect();
         let answers: Vec<_> = stream::iter(asked).buffer_unordered(AT_ONCE).collect().await;
         let mut concluded = Vec::with_capacity(answers.len() + moving.len());
         for id in moving {
-            tracing::debug!(resource = %id, "it is not at rest: a goal still runs at it, or its driver has not said so");
+            tracing::debug!(resource = %id, "it is not known to be at rest: a goal may still run at it");
             self.missing.notify_one();
             concluded.push((id.clone(), Ok(false)));
         }
@@ -266,10 +283,21 @@ impl Shared {
         concluded
     }
 
-    /// Whether something still moves of what the manager has not got.
+    /// Of a session that was made anew nothing is there of before.
+    fn look_at_session(&self, desired: &mut BTreeMap<String, DesiredState>) {
+        let generation = self.state.borrow().generation;
+        if self.generation.swap(generation, Ordering::SeqCst) != generation {
+            desired.values_mut().for_each(DesiredState::gone);
+        }
+    }
+
+    /// Whether something still moves of what the manager has not got, or may.
     fn moves(&self, desired: &BTreeMap<String, DesiredState>, id: &str) -> bool {
-        let is_missing = desired.get(id).is_some_and(|entry| entry.resource.is_some() && !entry.there);
-        is_missing && self.leases.as_ref().is_some_and(|leases| !leases.is_at_rest(id))
+        let missing = desired.get(id).filter(|entry| entry.resource.is_some() && !entry.there);
+        missing.is_some_and(|entry| match &self.leases {
+            Some(leases) => !leases.is_at_rest(id),
+            None => entry.at_rest_from.is_some_and(|from| Instant::now() < from),
+        })
     }
 }
 
@@ -294,6 +322,17 @@ async fn answered<T>(
 }
 
 impl DesiredState {
+    /// The manager has not got it any more, and who held it may move it within its bound.
+    fn gone(&mut self) {
+        if std::mem::take(&mut self.there) {
+            self.lost(self.resource.as_ref().and_then(Resource::standstill));
+        }
+    }
+
+    fn lost(&mut self, bound: Option<Duration>) {
+        self.at_rest_from = self.at_rest_from.max(bound.map(|bound| Instant::now() + bound));
+    }
+
     /// Whether it is so now; an error where it never will be.
     fn conclude(&mut self, id: &str, answer: Result<(), CallError>) -> Result<bool, CallError> {
         match answer {
@@ -313,6 +352,7 @@ impl DesiredState {
         self.problem.clear();
         self.taken = None;
         self.there = self.resource.is_some();
+        self.at_rest_from = None;
         Ok(true)
     }
 }
@@ -332,8 +372,7 @@ fn is_transient(error: &CallError) -> bool {
 /// Asks for everything again whenever the session was made anew, and for what is not so yet.
 async fn restore(shared: Arc<Shared>) {
     let mut state = shared.state.clone();
-    // Of the first session nothing was there before.
-    let (mut restored, mut seen) = (0, 1);
+    let mut restored = 0;
     loop {
         let Ok(generation) = state.wait_for(|s| s.alive).await.map(|s| s.generation) else { return };
         if generation == restored {
@@ -344,10 +383,6 @@ async fn restore(shared: Arc<Shared>) {
                     Err(_) => return,
                 },
             }
-        }
-        if std::mem::replace(&mut seen, generation) != generation {
-            // Nothing is there of before.
-            shared.desired.lock().await.values_mut().for_each(|entry| entry.there = false);
         }
         if ask_for_all(&shared).await {
             restored = generation;

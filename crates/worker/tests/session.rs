@@ -22,7 +22,7 @@ use ratn_worker::session::Session;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Request, Response, Status, Streaming};
@@ -682,6 +682,47 @@ async fn what_a_new_watch_does_not_show_is_offered_again_although_nobody_said_th
     manager.changed.send_replace(());
     manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
     assert_eq!(session.state().borrow().generation, 1);
+}
+
+/// A process manager's drivers: it does not follow the leases of what it offers.
+#[tokio::test]
+async fn what_may_still_move_for_who_held_it_under_a_lapsed_session_is_offered_again_when_its_bound_has_passed() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open(&channels, &endpoint, "pools", TTL);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    let bound = Duration::from_millis(1_500);
+    let began = Instant::now();
+    let planner = Resource::new("planner@sim", ResourceClass::Process, "Planner");
+    for new in [arm().with_standstill(bound), planner.clone()] {
+        assert!(provider.offer(new).await.unwrap());
+    }
+    assert!(began.elapsed() < bound, "what is new has moved for nobody");
+    let began = Instant::now();
+    {
+        let mut pool = manager.pool.lock().unwrap();
+        pool.sessions.clear();
+        pool.resources.clear();
+    }
+    manager.until(|pool| pool.resources.contains_key("planner@sim")).await;
+    // Not by an update either.
+    let updated = arm().with_standstill(bound).with_attribute("level", Value::Float(0.5));
+    assert!(!provider.offer(updated).await.unwrap() || began.elapsed() >= bound);
+    assert!(!manager.pool.lock().unwrap().resources.contains_key("arm@sim") || began.elapsed() >= bound);
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    assert!(began.elapsed() >= bound, "after {:?}", began.elapsed());
+    // What a process before this one has offered.
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    let other = Resource::new("other@sim", ResourceClass::Module, "Arm").with_standstill(bound);
+    let began = Instant::now();
+    provider.may_move(&[other.clone(), planner]).await;
+    assert!(!provider.offer(other).await.unwrap() || began.elapsed() >= bound);
+    manager.until(|pool| pool.resources.contains_key("other@sim")).await;
+    assert!(began.elapsed() >= bound, "after {:?}", began.elapsed());
 }
 
 #[tokio::test]

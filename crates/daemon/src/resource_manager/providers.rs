@@ -183,7 +183,7 @@ mod tests {
             let spec =
                 || ResourceSpec::new(ResourceClass::Process, "Planner").attribute("host", Value::Int(number as i64));
             (0..planners).for_each(|_| drop(pool.create(NOW, Some(&session), spec()).unwrap()));
-            let attributes = (0..64).map(|size| (format!("size-{size}"), Value::Bool(true))).collect();
+            let attributes = (0..256).map(|size| (format!("size-{size}"), Value::Bool(true))).collect();
             let provisions = Provisions { kinds: [("Planner".to_owned(), 100_000)].into(), attributes };
             told.push(providers.join(session, provisions, count).unwrap());
         }
@@ -213,13 +213,15 @@ mod tests {
 
     #[test]
     fn what_many_providers_are_told_of_many_selectors_is_told_over_several_turns() {
-        let (pool, mut providers, told) = providers(64, 64);
-        let demands = demands(64);
-        // 64 selectors times 4,096 resources, which are looked at once for all providers.
+        let (pool, mut providers, told) = providers(256, 16);
+        let demands = demands(256);
+        // 256 selectors times 4,096 resources, which are looked at once for all providers; 256 selectors are handed out to 256 providers,
+        // and 256 are told of those.
+        let (counted, asked) = (256 * 4_096, 2 * 256 * 257);
         let turns = turns(&pool, &mut providers, &demands);
-        assert!((64 * 4_096 / LOOKS..64 * 4_096 / LOOKS + 20).contains(&turns), "{turns}");
+        assert!(((counted + asked) / LOOKS..(counted + asked) / LOOKS + 30).contains(&turns), "{turns}");
         let asked: Vec<usize> = told.iter().map(|told| told.borrow().len()).collect();
-        assert_eq!((asked[0], asked[1..].iter().sum::<usize>()), (64, 0), "the first has room for all of it");
+        assert_eq!((asked[0], asked[1..].iter().sum::<usize>()), (256, 0), "the first has room for all of it");
         assert!(told[0].borrow().iter().all(|demand| demand.requirement.count.units() == 1));
         let again = self::turns(&pool, &mut providers, &demands);
         assert_eq!(again, turns);
