@@ -99,7 +99,7 @@ async fn a_grant_that_crossed_a_dropped_call_is_given_back_by_its_request_id() {
         let request = v1::WithdrawRequest {
             request_id: "run/i1/acquire".to_owned(),
             session_id: a.session.id().to_owned(),
-            call: 0,
+            ..Default::default()
         };
         raw.withdraw(request).await.unwrap().into_inner().withdrawn
     };

@@ -3,16 +3,20 @@
 
 mod support;
 
+use ratn_model::id::LeaseId;
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_proto::v1::session_request::Kind as Asked;
 use ratn_proto::v1::session_response::Kind;
 use ratn_proto::v1::{self, SessionRequest};
-use ratn_worker::client::AcquireOptions;
+use ratn_worker::client::{AcquireOptions, Channels, ResourceClient};
+use ratn_worker::endpoint::Endpoint;
 use std::collections::BTreeMap;
 use support::{TestSystem, block, in_time};
-use tokio::sync::mpsc;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{UnixListener, UnixStream};
+use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Streaming};
 
@@ -100,7 +104,8 @@ async fn a_call_that_fails_leaves_the_stream_as_it_is() {
     assert_eq!(line.failure().await, (2, Code::InvalidArgument));
     line.ask(3, acquire("nobody", "x")).await;
     assert_eq!(line.failure().await, (3, Code::FailedPrecondition));
-    let undo = v1::WithdrawRequest { request_id: "never asked".to_owned(), session_id: "a".to_owned(), call: 0 };
+    let undo =
+        v1::WithdrawRequest { request_id: "never asked".to_owned(), session_id: "a".to_owned(), ..Default::default() };
     line.ask(4, Some(Asked::Withdraw(undo))).await;
     assert!(matches!(line.hear().await, (4, Kind::Withdraw(undone)) if !undone.withdrawn));
     manager.end().await;
@@ -134,7 +139,8 @@ async fn the_last_call_that_a_stream_may_have_waits_and_one_more_is_refused_unti
     for id in 10..10 + CALLS {
         line.ask(id, acquire("a", &format!("waits {id}"))).await;
     }
-    let undo = v1::WithdrawRequest { request_id: "waits 10".to_owned(), session_id: "a".to_owned(), call: 0 };
+    let undo =
+        v1::WithdrawRequest { request_id: "waits 10".to_owned(), session_id: "a".to_owned(), ..Default::default() };
     line.ask(5_000, Some(Asked::Withdraw(undo.clone()))).await;
     assert_eq!(line.failure().await, (5_000, Code::ResourceExhausted));
     // Undone from elsewhere, the first one ends.
@@ -208,7 +214,8 @@ async fn a_stream_that_broke_fails_its_calls_and_the_next_call_opens_another() {
 
 /// The client does not wait for this call any more.
 fn dropped(call: u64, request: &str) -> Option<Asked> {
-    Some(Asked::Withdraw(v1::WithdrawRequest { request_id: request.to_owned(), session_id: "b".to_owned(), call }))
+    let (request_id, session_id) = (request.to_owned(), "b".to_owned());
+    Some(Asked::Withdraw(v1::WithdrawRequest { request_id, session_id, call, unheard: false }))
 }
 
 impl Line {
@@ -253,6 +260,96 @@ async fn a_lease_that_two_questions_were_answered_with_ends_when_both_are_droppe
     }
     assert!(answers.iter().all(|(_, token)| *token > tokens[0].1), "{answers:?}");
     assert_eq!(a.resources.get("arm").await.unwrap().free.units(), 0);
+    manager.end().await;
+}
+
+/// A relay of a Unix socket that can stop to pass on what the manager says, and cut its connections.
+struct Relay {
+    endpoint: Endpoint,
+    deaf: watch::Sender<bool>,
+    cut: watch::Sender<()>,
+    _place: tempfile::TempDir,
+}
+
+impl Relay {
+    fn to(manager: &support::Daemon) -> Relay {
+        let Endpoint::Unix(to) = manager.endpoint.clone() else { panic!("it listens at a socket") };
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("relay.sock");
+        let listener = UnixListener::bind(&path).unwrap();
+        let (deaf, cut) = (watch::Sender::new(false), watch::Sender::new(()));
+        let (hears, cuts) = (deaf.subscribe(), cut.subscribe());
+        tokio::spawn(async move {
+            while let Ok((client, _)) = listener.accept().await {
+                let manager = UnixStream::connect(&to).await.unwrap();
+                let (mut hears, mut cuts) = (hears.clone(), cuts.clone());
+                cuts.mark_unchanged();
+                tokio::spawn(async move {
+                    let (mut from_client, mut to_client) = client.into_split();
+                    let (mut from_manager, mut to_manager) = manager.into_split();
+                    let back = async {
+                        let mut bytes = [0; 4_096];
+                        while let Ok(count @ 1..) = from_manager.read(&mut bytes).await {
+                            if hears.wait_for(|deaf| !deaf).await.is_err()
+                                || to_client.write_all(&bytes[..count]).await.is_err()
+                            {
+                                return;
+                            }
+                        }
+                    };
+                    tokio::select! {
+                        _ = tokio::io::copy(&mut from_client, &mut to_manager) => {}
+                        () = back => {}
+                        _ = cuts.changed() => {}
+                    }
+                });
+            }
+        });
+        Relay { endpoint: Endpoint::Unix(path), deaf, cut, _place: place }
+    }
+}
+
+#[tokio::test]
+async fn a_grant_whose_answer_was_lost_goes_back_when_it_is_asked_for_again_and_then_dropped() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let free = async || a.resources.get("arm").await.unwrap().free.units();
+    let relay = Relay::to(&manager);
+    let client = ResourceClient::new(&Channels::new(), &relay.endpoint, b.session.id()).unwrap();
+    let options = || AcquireOptions { request: "run/i1".to_owned(), ..AcquireOptions::default() };
+    let ask = || client.acquire(vec![block("Arm")], options());
+    // The answer of the first question does not arrive.
+    in_time(client.release(LeaseId(1))).await.unwrap();
+    relay.deaf.send_replace(true);
+    let mut first = Box::pin(ask());
+    in_time(async {
+        while free().await == 1 {
+            assert!(futures::poll!(&mut first).is_pending());
+        }
+    })
+    .await;
+    relay.cut.send_replace(());
+    assert!(in_time(first).await.unwrap_err().is_crash());
+    relay.deaf.send_replace(false);
+    // Neither does that of the second, which is dropped.
+    in_time(async { while client.release(LeaseId(1)).await.is_err() {} }).await;
+    relay.deaf.send_replace(true);
+    let mut again = Box::pin(ask());
+    assert!(futures::poll!(&mut again).is_pending());
+    assert_eq!(free().await, 0);
+    drop(again);
+    in_time(async { while free().await == 0 {} }).await;
+    // Asked once more it is acquired anew, and one that has heard its answer keeps the lease.
+    relay.deaf.send_replace(false);
+    let lease = in_time(ask()).await.unwrap();
+    relay.deaf.send_replace(true);
+    let mut beside = Box::pin(ask());
+    assert!(futures::poll!(&mut beside).is_pending());
+    drop(beside);
+    relay.deaf.send_replace(false);
+    assert!(in_time(client.release(lease.id)).await.unwrap(), "it was still held");
     manager.end().await;
 }
 

@@ -49,10 +49,24 @@ impl Pool {
     /// # Errors
     /// An acquire of another session.
     pub fn withdraw(&mut self, now: Timestamp, caller: &SessionId, request_id: &str) -> Result<bool, PoolError> {
+        let undone = self.undo(now, caller, request_id)?;
+        if let Some(session) = self.sessions.get(caller).filter(|_| !undone) {
+            let id = RequestId::new(&session.opened_by, request_id);
+            if self.memory.reply(&id).is_none() {
+                self.withdrawals.withdrawn(self.now, &self.limits, id);
+            }
+        }
+        Ok(undone)
+    }
+
+    /// As [`Pool::withdraw`]; an acquire that was not heard of yet is none of it.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn undo(&mut self, now: Timestamp, caller: &SessionId, request_id: &str) -> Result<bool, PoolError> {
         self.begin(now);
         let Some(session) = self.sessions.get(caller) else { return Ok(false) };
-        let id = RequestId::new(&session.opened_by, request_id);
-        match self.memory.reply(&id) {
+        match self.memory.reply(&RequestId::new(&session.opened_by, request_id)) {
             Some(Recalled::Waiting(id)) => {
                 let Some(waiter) = self.queue.get(id) else { return Ok(false) };
                 check_owner(|| id.to_string(), &waiter.request.session, caller)?;
@@ -64,11 +78,7 @@ impl Pool {
                 self.return_consumed(lease);
                 self.commit(Effect::LeaseEnded { lease, reason: EndReason::Undelivered });
             }
-            Some(Recalled::Answered(_)) => return Ok(false),
-            None => {
-                self.withdrawals.withdrawn(self.now, &self.limits, id);
-                return Ok(false);
-            }
+            _ => return Ok(false),
         }
         self.schedule();
         Ok(true)

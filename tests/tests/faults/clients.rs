@@ -260,8 +260,11 @@ impl Client {
         let begin = now();
         let (answer, lost) = known(|| {
             let (patience, mut rpc) = (self.patience(), self.any());
-            let question =
-                v1::WithdrawRequest { request_id: request.clone(), session_id: session(self.number), call: 0 };
+            let question = v1::WithdrawRequest {
+                request_id: request.clone(),
+                session_id: session(self.number),
+                ..Default::default()
+            };
             async move { once(patience, rpc.withdraw(question)).await }
         })
         .await;

@@ -93,22 +93,26 @@ impl Serve<SessionCalls> for CallerService {
     }
 
     /// The client dropped a call. Where its answer was under way, the lease goes back as from a unary call that is dropped: unless another
-    /// call of the same request got it.
+    /// call of the same request got it, and the client heard that.
     fn end(&mut self, ended: u64, by: Asked, end: impl FnOnce() -> bool) -> Option<Result<Kind, Status>> {
-        let Asked::Withdraw(v1::WithdrawRequest { request_id, session_id, .. }) = by else { return None };
+        let Asked::Withdraw(v1::WithdrawRequest { request_id, session_id, unheard, .. }) = by else { return None };
         if let Err(malformed) = name(&request_id, "request_id").and_then(|()| name(&session_id, "session_id")) {
             return Some(Err(malformed.into()));
         }
         let mut withdrawn = end();
         if !withdrawn && let Some(lease) = self.grants.leases.remove(&ended) {
             self.service.return_later(lease);
-            audit::begin(&self.caller, &request_id, || Mutation::Withdraw { session: session_id }).ended(&Ok(()));
+            let withdraw = || Mutation::Withdraw { session: session_id.clone() };
+            audit::begin(&self.caller, &request_id, withdraw).ended(&Ok(()));
             withdrawn = true;
         }
         // The end of a call was counted with the call.
         let counts = self.quotas.as_ref().filter(|_| !withdrawn);
         if let Some(Err(refused)) = counts.map(|quotas| quotas.admit(&self.caller, WITHDRAW, Instant::now())) {
             return Some(Err(refused));
+        }
+        if unheard {
+            self.service.undo_later(&self.caller, &session_id, request_id);
         }
         Some(Ok(Kind::Withdraw(v1::WithdrawResponse { withdrawn })))
     }

@@ -7,6 +7,7 @@ mod process;
 mod resource;
 mod retry;
 mod snapshot;
+mod unheard;
 mod world;
 
 pub use action::{ActionClient, ActionInfo, Fate, ProviderInfo};

@@ -1,5 +1,6 @@
 //! The client of the resource manager. What is asked for again and again while a task runs goes over the session's stream.
 
+use super::unheard::Unheard;
 use super::{CallError, Channels, fresh_id, snapshot};
 use crate::endpoint::Endpoint;
 use crate::multiplex::SessionCalls;
@@ -28,6 +29,7 @@ pub struct ResourceClient {
     session: String,
     client: ResourceServiceClient<Traced>,
     calls: Multiplexer<SessionCalls>,
+    unheard: Unheard,
 }
 
 /// How an acquire waits.
@@ -78,8 +80,8 @@ impl ResourceClient {
         let client = ResourceServiceClient::new(channels.get(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
-        let (endpoint, session, calls) = (endpoint.clone(), session.to_owned(), Multiplexer::default());
-        Ok(ResourceClient { endpoint, session, client, calls })
+        let (endpoint, session) = (endpoint.clone(), session.to_owned());
+        Ok(ResourceClient { endpoint, session, client, calls: Multiplexer::default(), unheard: Unheard::default() })
     }
 
     /// Where the resource manager is.
@@ -174,7 +176,7 @@ impl ResourceClient {
             deadline_ms: milliseconds(options.deadline),
             holder: options.holder,
         };
-        match self.ask(Asked::Block(question)).await? {
+        match self.ask_for_lease(&question.request_id.clone(), Asked::Block(question)).await? {
             Answered::Block(granted) => self.field(granted.lease, "lease"),
             _ => Err(self.another("a block")),
         }
@@ -195,7 +197,7 @@ impl ResourceClient {
             deadline_ms: milliseconds(options.deadline),
             holder: options.holder,
         };
-        match self.ask(Asked::Acquire(question)).await? {
+        match self.ask_for_lease(&question.request_id.clone(), Asked::Acquire(question)).await? {
             Answered::Acquire(granted) => self.field(granted.lease, "lease"),
             _ => Err(self.another("an acquire")),
         }
@@ -208,7 +210,7 @@ impl ResourceClient {
     /// [`CallError`].
     pub async fn withdraw(&self, request: &str) -> Result<bool, CallError> {
         let (request_id, session_id) = (request.to_owned(), self.session.clone());
-        let question = v1::WithdrawRequest { request_id, session_id, call: 0 };
+        let question = v1::WithdrawRequest { request_id, session_id, ..Default::default() };
         match self.ask(Asked::Withdraw(question)).await? {
             Answered::Withdraw(undone) => Ok(undone.withdrawn),
             _ => Err(self.another("a withdraw")),
@@ -402,6 +404,23 @@ impl ResourceClient {
         let mut client = self.client.clone();
         let open = |questions| async move { client.session(questions).await };
         self.calls.call(open, question).await.map_err(|status| self.failed(&status))
+    }
+
+    /// The same, of a question that is answered with a lease. Dropped after the answer to an earlier one of its request was lost, it gives
+    /// back the lease of that.
+    async fn ask_for_lease(&self, request: &str, question: Asked) -> Result<Answered, CallError> {
+        let mut client = self.client.clone();
+        let open = |questions| async move { client.session(questions).await };
+        let asking = self.unheard.ask(request);
+        let when_dropped = |told: &mut Asked| {
+            if let Asked::Withdraw(withdraw) = told {
+                withdraw.unheard = asking.dropped();
+            }
+        };
+        let answer = self.calls.call_dropped_with(open, question, when_dropped).await;
+        let answer = answer.map_err(|status| self.failed(&status));
+        asking.ended(answer.as_ref().is_err_and(CallError::is_crash));
+        answer
     }
 
     /// The answer is that of another call.

@@ -56,7 +56,20 @@ impl<P: Protocol> Multiplexer<P> {
     where
         F: Future<Output = Opened<P>>,
     {
-        self.open(open).await?.call(call, None).await
+        self.open(open).await?.call(call, None, |_| {}).await
+    }
+
+    /// As [`Multiplexer::call`]; what the other side is told when the call is dropped is completed then.
+    pub(crate) async fn call_dropped_with<F>(
+        &self,
+        open: impl FnOnce(ReceiverStream<P::Request>) -> F,
+        call: P::Call,
+        when_dropped: impl FnOnce(&mut P::Call),
+    ) -> Result<P::Answer, Status>
+    where
+        F: Future<Output = Opened<P>>,
+    {
+        self.open(open).await?.call(call, None, when_dropped).await
     }
 
     /// Makes a call that may have other answers before the last one.
@@ -77,7 +90,7 @@ impl<P: Protocol> Multiplexer<P> {
             }
         };
         // The other end of the progress is dropped before the last answer is handed over.
-        let (last, ()) = tokio::join!(stream.call(call, Some(progress)), listened);
+        let (last, ()) = tokio::join!(stream.call(call, Some(progress), |_| {}), listened);
         last
     }
 
@@ -104,10 +117,16 @@ impl<P: Protocol> Multiplexer<P> {
 }
 
 impl<P: Protocol> Stream<P> {
-    async fn call(&self, call: P::Call, progress: Option<mpsc::Sender<P::Answer>>) -> Result<P::Answer, Status> {
+    async fn call(
+        &self,
+        call: P::Call,
+        progress: Option<mpsc::Sender<P::Answer>>,
+        when_dropped: impl FnOnce(&mut P::Call),
+    ) -> Result<P::Answer, Status> {
         let (last, answered) = oneshot::channel();
         let id = self.calls().begin(Waiting { progress, last })?;
-        let mut under_way = UnderWay { stream: self, id, when_dropped: P::when_dropped(id, &call) };
+        let told = P::when_dropped(id, &call).map(|(id, call)| (id, call, when_dropped));
+        let mut under_way = UnderWay { stream: self, id, when_dropped: told };
         let traceparent = trace::current().map_or_else(String::new, |context| context.child().to_string());
         // Where that fails the stream has broken, and `answered` says why.
         let _ = self.requests.send(P::request(id, call, traceparent)).await;
@@ -151,17 +170,18 @@ impl<P: Protocol> Calls<P> {
 }
 
 /// A call under way.
-struct UnderWay<'a, P: Protocol> {
+struct UnderWay<'a, P: Protocol, F: FnOnce(&mut P::Call)> {
     stream: &'a Stream<P>,
     id: u64,
-    /// What tells the other side that nobody waits for the answer any more.
-    when_dropped: Option<(u64, P::Call)>,
+    /// What tells the other side that nobody waits for the answer any more, and what completes it.
+    when_dropped: Option<(u64, P::Call, F)>,
 }
 
-impl<P: Protocol> Drop for UnderWay<'_, P> {
+impl<P: Protocol, F: FnOnce(&mut P::Call)> Drop for UnderWay<'_, P, F> {
     fn drop(&mut self) {
         self.stream.calls().waiting.remove(&self.id);
-        let Some((id, call)) = self.when_dropped.take() else { return };
+        let Some((id, mut call, complete)) = self.when_dropped.take() else { return };
+        complete(&mut call);
         let told = P::request(id, call, String::new());
         if let Err(mpsc::error::TrySendError::Full(told)) = self.stream.requests.try_send(told) {
             let requests = self.stream.requests.clone();

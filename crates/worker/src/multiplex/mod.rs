@@ -105,8 +105,8 @@ impl Protocol for SessionCalls {
             Kind::Acquire(acquire) => (&acquire.request_id, &acquire.session_id),
             Kind::KeepAlive(_) | Kind::Release(_) | Kind::Withdraw(_) => return None,
         };
-        let withdraw = WithdrawRequest { request_id: request_id.clone(), session_id: session_id.clone(), call: id };
-        Some((0, Kind::Withdraw(withdraw)))
+        let (request_id, session_id) = (request_id.clone(), session_id.clone());
+        Some((0, Kind::Withdraw(WithdrawRequest { request_id, session_id, call: id, unheard: false })))
     }
 }
 

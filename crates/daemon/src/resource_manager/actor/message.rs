@@ -64,6 +64,12 @@ pub(in super::super) enum Message {
     Return {
         lease: LeaseId,
     },
+    /// The client has heard of no answer to this request, and does not want one any more.
+    Undo {
+        speaker: Speaker,
+        session: SessionId,
+        request_id: String,
+    },
     /// Looks at so many more resources; whether it has looked at all.
     Search {
         search: Search,
@@ -143,7 +149,8 @@ impl Handle {
 /// came before it: it may be the same request, asked again.
 pub(super) fn most_urgent_first(messages: &mut [Message]) {
     let ends_call = |message: &Message| {
-        matches!(message, Message::Withdraw { .. } | Message::Abandon { .. } | Message::Return { .. })
+        use Message::{Abandon, Return, Undo, Withdraw};
+        matches!(message, Withdraw { .. } | Undo { .. } | Abandon { .. } | Return { .. })
     };
     for messages in messages.split_mut(ends_call) {
         messages.sort_by_key(|message| match message {

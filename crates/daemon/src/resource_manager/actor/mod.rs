@@ -208,6 +208,12 @@ impl Core for ResourceCore {
                 desk.reply(answer, withdrawn);
             }
             Message::Return { lease } => self.give_back(lease, desk),
+            Message::Undo { speaker, session, request_id } => {
+                if self.may_speak(now, &speaker, Some(&session)).is_ok() {
+                    // Another session's is not undone.
+                    let _ = self.pool.undo(now, &session, &request_id);
+                }
+            }
             Message::Search { mut search, resources, answer } => {
                 let finished = self.pool.go_on(&mut search, resources);
                 desk.tell(answer, (search, finished));
@@ -367,7 +373,7 @@ fn refuse_change(message: Message, stopped: Status, desk: &mut ResourceDesk) -> 
         Message::Withdraw { answer, .. } => desk.reply(answer, Err(stopped)),
         Message::WatchDemand { answer, .. } => desk.reply(answer, Err(stopped)),
         Message::ReportShortage { answer, .. } => desk.reply(answer, Err(stopped)),
-        Message::Abandon { .. } | Message::Return { .. } => {}
+        Message::Abandon { .. } | Message::Return { .. } | Message::Undo { .. } => {}
         read @ (Message::Search { .. }
         | Message::Get { .. }
         | Message::List { .. }

@@ -93,7 +93,7 @@ pub(super) async fn withdraw(
     caller: &Caller,
     request: v1::WithdrawRequest,
 ) -> Result<v1::WithdrawResponse, Status> {
-    let v1::WithdrawRequest { request_id, session_id, call } = request;
+    let v1::WithdrawRequest { request_id, session_id, call, .. } = request;
     name(&request_id, "request_id")?;
     let session = session(&session_id)?;
     let pending = audit::begin(caller, &request_id, || Mutation::Withdraw { session: session_id });

@@ -19,12 +19,13 @@ mod watches;
 
 use super::actor::{Handle, Message};
 use super::stream::CallerService;
-use crate::access::Caller;
+use crate::access::{Caller, speaker};
 use crate::metrics::Metrics;
 use crate::quota::Quotas;
 use futures::stream::BoxStream;
 use ratn_model::id::LeaseId;
 use ratn_proto::v1;
+use ratn_resources::SessionId;
 use ratn_worker::multiplex::SessionCalls;
 use ratn_worker::multiplex::server::Answers;
 use requests::Requests;
@@ -63,6 +64,12 @@ impl Service {
     /// Gives back a lease whose grant the caller did not read.
     pub(super) fn return_later(&self, lease: LeaseId) {
         self.requests.actor().send_later(Message::Return { lease });
+    }
+
+    /// Gives back what a request was granted, whatever calls were answered with it: the caller has heard of none.
+    pub(super) fn undo_later(&self, caller: &Caller, session: &str, request_id: String) {
+        let (speaker, session) = (speaker(caller), SessionId::from(session));
+        self.requests.actor().send_later(Message::Undo { speaker, session, request_id });
     }
 }
 

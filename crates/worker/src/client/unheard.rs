@@ -1,0 +1,104 @@
+//! Acquires whose answers may have been lost: whoever asks again and then drops that says so, or a lease that nobody heard of would stay.
+//!
+//! The resource manager cannot know whether an answer was read. A client does: a request is unheard from the break of a stream on until
+//! one of its questions is answered.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Requests that are remembered without a question under way; whose answer was lost before these is told apart no more.
+const MOST: usize = 1_024;
+
+/// By request id. Clones share everything.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Unheard(Arc<Mutex<BTreeMap<String, Request>>>);
+
+#[derive(Debug, Default)]
+struct Request {
+    /// Questions under way.
+    under_way: usize,
+    /// No question was answered since one was lost.
+    lost: bool,
+}
+
+/// A question under way.
+#[derive(Debug)]
+pub(super) struct Question {
+    unheard: Unheard,
+    request: String,
+}
+
+impl Unheard {
+    /// A question of a request begins.
+    pub(super) fn ask(&self, request: &str) -> Question {
+        self.open().entry(request.to_owned()).or_default().under_way += 1;
+        Question { unheard: self.clone(), request: request.to_owned() }
+    }
+
+    fn open(&self) -> MutexGuard<'_, BTreeMap<String, Request>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Question {
+    /// It was answered, or its answer is lost.
+    pub(super) fn ended(&self, lost: bool) {
+        let mut requests = self.unheard.open();
+        if lost && requests.len() > MOST {
+            let idle = requests.iter().find(|(_, request)| request.under_way == 0).map(|(id, _)| id.clone());
+            idle.map(|id| requests.remove(&id));
+        }
+        if let Some(request) = requests.get_mut(&self.request) {
+            request.lost = lost;
+        }
+    }
+
+    /// It is dropped; whether that is the end of its request, of which no answer was heard.
+    pub(super) fn dropped(&self) -> bool {
+        let mut requests = self.unheard.open();
+        let Some(request) = requests.get_mut(&self.request).filter(|request| request.under_way == 1) else {
+            return false;
+        };
+        std::mem::take(&mut request.lost)
+    }
+}
+
+impl Drop for Question {
+    fn drop(&mut self) {
+        let mut requests = self.unheard.open();
+        let Some(request) = requests.get_mut(&self.request) else { return };
+        request.under_way -= 1;
+        if request.under_way == 0 && !request.lost {
+            requests.remove(&self.request);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_is_unheard_from_a_lost_answer_on_until_one_is_heard() {
+        let unheard = Unheard::default();
+        let first = unheard.ask("r");
+        assert!(!first.dropped(), "nothing was lost");
+        first.ended(true);
+        drop(first);
+        let (second, other) = (unheard.ask("r"), unheard.ask("other"));
+        assert!(!other.dropped());
+        let beside = unheard.ask("r");
+        assert!(!second.dropped(), "another question of it is under way");
+        beside.ended(false);
+        drop(beside);
+        assert!(!second.dropped(), "the answer was heard");
+        second.ended(true);
+        assert!(second.dropped() && !second.dropped(), "it is said once");
+        drop((second, other));
+        assert!(unheard.open().is_empty());
+        for number in 0..2 * MOST {
+            unheard.ask(&number.to_string()).ended(true);
+        }
+        assert!(unheard.open().len() <= MOST + 1);
+    }
+}
