@@ -152,7 +152,8 @@ fn a_base_that_is_to_stop_holds_where_it_is_as_at_an_emergency_stop() {
             true => Event::Stop { ticket, reason: "session expired".to_owned() },
             false => Event::Safety { state: SafetyState::Stopped { reason: "a person".to_owned() } },
         };
-        let commands = bench.cell.handle(bench.now, event);
+        assert_eq!(bench.cell.handle(bench.now, event), vec![]);
+        let commands = bench.pass(3.0);
         let ended = |ending: &Ending| match by_goal {
             true => matches!(ending, Ending::Preempted(r) if r.contains("session expired")),
             false => matches!(ending, Ending::Stopped(r) if r == "a person"),
@@ -177,6 +178,7 @@ fn a_hold_pauses_a_drive_and_it_goes_on_to_its_end_afterwards() {
     bench.start(request);
     bench.pass(1.0);
     bench.cell.handle(bench.now, Event::Safety { state: SafetyState::Held { reason: "a door".to_owned() } });
+    assert_eq!(bench.pass(3.0), vec![]);
     let held = bench.cell.base_pose();
     assert_eq!(bench.pass(30.0), vec![]);
     assert_eq!(bench.cell.base_pose(), held);

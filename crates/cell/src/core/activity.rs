@@ -1,6 +1,7 @@
 //! What a module is doing, and where that has brought it at a moment.
 
-use super::motion::{Motion, Tracking};
+use super::braking::Way;
+use super::motion::Tracking;
 use super::picture::Exposure;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
@@ -39,8 +40,7 @@ pub(crate) struct Activity {
 
 #[derive(Debug, Clone)]
 pub(crate) enum Kind {
-    Drive(Motion<3>),
-    Follow(Motion<7>),
+    Follow(Way),
     Close { from: f64, to: f64, object: String, expected: Option<Pose> },
     Open { from: f64, to: f64 },
     Look { from: [f64; 2], to: [f64; 2] },
@@ -68,15 +68,14 @@ impl Module {
 
 impl Activity {
     /// The time since it started.
-    fn elapsed_s(&self, now: Timestamp) -> f64 {
+    pub(crate) fn elapsed_s(&self, now: Timestamp) -> f64 {
         now.since(self.started).as_secs_f64()
     }
 
     /// How well it has followed a trajectory so far, if it follows one.
     pub(crate) fn tracking(&self, now: Timestamp) -> Option<Tracking> {
         match &self.kind {
-            Kind::Drive(motion) => Some(motion.tracking(self.elapsed_s(now))),
-            Kind::Follow(motion) => Some(motion.tracking(self.elapsed_s(now))),
+            Kind::Follow(way) => Some(way.tracking(self.elapsed_s(now))),
             _ => None,
         }
     }
@@ -90,7 +89,7 @@ impl Activity {
     /// Where the base is, if it moves the base: x, y and heading.
     pub(crate) fn base(&self, now: Timestamp) -> Option<[f64; 3]> {
         match &self.kind {
-            Kind::Drive(motion) => Some(motion.at(self.elapsed_s(now))),
+            Kind::Follow(Way::Base(motion)) => Some(motion.at(self.elapsed_s(now))),
             _ => None,
         }
     }
@@ -98,7 +97,7 @@ impl Activity {
     /// Where the arm is, if it moves the arm.
     pub(crate) fn arm(&self, now: Timestamp) -> Option<Joints> {
         match &self.kind {
-            Kind::Follow(motion) => Some(motion.at(self.elapsed_s(now))),
+            Kind::Follow(Way::Arm(motion)) => Some(motion.at(self.elapsed_s(now))),
             _ => None,
         }
     }

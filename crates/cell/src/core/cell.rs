@@ -2,14 +2,15 @@
 //!
 //! ```text
 //! module:  idle ──Start──▶ active ──its time is over──▶ idle      (Ended: done, or aborted with the reason)
-//!                            ├──Stop──▶ idle, holds where it is   (Ended: preempted)
-//!                            └──emergency stop──▶ idle, holds     (Ended: stopped)
+//!                            ├──Stop──▶ brakes ──it stands──▶ idle            (Ended: preempted)
+//!                            └──emergency stop──▶ brakes hard ──it stands──▶ idle   (Ended: stopped)
 //! ```
 //! Time is the robot's and comes in with every event; what should have happened since the last one happens first, in its
-//! order. What moves has a time of its own, which stands still during a hold. [`Cell::next_wake`] says when the next thing will happen by itself.
+//! order. What moves has a time of its own, which slows down to a hold, stands still, and sets out again (`braking`). [`Cell::next_wake`] says when the next thing will happen by itself.
 
 use super::activity::{Activity, Kind, seconds};
 use super::battery::Battery;
+use super::braking::{Braking, EMERGENCY, MotionClock, Way};
 use super::contacts::{Contact, Contacts};
 use super::deviations::LOST;
 use super::environment::Environment;
@@ -19,7 +20,7 @@ use super::holding::Held;
 use super::objects::{Placed, TrueObject};
 use super::picture::{Exposure, Scenery};
 use super::placement::{self, PlacementError, TABLE};
-use super::protocol::{Command, Ending, Event, Module, Product};
+use super::protocol::{Command, Ending, Event, Module, Product, Ticket};
 use super::tableware;
 use crate::config::{CellConfig, Goods, Setting};
 use ratn_model::pose::Pose;
@@ -39,9 +40,12 @@ pub struct Cell {
     pub(super) now: Timestamp,
     /// The time of what moves: as much behind `now` as everything was held.
     pub(super) motion_time: Timestamp,
+    pub(super) clock: MotionClock,
     pub(super) safety: SafetyState,
     pub(super) resting: Configuration,
     pub(super) activities: BTreeMap<Module, Activity>,
+    /// What is coming to rest.
+    pub(super) braking: BTreeMap<Module, Braking>,
     pub(super) environment: Environment,
     /// The objects' names.
     pub(super) ids: Vec<String>,
@@ -82,9 +86,11 @@ impl Cell {
             pads,
             now,
             motion_time: now,
+            clock: MotionClock::new(now),
             safety: SafetyState::Ready,
             resting,
             activities: BTreeMap::new(),
+            braking: BTreeMap::new(),
             environment,
             tilts: vec![0.0; ids.len()],
             ids,
@@ -114,12 +120,16 @@ impl Cell {
                 out.extend(refused.map(|ending| Command::Ended { ticket, ending, tracking: None }));
             }
             Event::Stop { ticket, reason } => {
-                self.hold(|a| a.ticket == ticket, |_| Ending::Preempted(reason.clone()), &mut out);
+                self.halt(|a| a.ticket == ticket, |_| Ending::Preempted(reason.clone()), 1.0, &mut out);
             }
             Event::Safety { state } => {
                 if let SafetyState::Stopped { reason } = &state {
-                    self.hold(|_| true, |_| Ending::Stopped(reason.clone()), &mut out);
+                    for braking in self.braking.values_mut() {
+                        braking.harder(&self.robot, self.now, EMERGENCY);
+                    }
+                    self.halt(|_| true, |_| Ending::Stopped(reason.clone()), EMERGENCY, &mut out);
                 }
+                self.go_on(!matches!(state, SafetyState::Held { .. }));
                 self.safety = state;
             }
             Event::Reset { seed, goods } => self.reset(seed, goods, &mut out),
@@ -134,13 +144,20 @@ impl Cell {
 
     /// When something will happen by itself.
     pub fn next_wake(&self) -> Option<Timestamp> {
-        let ends = self.activities.values().map(|a| a.ends).min().filter(|_| !self.is_held());
-        ends.map(|ends| self.real_time(ends)).into_iter().chain(self.faults.next()).min()
+        let ends = self.activities.values().map(|a| a.ends).min().and_then(|ends| self.clock.real_time(ends));
+        let stands = self.clock.comes_to_stand().filter(|stands| *stands > self.now);
+        let braking = self.braking.values().map(Braking::ends);
+        ends.into_iter().chain(self.faults.next()).chain(stands).chain(braking).min()
     }
 
     /// Whether something moves: then every step costs time, and who waits until the last of them is due is late.
     pub fn is_restless(&self) -> bool {
         !self.environment.is_at_rest() || self.may_move()
+    }
+
+    /// Whether what was told to stand stands: no goal is braking, and during a hold nothing moves.
+    pub fn stands(&self) -> bool {
+        self.braking.is_empty() && (self.clock.goes_on() || self.clock.stands(self.now))
     }
 
     /// Where the joints are.
@@ -153,6 +170,7 @@ impl Cell {
             [configuration.pan, configuration.tilt] =
                 activity.head(self.motion_time).unwrap_or([configuration.pan, configuration.tilt]);
         }
+        self.braking.values().for_each(|braking| braking.place(self.now, &mut configuration));
         configuration
     }
 
@@ -198,7 +216,13 @@ impl Cell {
 
     /// Whether a module is doing something.
     pub fn is_active(&self, module: Module) -> bool {
-        self.activities.contains_key(&module)
+        self.busy_with(module).is_some()
+    }
+
+    /// The goal that a module is doing, or comes to rest from.
+    pub(super) fn busy_with(&self, module: Module) -> Option<Ticket> {
+        let active = self.activities.get(&module).map(|activity| activity.ticket);
+        active.or(self.braking.get(&module).map(|braking| braking.ticket))
     }
 
     /// The robot.
@@ -244,29 +268,23 @@ impl Cell {
         Scenery { configuration, setting: self.config.scene, objects: (0..self.ids.len()).map(object).collect() }
     }
 
-    pub(super) fn is_held(&self) -> bool {
-        matches!(self.safety, SafetyState::Held { .. })
-    }
-
-    /// When the time of what moves will be that, unless it is held.
-    fn real_time(&self, motion_time: Timestamp) -> Timestamp {
-        motion_time + self.now.since(self.motion_time)
-    }
-
     fn advance(&mut self, now: Timestamp, out: &mut Vec<Command>) {
         loop {
             let frame = self.activities.get(&Module::Camera).and_then(next_frame);
-            let due = self.activities.values().map(|a| a.ends).chain(frame).min().filter(|_| !self.is_held());
-            let due = due.map(|due| self.real_time(due)).into_iter().chain(self.faults.next()).min();
-            let due = due.filter(|due| *due <= now);
-            self.pass_until(due.unwrap_or(now), out);
-            if due.is_none() {
+            let motion_due = self.activities.values().map(|a| a.ends).chain(frame).min();
+            let moved = motion_due.and_then(|due| Some((due, self.clock.real_time(due)?)));
+            let stands = self.braking.values().map(Braking::ends).min();
+            let due = moved.map(|(_, due)| due).into_iter().chain(self.faults.next()).chain(stands).min();
+            let Some(due) = due.filter(|due| *due <= now) else {
+                self.pass_until(now, out);
                 break;
-            }
+            };
+            self.pass_until(due, out);
             self.deviate(out);
-            if self.is_held() {
-                continue;
-            }
+            self.come_to_rest(out);
+            let Some((motion_due, _)) = moved.filter(|(_, moved)| *moved <= due) else { continue };
+            // Rounding does not keep anything from ending.
+            self.motion_time = self.motion_time.max(motion_due);
             let due = self.motion_time;
             if frame.is_some_and(|f| f <= due) {
                 self.expose();
@@ -287,23 +305,27 @@ impl Cell {
         let tracking = activity.tracking(self.motion_time);
         let followed = tracking.unwrap_or_default();
         let ending = match activity.kind {
-            Kind::Drive(motion) => {
-                let ([x, y, heading], broken) = motion.end();
-                self.resting.base = [x, y, wrapped(heading)];
-                match broken {
-                    Some(reason) => Ending::Aborted(reason.to_owned()),
-                    None => Ending::Done(Product::Driven { end: self.base_pose(), tracking: followed }),
+            Kind::Follow(Way::Base(ref motion)) => match motion.end() {
+                Ok([x, y, heading]) => {
+                    self.resting.base = [x, y, wrapped(heading)];
+                    Ending::Done(Product::Driven { end: self.base_pose(), tracking: followed })
                 }
-            }
-            Kind::Follow(motion) => {
-                let (end, broken) = motion.end();
-                self.resting.arm = end;
-                self.contacts.arrived();
-                match broken {
-                    Some(reason) => Ending::Aborted(reason.to_owned()),
-                    None => Ending::Done(Product::Moved { end, tracking: followed }),
+                Err(reason) => {
+                    let ending = Ending::Aborted(reason.to_owned());
+                    return self.brake(module, activity, ending, 1.0);
                 }
-            }
+            },
+            Kind::Follow(Way::Arm(ref motion)) => match motion.end() {
+                Ok(end) => {
+                    self.resting.arm = end;
+                    self.contacts.arrived();
+                    Ending::Done(Product::Moved { end, tracking: followed })
+                }
+                Err(reason) => {
+                    let ending = Ending::Aborted(reason.to_owned());
+                    return self.brake(module, activity, ending, 1.0);
+                }
+            },
             Kind::Close { from, object, expected, .. } => self.close(from, object, expected.as_ref()),
             Kind::Open { to, .. } => {
                 self.resting.finger = to;
@@ -320,33 +342,92 @@ impl Cell {
                 (self.resting.pan, self.resting.tilt) = (pan, tilt);
                 Ending::Done(Product::Looking { pan, tilt })
             }
-            Kind::Capture { camera, exposures, .. } => match self.spoilt_picture(self.real_time(activity.started)) {
-                Some(reason) => Ending::Aborted(reason.to_owned()),
-                None => Ending::Done(Product::Captured { camera, exposures }),
-            },
+            Kind::Capture { camera, exposures, .. } => {
+                match self.spoilt_picture(activity.started + self.now.since(self.motion_time)) {
+                    Some(reason) => Ending::Aborted(reason.to_owned()),
+                    None => Ending::Done(Product::Captured { camera, exposures }),
+                }
+            }
         };
         out.push(Command::Ended { ticket: activity.ticket, ending, tracking });
     }
 
-    /// Ends activities where they are: every joint stays where it has come to.
-    pub(super) fn hold(
+    /// Ends activities: arm and base brake, at `times` the limits that motions are planned with, and what has come to rest has ended; what else
+    /// moves stays where it is.
+    pub(super) fn halt(
         &mut self,
         which: impl Fn(&Activity) -> bool,
         ending: impl Fn(&Activity) -> Ending,
+        times: f64,
         out: &mut Vec<Command>,
     ) {
         self.resting = self.configuration();
         let stopped: Vec<Module> = self.activities.iter().filter(|(_, a)| which(a)).map(|(m, _)| *m).collect();
         for module in stopped {
-            if let Some(activity) = self.activities.remove(&module) {
-                let tracking = activity.tracking(self.motion_time);
-                out.push(Command::Ended { ticket: activity.ticket, ending: ending(&activity), tracking });
+            let Some(activity) = self.activities.remove(&module) else { continue };
+            let ending = ending(&activity);
+            if matches!(activity.kind, Kind::Follow(_)) {
+                self.brake(module, activity, ending, times);
+            } else {
+                out.push(Command::Ended { ticket: activity.ticket, ending, tracking: None });
             }
+        }
+        self.come_to_rest(out);
+    }
+
+    /// A motion comes to rest from now on.
+    fn brake(&mut self, module: Module, activity: Activity, ending: Ending, times: f64) {
+        let at_s = activity.elapsed_s(self.motion_time);
+        if let Kind::Follow(way) = activity.kind {
+            let along = [self.clock.rate(self.now), at_s];
+            let whose = (activity.ticket, ending);
+            self.braking.insert(module, Braking::begin(&self.robot, self.now, way, along, times, whose));
         }
     }
 
+    /// What brakes and stands by now has ended.
+    fn come_to_rest(&mut self, out: &mut Vec<Command>) {
+        let standing: Vec<Module> =
+            self.braking.iter().filter(|(_, b)| b.ends() <= self.now).map(|(m, _)| *m).collect();
+        for module in standing {
+            let Some(braking) = self.braking.remove(&module) else { continue };
+            braking.place(self.now, &mut self.resting);
+            if module == Module::Arm {
+                self.contacts.arrived();
+            }
+            let tracking = Some(braking.tracking(self.now));
+            out.push(Command::Ended { ticket: braking.ticket, ending: braking.ending, tracking });
+        }
+    }
+
+    /// What moves is to go on, or to stand.
+    fn go_on(&mut self, goes_on: bool) {
+        if goes_on == self.clock.goes_on() {
+            return;
+        }
+        let way = self.activities.values().find_map(|activity| match &activity.kind {
+            Kind::Follow(way) => Some((way, activity.elapsed_s(self.motion_time))),
+            _ => None,
+        });
+        self.clock.change(&self.robot, [self.now, self.motion_time], goes_on, way);
+    }
+
+    /// Everything ends and is where it is, as nothing real can: for when the world is made anew.
+    pub(super) fn freeze(&mut self, reason: &str, out: &mut Vec<Command>) {
+        self.resting = self.configuration();
+        let active =
+            std::mem::take(&mut self.activities).into_values().map(|a| (a.ticket, a.tracking(self.motion_time)));
+        let braking = std::mem::take(&mut self.braking).into_values().map(|b| (b.ticket, Some(b.tracking(self.now))));
+        for (ticket, tracking) in active.chain(braking) {
+            out.push(Command::Ended { ticket, ending: Ending::Aborted(reason.to_owned()), tracking });
+        }
+        // A hold that was about to be one is one.
+        let goes_on = self.clock.goes_on();
+        self.clock.change(&self.robot, [self.now, self.motion_time], goes_on, None);
+    }
+
     fn reset(&mut self, seed: u64, goods: Goods, out: &mut Vec<Command>) {
-        self.hold(|_| true, |_| Ending::Aborted("the cell was reset".to_owned()), out);
+        self.freeze("the cell was reset", out);
         self.resting = first_posture(&self.config);
         self.seed = seed;
         // The request was checked before it became an event; a table that cannot be laid is an empty one.

@@ -1,6 +1,7 @@
 //! What comes of a fault that occurs.
 
 use super::activity::{Activity, Kind as Doing, seconds};
+use super::braking::Way;
 use super::cell::Cell;
 use super::faults::{Fault, Kind, When};
 use super::placement::TABLE;
@@ -36,7 +37,7 @@ impl Cell {
                 Kind::SensorDropout => self.blind_until = self.now + seconds(OUTAGE_S),
                 Kind::LocalisationLost => {
                     self.lost_until = self.now + seconds(OUTAGE_S);
-                    self.hold(moves_the_base, |_| Ending::Aborted(LOST.to_owned()), out);
+                    self.halt(moves_the_base, |_| Ending::Aborted(LOST.to_owned()), 1.0, out);
                 }
                 Kind::ControllerAbort => self.give_up(out),
             }
@@ -84,10 +85,10 @@ impl Cell {
 
     /// The controller of what moves gives up now, or in the next motion.
     fn give_up(&mut self, out: &mut Vec<Command>) {
-        let moves_the_arm = |a: &Activity| matches!(a.kind, Doing::Follow(_));
+        let moves_the_arm = |a: &Activity| matches!(a.kind, Doing::Follow(Way::Arm(_)));
         if self.activities.values().any(|a| moves_the_arm(a) || moves_the_base(a)) {
             let why = |a: &Activity| if moves_the_base(a) { BASE_GAVE_UP } else { GAVE_UP };
-            self.hold(|a| moves_the_arm(a) || moves_the_base(a), |a| Ending::Aborted(why(a).to_owned()), out);
+            self.halt(|a| moves_the_arm(a) || moves_the_base(a), |a| Ending::Aborted(why(a).to_owned()), 1.0, out);
         } else {
             // There is room: one was just taken out.
             self.faults.add(Fault { kind: Kind::ControllerAbort, when: When::Nth(1) });
@@ -130,7 +131,7 @@ impl Cell {
 }
 
 fn moves_the_base(activity: &Activity) -> bool {
-    matches!(activity.kind, Doing::Drive(_))
+    matches!(activity.kind, Doing::Follow(Way::Base(_)))
 }
 
 /// Why a motion ended.

@@ -1,5 +1,6 @@
 //! The cell as a pure machine: events in, commands out, time as an argument.
 
+pub mod braking;
 pub mod cell;
 pub mod contacts;
 pub mod environment;

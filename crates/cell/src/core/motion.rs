@@ -3,7 +3,8 @@
 //! The joints are driven by a controller that sees where they are and where the trajectory has them: each is a critically damped
 //! second-order system with the trajectory's velocity fed forward, a = ω²(x* − x) + 2ω(v* − v). It lags by about x*″ / ω² while the
 //! trajectory accelerates. A motion is over when the joints have settled at the trajectory's end, where the brakes close; it breaks
-//! off where they are too far from it. All of that follows from the trajectory alone, so it is worked out when the motion starts.
+//! off where they are too far from it, and brakes (`braking`). All of that follows from the trajectory alone, so it is worked out when the motion
+//! starts.
 
 use super::environment::STEP;
 use ratn_motion::trajectory::Curve;
@@ -68,12 +69,14 @@ impl<const N: usize> Motion<N> {
         let (mut at, mut moving) = (start, [0.0_f64; N]);
         loop {
             let time_s = dt * (motion.course.len() - 1) as f64;
-            if motion.breaks.as_ref().is_some_and(|(breaks_s, _)| *breaks_s <= time_s) {
-                return motion;
-            }
+            // What is on its way goes on while it brakes.
+            let broken = motion.breaks.as_ref().is_some_and(|(breaks_s, _)| *breaks_s <= time_s);
             let wanted = motion.trajectory.sample(time_s);
             let (radians, metres) = motion.off(&at, &wanted.positions);
             if radians > controller.most_off || metres > controller.most_off {
+                if broken {
+                    return motion;
+                }
                 motion.breaks = Some((time_s, controller.lost(radians, metres)));
                 return motion;
             }
@@ -82,6 +85,9 @@ impl<const N: usize> Motion<N> {
                 return motion;
             }
             if time_s > duration_s + MAX_SETTLING_S {
+                if broken {
+                    return motion;
+                }
                 let reason = format!("the {} did not settle within {MAX_SETTLING_S} s; it holds", controller.of);
                 motion.breaks = Some((time_s, reason));
                 return motion;
@@ -102,20 +108,42 @@ impl<const N: usize> Motion<N> {
         self.breaks.as_ref().map_or(settled_s, |(breaks_s, _)| *breaks_s)
     }
 
-    /// Where the joints are after so many seconds.
+    /// Where the joints are after so many seconds: a smooth curve through the course (Catmull and Rom). Beyond its end they go on as fast
+    /// as they were.
     pub(crate) fn at(&self, time_s: f64) -> [f64; N] {
         let steps = (time_s / STEP.as_secs_f64()).max(0.0);
-        let (index, fraction) = (steps as usize, steps.fract());
-        let last = self.course.len() - 1;
-        let (a, b) = (&self.course[index.min(last)], &self.course[(index + 1).min(last)]);
-        std::array::from_fn(|j| a[j] + (b[j] - a[j]) * fraction)
+        let (index, t) = (steps as usize, steps.fract());
+        let points =
+            [self.point(index.saturating_sub(1)), self.point(index), self.point(index + 1), self.point(index + 2)];
+        let [p, a, b, q] = points;
+        std::array::from_fn(|j| {
+            let (bend, slope) = (2.0 * p[j] - 5.0 * a[j] + 4.0 * b[j] - q[j], 3.0 * (a[j] - b[j]) + q[j] - p[j]);
+            a[j] + 0.5 * t * (b[j] - p[j] + t * (bend + t * slope))
+        })
     }
 
-    /// Where they end; why they do not get to the trajectory's end, if so.
-    pub(crate) fn end(&self) -> ([f64; N], Option<&str>) {
+    /// How fast the joints are after so many seconds, and how fast that changes, per second and per second squared.
+    pub(crate) fn derivatives(&self, time_s: f64) -> ([f64; N], [f64; N]) {
+        let dt = STEP.as_secs_f64();
+        let time_s = time_s.max(dt);
+        let [before, at, after] = [-dt, 0.0, dt].map(|off| self.at(time_s + off));
+        let velocity = std::array::from_fn(|j| (after[j] - before[j]) / (2.0 * dt));
+        let acceleration = std::array::from_fn(|j| (after[j] - 2.0 * at[j] + before[j]) / (dt * dt));
+        (velocity, acceleration)
+    }
+
+    fn point(&self, index: usize) -> [f64; N] {
+        let last = self.course.len() - 1;
+        let Some(beyond) = index.checked_sub(last).filter(|_| last > 0) else { return self.course[index.min(last)] };
+        let (end, before) = (&self.course[last], &self.course[last - 1]);
+        std::array::from_fn(|j| end[j] + (end[j] - before[j]) * beyond as f64)
+    }
+
+    /// Where they end, at rest; or why they are still on their way then.
+    pub(crate) fn end(&self) -> Result<[f64; N], &str> {
         match &self.breaks {
-            Some((breaks_s, reason)) => (self.at(*breaks_s), Some(reason)),
-            None => (self.trajectory.end(), None),
+            Some((_, reason)) => Err(reason),
+            None => Ok(self.trajectory.end()),
         }
     }
 
@@ -210,16 +238,16 @@ mod tests {
         let over = motion.lasts_s() - 4.0;
         assert!(over > 0.1 && over < 1.0, "{over} s");
         assert!((motion.at(4.0)[0] - 2.0).abs() > SETTLED && (motion.at(motion.lasts_s())[0] - 2.0).abs() <= SETTLED);
-        assert_eq!(motion.end(), ([2.0, 0.0, 0.0], None));
+        assert_eq!(motion.end(), Ok([2.0, 0.0, 0.0]));
     }
 
     #[test]
     fn what_is_too_far_off_breaks_off_there_and_says_how_far() {
         let weak = Controller { stiffness: 3.0, ..CONTROLLER };
         let motion = Motion::new(straight(&Robot::aimm()), [0.0; 3], weak, None);
-        let (end, reason) = motion.end();
-        assert!(motion.lasts_s() < 3.0 && end[0] < 2.0);
-        assert!(reason.is_some_and(|r| r.contains("m from its trajectory, 0.05 m are allowed")), "{reason:?}");
+        let reason = motion.end();
+        assert!(motion.lasts_s() < 3.0 && motion.at(motion.lasts_s())[0] < 2.0);
+        assert!(reason.is_err_and(|r| r.contains("m from its trajectory, 0.05 m are allowed")), "{reason:?}");
         assert!((motion.tracking(f64::INFINITY).most_m - 0.05).abs() < 0.002);
     }
 
@@ -228,6 +256,6 @@ mod tests {
         let motion = Motion::new(straight(&Robot::aimm()), [0.0, 0.01, 0.01], CONTROLLER, None);
         let tracking = motion.tracking(f64::INFINITY);
         assert!((tracking.most_rad - 0.01).abs() < 1e-9 && tracking.rms_rad < 0.002, "{tracking:?}");
-        assert_eq!(motion.end().0, [2.0, 0.0, 0.0]);
+        assert_eq!(motion.end(), Ok([2.0, 0.0, 0.0]));
     }
 }

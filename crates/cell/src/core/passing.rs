@@ -29,8 +29,8 @@ impl Cell {
         if let Some(lost) = self.keep_hold(&tool) {
             let holds = if self.is_active(Module::Base) { "base" } else { "arm" };
             let reason = format!("{} slipped out of the fingers; the {holds} holds", self.ids[lost]);
-            let moves = |a: &Activity| matches!(a.kind, Kind::Follow(_) | Kind::Drive(_));
-            self.hold(moves, |_| Ending::Aborted(reason.clone()), out);
+            let moves = |a: &Activity| matches!(a.kind, Kind::Follow(_));
+            self.halt(moves, |_| Ending::Aborted(reason.clone()), 1.0, out);
         }
         let open = self.config.gripper.opening_m / 2.0 - configuration.finger < OPEN_M;
         // Closed around something, they stand at its faces.
@@ -49,18 +49,18 @@ impl Cell {
     /// Whether something may move that the environment does not know of: the robot, or what it holds.
     pub(super) fn may_move(&self) -> bool {
         let modules = [Module::Base, Module::Arm, Module::Gripper, Module::PanTilt];
-        let moves = modules.into_iter().any(|module| self.is_active(module));
-        (moves && !self.is_held()) || self.held.is_some_and(|held| !held.is_steady())
+        let moves = modules.into_iter().any(|module| self.activities.contains_key(&module));
+        let moves = (moves && !self.clock.stands(self.now)) || !self.braking.is_empty();
+        moves || self.held.is_some_and(|held| !held.is_steady())
     }
 
     fn drain_until(&mut self, time: Timestamp) {
         let passed = time.since(self.now);
-        let moves = |module| self.is_active(module) && !self.is_held();
+        let stands = self.clock.stands(self.now);
+        let moves = |module| self.braking.contains_key(&module) || (self.activities.contains_key(&module) && !stands);
         let (moving, driving) = (moves(Module::Arm), moves(Module::Base));
         self.battery.drain(passed, moving, driving);
         self.now = self.now.max(time);
-        if !self.is_held() {
-            self.motion_time = self.motion_time + passed;
-        }
+        self.motion_time = self.motion_time.max(self.clock.motion_time(self.now));
     }
 }

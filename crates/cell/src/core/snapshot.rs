@@ -10,7 +10,7 @@ use super::environment::{Environment, Saved};
 use super::faults::{Fault, Faults};
 use super::holding::Held;
 use super::placement::furniture;
-use super::protocol::{Command, Ending};
+use super::protocol::Command;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::robot::{Configuration, Joints};
@@ -129,7 +129,7 @@ impl Cell {
 
     /// Back to a state; goals under way end aborted.
     pub(super) fn put_back(&mut self, snapshot: &Snapshot, out: &mut Vec<Command>) {
-        self.hold(|_| true, |_| Ending::Aborted("the cell was put back to a snapshot".to_owned()), out);
+        self.freeze("the cell was put back to a snapshot", out);
         let Posture { base, arm, pan, tilt, finger } = snapshot.posture.clone();
         self.resting = Configuration { base, arm, pan, tilt, finger };
         self.environment =

@@ -1,6 +1,7 @@
 //! How goals start: what is refused, and how long the rest will take.
 
 use super::activity::{Activity, Kind, Module, Ticket, seconds};
+use super::braking::Way;
 use super::cell::Cell;
 use super::deviations::LOST;
 use super::motion::{Controller, Motion};
@@ -18,8 +19,8 @@ const MAX_LOOK_ERROR_RAD: f64 = 0.02;
 impl Cell {
     pub(super) fn start(&mut self, ticket: Ticket, request: Request) -> Result<(), String> {
         let module = request.module();
-        if let Some(other) = self.activities.get(&module) {
-            return Err(format!("the {} is busy with goal {}", module.kind(), other.ticket.0));
+        if let Some(other) = self.busy_with(module) {
+            return Err(format!("the {} is busy with goal {}", module.kind(), other.0));
         }
         if self.battery.level() <= 0.0 {
             return Err("the battery is empty".to_owned());
@@ -92,7 +93,7 @@ impl Cell {
                 (kind, period * f64::from(frames))
             }
         };
-        if matches!(kind, Kind::Follow(_) | Kind::Drive(_)) {
+        if matches!(kind, Kind::Follow(_)) {
             self.contacts.sets_out();
         }
         let (started, ends) = (self.motion_time, self.motion_time + seconds(lasts_s));
@@ -109,7 +110,7 @@ impl Cell {
         let breaks = self.arm_breaks_off(lasts_s);
         let motion = Motion::new(trajectory, self.configuration().arm, controller, breaks);
         let lasts_s = motion.lasts_s();
-        (Kind::Follow(motion), lasts_s)
+        (Kind::Follow(Way::Arm(motion)), lasts_s)
     }
 
     /// What the base does, and for how long.
@@ -124,16 +125,16 @@ impl Cell {
         let start = [x, y, first + wrapped(heading - first)];
         let motion = Motion::new(trajectory, start, controller, breaks);
         let lasts_s = motion.lasts_s();
-        (Kind::Drive(motion), lasts_s)
+        (Kind::Follow(Way::Base(motion)), lasts_s)
     }
 
     fn no_motion_of(&self, module: Module) -> Result<(), String> {
-        match self.activities.get(&module) {
+        match self.busy_with(module) {
             None => Ok(()),
             Some(other) => Err(format!(
                 "the {} is under way with goal {}: {}",
                 module.kind(),
-                other.ticket.0,
+                other.0,
                 match module {
                     Module::Base => "nothing else happens while the base drives, so let both states block `Base`",
                     Module::Arm | Module::Gripper =>

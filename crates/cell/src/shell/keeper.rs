@@ -260,6 +260,8 @@ impl Holds {
 fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Receiver<QueuedMessage>, vitals: &Vitals) {
     let mut waiting: BTreeMap<Ticket, oneshot::Sender<Ending>> = BTreeMap::new();
     let mut holds = Holds::default();
+    // Who waits until what was told to stand stands.
+    let mut applying: Vec<oneshot::Sender<()>> = Vec::new();
     loop {
         vitals.beat();
         panic_point("cell-core");
@@ -320,8 +322,11 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
                 Command::Touched { contact } => tracing::warn!(%contact, "bodies touched that should not have"),
             }
         }
-        if let Some(applied) = safety {
-            let _ = applied.send(());
+        applying.extend(safety);
+        if cell.stands() || holds.state() == SafetyState::Ready {
+            applying.drain(..).for_each(|applied| {
+                let _ = applied.send(());
+            });
         }
         if let Some(state) = asked {
             let _ = state.send(state_of(&cell, now));
@@ -346,6 +351,29 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
     use crate::config::CellConfig;
+    use ratn_motion::aimm;
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_stop_and_a_hold_of_an_arm_under_way_are_confirmed_when_it_stands() {
+        for state in
+            [SafetyState::Stopped { reason: "a hand".to_owned() }, SafetyState::Held { reason: "a door".to_owned() }]
+        {
+            let cell = Cell::new(CellConfig::default()).unwrap();
+            let keeper = start(cell, Recorder::none(), RobotClock::start(1.0), Vitals::default()).unwrap();
+            let motion = keeper.perform(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 }).unwrap();
+            let far = |at: &State| (at.arm[0] - aimm::HOME[0]).abs() > 0.3;
+            while !far(&keeper.state().await.unwrap()) {}
+            let told = keeper.state().await.unwrap();
+            keeper.apply(&state).await.unwrap();
+            let confirmed = keeper.state().await.unwrap();
+            let later = keeper.state().await.unwrap();
+            assert_eq!(confirmed.arm, later.arm, "{state:?}");
+            // It was on its way when that was asked for, and braked.
+            assert!(confirmed.now.since(told.now) > Duration::from_millis(40), "{state:?}");
+            assert!((confirmed.arm[0] - told.arm[0]).abs() > 1e-3, "{state:?}");
+            drop(motion);
+        }
+    }
 
     #[tokio::test]
     async fn a_stop_arrives_however_many_questions_wait_also_of_a_goal_that_nobody_waits_for() {

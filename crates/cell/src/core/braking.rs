@@ -1,0 +1,288 @@
+//! How what moves comes to rest, and sets out again: along its path, its own time slowed down, with each joint within its limits.
+//!
+//! A motion is a course over a time τ of its own, which goes on as time does unless it is told to stop. Then its rate r = dτ/dt falls
+//! from 1 to 0, step by step, as fast as the joints allow: each is accelerated by q″r² + q′ṙ (Bobrow, Dubowsky and Gibson,
+//! "Time-optimal control of robotic manipulators along specified paths", IJRR 1985), and the most negative ṙ is taken with which none
+//! exceeds its limit; ṙ = 0 is always one where the course itself keeps to the limits. To set out again the rate rises in the same
+//! way. So nothing leaves the path that was checked. The jerk is not limited: the rate's slope steps.
+//!
+//! A stop on request, a hold and a lost lease brake within the limits that motions are planned by. An emergency stop is of category 1
+//! (IEC 60204-1): the joints brake within [`EMERGENCY`] times those limits, then the brakes close. The fingers and the camera's head,
+//! which are slow, end at once.
+
+use super::activity::seconds;
+use super::environment::STEP;
+use super::motion::{Motion, Tracking};
+use super::protocol::{Ending, Ticket};
+use ratn_model::time::Timestamp;
+use ratn_motion::drive::wrapped;
+use ratn_motion::robot::{Configuration, Joint, Robot};
+use std::time::Duration;
+
+/// How much harder than motions are planned an emergency stop brakes.
+pub const EMERGENCY: f64 = 2.0;
+/// The part of a limit that is made use of: the course is known at its steps only.
+const USED: f64 = 0.95;
+/// The most steps that a change of rate takes: a minute.
+const MAX_STEPS: usize = 15_000;
+
+/// The time of what moves, which goes on as fast as time, or not at all, or changes between both.
+#[derive(Debug, Clone)]
+pub(super) struct MotionClock {
+    pace: Pace,
+    /// The time of what moves when the pace began.
+    from: Timestamp,
+}
+
+/// A motion that is coming to rest, whatever becomes of the time of what else moves.
+#[derive(Debug, Clone)]
+pub(super) struct Braking {
+    pub(super) ticket: Ticket,
+    pub(super) ending: Ending,
+    way: Way,
+    /// How far it had come along its course when it began to brake, in seconds.
+    from_s: f64,
+    pace: Pace,
+}
+
+/// What the robot follows.
+#[derive(Debug, Clone)]
+pub(super) enum Way {
+    /// With its arm.
+    Arm(Motion<7>),
+    /// With its base.
+    Base(Motion<3>),
+}
+
+/// How time goes on for what moves, from a moment on.
+#[derive(Debug, Clone)]
+struct Pace {
+    since: Timestamp,
+    /// Seconds that have passed for it, after every [`STEP`] since, and the rate then; between them the rate changes evenly.
+    course: Vec<[f64; 2]>,
+}
+
+impl MotionClock {
+    /// It goes on as time does.
+    pub(super) fn new(now: Timestamp) -> MotionClock {
+        MotionClock { pace: Pace::at_once(now, 1.0), from: now }
+    }
+
+    /// The time of what moves; `now` is not before the last change.
+    pub(super) fn motion_time(&self, now: Timestamp) -> Timestamp {
+        let (settles, passed) = (self.pace.settles(), self.pace.whole());
+        if now < settles {
+            return self.from + seconds(self.pace.passed_s(now));
+        }
+        if self.pace.then() > 0.0 { self.from + passed + now.since(settles) } else { self.from + passed }
+    }
+
+    /// When the time of what moves will be that; `None`: never, unless it goes on.
+    pub(super) fn real_time(&self, motion_time: Timestamp) -> Option<Timestamp> {
+        let whole = self.from + self.pace.whole();
+        if motion_time >= whole {
+            let goes_on = self.pace.then() > 0.0 || motion_time == whole;
+            return goes_on.then(|| self.pace.settles() + motion_time.since(whole));
+        }
+        Some(self.pace.when(motion_time.since(self.from).as_secs_f64()))
+    }
+
+    /// Whether nothing moves in this time any more.
+    pub(super) fn stands(&self, now: Timestamp) -> bool {
+        self.pace.then() == 0.0 && now >= self.pace.settles()
+    }
+
+    /// When it will stand, where it is to.
+    pub(super) fn comes_to_stand(&self) -> Option<Timestamp> {
+        (self.pace.then() == 0.0).then(|| self.pace.settles())
+    }
+
+    /// Whether it is to go on, or goes on.
+    pub(super) fn goes_on(&self) -> bool {
+        self.pace.then() > 0.0
+    }
+
+    /// How fast it goes on.
+    pub(super) fn rate(&self, now: Timestamp) -> f64 {
+        self.pace.rate(now)
+    }
+
+    /// It is to go on, or to stand, as fast as what moves can, which is so far along its way.
+    pub(super) fn change(
+        &mut self,
+        robot: &Robot,
+        [now, motion_time]: [Timestamp; 2],
+        goes_on: bool,
+        way: Option<(&Way, f64)>,
+    ) {
+        let then = if goes_on { 1.0 } else { 0.0 };
+        let pace = match way {
+            Some((way, from_s)) => way.pace(robot, now, [self.rate(now), then], from_s, 1.0),
+            None => Pace::at_once(now, then),
+        };
+        *self = MotionClock { pace, from: motion_time };
+    }
+}
+
+impl Braking {
+    /// From now on, where the way is followed at a rate and has come so far; at `times` the limits of the joints.
+    pub(super) fn begin(
+        robot: &Robot,
+        now: Timestamp,
+        way: Way,
+        [rate, from_s]: [f64; 2],
+        times: f64,
+        (ticket, ending): (Ticket, Ending),
+    ) -> Braking {
+        let pace = way.pace(robot, now, [rate, 0.0], from_s, times);
+        Braking { ticket, ending, way, from_s, pace }
+    }
+
+    /// It brakes at `times` the limits from now on.
+    pub(super) fn harder(&mut self, robot: &Robot, now: Timestamp, times: f64) {
+        let (rate, from_s) = (self.pace.rate(now), self.from_s + self.pace.passed_s(now));
+        (self.pace, self.from_s) = (self.way.pace(robot, now, [rate, 0.0], from_s, times), from_s);
+    }
+
+    /// When it stands.
+    pub(super) fn ends(&self) -> Timestamp {
+        self.pace.settles()
+    }
+
+    /// Brings the joints that move to where they are.
+    pub(super) fn place(&self, now: Timestamp, configuration: &mut Configuration) {
+        let at_s = self.from_s + self.pace.passed_s(now);
+        match &self.way {
+            Way::Arm(motion) => configuration.arm = motion.at(at_s),
+            Way::Base(motion) => {
+                let [x, y, heading] = motion.at(at_s);
+                configuration.base = [x, y, wrapped(heading)];
+            }
+        }
+    }
+
+    /// How well it followed its trajectory, as far as it has come.
+    pub(super) fn tracking(&self, now: Timestamp) -> Tracking {
+        self.way.tracking(self.from_s + self.pace.passed_s(now))
+    }
+}
+
+impl Way {
+    pub(super) fn tracking(&self, time_s: f64) -> Tracking {
+        match self {
+            Way::Arm(motion) => motion.tracking(time_s),
+            Way::Base(motion) => motion.tracking(time_s),
+        }
+    }
+
+    fn pace(&self, robot: &Robot, now: Timestamp, rates: [f64; 2], from_s: f64, times: f64) -> Pace {
+        match self {
+            Way::Arm(motion) => Pace::change(now, rates, motion, from_s, &limits(robot.arm_joints(), times)),
+            Way::Base(motion) => Pace::change(now, rates, motion, from_s, &limits(robot.base_joints(), times)),
+        }
+    }
+}
+
+impl Pace {
+    /// As fast as time (1), or not at all (0), at once.
+    fn at_once(since: Timestamp, rate: f64) -> Pace {
+        Pace { since, course: vec![[0.0, rate]] }
+    }
+
+    /// From a rate to another, where the motion has come to `from_s` of its time: as fast as joints of these greatest accelerations can.
+    fn change<const N: usize>(
+        since: Timestamp,
+        [mut rate, then]: [f64; 2],
+        motion: &Motion<N>,
+        from_s: f64,
+        limits: &[f64; N],
+    ) -> Pace {
+        let (dt, brakes) = (STEP.as_secs_f64(), then < rate);
+        let mut passed = 0.0;
+        let mut course = vec![[passed, rate]];
+        while rate != then {
+            // What the joints do in the middle of the step.
+            let (velocity, acceleration) = motion.derivatives(from_s + passed + 0.5 * rate * dt);
+            let slope = greatest_slope(&velocity, &acceleration, rate, brakes, limits);
+            let given_up = course.len() == MAX_STEPS;
+            let next = match brakes {
+                _ if given_up => then,
+                true => (rate - slope * dt).max(then),
+                false => (rate + slope * dt).min(then),
+            };
+            passed += 0.5 * (rate + next) * dt;
+            course.push([passed, next]);
+            rate = next;
+        }
+        Pace { since, course }
+    }
+
+    /// Seconds that have passed for what moves.
+    fn passed_s(&self, now: Timestamp) -> f64 {
+        let (index, part_s) = self.step(now);
+        let [passed, rate] = self.course[index];
+        let slope = self.course.get(index + 1).map_or(0.0, |[_, next]| (next - rate) / STEP.as_secs_f64());
+        passed + part_s * (rate + 0.5 * slope * part_s)
+    }
+
+    fn rate(&self, now: Timestamp) -> f64 {
+        let (index, part_s) = self.step(now);
+        let rate = self.course[index][1];
+        self.course.get(index + 1).map_or(rate, |[_, next]| rate + (next - rate) * part_s / STEP.as_secs_f64())
+    }
+
+    /// The last step that has begun, and how long ago, in seconds.
+    fn step(&self, now: Timestamp) -> (usize, f64) {
+        let since = now.since(self.since);
+        let steps = usize::try_from(since.as_nanos() / STEP.as_nanos()).unwrap_or(usize::MAX);
+        let index = steps.min(self.course.len() - 1);
+        (index, since.as_secs_f64() - index as f64 * STEP.as_secs_f64())
+    }
+
+    /// When so many seconds will have passed for what moves, before the rate stays.
+    fn when(&self, passed_s: f64) -> Timestamp {
+        let last = self.course.len() - 1;
+        let next = self.course.partition_point(|[passed, _]| *passed < passed_s).clamp(1, last.max(1));
+        let Some([after, _]) = self.course.get(next) else { return self.since };
+        let [before, _] = self.course[next - 1];
+        let part = if *after > before { (passed_s - before) / (after - before) } else { 1.0 };
+        self.since + seconds(((next - 1) as f64 + part) * STEP.as_secs_f64())
+    }
+
+    /// The rate that stays: 0 or 1.
+    fn then(&self) -> f64 {
+        self.course[self.course.len() - 1][1]
+    }
+
+    /// From when on the rate stays.
+    fn settles(&self) -> Timestamp {
+        self.since + STEP * u32::try_from(self.course.len() - 1).unwrap_or(u32::MAX)
+    }
+
+    /// What has passed for what moves by then.
+    fn whole(&self) -> Duration {
+        seconds(self.course[self.course.len() - 1][0])
+    }
+}
+
+/// The greatest accelerations of joints, `times` as much as motions are planned with.
+fn limits<const N: usize>(joints: &[Joint], times: f64) -> [f64; N] {
+    std::array::from_fn(|j| joints[j].acceleration * times * USED)
+}
+
+/// How fast the rate may fall, or rise, in 1/s.
+fn greatest_slope<const N: usize>(
+    velocity: &[f64; N],
+    acceleration: &[f64; N],
+    rate: f64,
+    brakes: bool,
+    limits: &[f64; N],
+) -> f64 {
+    let slope = |j: usize| {
+        // What the change of rate adds is along the velocity, or against it.
+        let (v, a) = (if brakes { -velocity[j] } else { velocity[j] }, acceleration[j] * rate * rate);
+        let room = if v >= 0.0 { limits[j] - a } else { limits[j] + a };
+        if v == 0.0 { f64::INFINITY } else { (room / v.abs()).max(0.0) }
+    };
+    (0..N).map(slope).fold(f64::INFINITY, f64::min)
+}
