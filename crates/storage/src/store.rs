@@ -80,19 +80,6 @@ pub trait Store: fmt::Debug + Send + Sync {
     /// Where what is there is damaged or of a newer format, or where reading fails.
     fn read(&self) -> Result<Recovered, ReadError>;
 
-    /// Says of a log that is open and empty that it will be a part of a copy for now: until [`Store::mark_whole`] nobody opens or reads it
-    /// ([`ReadError::Unfinished`]). Durable when this returns. Blocks.
-    ///
-    /// # Errors
-    /// Where it cannot be written.
-    fn mark_unfinished(&self) -> Result<(), CopyError>;
-
-    /// The copy is whole. Blocks.
-    ///
-    /// # Errors
-    /// Where it cannot be written.
-    fn mark_whole(&self) -> Result<(), CopyError>;
-
     /// Where it is, for people.
     fn place(&self) -> String;
 }
@@ -124,6 +111,19 @@ pub trait Writer: fmt::Debug + Send {
     fn attend(&mut self, turns: Turns) {
         drop(turns);
     }
+
+    /// Says of a log that is empty that it will be a part of a copy for now: until [`Writer::mark_whole`] nobody opens or reads it
+    /// ([`ReadError::Unfinished`]). Only where the place is still this writer's, and durable when this returns. Blocks.
+    ///
+    /// # Errors
+    /// Where another writer has the place, or it cannot be written.
+    fn mark_unfinished(&mut self) -> Result<(), CopyError>;
+
+    /// The copy is whole. Only where the place is still this writer's, and durable when this returns. Blocks.
+    ///
+    /// # Errors
+    /// Where another writer has the place, or it cannot be written.
+    fn mark_whole(&mut self) -> Result<(), CopyError>;
 
     /// Says of the log that all of it was moved: nobody opens or reads it any more ([`ReadError::Moved`]). Only where the place is still
     /// this writer's, and durable when this returns. Blocks.

@@ -1,7 +1,7 @@
 //! A log from one place to another, whatever each is kept in: from files to etcd and back.
 
 use crate::error::{CompactError, CopyError};
-use crate::store::{Position, Recovered, Store};
+use crate::store::{Position, Recovered, Store, Writer};
 
 /// What stands in place of the records of a snapshot: the position that the snapshot stands for. Nobody reads it.
 const PLACEHOLDER: &[u8] = b"";
@@ -9,16 +9,17 @@ const PLACEHOLDER: &[u8] = b"";
 /// Copies a log into one that is empty. Its records get positions of their own; what they say is the same. The source's place is taken
 /// meanwhile, so that nothing is written there that the copy lacks. Holds the whole log in memory. Blocks.
 ///
-/// The target is marked as unfinished first, and the mark is removed last: of a copy that was interrupted nobody opens the part that is there.
+/// The target's place is held until the end. The target is marked as unfinished first, and the mark is removed last: of a copy that was
+/// interrupted nobody opens the part that is there.
 /// Before that the source is marked as moved ([`Writer::mark_moved`](crate::Writer::mark_moved)), so that nobody goes on with it: there are never two that can be opened.
 ///
 /// # Errors
 /// Where either has a writer, the source cannot be read, the target is not empty, or writing fails: then throw the target away.
 pub fn transfer(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
     let (recovered, mut held) = from.open()?;
-    let last = put(recovered, from, to)?;
+    let (last, mut copy) = put(recovered, from, to)?;
     held.mark_moved(&to.place())?;
-    to.mark_whole()?;
+    copy.mark_whole()?;
     Ok(last)
 }
 
@@ -27,13 +28,13 @@ pub fn transfer(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError>
 /// # Errors
 /// As [`transfer`].
 pub fn transfer_running(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
-    let last = put(from.read()?, from, to)?;
-    to.mark_whole()?;
+    let (last, mut copy) = put(from.read()?, from, to)?;
+    copy.mark_whole()?;
     Ok(last)
 }
 
 /// All of it, still marked as unfinished.
-fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
+fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<(Position, Box<dyn Writer>), CopyError> {
     if recovered.last() == Position(0) {
         return Err(CopyError::Nothing { place: from.place() });
     }
@@ -41,10 +42,11 @@ fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<Positio
     if there.last() != Position(0) {
         return Err(CopyError::NotEmpty { place: to.place() });
     }
-    to.mark_unfinished()?;
-    let mut durable = writer.durable();
+    writer.mark_unfinished()?;
+    let (mut last, mut durable) = (Position(0), writer.durable());
     if let Some(snapshot) = recovered.snapshot {
         let through = writer.append(PLACEHOLDER)?;
+        last = through;
         durable.wait_blocking(through)?;
         let payload = snapshot.payload;
         writer.compact(through, Box::new(move || payload)).map_err(|error| match error {
@@ -60,9 +62,9 @@ fn put(recovered: Recovered, from: &dyn Store, to: &dyn Store) -> Result<Positio
         }
     }
     for record in &recovered.records {
-        let position = writer.append(&record.payload)?;
+        last = writer.append(&record.payload)?;
         // One at a time: what waits is bounded.
-        durable.wait_blocking(position)?;
+        durable.wait_blocking(last)?;
     }
-    Ok(writer.close()?)
+    Ok((last, writer))
 }

@@ -80,6 +80,41 @@ fn a_copy_of_what_another_writer_has_taken_meanwhile_is_not_opened() {
 }
 
 #[test]
+fn what_is_moved_while_somebody_takes_its_place_is_not_taken() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Arc::new(Cluster::start(1, &[]));
+    let (_, mut writer) = store(cluster.endpoints(), "/test/late-mark", "first").open().unwrap();
+    append_durably(&mut *writer, b"moved");
+    writer.close().unwrap();
+    let proxy = Proxy::to(&cluster.members[0].client);
+    // Behind its last look, and before it takes the place: the mark of a copier that was suspended until now.
+    let marking = cluster.clone();
+    proxy.before("\"about\":\"second\"", move || {
+        assert!(marking.ctl(&["put", "/test/late-mark/moved", "elsewhere"]).status.success());
+    });
+    let next = store(vec![proxy.address.clone()], "/test/late-mark", "second");
+    assert!(next.open().is_err(), "two go on with one state");
+    let leader = String::from_utf8(cluster.ctl(&["get", "/test/late-mark/leader"]).stdout).unwrap();
+    assert!(leader.contains("\"holder\":null"), "{leader}");
+    let error = next.open().map(drop).unwrap_err();
+    assert!(matches!(error, OpenError::Read(ReadError::Moved { .. })), "{error}");
+}
+
+#[test]
+fn a_copy_to_what_another_writer_has_taken_meanwhile_leaves_it_alone() {
+    if !is_there() {
+        return;
+    }
+    let cluster = Cluster::start(1, &[]);
+    let make =
+        |name: &str| -> Box<dyn Store> { Box::new(store(cluster.endpoints(), &format!("/test/{name}"), "test")) };
+    let take = |name: &str| assert!(cluster.ctl(&["del", &format!("/test/{name}/leader")]).status.success());
+    promises::a_copy_to_what_another_writer_has_taken_meanwhile_leaves_it_alone(&make, &take);
+}
+
+#[test]
 fn a_member_that_was_made_anew_as_a_cluster_of_its_own_begins_no_second_log() {
     if !is_there() {
         return;
@@ -505,6 +540,55 @@ fn an_older_state_of_etcd_is_refused_unless_told() {
     assert!(recovered.restored, "it is empty, and was not");
     drop(writer);
     drop(open(&marked("mark", None)));
+}
+
+#[test]
+fn a_state_that_is_copied_back_is_accepted_by_every_host_and_one_from_before_it_was_moved_by_none() {
+    if !is_there() {
+        return;
+    }
+    let kept = tempfile::tempdir().unwrap();
+    let file = kept.path().join("snapshot").display().to_string();
+    let mut cluster = Cluster::start(1, &[]);
+    // From now on a restored etcd has the number of this one.
+    assert!(cluster.ctl(&["snapshot", "save", &file]).status.success());
+    cluster.restore(&file);
+    let endpoints = cluster.endpoints();
+    let host = |name: &str, prefix: &str| {
+        let (mark, options) = (Some(kept.path().join(name)), options(endpoints.clone(), prefix, name));
+        Etcd::new(ratn_storage::EtcdOptions { mark, ..options }).unwrap()
+    };
+    // The tool that copies keeps nothing.
+    let tool = |prefix: &str| store(endpoints.clone(), prefix, "tool");
+    let in_files = |name: &str| ratn_storage::Log::new(kept.path().join(name), ratn_storage::Options::default());
+    let hosts = ["leader", "standby"];
+    let (_, mut writer) = host("leader", "/test/back").open().unwrap();
+    append_durably(&mut *writer, b"1");
+    append_durably(&mut *writer, b"2");
+    let standby = host("standby", "/test/back");
+    for _ in 0..2 {
+        assert!(matches!(standby.open(), Err(OpenError::Held { .. })));
+    }
+    writer.close().unwrap();
+    assert!(cluster.ctl(&["snapshot", "save", &file]).status.success());
+    transfer(&tool("/test/back"), &in_files("files")).unwrap();
+    transfer(&in_files("files"), &tool("/test/other")).unwrap();
+    for name in hosts {
+        assert_eq!(payloads(&open(&host(name, "/test/other")).0.records), [b"1", b"2"]);
+    }
+    // A copy begins a generation of its own where it is not of the same second.
+    std::thread::sleep(Duration::from_secs(1));
+    assert!(cluster.ctl(&["del", "--prefix", "/test/back/"]).status.success());
+    transfer(&tool("/test/other"), &tool("/test/back")).unwrap();
+    for name in hosts {
+        let (recovered, _writer) = open(&host(name, "/test/back"));
+        assert_eq!(payloads(&recovered.records), [b"1", b"2"]);
+        assert!(!recovered.restored, "nothing is missing");
+    }
+    cluster.restore(&file);
+    for name in hosts {
+        assert!(matches!(host(name, "/test/back").open(), Err(OpenError::Restored { .. })));
+    }
 }
 
 #[test]

@@ -52,6 +52,14 @@ fn a_copy_of_what_another_writer_has_taken_meanwhile_is_not_opened() {
 }
 
 #[test]
+fn a_copy_to_what_another_writer_has_taken_meanwhile_leaves_it_alone() {
+    let place = tempfile::tempdir().unwrap();
+    let make = |name: &str| -> Box<dyn Store> { Box::new(Log::new(place.path().join(name), Options::default())) };
+    let take = |name: &str| std::fs::remove_file(place.path().join(name).join("writer.lock")).unwrap();
+    promises::a_copy_to_what_another_writer_has_taken_meanwhile_leaves_it_alone(&make, &take);
+}
+
+#[test]
 fn a_copy_that_was_interrupted_is_not_opened() {
     with_logs(promises::a_copy_that_was_interrupted_is_not_opened);
 }

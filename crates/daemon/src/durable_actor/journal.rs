@@ -278,14 +278,6 @@ impl Store for PutInPlace {
         self.0.read()
     }
 
-    fn mark_unfinished(&self) -> Result<(), ratn_storage::CopyError> {
-        self.0.mark_unfinished()
-    }
-
-    fn mark_whole(&self) -> Result<(), ratn_storage::CopyError> {
-        self.0.mark_whole()
-    }
-
     fn place(&self) -> String {
         self.0.place()
     }

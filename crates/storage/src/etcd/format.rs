@@ -2,7 +2,8 @@
 //!
 //! ```text
 //!   meta      {"version":1, "store":N, "cluster":N, "generation":N, "accepted":N}
-//!             the log's number, etcd's own of the cluster, how often an older state was accepted, and behind which record the last time
+//!             the log's number, etcd's own of the cluster, the generation (0; a copy's is the seconds since 1970; one more whenever an
+//!             older state is accepted), and behind which record one was accepted last
 //!   leader    {"epoch":N, "holder":{…} or null, "draw":N}
 //!   head      {"position":N, "epoch":N, "step":N}
 //!   step      {"epoch":N, "step":N}
@@ -32,7 +33,7 @@ pub(super) struct Meta {
     pub(super) store: u64,
     /// etcd's number of its cluster: another one after a snapshot of etcd was restored.
     pub(super) cluster: u64,
-    /// Grows with every older state that was put in place and accepted.
+    /// Grows with every copy, and with every older state that was put in place and accepted.
     #[serde(default)]
     pub(super) generation: u64,
     /// The last record that the state had when it was accepted.

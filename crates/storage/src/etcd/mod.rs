@@ -34,21 +34,20 @@ pub use client::Connect;
 pub use format::Holder;
 pub use writer::Bounds;
 
-use crate::error::{CopyError, Fault, OpenError, ReadError};
+use crate::error::{Fault, OpenError, ReadError};
 use crate::store::{Position, Recovered, Store, Writer};
 use chain::Chain;
 use client::Client;
 use contents::{Contents, Known};
 use format::{Head, Step, text};
-use keys::{Keys, delete, delete_span, put, written_at};
+use keys::{Keys, delete_span};
 use mark::{Height, Mark};
 use silence::Silence;
 use std::fmt;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
-use term::{Seen, Term, unreadable};
-use wire::TxnRequest;
+use term::{Seen, Term};
 use writer::{EtcdWriter, Renewing, Shared};
 
 /// Where a log in etcd is, and who opens it.
@@ -205,13 +204,6 @@ impl Etcd {
         Ok((recovered, shared, chain))
     }
 
-    fn write_mark(&self, request: &TxnRequest) -> Result<(), CopyError> {
-        let client = self.client()?;
-        let answer = client.repeat(request, term::PATIENCE, Instant::now() + REACH);
-        let answer = answer.map_err(|error| unreadable(&client, &error))?;
-        if answer.succeeded { Ok(()) } else { Err(self.held("somebody who took it just now").into()) }
-    }
-
     fn held(&self, holder: &str) -> OpenError {
         OpenError::Held { place: self.keys.prefix().to_owned(), holder: holder.to_owned() }
     }
@@ -272,19 +264,6 @@ impl Store for Etcd {
                 read => return Ok(Contents::of(read?, &seen).recovered),
             }
         }
-    }
-
-    fn mark_unfinished(&self) -> Result<(), CopyError> {
-        let seen = Seen::look(&*self.client()?, &self.keys)?;
-        let leader = written_at(self.keys.leader(), seen.revision_of_leader());
-        // A copy of it that arrives when the place was given up does nothing.
-        let success = vec![put(self.keys.unfinished(), "a copy is being made")];
-        self.write_mark(&TxnRequest { compare: vec![leader], success, failure: Vec::new() })
-    }
-
-    fn mark_whole(&self) -> Result<(), CopyError> {
-        let success = vec![delete(self.keys.unfinished())];
-        self.write_mark(&TxnRequest { success, ..TxnRequest::default() })
     }
 
     fn place(&self) -> String {

@@ -30,7 +30,7 @@ use crate::store::{Epoch, Place};
 use bytes::Bytes;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// Who has the place writes `alive` so often.
 pub(super) const RENEW_INTERVAL: Duration = Duration::from_millis(250);
@@ -156,15 +156,26 @@ impl Seen {
         self.leader.as_ref().and_then(|(_, leader)| leader.holder.as_ref())
     }
 
-    pub(super) fn revision_of_leader(&self) -> i64 {
-        self.signs.leader
-    }
-
     /// Holds as long as nobody has said anything since.
     fn unchanged(&self, keys: &Keys) -> Vec<Compare> {
         let Signs { leader, alive, writable } = self.signs;
         vec![written_at(keys.leader(), leader), written_at(keys.alive(), alive), written_at(keys.writable(), writable)]
     }
+}
+
+/// Holds as long as it is neither a part of a copy nor moved.
+fn unmarked(keys: &Keys) -> Vec<Compare> {
+    vec![written_at(keys.unfinished(), 0), written_at(keys.moved(), 0)]
+}
+
+/// The generation of a copy that is made now: the seconds since 1970. Generations that begin otherwise are counted on.
+fn copied_now() -> u64 {
+    #[expect(
+        clippy::disallowed_methods,
+        reason = "it has to grow from one host to another; where it does not, the copy is refused"
+    )]
+    let now = SystemTime::now();
+    now.duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
 }
 
 fn with_revision<T: serde::de::DeserializeOwned>(
@@ -211,7 +222,8 @@ pub(super) fn await_vacancy(
     }
 }
 
-/// Takes the place, if nobody has taken it or said something since it was looked at. `accepts`: the generation that begins, where an older
+/// Takes the place, if nobody has taken it or said something since it was looked at, and it is still a whole log that was not moved: from then
+/// on only whoever has taken it can mark it as such. `accepts`: the generation that begins, where an older
 /// state is accepted.
 pub(super) fn take(
     client: &Arc<Client>,
@@ -242,7 +254,8 @@ pub(super) fn take(
         put(keys.writable(), text(&epoch)),
         put(keys.meta(), text(&meta)),
     ];
-    let request = TxnRequest { compare: seen.unchanged(keys), success, failure: vec![get(keys.leader())] };
+    let compare = [seen.unchanged(keys), unmarked(keys)].concat();
+    let request = TxnRequest { compare, success, failure: vec![get(keys.leader())] };
     // Repeated it finds what it wrote itself.
     let answer = client.repeat(&request, PATIENCE, Instant::now() + REACH);
     let answer = answer.map_err(|error| OpenError::Read(unreadable(client, &error)))?;
@@ -284,6 +297,14 @@ impl Term {
         let [lost, unheard, unwritable, owner_hangs] = [(); 4].map(|()| AtomicBool::new(false));
         let (epoch, store, generation, accepted, draw) = (Epoch(1), 1, 0, None, 1);
         Term { client, keys, epoch, store, generation, accepted, leader, draw, lost, unheard, unwritable, owner_hangs }
+    }
+
+    /// What is said of a log that becomes a copy. Its generation is above that of every state which was here or anywhere else before, so that
+    /// hosts which have seen one of those accept the copy, and none of those in place of the copy.
+    pub(super) fn meta_of_a_copy(&self) -> Meta {
+        let generation = self.generation.max(copied_now());
+        let cluster = self.client.cluster().unwrap_or_default();
+        Meta { version: VERSION, store: self.store, cluster, generation, accepted: None }
     }
 
     /// Holds as long as the place is held.

@@ -11,7 +11,7 @@ use super::chain::Chain;
 use super::client::{CallError, Client, FIRST_PAUSE, LONGEST_PAUSE};
 use super::compaction::Compaction;
 use super::format::{Current, Head, Step, encode_frame, parse, text};
-use super::keys::{found_one, get, put};
+use super::keys::{delete, found_one, get, put};
 use super::mark::{Height, Mark};
 use super::owner::Owner;
 use super::term::{HeldPlace, RENEW_INTERVAL, Term};
@@ -95,7 +95,7 @@ impl Shared {
         Shared { term, pending, bounds, frames, snapshots, closing_since: Mutex::default() }
     }
 
-    /// Changes a snapshot, or what one replaces. Nobody waits for that who closes the log.
+    /// Changes a snapshot, what one replaces, or what is said of the whole log. Nobody waits for that who closes the log.
     pub(super) fn change_snapshots(&self, operations: Vec<RequestOp>) -> Result<(), Fault> {
         if self.pending.is_closing() {
             return Err(Fault::Closed);
@@ -436,14 +436,19 @@ impl Writer for EtcdWriter {
         let _ = self.renewing.turns.set(turns);
     }
 
-    fn mark_moved(&mut self, to: &str) -> Result<(), CopyError> {
+    fn mark_unfinished(&mut self) -> Result<(), CopyError> {
         let term = &self.shared.term;
-        let answer = self.shared.perform(&term.guarded(vec![put(term.keys.moved(), to.to_owned())]));
-        match answer {
-            Ok(answer) if answer.succeeded => Ok(()),
-            Ok(_) => Err(CopyError::SourceLost(term.deposed())),
-            Err(fault) => Err(CopyError::SourceLost(fault)),
-        }
+        let unfinished = put(term.keys.unfinished(), "a copy is being made");
+        Ok(self.shared.change_snapshots(vec![unfinished, put(term.keys.meta(), text(&term.meta_of_a_copy()))])?)
+    }
+
+    fn mark_whole(&mut self) -> Result<(), CopyError> {
+        Ok(self.shared.change_snapshots(vec![delete(self.shared.term.keys.unfinished())])?)
+    }
+
+    fn mark_moved(&mut self, to: &str) -> Result<(), CopyError> {
+        let moved = put(self.shared.term.keys.moved(), to.to_owned());
+        self.shared.change_snapshots(vec![moved]).map_err(CopyError::SourceLost)
     }
 
     fn waiting_bytes(&self) -> usize {

@@ -24,7 +24,7 @@ mod writer;
 pub use backup::{Copied, backup, restore};
 pub use files::{Disk, Files, LogFile};
 
-use crate::error::{CopyError, OpenError, ReadError};
+use crate::error::{OpenError, ReadError};
 use crate::store::{Epoch, Position, Recovered, Store, Writer};
 use contents::Contents;
 use format::{SegmentHeader, StoreId};
@@ -198,19 +198,6 @@ impl Store for Log {
 
     fn read(&self) -> Result<Recovered, ReadError> {
         Ok(contents::read(&self.directory)?.recovered())
-    }
-
-    fn mark_unfinished(&self) -> Result<(), CopyError> {
-        let mark = self.directory.join(directory::UNFINISHED_COPY);
-        let marked = self.files.create(&mark).and_then(|mut file| file.sync());
-        let marked = marked.and_then(|()| self.files.sync_directory(&self.directory));
-        marked.map_err(|source| CopyError::Io { action: "make", place: mark.display().to_string(), source })
-    }
-
-    fn mark_whole(&self) -> Result<(), CopyError> {
-        let mark = self.directory.join(directory::UNFINISHED_COPY);
-        let removed = self.files.remove(&mark).and_then(|()| self.files.sync_directory(&self.directory));
-        removed.map_err(|source| CopyError::Io { action: "remove", place: mark.display().to_string(), source })
     }
 
     fn place(&self) -> String {

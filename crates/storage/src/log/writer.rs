@@ -86,6 +86,21 @@ impl Writer for LogWriter {
         Box::new(self.place.clone())
     }
 
+    fn mark_unfinished(&mut self) -> Result<(), CopyError> {
+        self.place.check()?;
+        let mark = self.shared.directory.join(directory::UNFINISHED_COPY);
+        let marked = self.files.create(&mark).and_then(|mut file| file.sync());
+        let marked = marked.and_then(|()| self.files.sync_directory(&self.shared.directory));
+        marked.map_err(|source| CopyError::Io { action: "make", place: mark.display().to_string(), source })
+    }
+
+    fn mark_whole(&mut self) -> Result<(), CopyError> {
+        self.place.check()?;
+        let mark = self.shared.directory.join(directory::UNFINISHED_COPY);
+        let removed = self.files.remove(&mark).and_then(|()| self.files.sync_directory(&self.shared.directory));
+        removed.map_err(|source| CopyError::Io { action: "remove", place: mark.display().to_string(), source })
+    }
+
     fn mark_moved(&mut self, to: &str) -> Result<(), CopyError> {
         self.place.check().map_err(CopyError::SourceLost)?;
         let mark = self.shared.directory.join(directory::MOVED);

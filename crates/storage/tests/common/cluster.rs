@@ -5,8 +5,8 @@
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::process::{Child, Command, Stdio};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
@@ -155,6 +155,8 @@ pub(crate) struct Proxy {
     loses: Arc<Loses>,
 }
 
+type Happening = Box<dyn FnOnce() + Send>;
+
 #[derive(Default)]
 struct Loses {
     answers: AtomicBool,
@@ -162,6 +164,8 @@ struct Loses {
     all: AtomicBool,
     /// What is asked is passed on up to so many milliseconds later.
     delay_ms: AtomicU64,
+    /// What happens once, before something is passed on that contains these bytes.
+    before: Mutex<Option<(Vec<u8>, Happening)>>,
 }
 
 impl Proxy {
@@ -198,6 +202,11 @@ impl Proxy {
     /// answered, at once.
     pub(crate) fn delay(&self, most: Duration) {
         self.loses.delay_ms.store(most.as_millis() as u64, Ordering::SeqCst);
+    }
+
+    /// Does something once, before a question is passed on that contains this text.
+    pub(crate) fn before(&self, text: &str, what: impl FnOnce() + Send + 'static) {
+        *self.loses.before.lock().unwrap() = Some((text.as_bytes().to_vec(), Box::new(what)));
     }
 
     /// Nothing arrives; connections that were open are broken.
@@ -267,6 +276,11 @@ fn pass(mut from: TcpStream, mut to: TcpStream, loses: Arc<Loses>, answers: bool
             let mut kept = bytes[..count].to_vec();
             if !answers {
                 kept = asked.pass(kept, most > 0);
+                let mut before = loses.before.lock().unwrap();
+                let contains = |text: &[u8]| kept.windows(text.len()).any(|window| window == text);
+                if let Some((_, what)) = before.take_if(|(text, _)| contains(text)) {
+                    what();
+                }
             }
             if most > 0 && !answers {
                 passed = (passed * 7_919 + 104_729) % 1_000_003;

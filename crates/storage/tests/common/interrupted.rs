@@ -27,14 +27,6 @@ impl Store for Interrupted {
         self.store.read()
     }
 
-    fn mark_unfinished(&self) -> Result<(), CopyError> {
-        self.store.mark_unfinished()
-    }
-
-    fn mark_whole(&self) -> Result<(), CopyError> {
-        self.store.mark_whole()
-    }
-
     fn place(&self) -> String {
         self.store.place()
     }
@@ -56,6 +48,14 @@ impl Writer for Ends {
 
     fn place(&self) -> Box<dyn Place> {
         self.writer.place()
+    }
+
+    fn mark_unfinished(&mut self) -> Result<(), CopyError> {
+        self.writer.mark_unfinished()
+    }
+
+    fn mark_whole(&mut self) -> Result<(), CopyError> {
+        self.writer.mark_whole()
     }
 
     fn mark_moved(&mut self, to: &str) -> Result<(), CopyError> {

@@ -118,6 +118,59 @@ pub(crate) fn a_copy_of_what_another_writer_has_taken_meanwhile_is_not_opened(
     assert_eq!(payloads(&make("taken").open().unwrap().0.records), [b"1"]);
 }
 
+pub(crate) fn a_copy_to_what_another_writer_has_taken_meanwhile_leaves_it_alone(
+    make: Make<'_>,
+    take: &(dyn Fn(&str) + Sync),
+) {
+    let (_, mut source) = make("kept").open().unwrap();
+    append_durably(&mut *source, b"1");
+    source.close().unwrap();
+    let (taken, another) = (std::sync::Mutex::new(None), make("target"));
+    let taking = || {
+        take("target");
+        let (_, mut writer) = another.open().unwrap();
+        append_durably(&mut *writer, b"its own");
+        *taken.lock().unwrap() = Some(writer);
+    };
+    let error = {
+        let target = Opened { store: make("target"), then: &taking };
+        transfer(&*make("kept"), &target).unwrap_err()
+    };
+    assert!(matches!(error, CopyError::Write(_)), "{error:?}");
+    append_durably(&mut **taken.lock().unwrap().as_mut().unwrap(), b"more");
+    drop(taken.into_inner().unwrap());
+    assert_eq!(payloads(&make("target").open().unwrap().0.records), [&b"its own"[..], b"more"]);
+    assert_eq!(payloads(&make("kept").open().unwrap().0.records), [b"1"]);
+}
+
+/// When it has been opened something else happens.
+struct Opened<'a> {
+    store: Box<dyn Store>,
+    then: &'a (dyn Fn() + Sync),
+}
+
+impl std::fmt::Debug for Opened<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.store.fmt(f)
+    }
+}
+
+impl Store for Opened<'_> {
+    fn open(&self) -> Result<(Recovered, Box<dyn Writer>), OpenError> {
+        let opened = self.store.open()?;
+        (self.then)();
+        Ok(opened)
+    }
+
+    fn read(&self) -> Result<Recovered, ReadError> {
+        self.store.read()
+    }
+
+    fn place(&self) -> String {
+        self.store.place()
+    }
+}
+
 /// While it is opened something else happens.
 struct Meanwhile<'a> {
     store: Box<dyn Store>,
@@ -138,14 +191,6 @@ impl Store for Meanwhile<'_> {
 
     fn read(&self) -> Result<Recovered, ReadError> {
         self.store.read()
-    }
-
-    fn mark_unfinished(&self) -> Result<(), CopyError> {
-        self.store.mark_unfinished()
-    }
-
-    fn mark_whole(&self) -> Result<(), CopyError> {
-        self.store.mark_whole()
     }
 
     fn place(&self) -> String {
