@@ -1,16 +1,18 @@
 //! Measures search and simplification on the problems of a file, a line per problem:
-//! `cargo run --release -p ratn-motion --example search -- URDF SRDF PROBLEMS [REPEAT [CLASS [ITERATIONS]]]`.
+//! `cargo run --release -p ratn-motion --example search -- URDF SRDF PROBLEMS [REPEAT [CLASS [ITERATIONS [SEED [WIDTH]]]]]`.
+//! WIDTH is how many postures are checked at once, of what the processor has: 16 (AVX-512) or 8 (AVX2).
 //!
-//! Each line: class, index, outcome, search and simplification in µs (the least of all repetitions), samples drawn, length before and after
-//! simplification, and what the exact shapes reject.
+//! Each line: class, index, outcome, search and simplification in µs of processor time (the least of all repetitions), samples drawn, length
+//! before and after simplification, and what the exact shapes reject. `scripts/search/compare.py` puts VAMP beside it.
 
 #![allow(clippy::print_stdout, clippy::unwrap_used, clippy::disallowed_methods, reason = "a measurement")]
 
 use ratn_motion::connect::{Budget, ConnectError};
 use ratn_motion::mechanism::Mechanism;
 use ratn_motion::problems::Problems;
+use ratn_motion::space::Isa;
 use ratn_motion::trial::{self, Settings};
-use std::time::Instant;
+use rustix::time::{ClockId, clock_gettime};
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -18,14 +20,18 @@ fn main() {
     let number = |i: usize, other: usize| arguments.get(i).map_or(other, |text| text.parse().unwrap());
     let problems = Problems::parse(&read(2)).unwrap();
     let mechanism = Mechanism::read(&read(0), Some(&read(1)), &problems.joints).unwrap();
-    let budget = Budget { iterations: number(5, 1_000_000), seed: 1 };
+    let budget = Budget { iterations: number(5, 1_000_000), seed: number(6, 1) as u64 };
+    let width = number(7, Isa::detect().width());
+    let isa = Isa::available().into_iter().find(|isa| isa.width() == width).unwrap();
     let settings = Settings { budget, repetitions: number(3, 1) };
     let only = arguments.get(4).filter(|class| !class.is_empty());
-    let begin = Instant::now();
-    let mut clock = || begin.elapsed().as_secs_f64() * 1e6;
+    let mut clock = || {
+        let time = clock_gettime(ClockId::ThreadCPUTime);
+        time.tv_sec as f64 * 1e6 + time.tv_nsec as f64 * 1e-3
+    };
     for (class, list) in problems.classes.iter().filter(|(class, _)| only.is_none_or(|only| only == *class)) {
         for problem in list {
-            let trial = trial::run(&mechanism, problem, settings, &mut clock);
+            let trial = trial::run_with_isa(&mechanism, problem, settings, isa, &mut clock);
             let times = format!("{:.3} {:.3}", trial.plan, trial.simplify);
             match trial.outcome {
                 Ok(found) => {

@@ -1,7 +1,7 @@
 //! RRT-Connect: two trees, one from the start and one from the goals, each growing towards samples and then towards the other
 //! (Kuffner and LaValle, ICRA 2000), with the trees kept balanced (Kuffner and LaValle 2005) and nodes that only take samples
-//! near them once an extension failed (dynamic domain, Yershova et al., ICRA 2005). A robot with several arms moves one after the
-//! other first (`branches`).
+//! near them once an extension failed (dynamic domain, Yershova et al., ICRA 2005), and make shorter motions now and then. A robot with several
+//! arms moves one after the other first (`branches`).
 //!
 //! The same space, ends, seed and budget give the same path. The caller is asked every `POLL` iterations whether to go on.
 
@@ -21,15 +21,22 @@ use std::cell::Cell;
 const RANGES: [f32; 2] = [0.5, 0.25];
 
 /// Samples of the first attempt; each further one has four times as many.
-const FIRST_ATTEMPT: usize = 32_768;
+const FIRST_ATTEMPT: usize = 131_072;
 
 /// As many for each branch of a robot that has several.
 const IN_TURN: usize = 4096;
 
-/// The dynamic domain: where it begins after a failure and its least size, as parts of the range, and how fast it changes.
-const DOMAIN: f32 = 4.0;
+/// The dynamic domain: where it begins after a failure and its least size, as parts of the range of the first attempt, and how fast it
+/// changes. It does not shrink with the range of an attempt: half of the radius of a ball holds one of 2^joints of its samples.
+const DOMAIN: f32 = 3.5;
 const LEAST_DOMAIN: f32 = 1.0;
 const DOMAIN_CHANGE: f32 = 1e-4;
+
+/// After so many samples, each so many extensions of nodes that have failed before one is shorter, by this factor: what is shut in finds its way
+/// out by short motions, which elsewhere only take time.
+const SHORT_FROM: usize = 4096;
+const SHORT_EVERY: usize = 4;
+const SHORT: f32 = 0.5;
 
 /// Iterations between two questions to the caller: some tens of microseconds.
 const POLL: usize = 32;
@@ -346,7 +353,8 @@ fn grow_by(
     for (i, end) in ends.iter().enumerate() {
         trees[1].push(*end, i);
     }
-    let (domain, least_domain) = (DOMAIN * range, LEAST_DOMAIN * range);
+    let first_range = self::range(space, RANGES[0]);
+    let (domain, least_domain) = (DOMAIN * first_range, LEAST_DOMAIN * first_range);
     // Which tree grows towards the sample.
     let mut growing = 1;
     // Where nothing may be left between postures, an iteration takes as long as many others.
@@ -367,7 +375,10 @@ fn grow_by(
             continue;
         }
         let from = tree.states[near];
-        let to = if far <= range { sample } else { between(&from, &sample, range / far) };
+        let may_be_short = iteration > SHORT_FROM && iteration.is_multiple_of(SHORT_EVERY);
+        let is_short = may_be_short && tree.radii[near].is_finite();
+        let step = if is_short { SHORT * range } else { range };
+        let to = if far <= step { sample } else { between(&from, &sample, step / far) };
         if !space.is_free_motion(&from, &to) {
             let radius = &mut tree.radii[near];
             *radius = if radius.is_infinite() { domain } else { (*radius * (1.0 - DOMAIN_CHANGE)).max(least_domain) };

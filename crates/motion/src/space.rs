@@ -9,8 +9,10 @@ use crate::branches;
 use crate::geometry::Geometry;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 pub use crate::simd::Isa;
-use crate::simd::{self, Block, Compiled, Edge, Frame, Group, Row, Scratch, SelfPair};
+use crate::simd::{self, Block, Compiled, Edge, Frame, Group, Rigid, Row, Scratch, SelfPair};
 use ratn_model::pose::Pose;
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
 
 /// Positions in the order of the joints; unused ones are zero.
 pub type State = [f32; MAX_JOINTS];
@@ -42,7 +44,7 @@ pub struct Space {
     compiled: Compiled,
     scratch: Scratch,
     isa: Isa,
-    /// Per group.
+    /// Per rigid part, then per group.
     arms: Vec<Arm>,
     inflate: Vec<f32>,
     lower: State,
@@ -53,14 +55,14 @@ pub struct Space {
     swept: bool,
 }
 
-/// How a group moves with each joint.
+/// How spheres move with each joint.
 #[derive(Debug, Clone)]
 struct Arm {
-    /// How far a point of it moves at most for one radian (or metre).
+    /// How far a point of them moves at most for one radian (or metre).
     levers: State,
-    /// How far it turns for one radian; zero for joints that slide.
+    /// How far they turn for one radian; zero for joints that slide.
     turns: State,
-    /// How far it slides for one metre; zero for joints that turn.
+    /// How far they slide for one metre; zero for joints that turn.
     slides: State,
 }
 
@@ -76,38 +78,39 @@ impl Space {
     /// As [`Space::new`], with instructions that are not the widest.
     pub fn with_isa(mechanism: &Mechanism, obstacles: &[Obstacle], isa: Isa) -> Space {
         let compiled_obstacles: Vec<simd::Obstacle> = obstacles.iter().map(compile_obstacle).collect();
-        let (mut compiled, shells, links) = compile_robot(mechanism, ROUNDING_M);
+        let allowed: Vec<Vec<usize>> = (0..mechanism.links.len())
+            .map(|link| (0..obstacles.len()).filter(|o| !mechanism.is_kept_from(link, &obstacles[*o].name)).collect())
+            .collect();
+        let (mut compiled, shells, links) = compile_robot(mechanism, &allowed, ROUNDING_M);
         let mut blocked = false;
-        for (index, group) in compiled.groups.iter_mut().enumerate() {
+        for (rigid, shell) in compiled.rigids.iter_mut().zip(&shells) {
             let mut near: Vec<(f64, usize)> = Vec::new();
-            for (o, obstacle) in obstacles.iter().enumerate() {
-                if !mechanism.is_kept_from(links[index], &obstacle.name) {
-                    continue;
-                }
-                if group.frame == 0 {
+            let allowed = &allowed[links[rigid.groups.start]];
+            for (o, obstacle) in obstacles.iter().enumerate().filter(|(o, _)| !allowed.contains(o)) {
+                if rigid.frame == 0 {
                     let touches =
                         |s: &[f32; 4]| gap(obstacle, std::array::from_fn(|i| f64::from(s[i]))) < f64::from(s[3]);
-                    blocked |= group.fine.iter().any(touches);
+                    blocked |= compiled.groups[rigid.groups.clone()].iter().any(|g| g.fine.iter().any(touches));
                     continue;
                 }
-                let far = gap(obstacle, shells[index].anchor);
-                if far <= shells[index].reach {
+                let far = gap(obstacle, shell.anchor);
+                if far <= shell.reach {
                     near.push((far, o));
                 }
             }
             near.sort_by(|a, b| a.0.total_cmp(&b.0));
             let order: Vec<usize> = near.into_iter().map(|(_, o)| o).collect();
-            group.near = order.chunks(isa.width()).map(|row| compile_row(row, obstacles)).collect();
+            rigid.near = order.chunks(isa.width()).map(|row| compile_row(row, obstacles)).collect();
         }
         compiled.obstacles = compiled_obstacles;
-        compiled.pairs = pairs(mechanism, &links);
-        let arms = compiled.groups.iter().map(|group| arm(&compiled, group)).collect();
+        compiled.pairs = pairs(mechanism, &compiled, &links);
+        let arms = spheres(&compiled).map(|(frame, coarse)| arm(&compiled, frame, coarse)).collect();
         let (mut lower, mut upper) = ([0.0; MAX_JOINTS], [0.0; MAX_JOINTS]);
         for (j, joint) in mechanism.joints.iter().enumerate() {
             (lower[j], upper[j]) = (joint.lower as f32, joint.upper as f32);
         }
         let scratch = Scratch::new(&compiled);
-        let inflate = vec![0.0; compiled.groups.len()];
+        let inflate = vec![0.0; compiled.rigids.len() + compiled.groups.len()];
         let branches = branches::branches(&parents(&compiled));
         Space { compiled, scratch, isa, arms, inflate, lower, upper, branches, blocked, swept: false }
     }
@@ -224,14 +227,14 @@ impl Space {
         // Each posture stands for the step that it is in the middle of: nothing is further than half a step from one.
         let step = 0.5 / self.isa.width() as f32;
         let joints = self.compiled.joints;
-        for ((inflate, arm), group) in self.inflate.iter_mut().zip(&self.arms).zip(&self.compiled.groups) {
+        for ((inflate, arm), (_, coarse)) in self.inflate.iter_mut().zip(&self.arms).zip(spheres(&self.compiled)) {
             let along = |levers: &State| (0..joints).map(|j| levers[j] * delta[j].abs()).sum::<f32>() * step;
             let (turned, moved, slid) = (along(&arm.turns), along(&arm.levers), along(&arm.slides));
             // The second derivative by two joints that turn is no longer than the lever of the later one. The mean speed of a
             // step differs from that anywhere in it and half a step beyond by what it changes in one step at most.
             let bend = 2.0 * turned * (moved + slid);
             // Points beside the centre of the bounding sphere turn about it.
-            *inflate = bend + turned * group.coarse[3];
+            *inflate = bend + turned * coarse[3];
         }
         let start: State = std::array::from_fn(|j| start[j] - delta[j] * step);
         let edge = Edge { compiled: &self.compiled, start: &start, delta, batches: 1, inflate: &self.inflate };
@@ -304,22 +307,23 @@ fn compile_row(order: &[usize], obstacles: &[Obstacle]) -> Row {
     row
 }
 
-/// Where a group can be: within a sphere about the first joint of its chain.
+/// Where a rigid part can be: within a sphere about the first joint of its chain.
 #[derive(Debug, Clone, Copy)]
 struct Shell {
     anchor: [f64; 3],
     reach: f64,
 }
 
-/// The robot's frames and groups, and of each group where it can be and its link.
-fn compile_robot(mechanism: &Mechanism, padding: f64) -> (Compiled, Vec<Shell>, Vec<usize>) {
+/// The robot's frames, rigid parts and groups, where each rigid part can be, and of each group its link. Groups whose links are allowed to touch
+/// other obstacles are not of one rigid part.
+fn compile_robot(mechanism: &Mechanism, allowed: &[Vec<usize>], padding: f64) -> (Compiled, Vec<Shell>, Vec<usize>) {
     let mut frames: Vec<Frame> = Vec::new();
     // Per frame: how far its origin can be from the first joint of its chain, and that joint's place.
     let mut chains: Vec<(f64, [f64; 3])> = vec![(0.0, [0.0; 3])];
     // Per link: its frame, and where it is there.
     let mut places: Vec<(usize, Pose)> = Vec::new();
     let mut compiled = Compiled { joints: mechanism.joints.len(), ..Compiled::default() };
-    let (mut shells, mut links) = (Vec::new(), Vec::new());
+    let mut links = Vec::new();
     for (index, link) in mechanism.links.iter().enumerate() {
         let (parent, place) = link.parent.map_or((0, Pose::IDENTITY), |p| places[p]);
         let origin = place.compose(&link.origin);
@@ -352,39 +356,64 @@ fn compile_robot(mechanism: &Mechanism, padding: f64) -> (Compiled, Vec<Shell>, 
                 })
                 .collect();
             let coarse = enclose(&fine);
-            let (way, anchor) = chains[frame];
-            shells.push(Shell { anchor, reach: way + f64::from(norm(&coarse) + coarse[3]) + 1e-4 });
             links.push(index);
-            compiled.groups.push(Group { frame, coarse, fine, slot: 0, near: Vec::new() });
+            compiled.groups.push(Group { frame, coarse, fine, slot: 0 });
         }
     }
     compiled.frames = frames;
     // The hand, deepest in the tree, is the likeliest to touch something.
     let mut order: Vec<usize> = (0..links.len()).collect();
-    order.sort_by_key(|i| std::cmp::Reverse((compiled.groups[*i].frame, *i)));
+    order.sort_by_key(|i| (Reverse(compiled.groups[*i].frame), &allowed[links[*i]], Reverse(*i)));
     compiled.groups = order.iter().map(|i| compiled.groups[*i].clone()).collect();
     for group in &mut compiled.groups {
         group.slot = compiled.slots;
         compiled.slots += group.fine.len();
     }
-    let shells = order.iter().map(|i| shells[*i]).collect();
-    let links = order.iter().map(|i| links[*i]).collect();
+    let links: Vec<usize> = order.iter().map(|i| links[*i]).collect();
+    let is_joined = |a: &usize, b: &usize| {
+        compiled.groups[*a].frame == compiled.groups[*b].frame && allowed[links[*a]] == allowed[links[*b]]
+    };
+    let all: Vec<usize> = (0..links.len()).collect();
+    let (mut rigids, mut shells) = (Vec::new(), Vec::new());
+    for joined in all.chunk_by(is_joined) {
+        let groups = joined[0]..joined[joined.len() - 1] + 1;
+        let coarse = match &compiled.groups[groups.clone()] {
+            [one] => one.coarse,
+            several => enclose(&several.iter().flat_map(|g| g.fine.iter().copied()).collect::<Vec<_>>()),
+        };
+        let frame = compiled.groups[groups.start].frame;
+        let (way, anchor) = chains[frame];
+        shells.push(Shell { anchor, reach: way + f64::from(norm(&coarse) + coarse[3]) + 1e-4 });
+        rigids.push(Rigid { frame, coarse, groups, near: Vec::new() });
+    }
+    compiled.rigids = rigids;
     (compiled, shells, links)
 }
 
-/// Pairs of groups, in the order of checking; `links` has the link of each group.
-fn pairs(mechanism: &Mechanism, links: &[usize]) -> Vec<SelfPair> {
-    let mut places = vec![0; mechanism.links.len()];
-    for (group, link) in links.iter().enumerate() {
-        places[*link] = group as u32;
+/// The frames and bounding spheres of the rigid parts, then of the groups.
+fn spheres(compiled: &Compiled) -> impl Iterator<Item = (usize, &[f32; 4])> {
+    let rigids = compiled.rigids.iter().map(|rigid| (rigid.frame, &rigid.coarse));
+    rigids.chain(compiled.groups.iter().map(|group| (group.frame, &group.coarse)))
+}
+
+/// Pairs, in the order of checking; `links` has the link of each group.
+fn pairs(mechanism: &Mechanism, compiled: &Compiled, links: &[usize]) -> Vec<SelfPair> {
+    let mut places = vec![(0, 0); mechanism.links.len()];
+    for (r, rigid) in compiled.rigids.iter().enumerate() {
+        for group in rigid.groups.clone() {
+            places[links[group]] = (r as u32, group as u32);
+        }
     }
-    let pairs = mechanism.pairs().into_iter().map(|(a, b)| {
-        let (a, b) = (places[a], places[b]);
-        SelfPair { first: a.min(b), second: a.max(b) }
+    let mut pairs: BTreeMap<(u32, u32), Vec<(u32, u32)>> = BTreeMap::new();
+    for (a, b) in mechanism.pairs() {
+        let (a, b) = (places[a].min(places[b]), places[a].max(places[b]));
+        pairs.entry((a.0, b.0)).or_default().push((a.1, b.1));
+    }
+    let sorted = pairs.into_iter().map(|((first, second), mut groups)| {
+        groups.sort_unstable();
+        SelfPair { first, second, groups }
     });
-    let mut pairs: Vec<SelfPair> = pairs.collect();
-    pairs.sort_by_key(|pair| (pair.first, pair.second));
-    pairs
+    sorted.collect()
 }
 
 /// The joint next towards the root, for each joint.
@@ -397,10 +426,9 @@ fn parents(compiled: &Compiled) -> Vec<Option<usize>> {
     parents
 }
 
-fn arm(compiled: &Compiled, group: &Group) -> Arm {
+fn arm(compiled: &Compiled, mut frame: usize, coarse: &[f32; 4]) -> Arm {
     let mut arm = Arm { levers: [0.0; MAX_JOINTS], turns: [0.0; MAX_JOINTS], slides: [0.0; MAX_JOINTS] };
-    let mut reach = norm(&group.coarse) + group.coarse[3];
-    let mut frame = group.frame;
+    let mut reach = norm(coarse) + coarse[3];
     while frame != 0 {
         let here = &compiled.frames[frame - 1];
         // A joint may move several links of a chain.

@@ -7,7 +7,7 @@ use crate::pace::Control;
 use crate::problems::Problem;
 use crate::robot::Joint;
 use crate::simplify::{path_length, simplify};
-use crate::space::{Space, State};
+use crate::space::{Isa, Space, State};
 
 /// Postures per radian that the exact check looks at: four times those of the search.
 const EXACT_PER_RADIAN: f64 = 4.0 * Space::RESOLUTION as f64;
@@ -53,7 +53,18 @@ pub struct Found {
 
 /// Solves a problem; `clock` gives the time in any units.
 pub fn run(mechanism: &Mechanism, problem: &Problem, settings: Settings, clock: &mut dyn FnMut() -> f64) -> Trial {
-    let mut space = Space::new(mechanism, &problem.obstacles);
+    run_with_isa(mechanism, problem, settings, Isa::detect(), clock)
+}
+
+/// As [`run`], with instructions that are not the widest.
+pub fn run_with_isa(
+    mechanism: &Mechanism,
+    problem: &Problem,
+    settings: Settings,
+    isa: Isa,
+    clock: &mut dyn FnMut() -> f64,
+) -> Trial {
+    let mut space = Space::with_isa(mechanism, &problem.obstacles, isa);
     let ends = [("start", &problem.start), ("goal", &problem.goal)].map(|(which, positions)| {
         let (positions, beyond) = mechanism.clamped(positions);
         (positions, beyond.iter().map(|b| format!("{which} state: {b}")).collect::<Vec<_>>())

@@ -153,6 +153,48 @@ fn for_a_robot_of_spheres_the_vector_check_is_the_exact_one() {
 }
 
 #[test]
+fn links_that_are_fixed_to_each_other_are_checked_as_one_by_one_whatever_each_may_touch() {
+    let (urdf, names) = chain(4);
+    let mut mechanism = Mechanism::read(&urdf, None, &names).unwrap();
+    let hand = mechanism.link("l4").unwrap();
+    let ball = |y: f64| Geometry::Sphere { radius: 0.04 }.at(Pose::at(0.25, y, 0.0));
+    let tools: Vec<usize> =
+        [-0.1, 0.0, 0.1].map(|y| mechanism.attach(&format!("tool at {y}"), hand, vec![ball(y)], &[])).to_vec();
+    // Of two tools side by side one may touch a thing, and the other may be in the first link.
+    mechanism.allow(tools[0], "thing 3");
+    mechanism.allow(tools[2], "thing 3");
+    let first = mechanism.link("l1").unwrap();
+    mechanism.disabled.insert((first, tools[1]));
+    let mut random = ChaCha8Rng::seed_from_u64(12);
+    let (mut free, mut touching) = (0, 0);
+    for _ in 0..40 {
+        let obstacles: Vec<Obstacle> = clutter(&mut random, 8, 0.9)
+            .into_iter()
+            .enumerate()
+            .map(|(i, thing)| Obstacle { name: format!("thing {i}"), ..thing })
+            .collect();
+        let exact = Exact::new(&mechanism, &obstacles);
+        let mut thin = mechanism.clone();
+        thin.pad_all(-1e-4);
+        for isa in Isa::available() {
+            let mut space = Space::with_isa(&mechanism, &obstacles, isa);
+            let mut smaller = Space::with_isa(&thin, &obstacles, isa);
+            for _ in 0..50 {
+                let state = posture(&mut random, &mechanism);
+                let touch = exact.touch(&positions(&mechanism, &state));
+                match (space.is_free(&state), touch) {
+                    (true, None) => free += 1,
+                    (false, Some(_)) => touching += 1,
+                    (false, None) => assert!(smaller.is_free(&state), "{isa:?} sees a touch that is none"),
+                    (true, Some(touch)) => panic!("{isa:?} misses that {touch}"),
+                }
+            }
+        }
+    }
+    assert!(free > 500 && touching > 500, "{free} free, {touching} touching");
+}
+
+#[test]
 fn all_instruction_sets_answer_as_the_plain_one_does() {
     let (urdf, names) = chain(6);
     let mechanism = Mechanism::read(&urdf, None, &names).unwrap();

@@ -2,14 +2,15 @@
 //!
 //! The postures of one batch are spread over the whole edge, later batches fill the gaps, so that the first batch most likely
 //! finds what is in the way (Thomason, Kingston, Kavraki: *Motions in Microseconds via Vectorized Sampling-Based Planning*, ICRA
-//! 2024). Kinematics first; then group by group, the hand before the shoulder, the box that holds its bounding sphere in
-//! all lanes against those of the obstacles that it can reach at all, as many at once as there are lanes; the sphere against what
-//! is in there, nearest to the shoulder first; its fine spheres only against obstacles that the bounding sphere meets. Then pairs
-//! of groups, in the same manner. Any touching lane ends it.
+//! 2024). Kinematics first; then, for all links that are fixed to one frame together, the hand before the shoulder, the box that holds their
+//! bounding sphere in all lanes against those of the obstacles that it can reach at all, as many at once as there are lanes; the sphere
+//! against what is in there, nearest to the shoulder first; then the bounding sphere of each link and its fine spheres, only against
+//! obstacles that the larger sphere meets. Then pairs, in the same manner. Any touching lane ends it.
 //!
 //! There are no closures over vectors here: a closure that is not inlined is compiled without the instructions of its caller.
 
 use super::lanes::{Block, Lanes};
+use std::ops::Range;
 
 /// Joints of a configuration at the most; unused ones are zero.
 pub(crate) const LENGTH: usize = 16;
@@ -27,15 +28,25 @@ pub(crate) struct Frame {
     pub(crate) travel: f32,
 }
 
-/// Spheres that are fixed to one frame. Frame 0 is the world.
+/// The spheres of a link.
 #[derive(Debug, Clone)]
 pub(crate) struct Group {
+    /// Frame 0 is the world.
     pub(crate) frame: usize,
     /// Centre and radius of a sphere that holds all others.
     pub(crate) coarse: [f32; 4],
     pub(crate) fine: Vec<[f32; 4]>,
     /// Where its fine centres are in the scratch blocks.
     pub(crate) slot: usize,
+}
+
+/// Groups that are fixed to one frame and may touch the same obstacles.
+#[derive(Debug, Clone)]
+pub(crate) struct Rigid {
+    pub(crate) frame: usize,
+    /// Centre and radius of a sphere that holds all of them.
+    pub(crate) coarse: [f32; 4],
+    pub(crate) groups: Range<usize>,
     /// What it can reach, nearest to its anchor first.
     pub(crate) near: Vec<Row>,
 }
@@ -51,11 +62,12 @@ pub(crate) struct Row {
     pub(crate) minus_greatest: [Block; 3],
 }
 
-/// Two groups that must not meet.
+/// Two rigid parts of which groups must not meet: which.
 #[derive(Debug, Clone)]
 pub(crate) struct SelfPair {
     pub(crate) first: u32,
     pub(crate) second: u32,
+    pub(crate) groups: Vec<(u32, u32)>,
 }
 
 /// A box with rounded corners (a box, a sphere, a capsule), or a cylinder; z is the axis.
@@ -80,6 +92,8 @@ pub(crate) struct Compiled {
     /// Parents first; the frame with index 0 is the world and not listed here.
     pub(crate) frames: Vec<Frame>,
     /// In the order of checking.
+    pub(crate) rigids: Vec<Rigid>,
+    /// In the order of the rigid parts.
     pub(crate) groups: Vec<Group>,
     pub(crate) pairs: Vec<SelfPair>,
     pub(crate) obstacles: Vec<Obstacle>,
@@ -90,12 +104,14 @@ pub(crate) struct Compiled {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Scratch {
     frames: Vec<[Block; 12]>,
-    coarse: Vec<[Block; 3]>,
+    /// Of each rigid part, how much larger its spheres are in this batch, too.
+    rigid: Vec<([Block; 3], f32)>,
+    /// As that, of each group.
+    coarse: Vec<([Block; 3], f32)>,
     fine: Vec<[Block; 3]>,
-    /// Batch in which a group's fine centres were computed last.
-    stamps: Vec<u64>,
-    /// How much larger the spheres of each group are in this batch.
-    grown: Vec<f32>,
+    /// Batches in which a group's coarse and fine centres were computed last.
+    coarse_stamps: Vec<u64>,
+    fine_stamps: Vec<u64>,
     batch: u64,
 }
 
@@ -108,10 +124,11 @@ impl Scratch {
         }
         Scratch {
             frames: vec![world; compiled.frames.len() + 1],
-            coarse: vec![[zero; 3]; compiled.groups.len()],
+            rigid: vec![([zero; 3], 0.0); compiled.rigids.len()],
+            coarse: vec![([zero; 3], 0.0); compiled.groups.len()],
             fine: vec![[zero; 3]; compiled.slots],
-            stamps: vec![0; compiled.groups.len()],
-            grown: vec![0.0; compiled.groups.len()],
+            coarse_stamps: vec![0; compiled.groups.len()],
+            fine_stamps: vec![0; compiled.groups.len()],
             batch: 0,
         }
     }
@@ -125,8 +142,8 @@ pub(crate) struct Edge<'a> {
     pub(crate) delta: &'a [f32; LENGTH],
     /// How many batches; the end is checked, the start is not.
     pub(crate) batches: usize,
-    /// For the check that leaves nothing between postures: what the spheres of each group grow by, beside half of the greatest
-    /// step of the group's bounding sphere. Empty for a check of the postures alone.
+    /// For the check that leaves nothing between postures: what the spheres of each rigid part, then of each group, grow by, beside half of
+    /// the greatest step of their bounding sphere. Empty for a check of the postures alone.
     pub(crate) inflate: &'a [f32],
 }
 
@@ -281,11 +298,32 @@ fn greatest_step(point: &[Block; 3], width: usize) -> f32 {
     squares[..width - 1].iter().fold(0.0, |most: f32, square| if *square > most { *square } else { most }).sqrt()
 }
 
+/// Fills in the centre of a group's bounding sphere, once per batch.
+#[inline(always)]
+fn approach<V: Lanes>(edge: &Edge<'_>, index: usize, scratch: &mut Scratch) {
+    if scratch.coarse_stamps[index] != scratch.batch {
+        scratch.coarse_stamps[index] = scratch.batch;
+        let group = &edge.compiled.groups[index];
+        let (at, grown) = &mut scratch.coarse[index];
+        store(place::<V>(&scratch.frames[group.frame], &group.coarse), at);
+        *grown = grow::<V>(edge, edge.compiled.rigids.len() + index, at);
+    }
+}
+
+/// How much larger the spheres about a centre are in this batch.
+#[inline(always)]
+fn grow<V: Lanes>(edge: &Edge<'_>, index: usize, centre: &[Block; 3]) -> f32 {
+    match edge.inflate.get(index) {
+        Some(more) => more + 0.5 * greatest_step(centre, V::WIDTH),
+        None => 0.0,
+    }
+}
+
 /// Fills in the fine centres of a group, once per batch.
 #[inline(always)]
 fn refine<V: Lanes>(group: &Group, index: usize, scratch: &mut Scratch) {
-    if scratch.stamps[index] != scratch.batch {
-        scratch.stamps[index] = scratch.batch;
+    if scratch.fine_stamps[index] != scratch.batch {
+        scratch.fine_stamps[index] = scratch.batch;
         let frame = &scratch.frames[group.frame];
         for (sphere, to) in group.fine.iter().zip(&mut scratch.fine[group.slot..]) {
             store(place::<V>(frame, sphere), to);
@@ -297,38 +335,63 @@ fn refine<V: Lanes>(group: &Group, index: usize, scratch: &mut Scratch) {
 fn in_obstacles<V: Lanes, const ALL: bool>(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
     let mut found = 0;
     let compiled = edge.compiled;
-    for (index, group) in compiled.groups.iter().enumerate() {
-        let centre = place::<V>(&scratch.frames[group.frame], &group.coarse);
-        store(centre, &mut scratch.coarse[index]);
-        let grown = match edge.inflate.get(index) {
-            Some(more) => more + 0.5 * greatest_step(&scratch.coarse[index], V::WIDTH),
-            None => 0.0,
-        };
-        scratch.grown[index] = grown;
-        if group.near.is_empty() {
+    for (index, rigid) in compiled.rigids.iter().enumerate() {
+        let centre = place::<V>(&scratch.frames[rigid.frame], &rigid.coarse);
+        let (at, grown) = &mut scratch.rigid[index];
+        store(centre, at);
+        *grown = grow::<V>(edge, index, at);
+        if rigid.near.is_empty() {
             continue;
         }
-        let radius = group.coarse[3] + grown;
+        let radius = rigid.coarse[3] + *grown;
         let bounds = bounds(centre, radius);
-        for row in &group.near {
+        for row in &rigid.near {
             let mut hits = overlaps::<V>(&bounds, row);
             while hits != 0 {
                 let obstacle = &compiled.obstacles[row.obstacles[hits.trailing_zeros() as usize] as usize];
                 hits &= hits - 1;
-                if meets(centre, radius, obstacle) & !found == 0 {
+                let about = meets(centre, radius, obstacle) & !found;
+                if about == 0 {
                     continue;
                 }
-                refine::<V>(group, index, scratch);
-                for (sphere, at) in group.fine.iter().zip(&scratch.fine[group.slot..]) {
-                    found |= meets::<V>(fetch(at), sphere[3] + grown, obstacle);
-                    if !ALL && found != 0 {
+                for group in rigid.groups.clone() {
+                    let about = if rigid.groups.len() == 1 { about } else { V::ALL };
+                    found |= group_in_obstacle::<V, ALL>(edge, group, obstacle, about, found, scratch);
+                    if found != 0 && (!ALL || found == V::ALL) {
                         return found;
                     }
                 }
-                if found == V::ALL {
-                    return found;
-                }
             }
+        }
+    }
+    found
+}
+
+/// Where a group meets an obstacle, beside what was found; `about` says where its bounding sphere does, if that is known, and else all lanes.
+#[inline(always)]
+fn group_in_obstacle<V: Lanes, const ALL: bool>(
+    edge: &Edge<'_>,
+    index: usize,
+    obstacle: &Obstacle,
+    mut about: u32,
+    mut found: u32,
+    scratch: &mut Scratch,
+) -> u32 {
+    let group = &edge.compiled.groups[index];
+    approach::<V>(edge, index, scratch);
+    let (at, grown) = &scratch.coarse[index];
+    let grown = *grown;
+    if about == V::ALL {
+        about = meets::<V>(fetch(at), group.coarse[3] + grown, obstacle) & !found;
+    }
+    if about == 0 || group.fine.len() == 1 {
+        return about;
+    }
+    refine::<V>(group, index, scratch);
+    for (sphere, at) in group.fine.iter().zip(&scratch.fine[group.slot..]) {
+        found |= meets::<V>(fetch(at), sphere[3] + grown, obstacle);
+        if found != 0 && (!ALL || found == V::ALL) {
+            return found;
         }
     }
     found
@@ -423,24 +486,49 @@ fn meet<V: Lanes>(a: [V; 3], b: [V; 3], reach: f32) -> u32 {
 fn in_itself<V: Lanes, const ALL: bool>(edge: &Edge<'_>, mut found: u32, scratch: &mut Scratch) -> u32 {
     for pair in &edge.compiled.pairs {
         let (i, j) = (pair.first as usize, pair.second as usize);
-        let (a, b) = (&edge.compiled.groups[i], &edge.compiled.groups[j]);
-        let more = scratch.grown[i] + scratch.grown[j];
-        let (at_a, at_b) = (fetch::<V>(&scratch.coarse[i]), fetch::<V>(&scratch.coarse[j]));
-        if meet(at_a, at_b, a.coarse[3] + b.coarse[3] + more) & !found == 0 {
+        let ((at_a, more_a), (at_b, more_b)) = (&scratch.rigid[i], &scratch.rigid[j]);
+        let (a, b) = (&edge.compiled.rigids[i], &edge.compiled.rigids[j]);
+        let reach = a.coarse[3] + b.coarse[3] + (more_a + more_b);
+        if meet::<V>(fetch(at_a), fetch(at_b), reach) & !found == 0 {
             continue;
         }
-        refine::<V>(a, i, scratch);
-        for (p, sphere) in a.fine.iter().enumerate() {
-            let at = fetch::<V>(&scratch.fine[a.slot + p]);
-            if meet(at, at_b, sphere[3] + b.coarse[3] + more) & !found == 0 {
-                continue;
+        for (i, j) in &pair.groups {
+            found = groups_meet::<V, ALL>(edge, (*i as usize, *j as usize), found, scratch);
+            if found != 0 && (!ALL || found == V::ALL) {
+                return found;
             }
-            refine::<V>(b, j, scratch);
-            for (q, other) in b.fine.iter().enumerate() {
-                found |= meet(at, fetch::<V>(&scratch.fine[b.slot + q]), sphere[3] + other[3] + more);
-                if found != 0 && (!ALL || found == V::ALL) {
-                    return found;
-                }
+        }
+    }
+    found
+}
+
+/// Adds to what was found where two groups touch.
+#[inline(always)]
+fn groups_meet<V: Lanes, const ALL: bool>(
+    edge: &Edge<'_>,
+    (i, j): (usize, usize),
+    mut found: u32,
+    scratch: &mut Scratch,
+) -> u32 {
+    approach::<V>(edge, i, scratch);
+    approach::<V>(edge, j, scratch);
+    let (a, b) = (&edge.compiled.groups[i], &edge.compiled.groups[j]);
+    let more = scratch.coarse[i].1 + scratch.coarse[j].1;
+    let (at_a, at_b) = (fetch::<V>(&scratch.coarse[i].0), fetch::<V>(&scratch.coarse[j].0));
+    if meet(at_a, at_b, a.coarse[3] + b.coarse[3] + more) & !found == 0 {
+        return found;
+    }
+    refine::<V>(a, i, scratch);
+    for (p, sphere) in a.fine.iter().enumerate() {
+        let at = fetch::<V>(&scratch.fine[a.slot + p]);
+        if meet(at, at_b, sphere[3] + b.coarse[3] + more) & !found == 0 {
+            continue;
+        }
+        refine::<V>(b, j, scratch);
+        for (q, other) in b.fine.iter().enumerate() {
+            found |= meet(at, fetch::<V>(&scratch.fine[b.slot + q]), sphere[3] + other[3] + more);
+            if found != 0 && (!ALL || found == V::ALL) {
+                return found;
             }
         }
     }

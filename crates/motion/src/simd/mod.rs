@@ -5,7 +5,7 @@ mod kernel;
 mod lanes;
 mod nearest;
 
-pub(crate) use kernel::{Compiled, Edge, Frame, Group, Obstacle, Row, Scratch, SelfPair};
+pub(crate) use kernel::{Compiled, Edge, Frame, Group, Obstacle, Rigid, Row, Scratch, SelfPair};
 pub(crate) use lanes::Block;
 #[allow(unreachable_pub, reason = "`space` makes it public")]
 pub use lanes::Isa;
