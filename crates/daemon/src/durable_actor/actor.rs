@@ -21,6 +21,8 @@ const AT_ONCE: usize = 64;
 const URGENT_AT_ONCE: usize = 64;
 /// What came together is written down together, and nothing else is looked at meanwhile, unless that takes longer than this.
 const TURN: Duration = Duration::from_millis(1);
+/// Before the state is closed, what is being written has so long to be on the disk.
+const LAST_WRITES: Duration = Duration::from_secs(1);
 
 pub(super) struct Actor<C: Core> {
     core: C,
@@ -117,11 +119,14 @@ impl<C: Core> Actor<C> {
     }
 
     fn receive_urgent(&mut self, urgent: C::Urgent) {
+        self.vitals.beat();
         self.core.receive_urgent(urgent, &mut self.desk);
         self.collect();
     }
 
+    /// A batch of messages may take long: each of them is a sign of life.
     fn receive(&mut self, message: C::Message) {
+        self.vitals.beat();
         let behind = if self.desk.stopped().is_none() { self.journal.behind() } else { None };
         let message = match behind {
             Some(behind) => C::refuse(message, &behind),
@@ -143,7 +148,9 @@ impl<C: Core> Actor<C> {
     /// showing that it is alive: how long this may take is decided by the deadline of the process, not by a watchdog.
     async fn end(mut self) {
         self.deliver();
+        self.write_last().await;
         tracing::info!("the state is closed when all of it is written");
+        self.desk.speech().expect_loss();
         let mut closing = self.journal.close();
         let closed = loop {
             tokio::select! {
@@ -156,7 +163,8 @@ impl<C: Core> Actor<C> {
             self.vitals.beat();
         };
         match closed {
-            Ok(Ok(())) => self.deliver(),
+            // What changes by it now is not written any more.
+            Ok(Ok(())) => self.hand_out_durable(),
             // It is the end of a process that was told to end. Nobody was told of anything that is lost.
             Ok(Err(fault)) if self.journal.is_written() => {
                 tracing::info!(%fault, "all was written before");
@@ -165,6 +173,21 @@ impl<C: Core> Actor<C> {
             Ok(Err(fault)) => drop(self.refuse_changes(&fault)),
             // The runtime ends, and with it the process.
             Err(error) => tracing::debug!(%error, "nobody waits for the state to be closed"),
+        }
+    }
+
+    /// Waits for a moment until all is on the disk, also what handing it out led to: a grant that nobody waits for any more is given back. A
+    /// log that is closed takes nothing.
+    async fn write_last(&mut self) {
+        let until = Instant::now() + LAST_WRITES;
+        while self.desk.stopped().is_none() && !self.journal.is_written() && Instant::now() < until {
+            tokio::select! {
+                biased;
+                progress = self.journal.changed() => if !matches!(progress, Ok(Progress { fault: None, .. })) { return },
+                () = tokio::time::sleep(TICK) => {}
+            }
+            self.vitals.beat();
+            self.deliver();
         }
     }
 
@@ -203,7 +226,9 @@ impl<C: Core> Actor<C> {
     }
 
     fn hand_out_durable(&mut self) {
-        while let Some(outgoing) = self.take_durable().filter(|_| self.desk.may_speak()) {
+        while self.desk.may_speak()
+            && let Some(outgoing) = self.take_durable()
+        {
             self.hand_out(outgoing);
         }
     }

@@ -25,7 +25,8 @@ use ratn_panic_point::panic_point;
 use ratn_storage::{Fault, Place};
 use ratn_worker::boot_clock::{BootClock, BootInstant};
 use ratn_worker::vitals::{CoreFailure, Vitals};
-use std::sync::mpsc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, mpsc};
 use std::thread;
 use std::time::Duration;
 use tokio::sync::watch;
@@ -72,6 +73,8 @@ pub(super) enum Speech {
 pub(super) struct MaySpeak {
     found: watch::Receiver<Found>,
     clock: BootClock,
+    /// The actor gives its place up.
+    loss_expected: Arc<AtomicBool>,
     _end: mpsc::Sender<()>,
 }
 
@@ -89,6 +92,8 @@ impl MaySpeak {
         let (tell, found) = watch::channel(first);
         let (end, ended) = mpsc::channel::<()>();
         let (looking, failing) = (clock.clone(), vitals.clone());
+        let loss_expected = Arc::<AtomicBool>::default();
+        let expected = loss_expected.clone();
         let keep = move || {
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(CONFIRM_INTERVAL) {
                 panic_point("may-speak");
@@ -100,6 +105,9 @@ impl MaySpeak {
                         };
                         tell.send_replace(Found { confirmed, unseen: None });
                         let Some(lost) = lost else { continue };
+                        if expected.load(Ordering::SeqCst) {
+                            return;
+                        }
                         // An actor that takes its turns ends by itself.
                         let hangs = || matches!(ended.recv_timeout(END_PATIENCE), Err(mpsc::RecvTimeoutError::Timeout));
                         if hangs() {
@@ -119,7 +127,7 @@ impl MaySpeak {
         thread::Builder::new()
             .name("may-speak".to_owned())
             .spawn(move || vitals.guard_blocking("the watch of its place", keep))?;
-        Ok(MaySpeak { found, clock, _end: end })
+        Ok(MaySpeak { found, clock, loss_expected, _end: end })
     }
 
     pub(super) fn now(&self) -> Speech {
@@ -129,6 +137,11 @@ impl MaySpeak {
             Confirmed::At(_) | Confirmed::NotYet => Speech::Held(found.unseen.clone()),
             Confirmed::Lost(fault) => Speech::Over(fault.clone()),
         }
+    }
+
+    /// From now on the place may be given up by the actor itself, however long it takes it to end then: that is no failure.
+    pub(super) fn expect_loss(&self) {
+        self.loss_expected.store(true, Ordering::SeqCst);
     }
 
     /// Returns after the next look.
@@ -162,7 +175,7 @@ fn look(clock: &BootClock, place: &dyn Place) -> Result<Confirmed, Fault> {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
-    use std::sync::{Arc, Mutex};
+    use std::sync::Mutex;
 
     /// A file system that hangs while a test holds the lock.
     #[derive(Debug)]
@@ -173,6 +186,31 @@ mod tests {
             drop(self.0.lock().unwrap());
             Ok(())
         }
+    }
+
+    /// Lost from a moment on.
+    #[derive(Debug)]
+    struct GivenUp(Arc<AtomicBool>);
+
+    impl Place for GivenUp {
+        fn check(&self) -> Result<(), Fault> {
+            match self.0.load(Ordering::SeqCst) {
+                true => Err(Fault::Deposed { place: "a test".to_owned() }),
+                false => Ok(()),
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_place_that_the_actor_gives_up_itself_is_no_failure_however_long_it_takes_to_end() {
+        let (given_up, vitals) = (Arc::<AtomicBool>::default(), Vitals::default());
+        let mut speech = MaySpeak::begin(Box::new(GivenUp(given_up.clone())), vitals.clone()).unwrap();
+        speech.expect_loss();
+        given_up.store(true, Ordering::SeqCst);
+        // Until the thread has ended.
+        while speech.found.changed().await.is_ok() {}
+        assert!(matches!(speech.now(), Speech::Over(_)));
+        assert_eq!(vitals.condition().borrow().failure, None);
     }
 
     #[tokio::test]

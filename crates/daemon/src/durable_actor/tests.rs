@@ -7,14 +7,15 @@ use super::{Core, Desk, Handle, Journal, JournalError, Journaled, start};
 use crate::config::StorageConfig;
 use bytes::Bytes;
 use ratn_model::time::Timestamp;
-use ratn_storage::{MakeSnapshot, Recovered};
+use ratn_storage::{MakeSnapshot, Recovered, Store};
 use ratn_worker::vitals::{CoreFailure, EXIT_CODE_FENCED, EXIT_CODE_PANICKED, Vitals};
-use std::convert::Infallible;
 use std::future::Future;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 use tokio::sync::{oneshot, watch};
+use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status};
 
@@ -38,6 +39,10 @@ enum Message {
     Pings(oneshot::Sender<usize>),
     /// Something is due after so long.
     Alarm(Duration),
+    /// Takes its time.
+    Work(Duration),
+    /// Something is said when it is on the disk, and what was said is taken back then.
+    Say,
     /// Whether it was.
     Rung(oneshot::Sender<bool>),
     Panic,
@@ -49,6 +54,20 @@ struct BlobCore {
     pings: usize,
     alarm: Option<Timestamp>,
     rung: bool,
+    /// How often the state was read anew.
+    restored: Arc<AtomicUsize>,
+    /// Is to be said.
+    says: bool,
+}
+
+/// As a grant that nobody waits for any more: a change of its own.
+struct TakenBack;
+
+impl BlobCore {
+    fn add(&mut self, length: usize) {
+        self.blobs.lengths.push(length);
+        self.blobs.entry = Some(vec![7; length]);
+    }
 }
 
 impl Journaled for Blobs {
@@ -66,7 +85,7 @@ impl Core for BlobCore {
     type State = Blobs;
     type Message = Message;
     type Urgent = oneshot::Sender<()>;
-    type Said = Infallible;
+    type Said = TakenBack;
     type Update = ();
     type Signal = ();
 
@@ -75,6 +94,7 @@ impl Core for BlobCore {
     }
 
     fn restore(&mut self, _: &Journal, _: &Desk<Self>) -> Result<(), JournalError> {
+        self.restored.fetch_add(1, Ordering::SeqCst);
         Ok(())
     }
 
@@ -91,14 +111,18 @@ impl Core for BlobCore {
     fn receive(&mut self, message: Message, desk: &mut Desk<Self>) {
         match message {
             Message::Add(length, answer) => {
-                self.blobs.lengths.push(length);
-                self.blobs.entry = Some(vec![7; length]);
+                self.add(length);
                 desk.reply(answer, Ok(self.blobs.lengths.len()));
             }
             Message::Count(answer) => desk.reply(answer, Ok(self.blobs.lengths.len())),
             Message::Taken(answer) => drop(answer.send(())),
             Message::Pings(answer) => drop(answer.send(self.pings)),
             Message::Alarm(after) => self.alarm = Some(desk.now() + after),
+            Message::Work(time) => std::thread::sleep(time),
+            Message::Say => {
+                self.add(1);
+                self.says = true;
+            }
             Message::Rung(answer) => drop(answer.send(self.rung)),
             Message::Panic => panic!("a defect"),
         }
@@ -111,10 +135,14 @@ impl Core for BlobCore {
 
     fn signal(&mut self, (): &(), _: &mut Desk<Self>) {}
 
-    fn collect(&mut self, _: &mut Desk<Self>) {}
+    fn collect(&mut self, desk: &mut Desk<Self>) {
+        if std::mem::take(&mut self.says) {
+            desk.say(TakenBack);
+        }
+    }
 
-    fn hand_out(&mut self, said: Infallible, _: &mut Desk<Self>) {
-        match said {}
+    fn hand_out(&mut self, TakenBack: TakenBack, _: &mut Desk<Self>) {
+        self.add(2);
     }
 
     fn refuse(message: Message, status: &Status) -> Option<Message> {
@@ -133,6 +161,19 @@ impl Core for BlobCore {
 }
 
 fn begin(place: &Path, disk: &SlowDisk) -> (Handle<BlobCore>, Vitals) {
+    let running = run(place, disk);
+    (running.handle, running.vitals)
+}
+
+struct Running {
+    handle: Handle<BlobCore>,
+    vitals: Vitals,
+    restored: Arc<AtomicUsize>,
+    over: CancellationToken,
+    ended: JoinHandle<()>,
+}
+
+fn run(place: &Path, disk: &SlowDisk) -> Running {
     let config = StorageConfig { compact_bytes: u64::MAX / 2, ..StorageConfig::default() };
     let log = Journal::log(&config, place).on(disk.files());
     let restore = |recovered: Recovered| -> Result<Blobs, std::fmt::Error> {
@@ -143,9 +184,10 @@ fn begin(place: &Path, disk: &SlowDisk) -> (Handle<BlobCore>, Vitals) {
     let vitals = Vitals::default();
     let signals = watch::Sender::new(()).subscribe();
     let (never, over) = (CancellationToken::new(), CancellationToken::new());
-    let (handle, _) =
-        start(BlobCore { blobs, ..BlobCore::default() }, journal, signals, vitals.clone(), never, over).unwrap();
-    (handle, vitals)
+    let restored = Arc::<AtomicUsize>::default();
+    let core = BlobCore { blobs, restored: restored.clone(), ..BlobCore::default() };
+    let (handle, ended) = start(core, journal, signals, vitals.clone(), never, over.clone()).unwrap();
+    Running { handle, vitals, restored, over, ended }
 }
 
 async fn in_time<T>(future: impl Future<Output = T>) -> T {
@@ -308,4 +350,42 @@ async fn a_message_is_taken_among_pings_without_end() {
         in_time(client).await.unwrap();
     }
     assert_eq!(in_time(handle.ask(Message::Pings)).await.unwrap(), clients * pings + 1, "and no ping is forgotten");
+}
+
+#[tokio::test]
+async fn an_actor_that_works_through_a_batch_is_seen_to_take_its_turns() {
+    let place = tempfile::tempdir().unwrap();
+    let (handle, vitals) = begin(place.path(), &SlowDisk::default());
+    assert_eq!(in_time(handle.request(Message::Count)).await.unwrap(), 0);
+    // They are taken together.
+    let before = vitals.beats().unwrap();
+    let messages = 32;
+    for _ in 0..messages {
+        handle.send_later(Message::Work(Duration::from_millis(5)));
+    }
+    in_time(handle.ask(Message::Taken)).await.unwrap();
+    let beats = vitals.beats().unwrap() - before;
+    assert!(beats >= messages, "{beats} signs of life in {messages} messages");
+}
+
+#[tokio::test]
+async fn what_is_taken_back_while_the_state_is_closed_is_written_and_nothing_is_read_for_that() {
+    let place = tempfile::tempdir().unwrap();
+    let disk = SlowDisk::default();
+    let Running { handle, vitals, restored, over, ended } = run(place.path(), &disk);
+    assert_eq!(in_time(handle.request(|answer| Message::Add(3, answer))).await.unwrap(), 1);
+    let hangs = disk.hang();
+    handle.send(Message::Say).await.unwrap();
+    in_time(handle.ask(Message::Taken)).await.unwrap();
+    over.cancel();
+    for _ in 0..10 {
+        tokio::task::yield_now().await;
+    }
+    drop(hangs);
+    in_time(ended).await.unwrap();
+    assert_eq!(restored.load(Ordering::SeqCst), 0, "the log was read");
+    assert_eq!(vitals.condition().borrow().unwell, None);
+    let read = Journal::log(&StorageConfig::default(), place.path()).read().unwrap();
+    let lengths: Vec<usize> = read.records.iter().map(|record| record.payload.len()).collect();
+    assert_eq!(lengths, [3, 1, 2]);
 }
