@@ -131,7 +131,8 @@ fn a_member_that_was_made_anew_as_a_cluster_of_its_own_begins_no_second_log() {
     };
     // Nobody can say whose log it would be.
     refused(&[&anew, &proxy.address], "several clusters");
-    // Most of them say nothing.
+    // Most of them say nothing, or one of two.
+    refused(&[&anew, &nobody], "only 1 of 2 members answer");
     refused(&[&anew, &nobody, &nobody], "only 1 of 3 members answer");
     let (_, mut writer) = store(ours.endpoints(), "/test/anew", "first").open().unwrap();
     append_durably(&mut *writer, b"ours");
@@ -647,6 +648,40 @@ fn a_restored_etcd_is_accepted_by_one_host_for_all() {
     }
 }
 
+#[test]
+fn a_leader_and_a_standby_notice_a_restored_etcd_while_a_member_of_the_old_one_still_runs_and_is_silent() {
+    if !is_there() {
+        return;
+    }
+    let kept = tempfile::tempdir().unwrap();
+    let file = kept.path().join("snapshot").display().to_string();
+    let mut cluster = Cluster::start(1, &[]);
+    // It will hold what it is asked for as long as nobody answers it.
+    let silent = Proxy::to(&cluster.members[0].client);
+    let endpoints = vec![silent.address.clone(), cluster.endpoints().remove(0)];
+    let (_, mut writer) = store(endpoints.clone(), "/test/minority", "leader").open().unwrap();
+    append_durably(&mut *writer, b"saved");
+    let standby = store(endpoints, "/test/minority", "standby");
+    for _ in 0..2 {
+        assert!(matches!(standby.open(), Err(OpenError::Held { .. })));
+    }
+    assert!(cluster.ctl(&["snapshot", "save", &file]).status.success());
+    silent.lose_answers(true);
+    cluster.restore(&file);
+    // It writes nothing.
+    let durable = writer.durable();
+    until("the leader goes on for ever", || durable.progress().fault.is_some());
+    let fault = durable.progress().fault.unwrap();
+    assert!(matches!(fault, Fault::Remote { .. }) && fault.to_string().contains("is of the cluster"), "{fault}");
+    let begin = Instant::now();
+    loop {
+        match standby.open().map(drop) {
+            Err(OpenError::Restored { .. }) => break,
+            other => assert!(begin.elapsed() < Duration::from_secs(20), "{other:?}"),
+        }
+    }
+}
+
 /// A server that refuses every call.
 fn refusing() -> (tokio::runtime::Runtime, String) {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
@@ -663,6 +698,8 @@ fn a_member_that_refuses_is_passed_over_as_long_as_another_one_answers() {
     }
     let cluster = Cluster::start(1, &[]);
     let (_runtime, refusing) = refusing();
+    // One of two members does not begin a log.
+    drop(store(cluster.endpoints(), "/test/refusing", "first").open().unwrap());
     let log = store([vec![refusing.clone()], cluster.endpoints()].concat(), "/test/refusing", "test");
     let (_, mut writer) = open(&log);
     append_durably(&mut *writer, b"performed");

@@ -89,8 +89,10 @@ pub(super) struct Client {
     current: AtomicUsize,
     /// etcd's number of the cluster; 0 before the first answer.
     cluster: Arc<AtomicU64>,
-    /// Nobody but members of another cluster answered.
+    /// The last call was answered by members of another cluster, and by nobody else.
     met_others: AtomicBool,
+    /// Since when all calls were that were answered at all, and what the first of them said.
+    only_others: Mutex<Option<(Instant, CallError)>>,
     /// The highest revision of etcd that was seen.
     seen: AtomicI64,
     /// The revision that was seen, and the lower one that came after it.
@@ -142,8 +144,9 @@ impl Client {
             |address: &String| Member { address: address.clone(), connect: connect.clone(), channel: Mutex::default() };
         let members = addresses.iter().map(member).collect();
         let (current, seen) = (AtomicUsize::new(0), AtomicI64::new(0));
-        let (cluster, met_others) = (Arc::default(), AtomicBool::new(false));
-        Ok(Client { members, current, cluster, met_others, seen, went_back: OnceLock::new(), runtime: Some(runtime) })
+        let (cluster, met_others, only_others) = (Arc::default(), AtomicBool::new(false), Mutex::default());
+        let (went_back, runtime) = (OnceLock::new(), Some(runtime));
+        Ok(Client { members, current, cluster, met_others, only_others, seen, went_back, runtime })
     }
 
     /// etcd's number of the cluster that counts; nothing before the first answer.
@@ -156,7 +159,7 @@ impl Client {
         let _ = self.cluster.compare_exchange(0, cluster, Ordering::SeqCst, Ordering::SeqCst);
     }
 
-    /// Whether the last call was answered by another cluster alone.
+    /// Whether the last call was answered by another cluster alone. Members of this one may have been asked, and silent.
     pub(super) fn has_met_others(&self) -> bool {
         self.met_others.load(Ordering::SeqCst)
     }
@@ -198,8 +201,8 @@ impl Client {
             return Err(error);
         }
         let known = self.seen.load(Ordering::SeqCst);
-        let answer = self.ask(request, patience.into());
-        self.met_others.store(matches!(answer, Err(CallError::OtherCluster { .. })), Ordering::SeqCst);
+        let (answer, others) = self.ask(request, patience.into());
+        self.note(&answer, others);
         let answer = answer?;
         let found = answer.header.as_ref().map_or(0, |header| header.revision);
         if found < known {
@@ -217,7 +220,26 @@ impl Client {
         self.went_back.get().is_some()
     }
 
-    fn went_back(&self) -> Option<CallError> {
+    /// Keeps who has answered.
+    fn note(&self, answer: &Result<TxnResponse, CallError>, others: Option<CallError>) {
+        self.met_others.store(others.is_some(), Ordering::SeqCst);
+        let mut only_others = self.only_others.lock().unwrap_or_else(PoisonError::into_inner);
+        match (answer, others) {
+            (Ok(_) | Err(CallError::NoSpace), _) => *only_others = None,
+            (_, Some(others)) => drop(only_others.get_or_insert((Instant::now(), others))),
+            // Nobody answered.
+            _ => {}
+        }
+    }
+
+    /// That nobody but another cluster has answered for at least so long, if that is so.
+    pub(super) fn only_others_for(&self, long: Duration) -> Option<CallError> {
+        let only_others = self.only_others.lock().unwrap_or_else(PoisonError::into_inner);
+        only_others.as_ref().filter(|(since, _)| since.elapsed() >= long).map(|(_, others)| others.clone())
+    }
+
+    /// That etcd knows less than it did, if that is so.
+    pub(super) fn went_back(&self) -> Option<CallError> {
         self.went_back.get().map(|(known, found)| CallError::WentBack { known: *known, found: *found })
     }
 
@@ -240,22 +262,32 @@ impl Client {
         }
     }
 
-    fn ask(&self, request: TxnRequest, patience: Patience) -> Result<TxnResponse, CallError> {
-        let unknown = |what: String| Err(CallError::Unknown(what));
+    /// The answer; where there is none, also what a member of another cluster said.
+    fn ask(&self, request: TxnRequest, patience: Patience) -> (Result<TxnResponse, CallError>, Option<CallError>) {
+        let unknown = |what: String| (Err(CallError::Unknown(what)), None);
         let (Some(runtime), true) = (&self.runtime, !self.members.is_empty()) else {
             return unknown("no address of a member is given".to_owned());
         };
         let first = self.current.load(Ordering::SeqCst);
         match blocking(runtime, hedged(self.members.clone(), self.cluster.clone(), first, request, patience)) {
-            Some((by, answered)) => {
+            Some(Asked { by, answer, others }) => {
                 if let Some(by) = by {
                     self.current.store(by, Ordering::SeqCst);
                 }
-                answered
+                (answer, others)
             }
             None => unknown("the client is ending".to_owned()),
         }
     }
+}
+
+/// What a call has come to.
+struct Asked {
+    /// Who answered.
+    by: Option<usize>,
+    answer: Result<TxnResponse, CallError>,
+    /// Nobody answered but a member of another cluster.
+    others: Option<CallError>,
 }
 
 /// Asks one after the other, round and round, each beside those that have not answered yet, and says who answered. A member whose own
@@ -266,7 +298,7 @@ async fn hedged(
     first: usize,
     request: TxnRequest,
     patience: Patience,
-) -> (Option<usize>, Result<TxnResponse, CallError>) {
+) -> Asked {
     let deadline = Instant::now() + patience.answer;
     let mut last = format!("nobody answered within {} ms", patience.answer.as_millis());
     let mut asked = JoinSet::new();
@@ -318,7 +350,7 @@ async fn hedged(
                     refused.insert(index, refusal);
                     until = until.min(Instant::now());
                 }
-                Some((index, answered)) => return (Some(index), answered),
+                Some((index, answer)) => return Asked { by: Some(index), answer, others: None },
                 None => {}
             }
         }
@@ -330,12 +362,13 @@ async fn hedged(
             break;
         }
     }
+    let others = refused.values().find(|refusal| matches!(refusal, CallError::OtherCluster { .. })).cloned();
     let answer = match refused.into_values().next() {
         Some(refusal) if silent.is_empty() => refusal,
         _ => CallError::Unknown(last),
     };
     silent.into_iter().for_each(|index| members[index].forget());
-    (None, Err(answer))
+    Asked { by: None, answer: Err(answer), others }
 }
 
 async fn ask_one(

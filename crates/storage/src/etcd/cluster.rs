@@ -2,7 +2,7 @@
 //! own, or an address leads to another etcd.
 //!
 //! A client is of one cluster for good. Where several answer when it begins, the one that has the log counts. A log is only begun where
-//! no other cluster could have it: at least half of the members have answered, all of one cluster, and none of them has the log.
+//! no other cluster could have it: more than half of the members have answered, all of one cluster, and none of them has the log.
 
 use super::client::{Client, cluster_of};
 use super::keys::{Keys, found_one, get, look};
@@ -68,7 +68,7 @@ pub(super) fn may_begin(client: &Client, keys: &Keys) -> Result<(), ReadError> {
         several(&said)
     } else if let Some(said) = said.iter().find(|said| said.has_log) {
         format!("{} has a log there by now", said.address)
-    } else if 2 * said.len() < asked {
+    } else if 2 * said.len() <= asked {
         format!("only {} of {asked} members answer", said.len())
     } else {
         return Ok(());

@@ -40,6 +40,8 @@ const LOOK_INTERVAL: Duration = Duration::from_millis(50);
 const RENEWAL_ASKS: usize = 2;
 /// A small transaction that takes longer comes too late.
 pub(super) const PATIENCE: Duration = Duration::from_millis(900);
+/// Where only another cluster answers for so long, the one of before is not waited for any more.
+pub(super) const OTHERS_PATIENCE: Duration = Duration::from_secs(5);
 /// After so long without an answer of any member there is no etcd.
 const REACH: Duration = Duration::from_secs(5);
 
@@ -365,6 +367,12 @@ impl Term {
         };
         self.unheard.store(matches!(renewed, Err(Fault::Remote { .. })), Ordering::SeqCst);
         renewed
+    }
+
+    /// Why the place will not be held again, whoever has it: etcd went back, or only another cluster has answered for long.
+    pub(super) fn is_gone(&self) -> Option<Fault> {
+        let error = self.client.went_back().or_else(|| self.client.only_others_for(OTHERS_PATIENCE))?;
+        Some(self.fault("keep", &error))
     }
 
     /// Whether whom the writer belongs to hangs. While it does, nothing is confirmed, and the place is not kept.

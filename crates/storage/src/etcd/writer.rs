@@ -14,7 +14,7 @@ use super::format::{Current, Head, Step, encode_frame, parse, text};
 use super::keys::{delete, found_one, get, put};
 use super::mark::{Height, Mark};
 use super::owner::Owner;
-use super::term::{HeldPlace, RENEW_INTERVAL, Term};
+use super::term::{HeldPlace, OTHERS_PATIENCE, RENEW_INTERVAL, Term};
 use super::wire::{RequestOp, TxnRequest};
 use crate::durable::Durable;
 use crate::error::{AppendError, CompactError, CompactionFailure, CopyError, Fault};
@@ -152,6 +152,11 @@ impl Shared {
             if let Some(fault) = self.pending.fault() {
                 return Err(fault);
             }
+            // A member of the cluster of before may run on, and hold what it is asked for.
+            let error = match error {
+                CallError::Unknown(_) => client.only_others_for(OTHERS_PATIENCE).unwrap_or(error),
+                error => error,
+            };
             let over = match &error {
                 CallError::Unknown(_) | CallError::NoSpace => false,
                 CallError::Refused(_) | CallError::OtherCluster { .. } => began.elapsed() >= REFUSED_PATIENCE,
@@ -299,12 +304,17 @@ impl Renewing {
             while let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(RENEW_INTERVAL) {
                 ratn_panic_point::panic_point("etcd-renewer");
                 renewed.owner_hangs(owner.hangs(taken.get().and_then(|taken| taken()), Instant::now()));
+                let over = match renewed.renew() {
+                    Err(fault @ Fault::Deposed { .. }) => Some(fault),
+                    Err(_) => renewed.is_gone(),
+                    Ok(()) => None,
+                };
+                keep(&kept, &tell);
                 // One that is found lost before there is a writer is found lost again.
-                if let (Err(fault @ Fault::Deposed { .. }), Some(writer)) = (renewed.renew(), tell.get()) {
+                if let (Some(fault), Some(writer)) = (over, tell.get()) {
                     writer.pending.stop(&fault);
                     return;
                 }
-                keep(&kept, &tell);
             }
             keep(&kept, &tell);
         };
