@@ -7,6 +7,9 @@
 //! One of what moves ([`Provider::start_at_rest`]) offers nothing at which an earlier goal still runs, and nothing before its driver has said
 //! that it is at rest. One that does not follow the leases of what moves (a process manager's, of its pooled drivers) offers what it has
 //! offered before, and the manager has lost, when the resource's bound for standstill has passed: those who held it may not have heard yet.
+//! An offer whose answer was lost counts as one that the manager had.
+
+mod bounds;
 
 use crate::action::STOP_GRACE;
 use crate::client::{CallError, Channels, ResourceClient};
@@ -14,6 +17,7 @@ use crate::endpoint::Endpoint;
 use crate::lease_watch::LeaseWatch;
 use crate::panic::exit_on_panic;
 use crate::session::{Session, SessionState};
+use bounds::Bounds;
 use futures::{StreamExt, stream};
 use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_proto::types::{Resource, ResourceEventKind, ResourceUpdate};
@@ -22,7 +26,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use tokio::sync::{Mutex, Notify, watch};
-use tokio::time::{Instant, timeout};
+use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::Code;
 
@@ -54,8 +58,8 @@ struct Shared {
     /// The session's id.
     session: String,
     state: watch::Receiver<SessionState>,
-    /// By id. Held during a call, so that an older state never overtakes a newer one.
-    desired: Mutex<BTreeMap<String, DesiredState>>,
+    /// Held during a call, so that an older state never overtakes a newer one.
+    desired: Mutex<Desired>,
     missing: Notify,
     /// Of the resources that are offered only where nothing moves.
     leases: Option<LeaseWatch>,
@@ -63,6 +67,14 @@ struct Shared {
     generation: AtomicU64,
     /// Of what is offered: what is watched.
     kinds: watch::Sender<BTreeSet<String>>,
+}
+
+/// What shall be at the manager, and what of it may not be offered yet.
+#[derive(Debug, Default)]
+struct Desired {
+    /// By id.
+    states: BTreeMap<String, DesiredState>,
+    bounds: Bounds,
 }
 
 /// What a resource shall be at the manager: there, or gone.
@@ -74,10 +86,21 @@ struct DesiredState {
     problem: String,
     /// The manager's words, where another session has a resource of the id.
     taken: Option<String>,
-    /// The manager has confirmed that it has the resource.
-    there: bool,
-    /// Something may move of it until then, for who held it before the manager lost it.
-    at_rest_from: Option<Instant>,
+    presence: Presence,
+    /// The widest bound for standstill that it was offered with.
+    standstill: Option<Duration>,
+}
+
+/// What is known of a resource at the manager.
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
+enum Presence {
+    /// The manager has not got it.
+    #[default]
+    Absent,
+    /// It was offered, and no answer has come: the manager may have it, and may have granted it.
+    Unknown,
+    /// The manager has confirmed that it has it.
+    There,
 }
 
 impl Provider {
@@ -147,7 +170,7 @@ impl Provider {
         let ids: BTreeSet<String> = resources.iter().map(|resource| resource.id.clone()).collect();
         for resource in resources {
             self.shared.watch_for(&resource.kind);
-            let entry = desired.entry(resource.id.clone()).or_default();
+            let entry = desired.states.entry(resource.id.clone()).or_default();
             entry.resource = Some(resource);
         }
         self.shared.ask(&mut desired, &ids).await
@@ -157,8 +180,8 @@ impl Provider {
     /// standstill has passed from now on.
     pub async fn may_move(&self, resources: &[Resource]) {
         let mut desired = self.shared.desired.lock().await;
-        for resource in resources.iter().filter(|resource| resource.standstill().is_some()) {
-            desired.entry(resource.id.clone()).or_default().lost(resource.standstill());
+        for resource in resources {
+            desired.bounds.lost(&resource.id, resource.standstill());
         }
     }
 
@@ -175,7 +198,7 @@ impl Provider {
     /// now: then it stays.
     pub async fn withdraw_unless_held(&self, id: &str) -> bool {
         let mut desired = self.shared.desired.lock().await;
-        let Some(resource) = desired.get(id).and_then(|entry| entry.resource.clone()) else { return true };
+        let Some(resource) = desired.states.get(id).and_then(|entry| entry.resource.clone()) else { return true };
         if !self.shared.state.borrow().alive {
             return false;
         }
@@ -186,7 +209,7 @@ impl Provider {
         match answered(&self.shared.client, self.shared.client.delete_matching(requirement)).await {
             Ok(deleted) => {
                 debug_assert_eq!(deleted, [id], "attributes of a resource are its own");
-                desired.remove(id);
+                desired.states.remove(id);
                 true
             }
             Err(error) => {
@@ -201,7 +224,7 @@ impl Provider {
         if let Some(resource) = &resource {
             self.shared.watch_for(&resource.kind);
         }
-        desired.entry(id.clone()).or_default().resource = resource;
+        desired.states.entry(id.clone()).or_default().resource = resource;
         let asked = self.shared.ask(&mut desired, &BTreeSet::from([id])).await;
         asked.into_iter().next().map_or(Ok(true), |(_, done)| done)
     }
@@ -209,12 +232,12 @@ impl Provider {
     /// Why the manager has not got a resource that is offered: another session has one of its id. That session may end, so it is
     /// offered again all the same.
     pub async fn refusal(&self, id: &str) -> Option<String> {
-        self.shared.desired.lock().await.get(id).and_then(|entry| entry.taken.clone())
+        self.shared.desired.lock().await.states.get(id).and_then(|entry| entry.taken.clone())
     }
 
     /// What is offered, by id.
     pub async fn offered(&self) -> Vec<Resource> {
-        self.shared.desired.lock().await.values().filter_map(|entry| entry.resource.clone()).collect()
+        self.shared.desired.lock().await.states.values().filter_map(|entry| entry.resource.clone()).collect()
     }
 }
 
@@ -236,8 +259,10 @@ impl Shared {
     /// A resource is gone. What was to be there, and was, is offered again.
     async fn vanished(&self, id: &str, reason: &str) {
         let mut desired = self.desired.lock().await;
-        let Some(entry) = desired.get_mut(id).filter(|entry| entry.there && entry.resource.is_some()) else { return };
-        entry.gone();
+        let Desired { states, bounds } = &mut *desired;
+        let is_known = |entry: &&mut DesiredState| entry.presence != Presence::Absent && entry.resource.is_some();
+        let Some(entry) = states.get_mut(id).filter(is_known) else { return };
+        entry.gone(id, bounds);
         if self.state.borrow().alive {
             tracing::warn!(
                 resource = id,
@@ -250,19 +275,20 @@ impl Shared {
 
     /// Asks for these, several at a time, if the session lives: true for what is so now, false for what will be asked for again. What
     /// is gone, or refused for good, is not desired any more.
-    async fn ask(
-        &self,
-        desired: &mut BTreeMap<String, DesiredState>,
-        ids: &BTreeSet<String>,
-    ) -> Vec<(String, Result<bool, CallError>)> {
+    async fn ask(&self, desired: &mut Desired, ids: &BTreeSet<String>) -> Vec<(String, Result<bool, CallError>)> {
         if !self.state.borrow().alive {
             self.missing.notify_one();
             return ids.iter().map(|id| (id.clone(), Ok(false))).collect();
         }
         self.look_at_session(desired);
         let (moving, ids): (BTreeSet<&String>, BTreeSet<&String>) = ids.iter().partition(|id| self.moves(desired, id));
-        let wished = ids.iter().filter_map(|&id| Some((id.clone(), desired.get(id)?.resource.clone())));
-        let asked: Vec<_> = wished.map(|(id, resource)| ask(self.client.clone(), id, resource)).collect();
+        let mut before = BTreeMap::new();
+        let mut asked = Vec::with_capacity(ids.len());
+        for id in ids {
+            let Some(entry) = desired.states.get_mut(id) else { continue };
+            before.insert(id.clone(), entry.asked());
+            asked.push(ask(self.client.clone(), id.clone(), entry.resource.clone()));
+        }
         let answers: Vec<_> = stream::iter(asked).buffer_unordered(AT_ONCE).collect().await;
         let mut concluded = Vec::with_capacity(answers.len() + moving.len());
         for id in moving {
@@ -271,12 +297,13 @@ impl Shared {
             concluded.push((id.clone(), Ok(false)));
         }
         for (id, answer) in answers {
-            let Some(entry) = desired.get_mut(&id) else { continue };
+            let Some(entry) = desired.states.get_mut(&id) else { continue };
+            entry.learn(&id, before.get(&id).copied().unwrap_or_default(), &answer, &mut desired.bounds);
             let done = entry.conclude(&id, answer);
             match &done {
                 Ok(false) => self.missing.notify_one(),
                 Ok(true) if entry.resource.is_some() => {}
-                Ok(true) | Err(_) => drop(desired.remove(&id)),
+                Ok(true) | Err(_) => drop(desired.states.remove(&id)),
             }
             concluded.push((id, done));
         }
@@ -284,20 +311,21 @@ impl Shared {
     }
 
     /// Of a session that was made anew nothing is there of before.
-    fn look_at_session(&self, desired: &mut BTreeMap<String, DesiredState>) {
+    fn look_at_session(&self, Desired { states, bounds }: &mut Desired) {
         let generation = self.state.borrow().generation;
         if self.generation.swap(generation, Ordering::SeqCst) != generation {
-            desired.values_mut().for_each(DesiredState::gone);
+            states.iter_mut().for_each(|(id, entry)| entry.gone(id, bounds));
         }
     }
 
     /// Whether something still moves of what the manager has not got, or may.
-    fn moves(&self, desired: &BTreeMap<String, DesiredState>, id: &str) -> bool {
-        let missing = desired.get(id).filter(|entry| entry.resource.is_some() && !entry.there);
-        missing.is_some_and(|entry| match &self.leases {
-            Some(leases) => !leases.is_at_rest(id),
-            None => entry.at_rest_from.is_some_and(|from| Instant::now() < from),
-        })
+    fn moves(&self, desired: &Desired, id: &str) -> bool {
+        let missing = |entry: &DesiredState| entry.resource.is_some() && entry.presence != Presence::There;
+        desired.states.get(id).is_some_and(missing)
+            && match &self.leases {
+                Some(leases) => !leases.is_at_rest(id),
+                None => desired.bounds.may_move(id),
+            }
     }
 }
 
@@ -323,14 +351,42 @@ async fn answered<T>(
 
 impl DesiredState {
     /// The manager has not got it any more, and who held it may move it within its bound.
-    fn gone(&mut self) {
-        if std::mem::take(&mut self.there) {
-            self.lost(self.resource.as_ref().and_then(Resource::standstill));
+    fn gone(&mut self, id: &str, bounds: &mut Bounds) {
+        if std::mem::take(&mut self.presence) != Presence::Absent {
+            bounds.lost(id, self.standstill);
         }
     }
 
-    fn lost(&mut self, bound: Option<Duration>) {
-        self.at_rest_from = self.at_rest_from.max(bound.map(|bound| Instant::now() + bound));
+    /// The manager is being asked for it; what was known of it before.
+    fn asked(&mut self) -> Presence {
+        let before = self.presence;
+        if let Some(resource) = &self.resource {
+            self.standstill = self.standstill.max(resource.standstill());
+            if before == Presence::Absent {
+                self.presence = Presence::Unknown;
+            }
+        }
+        before
+    }
+
+    /// What an answer says of whether the manager has it, or had it meanwhile.
+    fn learn(&mut self, id: &str, before: Presence, answer: &Result<(), CallError>, bounds: &mut Bounds) {
+        match answer {
+            Ok(()) if self.resource.is_some() => self.presence = Presence::There,
+            // Withdrawn: who held it has lost it, and may not have heard yet.
+            Ok(()) => self.gone(id, bounds),
+            Err(error) => match error.code() {
+                None | Some(Code::DeadlineExceeded) => {}
+                // Created and gone since, or gone before it was withdrawn.
+                Some(Code::NotFound) => self.gone(id, bounds),
+                // The session is not known any more, nor what was offered in it.
+                Some(Code::FailedPrecondition) => {
+                    self.presence = before;
+                    self.gone(id, bounds);
+                }
+                Some(_) => self.presence = before,
+            },
+        }
     }
 
     /// Whether it is so now; an error where it never will be.
@@ -351,8 +407,6 @@ impl DesiredState {
         }
         self.problem.clear();
         self.taken = None;
-        self.there = self.resource.is_some();
-        self.at_rest_from = None;
         Ok(true)
     }
 }
@@ -396,7 +450,7 @@ async fn restore(shared: Arc<Shared>) {
 /// Asks for everything; whether all is so (or refused for good).
 async fn ask_for_all(shared: &Shared) -> bool {
     let mut desired = shared.desired.lock().await;
-    let ids = desired.keys().cloned().collect();
+    let ids = desired.states.keys().cloned().collect();
     let mut all = true;
     for (id, done) in shared.ask(&mut desired, &ids).await {
         match done {
@@ -425,8 +479,9 @@ async fn watch_own(shared: Arc<Shared>) {
 
 async fn watch_kinds(shared: &Shared, kinds: &BTreeSet<String>) {
     let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
-    let there = |desired: &BTreeMap<String, DesiredState>| -> BTreeSet<String> {
-        desired.iter().filter(|(_, entry)| entry.there).map(|(id, _)| id.clone()).collect()
+    let there = |desired: &Desired| -> BTreeSet<String> {
+        let there = desired.states.iter().filter(|(_, entry)| entry.presence == Presence::There);
+        there.map(|(id, _)| id.clone()).collect()
     };
     // Known before the snapshot is made: what is not in it is gone.
     let before = there(&*shared.desired.lock().await);

@@ -39,6 +39,8 @@ struct Pool {
     made: u64,
     /// So many creations are never answered, and change nothing.
     unanswered: usize,
+    /// Creations are done, their answers are held back, and then lost.
+    loses_answers: bool,
     /// Pings that arrived.
     pings: usize,
     /// So many pings break their stream.
@@ -87,25 +89,31 @@ impl ResourceService for Manager {
         if is_unanswered {
             return std::future::pending().await;
         }
-        let mut pool = self.pool.lock().unwrap();
-        if !pool.sessions.contains_key(&request.session_id) {
-            return Err(Status::failed_precondition("no such session"));
-        }
-        let resource = request.resource.unwrap();
-        if resource.kind == "Forbidden" {
-            return Err(Status::permission_denied("not here"));
-        }
-        if pool.taken.contains(&resource.id) {
-            return Err(Status::already_exists("another session has it"));
-        }
-        if let Some(left) = pool.short_lived.checked_sub(1) {
-            pool.short_lived = left;
-            return Err(Status::not_found("created by this request and gone since"));
-        }
-        let resource = ratn_proto::v1::Resource { session_id: request.session_id, ..resource };
-        pool.resources.insert(resource.id.clone(), resource.clone());
-        drop(pool);
+        let (resource, is_lost) = {
+            let mut pool = self.pool.lock().unwrap();
+            if !pool.sessions.contains_key(&request.session_id) {
+                return Err(Status::failed_precondition("no such session"));
+            }
+            let resource = request.resource.unwrap();
+            if resource.kind == "Forbidden" {
+                return Err(Status::permission_denied("not here"));
+            }
+            if pool.taken.contains(&resource.id) {
+                return Err(Status::already_exists("another session has it"));
+            }
+            if let Some(left) = pool.short_lived.checked_sub(1) {
+                pool.short_lived = left;
+                return Err(Status::not_found("created by this request and gone since"));
+            }
+            let resource = ratn_proto::v1::Resource { session_id: request.session_id, ..resource };
+            pool.resources.insert(resource.id.clone(), resource.clone());
+            (resource, pool.loses_answers)
+        };
         self.changed.send_replace(());
+        if is_lost {
+            self.until(|pool| !pool.loses_answers).await;
+            return Err(Status::unavailable("the connection broke"));
+        }
         Ok(Response::new(CreateResponse { resource: Some(resource) }))
     }
 
@@ -722,6 +730,63 @@ async fn what_may_still_move_for_who_held_it_under_a_lapsed_session_is_offered_a
     provider.may_move(&[other.clone(), planner]).await;
     assert!(!provider.offer(other).await.unwrap() || began.elapsed() >= bound);
     manager.until(|pool| pool.resources.contains_key("other@sim")).await;
+    assert!(began.elapsed() >= bound, "after {:?}", began.elapsed());
+}
+
+#[tokio::test]
+async fn what_was_offered_with_an_answer_that_was_lost_is_offered_again_when_its_bound_has_passed() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open(&channels, &endpoint, "pools", TTL);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    let bound = Duration::from_millis(1_500);
+    manager.pool.lock().unwrap().loses_answers = true;
+    let lost = async {
+        manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+        // Somebody may hold it by now. The session ends and is made anew before the answer is known to be lost.
+        {
+            let mut pool = manager.pool.lock().unwrap();
+            pool.sessions.clear();
+            pool.resources.clear();
+        }
+        session.state().wait_for(|state| state.generation == 2).await.unwrap();
+        manager.pool.lock().unwrap().loses_answers = false;
+        manager.changed.send_replace(());
+        Instant::now()
+    };
+    let (offered, began) = tokio::join!(provider.offer(arm().with_standstill(bound)), lost);
+    assert!(!offered.unwrap());
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    assert!(began.elapsed() >= bound, "after {:?}", began.elapsed());
+}
+
+#[tokio::test]
+async fn a_bound_for_standstill_stays_where_the_resource_is_withdrawn_and_wanted_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let channels = Channels::new();
+    let session = Session::open(&channels, &endpoint, "pools", LONG);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    let bound = Duration::from_millis(700);
+    let moving = arm().with_standstill(bound);
+    let began = Instant::now();
+    provider.may_move(std::slice::from_ref(&moving)).await;
+    assert!(provider.withdraw("arm@sim").await.unwrap());
+    assert!(!provider.offer(moving.clone()).await.unwrap() || began.elapsed() >= bound);
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    assert!(began.elapsed() >= bound, "after {:?}", began.elapsed());
+    // Whoever held it when it was withdrawn has lost it as well.
+    let began = Instant::now();
+    assert!(provider.withdraw("arm@sim").await.unwrap());
+    assert!(!provider.offer(moving).await.unwrap() || began.elapsed() >= bound);
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
     assert!(began.elapsed() >= bound, "after {:?}", began.elapsed());
 }
 
