@@ -64,7 +64,7 @@ impl Pool {
         let kinds = self.resources.kinds();
         let lacking = selectors.filter_map(|key| {
             let group = self.queue.groups.get(key)?;
-            let first = group.hopeless.first()?;
+            let first = group.lacking.first()?;
             let is_provided = kinds.subclasses(&group.selector.kind).any(|kind| self.queue.provided.contains(kind));
             let amount = if is_provided { self.missing(key, group) } else { Quantity::ZERO };
             (!amount.is_zero()).then_some((*first, key, amount))
@@ -84,13 +84,9 @@ impl Pool {
         let counted =
             if group.divisible == 0 { group.by_amount.iter().rev().take(LOOKED_AT).find(counts) } else { None };
         let counted = counted.map(|(amount, _)| amount.saturating_sub(group.existing)).unwrap_or_default();
-        let found = |place: &Place| {
-            let waiter = self.queue.get(place.1)?;
-            let of_group = waiter.groups.iter().zip(&waiter.missing).filter(|(other, _)| *other == key);
-            of_group.map(|(_, amount)| *amount).max()
-        };
-        let to_look_at = if group.divisible == 0 { &group.several } else { &group.hopeless };
-        let looked_at = to_look_at.iter().filter(|place| group.hopeless.contains(*place)).take(LOOKED_AT);
+        let found = |place: &Place| self.queue.get(place.1).map(|waiter| waiter.missing_of(key));
+        let is_looked_at = |place: &&Place| group.divisible > 0 || group.several.contains(*place);
+        let looked_at = group.lacking.iter().filter(is_looked_at).take(LOOKED_AT);
         looked_at.filter_map(found).max().unwrap_or_default().max(counted)
     }
 

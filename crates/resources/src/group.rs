@@ -25,8 +25,8 @@ pub(crate) struct Group {
     pub(crate) by_amount: BTreeSet<(Quantity, Place)>,
     /// Those of them with several requirements in the family, and those who want parts of units: for these it is not enough to count.
     pub(crate) several: BTreeSet<Place>,
-    /// Those of them for whom what exists would not do.
-    pub(crate) hopeless: BTreeSet<Place>,
+    /// Those of them for whom what exists would not do, and who lack something of it.
+    pub(crate) lacking: BTreeSet<Place>,
     /// Requirements in it.
     pub(crate) members: usize,
     /// How much there is, held or not.
@@ -80,8 +80,8 @@ impl Group {
         let free = (!resources.fits_every(&selector))
             .then(|| resources.free(&selector).map(|(slot, _)| slot).collect::<BTreeSet<Slot>>());
         let (existing, divisible) = (resources.quantity(&selector), resources.divisible(&selector));
-        let (wanting, by_amount, several, hopeless) = Default::default();
-        Group { selector, family, wanting, by_amount, several, hopeless, members: 0, existing, divisible, free }
+        let (wanting, by_amount, several, lacking) = Default::default();
+        Group { selector, family, wanting, by_amount, several, lacking, members: 0, existing, divisible, free }
     }
 
     pub(crate) fn fits(&self, resources: &Resources, description: &Description) -> bool {

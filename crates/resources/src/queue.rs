@@ -112,6 +112,11 @@ impl Waiter {
     pub(crate) fn place(&self, id: WaiterId) -> Place {
         (Reverse(self.request.priority), id)
     }
+
+    /// What was missing of a group when what exists would last not have done.
+    pub(crate) fn missing_of(&self, key: &Key) -> Quantity {
+        self.groups.iter().zip(&self.missing).filter(|(other, _)| *other == key).map(|(_, amount)| *amount).sum()
+    }
 }
 
 impl Queue {
@@ -186,17 +191,20 @@ impl Queue {
         Some(next)
     }
 
-    /// Whether what exists would do for this one is known; whether that is otherwise than before.
+    /// Whether what exists would do for this one is known; whether that is otherwise than before. Of whoever is hopeless, its groups learn
+    /// whether something of them is missing.
     pub(crate) fn set_hopeless(&mut self, place: Place, hopeless: bool) -> bool {
         let changed = if hopeless { self.hopeless.insert(place) } else { self.hopeless.remove(&place) };
-        if changed {
-            for key in self.waiters.get(&place.1).into_iter().flat_map(|waiter| &waiter.groups) {
-                let Some(group) = self.groups.get_mut(key) else { continue };
-                if hopeless {
-                    group.hopeless.insert(place)
-                } else {
-                    group.hopeless.remove(&place)
-                };
+        if !hopeless && !changed {
+            return false;
+        }
+        let Some(waiter) = self.waiters.get(&place.1) else { return changed };
+        for key in &waiter.groups {
+            let Some(group) = self.groups.get_mut(key) else { continue };
+            if hopeless && !waiter.missing_of(key).is_zero() {
+                group.lacking.insert(place);
+            } else {
+                group.lacking.remove(&place);
             }
         }
         changed
@@ -225,15 +233,16 @@ impl Queue {
             ensure(self.ready.contains(&place) == ready, "who is ready is not among them")?;
             let known = self.hopeless.contains(&place) != waiter.hopeful || self.doubtful.contains(&place);
             ensure(known, "who is hopeless is not among them")?;
-            let groups = waiter.groups.iter().filter_map(|key| self.groups.get(key));
+            let groups = waiter.groups.iter().filter_map(|key| Some((key, self.groups.get(key)?)));
             let hopeless = self.hopeless.contains(&place);
-            let agrees = groups.clone().all(|group| group.hopeless.contains(&place) == hopeless);
-            ensure(agrees, "a group has somebody hopeless who is not, or not one who is")?;
+            let lacks = |key| hopeless && !waiter.missing_of(key).is_zero();
+            let agrees = groups.into_iter().all(|(key, group)| group.lacking.contains(&place) == lacks(key));
+            ensure(agrees, "a group has somebody who lacks nothing of it, or not one who does")?;
         }
         ensure(self.hopeless.len() <= self.waiters.len(), "somebody hopeless has left")?;
         ensure(reserved == self.reserved, "what is reserved is not what waiters have reserved")?;
         ensure(self.groups.values().map(|group| group.members).sum::<usize>() == members, "a group miscounts")?;
-        let known = self.groups.values().all(|group| group.hopeless.is_subset(&self.hopeless));
+        let known = self.groups.values().all(|group| group.lacking.is_subset(&self.hopeless));
         ensure(known, "somebody hopeless has left, and not the group")?;
         ensure(self.groups.is_empty() == self.families.is_empty(), "a family without a group")
     }

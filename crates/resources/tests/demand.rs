@@ -141,3 +141,32 @@ fn what_nobody_provides_takes_no_room_from_what_somebody_does() {
     assert_eq!(told(&mut pool, &["Planner", "Ghost-7"]), Some(vec!["Ghost-7".to_owned(), "Planner".to_owned()]));
     assert_eq!(told(&mut pool, &[]), Some(vec![]));
 }
+
+#[test]
+fn those_who_lack_nothing_of_a_kind_do_not_hide_who_does() {
+    let mut pool = pool();
+    create(&mut pool, planner());
+    create(&mut pool, planner());
+    // Hopeless for the ghost, which nobody provides; planners there are enough.
+    for _ in 0..65 {
+        ask(&mut pool, "eve", 0, vec![block("Planner", 1), block("Planner", 1), block("Ghost", 1)]);
+    }
+    ask(&mut pool, "adam", 0, vec![block("Planner", 2), block("Planner", 1)]);
+    pool.check_invariants().unwrap();
+    let provided = Arc::new(["Planner".to_owned()].into());
+    let missing = |pool: &mut Pool| {
+        let demand = pool.take_demand(&provided).unwrap();
+        demand.into_iter().map(|demand| demand.requirement.count).collect::<Vec<_>>()
+    };
+    assert_eq!(missing(&mut pool), [Quantity::ONE]);
+    // One planner less, and all of them lack one: the most urgent come first, he when they do not lack it any more.
+    pool.delete(NOW, None, "Planner-1").unwrap();
+    for expected in [vec![Quantity::ONE], vec![Quantity::ONE], vec![]] {
+        while pool.next_deadline() == Some(NOW) {
+            pool.advance(NOW);
+        }
+        pool.check_invariants().unwrap();
+        assert_eq!(missing(&mut pool), expected);
+        create(&mut pool, planner());
+    }
+}
