@@ -1,15 +1,22 @@
 //! The slow and exact check: every shape of the robot as the URDF has it, against every obstacle, by parry3d.
 //!
-//! It confirms what the vector kernels found, and says what touches what and how deep.
+//! It confirms what the vector kernels found, and says what touches what and how deep. A closed mesh is solid: what is wholly inside
+//! touches it, too.
 
+use crate::cloud::Cloud;
 use crate::frame::compose;
+use crate::geometry::Body;
+use crate::inside::Inside;
 use crate::mechanism::Mechanism;
+use crate::mesh::Mesh;
 use crate::robot::to_f32;
 use crate::space::Obstacle;
-use parry3d::math::Pose as Pose32;
+use crate::surroundings::{MeshObstacle, Surroundings};
+use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::query;
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
+use std::collections::BTreeSet;
 use std::fmt;
 
 /// Two things that touch.
@@ -33,50 +40,105 @@ impl fmt::Display for Touch {
 #[derive(Debug)]
 pub struct Exact<'a> {
     mechanism: &'a Mechanism,
-    obstacles: Vec<Solid<'a>>,
+    obstacles: Vec<(&'a str, Shape)>,
+    clouds: &'a [Cloud],
     /// Per link.
     bodies: Vec<Vec<Shape>>,
     /// Links that are to be kept apart.
     pairs: Vec<(usize, usize)>,
 }
 
-/// What a link has: its pose there, its shape, and how near to it is as good as touching, in metres.
+/// What a link or an obstacle has: its pose there, its shape, and how near to it is as good as touching, in metres.
 #[derive(Debug)]
 struct Shape {
     at: Pose,
     shape: SharedShape,
     skin: f32,
+    /// Of a mesh; other shapes are solid by themselves.
+    inside: Option<Inside>,
 }
 
 /// A shape in its place.
 struct Placed<'s> {
     pose: Pose32,
-    shape: &'s SharedShape,
-    skin: f32,
+    shape: &'s Shape,
 }
 
-#[derive(Debug)]
-struct Solid<'a> {
-    name: &'a str,
-    pose: Pose32,
-    shape: SharedShape,
+impl Shape {
+    fn primitive(body: &Body, padding_m: f64) -> Shape {
+        Shape { at: body.pose, shape: body.geometry.shape(padding_m), skin: 0.0, inside: None }
+    }
+
+    fn mesh(at: Pose, mesh: &Mesh, padding_m: f64) -> Shape {
+        Shape { at, shape: mesh.shape(), skin: padding_m as f32, inside: Some(Inside::new(mesh)) }
+    }
+}
+
+impl Placed<'_> {
+    /// How deep this is in another shape whose surface it does not meet: as deep as the deepest of its parts, by a point of each.
+    fn depth_inside(&self, other: &Placed<'_>) -> Option<f64> {
+        let centre = [[0.0; 3]];
+        let points = self.shape.inside.as_ref().map_or(&centre[..], Inside::corners);
+        let deep = |point: &[f64; 3]| {
+            let [x, y, z] = point.map(|c| c as f32);
+            let at = other.pose.inverse_transform_point(self.pose.transform_point(Vector::new(x, y, z)));
+            let is_inside = match &other.shape.inside {
+                Some(inside) => inside.contains([at.x, at.y, at.z].map(f64::from)),
+                None => other.shape.shape.contains_local_point(at),
+            };
+            let surface = || other.shape.shape.project_local_point(at, false).point;
+            is_inside.then(|| f64::from((surface() - at).length()))
+        };
+        points.iter().filter_map(deep).reduce(f64::max)
+    }
+
+    /// How deep the deepest ball of a cloud is in this.
+    fn depth_in(&self, cloud: &Cloud) -> Option<f64> {
+        let mut deepest = None;
+        self.meet(cloud, 0.0, &mut |_, depth| {
+            deepest = Some(deepest.map_or(depth, |d: f32| d.max(depth)));
+            true
+        });
+        deepest.map(f64::from)
+    }
+
+    /// Shows the balls of a cloud that come within a margin, by number, and how deep they are in that.
+    fn meet(&self, cloud: &Cloud, margin: f32, wants_more: &mut dyn FnMut(usize, f32) -> bool) {
+        let reach = cloud.radius_m() as f32 + self.shape.skin + margin;
+        let shape = &self.shape.shape;
+        let around = shape.compute_aabb(&self.pose);
+        let (least, greatest) = (around.mins - Vector::splat(reach), around.maxs + Vector::splat(reach));
+        cloud.visit(least.into(), greatest.into(), &mut |point, [x, y, z]| {
+            let at = self.pose.inverse_transform_point(Vector::new(x, y, z));
+            let projection = shape.project_local_point(at, false);
+            let is_inside = match &self.shape.inside {
+                Some(inside) => inside.contains([at.x, at.y, at.z].map(f64::from)),
+                None => projection.is_inside,
+            };
+            let gap = (projection.point - at).length() * if is_inside { -1.0 } else { 1.0 };
+            gap >= reach || wants_more(point, reach - gap)
+        });
+    }
 }
 
 impl<'a> Exact<'a> {
     /// A robot among obstacles.
-    pub fn new(mechanism: &'a Mechanism, obstacles: &'a [Obstacle]) -> Exact<'a> {
+    pub fn new(mechanism: &'a Mechanism, surroundings: impl Into<Surroundings<'a>>) -> Exact<'a> {
+        let Surroundings { obstacles, clouds, meshes } = surroundings.into();
+        let meshed = |mesh: &'a MeshObstacle| (&*mesh.name, Shape::mesh(mesh.pose, &mesh.mesh, 0.0));
         let solid = |obstacle: &'a Obstacle| {
             let body = obstacle.geometry.at(obstacle.pose);
-            Solid { name: &obstacle.name, pose: to_f32(&body.pose), shape: body.geometry.shape(0.0) }
+            (&*obstacle.name, Shape::primitive(&body, 0.0))
         };
         let bodies = |link: &crate::mechanism::Part| {
-            let primitives = link.bodies.iter().map(|b| (b.pose, b.geometry.shape(link.padding_m), 0.0));
-            let meshes = link.meshes.iter().map(|m| (m.pose, m.mesh.shape(), link.padding_m as f32));
-            primitives.chain(meshes).map(|(at, shape, skin)| Shape { at, shape, skin }).collect()
+            let primitives = link.bodies.iter().map(|body| Shape::primitive(body, link.padding_m));
+            let meshes = link.meshes.iter().map(|m| Shape::mesh(m.pose, &m.mesh, link.padding_m));
+            primitives.chain(meshes).collect()
         };
         Exact {
             mechanism,
-            obstacles: obstacles.iter().map(solid).collect(),
+            obstacles: obstacles.iter().map(solid).chain(meshes.iter().map(meshed)).collect(),
+            clouds,
             bodies: mechanism.links.iter().map(bodies).collect(),
             pairs: mechanism.pairs(),
         }
@@ -109,24 +171,50 @@ impl<'a> Exact<'a> {
         deepest
     }
 
+    /// The numbers of a cloud's points whose balls come within `margin_m` metres of the robot.
+    pub(crate) fn points_near(&self, positions: &[f64], cloud: &Cloud, margin_m: f64) -> BTreeSet<usize> {
+        let mut near = BTreeSet::new();
+        for body in self.placed(positions).iter().flatten() {
+            body.meet(cloud, margin_m as f32, &mut |point, _| {
+                near.insert(point);
+                true
+            });
+        }
+        near
+    }
+
+    fn placed(&self, positions: &[f64]) -> Vec<Vec<Placed<'_>>> {
+        let poses = self.mechanism.poses(positions);
+        let mut placed = Vec::with_capacity(self.bodies.len());
+        for (shapes, link) in self.bodies.iter().zip(&poses) {
+            placed.push(shapes.iter().map(|shape| Placed { pose: to_f32(&compose(link, &shape.at)), shape }).collect());
+        }
+        placed
+    }
+
     /// Shows touches until it hears that no more are wanted.
     fn visit(&self, positions: &[f64], wants_more: &mut dyn FnMut(Touch) -> bool) {
-        let poses = self.mechanism.poses(positions);
-        let mut placed: Vec<Vec<Placed<'_>>> = Vec::with_capacity(self.bodies.len());
-        for (shapes, link) in self.bodies.iter().zip(&poses) {
-            let place = |s: &'_ Shape| to_f32(&compose(link, &s.at));
-            placed.push(shapes.iter().map(|s| Placed { pose: place(s), shape: &s.shape, skin: s.skin }).collect());
-        }
+        let placed = self.placed(positions);
         let name = |link: usize| self.mechanism.links[link].name.clone();
         for (link, bodies) in placed.iter().enumerate() {
             for body in bodies {
-                for solid in self.obstacles.iter().filter(|o| self.mechanism.is_kept_from(link, o.name)) {
-                    let other = Placed { pose: solid.pose, shape: &solid.shape, skin: 0.0 };
+                for (obstacle, shape) in self.obstacles.iter().filter(|o| self.mechanism.is_kept_from(link, o.0)) {
+                    let other = Placed { pose: to_f32(&shape.at), shape };
                     if let Some(depth_m) = depth(body, &other)
-                        && !wants_more(Touch { link: name(link), other: solid.name.to_owned(), depth_m })
+                        && !wants_more(Touch { link: name(link), other: (*obstacle).to_owned(), depth_m })
                     {
                         return;
                     }
+                }
+            }
+        }
+        for (link, bodies) in placed.iter().enumerate() {
+            for cloud in self.clouds.iter().filter(|cloud| self.mechanism.is_kept_from(link, &cloud.name)) {
+                let deepest = bodies.iter().filter_map(|body| body.depth_in(cloud)).reduce(f64::max);
+                if let Some(depth_m) = deepest
+                    && !wants_more(Touch { link: name(link), other: cloud.name.clone(), depth_m })
+                {
+                    return;
                 }
             }
         }
@@ -158,19 +246,27 @@ impl<'a> Exact<'a> {
     }
 }
 
-/// How deep two shapes are in each other, if they touch; a pair that parry cannot decide counts as touching.
+/// How deep two shapes are in each other, if they touch or one is inside the other; a pair that parry cannot decide counts as touching.
 fn depth(a: &Placed<'_>, b: &Placed<'_>) -> Option<f64> {
-    let skin = a.skin + b.skin;
+    let meshes = a.shape.inside.is_some() || b.shape.inside.is_some();
+    // parry3d knows only the surface of a mesh.
+    let inside = || if meshes { a.depth_inside(b).or_else(|| b.depth_inside(a)) } else { None };
+    surfaces(a, b).or_else(inside)
+}
+
+fn surfaces(a: &Placed<'_>, b: &Placed<'_>) -> Option<f64> {
+    let skin = a.shape.skin + b.shape.skin;
+    let (first, second) = (&*a.shape.shape, &*b.shape.shape);
     if skin > 0.0 {
-        return match query::contact(&a.pose, &**a.shape, &b.pose, &**b.shape, skin) {
+        return match query::contact(&a.pose, first, &b.pose, second, skin) {
             Ok(contact) => contact.map(|c| f64::from(skin - c.dist)),
             Err(_) => Some(0.0),
         };
     }
-    match query::intersection_test(&a.pose, &**a.shape, &b.pose, &**b.shape) {
+    match query::intersection_test(&a.pose, first, &b.pose, second) {
         Ok(found) if !found.intersecting => None,
         Ok(_) => {
-            let contact = query::contact(&a.pose, &**a.shape, &b.pose, &**b.shape, 0.0).ok().flatten();
+            let contact = query::contact(&a.pose, first, &b.pose, second, 0.0).ok().flatten();
             Some(contact.map_or(0.0, |c| -f64::from(c.dist)))
         }
         Err(_) => Some(0.0),

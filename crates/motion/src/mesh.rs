@@ -1,10 +1,11 @@
-//! Triangle meshes as collision shapes: read from STL, binary or text, and held by spheres.
+//! Triangle meshes as collision shapes: read from STL, binary or text, OBJ and Collada, and held by spheres.
 //!
 //! For the cover the mesh is put into a grid; the cells that the surface passes through and those that it closes in get a sphere
 //! around each. So everything of the mesh is in a sphere by construction, its inside too where it is closed. Files are found and
 //! read by `mesh_files` or by whoever uses the crate.
 
 use crate::spheres::Sphere;
+use crate::{collada, obj};
 use parry3d::math::Vector;
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
@@ -28,8 +29,16 @@ const SKIN: f64 = 1e-6;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum MeshError {
     /// Of another kind.
-    #[error("only STL meshes are supported; convert it")]
-    NotStl,
+    #[error("only STL, OBJ and Collada (.dae) meshes are supported; convert it")]
+    Kind,
+    /// Something in an OBJ or Collada file that cannot be read.
+    #[error("line {line}: {reason}")]
+    Text {
+        /// Counted from 1.
+        line: usize,
+        /// What is wrong.
+        reason: String,
+    },
     /// It ends too early, or has no triangles, or too many.
     #[error("{triangles} triangles announced, {bytes} bytes there: expected 1 to {MAX_TRIANGLES} whole triangles")]
     Triangles {
@@ -37,6 +46,12 @@ pub enum MeshError {
         triangles: usize,
         /// How long the file is.
         bytes: usize,
+    },
+    /// No triangles, or too many.
+    #[error("it has {triangles} triangles: expected 1 to {MAX_TRIANGLES}; simplify it")]
+    Count {
+        /// How many.
+        triangles: usize,
     },
     /// A text that is no STL.
     #[error("line {line} is no vertex of three numbers, or comes too early or too late for a triangle")]
@@ -74,6 +89,39 @@ pub struct Meshed {
 }
 
 impl Mesh {
+    /// A mesh of triangles, in metres.
+    ///
+    /// # Errors
+    /// [`MeshError`] where there are none, too many, or one that is not finite.
+    pub fn new(triangles: Vec<[[f64; 3]; 3]>) -> Result<Mesh, MeshError> {
+        if triangles.is_empty() || triangles.len() > MAX_TRIANGLES {
+            return Err(MeshError::Count { triangles: triangles.len() });
+        }
+        let is_wild = |c: &f64| c.is_nan() || c.abs() > 1e3;
+        match triangles.iter().position(|triangle| triangle.iter().flatten().any(is_wild)) {
+            Some(triangle) => Err(MeshError::NotFinite { triangle }),
+            None => Ok(Mesh { triangles }),
+        }
+    }
+
+    /// Reads a file, by the end of its name: `.stl`, `.obj` or `.dae`; its numbers are multiplied by `scale` along x, y, z to be metres.
+    ///
+    /// # Errors
+    /// [`MeshError`] says what is wrong with it.
+    pub fn read(name: &str, bytes: &[u8], scale: [f64; 3]) -> Result<Mesh, MeshError> {
+        let name = name.to_ascii_lowercase();
+        let mut triangles = match name.rsplit_once('.') {
+            Some((_, "stl")) => return Mesh::stl(bytes, scale),
+            Some((_, "obj")) => obj::triangles(bytes)?,
+            Some((_, "dae")) => collada::triangles(bytes, MAX_TRIANGLES)?,
+            _ => return Err(MeshError::Kind),
+        };
+        for corner in triangles.iter_mut().flatten() {
+            *corner = std::array::from_fn(|i| corner[i] * scale[i]);
+        }
+        Mesh::new(triangles)
+    }
+
     /// Reads an STL; its numbers are multiplied by `scale` along x, y, z to be metres.
     ///
     /// # Errors
@@ -88,18 +136,13 @@ impl Mesh {
             Ok(text) if text.trim_start().starts_with("solid") => lines(text)?,
             _ => return Err(MeshError::Triangles { triangles: count, bytes: bytes.len() }),
         };
-        if triangles.is_empty() || triangles.len() > MAX_TRIANGLES {
-            return Err(MeshError::Triangles { triangles: triangles.len(), bytes: bytes.len() });
+        if triangles.is_empty() {
+            return Err(MeshError::Triangles { triangles: 0, bytes: bytes.len() });
         }
-        for (index, triangle) in triangles.iter_mut().enumerate() {
-            for corner in triangle {
-                *corner = std::array::from_fn(|i| corner[i] * scale[i]);
-                if corner.iter().any(|c| c.is_nan() || c.abs() > 1e3) {
-                    return Err(MeshError::NotFinite { triangle: index });
-                }
-            }
+        for corner in triangles.iter_mut().flatten() {
+            *corner = std::array::from_fn(|i| corner[i] * scale[i]);
         }
-        Ok(Mesh { triangles })
+        Mesh::new(triangles)
     }
 
     /// Corners of the triangles.

@@ -4,12 +4,22 @@
 //! `goal` (radians, metres for sliding joints) and `objects` (`name`, `position` in metres, `quat_xyzw`, and by `type` a `box`
 //! with `size`, a `cylinder` or `capsule` with `length` and `radius`, a `sphere` with `radius`; a capsule's `length` is between
 //! the centres of its ends). `attached` counts what the robot holds, which must be nothing.
+//!
+//! Clouds (`cloud`), meshes (`mesh`) and heights (`heightfield`) are in files of their own, which the caller reads; the points of a small
+//! cloud may stand in the problem itself.
 
+use crate::cloud::Cloud;
 use crate::geometry::Geometry;
+use crate::heightfield::Heights;
+use crate::mechanism::Mechanism;
+use crate::mesh::Mesh;
+use crate::point_files;
 use crate::space::Obstacle;
+use crate::surroundings::{MeshObstacle, OVERHANG_M, Surroundings};
 use ratn_model::pose::Pose;
 use serde::Deserialize;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// All problems of a file.
 #[derive(Debug, Clone, PartialEq)]
@@ -23,16 +33,38 @@ pub struct Problems {
 }
 
 /// A start and a goal among obstacles.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Problem {
     /// Its number in its class.
     pub index: u64,
-    /// What stands around.
+    /// What stands around: primitive shapes.
     pub obstacles: Vec<Obstacle>,
+    /// Points.
+    pub clouds: Vec<Cloud>,
+    /// Which of the clouds, by number, show the robot itself at the start, and how far from it what they show is left out, in metres.
+    pub self_filters: Vec<(usize, f64)>,
+    /// Meshes, and what heightfields are as such.
+    pub meshes: Vec<MeshObstacle>,
     /// Joint positions.
     pub start: Vec<f64>,
     /// Joint positions.
     pub goal: Vec<f64>,
+}
+
+impl Problem {
+    /// Leaves out of clouds what they show of the robot itself at the start.
+    pub fn filter(&mut self, mechanism: &Mechanism) {
+        for (cloud, margin_m) in std::mem::take(&mut self.self_filters) {
+            if let Ok(others) = self.clouds[cloud].without_robot(mechanism, &self.start, margin_m) {
+                self.clouds[cloud] = others;
+            }
+        }
+    }
+
+    /// All that stands around.
+    pub fn surroundings(&self) -> Surroundings<'_> {
+        Surroundings { obstacles: &self.obstacles, clouds: &self.clouds, meshes: &self.meshes }
+    }
 }
 
 /// A file that holds no problems.
@@ -63,11 +95,24 @@ pub enum ProblemError {
 }
 
 impl Problems {
-    /// Reads the text of a file.
+    /// Reads the text of a file that names no others.
     ///
     /// # Errors
     /// [`ProblemError`] names the line, or the problem and what is wrong with it.
     pub fn parse(text: &str) -> Result<Problems, ProblemError> {
+        Problems::parse_with_files(text, &mut |_| Err("no folder to look in was named".to_owned()))
+    }
+
+    /// Reads the text of a file; `load` gives what is in a file that it names, or why it cannot be read. A file is loaded once, however
+    /// often it is named.
+    ///
+    /// # Errors
+    /// [`ProblemError`] names the line, or the problem, the object, its file and what is wrong with it.
+    pub fn parse_with_files(
+        text: &str,
+        load: &mut dyn FnMut(&str) -> Result<Vec<u8>, String>,
+    ) -> Result<Problems, ProblemError> {
+        let mut files = Files { load, loaded: BTreeMap::new(), meshes: BTreeMap::new() };
         let file: File = serde_json::from_str(text)?;
         let twice = file.joints.iter().enumerate().find(|(i, name)| file.joints[..*i].contains(name));
         if let Some((_, joint)) = twice {
@@ -78,15 +123,15 @@ impl Problems {
         }
         let mut classes = BTreeMap::new();
         for (class, entries) in file.problems {
-            let read = |entry: Entry| {
+            let mut read = |entry: Entry| {
                 let index = entry.index;
-                entry.read(file.joints.len()).map_err(|reason| ProblemError::Value {
+                entry.read(file.joints.len(), &mut files).map_err(|reason| ProblemError::Value {
                     class: class.clone(),
                     index,
                     reason,
                 })
             };
-            let problems = entries.into_iter().map(read).collect::<Result<Vec<_>, _>>()?;
+            let problems = entries.into_iter().map(&mut read).collect::<Result<Vec<_>, _>>()?;
             classes.insert(class, problems);
         }
         Ok(Problems { robot: file.robot, joints: file.joints, classes })
@@ -115,7 +160,9 @@ struct Entry {
 #[derive(Deserialize)]
 struct Object {
     name: String,
+    #[serde(default)]
     position: [f64; 3],
+    #[serde(default = "upright")]
     quat_xyzw: [f64; 4],
     #[serde(flatten)]
     shape: Shape,
@@ -128,10 +175,80 @@ enum Shape {
     Cylinder { length: f64, radius: f64 },
     Capsule { length: f64, radius: f64 },
     Sphere { radius: f64 },
+    Cloud(PointsEntry),
+    Mesh(MeshEntry),
+    Heightfield(HeightsEntry),
+}
+
+/// Points in the file itself or in one of their own.
+#[derive(Deserialize)]
+struct PointsEntry {
+    file: Option<String>,
+    points: Option<Vec<[f32; 3]>>,
+    radius: f64,
+    thin: Option<f64>,
+    self_filter: Option<f64>,
+}
+
+#[derive(Deserialize)]
+struct MeshEntry {
+    file: String,
+    scale: Option<Scale>,
+    overhang: Option<f64>,
+}
+
+#[derive(Deserialize)]
+struct HeightsEntry {
+    file: String,
+    size: [f64; 2],
+    scale: Option<f64>,
+    #[serde(default)]
+    bottom: f64,
+    overhang: Option<f64>,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Scale {
+    All(f64),
+    Each([f64; 3]),
+}
+
+fn upright() -> [f64; 4] {
+    [0.0, 0.0, 0.0, 1.0]
+}
+
+/// What objects name, each file once.
+struct Files<'l> {
+    load: &'l mut dyn FnMut(&str) -> Result<Vec<u8>, String>,
+    loaded: BTreeMap<String, Arc<Vec<u8>>>,
+    /// By file, and the scale as it is written.
+    meshes: BTreeMap<(String, String), Arc<Mesh>>,
+}
+
+impl Files<'_> {
+    fn bytes(&mut self, name: &str) -> Result<Arc<Vec<u8>>, String> {
+        if let Some(bytes) = self.loaded.get(name) {
+            return Ok(Arc::clone(bytes));
+        }
+        let bytes = Arc::new((self.load)(name)?);
+        self.loaded.insert(name.to_owned(), Arc::clone(&bytes));
+        Ok(bytes)
+    }
+
+    fn mesh(&mut self, name: &str, scale: [f64; 3]) -> Result<Arc<Mesh>, String> {
+        let key = (name.to_owned(), format!("{scale:?}"));
+        if let Some(mesh) = self.meshes.get(&key) {
+            return Ok(Arc::clone(mesh));
+        }
+        let mesh = Arc::new(Mesh::read(name, &self.bytes(name)?, scale).map_err(|error| error.to_string())?);
+        self.meshes.insert(key, Arc::clone(&mesh));
+        Ok(mesh)
+    }
 }
 
 impl Entry {
-    fn read(self, joints: usize) -> Result<Problem, String> {
+    fn read(self, joints: usize, files: &mut Files<'_>) -> Result<Problem, String> {
         for (what, positions) in [("start", &self.start), ("goal", &self.goal)] {
             if positions.len() != joints {
                 return Err(format!("its {what} has {} positions, the robot has {joints} joints", positions.len()));
@@ -143,13 +260,24 @@ impl Entry {
         if self.attached > 0 {
             return Err("attached objects are not supported".to_owned());
         }
-        let obstacles = self.objects.into_iter().map(Object::read).collect::<Result<_, _>>()?;
-        Ok(Problem { index: self.index, obstacles, start: self.start, goal: self.goal })
+        let mut problem = Problem { index: self.index, start: self.start, goal: self.goal, ..Problem::default() };
+        for object in self.objects {
+            object.read(&mut problem, files)?;
+        }
+        Ok(problem)
     }
 }
 
 impl Object {
-    fn read(self) -> Result<Obstacle, String> {
+    /// Adds itself to what stands around.
+    fn read(self, problem: &mut Problem, files: &mut Files<'_>) -> Result<(), String> {
+        let name = self.name;
+        let improper = format!("object `{name}` has no proper size, place or rotation");
+        let norm = self.quat_xyzw.iter().map(|c| c * c).sum::<f64>().sqrt();
+        if !self.position.iter().all(|c| c.is_finite()) || !norm.is_finite() || norm < 1e-6 {
+            return Err(improper);
+        }
+        let pose = Pose { position: self.position, quaternion_xyzw: self.quat_xyzw.map(|c| c / norm) };
         let (geometry, extents) = match self.shape {
             Shape::Box { size } => (Geometry::Box { half: size.map(|s| s / 2.0) }, size.to_vec()),
             Shape::Cylinder { length, radius } => {
@@ -159,13 +287,85 @@ impl Object {
                 (Geometry::Capsule { radius, half_length: length / 2.0 }, vec![length, radius])
             }
             Shape::Sphere { radius } => (Geometry::Sphere { radius }, vec![radius]),
+            Shape::Cloud(entry) => {
+                let filter = entry.self_filter;
+                let cloud = entry.read(&name, &pose, files)?;
+                problem.self_filters.extend(filter.map(|margin_m| (problem.clouds.len(), margin_m)));
+                problem.clouds.push(cloud);
+                return Ok(());
+            }
+            Shape::Mesh(entry) => {
+                let (file, overhang) = (entry.file.clone(), entry.overhang);
+                let read = entry.read(files).and_then(|mesh| Ok((mesh, overhang_m(overhang)?)));
+                return add_mesh(problem, name, pose, &file, read);
+            }
+            Shape::Heightfield(entry) => {
+                let (file, overhang) = (entry.file.clone(), entry.overhang);
+                let read = entry.read(files).and_then(|mesh| Ok((mesh, overhang_m(overhang)?)));
+                return add_mesh(problem, name, pose, &file, read);
+            }
         };
-        let norm = self.quat_xyzw.iter().map(|c| c * c).sum::<f64>().sqrt();
-        let good = extents.iter().all(|e| *e > 0.0 && e.is_finite()) && self.position.iter().all(|c| c.is_finite());
-        if !good || !norm.is_finite() || norm < 1e-6 {
-            return Err(format!("object `{}` has no proper size, place or rotation", self.name));
+        if !extents.iter().all(|e| *e > 0.0 && e.is_finite()) {
+            return Err(improper);
         }
-        let quaternion_xyzw = self.quat_xyzw.map(|c| c / norm);
-        Ok(Obstacle { name: self.name, pose: Pose { position: self.position, quaternion_xyzw }, geometry })
+        problem.obstacles.push(Obstacle { name, pose, geometry });
+        Ok(())
     }
+}
+
+fn add_mesh(
+    problem: &mut Problem,
+    name: String,
+    pose: Pose,
+    file: &str,
+    read: Result<(Arc<Mesh>, f64), String>,
+) -> Result<(), String> {
+    let (mesh, overhang_m) = read.map_err(|reason| format!("object `{name}`, file `{file}`: {reason}"))?;
+    problem.meshes.push(MeshObstacle { name, pose, mesh, overhang_m });
+    Ok(())
+}
+
+impl PointsEntry {
+    fn read(self, name: &str, pose: &Pose, files: &mut Files<'_>) -> Result<Cloud, String> {
+        let points = match (self.file, self.points) {
+            (Some(file), None) => {
+                let wrong = |reason: String| format!("object `{name}`, file `{file}`: {reason}");
+                let bytes = files.bytes(&file).map_err(wrong)?;
+                point_files::points(&file, &bytes).map_err(|error| wrong(error.to_string()))?
+            }
+            (None, Some(points)) => points,
+            _ => return Err(format!("object `{name}` has either a `file` or `points`")),
+        };
+        let cloud = Cloud::new(name, &points, self.radius).and_then(|cloud| cloud.moved(pose));
+        let thinned = cloud.and_then(|cloud| cloud.thinned(self.thin.unwrap_or(0.0)));
+        thinned.map_err(|error| format!("object `{name}`: {error}"))
+    }
+}
+
+impl MeshEntry {
+    fn read(self, files: &mut Files<'_>) -> Result<Arc<Mesh>, String> {
+        let scale = match self.scale {
+            None => [1.0; 3],
+            Some(Scale::All(scale)) => [scale; 3],
+            Some(Scale::Each(scale)) => scale,
+        };
+        files.mesh(&self.file, scale)
+    }
+}
+
+impl HeightsEntry {
+    fn read(self, files: &mut Files<'_>) -> Result<Arc<Mesh>, String> {
+        if !self.size.iter().all(|s| *s > 0.0 && s.is_finite()) {
+            return Err("its `size` is two lengths in metres".to_owned());
+        }
+        let heights = Heights::read(&files.bytes(&self.file)?, self.scale.unwrap_or(1.0));
+        let solid = heights.and_then(|heights| heights.solid(self.size, self.bottom));
+        Ok(Arc::new(solid.map_err(|error| error.to_string())?))
+    }
+}
+
+fn overhang_m(overhang: Option<f64>) -> Result<f64, String> {
+    let overhang = overhang.unwrap_or(OVERHANG_M);
+    let fits = (0.001..=0.1).contains(&overhang);
+    if fits { Ok(overhang) } else { Err(format!("its `overhang` is {overhang} m: expected 0.001 to 0.1")) }
 }

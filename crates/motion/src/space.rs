@@ -8,11 +8,14 @@
 use crate::branches;
 use crate::geometry::Geometry;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
+use crate::occupied::{self, Reached};
 pub use crate::simd::Isa;
 use crate::simd::{self, Block, Compiled, Edge, Frame, Group, Rigid, Row, Scratch, SelfPair};
+use crate::surroundings::Surroundings;
 use ratn_model::pose::Pose;
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// Positions in the order of the joints; unused ones are zero.
 pub type State = [f32; MAX_JOINTS];
@@ -71,15 +74,23 @@ impl Space {
     pub const RESOLUTION: f32 = 32.0;
 
     /// A robot among obstacles.
-    pub fn new(mechanism: &Mechanism, obstacles: &[Obstacle]) -> Space {
-        Space::with_isa(mechanism, obstacles, Isa::detect())
+    pub fn new<'a>(mechanism: &Mechanism, surroundings: impl Into<Surroundings<'a>>) -> Space {
+        Space::with_isa(mechanism, surroundings, Isa::detect())
     }
 
     /// As [`Space::new`], with instructions that are not the widest.
-    pub fn with_isa(mechanism: &Mechanism, obstacles: &[Obstacle], isa: Isa) -> Space {
+    pub fn with_isa<'a>(mechanism: &Mechanism, surroundings: impl Into<Surroundings<'a>>, isa: Isa) -> Space {
+        let surroundings = surroundings.into();
+        let obstacles = surroundings.obstacles;
         let compiled_obstacles: Vec<simd::Obstacle> = obstacles.iter().map(compile_obstacle).collect();
+        let names: Vec<&String> = obstacles
+            .iter()
+            .map(|o| &o.name)
+            .chain(surroundings.clouds.iter().map(|c| &c.name))
+            .chain(surroundings.meshes.iter().map(|m| &m.name))
+            .collect();
         let allowed: Vec<Vec<usize>> = (0..mechanism.links.len())
-            .map(|link| (0..obstacles.len()).filter(|o| !mechanism.is_kept_from(link, &obstacles[*o].name)).collect())
+            .map(|link| (0..names.len()).filter(|o| !mechanism.is_kept_from(link, names[*o])).collect())
             .collect();
         let (mut compiled, shells, links) = compile_robot(mechanism, &allowed, ROUNDING_M);
         let mut blocked = false;
@@ -103,6 +114,7 @@ impl Space {
             rigid.near = order.chunks(isa.width()).map(|row| compile_row(row, obstacles)).collect();
         }
         compiled.obstacles = compiled_obstacles;
+        blocked |= add_clouds(&mut compiled, mechanism, &surroundings, &shells, &links, isa);
         compiled.pairs = pairs(mechanism, &compiled, &links);
         let arms = spheres(&compiled).map(|(frame, coarse)| arm(&compiled, frame, coarse)).collect();
         let (mut lower, mut upper) = ([0.0; MAX_JOINTS], [0.0; MAX_JOINTS]);
@@ -292,6 +304,53 @@ fn compile_obstacle(obstacle: &Obstacle) -> simd::Obstacle {
     }
 }
 
+/// Adds clouds and meshes where they are reached; says whether a part that no joint moves stands in one.
+fn add_clouds(
+    compiled: &mut Compiled,
+    mechanism: &Mechanism,
+    surroundings: &Surroundings<'_>,
+    shells: &[Shell],
+    links: &[usize],
+    isa: Isa,
+) -> bool {
+    let radii = || compiled.groups.iter().flat_map(|g| &g.fine).map(|sphere| f64::from(sphere[3]));
+    let (least, greatest) = (radii().fold(f64::INFINITY, f64::min), radii().fold(0.0, f64::max));
+    if compiled.groups.is_empty() {
+        return false;
+    }
+    let shell = |i: usize| match compiled.rigids[i].frame {
+        0 => {
+            let [x, y, z, r] = compiled.rigids[i].coarse.map(f64::from);
+            ([x, y, z], r)
+        }
+        _ => (shells[i].anchor, shells[i].reach),
+    };
+    let robot = Reached { shells: (0..shells.len()).map(shell).collect(), radii: [least, greatest] };
+    let clouds = surroundings.clouds.iter().map(|c| (&c.name, occupied::cloud(c, &robot, isa)));
+    let meshes = surroundings.meshes.iter().map(|m| (&m.name, occupied::mesh(m, &robot, isa)));
+    let mut blocked = false;
+    for (name, cloud) in clouds.chain(meshes) {
+        let Some(cloud) = cloud else { continue };
+        let index = compiled.clouds.len() as u32;
+        for (i, rigid) in compiled.rigids.iter_mut().enumerate() {
+            if !mechanism.is_kept_from(links[rigid.groups.start], name) {
+                continue;
+            }
+            if rigid.frame == 0 {
+                let mut fine = compiled.groups[rigid.groups.clone()].iter().flat_map(|group| &group.fine);
+                blocked |= fine.any(|[x, y, z, r]| cloud.touches_sphere([*x, *y, *z], *r));
+            } else {
+                let (anchor, reach) = robot.shells[i];
+                if cloud.is_within(anchor, reach) {
+                    rigid.clouds.push(index);
+                }
+            }
+        }
+        compiled.clouds.push(Arc::new(cloud));
+    }
+    blocked
+}
+
 fn compile_row(order: &[usize], obstacles: &[Obstacle]) -> Row {
     let unused = [Block([f32::INFINITY; 16]); 3];
     let indices = order.iter().map(|o| *o as u32).collect();
@@ -384,7 +443,7 @@ fn compile_robot(mechanism: &Mechanism, allowed: &[Vec<usize>], padding: f64) ->
         let frame = compiled.groups[groups.start].frame;
         let (way, anchor) = chains[frame];
         shells.push(Shell { anchor, reach: way + f64::from(norm(&coarse) + coarse[3]) + 1e-4 });
-        rigids.push(Rigid { frame, coarse, groups, near: Vec::new() });
+        rigids.push(Rigid { frame, coarse, groups, near: Vec::new(), clouds: Vec::new() });
     }
     compiled.rigids = rigids;
     (compiled, shells, links)

@@ -64,7 +64,13 @@ pub fn run_with_isa(
     isa: Isa,
     clock: &mut dyn FnMut() -> f64,
 ) -> Trial {
-    let mut space = Space::with_isa(mechanism, &problem.obstacles, isa);
+    let filtered = (!problem.self_filters.is_empty()).then(|| {
+        let mut problem = problem.clone();
+        problem.filter(mechanism);
+        problem
+    });
+    let problem = filtered.as_ref().unwrap_or(problem);
+    let mut space = Space::with_isa(mechanism, problem.surroundings(), isa);
     let ends = [("start", &problem.start), ("goal", &problem.goal)].map(|(which, positions)| {
         let (positions, beyond) = mechanism.clamped(positions);
         (positions, beyond.iter().map(|b| format!("{which} state: {b}")).collect::<Vec<_>>())
@@ -104,14 +110,14 @@ fn diagnose(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which: 
         let Joint { name, lower, upper, .. } = joint;
         format!("{which}: {name} is at {position}, outside {lower} to {upper} by {by:.2e}")
     });
-    let touches = Exact::new(mechanism, &problem.obstacles).touches(positions);
+    let touches = Exact::new(mechanism, problem.surroundings()).touches(positions);
     limits.chain(touches.iter().map(|touch| format!("{which}: {touch}"))).collect()
 }
 
 fn found(mechanism: &Mechanism, problem: &Problem, route: &Route, path: &[State]) -> Found {
     let joints = mechanism.joints.len();
     let postures: Vec<Vec<f64>> = path.iter().map(|s| s[..joints].iter().map(|q| f64::from(*q)).collect()).collect();
-    let touch = Exact::new(mechanism, &problem.obstacles).touch_along(&postures, EXACT_PER_RADIAN);
+    let touch = Exact::new(mechanism, problem.surroundings()).touch_along(&postures, EXACT_PER_RADIAN);
     Found {
         path: postures,
         length_rad: path_length(path),

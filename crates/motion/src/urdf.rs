@@ -155,11 +155,8 @@ pub(crate) fn shapes(link: &urdf_rs::Link, load: &mut Loader<'_>) -> Result<(Vec
             bodies.push(geometry.at(pose));
         } else if let urdf_rs::Geometry::Mesh { filename, scale } = &collision.geometry {
             let failed = |source| RobotError::Mesh { link: link.name.clone(), file: filename.clone(), source };
-            if !filename.to_ascii_lowercase().ends_with(".stl") {
-                return Err(failed(MeshError::NotStl));
-            }
             let scale = scale.map_or([1.0; 3], |scale| scale.0);
-            let mesh = load(filename).and_then(|bytes| Mesh::stl(&bytes, scale)).map_err(failed)?;
+            let mesh = load(filename).and_then(|bytes| Mesh::read(filename, &bytes, scale)).map_err(failed)?;
             meshes.push(Meshed { pose, mesh: Arc::new(mesh) });
         }
     }

@@ -514,7 +514,7 @@ fn a_problem_that_cannot_be_says_what_touches_what_and_how_deep() {
         Obstacle { name: "near".into(), pose: Pose::at(0.58, 0.0, 0.08), geometry: ball },
         Obstacle { name: "nearer".into(), pose: Pose::at(0.58, 0.0, -0.075), geometry: ball },
     ];
-    let problem = Problem { index: 0, obstacles, start: vec![1.0, 0.0, 0.0, 0.0], goal: vec![0.0; 4] };
+    let problem = Problem { obstacles, start: vec![1.0, 0.0, 0.0, 0.0], goal: vec![0.0; 4], ..Problem::default() };
     let settings = Settings { budget: BUDGET, repetitions: 1 };
     let mut now = 0.0;
     let mut clock = || {
@@ -614,7 +614,7 @@ fn a_position_that_is_rounded_beyond_a_limit_is_taken_as_the_limit_and_said() {
     let mechanism = Mechanism::read(&urdf.replace("2.5'", "3.14159265'"), None, &names).unwrap();
     let settings = Settings { budget: BUDGET, repetitions: 1 };
     let try_goal = |goal: f64| {
-        let problem = Problem { index: 0, obstacles: Vec::new(), start: vec![0.0; 4], goal: vec![0.5, goal, 0.0, 0.0] };
+        let problem = Problem { start: vec![0.0; 4], goal: vec![0.5, goal, 0.0, 0.0], ..Problem::default() };
         trial::run(&mechanism, &problem, settings, &mut || 0.0)
     };
     for goal in [3.1416, -3.1416] {

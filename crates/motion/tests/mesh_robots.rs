@@ -172,6 +172,35 @@ fn a_posture_that_the_spheres_of_meshes_find_free_is_free_by_the_meshes() {
 }
 
 #[test]
+fn what_is_wholly_inside_a_closed_mesh_touches_it() {
+    let ball = |x: f64, y: f64| {
+        let pose = Pose::at(x, y, 0.0);
+        [Obstacle { name: "ball".into(), pose, geometry: Geometry::Sphere { radius: 0.005 } }]
+    };
+    let closed = mechanism();
+    // The link lies from 5 to 25 cm along x, its thick end from -2 to 10 cm along y, 5 cm high.
+    for (at, inside) in [([0.08, 0.06], true), ([0.2, 0.0], true), ([0.2, 0.06], false), ([0.04, 0.0], false)] {
+        let touch = Exact::new(&closed, &ball(at[0], at[1])).touch(&[0.0; 3]);
+        assert_eq!(touch.is_some(), inside, "{at:?}: {touch:?}");
+        assert!(touch.is_none_or(|touch| touch.link == "l1" && touch.depth_m > 0.015), "{at:?}");
+    }
+    // One wall is missing: nothing is inside a sheet.
+    let mut open = elbow();
+    open.pop();
+    let sheet = Mechanism::read_with_meshes(&robot("elbow.stl"), None, &[], &mut |_| Ok(binary(&open))).unwrap();
+    assert_eq!(Exact::new(&sheet, &ball(0.08, 0.06)).touch(&[0.0; 3]), None);
+    // Of two parts in one file the second is small and deep in what it meets, the first is far away.
+    let pin = prism(&[[300.0, 0.0], [303.0, 0.0], [303.0, 3.0], [300.0, 3.0]], 3.0);
+    let parts = [elbow(), pin].concat();
+    let pinned = Mechanism::read_with_meshes(&robot("elbow.stl"), None, &[], &mut |_| Ok(binary(&parts))).unwrap();
+    let block = Geometry::Box { half: [0.03; 3] };
+    let blocks = [Obstacle { name: "block".into(), pose: Pose::at(0.35, -0.02, -0.02), geometry: block }];
+    let mut alone = pinned.clone();
+    alone.links.truncate(2);
+    assert!(Exact::new(&alone, &blocks).touch(&[0.0; 3]).is_some_and(|touch| touch.link == "l1"));
+}
+
+#[test]
 fn a_robot_of_meshes_is_planned_for() {
     let mechanism = mechanism();
     let post = Geometry::Cylinder { radius: 0.03, half_length: 0.4 };
@@ -229,8 +258,13 @@ fn a_mesh_that_cannot_be_used_is_refused_by_link_and_file() {
         read.unwrap_err().to_string()
     };
     let whole = binary(&elbow());
+    let other = refused("elbow.glb", whole.clone());
+    assert_eq!(
+        other,
+        "the mesh `elbow.glb` of link `l1`: only STL, OBJ and Collada (.dae) meshes are supported; convert it"
+    );
     let collada = refused("elbow.dae", whole.clone());
-    assert_eq!(collada, "the mesh `elbow.dae` of link `l1`: only STL meshes are supported; convert it");
+    assert!(collada.starts_with("the mesh `elbow.dae` of link `l1`: line 1: it is not valid XML"), "{collada}");
     let cut = refused("elbow.stl", whole[..500].to_vec());
     assert!(cut.contains("`elbow.stl` of link `l1`: 20 triangles announced, 500 bytes there"), "{cut}");
     assert!(refused("elbow.stl", Vec::new()).contains("0 triangles announced, 0 bytes there"));

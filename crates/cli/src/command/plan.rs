@@ -60,7 +60,11 @@ struct Line {
 pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     let urdf = read(&arguments.robot)?;
     let srdf = arguments.srdf.as_deref().map(read).transpose()?;
-    let problems = Problems::parse(&read(&arguments.problems)?).map_err(|error| refused(&arguments.problems, error))?;
+    let beside = arguments.problems.parent().unwrap_or(Path::new("")).to_owned();
+    let files = MeshFiles { beside, packages: arguments.packages.clone() };
+    let mut load = |name: &str| files.read(name).map_err(|error| error.to_string());
+    let problems = Problems::parse_with_files(&read(&arguments.problems)?, &mut load)
+        .map_err(|error| refused(&arguments.problems, error))?;
     let beside = arguments.robot.parent().unwrap_or(Path::new("")).to_owned();
     let meshes = MeshFiles { beside, packages: arguments.packages.clone() };
     let mut load = |name: &str| meshes.read(name);

@@ -5,12 +5,14 @@
 //! 2024). Kinematics first; then, for all links that are fixed to one frame together, the hand before the shoulder, the box that holds their
 //! bounding sphere in all lanes against those of the obstacles that it can reach at all, as many at once as there are lanes; the sphere
 //! against what is in there, nearest to the shoulder first; then the bounding sphere of each link and its fine spheres, only against
-//! obstacles that the larger sphere meets. Then pairs, in the same manner. Any touching lane ends it.
+//! obstacles that the larger sphere meets. Then clouds of points and pairs, in the same manner. Any touching lane ends it.
 //!
 //! There are no closures over vectors here: a closure that is not inlined is compiled without the instructions of its caller.
 
+use super::cloud::Cloud;
 use super::lanes::{Block, Lanes};
 use std::ops::Range;
+use std::sync::Arc;
 
 /// Joints of a configuration at the most; unused ones are zero.
 pub(crate) const LENGTH: usize = 16;
@@ -49,6 +51,8 @@ pub(crate) struct Rigid {
     pub(crate) groups: Range<usize>,
     /// What it can reach, nearest to its anchor first.
     pub(crate) near: Vec<Row>,
+    /// Indices of the clouds that it can reach.
+    pub(crate) clouds: Vec<u32>,
 }
 
 /// As many obstacles as there are lanes, and the boxes along the axes of the world that hold them.
@@ -97,6 +101,7 @@ pub(crate) struct Compiled {
     pub(crate) groups: Vec<Group>,
     pub(crate) pairs: Vec<SelfPair>,
     pub(crate) obstacles: Vec<Obstacle>,
+    pub(crate) clouds: Vec<Arc<Cloud>>,
     pub(crate) slots: usize,
 }
 
@@ -340,7 +345,7 @@ fn in_obstacles<V: Lanes, const ALL: bool>(edge: &Edge<'_>, scratch: &mut Scratc
         let (at, grown) = &mut scratch.rigid[index];
         store(centre, at);
         *grown = grow::<V>(edge, index, at);
-        if rigid.near.is_empty() {
+        if rigid.near.is_empty() && rigid.clouds.is_empty() {
             continue;
         }
         let radius = rigid.coarse[3] + *grown;
@@ -360,6 +365,23 @@ fn in_obstacles<V: Lanes, const ALL: bool>(edge: &Edge<'_>, scratch: &mut Scratc
                     if found != 0 && (!ALL || found == V::ALL) {
                         return found;
                     }
+                }
+            }
+        }
+        for cloud in &rigid.clouds {
+            let cloud = &*compiled.clouds[*cloud as usize];
+            if cloud.is_beside(&bounds) {
+                continue;
+            }
+            let mut cells = Block([0.0; 16]);
+            let about = cloud.may_touch(centre, radius + cloud.radius, V::ALL & !found, &mut cells);
+            if about == 0 {
+                continue;
+            }
+            for group in rigid.groups.clone() {
+                found |= group_in_cloud::<V, ALL>(edge, group, cloud, about & !found, scratch);
+                if found != 0 && (!ALL || found == V::ALL) {
+                    return found;
                 }
             }
         }
@@ -391,6 +413,35 @@ fn group_in_obstacle<V: Lanes, const ALL: bool>(
     for (sphere, at) in group.fine.iter().zip(&scratch.fine[group.slot..]) {
         found |= meets::<V>(fetch(at), sphere[3] + grown, obstacle);
         if found != 0 && (!ALL || found == V::ALL) {
+            return found;
+        }
+    }
+    found
+}
+
+/// Which of some lanes of a group touch a cloud.
+#[inline(always)]
+fn group_in_cloud<V: Lanes, const ALL: bool>(
+    edge: &Edge<'_>,
+    index: usize,
+    cloud: &Cloud,
+    mut about: u32,
+    scratch: &mut Scratch,
+) -> u32 {
+    let group = &edge.compiled.groups[index];
+    approach::<V>(edge, index, scratch);
+    let (at, grown) = &scratch.coarse[index];
+    let grown = *grown + cloud.radius;
+    let mut cells = Block([0.0; 16]);
+    about = cloud.may_touch::<V>(fetch(at), group.coarse[3] + grown, about, &mut cells);
+    if about == 0 {
+        return 0;
+    }
+    refine::<V>(group, index, scratch);
+    let mut found = 0;
+    for (sphere, at) in group.fine.iter().zip(&scratch.fine[group.slot..]) {
+        found |= cloud.touching::<V, ALL>(fetch(at), sphere[3] + grown, about & !found);
+        if found != 0 && (!ALL || found == about) {
             return found;
         }
     }

@@ -7,6 +7,7 @@
 
 #![allow(unsafe_code, reason = "vector intrinsics behind a detected instruction set, see above")]
 
+use super::cloud::{self, Cloud};
 use super::kernel::{self, Edge, Scratch};
 use super::nearest;
 
@@ -22,6 +23,8 @@ pub(super) trait Lanes: Copy {
     const ALL: u32 = (1 << Self::WIDTH) - 1;
     fn splat(value: f32) -> Self;
     fn load(block: &Block) -> Self;
+    /// The numbers of a block from `part` times the width on.
+    fn load_part(block: &Block, part: usize) -> Self;
     fn store(self, block: &mut Block);
     fn add(self, other: Self) -> Self;
     fn sub(self, other: Self) -> Self;
@@ -29,6 +32,7 @@ pub(super) trait Lanes: Copy {
     /// `self * factor + term`, rounded once where the processor does.
     fn mul_add(self, factor: Self, term: Self) -> Self;
     fn max(self, other: Self) -> Self;
+    fn min(self, other: Self) -> Self;
     fn sqrt(self) -> Self;
     fn below(self, other: Self) -> u32;
     /// The greatest lane.
@@ -127,6 +131,22 @@ impl Isa {
         }
     }
 
+    /// See [`cloud::fill`].
+    pub(crate) fn fill_cloud(self, cloud: &mut Cloud, points: &[[Block; 3]], reach: f32) {
+        match self.0 {
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx512 => unsafe { fill_cloud_avx512(cloud, points, reach) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx2 => unsafe { fill_cloud_avx2(cloud, points, reach) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => unsafe { fill_cloud_neon(cloud, points, reach) },
+            Kind::Plain => cloud::fill::<[f32; 8]>(cloud, points, reach),
+        }
+    }
+
     /// See [`nearest::nearest`].
     #[inline]
     pub(crate) fn nearest(self, blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> usize {
@@ -168,6 +188,24 @@ fn touching_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx2,fma")]
+fn fill_cloud_avx512(cloud: &mut Cloud, points: &[[Block; 3]], reach: f32) {
+    cloud::fill::<x86::Wide16>(cloud, points, reach);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn fill_cloud_avx2(cloud: &mut Cloud, points: &[[Block; 3]], reach: f32) {
+    cloud::fill::<x86::Wide8>(cloud, points, reach);
+}
+
+#[cfg(target_arch = "aarch64")]
+#[target_feature(enable = "neon")]
+fn fill_cloud_neon(cloud: &mut Cloud, points: &[[Block; 3]], reach: f32) {
+    cloud::fill::<arm::Pair>(cloud, points, reach);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx2,fma")]
 fn nearest_avx512(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> usize {
     nearest::nearest::<true>(blocks, dimensions, count, to)
 }
@@ -201,6 +239,10 @@ impl Lanes for [f32; 8] {
         std::array::from_fn(|i| block.0[i])
     }
     #[inline(always)]
+    fn load_part(block: &Block, part: usize) -> Self {
+        std::array::from_fn(|i| block.0[8 * (part & 1) + i])
+    }
+    #[inline(always)]
     fn store(self, block: &mut Block) {
         block.0[..8].copy_from_slice(&self);
     }
@@ -224,6 +266,10 @@ impl Lanes for [f32; 8] {
     #[inline(always)]
     fn max(self, other: Self) -> Self {
         std::array::from_fn(|i| if self[i] > other[i] { self[i] } else { other[i] })
+    }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        std::array::from_fn(|i| if self[i] < other[i] { self[i] } else { other[i] })
     }
     #[inline(always)]
     fn sqrt(self) -> Self {
@@ -261,6 +307,10 @@ mod x86 {
             Wide16(unsafe { _mm512_load_ps(block.0.as_ptr()) })
         }
         #[inline(always)]
+        fn load_part(block: &Block, _: usize) -> Self {
+            Self::load(block)
+        }
+        #[inline(always)]
         fn store(self, block: &mut Block) {
             unsafe { _mm512_store_ps(block.0.as_mut_ptr(), self.0) }
         }
@@ -283,6 +333,10 @@ mod x86 {
         #[inline(always)]
         fn max(self, other: Self) -> Self {
             Wide16(unsafe { _mm512_max_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn min(self, other: Self) -> Self {
+            Wide16(unsafe { _mm512_min_ps(self.0, other.0) })
         }
         #[inline(always)]
         fn sqrt(self) -> Self {
@@ -316,6 +370,10 @@ mod x86 {
             Wide8(unsafe { _mm256_load_ps(block.0.as_ptr()) })
         }
         #[inline(always)]
+        fn load_part(block: &Block, part: usize) -> Self {
+            Wide8(unsafe { _mm256_load_ps(block.0.as_ptr().add(8 * (part & 1))) })
+        }
+        #[inline(always)]
         fn store(self, block: &mut Block) {
             unsafe { _mm256_store_ps(block.0.as_mut_ptr(), self.0) }
         }
@@ -338,6 +396,10 @@ mod x86 {
         #[inline(always)]
         fn max(self, other: Self) -> Self {
             Wide8(unsafe { _mm256_max_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn min(self, other: Self) -> Self {
+            Wide8(unsafe { _mm256_min_ps(self.0, other.0) })
         }
         #[inline(always)]
         fn sqrt(self) -> Self {
@@ -386,6 +448,11 @@ mod arm {
             Pair(unsafe { vld1q_f32(first) }, unsafe { vld1q_f32(first.add(4)) })
         }
         #[inline(always)]
+        fn load_part(block: &Block, part: usize) -> Self {
+            let first = unsafe { block.0.as_ptr().add(8 * (part & 1)) };
+            Pair(unsafe { vld1q_f32(first) }, unsafe { vld1q_f32(first.add(4)) })
+        }
+        #[inline(always)]
         fn store(self, block: &mut Block) {
             let first = block.0.as_mut_ptr();
             unsafe { vst1q_f32(first, self.0) };
@@ -411,6 +478,10 @@ mod arm {
         #[inline(always)]
         fn max(self, other: Self) -> Self {
             Pair(unsafe { vmaxq_f32(self.0, other.0) }, unsafe { vmaxq_f32(self.1, other.1) })
+        }
+        #[inline(always)]
+        fn min(self, other: Self) -> Self {
+            Pair(unsafe { vminq_f32(self.0, other.0) }, unsafe { vminq_f32(self.1, other.1) })
         }
         #[inline(always)]
         fn sqrt(self) -> Self {

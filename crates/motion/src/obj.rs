@@ -1,0 +1,42 @@
+//! Reading Wavefront OBJ: vertices and faces; normals, textures, groups and materials say nothing of the shape.
+
+use crate::mesh::MeshError;
+
+/// The triangles of a file; a face of more corners is cut from its first one.
+pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
+    let text = std::str::from_utf8(bytes).map_err(|error| {
+        let line = bytes[..error.valid_up_to()].iter().filter(|b| **b == b'\n').count() + 1;
+        MeshError::Text { line, reason: "it is no text in UTF-8".to_owned() }
+    })?;
+    let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
+    for (index, line) in text.lines().enumerate() {
+        let wrong = |reason: String| MeshError::Text { line: index + 1, reason };
+        let mut words = line.split('#').next().unwrap_or("").split_whitespace();
+        match words.next() {
+            Some("v") => {
+                let numbers: Vec<f64> = words.map_while(|word| word.parse().ok()).take(3).collect();
+                let vertex = <[f64; 3]>::try_from(numbers);
+                vertices.push(vertex.map_err(|_| wrong("a vertex `v` has three numbers".to_owned()))?);
+            }
+            Some("f") => {
+                let corner = |word: &str| corner(word, vertices.len()).map(|i| vertices[i]).map_err(wrong);
+                let corners = words.map(corner).collect::<Result<Vec<[f64; 3]>, _>>()?;
+                if corners.len() < 3 {
+                    return Err(wrong(format!("a face `f` has at least three corners, this has {}", corners.len())));
+                }
+                triangles.extend((1..corners.len() - 1).map(|i| [corners[0], corners[i], corners[i + 1]]));
+            }
+            _ => {}
+        }
+    }
+    Ok(triangles)
+}
+
+/// The vertex that a corner `7`, `7/1` or `7//2` names; negative numbers count from the last vertex so far.
+fn corner(word: &str, vertices: usize) -> Result<usize, String> {
+    let number = word.split('/').next().unwrap_or("");
+    let named: i64 = number.parse().map_err(|_| format!("`{word}` names no vertex by a number"))?;
+    let index = if named < 0 { named + vertices as i64 } else { named - 1 };
+    let found = usize::try_from(index).ok().filter(|i| *i < vertices);
+    found.ok_or_else(|| format!("the face names vertex {named}, there are {vertices} before it"))
+}

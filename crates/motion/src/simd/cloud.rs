@@ -1,0 +1,403 @@
+//! A cloud of points, ready for the question whether spheres touch any of its balls, for as many spheres at once as there are lanes.
+//!
+//! A grid lies over the cloud. Every cell knows how far its centre is from the nearest point, and the points that are the nearest to
+//! any place in the cell: those that no other point keeps from it (a place is nearer to q than to p where it is on q's side of the plane
+//! between them; p is left out where the whole cell is). The lists are made by halving: a part of the grid passes on to its halves only
+//! what it has not left out. So the answer from the list of the cell that a centre is in is exact, for any radius; the distances of
+//! the cells' centres decide for most spheres that they touch nothing. What is beside the grid is further from the points than
+//! any sphere reaches for which there are lists.
+//!
+//! Nearest neighbours by cells with the sites of their Voronoi diagrams are old (Clarkson, SIAM J. Comput. 1988); that spheres of a robot
+//! are looked up in a structure laid out for vectors is from Ramsey, Kingston, Thomason, Kavraki: *Collision-Affording Point Trees* (RSS
+//! 2024), whose lists are of points within a greatest radius instead.
+
+use super::lanes::{Block, Isa, Lanes};
+
+/// Cells of a grid at the most, about, and for one point.
+const MOST_CELLS: f32 = 60_000.0;
+const CELLS_PER_POINT: f32 = 10.0;
+
+/// Cells of the smallest grid, about.
+const LEAST_CELLS: f32 = 5_000.0;
+
+/// The smallest cell, in metres.
+const LEAST_CELL_M: f32 = 0.004;
+
+/// Cells further away than where there are lists are looked at together, up to this part of their distance.
+const COARSENESS: f32 = 0.3;
+
+/// Added to a whole number below 2^23, this leaves the number in the lowest bits.
+const TO_BITS: f32 = 8_388_608.0;
+
+/// Adding and taking away this rounds to whole numbers.
+const ROUND: f32 = 12_582_912.0;
+
+/// The list of a cell where every centre touches.
+const SOLID: [u32; 2] = [u32::MAX; 2];
+
+/// Sixteen points, or fewer and such as are infinitely far away.
+type Points = [Block; 3];
+
+const FAR: Points = [Block([f32::INFINITY; 16]); 3];
+
+/// A cloud as the kernel reads it.
+#[derive(Debug, Clone)]
+pub(crate) struct Cloud {
+    /// Radius of the balls.
+    pub(crate) radius: f32,
+    /// The box of all balls: its least sides, and its greatest with their signs changed.
+    least: [f32; 3],
+    minus_greatest: [f32; 3],
+    layout: Layout,
+    /// Per cell, how far its centre is from the nearest point, or less.
+    near: Vec<f32>,
+    /// Per cell, where its points are in `points`; nothing where no sphere is large enough.
+    lists: Vec<[u32; 2]>,
+    points: Vec<Points>,
+}
+
+/// Where the cells are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Layout {
+    pub(crate) least: [f32; 3],
+    pub(crate) greatest: [f32; 3],
+    pub(crate) cell: f32,
+    pub(crate) counts: [usize; 3],
+}
+
+impl Layout {
+    /// Over a box that holds so many points, and `margin` around.
+    pub(crate) fn over(points: usize, least: [f32; 3], greatest: [f32; 3], margin: f32) -> Layout {
+        let most = (points as f32 * CELLS_PER_POINT).clamp(LEAST_CELLS, MOST_CELLS);
+        let extents: [f32; 3] = std::array::from_fn(|i| greatest[i] - least[i] + 2.0 * margin);
+        let volume = extents.iter().map(|e| e.max(LEAST_CELL_M)).product::<f32>();
+        let mut cell = (volume / most).cbrt().max(LEAST_CELL_M);
+        loop {
+            let counts = extents.map(|e| (e / cell).ceil().max(1.0) as usize);
+            if counts.iter().product::<usize>() as f32 <= 2.0 * most {
+                let least: [f32; 3] = std::array::from_fn(|i| least[i] - margin);
+                let greatest = std::array::from_fn(|i| least[i] + counts[i] as f32 * cell);
+                return Layout { least, greatest, cell, counts };
+            }
+            cell *= 1.1;
+        }
+    }
+
+    /// The number of a cell.
+    pub(crate) fn index(&self, [x, y, z]: [usize; 3]) -> usize {
+        (x * self.counts[1] + y) * self.counts[2] + z
+    }
+
+    /// Where the cell of a number is.
+    pub(crate) fn slots(&self, index: usize) -> [usize; 3] {
+        let [_, y, z] = self.counts;
+        [index / (y * z), index / z % y, index % z]
+    }
+
+    /// Where a coordinate is along an axis; at the end of the grid what is beside it.
+    pub(crate) fn slot(&self, axis: usize, at: f32) -> usize {
+        (((at - self.least[axis]) / self.cell).max(0.0) as usize).min(self.counts[axis] - 1)
+    }
+
+    /// The centre of a cell.
+    pub(crate) fn centre(&self, index: usize) -> [f32; 3] {
+        let at = self.slots(index);
+        std::array::from_fn(|i| self.least[i] + (at[i] as f32 + 0.5) * self.cell)
+    }
+
+    /// How many there are.
+    pub(crate) fn cells(&self) -> usize {
+        self.counts.iter().product()
+    }
+}
+
+impl Cloud {
+    /// A cloud of balls. Spheres whose radius and that of the balls are together at most `reach` are judged exactly; for larger ones it may find
+    /// a touch that is none. The layout's margin is `reach` at least.
+    pub(crate) fn new(points: &[[f32; 3]], radius: f32, layout: Layout, reach: f32, isa: Isa) -> Cloud {
+        let cells = layout.cells();
+        let (near, lists) = (vec![f32::INFINITY; cells], vec![[0; 2]; cells]);
+        let side = |i: usize, sign: f32| points.iter().map(|p| p[i] * sign).fold(f32::INFINITY, f32::min) - radius;
+        let (least, minus_greatest) = (std::array::from_fn(|i| side(i, 1.0)), std::array::from_fn(|i| side(i, -1.0)));
+        let mut cloud = Cloud { radius, least, minus_greatest, layout, near, lists, points: Vec::new() };
+        let mut blocks: Vec<Points> = Vec::with_capacity(points.len().div_ceil(16));
+        for sixteen in points.chunks(16) {
+            let mut block = FAR;
+            for (lane, point) in sixteen.iter().enumerate() {
+                for axis in 0..3 {
+                    block[axis].0[lane] = point[axis];
+                }
+            }
+            blocks.push(block);
+        }
+        if !points.is_empty() {
+            isa.fill_cloud(&mut cloud, &blocks, reach);
+        }
+        cloud
+    }
+
+    /// Makes every centre in a cell touch.
+    pub(crate) fn solidify(&mut self, cell: usize) {
+        self.near[cell] = f32::NEG_INFINITY;
+        self.lists[cell] = SOLID;
+    }
+
+    /// Whether one sphere touches a ball.
+    pub(crate) fn touches_sphere(&self, centre: [f32; 3], radius: f32) -> bool {
+        self.touching::<[f32; 8], true>(centre.map(|c| [c; 8]), radius + self.radius, 1) != 0
+    }
+
+    /// Whether a ball is about within a distance of a place, in metres.
+    pub(crate) fn is_within(&self, place: [f64; 3], reach: f64) -> bool {
+        let beside = |i: usize| {
+            let (least, greatest) = (f64::from(self.least[i]), -f64::from(self.minus_greatest[i]));
+            (least - place[i]).max(place[i] - greatest).max(0.0).powi(2)
+        };
+        (0..3).map(beside).sum::<f64>() <= reach * reach
+    }
+
+    /// Whether spheres that are all in this box, the least sides with their signs changed, are beside the box of all balls.
+    #[inline(always)]
+    pub(super) fn is_beside(&self, bounds: &[f32; 6]) -> bool {
+        (0..3).any(|i| bounds[i] < self.least[i] || bounds[3 + i] < self.minus_greatest[i])
+    }
+
+    /// Which lanes' spheres may touch something; for all others it is certain that they do not.
+    #[inline(always)]
+    pub(super) fn may_touch<V: Lanes>(&self, centre: [V; 3], radius: f32, lanes: u32, cells: &mut Block) -> u32 {
+        let layout = &self.layout;
+        let inverse = 1.0 / layout.cell;
+        let mut index = V::splat(0.0);
+        let (mut off, mut out) = (V::splat(0.0), V::splat(0.0));
+        let mut inside = centre;
+        for i in 0..3 {
+            // The nearest place in the grid: all points are nearer to it than to a centre outside.
+            let (least, greatest) = (V::splat(layout.least[i]), V::splat(layout.greatest[i]));
+            inside[i] = inside[i].max(least).min(greatest);
+            let beyond = centre[i].sub(inside[i]);
+            let along = inside[i].sub(least).mul_add(V::splat(inverse), V::splat(-0.5));
+            let last = V::splat((layout.counts[i] - 1) as f32);
+            let slot = along.add(V::splat(ROUND)).sub(V::splat(ROUND)).max(V::splat(0.0)).min(last);
+            let beside = along.sub(slot).mul(V::splat(layout.cell));
+            off = beside.mul_add(beside, off);
+            out = beyond.mul_add(beyond, out);
+            index = index.mul_add(V::splat(layout.counts[i] as f32), slot);
+        }
+        index.add(V::splat(TO_BITS)).store(cells);
+        let mut near = Block([f32::INFINITY; 16]);
+        let mut left = lanes;
+        while left != 0 {
+            let lane = left.trailing_zeros() as usize & 15;
+            left &= left - 1;
+            near.0[lane] = self.near[slot_of(cells.0[lane])];
+        }
+        let gap = V::load(&near).sub(off.sqrt()).max(V::splat(0.0));
+        lanes & gap.mul_add(gap, out).below(V::splat(radius * radius))
+    }
+
+    /// Which lanes' spheres touch a ball; `lanes` are looked at.
+    #[inline(always)]
+    pub(super) fn touching<V: Lanes, const ALL: bool>(&self, centre: [V; 3], radius: f32, lanes: u32) -> u32 {
+        let mut cells = Block([0.0; 16]);
+        let mut doubtful = self.may_touch(centre, radius, lanes, &mut cells);
+        if doubtful == 0 {
+            return 0;
+        }
+        let mut at = FAR;
+        for i in 0..3 {
+            centre[i].store(&mut at[i]);
+        }
+        let mut found = 0;
+        while doubtful != 0 {
+            let lane = doubtful.trailing_zeros() as usize & 15;
+            doubtful &= doubtful - 1;
+            let cell = slot_of(cells.0[lane]);
+            if self.touches::<V>([at[0].0[lane], at[1].0[lane], at[2].0[lane]], radius, cell) {
+                found |= 1 << lane;
+                if !ALL {
+                    return found;
+                }
+            }
+        }
+        found
+    }
+
+    #[inline(always)]
+    fn touches<V: Lanes>(&self, centre: [f32; 3], radius: f32, cell: usize) -> bool {
+        let [first, end] = self.lists[cell];
+        if first == end {
+            // Nothing is listed so far from all points: solid, or a sphere that is larger than was announced.
+            return true;
+        }
+        let reach = V::splat(radius * radius);
+        for points in &self.points[first as usize..end as usize] {
+            for part in 0..16 / V::WIDTH {
+                if squares::<V>(points, &centre, part).below(reach) != 0 {
+                    return true;
+                }
+            }
+        }
+        false
+    }
+}
+
+/// The cell whose number was added to `TO_BITS`.
+#[inline(always)]
+fn slot_of(number: f32) -> usize {
+    (number.to_bits() & 0x7f_ffff) as usize
+}
+
+/// Squared distances of points from a place; `part` is which of the points where they are more than there are lanes.
+#[inline(always)]
+fn squares<V: Lanes>(points: &Points, from: &[f32; 3], part: usize) -> V {
+    let mut sum = V::splat(0.0);
+    for i in 0..3 {
+        let along = V::load_part(&points[i], part).sub(V::splat(from[i]));
+        sum = along.mul_add(along, sum);
+    }
+    sum
+}
+
+/// A part of a grid: from these cells up to those.
+#[derive(Clone, Copy)]
+struct Cells {
+    from: [usize; 3],
+    to: [usize; 3],
+}
+
+/// Fills in the cells of a cloud.
+#[inline(always)]
+pub(super) fn fill<V: Lanes>(cloud: &mut Cloud, points: &[Points], reach: f32) {
+    let whole = Cells { from: [0; 3], to: cloud.layout.counts };
+    // A list per depth, used again and again.
+    let mut rooms: Vec<Vec<Points>> = vec![Vec::new(); 3 * usize::BITS as usize];
+    let mut spare = Vec::new();
+    let mut todo: Vec<(Cells, usize)> = vec![(whole, 0)];
+    rooms[0] = points.to_vec();
+    while let Some((part, depth)) = todo.pop() {
+        // Depth first: the list of a depth is that of the part that was cut last.
+        let (above, below) = rooms.split_at_mut(depth + 1);
+        let (parent, room) = (&above[depth], &mut below[0]);
+        let layout = cloud.layout;
+        let half: [f32; 3] = std::array::from_fn(|i| (part.to[i] - part.from[i]) as f32 * layout.cell * 0.5);
+        let middle: [f32; 3] = std::array::from_fn(|i| layout.least[i] + part.from[i] as f32 * layout.cell + half[i]);
+        let (nearest, distance) = nearest::<V>(parent, &middle);
+        let diagonal = (half[0] * half[0] + half[1] * half[1] + half[2] * half[2]).sqrt();
+        let is_cell = (0..3).all(|i| part.to[i] - part.from[i] == 1);
+        let is_far = distance - diagonal > reach;
+        if is_far && (is_cell || 2.0 * diagonal < COARSENESS * (distance - diagonal)) {
+            fill_far(cloud, part, &middle, distance);
+            continue;
+        }
+        room.clear();
+        keep::<V>(parent, &middle, &nearest, half.map(|h| 2.0 * h), room);
+        thin::<V>(room, &middle, half.map(|h| 2.0 * h), &mut spare);
+        if is_cell {
+            let index = layout.index(part.from);
+            let first = cloud.points.len() as u32;
+            cloud.points.extend_from_slice(room);
+            cloud.near[index] = distance;
+            cloud.lists[index] = [first, cloud.points.len() as u32];
+            continue;
+        }
+        let cuts: [usize; 3] = std::array::from_fn(|i| (part.from[i] + part.to[i]).div_ceil(2));
+        for corner in 0..8 {
+            let upper: [bool; 3] = std::array::from_fn(|i| corner >> i & 1 == 1);
+            let from = std::array::from_fn(|i| if upper[i] { cuts[i] } else { part.from[i] });
+            let to = std::array::from_fn(|i| if upper[i] { part.to[i] } else { cuts[i] });
+            if (0..3).all(|i| from[i] < to[i]) {
+                todo.push((Cells { from, to }, depth + 1));
+            }
+        }
+    }
+}
+
+/// Where no sphere reaches that has lists, a bound is enough.
+fn fill_far(cloud: &mut Cloud, part: Cells, middle: &[f32; 3], distance: f32) {
+    let layout = cloud.layout;
+    let along = |i: usize, slot: usize| layout.least[i] + (slot as f32 + 0.5) * layout.cell - middle[i];
+    for x in part.from[0]..part.to[0] {
+        for y in part.from[1]..part.to[1] {
+            let flat = along(0, x).powi(2) + along(1, y).powi(2);
+            let first = layout.index([x, y, 0]);
+            for z in part.from[2]..part.to[2] {
+                cloud.near[first + z] = distance - (flat + along(2, z).powi(2)).sqrt();
+            }
+        }
+    }
+}
+
+/// The point nearest to a place, and how far it is.
+#[inline(always)]
+fn nearest<V: Lanes>(points: &[Points], to: &[f32; 3]) -> ([f32; 3], f32) {
+    let mut least = V::splat(f32::INFINITY);
+    for block in points {
+        for part in 0..16 / V::WIDTH {
+            least = least.min(squares(block, to, part));
+        }
+    }
+    let best = -V::splat(0.0).sub(least).peak();
+    let mut at = [f32::INFINITY; 3];
+    for block in points {
+        for part in 0..16 / V::WIDTH {
+            let others = V::splat(best).below(squares(block, to, part));
+            if others != V::ALL {
+                let lane = part * V::WIDTH + (!others).trailing_zeros() as usize;
+                at = std::array::from_fn(|i| block[i].0[lane & 15]);
+                return (at, best.sqrt());
+            }
+        }
+    }
+    (at, best.sqrt())
+}
+
+/// Appends the points that `nearest` does not keep from a box, in whole blocks.
+#[inline(always)]
+fn keep<V: Lanes>(points: &[Points], middle: &[f32; 3], nearest: &[f32; 3], size: [f32; 3], kept: &mut Vec<Points>) {
+    let best: f32 = (0..3).map(|i| (nearest[i] - middle[i]).powi(2)).sum();
+    let mut open = FAR;
+    let mut filled = 0;
+    for block in points {
+        for part in 0..16 / V::WIDTH {
+            let mut room = V::splat(best);
+            for i in 0..3 {
+                let aside = V::load_part(&block[i], part).sub(V::splat(nearest[i])).abs();
+                room = aside.mul_add(V::splat(size[i]), room);
+            }
+            // Infinitely far ones are not below; the nearest itself is kept by the rounding.
+            let mut stays = squares::<V>(block, middle, part).below(room.mul(V::splat(1.0 + 1e-6)).add(V::splat(1e-9)));
+            while stays != 0 {
+                let lane = stays.trailing_zeros() as usize + part * V::WIDTH;
+                stays &= stays - 1;
+                for i in 0..3 {
+                    open[i].0[filled] = block[i].0[lane & 15];
+                }
+                filled += 1;
+                if filled == 16 {
+                    kept.push(open);
+                    open = FAR;
+                    filled = 0;
+                }
+            }
+        }
+    }
+    if filled > 0 {
+        kept.push(open);
+    }
+}
+
+/// Leaves only the points that those nearest to the corners do not keep from a box either.
+#[inline(always)]
+fn thin<V: Lanes>(points: &mut Vec<Points>, middle: &[f32; 3], size: [f32; 3], spare: &mut Vec<Points>) {
+    // Opposite corners follow each other.
+    for corner in [0, 7, 1, 6, 2, 5, 3, 4] {
+        if points.len() <= 1 {
+            return;
+        }
+        let at = std::array::from_fn(|i| middle[i] + size[i] * if corner >> i & 1 == 1 { 0.5 } else { -0.5 });
+        let (nearest, _) = nearest::<V>(points, &at);
+        spare.clear();
+        keep::<V>(points, middle, &nearest, size, spare);
+        std::mem::swap(points, spare);
+    }
+}
