@@ -7,6 +7,7 @@ use crate::id::{SessionId, Slot};
 use crate::pool::Pool;
 use crate::record::Effect;
 use crate::resource::{Description, LONGEST_STANDSTILL_MS, Resource, ResourceSpec, ResourceView, STANDSTILL_ATTRIBUTE};
+use crate::session::Session;
 use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -65,12 +66,13 @@ impl Pool {
     }
 
     /// Whether a resource is a task's, and gives its id to another of this class: who may create others than a task's is a provider. Nothing
-    /// moves for what a task has made, so that no standstill is lost with it. An operator's stays.
+    /// moves for what a task has made, so that no standstill is lost with it. An operator's stays, and whatever may be an operator's: before
+    /// the first ping after a restart the provider is refused, and asks again. By then its owner has pinged, or has no session any more.
     fn gives_way(&self, resource: &Resource, class: ResourceClass) -> bool {
         let owner = resource.owner.as_ref().and_then(|owner| self.sessions.get(owner));
         resource.description.class == ResourceClass::Task
             && class != ResourceClass::Task
-            && owner.is_some_and(|owner| !owner.is_operators())
+            && owner.is_some_and(Session::is_no_operators)
     }
 
     /// Removes a resource; holders hear [`crate::Change::ResourceLost`]. `None` as session may delete anything.

@@ -6,7 +6,11 @@
 //! Where nobody knows who opened a session, its id is kept for nobody.
 //!
 //! An id is kept by the record that ends its session, and given up by the one that opens the next: nothing else is written down. After a
-//! restart the time begins anew.
+//! restart the time begins anew, and a replay may keep more ids than there were: those that had been given up for their age, or under narrower
+//! bounds, are kept again, within the bounds of now.
+//!
+//! Whoever may open sessions can reserve ids of its choice by opening and ending sessions of them. Ids of the project's own parts are fresh, and
+//! nobody guesses them. `keep_session_ids_for_ms = 0` keeps none, also of those that are there.
 
 use crate::id::SessionId;
 use crate::limits::Limits;

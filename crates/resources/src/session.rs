@@ -22,8 +22,8 @@ pub(crate) struct Session {
     pub(crate) name: String,
     /// Who opened it, as the connection proved: nobody else speaks for it. Empty where nobody knows.
     pub(crate) opened_by: Arc<str>,
-    /// Whether that is an operator: as its last ping said; before the first one after a restart nobody knows.
-    pub(crate) for_anybody: bool,
+    /// Whether that is an operator, as its last ping said; nothing before the first one after a restart.
+    pub(crate) for_anybody: Option<bool>,
     /// Which of all sessions of this pool it is: one that is opened anew under the same id has another number. 0 where it was opened by a
     /// version that did not number them.
     pub(crate) number: u64,
@@ -89,7 +89,7 @@ impl Session {
         Session {
             name,
             opened_by,
-            for_anybody: false,
+            for_anybody: None,
             number,
             ttl,
             expires,
@@ -103,7 +103,12 @@ impl Session {
 
     /// Whether it is an operator's, or of one who is not known.
     pub(crate) fn is_operators(&self) -> bool {
-        self.for_anybody || self.opened_by.is_empty()
+        self.for_anybody == Some(true) || self.opened_by.is_empty()
+    }
+
+    /// Whether it is known to be nobody's who is an operator.
+    pub(crate) fn is_no_operators(&self) -> bool {
+        self.for_anybody == Some(false) && !self.opened_by.is_empty()
     }
 }
 
@@ -145,7 +150,7 @@ impl Pool {
         }
         let opened = self.kept_alive(speaker, id, client, ttl)?;
         if let Some(session) = self.sessions.get_mut(id).filter(|session| session.opened_by == speaker.name) {
-            session.for_anybody = speaker.for_anybody;
+            session.for_anybody = Some(speaker.for_anybody);
         }
         Ok(opened)
     }

@@ -104,3 +104,29 @@ fn a_full_pool_has_room_for_what_displaces_and_a_provider_beyond_its_quota_displ
         pool.check_invariants().unwrap();
     }
 }
+
+#[test]
+fn what_an_operator_made_stays_also_over_a_restart_and_a_tasks_gives_way_once_it_is_known_to_be_one() {
+    for (owner, is_operator) in [("root", true), ("eve", false)] {
+        let mut pool = Pool::new(Limits::default());
+        let id = open(&mut pool, owner, is_operator);
+        pool.create(NOW, Some(&id), arm(ResourceClass::Task)).unwrap();
+        let snapshot = Snapshot::decode(&pool.snapshot().encode()).unwrap();
+        let records = decode(&encode(&pool.take_records())).unwrap();
+        let from_snapshot = Pool::restore(Limits::default(), NOW, Some(snapshot), []).unwrap();
+        let from_records = Pool::restore(Limits::default(), NOW, None, records).unwrap();
+        for mut pool in [from_snapshot, from_records] {
+            let cell = open(&mut pool, "cell", false);
+            let taken = pool.create(NOW, Some(&cell), arm(ResourceClass::Module)).unwrap_err();
+            assert!(matches!(taken, PoolError::ResourceTaken { .. }), "nobody knows yet whose it is: {taken}");
+            // Somebody who speaks for its owner says nothing about the owner.
+            let operator = Speaker { name: "other-root".into(), for_anybody: true };
+            pool.keep_alive_as(NOW, &operator, &id, owner, TTL).unwrap();
+            assert!(pool.create(NOW, Some(&cell), arm(ResourceClass::Module)).is_err());
+            open(&mut pool, owner, is_operator);
+            let made = pool.create(NOW, Some(&cell), arm(ResourceClass::Module));
+            assert_eq!(made.is_err(), is_operator, "{made:?}");
+            pool.check_invariants().unwrap();
+        }
+    }
+}
