@@ -137,6 +137,25 @@ async fn one_of_a_template_that_has_changed_is_replaced_once_its_successor_is_re
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn one_that_was_told_of_another_session_is_ended_before_another_is_started() {
+    let system = TestSystem::new();
+    let resources = system.resource_manager().await;
+    let mut watch = system.watch(&resources, &["PathPlanner"]).await;
+    let mut first = Manager::start(&system, &["adopt", "20"]);
+    let old = watch.created("PathPlanner").await;
+    first.kill();
+    assert!(lives(pid(&old)));
+    // As if the id had been another caller's, and the first one had not got further than to write down another one.
+    std::fs::write(system.directory.path().join("process-manager.session"), "another-session").unwrap();
+    let _second = Manager::start(&system, &["adopt", "20"]);
+    let adopted_or_new = pools(&system, one_ready).await.pools[0].workers[0].id.clone();
+    assert_eq!(adopted_or_new, "planner-2@localhost");
+    let new = watch.created("PathPlanner").await;
+    assert_eq!((new.id.as_str(), new.session.as_str()), ("planner-2@localhost", "another-session"));
+    assert!(!lives(pid(&old)), "it would take another's leases for those of its own resource");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn who_is_not_to_be_adopted_is_ended_with_all_that_it_started_before_another_is_started() {
     for (how, then) in [(vec!["sleep"], vec!["sleep"]), (vec!["adopt", "20"], vec![])] {
         let system = TestSystem::new();

@@ -122,6 +122,9 @@ pub(super) fn start(
     let (processes, events) = Processes::start(&config, parts.directory, parts.told, parts.roster, parts.tracker)?;
     let mut pools = Pools::new(&config.host, config.templates).with_labels(config.labels.clone());
     pools.go_on_after(&parts.before);
+    let is_adopted = |id: &String| adopted.iter().any(|one| one.entry.id == *id);
+    let ended: Vec<String> = parts.before.iter().filter(|id| !is_adopted(id)).cloned().collect();
+    pools.ended_before(Timestamp(0), &ended);
     let actor = Actor {
         pools,
         processes,
@@ -228,26 +231,19 @@ impl Actor {
         self.perform(commands);
     }
 
-    /// The session that offers the workers has another id from now on. Those that were told of the one before confirm no lease of what this
-    /// one offers: none of them is offered, and others take their places.
+    /// The session that offers the workers has another id from now on. Those that were told of the one before take leases of somebody else's
+    /// resources for those of their own: all of them are withdrawn and ended at once, and others take their places.
     fn renew_session(&mut self, answer: oneshot::Sender<String>) {
-        let id = match self.session_file.renew() {
-            Ok(id) => id,
-            Err(error) => return tracing::error!(%error, "the session gets no other id, and nothing is offered"),
-        };
+        let (id, written) = self.session_file.renew();
+        if let Err(error) = written {
+            tracing::error!(%error, "the session's new id is not on the disk: a successor does not go on with it");
+        }
         tracing::warn!(session = id, "the session has another id now: every worker is replaced");
         self.processes.offered_by(&id);
-        let pools = self.pools.status();
-        let known: BTreeSet<&str> =
-            pools.iter().flat_map(|pool| &pool.workers).map(|worker| worker.id.as_str()).collect();
-        self.wanted.send_modify(|wanted| wanted.retain(|id, _| !known.contains(id.as_str())));
+        let commands = self.pools.renew(self.now());
+        self.perform(commands);
+        // None of them is wanted any more.
         let _ = answer.send(id);
-        for pool in &pools {
-            // On a host that is drained they end without a successor.
-            if let Ok((_, commands)) = self.pools.restart(self.now(), &Restart::Template(pool.template.clone())) {
-                self.perform(commands);
-            }
-        }
     }
 
     /// Ends every worker, whatever it takes.

@@ -2,7 +2,8 @@
 //! any other is started.
 //!
 //! ```text
-//!   its process is gone ──▶ forgotten            it serves, its template says `adopt`, and it listens for a successor ──▶ adopted
+//!   its process is gone ──▶ forgotten
+//!   it serves, its template says `adopt`, it was told of the session of now, and it listens for a successor ──▶ adopted
 //!   everybody else ──▶ SIGTERM, after `stop_timeout_s` SIGKILL, and with it all that it started
 //!   it was about to be started ──▶ its group is ended, and whatever carries its marker
 //! ```
@@ -160,6 +161,10 @@ async fn greet(
     if !(template.adopt && entry.template.adopt) {
         return Err((exit, "its template does not say `adopt`"));
     }
+    // The one that it was told of may be somebody else's, whose leases it would confirm.
+    if entry.session.as_ref() != Some(&told.session) {
+        return Err((exit, "it was told of another session"));
+    }
     if entry.endpoint.is_none() {
         return Err((exit, "it was not ready yet"));
     }
@@ -174,12 +179,10 @@ async fn greet(
     }
 }
 
-/// Whether a worker of now would be another one: of another template, or told of another resource manager or session. One that asks a manager
-/// which is not that of the system, or takes another session for the one that offers it, confirms no lease of it.
+/// Whether a worker of now would be another one: of another template, or told of another resource manager. One that asks a manager
+/// which is not that of the system confirms no lease of it.
 fn is_outdated(entry: &Entry, template: &Template, told: &Told) -> bool {
-    let was_told_otherwise =
-        entry.manager.as_ref() != Some(&told.manager.to_string()) || entry.session.as_ref() != Some(&told.session);
-    was_told_otherwise || !template.starts_the_same_as(&entry.template)
+    entry.manager.as_ref() != Some(&told.manager.to_string()) || !template.starts_the_same_as(&entry.template)
 }
 
 async fn end(entry: &Entry, exit: &Exit) {
@@ -213,27 +216,25 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_worker_that_was_told_of_another_resource_manager_or_session_is_outdated() {
+    fn a_worker_that_was_told_of_another_resource_manager_is_outdated() {
         let template = Template::new("planner", "PathPlanner");
         let told = Told { manager: "http://127.0.0.1:2".parse().unwrap(), session: "s-2".to_owned() };
-        let outdated = |manager: Option<&str>, session: Option<&str>| {
+        let outdated = |manager: Option<&str>| {
             let entry = Entry {
                 id: "planner-1".to_owned(),
                 pid: 42,
                 began: 7,
                 endpoint: None,
                 manager: manager.map(str::to_owned),
-                session: session.map(str::to_owned),
+                session: Some(told.session.clone()),
                 limits: String::new(),
                 groups: Vec::new(),
                 template: template.clone(),
             };
             is_outdated(&entry, &template, &told)
         };
-        let (manager, session) = (Some("http://127.0.0.1:2"), Some("s-2"));
-        assert!(!outdated(manager, session));
-        assert!(outdated(Some("http://127.0.0.1:1"), session));
-        assert!(outdated(manager, Some("s-1")));
-        assert!(outdated(None, session) && outdated(manager, None), "nobody knows");
+        assert!(!outdated(Some("http://127.0.0.1:2")));
+        assert!(outdated(Some("http://127.0.0.1:1")));
+        assert!(outdated(None), "nobody knows");
     }
 }

@@ -1,5 +1,6 @@
 //! The id of the session of a runtime directory's process manager, in a file: a successor of one that was killed goes on with the session, so
-//! that leases of workers that it adopts hold. Where the id is another caller's, another one is on the disk before it is used.
+//! that leases of workers that it adopts hold. Where the id is another caller's, another one takes its place. Where that one cannot be written
+//! down, it is used all the same: a successor finds the id of before, which is another caller's still, and goes on with a third one.
 
 use super::ROLE;
 use ratn_worker::client::fresh_id;
@@ -22,22 +23,30 @@ impl SessionFile {
     pub(super) fn id(&self) -> io::Result<String> {
         match std::fs::read_to_string(&self.file) {
             Ok(known) if !known.trim().is_empty() => Ok(known.trim().to_owned()),
-            _ => self.renew(),
+            _ => {
+                let (fresh, written) = self.renew();
+                written.map(|()| fresh)
+            }
         }
     }
 
-    /// Another id, once it is on the disk.
-    pub(super) fn renew(&self) -> io::Result<String> {
+    /// Another id, and whether it is on the disk.
+    pub(super) fn renew(&self) -> (String, io::Result<()>) {
         let fresh = fresh_id(ROLE);
+        let written = self.write(&fresh);
+        (fresh, written)
+    }
+
+    fn write(&self, id: &str) -> io::Result<()> {
         let new = self.file.with_extension("session.new");
         let mut file = File::create(&new)?;
-        file.write_all(fresh.as_bytes())?;
+        file.write_all(id.as_bytes())?;
         file.sync_all()?;
         std::fs::rename(&new, &self.file)?;
         if let Some(folder) = self.file.parent() {
             File::open(folder)?.sync_all()?;
         }
-        Ok(fresh)
+        Ok(())
     }
 }
 
@@ -53,8 +62,22 @@ mod tests {
         let id = || SessionFile::of(&directory).id().unwrap();
         let first = id();
         assert_eq!(id(), first);
-        let second = SessionFile::of(&directory).renew().unwrap();
+        let (second, written) = SessionFile::of(&directory).renew();
+        written.unwrap();
         assert_ne!(second, first);
         assert_eq!(id(), second);
+    }
+
+    #[test]
+    fn where_an_id_cannot_be_written_down_the_next_one_is_another_all_the_same() {
+        let place = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(place.path().join("run")).unwrap();
+        let file = SessionFile::of(&directory);
+        let first = file.id().unwrap();
+        // Where its new content would be written.
+        std::fs::create_dir(directory.path().join("process-manager.session.new")).unwrap();
+        let (second, written) = file.renew();
+        assert!(written.is_err() && second != first);
+        assert_eq!(file.id().unwrap(), first);
     }
 }

@@ -223,6 +223,11 @@ impl Template {
         Duration::from_secs_f64(self.stop_timeout_s)
     }
 
+    /// What a worker moves stands still so long after its lease has ended; nothing for one that moves nothing.
+    pub(crate) fn standstill(&self) -> Option<Duration> {
+        self.standstill_ms.map(Duration::from_millis)
+    }
+
     pub(crate) fn stable(&self) -> Duration {
         Duration::from_secs_f64(self.stable_s)
     }

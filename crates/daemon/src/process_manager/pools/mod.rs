@@ -133,6 +133,17 @@ impl Pools {
         }
     }
 
+    /// These workers of a process manager before this one have ended. What they moved may still move.
+    pub fn ended_before(&mut self, now: Timestamp, ids: &[String]) {
+        for id in ids {
+            if let Some((template, _)) = self.parts_of(id)
+                && let Some(pool) = self.pools.get_mut(template)
+            {
+                pool.may_move(now);
+            }
+        }
+    }
+
     /// Takes over a worker that serves already, of a process manager that is gone; what to do. Nothing where its pool is not known.
     pub fn adopt(&mut self, now: Timestamp, worker: &WorkerStatus, outdated: bool) -> Option<Vec<Command>> {
         let mut commands = Vec::new();
@@ -189,6 +200,20 @@ impl Pools {
         let going = pool.restart(only);
         pool.fill(now, &mut commands);
         Ok((going, commands))
+    }
+
+    /// Another session offers the workers from now on. Those that were told of the one before, which is another caller's, are of no use:
+    /// every one is ended at once, held or not, and others take their places.
+    pub fn renew(&mut self, now: Timestamp) -> Vec<Command> {
+        let mut commands = Vec::new();
+        let takes_work = self.takes_work().is_ok();
+        for pool in self.pools.values_mut() {
+            pool.renew(now, &mut commands);
+            if takes_work {
+                pool.fill(now, &mut commands);
+            }
+        }
+        commands
     }
 
     /// Changes how many workers a template has; the pool as it is then.

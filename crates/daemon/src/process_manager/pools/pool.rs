@@ -29,6 +29,8 @@ pub(super) struct Pool {
     last_number: u64,
     /// For so many more than the minimum the machine has room; `None` where none is needed.
     room: Option<u32>,
+    /// What its workers moved may still move until then.
+    at_rest_from: Timestamp,
     /// Workers that ended unasked, and how the last one did.
     crashes: u64,
     last_exit: String,
@@ -44,6 +46,7 @@ impl Pool {
             last_number: 0,
             // Until the machine has been looked at.
             room: template.needs.is_something().then_some(0),
+            at_rest_from: Timestamp(0),
             crashes: 0,
             last_exit: String::new(),
             host: host.to_owned(),
@@ -100,13 +103,16 @@ impl Pool {
     pub(super) fn deadline(&self) -> Option<Timestamp> {
         let restart = self.restarts.pause_until().filter(|_| self.missing() > 0);
         let (_, retires) = self.retiring(Timestamp(0));
-        self.workers.values().filter_map(Worker::deadline).chain(restart).chain(retires).min()
+        let waits = self.workers.values().any(Worker::waits_for_rest) && !self.moves_until_an_end();
+        let rest = waits.then_some(self.at_rest_from);
+        self.workers.values().filter_map(Worker::deadline).chain(restart).chain(retires).chain(rest).min()
     }
 
     /// Does what is due: kills, asks, and ends those that have been too many for long enough.
     pub(super) fn advance(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         self.restarts.advance(now);
         self.workers.values_mut().for_each(|worker| worker.advance(now, &self.template, commands));
+        self.offer(now, commands);
         for number in self.retiring(now).0 {
             if let Some(worker) = self.workers.get_mut(&number) {
                 worker.retire(commands);
@@ -180,7 +186,8 @@ impl Pool {
         self.go_on_after(number);
         let mut adopted = Worker::starting(now, worker.id.clone(), &self.template);
         adopted.spawned(worker.pid, worker.limits.clone(), commands);
-        adopted.serving(now, &worker.endpoint, &self.template.kind, commands);
+        adopted.serving(now, &worker.endpoint);
+        adopted.offer(&self.template.kind, commands);
         adopted.ask_at_once(now);
         if outdated {
             adopted.outdate();
@@ -202,6 +209,9 @@ impl Pool {
         let exited = worker.exited(reason);
         let reason = exited.reason.clone();
         commands.push(Command::Notify(exited));
+        if !worker.is_at_rest() {
+            self.may_move(now);
+        }
         if !worker.is_stopping() {
             let words = if last_words.is_empty() { String::new() } else { format!("; its last words: {last_words}") };
             let what = format!("{id}: {reason}{words}");
@@ -214,8 +224,29 @@ impl Pool {
     /// A worker serves: another one may be started now.
     pub(super) fn serving(&mut self, now: Timestamp, number: u64, endpoint: &str, commands: &mut Vec<Command>) {
         if let Some(worker) = self.workers.get_mut(&number) {
-            worker.serving(now, endpoint, &self.template.kind, commands);
+            worker.serving(now, endpoint);
         }
+        self.offer(now, commands);
+    }
+
+    /// Offers those that serve, where nothing moves for who held one of before.
+    fn offer(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        if self.at_rest_from <= now && !self.moves_until_an_end() {
+            self.workers.values_mut().for_each(|worker| worker.offer(&self.template.kind, commands));
+        }
+    }
+
+    /// What its workers move may move as long as its template says, though no process does anything for it any more.
+    pub(super) fn may_move(&mut self, now: Timestamp) {
+        if let Some(bound) = self.template.standstill() {
+            self.at_rest_from = now + bound;
+        }
+    }
+
+    /// Whether one that is being ended may move something until its process is gone, and for the bound after that.
+    fn moves_until_an_end(&self) -> bool {
+        let ends = |worker: &Worker| worker.is_ending() && !worker.is_at_rest();
+        self.template.standstill().is_some() && self.workers.values().any(ends)
     }
 
     /// A worker's resource is there.
@@ -295,6 +326,16 @@ impl Pool {
         workers.filter_map(|(_, worker)| worker.outdate().then(|| worker.id().to_owned())).collect()
     }
 
+    /// Another session offers workers from now on: all that there are end now, and others take their places. Of the session before
+    /// somebody else makes leases, which these workers confirm: what they move may move until they are gone.
+    pub(super) fn renew(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
+        self.restarts.forgive();
+        let kill_at = now + self.template.stop_timeout();
+        for worker in self.workers.values_mut() {
+            worker.disown(kill_at, commands);
+        }
+    }
+
     /// One that is to be replaced ends once there is one more than is wanted, and all of them are ready. One at a time.
     fn roll(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         let leaving = self.workers.values().any(Worker::is_leaving);
@@ -315,9 +356,9 @@ impl Pool {
         u32::from(surges)
     }
 
-    /// Whether there cannot be two at the same time, not even for a moment.
+    /// Whether there cannot be one more than is wanted, not even for a moment: there is one port, or one robot that they move.
     fn is_single(&self) -> bool {
-        matches!(self.template.readiness, Readiness::Port { .. })
+        matches!(self.template.readiness, Readiness::Port { .. }) || self.template.standstill().is_some()
     }
 
     /// From now on it has another size. What is above the new maximum ends now, or once nobody holds it.

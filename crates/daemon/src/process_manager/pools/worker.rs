@@ -30,6 +30,8 @@ pub(super) struct Worker {
     refused: Option<(Timestamp, String)>,
     /// Another one is to take its place.
     outdated: bool,
+    /// Nothing moves by it: it was not offered yet, or was withdrawn while nobody held it.
+    at_rest: bool,
     pid: u32,
     /// What it may use of the machine, for people.
     limits: String,
@@ -41,7 +43,10 @@ enum Phase {
     Starting {
         until: Timestamp,
     },
-    Serving,
+    /// Not offered while something may move for who held one before it.
+    Serving {
+        offered: bool,
+    },
     Ready,
     /// Its resource goes as soon as nobody holds it; at the latest then, where it was asked to stop.
     Leaving {
@@ -69,6 +74,7 @@ impl Worker {
             liveness: liveness::Liveness::of(template),
             refused: None,
             outdated: false,
+            at_rest: true,
             pid: 0,
             limits: String::new(),
             endpoint: String::new(),
@@ -87,20 +93,33 @@ impl Worker {
             Phase::Stopping { kill_at: None } | Phase::Failed { .. } => {
                 commands.push(Command::Kill { id: self.id.clone() });
             }
-            Phase::Starting { .. } | Phase::Serving | Phase::Ready | Phase::Leaving { .. } => {}
+            Phase::Starting { .. } | Phase::Serving { .. } | Phase::Ready | Phase::Leaving { .. } => {}
         }
         commands.push(Command::Notify(self.status()));
     }
 
-    /// It serves as a resource of `kind`. Too late is too late.
-    pub(super) fn serving(&mut self, now: Timestamp, endpoint: &str, kind: &str, commands: &mut Vec<Command>) {
+    /// It serves, and can be offered. Too late is too late.
+    pub(super) fn serving(&mut self, now: Timestamp, endpoint: &str) {
         if self.is_starting() {
-            self.phase = Phase::Serving;
+            self.phase = Phase::Serving { offered: false };
             self.serves_since = Some(now);
             self.liveness.answered(now);
             endpoint.clone_into(&mut self.endpoint);
+        }
+    }
+
+    /// Offers it as a resource of `kind`, where it serves and was not offered yet.
+    pub(super) fn offer(&mut self, kind: &str, commands: &mut Vec<Command>) {
+        if self.waits_for_rest() {
+            self.phase = Phase::Serving { offered: true };
+            self.at_rest = false;
             commands.push(Command::Offer { worker: self.status(), kind: kind.to_owned() });
         }
+    }
+
+    /// Whether it serves and is not offered yet.
+    pub(super) fn waits_for_rest(&self) -> bool {
+        self.phase == Phase::Serving { offered: false }
     }
 
     /// Whether it still serves is to be asked now.
@@ -111,7 +130,7 @@ impl Worker {
     /// The resource manager does not take its resource. That may pass, as where a session of before still has one of its id: it is waited
     /// for until then.
     pub(super) fn refused(&mut self, until: Timestamp, why: &str) {
-        if self.phase == Phase::Serving {
+        if matches!(self.phase, Phase::Serving { .. }) {
             let (_, words) = self.refused.get_or_insert_with(|| (until, String::new()));
             why.clone_into(words);
         }
@@ -120,7 +139,7 @@ impl Worker {
     /// Its resource is there.
     pub(super) fn offered(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
         self.refused = None;
-        if self.phase == Phase::Serving {
+        if matches!(self.phase, Phase::Serving { .. }) {
             self.phase = Phase::Ready;
             self.idle_since = self.idle_since.and(Some(now));
             commands.push(Command::Notify(self.status()));
@@ -159,6 +178,7 @@ impl Worker {
     /// Its resource is gone as it was to be: nothing is given to it any more.
     pub(super) fn withdrawn(&mut self, kill_at: Timestamp, commands: &mut Vec<Command>) {
         if matches!(self.phase, Phase::Leaving { .. }) {
+            self.at_rest = true;
             self.stop(kill_at, commands);
         }
     }
@@ -176,7 +196,7 @@ impl Worker {
                 true
             }
             Phase::Leaving { .. } => false,
-            Phase::Starting { .. } | Phase::Serving | Phase::Failed { .. } | Phase::Stopping { .. } => {
+            Phase::Starting { .. } | Phase::Serving { .. } | Phase::Failed { .. } | Phase::Stopping { .. } => {
                 self.stop(kill_at, commands)
             }
         }
@@ -199,6 +219,14 @@ impl Worker {
         true
     }
 
+    /// The session that it was told offers it is somebody else's: it ends now, and until its process is gone it may move for them.
+    pub(super) fn disown(&mut self, kill_at: Timestamp, commands: &mut Vec<Command>) {
+        self.at_rest = false;
+        if !matches!(self.phase, Phase::Failed { .. }) {
+            self.stop(kill_at, commands);
+        }
+    }
+
     /// It has said that it still serves.
     pub(super) fn answered(&mut self, now: Timestamp) {
         self.liveness.answered(now);
@@ -218,7 +246,7 @@ impl Worker {
             Phase::Starting { until } if until <= now => {
                 self.fail(format!("not ready within {} s", template.start_timeout_s), commands);
             }
-            Phase::Serving if self.refused.as_ref().is_some_and(|(until, _)| *until <= now) => {
+            Phase::Serving { .. } if self.refused.as_ref().is_some_and(|(until, _)| *until <= now) => {
                 let why = self.refused.take().map(|(_, why)| why).unwrap_or_default();
                 commands.push(Command::Withdraw { id: self.id.clone() });
                 self.fail(format!("its resource is not taken: {why}"), commands);
@@ -250,7 +278,7 @@ impl Worker {
             Phase::Starting { until } => Some(until),
             Phase::Leaving { until } => until,
             Phase::Stopping { kill_at } => kill_at,
-            Phase::Serving => self.refused.as_ref().map(|(until, _)| *until),
+            Phase::Serving { .. } => self.refused.as_ref().map(|(until, _)| *until),
             Phase::Ready | Phase::Failed { .. } => None,
         };
         let of_liveness = self.liveness.deadline().filter(|_| self.is_live());
@@ -280,9 +308,19 @@ impl Worker {
         matches!(self.phase, Phase::Stopping { .. })
     }
 
+    /// Whether its process is being ended.
+    pub(super) fn is_ending(&self) -> bool {
+        matches!(self.phase, Phase::Stopping { .. } | Phase::Failed { .. })
+    }
+
+    /// Whether nothing moves by it.
+    pub(super) fn is_at_rest(&self) -> bool {
+        self.at_rest
+    }
+
     /// Whether it serves, and is to answer.
     fn is_live(&self) -> bool {
-        matches!(self.phase, Phase::Serving | Phase::Ready | Phase::Leaving { .. })
+        matches!(self.phase, Phase::Serving { .. } | Phase::Ready | Phase::Leaving { .. })
     }
 
     /// Whether somebody holds its resource.
@@ -301,10 +339,15 @@ impl Worker {
 
     pub(super) fn status(&self) -> WorkerStatus {
         let state = match self.phase {
-            Phase::Starting { .. } | Phase::Serving => WorkerState::Starting,
+            Phase::Starting { .. } | Phase::Serving { .. } => WorkerState::Starting,
             // Where somebody holds it in the same moment it stays.
             Phase::Ready | Phase::Leaving { until: None } => WorkerState::Ready,
             Phase::Leaving { until: Some(_) } | Phase::Failed { .. } | Phase::Stopping { .. } => WorkerState::Stopping,
+        };
+        let reason = match &self.refused {
+            Some((_, why)) => why,
+            None if self.waits_for_rest() => "what the one before it moved may still move",
+            None => "",
         };
         WorkerStatus {
             id: self.id.clone(),
@@ -312,7 +355,7 @@ impl Worker {
             state,
             pid: self.pid,
             endpoint: self.endpoint.clone(),
-            reason: self.refused.as_ref().map(|(_, why)| why.clone()).unwrap_or_default(),
+            reason: reason.to_owned(),
             resident_bytes: 0,
             cpu_millicores: 0,
             limits: self.limits.clone(),
@@ -359,7 +402,8 @@ mod tests {
     fn ready() -> Worker {
         let mut worker = worker();
         worker.spawned(4711, String::new(), &mut Vec::new());
-        worker.serving(at(1.0), "unix:/w", "PathPlanner", &mut Vec::new());
+        worker.serving(at(1.0), "unix:/w");
+        worker.offer("PathPlanner", &mut Vec::new());
         worker.offered(at(1.0), &mut Vec::new());
         worker
     }
@@ -379,7 +423,9 @@ mod tests {
     fn a_worker_is_offered_when_it_serves_and_ready_when_its_resource_is_there() {
         let mut worker = worker();
         assert!(commands(|c| worker.spawned(4711, String::new(), c)).is_empty());
-        let offered = commands(|c| worker.serving(at(1.0), "unix:/w", "PathPlanner", c));
+        worker.serving(at(1.0), "unix:/w");
+        assert!(worker.is_at_rest(), "nobody can hold it yet");
+        let offered = commands(|c| worker.offer("PathPlanner", c));
         assert!(matches!(&offered[..], [Command::Offer { worker, kind }]
             if worker.endpoint == "unix:/w" && worker.pid == 4711 && kind == "PathPlanner"));
         assert_eq!(worker.status().state, WorkerState::Starting);
@@ -394,7 +440,8 @@ mod tests {
         assert!(commands(|c| worker.advance(at(2.0), &template(), c)).is_empty());
         assert_eq!(commands(|c| worker.advance(at(3.0), &template(), c)), [Command::Kill { id: ID.into() }]);
         assert!(worker.deadline().is_none());
-        assert!(commands(|c| worker.serving(at(4.0), "unix:/late", "PathPlanner", c)).is_empty());
+        worker.serving(at(4.0), "unix:/late");
+        assert!(commands(|c| worker.offer("PathPlanner", c)).is_empty());
         // Its process came only now.
         assert_eq!(commands(|c| worker.spawned(4711, String::new(), c)), [Command::Kill { id: ID.into() }]);
         assert_eq!(worker.exited("killed by signal 9").reason, "not ready within 3 s");
@@ -403,7 +450,8 @@ mod tests {
     #[test]
     fn one_whose_resource_is_not_taken_is_killed_after_a_while_and_it_is_said_why() {
         let mut worker = worker();
-        worker.serving(at(1.0), "unix:/w", "PathPlanner", &mut Vec::new());
+        worker.serving(at(1.0), "unix:/w");
+        worker.offer("PathPlanner", &mut Vec::new());
         worker.refused(at(4.0), "another session has it");
         worker.refused(at(5.0), "another session has it");
         assert_eq!((worker.status().reason.as_str(), worker.deadline()), ("another session has it", Some(at(4.0))));
@@ -417,7 +465,8 @@ mod tests {
     #[test]
     fn one_whose_resource_is_taken_in_time_is_ready() {
         let mut worker = worker();
-        worker.serving(at(1.0), "unix:/w", "PathPlanner", &mut Vec::new());
+        worker.serving(at(1.0), "unix:/w");
+        worker.offer("PathPlanner", &mut Vec::new());
         worker.refused(at(4.0), "a session of before has it");
         worker.offered(at(2.0), &mut Vec::new());
         assert!(commands(|c| worker.advance(at(9.0), &template(), c)).is_empty());
