@@ -55,12 +55,16 @@ pub enum ReadError {
     },
     /// A copy that was interrupted, or is still being made.
     #[error(
-        "{place} holds a part of a copy: `ratn state copy` was interrupted there, or is still at work; if it is not, empty the place ({how}) \
-         and copy again"
+        "{place} holds a part of a copy: `ratn state copy` was interrupted there, or is still at work; if it is not, {}empty the place ({how}) \
+         and copy again",
+        if *complete { "start the same `ratn state copy` again, which lets it count where all of it is there and its source is marked as moved to it; \
+         where the source is not marked, " } else { "" }
     )]
     Unfinished {
         /// In what.
         place: String,
+        /// All of it may be there.
+        complete: bool,
         /// How it is emptied.
         how: String,
     },

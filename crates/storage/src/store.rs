@@ -80,6 +80,13 @@ pub trait Store: fmt::Debug + Send + Sync {
     /// Where what is there is damaged or of a newer format, or where reading fails.
     fn read(&self) -> Result<Recovered, ReadError>;
 
+    /// Lets a copy count of which all is there ([`Writer::mark_complete`] with this text), and says its last position. Nothing where there is
+    /// no such copy. Blocks.
+    ///
+    /// # Errors
+    /// Where somebody writes there, or it cannot be read or written.
+    fn finish_copy(&self, moved: &str) -> Result<Option<Position>, CopyError>;
+
     /// Where it is, for people.
     fn place(&self) -> String;
 }
@@ -118,6 +125,13 @@ pub trait Writer: fmt::Debug + Send {
     /// # Errors
     /// Where another writer has the place, or it cannot be written.
     fn mark_unfinished(&mut self) -> Result<(), CopyError>;
+
+    /// All of the copy is there and durable; it still counts as unfinished. It is whole where its source is marked as moved with the same
+    /// text ([`Store::finish_copy`]). Blocks.
+    ///
+    /// # Errors
+    /// Where another writer has the place, or it cannot be written.
+    fn mark_complete(&mut self, moved: &str) -> Result<(), CopyError>;
 
     /// The copy is whole. Only where the place is still this writer's, and durable when this returns. Blocks.
     ///

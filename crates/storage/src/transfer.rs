@@ -1,6 +1,6 @@
 //! A log from one place to another, whatever each is kept in: from files to etcd and back.
 
-use crate::error::{CompactError, CopyError};
+use crate::error::{CompactError, CopyError, OpenError, ReadError};
 use crate::store::{Position, Recovered, Store, Writer};
 
 /// What stands in place of the records of a snapshot: the position that the snapshot stands for. Nobody reads it.
@@ -12,13 +12,26 @@ const PLACEHOLDER: &[u8] = b"";
 /// The target's place is held until the end. The target is marked as unfinished first, and the mark is removed last: of a copy that was
 /// interrupted nobody opens the part that is there.
 /// Before that the source is marked as moved ([`Writer::mark_moved`](crate::Writer::mark_moved)), so that nobody goes on with it: there are never two that can be opened.
+/// Interrupted between the two, the same copy again finishes it.
 ///
 /// # Errors
 /// Where either has a writer, the source cannot be read, the target is not empty, or writing fails: then throw the target away.
 pub fn transfer(from: &dyn Store, to: &dyn Store) -> Result<Position, CopyError> {
-    let (recovered, mut held) = from.open()?;
+    let (recovered, mut held) = match from.open() {
+        Err(OpenError::Read(ReadError::Moved { place, to: moved, how })) => {
+            // Interrupted between the two marks: all of it is there, and the source is no one's any more.
+            let finished = to.finish_copy(&moved)?;
+            return finished.ok_or(CopyError::Read(ReadError::Moved { place, to: moved, how }));
+        }
+        opened => opened?,
+    };
     let (last, mut copy) = put(recovered, from, to)?;
-    held.mark_moved(&to.place())?;
+    let draw = crate::draw::number();
+    let draw = draw.map_err(|source| CopyError::Io { action: "draw a number for", place: to.place(), source })?;
+    // By the number it is known which copy the source was moved to.
+    let moved = format!("{} (copy {draw:016x})", to.place());
+    copy.mark_complete(&moved)?;
+    held.mark_moved(&moved)?;
     copy.mark_whole()?;
     Ok(last)
 }

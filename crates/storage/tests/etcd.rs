@@ -62,6 +62,14 @@ fn a_copy_that_was_interrupted_is_not_opened() {
 }
 
 #[test]
+fn a_copy_that_was_interrupted_when_its_source_was_marked_is_finished_by_the_same_copy() {
+    with_logs(
+        Bounds::default(),
+        promises::a_copy_that_was_interrupted_when_its_source_was_marked_is_finished_by_the_same_copy,
+    );
+}
+
+#[test]
 fn what_was_moved_is_opened_only_where_it_is_now() {
     with_logs(Bounds::default(), promises::what_was_moved_is_opened_only_where_it_is_now);
 }

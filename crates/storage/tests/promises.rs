@@ -39,6 +39,11 @@ fn a_log_is_a_vector() {
 }
 
 #[test]
+fn a_copy_that_was_interrupted_when_its_source_was_marked_is_finished_by_the_same_copy() {
+    with_logs(promises::a_copy_that_was_interrupted_when_its_source_was_marked_is_finished_by_the_same_copy);
+}
+
+#[test]
 fn what_was_moved_is_opened_only_where_it_is_now() {
     with_logs(promises::what_was_moved_is_opened_only_where_it_is_now);
 }

@@ -278,6 +278,10 @@ impl Store for PutInPlace {
         self.0.read()
     }
 
+    fn finish_copy(&self, moved: &str) -> Result<Option<Position>, ratn_storage::CopyError> {
+        self.0.finish_copy(moved)
+    }
+
     fn place(&self) -> String {
         self.0.place()
     }

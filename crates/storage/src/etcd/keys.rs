@@ -7,7 +7,7 @@
 //!   PREFIX/writable                   there as long as who leads can write `alive`
 //!   PREFIX/head                       the last record that counts
 //!   PREFIX/step                       how often a snapshot, or what it replaces, or one of the next two was changed
-//!   PREFIX/unfinished                 as long as not all of a copy is there
+//!   PREFIX/unfinished                 until a copy counts; says where its source was moved to, as `moved` does there, when all is there
 //!   PREFIX/moved                      where all of it was moved to
 //!   PREFIX/log/POSITION/PART          a frame of records, by the first of them
 //!   PREFIX/snapshot/current           which snapshot counts

@@ -34,20 +34,21 @@ pub use client::Connect;
 pub use format::Holder;
 pub use writer::Bounds;
 
-use crate::error::{Fault, OpenError, ReadError};
+use crate::error::{CopyError, Fault, OpenError, ReadError};
 use crate::store::{Position, Recovered, Store, Writer};
 use chain::Chain;
 use client::Client;
 use contents::{Contents, Known};
 use format::{Head, Step, text};
-use keys::{Keys, delete_span};
+use keys::{Keys, delete, delete_span, written_at};
 use mark::{Height, Mark};
 use silence::Silence;
 use std::fmt;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
-use term::{Seen, Term};
+use term::{Seen, Term, unreadable};
+use wire::TxnRequest;
 use writer::{EtcdWriter, Renewing, Shared};
 
 /// Where a log in etcd is, and who opens it.
@@ -264,6 +265,20 @@ impl Store for Etcd {
                 read => return Ok(Contents::of(read?, &seen).recovered),
             }
         }
+    }
+
+    fn finish_copy(&self, moved: &str) -> Result<Option<Position>, CopyError> {
+        let client = self.client()?;
+        let seen = Seen::look(&client, &self.keys)?;
+        let Some((written, _)) = seen.unfinished.as_ref().filter(|(_, says)| says == moved) else { return Ok(None) };
+        let compare = vec![written_at(self.keys.unfinished(), *written)];
+        let success = vec![delete(self.keys.unfinished())];
+        let request = TxnRequest { compare, success, failure: Vec::new() };
+        // Where it is not as it was any more, an earlier attempt or the copier itself has taken the mark away, or somebody has emptied the place.
+        let answer = client.repeat(&request, term::PATIENCE, Instant::now() + REACH);
+        answer.map_err(|error| unreadable(&client, &error))?;
+        let seen = Seen::look(&client, &self.keys)?.whole(&self.keys)?;
+        Ok(seen.head.map(|(_, head)| Position(head.position)))
     }
 
     fn place(&self) -> String {

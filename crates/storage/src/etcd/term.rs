@@ -45,6 +45,9 @@ pub(super) const OTHERS_PATIENCE: Duration = Duration::from_secs(5);
 /// After so long without an answer of any member there is no etcd.
 const REACH: Duration = Duration::from_secs(5);
 
+/// What `unfinished` says until all of a copy is there.
+pub(super) const PART_OF_A_COPY: &str = "a copy is being made";
+
 /// Everything small, as it was at one moment.
 #[derive(Debug)]
 pub(super) struct Seen {
@@ -55,8 +58,8 @@ pub(super) struct Seen {
     pub(super) step: i64,
     /// What the snapshot that counts stands for.
     pub(super) through: Option<u64>,
-    /// It is a part of a copy.
-    unfinished: bool,
+    /// It is a part of a copy: when that was said, and what.
+    pub(super) unfinished: Option<(i64, String)>,
     /// It was moved, where to.
     moved: Option<String>,
     signs: Signs,
@@ -119,8 +122,9 @@ impl Seen {
         let signs = Signs { leader: leader.as_ref().map_or(0, |(revision, _)| *revision), alive, writable };
         let current: Option<Current> = next().map(|kv| parse(&keys.current(), &kv.value)).transpose()?;
         let through = current.map(|current| current.through);
-        let unfinished = next().is_some();
-        let moved = next().map(|kv| String::from_utf8_lossy(&kv.value).into_owned());
+        let says = |kv: KeyValue| (kv.mod_revision, String::from_utf8_lossy(&kv.value).into_owned());
+        let unfinished = next().map(says);
+        let moved = next().map(|kv| says(kv).1);
         if let Some(newer) = meta.as_ref().filter(|meta| meta.version > VERSION) {
             let place = keys.prefix().to_owned();
             return Err(ReadError::Newer { place, found: newer.version, supported: VERSION });
@@ -132,15 +136,16 @@ impl Seen {
     pub(super) fn whole(self, keys: &Keys) -> Result<Seen, ReadError> {
         let prefix = keys.prefix();
         let place = format!("{prefix} in etcd");
-        match &self.moved {
-            _ if self.unfinished => {
-                Err(ReadError::Unfinished { place, how: format!("etcdctl del --prefix {prefix}/") })
+        match (&self.unfinished, &self.moved) {
+            (Some((_, says)), _) => {
+                let complete = says != PART_OF_A_COPY;
+                Err(ReadError::Unfinished { place, complete, how: format!("etcdctl del --prefix {prefix}/") })
             }
-            Some(to) => {
+            (None, Some(to)) => {
                 let how = format!("etcdctl del {}", String::from_utf8_lossy(&keys.moved()));
                 Err(ReadError::Moved { place, to: to.clone(), how })
             }
-            None => Ok(self),
+            (None, None) => Ok(self),
         }
     }
 

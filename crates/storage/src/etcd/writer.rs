@@ -14,7 +14,7 @@ use super::format::{Current, Head, Step, encode_frame, parse, text};
 use super::keys::{delete, found_one, get, put};
 use super::mark::{Height, Mark};
 use super::owner::Owner;
-use super::term::{HeldPlace, OTHERS_PATIENCE, RENEW_INTERVAL, Term};
+use super::term::{HeldPlace, OTHERS_PATIENCE, PART_OF_A_COPY, RENEW_INTERVAL, Term};
 use super::wire::{RequestOp, TxnRequest};
 use crate::durable::Durable;
 use crate::error::{AppendError, CompactError, CompactionFailure, CopyError, Fault};
@@ -448,8 +448,13 @@ impl Writer for EtcdWriter {
 
     fn mark_unfinished(&mut self) -> Result<(), CopyError> {
         let term = &self.shared.term;
-        let unfinished = put(term.keys.unfinished(), "a copy is being made");
+        let unfinished = put(term.keys.unfinished(), PART_OF_A_COPY);
         Ok(self.shared.change_snapshots(vec![unfinished, put(term.keys.meta(), text(&term.meta_of_a_copy()))])?)
+    }
+
+    fn mark_complete(&mut self, moved: &str) -> Result<(), CopyError> {
+        let complete = put(self.shared.term.keys.unfinished(), moved.to_owned());
+        Ok(self.shared.change_snapshots(vec![complete])?)
     }
 
     fn mark_whole(&mut self) -> Result<(), CopyError> {

@@ -73,9 +73,12 @@ fn read_once(directory: &Path) -> Result<Contents, ReadError> {
         place: directory.display().to_string(),
         source,
     })?;
-    if directory.join(directory::UNFINISHED_COPY).exists() {
+    let unfinished = directory.join(directory::UNFINISHED_COPY);
+    if unfinished.exists() {
         let place = directory.display().to_string();
-        return Err(ReadError::Unfinished { how: format!("rm -r {place}"), place });
+        // A copy of which all is there says more than that.
+        let complete = std::fs::metadata(&unfinished).is_ok_and(|mark| mark.len() > 0);
+        return Err(ReadError::Unfinished { complete, how: format!("rm -r {place}"), place });
     }
     let moved = directory.join(directory::MOVED);
     match std::fs::read_to_string(&moved) {

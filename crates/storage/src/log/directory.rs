@@ -4,7 +4,7 @@
 //!   writer.lock                         whose inode is locked by the writer
 //!   segment-00000000000000000001.log    by number
 //!   snapshot-00000000000000004711.snap  by the last position it stands for
-//!   unfinished-copy                     as long as not all of a copy is there
+//!   unfinished-copy                     until a copy counts; says what the source's moved-to says, when all is there
 //!   moved-to                            says where all of it was moved to
 //!   *.tmp                               not finished; the next writer removes it
 //! ```

@@ -24,7 +24,7 @@ mod writer;
 pub use backup::{Copied, backup, restore};
 pub use files::{Disk, Files, LogFile};
 
-use crate::error::{OpenError, ReadError};
+use crate::error::{CopyError, OpenError, ReadError};
 use crate::store::{Epoch, Position, Recovered, Store, Writer};
 use contents::Contents;
 use format::{SegmentHeader, StoreId};
@@ -198,6 +198,24 @@ impl Store for Log {
 
     fn read(&self) -> Result<Recovered, ReadError> {
         Ok(contents::read(&self.directory)?.recovered())
+    }
+
+    fn finish_copy(&self, moved: &str) -> Result<Option<Position>, CopyError> {
+        let mark = self.directory.join(directory::UNFINISHED_COPY);
+        let failed = |action| {
+            let place = mark.display().to_string();
+            move |source| CopyError::Io { action, place, source }
+        };
+        if !mark.exists() {
+            return Ok(None);
+        }
+        let _lock = Lock::take(&self.directory)?;
+        if std::fs::read(&mark).map_err(failed("read"))? != moved.as_bytes() {
+            return Ok(None);
+        }
+        let removed = self.files.remove(&mark).and_then(|()| self.files.sync_directory(&self.directory));
+        removed.map_err(failed("remove"))?;
+        Ok(Some(contents::read(&self.directory)?.last()))
     }
 
     fn place(&self) -> String {

@@ -33,6 +33,17 @@ impl LogWriter {
         Ok(LogWriter { shared, files, store, options, place, syncer: Some(syncer), compaction: None })
     }
 
+    /// In place of what the mark said before.
+    fn write_mark(&self, name: &str, text: &str) -> Result<(), CopyError> {
+        let mark = self.shared.directory.join(name);
+        let temporary = directory::temporary(&mark);
+        let written =
+            self.files.create(&temporary).and_then(|mut file| file.write(text.as_bytes()).and_then(|()| file.sync()));
+        let marked = written.and_then(|()| self.files.rename(&temporary, &mark));
+        let marked = marked.and_then(|()| self.files.sync_directory(&self.shared.directory));
+        marked.map_err(|source| CopyError::Io { action: "make", place: mark.display().to_string(), source })
+    }
+
     /// Writes what waits, and ends both threads.
     fn end(&mut self) {
         self.shared.pending.close();
@@ -94,6 +105,11 @@ impl Writer for LogWriter {
         marked.map_err(|source| CopyError::Io { action: "make", place: mark.display().to_string(), source })
     }
 
+    fn mark_complete(&mut self, moved: &str) -> Result<(), CopyError> {
+        self.place.check()?;
+        self.write_mark(directory::UNFINISHED_COPY, moved)
+    }
+
     fn mark_whole(&mut self) -> Result<(), CopyError> {
         self.place.check()?;
         let mark = self.shared.directory.join(directory::UNFINISHED_COPY);
@@ -103,13 +119,7 @@ impl Writer for LogWriter {
 
     fn mark_moved(&mut self, to: &str) -> Result<(), CopyError> {
         self.place.check().map_err(CopyError::SourceLost)?;
-        let mark = self.shared.directory.join(directory::MOVED);
-        let temporary = directory::temporary(&mark);
-        let written =
-            self.files.create(&temporary).and_then(|mut file| file.write(to.as_bytes()).and_then(|()| file.sync()));
-        let marked = written.and_then(|()| self.files.rename(&temporary, &mark));
-        let marked = marked.and_then(|()| self.files.sync_directory(&self.shared.directory));
-        marked.map_err(|source| CopyError::Io { action: "make", place: mark.display().to_string(), source })
+        self.write_mark(directory::MOVED, to)
     }
 
     fn waiting_bytes(&self) -> usize {

@@ -1,4 +1,4 @@
-//! A log whose writer accepts so many records and no more.
+//! A log whose writer accepts so many records and no more; that a copy of them is whole counts as one.
 
 use ratn_storage::{
     AppendError, CompactError, CopyError, Durable, Fault, MakeSnapshot, OpenError, Place, Position, ReadError,
@@ -25,6 +25,10 @@ impl Store for Interrupted {
 
     fn read(&self) -> Result<Recovered, ReadError> {
         self.store.read()
+    }
+
+    fn finish_copy(&self, moved: &str) -> Result<Option<Position>, CopyError> {
+        self.store.finish_copy(moved)
     }
 
     fn place(&self) -> String {
@@ -54,7 +58,12 @@ impl Writer for Ends {
         self.writer.mark_unfinished()
     }
 
+    fn mark_complete(&mut self, moved: &str) -> Result<(), CopyError> {
+        self.writer.mark_complete(moved)
+    }
+
     fn mark_whole(&mut self) -> Result<(), CopyError> {
+        self.left = self.left.checked_sub(1).ok_or(Fault::Closed)?;
         self.writer.mark_whole()
     }
 

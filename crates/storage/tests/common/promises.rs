@@ -76,6 +76,33 @@ pub(crate) fn a_copy_that_was_interrupted_is_not_opened(make: Make<'_>) {
     assert_eq!(payloads(&make("target").open().unwrap().0.records), [b"1", b"2", b"3"]);
 }
 
+pub(crate) fn a_copy_that_was_interrupted_when_its_source_was_marked_is_finished_by_the_same_copy(make: Make<'_>) {
+    let (_, mut source) = make("begun").open().unwrap();
+    for record in [b"1", b"2", b"3"] {
+        append_durably(&mut *source, record);
+    }
+    source.close().unwrap();
+    // Another one, which is not what the source was moved to.
+    transfer_running(&*make("begun"), &*make("earlier")).unwrap();
+    assert!(transfer(&*make("begun"), &Interrupted { store: make("part"), after: 2 }).is_err());
+    // All records, and not the removal of the mark.
+    assert!(transfer(&*make("begun"), &Interrupted { store: make("finished"), after: 3 }).is_err());
+    let refused = make("finished").open().map(drop).unwrap_err();
+    assert!(refused.to_string().contains("the same `ratn state copy` again"), "{refused}");
+    let moved = |error: CopyError| assert!(error.to_string().contains("was moved to"), "{error}");
+    for other in ["part", "earlier", "empty"] {
+        moved(transfer(&*make("begun"), &*make(other)).unwrap_err());
+    }
+    assert!(matches!(make("part").open(), Err(OpenError::Read(ReadError::Unfinished { .. }))));
+    assert_eq!(transfer(&*make("begun"), &*make("finished")).unwrap(), Position(3));
+    let (recovered, mut writer) = make("finished").open().unwrap();
+    assert_eq!(payloads(&recovered.records), [b"1", b"2", b"3"]);
+    append_durably(&mut *writer, b"4");
+    writer.close().unwrap();
+    moved(transfer(&*make("begun"), &*make("finished")).unwrap_err());
+    assert!(matches!(make("begun").open(), Err(OpenError::Read(ReadError::Moved { .. }))));
+}
+
 pub(crate) fn what_was_moved_is_opened_only_where_it_is_now(make: Make<'_>) {
     let (_, mut source) = make("here").open().unwrap();
     for record in [b"1", b"2", b"3"] {
@@ -166,6 +193,10 @@ impl Store for Opened<'_> {
         self.store.read()
     }
 
+    fn finish_copy(&self, moved: &str) -> Result<Option<Position>, CopyError> {
+        self.store.finish_copy(moved)
+    }
+
     fn place(&self) -> String {
         self.store.place()
     }
@@ -191,6 +222,10 @@ impl Store for Meanwhile<'_> {
 
     fn read(&self) -> Result<Recovered, ReadError> {
         self.store.read()
+    }
+
+    fn finish_copy(&self, moved: &str) -> Result<Option<Position>, CopyError> {
+        self.store.finish_copy(moved)
     }
 
     fn place(&self) -> String {
