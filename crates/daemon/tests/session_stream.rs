@@ -354,6 +354,41 @@ async fn a_grant_whose_answer_was_lost_goes_back_when_it_is_asked_for_again_and_
 }
 
 #[tokio::test]
+async fn a_grant_whose_answer_was_lost_goes_back_where_a_refusal_came_before_the_question_that_is_dropped() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
+    a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
+    let free = async || a.resources.get("arm").await.unwrap().free.units();
+    let relay = Relay::to(&manager);
+    let client = ResourceClient::new(&Channels::new(), &relay.endpoint, b.session.id()).unwrap();
+    let options = || AcquireOptions { request: "run/i1".to_owned(), ..AcquireOptions::default() };
+    let ask = || client.acquire(vec![block("Arm")], options());
+    in_time(client.release(LeaseId(1))).await.unwrap();
+    relay.deaf.send_replace(true);
+    let mut first = Box::pin(ask());
+    in_time(async {
+        while free().await == 1 {
+            assert!(futures::poll!(&mut first).is_pending());
+        }
+    })
+    .await;
+    relay.cut.send_replace(());
+    assert!(in_time(first).await.unwrap_err().is_crash());
+    relay.deaf.send_replace(false);
+    in_time(async { while client.release(LeaseId(1)).await.is_err() {} }).await;
+    // Refused, and the grant of the first question stays: of this request something else was asked before.
+    let refused = in_time(client.acquire(vec![block("Gripper")], options())).await.unwrap_err();
+    assert_eq!((refused.code(), free().await), (Some(Code::InvalidArgument), 0));
+    relay.deaf.send_replace(true);
+    let mut again = Box::pin(ask());
+    assert!(futures::poll!(&mut again).is_pending());
+    drop(again);
+    in_time(async { while free().await == 0 {} }).await;
+    manager.end().await;
+}
+
+#[tokio::test]
 async fn of_two_questions_of_one_request_that_wait_the_dropped_one_takes_nothing_from_the_other() {
     let system = TestSystem::new();
     let manager = system.resource_manager().await;

@@ -53,7 +53,7 @@ impl Pool {
         if let Some(session) = self.sessions.get(caller).filter(|_| !undone) {
             let id = RequestId::new(&session.opened_by, request_id);
             if self.memory.reply(&id).is_none() {
-                self.withdrawals.withdrawn(self.now, &self.limits, id);
+                self.withdrawals.withdrawn(self.now, &self.limits, id, caller);
             }
         }
         Ok(undone)

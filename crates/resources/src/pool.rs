@@ -170,11 +170,18 @@ impl Pool {
             Some(Recalled::Answered(Remembered::Created { id, revision })) => Ok(Reply::Created { id, revision }),
             Some(Recalled::Answered(Remembered::Touched(ids))) => Ok(Reply::Touched(ids)),
             Some(Recalled::Answered(Remembered::Done)) => Ok(Reply::Done),
-            None if matches!(request, Request::Acquire(_)) && self.withdrawals.is_withdrawn(&id) => {
+            None if let Request::Acquire(acquire) = &request
+                && self.withdrawals.is_withdrawn(&id, &acquire.session) =>
+            {
                 Err(PoolError::Withdrawn { id: request_id.to_owned() })
             }
             None => {
-                let reply = self.perform(now, speaker, id.clone(), fingerprint, request)?;
+                let is_acquire = matches!(request, Request::Acquire(_));
+                let reply = self.perform(now, speaker, id.clone(), fingerprint, request);
+                if reply.is_err() && is_acquire {
+                    self.withdrawals.heard_of(self.now, &self.limits, id.clone());
+                }
+                let reply = reply?;
                 let remembered = match &reply {
                     // Remembered by the grant, which may be long after this or was within it.
                     Reply::Queued(_) | Reply::Granted(_) => return Ok(reply),

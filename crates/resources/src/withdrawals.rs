@@ -1,17 +1,18 @@
 //! Request ids that were withdrawn before their acquire was heard of: the acquire may still be on its way, and is refused when it arrives.
 //! One of an id that was heard of before acquires anew, however often that was withdrawn: so ids that were refused or undone are known, too.
 //!
-//! Kept as long as answers are (`memory.rs`), bounded for each caller and in all in the same way. Not written down: what was on its way to a
-//! process that has ended does not arrive.
+//! Kept as long as answers are (`memory.rs`), bounded for each caller and in all in the same way; ids of either sort displace none of the
+//! other of their caller. Not written down: what was on its way to a process that has ended does not arrive.
 
+use crate::id::SessionId;
 use crate::limits::Limits;
 use crate::memory::RequestId;
 use ratn_model::time::Timestamp;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Of one caller at the most: its own oldest is forgotten first.
+/// Of one caller and sort at the most: its own oldest is forgotten first.
 const OF_CALLER: usize = 4_096;
 
 /// By who withdrew.
@@ -22,62 +23,97 @@ pub(crate) struct Withdrawals {
 
 #[derive(Debug, Clone, Default)]
 struct OfCaller {
-    /// Whether an acquire was heard of.
-    ids: BTreeMap<Arc<str>, bool>,
+    /// Of another session of the caller the id is free.
+    withdrawn: Ids<(Arc<str>, SessionId)>,
+    heard_of: Ids<Arc<str>>,
+}
+
+#[derive(Debug, Clone)]
+struct Ids<T> {
+    known: BTreeSet<T>,
     /// The oldest first.
-    order: VecDeque<(Timestamp, Arc<str>)>,
+    order: VecDeque<(Timestamp, T)>,
+}
+
+impl<T> Default for Ids<T> {
+    fn default() -> Ids<T> {
+        Ids { known: BTreeSet::new(), order: VecDeque::new() }
+    }
+}
+
+impl<T: Ord + Clone> Ids<T> {
+    fn keep(&mut self, now: Timestamp, id: T) {
+        if self.known.insert(id.clone()) {
+            self.order.push_back((now, id));
+        }
+        if self.order.len() > OF_CALLER {
+            self.forget_oldest();
+        }
+    }
+
+    fn forget_oldest(&mut self) {
+        if let Some((_, id)) = self.order.pop_front() {
+            self.known.remove(&id);
+        }
+    }
+
+    fn forget_until(&mut self, until: impl Fn(Timestamp) -> bool) {
+        while self.order.front().is_some_and(|(at, _)| until(*at)) {
+            self.forget_oldest();
+        }
+    }
 }
 
 impl OfCaller {
+    fn len(&self) -> usize {
+        self.withdrawn.order.len() + self.heard_of.order.len()
+    }
+
+    /// Of what there is more of.
     fn forget_oldest(&mut self) {
-        if let Some((_, id)) = self.order.pop_front() {
-            self.ids.remove(&id);
+        if self.heard_of.order.len() >= self.withdrawn.order.len() {
+            self.heard_of.forget_oldest();
+        } else {
+            self.withdrawn.forget_oldest();
         }
     }
 }
 
 impl Withdrawals {
-    /// Whether it was withdrawn, and no acquire was heard of.
-    pub(crate) fn is_withdrawn(&self, id: &RequestId) -> bool {
-        self.callers.get(&id.caller).and_then(|of_caller| of_caller.ids.get(&id.id)) == Some(&false)
+    /// Whether it was withdrawn in this session, and no acquire was heard of.
+    pub(crate) fn is_withdrawn(&self, id: &RequestId, session: &SessionId) -> bool {
+        self.callers.get(&id.caller).is_some_and(|own| {
+            !own.heard_of.known.contains(&id.id) && own.withdrawn.known.contains(&(id.id.clone(), session.clone()))
+        })
     }
 
-    /// An acquire ended without a lease, or its lease was undone.
+    /// An acquire was refused, ended without a lease, or its lease was undone.
     pub(crate) fn heard_of(&mut self, now: Timestamp, limits: &Limits, id: RequestId) {
         if !id.is_empty() {
-            self.keep(now, limits, id, true);
+            self.callers.entry(id.caller).or_default().heard_of.keep(now, id.id);
+            self.forget(now, limits);
         }
     }
 
     /// No answer is known that this id was given.
-    pub(crate) fn withdrawn(&mut self, now: Timestamp, limits: &Limits, id: RequestId) {
-        self.keep(now, limits, id, false);
+    pub(crate) fn withdrawn(&mut self, now: Timestamp, limits: &Limits, id: RequestId, session: &SessionId) {
+        self.callers.entry(id.caller).or_default().withdrawn.keep(now, (id.id, session.clone()));
+        self.forget(now, limits);
     }
 
-    fn keep(&mut self, now: Timestamp, limits: &Limits, id: RequestId, heard_of: bool) {
+    fn forget(&mut self, now: Timestamp, limits: &Limits) {
         let for_at_most = Duration::from_millis(limits.remember_for_ms);
         for of_caller in self.callers.values_mut() {
-            while of_caller.order.front().is_some_and(|(at, _)| *at + for_at_most <= now) {
-                of_caller.forget_oldest();
-            }
+            of_caller.withdrawn.forget_until(|at| at + for_at_most <= now);
+            of_caller.heard_of.forget_until(|at| at + for_at_most <= now);
         }
-        let own = self.callers.entry(id.caller).or_default();
-        if let Some(known) = own.ids.get_mut(&id.id) {
-            *known |= heard_of;
-        } else {
-            own.ids.insert(id.id.clone(), heard_of);
-            own.order.push_back((now, id.id));
-        }
-        if own.order.len() > OF_CALLER {
-            own.forget_oldest();
-        }
-        let in_all: usize = self.callers.values().map(|of_caller| of_caller.order.len()).sum();
+        let in_all: usize = self.callers.values().map(OfCaller::len).sum();
         if in_all > limits.remembered_requests.max(1)
-            && let Some(most) = self.callers.values_mut().max_by_key(|of_caller| of_caller.order.len())
+            && let Some(most) = self.callers.values_mut().max_by_key(|of_caller| of_caller.len())
         {
             most.forget_oldest();
         }
-        self.callers.retain(|_, of_caller| !of_caller.order.is_empty());
+        self.callers.retain(|_, of_caller| of_caller.len() > 0);
     }
 }
 
@@ -89,24 +125,32 @@ mod tests {
         RequestId::new(&caller.into(), &number.to_string())
     }
 
+    fn session() -> SessionId {
+        SessionId::from("s")
+    }
+
     #[test]
     fn as_many_are_kept_as_may_be_and_those_of_the_caller_with_the_most_are_forgotten_first() {
         let limits = Limits { remembered_requests: 10, remember_for_ms: 1_000, ..Limits::default() };
         let mut withdrawals = Withdrawals::default();
         let at = |ms: u64| Timestamp(ms * 1_000_000);
-        withdrawals.withdrawn(at(0), &limits, id("adam", 0));
-        (0..20).for_each(|number| withdrawals.withdrawn(at(500), &limits, id("eve", number)));
+        withdrawals.withdrawn(at(0), &limits, id("adam", 0), &session());
+        (0..20).for_each(|number| withdrawals.withdrawn(at(500), &limits, id("eve", number), &session()));
         let known = |withdrawals: &Withdrawals| {
-            let of_eve = (0..20).filter(|number| withdrawals.is_withdrawn(&id("eve", *number)));
-            (withdrawals.is_withdrawn(&id("adam", 0)), of_eve.collect::<Vec<_>>())
+            let of_eve = (0..20).filter(|number| withdrawals.is_withdrawn(&id("eve", *number), &session()));
+            (withdrawals.is_withdrawn(&id("adam", 0), &session()), of_eve.collect::<Vec<_>>())
         };
         assert_eq!(known(&withdrawals), (true, (11..20).collect()));
-        withdrawals.withdrawn(at(1_000), &limits, id("eve", 19));
+        withdrawals.withdrawn(at(1_000), &limits, id("eve", 19), &session());
         assert_eq!(known(&withdrawals), (false, (11..20).collect()));
-        withdrawals.withdrawn(at(1_500), &limits, id("adam", 1));
+        withdrawals.withdrawn(at(1_500), &limits, id("adam", 1), &session());
         assert_eq!(known(&withdrawals), (false, vec![]));
         let unbounded = Limits::default();
-        (0..=OF_CALLER).for_each(|number| withdrawals.withdrawn(at(1_500), &unbounded, id("eve", number)));
-        assert!(!withdrawals.is_withdrawn(&id("eve", 0)) && withdrawals.is_withdrawn(&id("eve", OF_CALLER)));
+        (0..=OF_CALLER).for_each(|number| withdrawals.withdrawn(at(1_500), &unbounded, id("eve", number), &session()));
+        let is_known = |withdrawals: &Withdrawals, number| withdrawals.is_withdrawn(&id("eve", number), &session());
+        assert!(!is_known(&withdrawals, 0) && is_known(&withdrawals, OF_CALLER));
+        // Many that were refused displace none of those.
+        (9_000..20_000).for_each(|number| withdrawals.heard_of(at(1_500), &unbounded, id("eve", number)));
+        assert!(is_known(&withdrawals, 1) && is_known(&withdrawals, OF_CALLER));
     }
 }

@@ -641,6 +641,15 @@ fn an_acquire_that_arrives_after_its_withdrawal_is_refused() {
         assert_eq!(bench.pool.withdraw(bench.now, &session("b"), "known"), Ok(true));
     }
     assert!(matches!(ask(&mut bench, "b", "known"), Ok(Reply::Queued(_))));
+    // So is one that was refused at once, and what another session of the caller has withdrawn.
+    let unknown = Request::Acquire(AcquireRequest::new(session("b"), Vec::new()));
+    assert!(bench.pool.handle(bench.now, "refused", unknown).is_err());
+    assert_eq!(bench.pool.withdraw(bench.now, &session("b"), "refused"), Ok(false));
+    assert!(matches!(ask(&mut bench, "b", "refused"), Ok(Reply::Queued(_))));
+    assert!(matches!(ask(&mut bench, "a", "late"), Ok(Reply::Queued(_))));
+    bench.pool.withdraw(bench.now, &session("a"), "late").unwrap();
+    bench.pool.withdraw(bench.now, &session("b"), "later").unwrap();
+    assert_eq!(ask(&mut bench, "b", "later"), Err(PoolError::Withdrawn { id: "later".into() }));
     // As long as answers are remembered.
     bench.at(3_601.0);
     for name in ["a", "b"] {

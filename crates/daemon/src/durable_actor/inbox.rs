@@ -2,8 +2,10 @@
 
 use super::Core;
 use crate::details::ending;
+use futures::FutureExt;
 use std::fmt;
 use tokio::sync::{mpsc, oneshot};
+use tokio::task::coop::unconstrained;
 use tonic::Status;
 
 /// Messages that wait for the actor; more make their senders wait.
@@ -59,11 +61,15 @@ impl<C: Core> Handle<C> {
         self.messages.send(message).await.map_err(|_| ending())
     }
 
-    /// Sends a message from where nothing can be waited for.
+    /// Sends a message from where nothing can be waited for. It comes before what is sent after this.
     pub(crate) fn send_later(&self, message: C::Message) {
         if let Err(mpsc::error::TrySendError::Full(message)) = self.messages.try_send(message) {
             let messages = self.messages.clone();
-            tokio::spawn(async move { messages.send(message).await });
+            let mut sending = Box::pin(unconstrained(async move { messages.send(message).await }));
+            // It takes its place here and now: the new task may run after what is sent next.
+            if sending.as_mut().now_or_never().is_none() {
+                tokio::spawn(sending);
+            }
         }
     }
 }

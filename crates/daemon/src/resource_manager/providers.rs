@@ -124,7 +124,8 @@ impl Providers {
 
     /// When something changes by time alone, or there is more to tell than a turn could.
     pub(super) fn deadline(&self, now: Timestamp) -> Option<Timestamp> {
-        self.round.as_ref().map(|_| now + A_MOMENT).or_else(|| self.hand_out.deadline())
+        let more = self.round.is_some() || self.news;
+        more.then_some(now + A_MOMENT).or_else(|| self.hand_out.deadline())
     }
 
     /// Whether something is to be told though nothing else is missing than before.

@@ -19,7 +19,7 @@ pub(super) fn of_error(error: &PoolError) -> Status {
             (Code::PermissionDenied, "NOT_YOURS")
         }
         PoolError::NotEnough { .. } => (Code::FailedPrecondition, "NOT_ENOUGH"),
-        PoolError::Withdrawn { .. } => (Code::Cancelled, "WITHDRAWN"),
+        PoolError::Withdrawn { .. } => (Code::Aborted, "WITHDRAWN"),
         PoolError::Malformed { .. } => (Code::InvalidArgument, "MALFORMED"),
         PoolError::RequestIdReused { .. } => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
         PoolError::SessionEnding { .. } => {
@@ -43,7 +43,7 @@ pub(super) fn without_session(who: &str) -> Status {
 pub(super) fn of_refusal(refusal: &Refusal) -> Status {
     let (code, reason) = match refusal {
         Refusal::Deadline { .. } => (Code::DeadlineExceeded, "NOT_GRANTED_IN_TIME"),
-        Refusal::Cancelled => (Code::Cancelled, "WITHDRAWN"),
+        Refusal::Cancelled => (Code::Aborted, "WITHDRAWN"),
         Refusal::SessionEnded => (Code::FailedPrecondition, "SESSION_UNKNOWN"),
     };
     status(code, reason, format!("not granted: {refusal}"))

@@ -1,6 +1,6 @@
 //! The client of the resource manager. What is asked for again and again while a task runs goes over the session's stream.
 
-use super::unheard::Unheard;
+use super::unheard::{Ended, Unheard};
 use super::{CallError, Channels, fresh_id, snapshot};
 use crate::endpoint::Endpoint;
 use crate::multiplex::SessionCalls;
@@ -212,7 +212,10 @@ impl ResourceClient {
         let (request_id, session_id) = (request.to_owned(), self.session.clone());
         let question = v1::WithdrawRequest { request_id, session_id, ..Default::default() };
         match self.ask(Asked::Withdraw(question)).await? {
-            Answered::Withdraw(undone) => Ok(undone.withdrawn),
+            Answered::Withdraw(undone) => {
+                self.unheard.withdrawn(request);
+                Ok(undone.withdrawn)
+            }
             _ => Err(self.another("a withdraw")),
         }
     }
@@ -419,7 +422,11 @@ impl ResourceClient {
         };
         let answer = self.calls.call_dropped_with(open, question, when_dropped).await;
         let answer = answer.map_err(|status| self.failed(&status));
-        asking.ended(answer.as_ref().is_err_and(CallError::is_crash));
+        asking.ended(match &answer {
+            Ok(_) => Ended::Granted,
+            Err(error) if error.is_crash() => Ended::Lost,
+            Err(_) => Ended::Refused,
+        });
         answer
     }
 

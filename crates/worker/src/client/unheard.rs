@@ -1,7 +1,8 @@
 //! Acquires whose answers may have been lost: whoever asks again and then drops that says so, or a lease that nobody heard of would stay.
 //!
 //! The resource manager cannot know whether an answer was read. A client does: a request is unheard from the break of a stream on until
-//! one of its questions is answered.
+//! one of its questions is granted, or the request is withdrawn. A refusal says nothing of it: what is asked again may be refused before the
+//! manager looks what an earlier question was granted.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -17,8 +18,17 @@ pub(super) struct Unheard(Arc<Mutex<BTreeMap<String, Request>>>);
 struct Request {
     /// Questions under way.
     under_way: usize,
-    /// No question was answered since one was lost.
+    /// No question was granted since the answer to one was lost.
     lost: bool,
+}
+
+/// How a question ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Ended {
+    Granted,
+    Refused,
+    /// Its answer did not arrive.
+    Lost,
 }
 
 /// A question under way.
@@ -35,6 +45,16 @@ impl Unheard {
         Question { unheard: self.clone(), request: request.to_owned() }
     }
 
+    /// The request is undone, whatever was granted to it.
+    pub(super) fn withdrawn(&self, request: &str) {
+        let mut requests = self.open();
+        let Some(known) = requests.get_mut(request) else { return };
+        known.lost = false;
+        if known.under_way == 0 {
+            requests.remove(request);
+        }
+    }
+
     fn open(&self) -> MutexGuard<'_, BTreeMap<String, Request>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -42,7 +62,11 @@ impl Unheard {
 
 impl Question {
     /// It was answered, or its answer is lost.
-    pub(super) fn ended(&self, lost: bool) {
+    pub(super) fn ended(&self, ended: Ended) {
+        if ended == Ended::Refused {
+            return;
+        }
+        let lost = ended == Ended::Lost;
         let mut requests = self.unheard.open();
         if lost && requests.len() > MOST {
             let idle = requests.iter().find(|(_, request)| request.under_way == 0).map(|(id, _)| id.clone());
@@ -83,21 +107,27 @@ mod tests {
         let unheard = Unheard::default();
         let first = unheard.ask("r");
         assert!(!first.dropped(), "nothing was lost");
-        first.ended(true);
+        first.ended(Ended::Lost);
         drop(first);
         let (second, other) = (unheard.ask("r"), unheard.ask("other"));
         assert!(!other.dropped());
         let beside = unheard.ask("r");
         assert!(!second.dropped(), "another question of it is under way");
-        beside.ended(false);
+        beside.ended(Ended::Granted);
         drop(beside);
         assert!(!second.dropped(), "the answer was heard");
-        second.ended(true);
-        assert!(second.dropped() && !second.dropped(), "it is said once");
+        second.ended(Ended::Lost);
+        let refused = unheard.ask("r");
+        refused.ended(Ended::Refused);
+        drop(refused);
+        assert!(second.dropped() && !second.dropped(), "a refusal is no grant; and it is said once");
+        second.ended(Ended::Lost);
+        unheard.withdrawn("r");
+        assert!(!second.dropped(), "there is nothing left of it");
         drop((second, other));
         assert!(unheard.open().is_empty());
         for number in 0..2 * MOST {
-            unheard.ask(&number.to_string()).ended(true);
+            unheard.ask(&number.to_string()).ended(Ended::Lost);
         }
         assert!(unheard.open().len() <= MOST + 1);
     }

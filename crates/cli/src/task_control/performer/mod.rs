@@ -30,12 +30,13 @@ use ratn_model::resource::{LeasedResource, Requirement, ResourceClass, ResourceO
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, Resource, WorldChange};
-use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
+use ratn_worker::client::{AcquireOptions, ActionClient, CallError, Channels, ResourceClient, WorldClient};
 use ratn_worker::client::{retry_unanswered, retry_until_answered};
 use ratn_worker::session::{DEFAULT_TTL, Session};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
@@ -316,7 +317,12 @@ impl Performer {
         let requirements: Vec<Requirement> = requirements.into_iter().map(|one| self.of_performers(one)).collect();
         let (resources, events) = (self.resources.clone(), self.events.clone());
         let mut asking = Box::pin(trace::within(self.trace.child(), async move {
-            let ask = || resources.acquire(requirements.clone(), options.clone());
+            let unheard = AtomicBool::new(false);
+            let ask = || async {
+                let answer = resources.acquire(requirements.clone(), options.clone()).await;
+                unheard.fetch_or(answer.as_ref().is_err_and(CallError::is_crash), Ordering::Relaxed);
+                answer
+            };
             let answer = match handed {
                 Some(lease) => Ok(lease),
                 None => tokio::select! {
@@ -329,6 +335,10 @@ impl Performer {
                     }
                 },
             };
+            if answer.is_err() && unheard.into_inner() {
+                // An answer that was lost before the refusal may have been a grant.
+                let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
+            }
             let event = match answer {
                 Ok(lease) => Event::Granted { instance, lease },
                 Err(error) => Event::Refused { instance, reason: said(&error) },
