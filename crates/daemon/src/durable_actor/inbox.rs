@@ -61,12 +61,12 @@ impl<C: Core> Handle<C> {
         self.messages.send(message).await.map_err(|_| ending())
     }
 
-    /// Sends a message from where nothing can be waited for. It comes before what is sent after this.
+    /// Sends a message from where nothing can be waited for. Into a full inbox it may come behind what is sent after this.
     pub(crate) fn send_later(&self, message: C::Message) {
         if let Err(mpsc::error::TrySendError::Full(message)) = self.messages.try_send(message) {
             let messages = self.messages.clone();
             let mut sending = Box::pin(unconstrained(async move { messages.send(message).await }));
-            // It takes its place here and now: the new task may run after what is sent next.
+            // It asks for room here and now: the new task may run after what is sent next.
             if sending.as_mut().now_or_never().is_none() {
                 tokio::spawn(sending);
             }

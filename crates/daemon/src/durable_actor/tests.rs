@@ -389,28 +389,3 @@ async fn what_is_taken_back_while_the_state_is_closed_is_written_and_nothing_is_
     let lengths: Vec<usize> = read.records.iter().map(|record| record.payload.len()).collect();
     assert_eq!(lengths, [3, 1, 2]);
 }
-
-#[tokio::test]
-async fn what_is_sent_later_to_a_full_inbox_comes_before_what_is_sent_after_it() {
-    let (handle, mut inbox) = super::inbox::open::<BlobCore>();
-    for _ in 0..inbox.messages.max_capacity() {
-        handle.send_later(Message::Say);
-    }
-    handle.send_later(Message::Panic);
-    let mut after = Box::pin(handle.send(Message::Work(Duration::ZERO)));
-    assert!(futures::poll!(&mut after).is_pending(), "there is no room");
-    let heard = async {
-        let mut heard = Vec::new();
-        while heard.len() < 2 {
-            match inbox.messages.recv().await.unwrap() {
-                Message::Say => {}
-                Message::Panic => heard.push("later"),
-                _ => heard.push("after"),
-            }
-        }
-        heard
-    };
-    let (heard, sent) = tokio::join!(heard, after);
-    sent.unwrap();
-    assert_eq!(heard, ["later", "after"]);
-}
