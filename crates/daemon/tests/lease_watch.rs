@@ -7,7 +7,7 @@ use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
 use ratn_worker::client::{AcquireOptions, Channels, wait_until_serving};
 use ratn_worker::endpoint::Endpoint;
-use ratn_worker::lease_watch::{Claim, LeaseWatch, ManagerLocation, Standing};
+use ratn_worker::lease_watch::{Claim, ClaimStatus, LeaseWatch, ManagerLocation};
 use ratn_worker::runtime_directory::wait_for_file;
 use ratn_worker::session::Session;
 use ratn_worker::worker::{Worker, WorkerOptions};
@@ -140,12 +140,12 @@ async fn a_lookalike_of_a_pooled_worker_has_no_lease_of_the_worker() {
     };
     // Anybody who may create resources can guess the id of the next worker.
     let said = said_of(&other).await;
-    assert!(matches!(&said, Standing::Refuted(why) if why.contains("no lease holds it")), "{said:?}");
+    assert!(matches!(&said, ClaimStatus::Refuted(why) if why.contains("no lease holds it")), "{said:?}");
     let planner = Resource::new(id, ResourceClass::Process, "PathPlanner");
     let refused = pools.resources.create(planner).await.unwrap_err();
     assert_eq!(refused.code(), Some(Code::AlreadyExists), "{refused}");
     other.session.close().await;
-    assert_eq!(said_of(&pools).await, Standing::Confirmed);
+    assert_eq!(said_of(&pools).await, ClaimStatus::Confirmed);
 }
 
 #[tokio::test(flavor = "multi_thread")]

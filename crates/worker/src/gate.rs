@@ -14,7 +14,7 @@ use crate::access::{Caller, HEALTH_CHECK};
 use crate::connections::{Link, LinkInfo, OutOfConnections};
 use crate::protocol;
 use crate::trace::{self, TraceContext};
-use crate::under_way::{Answer, Held, Standing};
+use crate::under_way::{Answer, Held, Revocation};
 use std::any::Any;
 use std::fmt;
 use std::future::Future;
@@ -272,9 +272,9 @@ fn admit(gate: &Arc<dyn Gate>, calls: &Calls, request: &mut http::Request<Body>)
         None => None,
     };
     let call = calls.begin(counted)?;
-    let standing = changes.map(|changes| Standing::new(gate.clone(), changes, identity, caller.clone(), path));
+    let revocation = changes.map(|changes| Revocation::new(gate.clone(), changes, identity, caller.clone(), path));
     request.extensions_mut().insert(caller);
-    Ok(Held { _call: call, _permit: permit, _in_use: in_use, standing })
+    Ok(Held { _call: call, _permit: permit, _in_use: in_use, revocation })
 }
 
 /// The code of an answer that is only a status; a body may still end with another.

@@ -123,7 +123,7 @@ impl Session {
         let (tell, state) = watch::channel(SessionState::default());
         let (expires, until) = watch::channel(clock.now());
         let belief = Belief { until, clock: clock.clone() };
-        let keeper = Keeper {
+        let keeper = SessionTask {
             clock,
             number: None,
             channels: channels.clone(),
@@ -273,7 +273,7 @@ impl Drop for Session {
     }
 }
 
-struct Keeper {
+struct SessionTask {
     channels: Channels,
     endpoint: Endpoint,
     id: String,
@@ -287,7 +287,7 @@ struct Keeper {
     number: Option<u64>,
 }
 
-impl Keeper {
+impl SessionTask {
     async fn keep(mut self) {
         let mut backoff = BACKOFF.0;
         loop {

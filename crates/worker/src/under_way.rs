@@ -26,13 +26,13 @@ pub(crate) struct Held {
     pub(crate) _call: Option<TaskTrackerToken>,
     pub(crate) _permit: Option<Permit>,
     pub(crate) _in_use: Option<InUse>,
-    pub(crate) standing: Option<Standing>,
+    pub(crate) revocation: Option<Revocation>,
 }
 
 /// Says when a call's caller has lost what it was let in with.
-pub(crate) struct Standing(Pin<Box<dyn Future<Output = Status> + Send>>);
+pub(crate) struct Revocation(Pin<Box<dyn Future<Output = Status> + Send>>);
 
-impl Standing {
+impl Revocation {
     /// Of a call to `path` that `then` was let in for. `changes` was there before it was asked who that is.
     pub(crate) fn new(
         gate: Arc<dyn Gate>,
@@ -40,8 +40,8 @@ impl Standing {
         identity: Identity,
         then: Caller,
         path: http::Uri,
-    ) -> Standing {
-        Standing(Box::pin(async move {
+    ) -> Revocation {
+        Revocation(Box::pin(async move {
             while changes.changed().await.is_ok() {
                 if let Err(lost) = gate.caller(&identity).goes_on(&then, path.path()) {
                     tracing::info!(who = %then, path = path.path(), "a call ends: {}", lost.message());
@@ -60,11 +60,11 @@ impl Standing {
 impl Held {
     /// Until `answering` is there; why the call ended where that came first.
     pub(crate) async fn until<T>(&mut self, answering: impl Future<Output = T>) -> Result<T, Status> {
-        let Some(standing) = &mut self.standing else { return Ok(answering.await) };
+        let Some(revocation) = &mut self.revocation else { return Ok(answering.await) };
         tokio::select! {
             biased;
             answered = answering => Ok(answered),
-            lost = std::future::poll_fn(|context| standing.poll_lost(context)) => Err(lost),
+            lost = std::future::poll_fn(|context| revocation.poll_lost(context)) => Err(lost),
         }
     }
 }
@@ -85,7 +85,7 @@ impl http_body::Body for Answer {
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Self::Data>, Status>>> {
         let Some(held) = &mut self.held else { return Poll::Ready(None) };
-        if let Some(Poll::Ready(lost)) = held.standing.as_mut().map(|standing| standing.poll_lost(context)) {
+        if let Some(Poll::Ready(lost)) = held.revocation.as_mut().map(|revocation| revocation.poll_lost(context)) {
             (self.held, self.body) = (None, Body::empty());
             let mut trailers = http::HeaderMap::new();
             return Poll::Ready(Some(lost.add_header(&mut trailers).map(|()| Frame::trailers(trailers))));

@@ -13,7 +13,7 @@ use ratn_worker::action::ActionServer;
 use ratn_worker::boot_clock::BootClock;
 use ratn_worker::client::Channels;
 use ratn_worker::endpoint::Endpoint;
-use ratn_worker::lease_watch::{Claim, LeaseWatch, ManagerLocation, Standing};
+use ratn_worker::lease_watch::{Claim, ClaimStatus, LeaseWatch, ManagerLocation};
 use ratn_worker::protocol::{HEADER, NEWEST, OLDEST};
 use ratn_worker::provider::Provider;
 use ratn_worker::safety::{Brakes, Safety, SafetyState};
@@ -521,9 +521,9 @@ async fn a_driver_of_a_fixed_session_id_begins_nothing_before_it_has_said_that_i
     let leases = LeaseWatch::of(["arm@sim"]);
     tokio::spawn(leases.follow_session(&channels, &endpoint, &session, LONG).unwrap());
     heard(&leases).await;
-    assert_eq!(leases.check(&CLAIM), Standing::NotAtRest);
+    assert_eq!(leases.check(&CLAIM), ClaimStatus::NotAtRest);
     leases.brought_to_rest();
-    assert_eq!(leases.check(&CLAIM), Standing::Confirmed);
+    assert_eq!(leases.check(&CLAIM), ClaimStatus::Confirmed);
 }
 
 #[tokio::test]
@@ -566,13 +566,13 @@ async fn a_lease_is_not_confirmed_when_the_machine_wakes_up_until_the_manager_is
             tokio::spawn(leases.follow_location(&channels, ManagerLocation::At(endpoint.clone()), "cell", hour))
         };
         heard(&leases).await;
-        assert_eq!(leases.check(&CLAIM), Standing::Confirmed);
+        assert_eq!(leases.check(&CLAIM), ClaimStatus::Confirmed);
         stop.cancel();
         serving.await.unwrap();
-        assert_eq!(leases.check(&CLAIM), Standing::Confirmed, "the manager may come back");
+        assert_eq!(leases.check(&CLAIM), ClaimStatus::Confirmed, "the manager may come back");
         // Nothing else has run when the next goal is looked at.
         clock.suspend(hour);
-        assert!(matches!(leases.check(&CLAIM), Standing::Unheard(_)), "{by_session}");
+        assert!(matches!(leases.check(&CLAIM), ClaimStatus::Unheard(_)), "{by_session}");
         let unheard = async {
             while leases.is_heard() {
                 tokio::time::sleep(Duration::from_millis(1)).await;
@@ -581,7 +581,7 @@ async fn a_lease_is_not_confirmed_when_the_machine_wakes_up_until_the_manager_is
         tokio::time::timeout(LONG, unheard).await.expect("what is under way goes on for another hour");
         let _serving = manager.serve(&endpoint).await;
         let again = async {
-            while leases.check(&CLAIM) != Standing::Confirmed {
+            while leases.check(&CLAIM) != ClaimStatus::Confirmed {
                 tokio::time::sleep(Duration::from_millis(1)).await;
             }
         };

@@ -1,6 +1,6 @@
 //! The actions of the five modules: reads a goal's inputs, has the core do it, writes its outputs.
 
-use super::keeper::Keeper;
+use super::cell_actor::CellHandle;
 use crate::config::CellConfig;
 use crate::core::protocol::{Ending, Module, Product, Request};
 use ratn_model::fact::{FactKey, Term};
@@ -34,7 +34,7 @@ pub(crate) fn leases(config: &CellConfig) -> LeaseWatch {
 
 /// The server of all modules. Each takes one goal at a time, under a lease of its own resource.
 pub(crate) fn server(
-    keeper: &Keeper,
+    handle: &CellHandle,
     config: &CellConfig,
     channels: Channels,
     safety: Safety,
@@ -46,7 +46,7 @@ pub(crate) fn server(
             name,
             description,
             resource: resource_id(module, &config.host),
-            keeper: keeper.clone(),
+            handle: handle.clone(),
             seed: config.seed,
             read,
         });
@@ -98,7 +98,7 @@ struct ModuleAction {
     name: &'static str,
     description: &'static str,
     resource: String,
-    keeper: Keeper,
+    handle: CellHandle,
     seed: u64,
     read: Read,
 }
@@ -125,7 +125,7 @@ impl Action for ModuleAction {
         let request = (self.read)(&goal)?;
         goal.while_held().await?;
         let mut suspended = goal.suspended();
-        let mut motion = self.keeper.perform(request)?;
+        let mut motion = self.handle.perform(request)?;
         let ending = loop {
             motion.suspend(*suspended.borrow_and_update());
             tokio::select! {
@@ -181,9 +181,9 @@ impl ModuleAction {
                 success.with_output("pan", Value::Float(pan)).with_output("tilt", Value::Float(tilt))
             }
             Product::Captured { camera, exposures } => {
-                let (keeper, seed) = (self.keeper.clone(), self.seed);
+                let (handle, seed) = (self.handle.clone(), self.seed);
                 let robot = exposures.iter().map(|e| configuration_value(&e.scenery.configuration)).collect();
-                let developing = tokio::task::spawn_blocking(move || keeper.develop(&camera, seed, &exposures));
+                let developing = tokio::task::spawn_blocking(move || handle.develop(&camera, seed, &exposures));
                 let image = developing.await?;
                 let optics = camera.intrinsics;
                 success

@@ -2,7 +2,7 @@
 //! Follows the manager when it comes back somewhere else.
 
 use super::actions::resource_id;
-use super::keeper::Keeper;
+use super::cell_actor::CellHandle;
 use crate::config::CellConfig;
 use crate::core::protocol::Module;
 use ratn_model::resource::ResourceClass;
@@ -34,7 +34,7 @@ pub(crate) struct Link {
     pub(crate) channels: Channels,
     /// Where the modules' actions are served.
     pub(crate) endpoint: Endpoint,
-    pub(crate) keeper: Keeper,
+    pub(crate) handle: CellHandle,
     /// Who holds the modules.
     pub(crate) leases: LeaseWatch,
     /// Who performs their goals.
@@ -104,7 +104,7 @@ impl Link {
             }
             let mut told = f64::NEG_INFINITY;
             loop {
-                let level = self.keeper.state().await.map_or(0.0, |state| state.battery);
+                let level = self.handle.state().await.map_or(0.0, |state| state.battery);
                 if (level - told).abs() >= LEVEL_STEP {
                     told = level;
                     provider.offer(self.battery(level)).await?;

@@ -2,13 +2,13 @@
 //!
 //! ```text
 //!   lease watch ─▶ action service ─┐                                      ┌─▶ outcome of the goal
-//!                                  ├─event─▶ keeper.rs (Cell, a clock) ───┤
+//!                                  ├─event─▶ handle.rs (Cell, a clock) ───┤
 //!   cell service ──────────────────┘         wakes when the core says     └─▶ ground truth
 //! ```
-//! The keeper's thread owns the core; everything else sends it messages.
+//! The handle's thread owns the core; everything else sends it messages.
 
 mod actions;
-mod keeper;
+mod cell_actor;
 mod link;
 #[cfg(test)]
 mod pace;
@@ -61,27 +61,27 @@ pub async fn run_as(
         Some(file) => Recorder::begin(file, &config)?,
         None => Recorder::none(),
     };
-    let keeper = keeper::start(cell, recorder, RobotClock::start(config.speed), serving.vitals.clone())
+    let handle = cell_actor::start(cell, recorder, RobotClock::start(config.speed), serving.vitals.clone())
         .context("cannot start the cell")?;
 
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     let channels = Channels::new();
-    let safety = safety(&config, &directory, &keeper).await?;
+    let safety = safety(&config, &directory, &handle).await?;
     let leases = actions::leases(&config);
     // A simulated robot ends with its process: this one has not moved yet.
     leases.brought_to_rest();
-    let server = actions::server(&keeper, &config, channels.clone(), safety.clone(), &leases);
+    let server = actions::server(&handle, &config, channels.clone(), safety.clone(), &leases);
     let services = Services::new()
         .with(server.clone().into_service())
         .with(safety.into_service())
-        .with(CellServiceServer::new(service::Service::new(keeper.clone(), config.scene)));
+        .with(CellServiceServer::new(service::Service::new(handle.clone(), config.scene)));
     let link = link::Link {
         config,
         directory: directory.clone(),
         channels,
         endpoint: endpoint.clone(),
-        keeper,
+        handle,
         leases,
         server,
         patience: serving.drain,
@@ -99,10 +99,14 @@ pub async fn run_as(
 }
 
 /// The safety of the cell, stopped where a stop was in force when the one before ended. Nothing has moved yet.
-async fn safety(config: &CellConfig, directory: &RuntimeDirectory, keeper: &keeper::Keeper) -> anyhow::Result<Safety> {
+async fn safety(
+    config: &CellConfig,
+    directory: &RuntimeDirectory,
+    handle: &cell_actor::CellHandle,
+) -> anyhow::Result<Safety> {
     let state = config.state_dir.clone().unwrap_or_else(|| directory.path().join("state").join(ROLE));
     let stopped = state.join(STOPPED_FILE);
-    let safety = Safety::kept_in(stopped.clone(), keeper.clone()).await;
+    let safety = Safety::kept_in(stopped.clone(), handle.clone()).await;
     let safety = safety.with_context(|| format!("cannot tell from {} whether it is stopped", stopped.display()))?;
     let earlier = directory.path().join(EARLIER_STOPPED_FILE);
     match std::fs::read_to_string(&earlier) {

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic and print")]
 
-use super::keeper::{self, Keeper};
+use super::cell_actor::{self, CellHandle};
 use super::recorder::Recorder;
 use crate::config::{CellConfig, MAX_BOXES};
 use crate::core::cell::Cell;
@@ -28,12 +28,12 @@ fn config(boxes: usize, faults: &[&str]) -> CellConfig {
     CellConfig { boxes, seed: 4, faults, ..CellConfig::default() }
 }
 
-fn live(cell: Cell, recorder: Recorder, speed: f64) -> Keeper {
-    keeper::start(cell, recorder, RobotClock::start(speed), Default::default()).unwrap()
+fn live(cell: Cell, recorder: Recorder, speed: f64) -> CellHandle {
+    cell_actor::start(cell, recorder, RobotClock::start(speed), Default::default()).unwrap()
 }
 
-async fn perform(keeper: &Keeper, request: Request) -> Ending {
-    keeper.perform(request).unwrap().ended().await.unwrap()
+async fn perform(handle: &CellHandle, request: Request) -> Ending {
+    handle.perform(request).unwrap().ended().await.unwrap()
 }
 
 fn saved(cell: &mut Cell, now: Timestamp) -> Box<Snapshot> {
@@ -49,14 +49,14 @@ async fn a_cell_at_fifty_times_and_one_as_fast_as_possible_come_to_the_same_to_t
     // Boxes that are put down elsewhere, and a camera that is blind by chance: physics, and draws.
     let config = config(3, &["object_moved@1", "object_moved@6.3", "sensor_dropout~0.5"]);
     let recorder = Recorder::begin(&file, &config).unwrap();
-    let keeper = live(Cell::new(config.clone()).unwrap(), recorder, 50.0);
+    let handle = live(Cell::new(config.clone()).unwrap(), recorder, 50.0);
     for joints in [aimm::OBSERVATION, aimm::HOME] {
-        assert!(matches!(perform(&keeper, Request::MoveTo { joints, speed: 0.5 }).await, Ending::Done(_)));
-        perform(&keeper, Request::Capture { frames: 2 }).await;
+        assert!(matches!(perform(&handle, Request::MoveTo { joints, speed: 0.5 }).await, Ending::Done(_)));
+        perform(&handle, Request::Capture { frames: 2 }).await;
     }
-    let way = keeper.perform(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.2 }).unwrap();
+    let way = handle.perform(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.2 }).unwrap();
     way.stop().await.unwrap();
-    let at_fifty = keeper.save().await.unwrap().to_json();
+    let at_fifty = handle.save().await.unwrap().to_json();
 
     let mut cell = Cell::new(config).unwrap();
     let mut as_fast = None;
@@ -153,13 +153,13 @@ async fn how_well_the_cell_keeps_pace_with_nine_boxes() {
         let steps = passed / STEP.as_secs_f64() / took;
         println!("| {name} | as fast as possible | {:.0}× | {steps:.0} steps/s | 100 % |", passed / took);
         for (speed, goals) in [(1.0, 2), (10.0, 6), (50.0, 20)] {
-            let keeper = live(make(), Recorder::none(), speed);
+            let handle = live(make(), Recorder::none(), speed);
             let (begin, used) = (Instant::now(), processor_s());
             let mut late = Vec::new();
             let mut passed = Duration::ZERO;
             for (request, lasts) in requests.iter().cycle().zip(&lasts).take(goals) {
                 let started = Instant::now();
-                assert!(matches!(perform(&keeper, request.clone()).await, Ending::Done(_)));
+                assert!(matches!(perform(&handle, request.clone()).await, Ending::Done(_)));
                 late.push(started.elapsed().saturating_sub(lasts.div_f64(speed)));
                 passed += *lasts;
             }

@@ -1,6 +1,6 @@
 //! The gRPC adapter of the ground truth.
 
-use super::keeper::{Keeper, KeeperError, State};
+use super::cell_actor::{CellActorError, CellHandle, State};
 use crate::config::{Goods, MAX_BOXES, MAX_TABLEWARE, Setting};
 use crate::core::contacts::Contact;
 use crate::core::faults::{Fault, FaultError, MAX_FAULTS};
@@ -16,24 +16,24 @@ use ratn_worker::audit::{self, Mutation};
 use tonic::{Request, Response, Status};
 
 pub(crate) struct Service {
-    keeper: Keeper,
+    handle: CellHandle,
     setting: Setting,
 }
 
 impl Service {
-    pub(crate) fn new(keeper: Keeper, setting: Setting) -> Service {
-        Service { keeper, setting }
+    pub(crate) fn new(handle: CellHandle, setting: Setting) -> Service {
+        Service { handle, setting }
     }
 
     async fn put_back_to(&self, snapshot: &str) -> Result<Vec<v1::TrueObject>, Status> {
         let snapshot = Snapshot::from_json(snapshot).map_err(|error| Status::invalid_argument(error.to_string()))?;
-        self.keeper.tell(Event::PutBack { snapshot: Box::new(snapshot) }).await.map_err(status)?;
-        Ok(objects(self.keeper.state().await.map_err(status)?))
+        self.handle.tell(Event::PutBack { snapshot: Box::new(snapshot) }).await.map_err(status)?;
+        Ok(objects(self.handle.state().await.map_err(status)?))
     }
 
     async fn inject(&self, text: &str) -> Result<(), Status> {
         let fault: Fault = text.parse().map_err(|error: FaultError| Status::invalid_argument(error.to_string()))?;
-        if self.keeper.inject(fault).await.map_err(status)? {
+        if self.handle.inject(fault).await.map_err(status)? {
             return Ok(());
         }
         Err(Status::resource_exhausted(format!("{MAX_FAULTS} faults are still to come: no more are taken")))
@@ -64,7 +64,7 @@ impl Service {
                 }
             }));
         }
-        let (state, count) = (self.keeper.reset(seed, goods).await.map_err(status)?, goods.count(self.setting));
+        let (state, count) = (self.handle.reset(seed, goods).await.map_err(status)?, goods.count(self.setting));
         if state.objects.len() != count {
             let message =
                 format!("no feasible scene with {count} objects was found from seed {seed}; try another seed");
@@ -80,7 +80,7 @@ impl CellService for Service {
         &self,
         _: Request<v1::GetGroundTruthRequest>,
     ) -> Result<Response<v1::GetGroundTruthResponse>, Status> {
-        let state = self.keeper.state().await.map_err(status)?;
+        let state = self.handle.state().await.map_err(status)?;
         Ok(Response::new(v1::GetGroundTruthResponse {
             battery_level: state.battery,
             base: Some(pose(&state.base)),
@@ -102,7 +102,7 @@ impl CellService for Service {
     }
 
     async fn save(&self, _: Request<v1::SaveRequest>) -> Result<Response<v1::SaveResponse>, Status> {
-        let snapshot = self.keeper.save().await.map_err(status)?;
+        let snapshot = self.handle.save().await.map_err(status)?;
         Ok(Response::new(v1::SaveResponse { snapshot: snapshot.to_json() }))
     }
 
@@ -159,9 +159,9 @@ fn pose(pose: &Pose) -> v1::Pose {
     v1::Pose { position_m: pose.position.to_vec(), quaternion_xyzw: pose.quaternion_xyzw.to_vec() }
 }
 
-fn status(error: KeeperError) -> Status {
+fn status(error: CellActorError) -> Status {
     match error {
-        KeeperError::Overloaded => Status::resource_exhausted(error.to_string()),
-        KeeperError::Ended => Status::unavailable(error.to_string()),
+        CellActorError::Overloaded => Status::resource_exhausted(error.to_string()),
+        CellActorError::Ended => Status::unavailable(error.to_string()),
     }
 }

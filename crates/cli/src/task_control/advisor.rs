@@ -21,15 +21,15 @@ const WORTHWHILE: f64 = 0.002;
 /// Advice that the run has not been told yet.
 const MAX_PENDING: usize = 2;
 
-/// The thread, and what lies on its desk.
+/// The thread, and what lies on its context.
 #[derive(Debug)]
 pub(super) struct Advisor {
-    desk: Arc<Desk>,
+    context: Arc<TurnContext>,
     advice: mpsc::Receiver<Event>,
 }
 
 #[derive(Debug, Default)]
-struct Desk {
+struct TurnContext {
     question: Mutex<Question>,
     changed: Condvar,
 }
@@ -47,16 +47,16 @@ impl Advisor {
     /// # Errors
     /// Where there can be no further thread.
     pub(super) fn start(seed: u64) -> std::io::Result<Advisor> {
-        let desk = Arc::new(Desk::default());
+        let context = Arc::new(TurnContext::default());
         let (tell, advice) = mpsc::channel(MAX_PENDING);
-        let at_desk = Arc::clone(&desk);
+        let at_desk = Arc::clone(&context);
         std::thread::Builder::new().name("look-ahead".to_owned()).spawn(move || at_desk.work(seed, &tell))?;
-        Ok(Advisor { desk, advice })
+        Ok(Advisor { context, advice })
     }
 
     /// Asks for a better order; the question before is forgotten.
     pub(super) fn ask(&self, problem: Problem) {
-        self.desk.change(|question| question.problem = Some(problem));
+        self.context.change(|question| question.problem = Some(problem));
     }
 
     /// The next advice.
@@ -70,11 +70,11 @@ impl Advisor {
 
 impl Drop for Advisor {
     fn drop(&mut self) {
-        self.desk.change(|question| question.is_over = true);
+        self.context.change(|question| question.is_over = true);
     }
 }
 
-impl Desk {
+impl TurnContext {
     fn change(&self, change: impl FnOnce(&mut Question)) {
         change(&mut self.question.lock().unwrap_or_else(PoisonError::into_inner));
         self.changed.notify_one();

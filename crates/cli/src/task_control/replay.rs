@@ -2,7 +2,7 @@
 //! was killed stood. With a checkpoint only the lines behind it are replayed. A log that says otherwise is of another program and
 //! is refused. Pure.
 
-use super::checkpoint::{Checkpoint, Standing};
+use super::checkpoint::{Checkpoint, ReplayedState};
 use super::ledger::Ledger;
 use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Note};
@@ -43,7 +43,7 @@ pub(crate) enum ReplayError {
 /// Where a run stands.
 pub(super) struct Replayed {
     pub(super) executive: Executive,
-    pub(super) standing: Standing,
+    pub(super) standing: ReplayedState,
     /// Commands of the last event that are not in the log: its writer was killed among them, and has performed none of them.
     /// They are to be performed.
     pub(super) missing: Vec<Command>,
@@ -81,7 +81,7 @@ pub(super) fn replay(program: &Arc<Program>, lines: &[LogLine]) -> Result<Replay
         check(program, first)?;
     }
     let executive = Executive::new(program.clone(), Tolerance::ROBOT);
-    go_on(executive, Standing::default(), 0, lines)
+    go_on(executive, ReplayedState::default(), 0, lines)
 }
 
 /// Replays the lines of a log that are behind a checkpoint of it.
@@ -102,11 +102,11 @@ pub(super) fn replay_behind(
 /// Hands the events of lines to an executive and compares what it says; `before` lines are before them.
 fn go_on(
     mut executive: Executive,
-    mut standing: Standing,
+    mut standing: ReplayedState,
     before: usize,
     lines: &[LogLine],
 ) -> Result<Replayed, ReplayError> {
-    let Standing { ledger, states, progress } = &mut standing;
+    let ReplayedState { ledger, states, progress } = &mut standing;
     let mut missing = Vec::new();
     let (mut next, mut events) = (0, 0);
     while let Some(LogLine { at, entry }) = lines.get(next) {

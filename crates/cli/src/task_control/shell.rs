@@ -9,7 +9,7 @@ pub(crate) use resume::{Resumption, resume};
 
 use super::Endpoints;
 use super::advisor::{self, Advisor};
-use super::checkpoint::Keeper;
+use super::checkpoint::Checkpointer;
 use super::control::Control;
 use super::ledger::Ledger;
 use super::log::LogWriter;
@@ -92,7 +92,7 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
     let performer = Performer::connect(place, &id, &run.program.name, events).await.context("cannot begin the run")?;
     // A run that is refused leaves no log.
     let log = LogWriter::create(&run.log)?;
-    let keeper = Keeper::start(&log, &run.program.digest, run.checkpoint_every, Ledger::default(), 0);
+    let checkpointer = Checkpointer::start(&log, &run.program.digest, run.checkpoint_every, Ledger::default(), 0);
     let shell = Shell {
         executive: Executive::new(run.program.clone(), Tolerance::ROBOT),
         states: BTreeMap::new(),
@@ -100,7 +100,7 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
         progress: Progress::new(run.quiet),
         program: run.program.clone(),
         log,
-        keeper,
+        checkpointer,
         clock: RobotClock::start(place.speed),
         control: Control::listen_if_possible(&place.directory),
         advisor: advisor_of(run.mode, run.seed),
@@ -147,7 +147,7 @@ struct Shell {
     timers: BTreeSet<Timestamp>,
     log: LogWriter,
     /// None where there shall be no checkpoints, or can be none.
-    keeper: Option<Keeper>,
+    checkpointer: Option<Checkpointer>,
     progress: Progress,
     clock: RobotClock,
     control: Option<Control>,
@@ -189,7 +189,7 @@ impl Shell {
         let mut asked_to_abort = false;
         loop {
             if let Some(ended) = ended {
-                self.keeper.take().into_iter().for_each(Keeper::end);
+                self.checkpointer.take().into_iter().for_each(Checkpointer::end);
                 return Ok(ended);
             }
             let event = self.next(interrupt, &mut asked_to_abort).await?;
@@ -216,8 +216,8 @@ impl Shell {
         if replay::must_be_durable(&self.program, &self.states, &commands) {
             self.log.make_durable()?;
         }
-        if let Some(keeper) = &mut self.keeper {
-            keeper.follow(now, event, &commands);
+        if let Some(checkpointer) = &mut self.checkpointer {
+            checkpointer.follow(now, event, &commands);
         }
         self.progress.follow(now, event, &commands);
         self.lookout.observe(&commands);
@@ -256,9 +256,9 @@ impl Shell {
 
     /// Whoever resumes this run begins here. Between two events all that was logged has been performed.
     fn make_checkpoint(&mut self) {
-        if let Some(keeper) = &mut self.keeper {
+        if let Some(checkpointer) = &mut self.checkpointer {
             let confirmed = self.performer.confirmed();
-            keeper.make(&self.log, &self.executive, &self.states, &self.progress, confirmed);
+            checkpointer.make(&self.log, &self.executive, &self.states, &self.progress, confirmed);
         }
     }
 
@@ -279,7 +279,7 @@ impl Shell {
                     None => std::future::pending().await,
                 }
             };
-            let checkpoint_at = self.keeper.as_mut().and_then(|keeper| keeper.due(&self.log));
+            let checkpoint_at = self.checkpointer.as_mut().and_then(|checkpointer| checkpointer.due(&self.log));
             let to_keep = async {
                 match checkpoint_at {
                     Some(at) => tokio::time::sleep_until(at.into()).await,

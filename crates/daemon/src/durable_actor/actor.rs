@@ -1,10 +1,10 @@
 //! The actor's turns.
 
 use super::clock::TICK;
-use super::desk::{Desk, Outgoing, Stopped};
 use super::inbox::Inbox;
 use super::may_speak::{MaySpeak, Speech, failure_of};
 use super::outbox::Outbox;
+use super::turn_context::{Outgoing, Stopped, TurnContext};
 use super::{Core, Journal};
 use crate::details::of_fault;
 use ratn_panic_point::panic_point;
@@ -27,7 +27,7 @@ const LAST_WRITES: Duration = Duration::from_secs(1);
 pub(super) struct Actor<C: Core> {
     core: C,
     journal: Journal,
-    desk: Desk<C>,
+    context: TurnContext<C>,
     outbox: Outbox<Outgoing<C>>,
     drained: bool,
     /// Nothing may be said for now, and health says so.
@@ -40,7 +40,7 @@ impl<C: Core> Actor<C> {
         Actor {
             core,
             journal,
-            desk: Desk::new(may_speak),
+            context: TurnContext::new(may_speak),
             outbox: Outbox::default(),
             drained: false,
             silenced: false,
@@ -61,16 +61,16 @@ impl<C: Core> Actor<C> {
         let mut tick = tokio::time::interval(TICK);
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
-            self.desk.begin_turn();
+            self.context.begin_turn();
             self.vitals.beat();
             panic_point("durable-actor");
-            match self.desk.speech().now() {
+            match self.context.speech().now() {
                 Speech::Over(fault) => return self.fenced(&fault),
                 Speech::Held(why) => self.silence(why.as_ref()),
                 Speech::Allowed => self.end_silence(),
             }
-            let deadline = self.core.next_deadline(&self.desk).and_then(|at| self.desk.instant(at));
-            let (running, room) = (self.desk.stopped().is_none(), !self.outbox.is_full() && !self.desk.is_full());
+            let deadline = self.core.next_deadline(&self.context).and_then(|at| self.context.instant(at));
+            let (running, room) = (self.context.stopped().is_none(), !self.outbox.is_full() && !self.context.is_full());
             // What is urgent comes first, but not for ever.
             let urgent_first = urgent_taken < URGENT_AT_ONCE || !room || inbox.messages.is_empty();
             tokio::select! {
@@ -78,15 +78,15 @@ impl<C: Core> Actor<C> {
                 () = over.cancelled() => return self.end().await,
                 () = draining.cancelled(), if !self.drained => self.drain(),
                 // While nothing may be said its answers wait as all do, so it waits for room as well.
-                Some(urgent) = inbox.urgent.recv(), if urgent_first && (room || self.desk.may_speak()) => {
+                Some(urgent) = inbox.urgent.recv(), if urgent_first && (room || self.context.may_speak()) => {
                     urgent_taken += 1;
                     self.receive_urgent(urgent);
                 }
-                Ok(()) = signals.changed() => self.core.signal(&signals.borrow_and_update(), &mut self.desk),
+                Ok(()) = signals.changed() => self.core.signal(&signals.borrow_and_update(), &mut self.context),
                 progress = self.journal.changed(), if running => self.written(progress),
                 _ = tick.tick() => {}
-                () = self.desk.speech().changed() => {}
-                () = sleep_until(deadline) => self.core.advance(&mut self.desk),
+                () = self.context.speech().changed() => {}
+                () = sleep_until(deadline) => self.core.advance(&mut self.context),
                 count = inbox.messages.recv_many(&mut arrived, AT_ONCE), if room => {
                     if count == 0 {
                         return self.end().await;
@@ -114,33 +114,33 @@ impl<C: Core> Actor<C> {
                 }
             }
             self.deliver();
-            self.core.turned(&mut self.desk);
+            self.core.turned(&mut self.context);
         }
     }
 
     fn receive_urgent(&mut self, urgent: C::Urgent) {
         self.vitals.beat();
-        self.core.receive_urgent(urgent, &mut self.desk);
+        self.core.receive_urgent(urgent, &mut self.context);
         self.collect();
     }
 
     /// A batch of messages may take long: each of them is a sign of life.
     fn receive(&mut self, message: C::Message) {
         self.vitals.beat();
-        let behind = if self.desk.stopped().is_none() { self.journal.behind() } else { None };
+        let behind = if self.context.stopped().is_none() { self.journal.behind() } else { None };
         let message = match behind {
             Some(behind) => C::refuse(message, &behind),
             None => Some(message),
         };
         if let Some(message) = message {
-            self.core.receive(message, &mut self.desk);
+            self.core.receive(message, &mut self.context);
             self.collect();
         }
     }
 
     fn drain(&mut self) {
         self.drained = true;
-        self.core.drain(&mut self.desk);
+        self.core.drain(&mut self.context);
         self.collect();
     }
 
@@ -150,7 +150,7 @@ impl<C: Core> Actor<C> {
         self.deliver();
         self.write_last().await;
         tracing::info!("the state is closed when all of it is written");
-        self.desk.speech().expect_loss();
+        self.context.speech().expect_loss();
         let mut closing = self.journal.close();
         let closed = loop {
             tokio::select! {
@@ -180,7 +180,7 @@ impl<C: Core> Actor<C> {
     /// log that is closed takes nothing.
     async fn write_last(&mut self) {
         let until = Instant::now() + LAST_WRITES;
-        while self.desk.stopped().is_none() && !self.journal.is_written() && Instant::now() < until {
+        while self.context.stopped().is_none() && !self.journal.is_written() && Instant::now() < until {
             tokio::select! {
                 biased;
                 progress = self.journal.changed() => if !matches!(progress, Ok(Progress { fault: None, .. })) { return },
@@ -193,8 +193,8 @@ impl<C: Core> Actor<C> {
 
     /// What the state has to say goes behind what was to be said before.
     fn collect(&mut self) {
-        if self.desk.stopped().is_none() {
-            self.core.collect(&mut self.desk);
+        if self.context.stopped().is_none() {
+            self.core.collect(&mut self.context);
         }
     }
 
@@ -202,14 +202,14 @@ impl<C: Core> Actor<C> {
     fn deliver(&mut self) {
         loop {
             self.collect();
-            let written = match self.desk.stopped() {
+            let written = match self.context.stopped() {
                 // What is told when nothing can be written any more is on the disk.
                 Some(_) => Ok(Position(0)),
                 None => self.journal.write(self.core.state()),
             };
             match written {
                 Ok(position) => {
-                    for outgoing in self.desk.take_outgoing() {
+                    for outgoing in self.context.take_outgoing() {
                         self.outbox.hold(position, outgoing);
                     }
                 }
@@ -217,7 +217,7 @@ impl<C: Core> Actor<C> {
                 Err(AppendError::Full { .. }) => {}
                 Err(error) => self.stop(&error),
             }
-            if !self.desk.may_speak() {
+            if !self.context.may_speak() {
                 return;
             }
             let Some(outgoing) = self.take_durable() else { return };
@@ -226,7 +226,7 @@ impl<C: Core> Actor<C> {
     }
 
     fn hand_out_durable(&mut self) {
-        while self.desk.may_speak()
+        while self.context.may_speak()
             && let Some(outgoing) = self.take_durable()
         {
             self.hand_out(outgoing);
@@ -239,11 +239,12 @@ impl<C: Core> Actor<C> {
     }
 
     fn hand_out(&mut self, outgoing: Outgoing<C>) {
-        let unreadable = self.desk.stopped().filter(|stopped| stopped.unreadable).map(|stopped| stopped.status.clone());
+        let unreadable =
+            self.context.stopped().filter(|stopped| stopped.unreadable).map(|stopped| stopped.status.clone());
         match outgoing {
             Outgoing::Answer(answer) => answer(unreadable.as_ref()),
-            Outgoing::Watcher(watcher) if unreadable.is_none() => self.desk.watchers.add(watcher),
-            Outgoing::Said(said) if unreadable.is_none() => self.core.hand_out(said, &mut self.desk),
+            Outgoing::Watcher(watcher) if unreadable.is_none() => self.context.watchers.add(watcher),
+            Outgoing::Said(said) if unreadable.is_none() => self.core.hand_out(said, &mut self.context),
             Outgoing::Watcher(_) | Outgoing::Said(_) => {}
         }
     }
@@ -279,7 +280,7 @@ impl<C: Core> Actor<C> {
 
     /// A log that has failed stays so, whatever else there is to say.
     fn tell_health(&self, silence: Option<&str>) {
-        match (self.desk.stopped(), silence) {
+        match (self.context.stopped(), silence) {
             (Some(stopped), _) => self.vitals.unwell(storage_failed(&stopped.status)),
             (None, Some(why)) => {
                 self.vitals.unwell(format!("nothing is said: it cannot be seen who has the state ({why})"))
@@ -291,8 +292,8 @@ impl<C: Core> Actor<C> {
     /// Another process has the state: nothing is said any more, and this one ends.
     fn fenced(&mut self, fault: &Fault) {
         self.outbox.take_all();
-        self.desk.take_outgoing();
-        self.desk.watchers.clear();
+        self.context.take_outgoing();
+        self.context.watchers.clear();
         let what = fault.to_string();
         if self.drained && self.journal.is_written() {
             return tracing::warn!(what, "it was to end anyhow, and all was written");
@@ -303,11 +304,11 @@ impl<C: Core> Actor<C> {
     /// Nothing changes any more. What was not on the disk has not happened, and is not shown either.
     fn stop(&mut self, fault: &(dyn std::error::Error + 'static)) {
         if self.refuse_changes(fault)
-            && let Err(error) = self.core.restore(&self.journal, &self.desk)
+            && let Err(error) = self.core.restore(&self.journal, &self.context)
         {
             let error = anyhow::Error::new(error);
             tracing::error!(error = format!("{error:#}"), "what is on the disk cannot be read either");
-            self.desk.set_unreadable();
+            self.context.set_unreadable();
         }
     }
 
@@ -321,7 +322,7 @@ impl<C: Core> Actor<C> {
             // Another process may be able to write: this one gives the place up, and stands by.
             Some(Fault::Remote { .. }) => self.vitals.fail(CoreFailure::Deposed { what: fault.to_string() }),
             Some(fenced) if fenced.is_lost_place() => {
-                self.desk.stop(Stopped { status, unreadable: true });
+                self.context.stop(Stopped { status, unreadable: true });
                 self.fenced(fenced);
                 return false;
             }
@@ -332,15 +333,15 @@ impl<C: Core> Actor<C> {
         self.journal.metrics().failed.set(1);
         self.hand_out_durable();
         let mut refused = self.outbox.take_all();
-        refused.extend(self.desk.take_outgoing());
+        refused.extend(self.context.take_outgoing());
         for outgoing in refused {
             if let Outgoing::Answer(answer) = outgoing {
                 answer(Some(&status));
             }
         }
         // They find a state that may be behind the one they saw coming, and watch again.
-        self.desk.watchers.clear();
-        self.desk.stop(Stopped { status, unreadable: false });
+        self.context.watchers.clear();
+        self.context.stop(Stopped { status, unreadable: false });
         true
     }
 }

@@ -10,7 +10,6 @@
 
 mod actor;
 mod clock;
-mod desk;
 mod inbox;
 pub(crate) mod journal;
 mod may_speak;
@@ -19,12 +18,13 @@ mod outbox;
 pub(crate) mod slow_disk;
 #[cfg(test)]
 mod tests;
+mod turn_context;
 mod watchers;
 
-pub(crate) use desk::Desk;
 pub(crate) use inbox::Handle;
 pub(crate) use journal::{Journal, JournalError, Journaled, floor};
 pub(crate) use may_speak::CONFIRMED_FOR;
+pub(crate) use turn_context::TurnContext;
 
 use actor::Actor;
 use ratn_model::time::Timestamp;
@@ -56,28 +56,28 @@ pub(crate) trait Core: Sized + Send + 'static {
     ///
     /// # Errors
     /// Where it cannot be read either.
-    fn restore(&mut self, journal: &Journal, desk: &Desk<Self>) -> Result<(), JournalError>;
+    fn restore(&mut self, journal: &Journal, context: &TurnContext<Self>) -> Result<(), JournalError>;
 
     /// When [`Core::advance`] is due.
-    fn next_deadline(&self, desk: &Desk<Self>) -> Option<Timestamp>;
+    fn next_deadline(&self, context: &TurnContext<Self>) -> Option<Timestamp>;
 
     /// Ends what time has ended.
-    fn advance(&mut self, desk: &mut Desk<Self>);
+    fn advance(&mut self, context: &mut TurnContext<Self>);
 
-    /// One message. It also comes when nothing can be written any more ([`Desk::stopped`]): then nothing may change.
-    fn receive(&mut self, message: Self::Message, desk: &mut Desk<Self>);
+    /// One message. It also comes when nothing can be written any more ([`TurnContext::stopped`]): then nothing may change.
+    fn receive(&mut self, message: Self::Message, context: &mut TurnContext<Self>);
 
     /// As [`Core::receive`], of what goes before every message.
-    fn receive_urgent(&mut self, urgent: Self::Urgent, desk: &mut Desk<Self>);
+    fn receive_urgent(&mut self, urgent: Self::Urgent, context: &mut TurnContext<Self>);
 
     /// The newest signal.
-    fn signal(&mut self, signal: &Self::Signal, desk: &mut Desk<Self>);
+    fn signal(&mut self, signal: &Self::Signal, context: &mut TurnContext<Self>);
 
-    /// Passes on what the state has to say since the last call ([`Desk::say`]), in order.
-    fn collect(&mut self, desk: &mut Desk<Self>);
+    /// Passes on what the state has to say since the last call ([`TurnContext::say`]), in order.
+    fn collect(&mut self, context: &mut TurnContext<Self>);
 
     /// What was said is on the disk: it leaves.
-    fn hand_out(&mut self, said: Self::Said, desk: &mut Desk<Self>);
+    fn hand_out(&mut self, said: Self::Said, context: &mut TurnContext<Self>);
 
     /// The disk is behind. A message that would add to it is answered with `status`; one that would not comes back.
     fn refuse(message: Self::Message, status: &Status) -> Option<Self::Message>;
@@ -91,10 +91,10 @@ pub(crate) trait Core: Sized + Send + 'static {
     }
 
     /// Nobody is made to wait any more.
-    fn drain(&mut self, _desk: &mut Desk<Self>) {}
+    fn drain(&mut self, _desk: &mut TurnContext<Self>) {}
 
     /// A turn has ended.
-    fn turned(&mut self, _desk: &mut Desk<Self>) {}
+    fn turned(&mut self, _desk: &mut TurnContext<Self>) {}
 }
 
 /// Starts the actor. With `draining` whoever waits is told to ask the successor; with `over` it ends, when everything is on the disk.

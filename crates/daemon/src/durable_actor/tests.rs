@@ -3,7 +3,7 @@
 
 use super::journal::MOST_WAITING_BYTES;
 use super::slow_disk::SlowDisk;
-use super::{Core, Desk, Handle, Journal, JournalError, Journaled, start};
+use super::{Core, Handle, Journal, JournalError, Journaled, TurnContext, start};
 use crate::config::StorageConfig;
 use bytes::Bytes;
 use ratn_model::time::Timestamp;
@@ -93,31 +93,31 @@ impl Core for BlobCore {
         &mut self.blobs
     }
 
-    fn restore(&mut self, _: &Journal, _: &Desk<Self>) -> Result<(), JournalError> {
+    fn restore(&mut self, _: &Journal, _: &TurnContext<Self>) -> Result<(), JournalError> {
         self.restored.fetch_add(1, Ordering::SeqCst);
         Ok(())
     }
 
-    fn next_deadline(&self, _: &Desk<Self>) -> Option<Timestamp> {
+    fn next_deadline(&self, _: &TurnContext<Self>) -> Option<Timestamp> {
         self.alarm
     }
 
-    fn advance(&mut self, desk: &mut Desk<Self>) {
-        if self.alarm.take_if(|at| *at <= desk.now()).is_some() {
+    fn advance(&mut self, context: &mut TurnContext<Self>) {
+        if self.alarm.take_if(|at| *at <= context.now()).is_some() {
             self.rung = true;
         }
     }
 
-    fn receive(&mut self, message: Message, desk: &mut Desk<Self>) {
+    fn receive(&mut self, message: Message, context: &mut TurnContext<Self>) {
         match message {
             Message::Add(length, answer) => {
                 self.add(length);
-                desk.reply(answer, Ok(self.blobs.lengths.len()));
+                context.reply(answer, Ok(self.blobs.lengths.len()));
             }
-            Message::Count(answer) => desk.reply(answer, Ok(self.blobs.lengths.len())),
+            Message::Count(answer) => context.reply(answer, Ok(self.blobs.lengths.len())),
             Message::Taken(answer) => drop(answer.send(())),
             Message::Pings(answer) => drop(answer.send(self.pings)),
-            Message::Alarm(after) => self.alarm = Some(desk.now() + after),
+            Message::Alarm(after) => self.alarm = Some(context.now() + after),
             Message::Work(time) => std::thread::sleep(time),
             Message::Say => {
                 self.add(1);
@@ -128,20 +128,20 @@ impl Core for BlobCore {
         }
     }
 
-    fn receive_urgent(&mut self, ping: oneshot::Sender<()>, _: &mut Desk<Self>) {
+    fn receive_urgent(&mut self, ping: oneshot::Sender<()>, _: &mut TurnContext<Self>) {
         self.pings += 1;
         let _ = ping.send(());
     }
 
-    fn signal(&mut self, (): &(), _: &mut Desk<Self>) {}
+    fn signal(&mut self, (): &(), _: &mut TurnContext<Self>) {}
 
-    fn collect(&mut self, desk: &mut Desk<Self>) {
+    fn collect(&mut self, context: &mut TurnContext<Self>) {
         if std::mem::take(&mut self.says) {
-            desk.say(TakenBack);
+            context.say(TakenBack);
         }
     }
 
-    fn hand_out(&mut self, TakenBack: TakenBack, _: &mut Desk<Self>) {
+    fn hand_out(&mut self, TakenBack: TakenBack, _: &mut TurnContext<Self>) {
         self.add(2);
     }
 

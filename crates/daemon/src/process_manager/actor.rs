@@ -6,7 +6,7 @@ use super::machine::Sample;
 use super::offered;
 use super::pools::{Command, Event, PoolError, Pools, Restart};
 use super::predecessor::Adopted;
-use super::processes::{ProcessEvents, Processes, Told};
+use super::processes::{ManagerContact, ProcessEvents, Processes};
 use super::roster::Roster;
 use super::session_file::SessionFile;
 use super::spawner::Outcome;
@@ -66,7 +66,7 @@ pub(super) struct Parts {
     pub(super) config: ProcessManagerConfig,
     pub(super) directory: RuntimeDirectory,
     /// What workers are told of the resource manager.
-    pub(super) told: Told,
+    pub(super) told: ManagerContact,
     pub(super) roster: Roster,
     /// Knows which processes belong to which worker.
     pub(super) tracker: Tracker,

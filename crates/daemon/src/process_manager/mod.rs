@@ -48,7 +48,7 @@ use crate::demand::{DemandLink, Shortages, Uses, WantedLink};
 use crate::link::{LINK, LastingSession, Link, Manager, OfferLifecycle, Wanted};
 use anyhow::Context;
 use machine::Machine;
-use processes::Told;
+use processes::ManagerContact;
 use ratn_proto::v1::process_service_server::ProcessServiceServer;
 use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -111,7 +111,7 @@ pub async fn run_as(
         left.iter().map(|entry| &entry.id).chain(unknown.iter().map(|intent| &intent.id)).cloned().collect();
     let session_file = SessionFile::of(&directory);
     let session = session_file.id().context("cannot keep the session's name")?;
-    let told = Told { manager: processes::manager_of(&config, &directory), session: session.clone() };
+    let told = ManagerContact { manager: processes::manager_of(&config, &directory), session: session.clone() };
     let adopted = predecessor::settle(left, unknown, &config.templates, &told, &directory, &tracker).await;
     roster.keep_only(&adopted.iter().map(|one| one.entry.id.as_str()).collect());
     let (wanted, to_offer) = watch::channel(Wanted::new());

@@ -10,7 +10,7 @@
 
 use super::account;
 use super::limits::end_group;
-use super::processes::Told;
+use super::processes::ManagerContact;
 use super::roster::{Entry, Intent};
 use super::spawner;
 use super::template::Template;
@@ -100,7 +100,7 @@ pub(super) async fn settle(
     left: Vec<Entry>,
     unknown: Vec<Intent>,
     templates: &[Template],
-    told: &Told,
+    told: &ManagerContact,
     directory: &RuntimeDirectory,
     tracker: &Tracker,
 ) -> Vec<Adopted> {
@@ -152,7 +152,7 @@ async fn greet(
     entry: &Entry,
     exit: Exit,
     templates: &[Template],
-    told: &Told,
+    told: &ManagerContact,
     directory: &RuntimeDirectory,
 ) -> Result<Adopted, (Exit, &'static str)> {
     let Some(template) = templates.iter().find(|template| template.name == entry.template.name) else {
@@ -181,7 +181,7 @@ async fn greet(
 
 /// Whether a worker of now would be another one: of another template, or told of another resource manager. One that asks a manager
 /// which is not that of the system confirms no lease of it.
-fn is_outdated(entry: &Entry, template: &Template, told: &Told) -> bool {
+fn is_outdated(entry: &Entry, template: &Template, told: &ManagerContact) -> bool {
     entry.manager.as_ref() != Some(&told.manager.to_string()) || !template.starts_the_same_as(&entry.template)
 }
 
@@ -218,7 +218,7 @@ mod tests {
     #[test]
     fn a_worker_that_was_told_of_another_resource_manager_is_outdated() {
         let template = Template::new("planner", "PathPlanner");
-        let told = Told { manager: "http://127.0.0.1:2".parse().unwrap(), session: "s-2".to_owned() };
+        let told = ManagerContact { manager: "http://127.0.0.1:2".parse().unwrap(), session: "s-2".to_owned() };
         let outdated = |manager: Option<&str>| {
             let entry = Entry {
                 id: "planner-1".to_owned(),

@@ -69,7 +69,7 @@ pub(super) enum BeginError {
 
 pub(super) struct Processes {
     host: String,
-    told: Told,
+    told: ManagerContact,
     /// Variables in the environment of every worker.
     worker_environment: BTreeMap<&'static str, PathBuf>,
     max_log_bytes: u64,
@@ -109,7 +109,7 @@ struct Process {
 
 /// What workers are told of the resource manager, which confirms the leases of their goals.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Told {
+pub(super) struct ManagerContact {
     /// Where it is.
     pub(super) manager: ManagerLocation,
     /// The session that offers them there.
@@ -129,7 +129,7 @@ impl Processes {
     pub(super) fn start(
         config: &ProcessManagerConfig,
         directory: RuntimeDirectory,
-        told: Told,
+        told: ManagerContact,
         roster: Roster,
         tracker: Tracker,
     ) -> io::Result<(Processes, ProcessEvents)> {

@@ -43,19 +43,19 @@ pub(super) struct HandOut {
     turns: BTreeMap<(Arc<str>, SessionId), Turn>,
     /// As they are after the round that is under way.
     next: BTreeMap<(Arc<str>, SessionId), Turn>,
-    standings: BTreeMap<SessionId, Standing>,
+    track_records: BTreeMap<SessionId, TrackRecord>,
 }
 
 /// How a provider did, whatever it was asked for.
 #[derive(Debug, Clone, Copy, Default)]
-struct Standing {
+struct TrackRecord {
     /// It has provided something that was missing.
     proven: bool,
     /// How often it came no closer in its time, since it did last.
     failed: u32,
 }
 
-impl Standing {
+impl TrackRecord {
     fn rank(self) -> u32 {
         self.failed.saturating_add(u32::from(!self.proven))
     }
@@ -76,13 +76,13 @@ struct Turn {
 impl HandOut {
     /// A provider has so long to come closer to what is asked of it.
     pub(super) fn new(patience: Duration) -> HandOut {
-        HandOut { patience, turns: BTreeMap::new(), next: BTreeMap::new(), standings: BTreeMap::new() }
+        HandOut { patience, turns: BTreeMap::new(), next: BTreeMap::new(), track_records: BTreeMap::new() }
     }
 
     /// A round begins, in which all that is missing is handed out to these.
     pub(super) fn begin(&mut self, providers: &[SessionId]) {
         let providers: BTreeSet<&SessionId> = providers.iter().collect();
-        self.standings.retain(|session, _| providers.contains(session));
+        self.track_records.retain(|session, _| providers.contains(session));
         self.next.clear();
     }
 
@@ -95,7 +95,7 @@ impl HandOut {
         };
         let mut able: Vec<(usize, u32, Turn)> = demand.of.iter().enumerate().filter_map(able).collect();
         able.sort_by_key(|(index, _, turn)| {
-            let standing = self.standings.get(&providers[*index]).copied().unwrap_or_default();
+            let standing = self.track_records.get(&providers[*index]).copied().unwrap_or_default();
             (standing.rank(), turn.passed, !standing.proven, *index)
         });
         let mut left = demand.count;
@@ -129,7 +129,7 @@ impl HandOut {
     /// As it is after what has passed since.
     fn turn(&mut self, now: Timestamp, selector: &Arc<str>, session: &SessionId, provided: u32) -> Turn {
         let key = (Arc::clone(selector), session.clone());
-        let standing = self.standings.entry(session.clone()).or_default();
+        let standing = self.track_records.entry(session.clone()).or_default();
         standing.proven |= provided > 0;
         let Some(turn) = self.turns.get(&key).copied() else {
             return Turn { asked: 0, provided, since: now, passed: 0 };

@@ -17,8 +17,8 @@ mod round;
 mod service;
 mod status;
 mod stream;
-mod told;
 mod watch_filter;
+mod watch_message;
 mod wire;
 
 pub use config::ResourceManagerConfig;

@@ -9,7 +9,7 @@ use super::leases::{Known, LiveLeases};
 use super::query::View;
 use super::{WorldPoolConfig, status};
 use crate::access::Caller;
-use crate::durable_actor::{self, Core, Desk, Journal, JournalError, floor};
+use crate::durable_actor::{self, Core, Journal, JournalError, TurnContext, floor};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
 use ratn_model::ontology::Ontology;
@@ -108,7 +108,7 @@ pub(super) struct NewProjection {
 /// Sends messages to the actor.
 pub(super) type Handle = durable_actor::Handle<WorldCore>;
 
-type WorldDesk = Desk<WorldCore>;
+type WorldTurn = TurnContext<WorldCore>;
 
 #[derive(Debug)]
 pub(super) struct WorldCore {
@@ -165,58 +165,58 @@ impl Core for WorldCore {
         &mut self.pool.history
     }
 
-    fn restore(&mut self, journal: &Journal, desk: &WorldDesk) -> Result<(), JournalError> {
+    fn restore(&mut self, journal: &Journal, context: &WorldTurn) -> Result<(), JournalError> {
         let history = journal.read(|recovered| History::restore(recovered, &self.config))?;
-        self.pool.replace_history(desk.now(), history);
+        self.pool.replace_history(context.now(), history);
         Ok(())
     }
 
-    fn next_deadline(&self, desk: &WorldDesk) -> Option<Timestamp> {
-        let stale = self.pool.next_expiry().filter(|_| desk.stopped().is_none());
+    fn next_deadline(&self, context: &WorldTurn) -> Option<Timestamp> {
+        let stale = self.pool.next_expiry().filter(|_| context.stopped().is_none());
         stale.into_iter().chain([self.next_look]).min()
     }
 
-    fn advance(&mut self, desk: &mut WorldDesk) {
-        let now = desk.now();
+    fn advance(&mut self, context: &mut WorldTurn) {
+        let now = context.now();
         if now >= self.next_look {
             self.pool.expire(now);
             self.next_look = now + EXPIRY_INTERVAL;
         }
-        if desk.stopped().is_none() {
+        if context.stopped().is_none() {
             self.pool.expire_facts(now);
         }
     }
 
-    fn receive_urgent(&mut self, urgent: Infallible, _: &mut WorldDesk) {
+    fn receive_urgent(&mut self, urgent: Infallible, _: &mut WorldTurn) {
         match urgent {}
     }
 
     // An answer that nobody waits for any more is of no consequence: commits and projections are idempotent by id.
-    fn receive(&mut self, message: Message, desk: &mut WorldDesk) {
+    fn receive(&mut self, message: Message, context: &mut WorldTurn) {
         match message {
             Message::Commit { commit, answer } => {
-                let committed = match desk.stopped() {
+                let committed = match context.stopped() {
                     Some(stopped) => Err(stopped.status.clone()),
-                    None => self.pool.commit(desk.now(), &commit).map_err(|error| status::of_commit(&error)),
+                    None => self.pool.commit(context.now(), &commit).map_err(|error| status::of_commit(&error)),
                 };
                 let contradictions = self.pool.take_contradictions();
                 self.contradicted.extend(contradictions.iter().cloned());
-                self.collect(desk);
+                self.collect(context);
                 let committed = committed.map(|revision| (revision, contradictions));
                 tracing::debug!(id = commit.id, changes = commit.changes.len(), ?committed, "commit");
-                desk.reply(answer, committed);
+                context.reply(answer, committed);
             }
             Message::Project { projection, answer } => {
-                let projected = self.project(projection, desk.now());
-                desk.reply(answer, projected);
+                let projected = self.project(projection, context.now());
+                context.reply(answer, projected);
             }
             Message::Query { projection, at, patterns, answer } => {
                 let view = self.pool.view(projection, at, &patterns).map_err(|error| status::of_query(&error));
-                desk.reply(answer, view);
+                context.reply(answer, view);
             }
             Message::Watch { after, answer } => {
-                let watch = self.watch(after, desk);
-                desk.reply(answer, watch);
+                let watch = self.watch(after, context);
+                context.reply(answer, watch);
             }
             Message::WatchProjection { projection, answer } => {
                 let watch = match self.pool.contradiction(projection) {
@@ -227,48 +227,48 @@ impl Core for WorldCore {
                     }
                     Err(error) => Err(status::of_query(&error)),
                 };
-                desk.reply(answer, watch);
+                context.reply(answer, watch);
             }
             Message::Diff { from, to, answer } => {
                 let to = to.unwrap_or(self.pool.root().revision());
                 let between = self.pool.history.between(from, to).map_err(status::of_revision);
-                desk.reply(answer, between.map(|between| (between, to)));
+                context.reply(answer, between.map(|between| (between, to)));
             }
             Message::Versions { key, limit, answer } => {
                 let versions = self.pool.history.versions(&key, limit);
-                desk.reply(answer, Ok(versions));
+                context.reply(answer, Ok(versions));
             }
             Message::Scene { projection, bases, answer } => {
                 let scene = self.pool.scene(projection, &bases).map_err(|error| status::of_query(&error));
-                desk.reply(answer, scene);
+                context.reply(answer, scene);
             }
             Message::Release { by, projection, answer } => {
                 let released = self.pool.release_for(&by, projection).map_err(|error| status::of_release(&error));
-                desk.reply(answer, released);
+                context.reply(answer, released);
             }
         }
     }
 
-    fn signal(&mut self, live: &LiveLeases, _: &mut WorldDesk) {
+    fn signal(&mut self, live: &LiveLeases, _: &mut WorldTurn) {
         let ended = self.pool.keep_leases(|lease| matches!(live.known(lease), Known::Lives { .. }));
         if ended > 0 {
             tracing::debug!(ended, left = self.pool.projections(), "projections ended with their leases");
         }
     }
 
-    fn collect(&mut self, desk: &mut WorldDesk) {
+    fn collect(&mut self, context: &mut WorldTurn) {
         for kept in self.pool.history.take_news() {
-            desk.say(Said::News(kept));
+            context.say(Said::News(kept));
         }
         self.contradicted.extend(self.pool.take_contradictions());
         for contradiction in self.contradicted.drain(..) {
-            desk.say(Said::Contradicted(contradiction));
+            context.say(Said::Contradicted(contradiction));
         }
     }
 
-    fn hand_out(&mut self, said: Said, desk: &mut WorldDesk) {
+    fn hand_out(&mut self, said: Said, context: &mut WorldTurn) {
         match said {
-            Said::News(kept) => desk.watchers.publish(&Update::Revision(kept)),
+            Said::News(kept) => context.watchers.publish(&Update::Revision(kept)),
             Said::Contradicted(contradiction) => {
                 if let Some(watched) = self.watched.get(&contradiction.projection) {
                     watched.send_if_modified(|first| {
@@ -296,15 +296,15 @@ impl Core for WorldCore {
         matches!(message, Message::Commit { .. })
     }
 
-    fn turned(&mut self, _: &mut WorldDesk) {
+    fn turned(&mut self, _: &mut WorldTurn) {
         let pool = &self.pool;
         self.watched.retain(|id, watched| pool.has(*id) && !watched.is_closed());
     }
 }
 
 impl WorldCore {
-    fn watch(&self, after: Option<Revision>, desk: &mut WorldDesk) -> Result<mpsc::Receiver<Update>, Status> {
-        desk.watchers.admit(self.config.max_watchers)?;
+    fn watch(&self, after: Option<Revision>, context: &mut WorldTurn) -> Result<mpsc::Receiver<Update>, Status> {
+        context.watchers.admit(self.config.max_watchers)?;
         let first = match after {
             None => vec![Update::Snapshot(self.pool.root().clone())],
             Some(after) => {
@@ -312,7 +312,7 @@ impl WorldCore {
                 missed.map(|kept| Update::Revision(Arc::clone(kept))).collect()
             }
         };
-        desk.watch(first)
+        context.watch(first)
     }
 
     fn project(&mut self, new: NewProjection, now: Timestamp) -> Result<ProjectionId, Status> {

@@ -2,7 +2,7 @@
 
 use super::goal::LeaseKey;
 use crate::access::Caller;
-use crate::lease_watch::{Claim, GRANT_WAIT, LeaseWatch, Standing};
+use crate::lease_watch::{Claim, ClaimStatus, GRANT_WAIT, LeaseWatch};
 use ratn_model::resource::Lease;
 use ratn_proto::types::Goal;
 use std::time::Duration;
@@ -71,7 +71,7 @@ impl Authority {
             retry_later(MANAGER_UNHEARD, message)
         };
         Ok(match watch.check(&claim) {
-            Standing::Confirmed => {
+            ClaimStatus::Confirmed => {
                 let opened_by = watch.opened_by(resource, lease.id);
                 if !caller.may_act_for(&opened_by) {
                     let lease = lease.id;
@@ -83,8 +83,8 @@ impl Authority {
                 }
                 Confirmation::Confirmed
             }
-            Standing::Refuted(why) => return Err(refusal(Code::FailedPrecondition, "LEASE_REFUTED", why)),
-            Standing::NotHeardOf { listening: true } => {
+            ClaimStatus::Refuted(why) => return Err(refusal(Code::FailedPrecondition, "LEASE_REFUTED", why)),
+            ClaimStatus::NotHeardOf { listening: true } => {
                 let message = format!(
                     "{} ({}) of {resource} is unknown: the resource manager told of no such grant within {} s; acquire it, and send \
                      the lease as it was granted",
@@ -94,11 +94,11 @@ impl Authority {
                 );
                 Confirmation::Awaited(refusal(Code::FailedPrecondition, "LEASE_UNKNOWN", message))
             }
-            Standing::NotHeardOf { listening: false } => {
+            ClaimStatus::NotHeardOf { listening: false } => {
                 Confirmation::Awaited(unheard("the resource manager is not heard just now"))
             }
-            Standing::Unheard(why) => Confirmation::Awaited(unheard(&why)),
-            Standing::NotAtRest => {
+            ClaimStatus::Unheard(why) => Confirmation::Awaited(unheard(&why)),
+            ClaimStatus::NotAtRest => {
                 let message = format!(
                     "{resource} begins nothing yet: its driver has not said that nothing moves of what a process before it began; \
                      nothing was begun, try again"
@@ -113,7 +113,7 @@ impl Authority {
         match self {
             Authority::Watch(watch) => {
                 let claim = Claim { resource, lease, token, session: "" };
-                matches!(watch.check(&claim), Standing::Refuted(_))
+                matches!(watch.check(&claim), ClaimStatus::Refuted(_))
             }
             Authority::Nobody | Authority::Claimant => token < newest.1,
         }

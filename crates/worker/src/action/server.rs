@@ -9,7 +9,7 @@ use super::{Action, GoalContext};
 use crate::access::Caller;
 use crate::client::Channels;
 use crate::gate::ending;
-use crate::lease_watch::{Claim, EndedHolding, GRANT_WAIT, LeaseListener, LeaseWatch, Standing};
+use crate::lease_watch::{Claim, ClaimStatus, EndedHolding, GRANT_WAIT, LeaseListener, LeaseWatch};
 use crate::panic::exit_on_panic;
 use crate::safety::Safety;
 use crate::trace;
@@ -329,9 +329,9 @@ impl LeaseListener for Inner {
                 watch.check(&Claim { resource: &goal.resource, lease, token, session: &goal.session })
             });
             match standing {
-                Some(Standing::Confirmed) => goal.suspend(false),
+                Some(ClaimStatus::Confirmed) => goal.suspend(false),
                 // The manager is not trusted any more already: what it says next decides.
-                Some(Standing::Unheard(_)) => {}
+                Some(ClaimStatus::Unheard(_)) => {}
                 _ => goal.stop(StopCause::LeaseEnded("it ended while the resource manager was not heard".to_owned())),
             }
         }

@@ -33,7 +33,7 @@ pub struct Claim<'a> {
 
 /// What the resource manager says of a claim.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Standing {
+pub enum ClaimStatus {
     /// It is so.
     Confirmed,
     /// It has not been heard of: it may have been granted a moment ago.
@@ -105,26 +105,26 @@ impl Default for Holdings {
 
 impl Holdings {
     /// What the manager says of a claim.
-    pub fn check(&self, claim: &Claim<'_>) -> Standing {
+    pub fn check(&self, claim: &Claim<'_>) -> ClaimStatus {
         if let Contact::Unheard(reason) = &self.contact {
-            return Standing::Unheard(reason.clone());
+            return ClaimStatus::Unheard(reason.clone());
         }
         let Claim { resource, lease, token, session } = *claim;
         let holders = self.by_resource.get(resource);
         match holders.and_then(|holders| holders.get(&lease)) {
-            Some(holder) if holder.token != token => Standing::Refuted(format!(
+            Some(holder) if holder.token != token => ClaimStatus::Refuted(format!(
                 "{lease} of {resource} has {}, and the goal says {token}: send the lease as it was granted",
                 holder.token
             )),
-            Some(holder) if !session.is_empty() && holder.session != session => Standing::Refuted(format!(
+            Some(holder) if !session.is_empty() && holder.session != session => ClaimStatus::Refuted(format!(
                 "{lease} of {resource} is held by session `{}`, and the goal says `{session}`: acquire a lease of your own",
                 holder.session
             )),
             // It may have ended since.
-            Some(_) if self.contact == Contact::Interrupted => Standing::Unheard(INTERRUPTED.to_owned()),
-            Some(_) => Standing::Confirmed,
-            None if lease > self.youngest => Standing::NotHeardOf { listening: self.contact == Contact::Heard },
-            None => Standing::Refuted(self.not_held(claim)),
+            Some(_) if self.contact == Contact::Interrupted => ClaimStatus::Unheard(INTERRUPTED.to_owned()),
+            Some(_) => ClaimStatus::Confirmed,
+            None if lease > self.youngest => ClaimStatus::NotHeardOf { listening: self.contact == Contact::Heard },
+            None => ClaimStatus::Refuted(self.not_held(claim)),
         }
     }
 
@@ -297,28 +297,28 @@ mod tests {
 
     fn refuted(holdings: &Holdings, claim: Claim<'_>, why: &str) {
         let standing = holdings.check(&claim);
-        assert!(matches!(&standing, Standing::Refuted(reason) if reason.contains(why)), "{standing:?}");
+        assert!(matches!(&standing, ClaimStatus::Refuted(reason) if reason.contains(why)), "{standing:?}");
     }
 
     #[test]
     fn only_what_the_manager_says_is_confirmed() {
         let holdings = heard(&[7], 9);
-        assert_eq!(holdings.check(&claim(7)), Standing::Confirmed);
-        assert_eq!(holdings.check(&Claim { session: "s7", ..claim(7) }), Standing::Confirmed);
+        assert_eq!(holdings.check(&claim(7)), ClaimStatus::Confirmed);
+        assert_eq!(holdings.check(&Claim { session: "s7", ..claim(7) }), ClaimStatus::Confirmed);
         refuted(&holdings, Claim { token: FencingToken(u64::MAX), ..claim(7) }, "has token-70, and the goal says");
         refuted(&holdings, Claim { session: "s8", ..claim(7) }, "is held by session `s7`, and the goal says `s8`");
         refuted(&holdings, Claim { resource: "camera", ..claim(7) }, "no lease holds it");
         for over in [0, 6, 8, 9] {
             refuted(&holdings, claim(over), "lease-7 (token-70) holds it");
         }
-        assert_eq!(holdings.check(&claim(10)), Standing::NotHeardOf { listening: true });
+        assert_eq!(holdings.check(&claim(10)), ClaimStatus::NotHeardOf { listening: true });
     }
 
     #[test]
     fn a_lease_is_confirmed_from_its_grant_to_its_end() {
         let mut holdings = heard(&[], 9);
         assert_eq!(holdings.tell(&event(ResourceEventKind::Leased, arm(&[12]), 12)), []);
-        assert_eq!(holdings.check(&claim(12)), Standing::Confirmed);
+        assert_eq!(holdings.check(&claim(12)), ClaimStatus::Confirmed);
         refuted(&holdings, claim(11), "is over");
         let ended = holdings.tell(&event(ResourceEventKind::Released, arm(&[]), 12));
         let reason = "it was released".to_owned();
@@ -332,9 +332,9 @@ mod tests {
         let mut holdings = heard(&[], 9);
         let camera = Resource { id: "camera".to_owned(), ..arm(&[12]) };
         holdings.tell(&event(ResourceEventKind::Leased, camera, 12));
-        assert_eq!(holdings.check(&claim(12)), Standing::NotHeardOf { listening: true });
+        assert_eq!(holdings.check(&claim(12)), ClaimStatus::NotHeardOf { listening: true });
         holdings.tell(&event(ResourceEventKind::Leased, arm(&[12]), 12));
-        assert_eq!(holdings.check(&claim(12)), Standing::Confirmed);
+        assert_eq!(holdings.check(&claim(12)), ClaimStatus::Confirmed);
     }
 
     #[test]
@@ -351,25 +351,25 @@ mod tests {
     #[test]
     fn while_the_watch_is_interrupted_nothing_is_confirmed_and_nothing_ends() {
         let mut holdings = Holdings::default();
-        assert_eq!(holdings.check(&claim(7)), Standing::Unheard(NEVER_HEARD.to_owned()));
+        assert_eq!(holdings.check(&claim(7)), ClaimStatus::Unheard(NEVER_HEARD.to_owned()));
         holdings.interrupted();
         assert!(!holdings.is_heard());
         holdings.tell(&snapshot(&[arm(&[7])], 7));
         holdings.interrupted();
-        assert_eq!(holdings.check(&claim(7)), Standing::Unheard(INTERRUPTED.to_owned()));
-        assert_eq!(holdings.check(&claim(8)), Standing::NotHeardOf { listening: false });
+        assert_eq!(holdings.check(&claim(7)), ClaimStatus::Unheard(INTERRUPTED.to_owned()));
+        assert_eq!(holdings.check(&claim(8)), ClaimStatus::NotHeardOf { listening: false });
         refuted(&holdings, claim(6), "is over");
         assert_eq!(holdings.tell(&snapshot(&[arm(&[7])], 7)), []);
-        assert_eq!(holdings.check(&claim(7)), Standing::Confirmed);
+        assert_eq!(holdings.check(&claim(7)), ClaimStatus::Confirmed);
         holdings.unheard("silence");
-        assert_eq!(holdings.check(&claim(7)), Standing::Unheard("silence".to_owned()));
+        assert_eq!(holdings.check(&claim(7)), ClaimStatus::Unheard("silence".to_owned()));
         let ended = holdings.tell(&snapshot(&[arm(&[8])], 8));
         assert_eq!(ended.iter().map(|ended| ended.lease).collect::<Vec<_>>(), [LeaseId(7)], "it ended meanwhile");
         holdings.tell(&snapshot(&[arm(&[7])], 8));
         holdings.lost("silence");
-        assert_eq!(holdings.check(&claim(7)), Standing::Unheard("silence".to_owned()));
+        assert_eq!(holdings.check(&claim(7)), ClaimStatus::Unheard("silence".to_owned()));
         holdings.tell(&snapshot(&[arm(&[7])], 7));
-        assert_eq!(holdings.check(&claim(7)), Standing::Confirmed);
+        assert_eq!(holdings.check(&claim(7)), ClaimStatus::Confirmed);
     }
 
     #[test]
@@ -378,7 +378,7 @@ mod tests {
             let (mut holdings, mut again) = (heard(&[7], 9), arm(&[7]));
             change(&mut again.holdings[0]);
             let ended = holdings.tell(&snapshot(&[again], 7));
-            assert_eq!(holdings.check(&claim(8)), Standing::NotHeardOf { listening: true }, "of the new count");
+            assert_eq!(holdings.check(&claim(8)), ClaimStatus::NotHeardOf { listening: true }, "of the new count");
             ended.iter().map(|ended| (ended.lease.0, ended.token.0)).collect::<Vec<_>>()
         };
         assert_eq!(ended(|holding| holding.token = FencingToken(71)), [(7, 70)]);
@@ -394,6 +394,6 @@ mod tests {
         refuted(&holdings, claim(7), "no lease holds it");
         holdings.begin("cell");
         holdings.tell(&snapshot(&[arm(&[8])], 8));
-        assert_eq!(holdings.check(&claim(8)), Standing::Confirmed);
+        assert_eq!(holdings.check(&claim(8)), ClaimStatus::Confirmed);
     }
 }

@@ -19,7 +19,7 @@ mod holdings;
 mod location;
 mod standstill;
 
-pub use holdings::{Claim, EndedHolding, Holdings, Standing};
+pub use holdings::{Claim, ClaimStatus, EndedHolding, Holdings};
 pub use location::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 
 use crate::boot_clock::{BootClock, BootInstant};
@@ -150,11 +150,11 @@ impl LeaseWatch {
     }
 
     /// What the resource manager says of a claim, as of now.
-    pub fn check(&self, claim: &Claim<'_>) -> Standing {
+    pub fn check(&self, claim: &Claim<'_>) -> ClaimStatus {
         let standing = self.shared.holdings().check(claim);
         match standing {
-            Standing::Confirmed if !self.shared.is_trusted() => Standing::Unheard(TOO_OLD.to_owned()),
-            Standing::Confirmed if self.shared.awaits_rest() => Standing::NotAtRest,
+            ClaimStatus::Confirmed if !self.shared.is_trusted() => ClaimStatus::Unheard(TOO_OLD.to_owned()),
+            ClaimStatus::Confirmed if self.shared.awaits_rest() => ClaimStatus::NotAtRest,
             standing => standing,
         }
     }

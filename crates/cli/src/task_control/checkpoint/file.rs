@@ -5,7 +5,7 @@
 //! that is shorter than its own checkpoint says. The log is on the disk before its checkpoint is, so somebody has cut it, and
 //! motions that were begun might be begun again.
 
-use super::{Checkpoint, Place, Standing, path_of};
+use super::{Checkpoint, Place, ReplayedState, path_of};
 use crate::task_control::replay::VERSION;
 use ratn_executive::protocol::Origin;
 use serde::{Deserialize, Serialize};
@@ -58,7 +58,7 @@ struct Header {
     version: String,
     digest: String,
     place: Place,
-    standing: Standing,
+    standing: ReplayedState,
 }
 
 impl Checkpoint {

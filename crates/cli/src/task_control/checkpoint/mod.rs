@@ -1,20 +1,20 @@
 //! Checkpoints of a run, beside its event log as `LOG.checkpoint`: a run is resumed from the newest one and the lines behind it,
 //! however long its log is.
 //!
-//! A checkpoint holds all that replaying the log up to a place comes to ([`Standing`]), and says which log and which place in it
+//! A checkpoint holds all that replaying the log up to a place comes to ([`ReplayedState`]), and says which log and which place in it
 //! ([`Place`]). It only saves time: without one, or with one that does not fit, the whole log is replayed. What the log says is
 //! never changed for it.
 //!
-//! [`file`] is the form of the file and its reading, [`pace`] says when one is due, [`keeper`] makes them during a run, and
+//! [`file`] is the form of the file and its reading, [`pace`] says when one is due, [`checkpointer`] makes them during a run, and
 //! [`writer`] writes them in a thread of its own.
 
+mod checkpointer;
 mod file;
-mod keeper;
 mod pace;
 mod writer;
 
+pub(super) use checkpointer::Checkpointer;
 pub(crate) use file::{FileError, find};
-pub(super) use keeper::Keeper;
 pub(crate) use pace::EVERY_EVENTS;
 
 use super::ledger::Ledger;
@@ -32,7 +32,7 @@ const COMPARED: u64 = 64 << 10;
 
 /// All that a run's log comes to up to a line, but for the executive.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Standing {
+pub(super) struct ReplayedState {
     pub(super) ledger: Ledger,
     /// Which states the instances are of.
     pub(super) states: BTreeMap<InstanceId, StateId>,
@@ -70,7 +70,7 @@ pub(crate) struct Checkpoint {
     /// The task file's digest.
     pub(super) digest: String,
     pub(super) place: Place,
-    pub(super) standing: Standing,
+    pub(super) standing: ReplayedState,
     /// The executive's state, in a form of its own.
     pub(super) executive: Vec<u8>,
 }

@@ -2,7 +2,7 @@
 //! whole one. The log is synced before: no checkpoint on the disk knows more than the log there.
 
 use super::file::MAX_BYTES;
-use super::{Checkpoint, Place, Standing, path_of};
+use super::{Checkpoint, Place, ReplayedState, path_of};
 use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ pub(super) struct Job {
     /// The log's length then.
     pub(super) bytes: u64,
     pub(super) lines: usize,
-    pub(super) standing: Standing,
+    pub(super) standing: ReplayedState,
     pub(super) executive: Vec<u8>,
 }
 

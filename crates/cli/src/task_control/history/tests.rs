@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use super::*;
-use crate::task_control::checkpoint::{Keeper, path_of};
+use crate::task_control::checkpoint::{Checkpointer, path_of};
 use crate::task_control::ledger::{Confirmed, Ledger};
 use crate::task_control::progress::Progress;
 use crate::task_control::replay::tests::{fetch_boxes, log};
@@ -39,7 +39,7 @@ impl Bench {
     /// Goes on with events until there are so many lines, with a checkpoint behind `place` of them; and is killed.
     fn run(&self, events: impl Iterator<Item = (Timestamp, Event)>, place: usize, lines: usize) {
         let mut writer = LogWriter::create(&self.log()).unwrap();
-        let mut keeper = Keeper::start(&writer, &self.program.digest, 1, Ledger::default(), 0).unwrap();
+        let mut checkpointer = Checkpointer::start(&writer, &self.program.digest, 1, Ledger::default(), 0).unwrap();
         let mut executive = Executive::new(self.program.clone(), Tolerance::ROBOT);
         let (mut states, mut progress) = (BTreeMap::new(), Progress::new(true));
         for (at, event) in events {
@@ -49,12 +49,12 @@ impl Bench {
             let commands = executive.handle(at, event.clone());
             commands.iter().for_each(|command| replay::follow(&mut states, command));
             writer.append(at, &event, &commands).unwrap();
-            keeper.follow(at, &event, &commands);
+            checkpointer.follow(at, &event, &commands);
             progress.follow(at, &event, &commands);
             if writer.lines() >= place && !self.checkpoint().exists() {
-                keeper.make(&writer, &executive, &states, &progress, Confirmed::default());
+                checkpointer.make(&writer, &executive, &states, &progress, Confirmed::default());
                 // It is there before the run goes on.
-                while keeper.is_busy() {
+                while checkpointer.is_busy() {
                     std::thread::yield_now();
                 }
             }
@@ -203,7 +203,7 @@ fn a_run_that_has_ended_leaves_no_checkpoint() {
     assert!(matches!(bench.resume().err().unwrap(), HistoryError::Replay(ReplayError::Ended { .. })));
     std::fs::remove_file(bench.log()).unwrap();
     let writer = LogWriter::create(&bench.log()).unwrap();
-    Keeper::start(&writer, &bench.program.digest, 1, Ledger::default(), 0).unwrap().end();
+    Checkpointer::start(&writer, &bench.program.digest, 1, Ledger::default(), 0).unwrap().end();
     assert!(!bench.checkpoint().exists());
 }
 

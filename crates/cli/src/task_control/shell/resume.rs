@@ -4,7 +4,7 @@
 use super::{Ended, LOOK, Place, Shell, advisor_of, unix_ms};
 use crate::interrupt::Interrupt;
 use crate::output;
-use crate::task_control::checkpoint::{Keeper, Standing};
+use crate::task_control::checkpoint::{Checkpointer, ReplayedState};
 use crate::task_control::control::Control;
 use crate::task_control::history::{History, HistoryError};
 use crate::task_control::log::{Log, LogWriter};
@@ -81,13 +81,13 @@ pub(crate) async fn resume(mut resumption: Resumption, place: &Place, interrupt:
     }
     let Resumption { program, history, replayed, log, checkpoint_every } = resumption;
     let Replayed { executive, standing, missing, events: replayed } = replayed;
-    let Standing { mut ledger, states, progress } = standing;
+    let ReplayedState { mut ledger, states, progress } = standing;
     let (mode, seed) = history.mode_and_seed();
     // It knows of what is missing before that is written: nothing is kept until it is.
     let mut kept = ledger.clone();
     let others = missing.iter().filter(|command| !matches!(command, Command::Commit { .. }));
     others.for_each(|command| kept.command(command));
-    let keeper = Keeper::start(&log, &program.digest, checkpoint_every, kept, replayed);
+    let checkpointer = Checkpointer::start(&log, &program.digest, checkpoint_every, kept, replayed);
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
     let performer = Performer::connect(place, &ledger.origin.run, &program.name, events).await;
     let shell = Shell {
@@ -97,7 +97,7 @@ pub(crate) async fn resume(mut resumption: Resumption, place: &Place, interrupt:
         progress,
         program,
         log,
-        keeper,
+        checkpointer,
         clock: RobotClock::going_on(replay::now(&ledger, unix_ms(), place.speed), place.speed),
         control: Control::listen_if_possible(&place.directory),
         advisor: advisor_of(mode, seed),

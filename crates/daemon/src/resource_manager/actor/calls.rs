@@ -1,6 +1,6 @@
 //! The calls that wait in the queue, and what is undone where one was dropped.
 
-use super::{ResourceCore, ResourceDesk, Said};
+use super::{ResourceCore, ResourceTurn, Said};
 use crate::resource_manager::Granted;
 use ratn_model::id::LeaseId;
 use ratn_model::resource::Lease;
@@ -8,25 +8,25 @@ use ratn_resources::WaiterId;
 use tokio::sync::oneshot;
 
 impl ResourceCore {
-    pub(super) fn abandon(&mut self, ticket: u64, desk: &ResourceDesk) {
+    pub(super) fn abandon(&mut self, ticket: u64, context: &ResourceTurn) {
         let Some(waiter) = self.tickets.remove(&ticket) else { return };
         let Some(calls) = self.calls.get_mut(&waiter) else { return };
         calls.retain(|(other, _)| *other != ticket);
         if calls.is_empty() {
             self.calls.remove(&waiter);
             // Unknown when it was answered in this moment: then the answer could not be delivered and was undone.
-            let _ = self.pool.cancel(desk.now(), waiter);
+            let _ = self.pool.cancel(context.now(), waiter);
         }
     }
 
-    pub(super) fn give_back(&mut self, lease: LeaseId, desk: &ResourceDesk) {
+    pub(super) fn give_back(&mut self, lease: LeaseId, context: &ResourceTurn) {
         if let Some(calls) = self.shared.get_mut(&lease).filter(|calls| **calls > 1) {
             *calls -= 1;
             return;
         }
         tracing::debug!(%lease, "granted to a call that was dropped: taken back");
         // Unknown when it has ended meanwhile.
-        let _ = self.pool.undo_grant(desk.now(), lease);
+        let _ = self.pool.undo_grant(context.now(), lease);
     }
 
     /// A repeated request is told the lease that it was granted before. Its first call may be dropped without having been read: the
@@ -36,18 +36,18 @@ impl ResourceCore {
         ticket: u64,
         lease: Lease,
         call: oneshot::Sender<Granted>,
-        desk: &mut ResourceDesk,
+        context: &mut ResourceTurn,
     ) {
         *self.shared.entry(lease.id).or_insert(1) += 1;
         self.repeated.insert(ticket, (lease, call));
-        desk.say(Said::GrantedAgain { ticket });
+        context.say(Said::GrantedAgain { ticket });
     }
 
-    pub(super) fn answer_again(&mut self, ticket: u64, desk: &ResourceDesk) {
+    pub(super) fn answer_again(&mut self, ticket: u64, context: &ResourceTurn) {
         let Some((lease, call)) = self.repeated.remove(&ticket) else { return };
         let id = lease.id;
         if call.send(Ok(lease)).is_err() {
-            self.give_back(id, desk);
+            self.give_back(id, context);
         }
     }
 

@@ -2,7 +2,7 @@
 
 use super::super::providers::Provisions;
 use super::super::status::of_error;
-use super::{ResourceCore, ResourceDesk};
+use super::{ResourceCore, ResourceTurn};
 use crate::details::{retry_later, status};
 use ratn_model::time::Timestamp;
 use ratn_proto::types::Demand;
@@ -44,11 +44,11 @@ impl ResourceCore {
     }
 
     /// Tells providers what is missing, where that may have changed.
-    pub(super) fn spread_demand(&mut self, desk: &ResourceDesk) {
+    pub(super) fn spread_demand(&mut self, context: &ResourceTurn) {
         if let Some(demand) = self.pool.take_demand(self.providers.kinds()) {
             self.demand = demand;
             self.providers.are_to_be_told();
         }
-        self.providers.tell(desk.now(), &self.pool, &self.demand);
+        self.providers.tell(context.now(), &self.pool, &self.demand);
     }
 }

@@ -1,12 +1,12 @@
 //! What leaves when its records are on the disk: grants to whoever still waits, events to everybody who watches.
 
-use super::{ResourceCore, ResourceDesk};
+use super::{ResourceCore, ResourceTurn};
 use crate::resource_manager::status;
-use crate::resource_manager::told::Told;
+use crate::resource_manager::watch_message::WatchMessage;
 use ratn_resources::{Change, Notice};
 
 impl ResourceCore {
-    pub(super) fn notify(&mut self, notice: Notice, desk: &mut ResourceDesk) {
+    pub(super) fn notify(&mut self, notice: Notice, context: &mut ResourceTurn) {
         match notice {
             Notice::Event(event) => {
                 self.told = self.told.max(event.revision);
@@ -14,12 +14,12 @@ impl ResourceCore {
                     self.shared.remove(lease);
                 }
                 tracing::trace!(revision = event.revision.0, change = ?event.change, "event");
-                desk.watchers.publish(&Told::Event(event));
+                context.watchers.publish(&WatchMessage::Event(event));
             }
             Notice::Granted { waiter, lease } => {
                 let id = lease.id;
                 match self.answer(waiter, Ok(lease)) {
-                    0 => self.give_back(id, desk),
+                    0 => self.give_back(id, context),
                     1 => {}
                     // Repeated since, perhaps.
                     calls => *self.shared.entry(id).or_insert(1) += calls - 1,

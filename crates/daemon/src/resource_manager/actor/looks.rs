@@ -1,6 +1,6 @@
 //! Who only looks: the sessions there are, and why an acquire waits. Each turn a part of it: the call asks for the next part.
 
-use super::{ResourceCore, ResourceDesk};
+use super::{ResourceCore, ResourceTurn};
 use crate::details::status as status_with;
 use crate::resource_manager::wire;
 use ratn_proto::types::{SessionStatus, WaitingAcquire};
@@ -17,8 +17,8 @@ const LOOKS: usize = 20_000;
 const LISTED_AT_ONCE: usize = 4_096;
 
 impl ResourceCore {
-    pub(super) fn sessions(&self, after: &str, desk: &ResourceDesk) -> Vec<SessionStatus> {
-        let now = desk.now();
+    pub(super) fn sessions(&self, after: &str, context: &ResourceTurn) -> Vec<SessionStatus> {
+        let now = context.now();
         let some = self.pool.sessions_after(after, LISTED_AT_ONCE, wire::NAMED);
         some.into_iter().map(|session| wire::session(session, now)).collect()
     }

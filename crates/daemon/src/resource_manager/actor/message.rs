@@ -1,8 +1,8 @@
 //! What the service asks of the actor, and how it gets there.
 
 use super::super::providers::Provisions;
-use super::super::told::Told;
 use super::super::watch_filter::WatchFilter;
+use super::super::watch_message::WatchMessage;
 use super::ResourceCore;
 use crate::resource_manager::Granted;
 use ratn_model::id::{LeaseId, Revision};
@@ -123,7 +123,7 @@ pub(in super::super) enum Message {
         /// Without a snapshot: what happened after this.
         after: Option<WatchPosition>,
         filter: Arc<WatchFilter>,
-        answer: Answer<mpsc::Receiver<Told>>,
+        answer: Answer<mpsc::Receiver<WatchMessage>>,
     },
 }
 

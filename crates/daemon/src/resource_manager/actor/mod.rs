@@ -13,10 +13,10 @@ mod watchers;
 pub(super) use message::{Answer, Handle, KeptAlive, Message};
 
 use super::providers::Providers;
-use super::told::Told;
+use super::watch_message::WatchMessage;
 use super::{Granted, ResourceManagerConfig, status};
 use crate::details::ending;
-use crate::durable_actor::{self, Core, Desk, Journal, JournalError};
+use crate::durable_actor::{self, Core, Journal, JournalError, TurnContext};
 use crate::metrics::{Amounts, Metrics};
 use message::{Ping, most_urgent_first};
 use ratn_model::id::{LeaseId, Revision};
@@ -35,7 +35,7 @@ use tonic::Status;
 /// A session lives at least this long.
 const MIN_SESSION_TTL: Duration = Duration::from_millis(50);
 
-type ResourceDesk = Desk<ResourceCore>;
+type ResourceTurn = TurnContext<ResourceCore>;
 
 #[derive(Debug)]
 pub(super) struct ResourceCore {
@@ -103,15 +103,15 @@ impl Core for ResourceCore {
     type Message = Message;
     type Urgent = Ping;
     type Said = Said;
-    type Update = Told;
+    type Update = WatchMessage;
     type Signal = ResourceManagerConfig;
 
     fn state(&mut self) -> &mut Pool {
         &mut self.pool
     }
 
-    fn restore(&mut self, journal: &Journal, desk: &ResourceDesk) -> Result<(), JournalError> {
-        let stopped = desk.stopped().map_or_else(ending, |stopped| stopped.status.clone());
+    fn restore(&mut self, journal: &Journal, context: &ResourceTurn) -> Result<(), JournalError> {
+        let stopped = context.stopped().map_or_else(ending, |stopped| stopped.status.clone());
         for (_, call) in std::mem::take(&mut self.calls).into_values().flatten() {
             let _ = call.send(Err(stopped.clone()));
         }
@@ -128,22 +128,22 @@ impl Core for ResourceCore {
         Ok(())
     }
 
-    fn next_deadline(&self, desk: &ResourceDesk) -> Option<Timestamp> {
-        let deadlines = self.pool.next_deadline().into_iter().chain(self.providers.deadline(desk.now()));
-        deadlines.min().filter(|_| desk.stopped().is_none())
+    fn next_deadline(&self, context: &ResourceTurn) -> Option<Timestamp> {
+        let deadlines = self.pool.next_deadline().into_iter().chain(self.providers.deadline(context.now()));
+        deadlines.min().filter(|_| context.stopped().is_none())
     }
 
-    fn advance(&mut self, desk: &mut ResourceDesk) {
-        self.pool.advance(desk.now());
+    fn advance(&mut self, context: &mut ResourceTurn) {
+        self.pool.advance(context.now());
     }
 
-    fn receive_urgent(&mut self, Ping { speaker, session, client, ttl, answer }: Ping, desk: &mut ResourceDesk) {
+    fn receive_urgent(&mut self, Ping { speaker, session, client, ttl, answer }: Ping, context: &mut ResourceTurn) {
         let before = self.pool.session_ttl(&session);
-        let kept = match desk.stopped() {
+        let kept = match context.stopped() {
             Some(stopped) => Err(stopped.status.clone()),
-            None => {
-                self.keep_alive(desk.now(), &speaker, &session, &client, ttl).map_err(|error| status::of_error(&error))
-            }
+            None => self
+                .keep_alive(context.now(), &speaker, &session, &client, ttl)
+                .map_err(|error| status::of_error(&error)),
         };
         match kept {
             // Nothing has changed that would have to be on the disk: however slow that is, it ends no session.
@@ -152,27 +152,27 @@ impl Core for ResourceCore {
                     && !kept.created
                     && !self.opening.contains_key(&session) =>
             {
-                desk.reply_now(answer, Ok(KeptAlive { revision: self.told, ..kept }));
+                context.reply_now(answer, Ok(KeptAlive { revision: self.told, ..kept }));
             }
             Ok(kept) => {
                 *self.opening.entry(session.clone()).or_default() += 1;
-                desk.reply(answer, Ok(kept));
-                desk.say(Said::SessionKept(session));
+                context.reply(answer, Ok(kept));
+                context.say(Said::SessionKept(session));
             }
-            Err(refused) => desk.reply(answer, Err(refused)),
+            Err(refused) => context.reply(answer, Err(refused)),
         }
     }
 
-    fn receive(&mut self, message: Message, desk: &mut ResourceDesk) {
-        let stopped = desk.stopped().map(|stopped| stopped.status.clone());
+    fn receive(&mut self, message: Message, context: &mut ResourceTurn) {
+        let stopped = context.stopped().map(|stopped| stopped.status.clone());
         let message = match stopped {
             None => message,
-            Some(stopped) => match refuse_change(message, stopped, desk) {
+            Some(stopped) => match refuse_change(message, stopped, context) {
                 Some(read) => read,
                 None => return,
             },
         };
-        let now = desk.now();
+        let now = context.now();
         match message {
             Message::Perform { speaker, request_id, request, answer } => {
                 let reply = self.may_speak(now, &speaker, request.session()).and_then(|()| {
@@ -182,12 +182,12 @@ impl Core for ResourceCore {
                         .map_err(|error| status::of_error(&error))?;
                     Ok((reply, self.pool.revision()))
                 });
-                desk.reply(answer, reply);
+                context.reply(answer, reply);
             }
             Message::Acquire { answer, .. } if self.draining => drop(answer.send(Err(ending()))),
             Message::Acquire { speaker, ticket, request_id, mut request, wait, answer } => {
                 if let Err(refused) = self.may_speak(now, &speaker, Some(&request.session)) {
-                    return desk.reply(answer, Err(refused));
+                    return context.reply(answer, Err(refused));
                 }
                 request.deadline = Some(now + wait.min(self.config.max_wait()));
                 match self.pool.handle_as(now, &speaker, &request_id, Request::Acquire(request)) {
@@ -195,19 +195,19 @@ impl Core for ResourceCore {
                         self.tickets.insert(ticket, waiter);
                         self.calls.entry(waiter).or_default().push((ticket, answer));
                     }
-                    Ok(Reply::Granted(lease)) => self.grant_again(ticket, lease, answer, desk),
+                    Ok(Reply::Granted(lease)) => self.grant_again(ticket, lease, answer, context),
                     Ok(reply) => debug_assert!(false, "an acquire is queued or granted, not {reply:?}"),
-                    Err(error) => desk.reply(answer, Err(status::of_error(&error))),
+                    Err(error) => context.reply(answer, Err(status::of_error(&error))),
                 }
             }
-            Message::Abandon { ticket } => self.abandon(ticket, desk),
+            Message::Abandon { ticket } => self.abandon(ticket, context),
             Message::Withdraw { speaker, session, request_id, answer } => {
                 let withdrawn = self.may_speak(now, &speaker, Some(&session)).and_then(|()| {
                     self.pool.withdraw(now, &session, &request_id).map_err(|error| status::of_error(&error))
                 });
-                desk.reply(answer, withdrawn);
+                context.reply(answer, withdrawn);
             }
-            Message::Return { lease } => self.give_back(lease, desk),
+            Message::Return { lease } => self.give_back(lease, context),
             Message::Undo { speaker, session, request_id } => {
                 if self.may_speak(now, &speaker, Some(&session)).is_ok() {
                     // Another session's is not undone.
@@ -216,59 +216,59 @@ impl Core for ResourceCore {
             }
             Message::Search { mut search, resources, answer } => {
                 let finished = self.pool.go_on(&mut search, resources);
-                desk.tell(answer, (search, finished));
+                context.tell(answer, (search, finished));
             }
-            Message::Get { id, answer } => desk.tell(answer, self.pool.get(&id)),
+            Message::Get { id, answer } => context.tell(answer, self.pool.get(&id)),
             Message::List { after, most, answer } => {
                 let listed = (self.pool.list_after(&after, most), self.pool.revision());
-                desk.tell(answer, listed);
+                context.tell(answer, listed);
             }
-            Message::Revision { answer } => desk.tell(answer, self.pool.revision()),
-            Message::Sessions { after, answer } => desk.tell(answer, self.sessions(&after, desk)),
+            Message::Revision { answer } => context.tell(answer, self.pool.revision()),
+            Message::Sessions { after, answer } => context.tell(answer, self.sessions(&after, context)),
             Message::WatchDemand { speaker, session, provisions, answer } => {
                 let allowed = self.may_speak(now, &speaker, Some(&session));
                 let watch = allowed.and_then(|()| self.watch_demand(session, provisions));
-                desk.reply(answer, watch);
+                context.reply(answer, watch);
             }
             Message::ReportShortage { speaker, session, kind, most, reason, answer } => {
                 let allowed = self.may_speak(now, &speaker, Some(&session));
                 let reported = allowed.and_then(|()| self.report_shortage(now, &session, &kind, most, &reason));
-                desk.reply(answer, reported);
+                context.reply(answer, reported);
             }
             Message::Waiters { caller, request_id, answer } => {
                 let waiters = self.waiters(&caller, &request_id);
-                desk.reply(answer, waiters);
+                context.reply(answer, waiters);
             }
-            Message::Explain { waiters, answer } => desk.tell(answer, self.explain(&waiters)),
+            Message::Explain { waiters, answer } => context.tell(answer, self.explain(&waiters)),
             Message::Watch { after, filter, answer } => {
-                let watch = self.watch(after, filter, desk);
-                desk.reply(answer, watch);
+                let watch = self.watch(after, filter, context);
+                context.reply(answer, watch);
             }
         }
     }
 
     /// Takes over the bounds of a config; the rest needs a restart.
-    fn signal(&mut self, config: &ResourceManagerConfig, desk: &mut ResourceDesk) {
+    fn signal(&mut self, config: &ResourceManagerConfig, context: &mut ResourceTurn) {
         let ResourceManagerConfig { max_session_ttl_ms, max_wait_ms, max_watchers, limits, .. } = config.clone();
         self.pool.set_limits(limits.clone());
         // With wider bounds somebody may be served who waited.
-        if desk.stopped().is_none() {
-            self.pool.advance(desk.now());
+        if context.stopped().is_none() {
+            self.pool.advance(context.now());
         }
         self.config =
             ResourceManagerConfig { max_session_ttl_ms, max_wait_ms, max_watchers, limits, ..self.config.clone() };
     }
 
-    fn collect(&mut self, desk: &mut ResourceDesk) {
+    fn collect(&mut self, context: &mut ResourceTurn) {
         for notice in self.pool.take_notices() {
-            desk.say(Said::Notice(notice));
+            context.say(Said::Notice(notice));
         }
     }
 
-    fn hand_out(&mut self, said: Said, desk: &mut ResourceDesk) {
+    fn hand_out(&mut self, said: Said, context: &mut ResourceTurn) {
         match said {
-            Said::Notice(notice) => self.notify(notice, desk),
-            Said::GrantedAgain { ticket } => self.answer_again(ticket, desk),
+            Said::Notice(notice) => self.notify(notice, context),
+            Said::GrantedAgain { ticket } => self.answer_again(ticket, context),
             Said::SessionKept(session) => {
                 if let Some(records) = self.opening.get_mut(&session) {
                     *records -= 1;
@@ -305,12 +305,12 @@ impl Core for ResourceCore {
     }
 
     /// Whoever waits is told, and leaves the queue.
-    fn drain(&mut self, desk: &mut ResourceDesk) {
+    fn drain(&mut self, context: &mut ResourceTurn) {
         self.draining = true;
         self.tickets.clear();
         let calls = std::mem::take(&mut self.calls);
         tracing::info!(waiting = calls.len(), "draining: nobody is granted anything any more");
-        let now = desk.now();
+        let now = context.now();
         for (waiter, calls) in calls {
             // Unknown when it was answered in this moment: then the grant finds nobody, and goes back.
             let _ = self.pool.cancel(now, waiter);
@@ -320,12 +320,12 @@ impl Core for ResourceCore {
         }
     }
 
-    fn turned(&mut self, desk: &mut ResourceDesk) {
-        if desk.may_speak() {
-            self.spread_demand(desk);
+    fn turned(&mut self, context: &mut ResourceTurn) {
+        if context.may_speak() {
+            self.spread_demand(context);
         }
         let [resources, sessions, leases, waiters] = self.pool.amounts();
-        self.metrics.set(Amounts { resources, sessions, leases, waiters, watchers: desk.watchers.len() });
+        self.metrics.set(Amounts { resources, sessions, leases, waiters, watchers: context.watchers.len() });
     }
 }
 
@@ -366,13 +366,13 @@ impl ResourceCore {
 }
 
 /// Refuses a change. A read is returned, for reads go on, of what is on the disk.
-fn refuse_change(message: Message, stopped: Status, desk: &mut ResourceDesk) -> Option<Message> {
+fn refuse_change(message: Message, stopped: Status, context: &mut ResourceTurn) -> Option<Message> {
     match message {
-        Message::Perform { answer, .. } => desk.reply(answer, Err(stopped)),
-        Message::Acquire { answer, .. } => desk.reply(answer, Err(stopped)),
-        Message::Withdraw { answer, .. } => desk.reply(answer, Err(stopped)),
-        Message::WatchDemand { answer, .. } => desk.reply(answer, Err(stopped)),
-        Message::ReportShortage { answer, .. } => desk.reply(answer, Err(stopped)),
+        Message::Perform { answer, .. } => context.reply(answer, Err(stopped)),
+        Message::Acquire { answer, .. } => context.reply(answer, Err(stopped)),
+        Message::Withdraw { answer, .. } => context.reply(answer, Err(stopped)),
+        Message::WatchDemand { answer, .. } => context.reply(answer, Err(stopped)),
+        Message::ReportShortage { answer, .. } => context.reply(answer, Err(stopped)),
         Message::Abandon { .. } | Message::Return { .. } | Message::Undo { .. } => {}
         read @ (Message::Search { .. }
         | Message::Get { .. }

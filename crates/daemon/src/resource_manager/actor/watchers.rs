@@ -1,9 +1,9 @@
 //! What a watch begins with: everything as it is, or what happened after a position that is known.
 
-use super::{ResourceCore, ResourceDesk};
+use super::{ResourceCore, ResourceTurn};
 use crate::resource_manager::status;
-use crate::resource_manager::told::Told;
 use crate::resource_manager::watch_filter::WatchFilter;
+use crate::resource_manager::watch_message::WatchMessage;
 use ratn_model::id::Revision;
 use ratn_proto::types::WatchPosition;
 use std::sync::Arc;
@@ -15,22 +15,22 @@ impl ResourceCore {
         &self,
         after: Option<WatchPosition>,
         filter: Arc<WatchFilter>,
-        desk: &mut ResourceDesk,
-    ) -> Result<mpsc::Receiver<Told>, Status> {
-        desk.watchers.admit(self.config.max_watchers)?;
+        context: &mut ResourceTurn,
+    ) -> Result<mpsc::Receiver<WatchMessage>, Status> {
+        context.watchers.admit(self.config.max_watchers)?;
         let first = match after {
             None => {
                 let resources = self.pool.list().into_iter().filter(|view| filter.passes(view)).collect();
                 let (revision, youngest) = (self.pool.revision(), self.pool.youngest_lease());
-                vec![Told::Snapshot { revision, resources, youngest }]
+                vec![WatchMessage::Snapshot { revision, resources, youngest }]
             }
             Some(after) => {
                 // Some of this revision may have been seen.
                 let before = Revision(after.revision.0.saturating_sub(u64::from(after.part.is_some())));
                 let events = self.pool.changes_after(before).map_err(|compacted| status::of_compacted(&compacted))?;
-                events.into_iter().map(Told::Event).filter(|told| told.concerns(&filter)).collect()
+                events.into_iter().map(WatchMessage::Event).filter(|told| told.concerns(&filter)).collect()
             }
         };
-        desk.watch_where(first, move |told| told.concerns(&filter))
+        context.watch_where(first, move |told| told.concerns(&filter))
     }
 }

@@ -10,30 +10,30 @@ use std::sync::Arc;
 
 /// See the module.
 #[derive(Debug, Clone)]
-pub(super) enum Told {
+pub(super) enum WatchMessage {
     /// What is there, of what a watch is about; events follow from the next revision on.
     Snapshot { revision: Revision, resources: Vec<ResourceView>, youngest: LeaseId },
     /// What happened since.
     Event(Arc<WatchEvent>),
 }
 
-impl Told {
+impl WatchMessage {
     /// Whether some of it is what a watch is about. A snapshot was made for it.
     pub(super) fn concerns(&self, filter: &WatchFilter) -> bool {
         match self {
-            Told::Snapshot { .. } => true,
-            Told::Event(event) => event.change.resources().iter().any(|resource| filter.passes(resource)),
+            WatchMessage::Snapshot { .. } => true,
+            WatchMessage::Event(event) => event.change.resources().iter().any(|resource| filter.passes(resource)),
         }
     }
 
     /// What a watch is told of it: what it is about, behind what it has seen.
     pub(super) fn updates(&self, filter: &WatchFilter, after: Option<WatchPosition>) -> Vec<ResourceUpdate> {
         match self {
-            Told::Snapshot { revision, resources, youngest } => {
+            WatchMessage::Snapshot { revision, resources, youngest } => {
                 let resources = resources.iter().map(wire::resource).collect();
                 vec![ResourceUpdate::Snapshot { revision: *revision, resources, youngest: *youngest }]
             }
-            Told::Event(event) => {
+            WatchMessage::Event(event) => {
                 let unseen = |event: &ResourceEvent| {
                     after.is_none_or(|after| event.revision > after.revision || Some(event.part) > after.part)
                 };

@@ -30,7 +30,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
 use crate::core::objects::TrueObject;
 
-/// Messages that wait for the keeper at the most, besides one per goal that tells it to stop.
+/// Messages that wait for the handle at the most, besides one per goal that tells it to stop.
 const MAX_MESSAGES: usize = 256;
 /// It looks at the clock at least this often.
 const MAX_SLEEP: Duration = Duration::from_secs(1);
@@ -50,9 +50,9 @@ pub(crate) struct State {
     pub(crate) contacts: Vec<Contact>,
 }
 
-/// Sends messages to the keeper. Clones share it; it ends with the last of them.
+/// Sends messages to the handle. Clones share it; it ends with the last of them.
 #[derive(Debug, Clone)]
-pub(crate) struct Keeper {
+pub(crate) struct CellHandle {
     messages: Sender<QueuedMessage>,
     room: Arc<Semaphore>,
     tickets: Arc<AtomicU64>,
@@ -82,9 +82,9 @@ struct Holds {
     suspended: BTreeSet<Ticket>,
 }
 
-/// The keeper does not take the message.
+/// The handle does not take the message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum KeeperError {
+pub(crate) enum CellActorError {
     #[error("the cell is overloaded: {MAX_MESSAGES} messages wait; try again later")]
     Overloaded,
     #[error("the cell has ended")]
@@ -109,25 +109,25 @@ enum Message {
 }
 
 /// Starts the thread.
-pub(crate) fn start(cell: Cell, recorder: Recorder, clock: RobotClock, vitals: Vitals) -> io::Result<Keeper> {
-    let (keeper, inbox) = keeper_of(&cell);
+pub(crate) fn start(cell: Cell, recorder: Recorder, clock: RobotClock, vitals: Vitals) -> io::Result<CellHandle> {
+    let (handle, inbox) = handle_of(&cell);
     let keep = move || {
         let _ = vitals.guard_blocking("the cell's core", || keep(cell, recorder, clock, &inbox, &vitals));
     };
     std::thread::Builder::new().name("cell".to_owned()).spawn(keep)?;
-    Ok(keeper)
+    Ok(handle)
 }
 
-fn keeper_of(cell: &Cell) -> (Keeper, Receiver<QueuedMessage>) {
+fn handle_of(cell: &Cell) -> (CellHandle, Receiver<QueuedMessage>) {
     let (messages, inbox) = channel();
     let optics = Arc::new(Optics { robot: cell.robot().clone(), noise: cell.config().camera.noise });
     let room = Arc::new(Semaphore::new(MAX_MESSAGES));
-    (Keeper { messages, room, tickets: Arc::default(), optics }, inbox)
+    (CellHandle { messages, room, tickets: Arc::default(), optics }, inbox)
 }
 
-impl Keeper {
+impl CellHandle {
     /// Starts a goal.
-    pub(crate) fn perform(&self, request: Request) -> Result<Motion, KeeperError> {
+    pub(crate) fn perform(&self, request: Request) -> Result<Motion, CellActorError> {
         let ticket = Ticket(self.tickets.fetch_add(1, Ordering::Relaxed) + 1);
         let (ended, ending) = oneshot::channel();
         self.ask(Message::Start { ticket, request, ended })?;
@@ -135,37 +135,37 @@ impl Keeper {
     }
 
     /// Tells the core of an event, as soon as there is room.
-    pub(crate) async fn tell(&self, event: Event) -> Result<(), KeeperError> {
-        let room = Arc::clone(&self.room).acquire_owned().await.map_err(|_| KeeperError::Ended)?;
+    pub(crate) async fn tell(&self, event: Event) -> Result<(), CellActorError> {
+        let room = Arc::clone(&self.room).acquire_owned().await.map_err(|_| CellActorError::Ended)?;
         self.send(Message::Happened(event), room)
     }
 
     /// A new table; what is true then.
-    pub(crate) async fn reset(&self, seed: u64, goods: Goods) -> Result<State, KeeperError> {
+    pub(crate) async fn reset(&self, seed: u64, goods: Goods) -> Result<State, CellActorError> {
         let (state, answer) = oneshot::channel();
         self.ask(Message::Reset { seed, goods, state })?;
-        answer.await.map_err(|_| KeeperError::Ended)
+        answer.await.map_err(|_| CellActorError::Ended)
     }
 
     /// The state now.
-    pub(crate) async fn save(&self) -> Result<Box<Snapshot>, KeeperError> {
+    pub(crate) async fn save(&self) -> Result<Box<Snapshot>, CellActorError> {
         let (snapshot, answer) = oneshot::channel();
         self.ask(Message::Save(snapshot))?;
-        answer.await.map_err(|_| KeeperError::Ended)
+        answer.await.map_err(|_| CellActorError::Ended)
     }
 
     /// Something shall go wrong; false where too much is to go wrong already.
-    pub(crate) async fn inject(&self, fault: Fault) -> Result<bool, KeeperError> {
+    pub(crate) async fn inject(&self, fault: Fault) -> Result<bool, CellActorError> {
         let (taken, answer) = oneshot::channel();
         self.ask(Message::Fault { fault, taken })?;
-        answer.await.map_err(|_| KeeperError::Ended)
+        answer.await.map_err(|_| CellActorError::Ended)
     }
 
     /// What is true now.
-    pub(crate) async fn state(&self) -> Result<State, KeeperError> {
+    pub(crate) async fn state(&self) -> Result<State, CellActorError> {
         let (state, answer) = oneshot::channel();
         self.ask(Message::State(state))?;
-        answer.await.map_err(|_| KeeperError::Ended)
+        answer.await.map_err(|_| CellActorError::Ended)
     }
 
     /// Makes an image of what was in front of the camera. Blocks for milliseconds per exposure.
@@ -174,31 +174,31 @@ impl Keeper {
     }
 
     /// Sends a message that can be refused.
-    fn ask(&self, message: Message) -> Result<(), KeeperError> {
-        let room = Arc::clone(&self.room).try_acquire_owned().map_err(|_| KeeperError::Overloaded)?;
+    fn ask(&self, message: Message) -> Result<(), CellActorError> {
+        let room = Arc::clone(&self.room).try_acquire_owned().map_err(|_| CellActorError::Overloaded)?;
         self.send(message, room)
     }
 
-    fn send(&self, message: Message, room: OwnedSemaphorePermit) -> Result<(), KeeperError> {
-        self.messages.send(QueuedMessage { message, _room: Some(room) }).map_err(|_| KeeperError::Ended)
+    fn send(&self, message: Message, room: OwnedSemaphorePermit) -> Result<(), CellActorError> {
+        self.messages.send(QueuedMessage { message, _room: Some(room) }).map_err(|_| CellActorError::Ended)
     }
 }
 
 #[tonic::async_trait]
-impl Brakes for Keeper {
+impl Brakes for CellHandle {
     /// Never refused for want of room.
     async fn apply(&self, state: &SafetyState) -> Result<(), String> {
         let (applied, done) = oneshot::channel();
         let message = Message::Safety { state: state.clone(), applied };
-        self.messages.send(QueuedMessage { message, _room: None }).map_err(|_| KeeperError::Ended.to_string())?;
-        done.await.map_err(|_| KeeperError::Ended.to_string())
+        self.messages.send(QueuedMessage { message, _room: None }).map_err(|_| CellActorError::Ended.to_string())?;
+        done.await.map_err(|_| CellActorError::Ended.to_string())
     }
 }
 
 impl Motion {
     /// How it ends.
-    pub(crate) async fn ended(&mut self) -> Result<Ending, KeeperError> {
-        let ending = (&mut self.ending).await.map_err(|_| KeeperError::Ended);
+    pub(crate) async fn ended(&mut self) -> Result<Ending, CellActorError> {
+        let ending = (&mut self.ending).await.map_err(|_| CellActorError::Ended);
         self.over = true;
         self.suspend(false);
         ending
@@ -209,13 +209,13 @@ impl Motion {
     pub(crate) fn suspend(&mut self, suspended: bool) {
         if std::mem::replace(&mut self.suspended, suspended) != suspended {
             let message = Message::Suspend { ticket: self.ticket, suspended };
-            // A keeper that has ended moves nothing.
+            // A handle that has ended moves nothing.
             let _ = self.messages.send(QueuedMessage { message, _room: None });
         }
     }
 
     /// Tells it to stop, and how it ends then. Never refused: there is at most one such message per goal.
-    pub(crate) async fn stop(mut self) -> Result<Ending, KeeperError> {
+    pub(crate) async fn stop(mut self) -> Result<Ending, CellActorError> {
         self.tell_to_stop();
         self.ended().await
     }
@@ -223,7 +223,7 @@ impl Motion {
     fn tell_to_stop(&mut self) {
         self.over = true;
         let stop = Event::Stop { ticket: self.ticket, reason: "the goal was told to stop".to_owned() };
-        // A keeper that has ended moves nothing.
+        // A handle that has ended moves nothing.
         let _ = self.messages.send(QueuedMessage { message: Message::Happened(stop), _room: None });
         self.suspend(false);
     }
@@ -359,14 +359,14 @@ mod tests {
             [SafetyState::Stopped { reason: "a hand".to_owned() }, SafetyState::Held { reason: "a door".to_owned() }]
         {
             let cell = Cell::new(CellConfig::default()).unwrap();
-            let keeper = start(cell, Recorder::none(), RobotClock::start(1.0), Vitals::default()).unwrap();
-            let motion = keeper.perform(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 }).unwrap();
+            let handle = start(cell, Recorder::none(), RobotClock::start(1.0), Vitals::default()).unwrap();
+            let motion = handle.perform(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 }).unwrap();
             let far = |at: &State| (at.arm[0] - aimm::HOME[0]).abs() > 0.3;
-            while !far(&keeper.state().await.unwrap()) {}
-            let told = keeper.state().await.unwrap();
-            keeper.apply(&state).await.unwrap();
-            let confirmed = keeper.state().await.unwrap();
-            let later = keeper.state().await.unwrap();
+            while !far(&handle.state().await.unwrap()) {}
+            let told = handle.state().await.unwrap();
+            handle.apply(&state).await.unwrap();
+            let confirmed = handle.state().await.unwrap();
+            let later = handle.state().await.unwrap();
             assert_eq!(confirmed.arm, later.arm, "{state:?}");
             // It was on its way when that was asked for, and braked.
             assert!(confirmed.now.since(told.now) > Duration::from_millis(40), "{state:?}");
@@ -377,11 +377,11 @@ mod tests {
 
     #[tokio::test]
     async fn a_stop_arrives_however_many_questions_wait_also_of_a_goal_that_nobody_waits_for() {
-        let (keeper, inbox) = keeper_of(&Cell::new(CellConfig::default()).unwrap());
-        let (stopped, dropped) = (keeper.perform(Request::Release).unwrap(), keeper.perform(Request::Release).unwrap());
+        let (handle, inbox) = handle_of(&Cell::new(CellConfig::default()).unwrap());
+        let (stopped, dropped) = (handle.perform(Request::Release).unwrap(), handle.perform(Request::Release).unwrap());
         let tickets = [stopped.ticket, dropped.ticket];
-        while keeper.ask(Message::Happened(Event::Tick)).is_ok() {}
-        assert_eq!(keeper.state().await, Err(KeeperError::Overloaded));
+        while handle.ask(Message::Happened(Event::Tick)).is_ok() {}
+        assert_eq!(handle.state().await, Err(CellActorError::Overloaded));
         drop(dropped);
         let stopping = tokio::spawn(stopped.stop());
         tokio::task::yield_now().await;
@@ -391,7 +391,7 @@ mod tests {
             _ => None,
         });
         assert_eq!(stops.collect::<std::collections::BTreeSet<_>>(), tickets.into());
-        assert_eq!(stopping.await.unwrap(), Err(KeeperError::Ended));
-        keeper.tell(Event::Tick).await.unwrap();
+        assert_eq!(stopping.await.unwrap(), Err(CellActorError::Ended));
+        handle.tell(Event::Tick).await.unwrap();
     }
 }

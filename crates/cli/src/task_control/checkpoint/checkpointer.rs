@@ -1,7 +1,7 @@
 //! Makes the checkpoints of a run that is under way: follows what replaying would come to, and hands a copy to the writer when one
 //! is due.
 
-use super::Standing;
+use super::ReplayedState;
 use super::pace::Pace;
 use super::writer::{self, Job, Writer};
 use crate::task_control::ledger::{Confirmed, Ledger};
@@ -17,7 +17,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 /// The checkpoints of one run.
-pub(in crate::task_control) struct Keeper {
+pub(in crate::task_control) struct Checkpointer {
     log: PathBuf,
     /// The task file's digest.
     digest: String,
@@ -30,7 +30,7 @@ pub(in crate::task_control) struct Keeper {
     writer: Writer,
 }
 
-impl Keeper {
+impl Checkpointer {
     /// For a run that writes a log and stands so, of which so many events are behind its last checkpoint. `None` where checkpoints
     /// are not wanted, or not possible: the log is no file, or there is no thread.
     pub(in crate::task_control) fn start(
@@ -39,7 +39,7 @@ impl Keeper {
         every_events: u64,
         ledger: Ledger,
         events: u64,
-    ) -> Option<Keeper> {
+    ) -> Option<Checkpointer> {
         if every_events == 0 || !log.is_on_disk() {
             return None;
         }
@@ -47,7 +47,7 @@ impl Keeper {
         let no_thread = |error: &io::Error| tracing::warn!(%error, "the run has no checkpoints: resuming takes longer");
         let writer = Writer::start(&path).inspect_err(no_thread).ok()?;
         let pace = Pace::new(every_events, events, log.written());
-        Some(Keeper {
+        Some(Checkpointer {
             log: path,
             digest: digest.to_owned(),
             ledger,
@@ -90,7 +90,7 @@ impl Keeper {
             digest: self.digest.clone(),
             bytes: log.written(),
             lines: log.lines(),
-            standing: Standing { ledger, states, progress },
+            standing: ReplayedState { ledger, states, progress },
             executive: executive.checkpoint(),
         });
         self.pace.made(log.written());
@@ -100,14 +100,14 @@ impl Keeper {
 
     /// The run has ended.
     pub(in crate::task_control) fn end(self) {
-        let Keeper { log, writer, .. } = self;
+        let Checkpointer { log, writer, .. } = self;
         drop(writer);
         writer::remove(&log);
     }
 }
 
 #[cfg(test)]
-impl Keeper {
+impl Checkpointer {
     /// Whether a checkpoint is being written.
     pub(in crate::task_control) fn is_busy(&mut self) -> bool {
         let _ = self.writer.took();

@@ -30,7 +30,7 @@ pub(crate) struct Stopped {
 }
 
 /// See the module.
-pub(crate) struct Desk<C: Core> {
+pub(crate) struct TurnContext<C: Core> {
     /// Everybody who watches.
     pub(crate) watchers: Watchers<C::Update>,
     outgoing: Vec<Outgoing<C>>,
@@ -39,10 +39,10 @@ pub(crate) struct Desk<C: Core> {
     may_speak: MaySpeak,
 }
 
-impl<C: Core> Desk<C> {
-    pub(super) fn new(may_speak: MaySpeak) -> Desk<C> {
+impl<C: Core> TurnContext<C> {
+    pub(super) fn new(may_speak: MaySpeak) -> TurnContext<C> {
         let clock = Clock::start(Instant::now());
-        Desk { watchers: Watchers::default(), outgoing: Vec::new(), stopped: None, clock, may_speak }
+        TurnContext { watchers: Watchers::default(), outgoing: Vec::new(), stopped: None, clock, may_speak }
     }
 
     /// The time since the start, without pauses of the process, and without the time in which it might say nothing.
@@ -69,7 +69,7 @@ impl<C: Core> Desk<C> {
         self.outgoing.push(Outgoing::Answer(send_answer(answer, result)));
     }
 
-    /// As [`Desk::reply`], of what has been on the disk for long: it leaves at once, past what waits.
+    /// As [`TurnContext::reply`], of what has been on the disk for long: it leaves at once, past what waits.
     pub(crate) fn reply_now<T: Send + 'static>(
         &mut self,
         answer: oneshot::Sender<Result<T, Status>>,
@@ -82,7 +82,7 @@ impl<C: Core> Desk<C> {
         }
     }
 
-    /// As [`Desk::reply`], to one who only looks; without an answer they ask again.
+    /// As [`TurnContext::reply`], to one who only looks; without an answer they ask again.
     pub(crate) fn tell<T: Send + 'static>(&mut self, answer: oneshot::Sender<T>, told: T) {
         self.outgoing.push(Outgoing::Answer(Box::new(move |stopped| {
             if stopped.is_none() {
@@ -104,10 +104,10 @@ impl<C: Core> Desk<C> {
         self.watch_where(first, |_| true)
     }
 
-    /// As [`Desk::watch`], of the updates that are wanted.
+    /// As [`TurnContext::watch`], of the updates that are wanted.
     ///
     /// # Errors
-    /// As [`Desk::watch`].
+    /// As [`TurnContext::watch`].
     pub(crate) fn watch_where(
         &mut self,
         first: Vec<C::Update>,
