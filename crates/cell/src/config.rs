@@ -220,9 +220,12 @@ impl CellConfig {
         Goods { boxes, bowls, forks, cups, plates }
     }
 
-    /// The bound within which the next lease of what moves is granted.
+    /// The bound within which the next lease of what moves is granted. What brakes takes seconds of the robot, which last longer in a
+    /// cell that is slowed down; below a speed of 0.06 longer than a bound may be.
     pub fn standstill(&self) -> Duration {
-        let unless_given = standstill_bound(Duration::from_millis(self.session_ttl_ms)).min(LONGEST_STANDSTILL);
+        let ttl = Duration::from_millis(self.session_ttl_ms);
+        let braking = (standstill_bound(ttl) - ttl).div_f64(self.speed.clamp(1e-3, 1.0));
+        let unless_given = (ttl + braking).min(LONGEST_STANDSTILL);
         self.standstill_ms.map_or(unless_given, Duration::from_millis)
     }
 
@@ -415,6 +418,14 @@ mod tests {
         let config: CellConfig = toml::from_str("").unwrap();
         assert_eq!(config, CellConfig::default());
         config.check().unwrap();
+    }
+
+    #[test]
+    fn a_cell_that_is_slowed_down_has_longer_to_come_to_rest() {
+        let of = |text: &str| toml::from_str::<CellConfig>(text).unwrap().standstill().as_secs_f64();
+        assert_eq!((of(""), of("speed = 50.0")), (6.0, 6.0));
+        assert_eq!((of("speed = 0.25"), of("speed = 0.01")), (15.0, 60.0));
+        assert_eq!(of("speed = 0.25\nstandstill_ms = 7000"), 7.0);
     }
 
     #[test]

@@ -12,11 +12,18 @@ use ratn_cell::core::recording::{Line, ReplayError, replay};
 use ratn_cell::core::snapshot::{Snapshot, SnapshotError};
 use ratn_motion::aimm;
 use ratn_motion::plan::Goal;
+use std::time::Duration;
 
 /// A box is grasped, lifted and lost, and the camera is blind for a while: as lines.
 fn eventful() -> Vec<String> {
-    let faults = ["grasp_slips@9", "sensor_dropout~0.5"].iter().map(|text| text.parse().unwrap()).collect();
+    eventful_with("grasp_slips@9", None)
+}
+
+/// With such a fault, and a tick so often besides, or only where the cell wakes up.
+fn eventful_with(slips: &str, tick: Option<Duration>) -> Vec<String> {
+    let faults = [slips, "sensor_dropout~0.5"].iter().map(|text| text.parse().unwrap()).collect();
     let mut bench = Bench::of(CellConfig { boxes: 3, seed: 4, faults, ..CellConfig::default() });
+    bench.tick = tick;
     bench.lines.push(Line::header(bench.cell.config()));
     bench.reach_for(0);
     bench.done(grasp());
@@ -46,6 +53,14 @@ fn the_same_comes_of_a_recording_and_another_thing_is_noticed_at_its_line() {
     let mut other = lines.clone();
     other[ended] = other[ended].replace("done", "stopped");
     assert!(matches!(replayed(&other), Err(ReplayError::Differs { line, .. }) if line == ended + 1));
+}
+
+#[test]
+fn what_is_lost_between_two_ticks_ends_the_motion_at_the_same_time_in_a_replay() {
+    // While it is lifted.
+    let ticked = eventful_with("grasp_slips@3.0", Some(Duration::from_millis(5)));
+    assert!(ticked.iter().any(|line| line.contains("slipped out of the fingers; the arm holds")));
+    replayed(&ticked).unwrap();
 }
 
 #[test]

@@ -3,8 +3,9 @@
 //! A motion is a course over a time τ of its own, which goes on as time does unless it is told to stop. Then its rate r = dτ/dt falls
 //! from 1 to 0, step by step, as fast as the joints allow: each is accelerated by q″r² + q′ṙ (Bobrow, Dubowsky and Gibson,
 //! "Time-optimal control of robotic manipulators along specified paths", IJRR 1985), and the most negative ṙ is taken with which none
-//! exceeds its limit; ṙ = 0 is always one where the course itself keeps to the limits. To set out again the rate rises in the same
-//! way. So nothing leaves the path that was checked. The jerk is not limited: the rate's slope steps.
+//! exceeds its limit. Where one of them slows down by itself as hard as it may, that is ṙ = 0, and there may always be one: so the rate
+//! falls by at least what [`URGENT`] of each limit does, and such a joint brakes by so much above its limit. To set out again the rate rises in the
+//! same way, and may wait. So nothing leaves the path that was checked. The jerk is not limited: the rate's slope steps.
 //!
 //! A stop on request, a hold and a lost lease brake within the limits that motions are planned by. An emergency stop is of category 1
 //! (IEC 60204-1): the joints brake within [`EMERGENCY`] times those limits, then the brakes close. The fingers and the camera's head,
@@ -23,7 +24,10 @@ use std::time::Duration;
 pub const EMERGENCY: f64 = 2.0;
 /// The part of a limit that is made use of: the course is known at its steps only.
 const USED: f64 = 0.95;
-/// The most steps that a change of rate takes: a minute.
+/// The part of a limit that braking takes at the least, whatever the course itself takes: with it what goes as fast and brakes as hard
+/// as it may stands after 2.3 times as long as it takes to brake from there alone.
+const URGENT: f64 = 0.2;
+/// The most steps that it takes to set out again: a minute.
 const MAX_STEPS: usize = 15_000;
 
 /// The time of what moves, which goes on as fast as time, or not at all, or changes between both.
@@ -282,7 +286,82 @@ fn greatest_slope<const N: usize>(
         // What the change of rate adds is along the velocity, or against it.
         let (v, a) = (if brakes { -velocity[j] } else { velocity[j] }, acceleration[j] * rate * rate);
         let room = if v >= 0.0 { limits[j] - a } else { limits[j] + a };
-        if v == 0.0 { f64::INFINITY } else { (room / v.abs()).max(0.0) }
+        let least = if brakes { URGENT * limits[j] } else { 0.0 };
+        if v == 0.0 { f64::INFINITY } else { room.max(least) / v.abs() }
     };
     (0..N).map(slope).fold(f64::INFINITY, f64::min)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
+mod tests {
+    use super::super::motion::Controller;
+    use super::*;
+    use ratn_model::value::{Trajectory, TrajectoryPoint};
+    use ratn_motion::trajectory::Curve;
+
+    /// Each joint goes to and fro at the acceleration that it may have, a third of a swing behind the one before it: one of them always slows
+    /// down as hard as it may.
+    fn swings(robot: &Robot, period_s: f64) -> Motion<3> {
+        let joints = robot.base_joints();
+        let (quarter_s, swings) = (period_s / 4.0, 20);
+        let velocity = |j: usize, time_s: f64| {
+            let phase = (time_s / period_s + j as f64 / 6.0).rem_euclid(1.0) * 4.0;
+            let shape = if phase < 1.0 {
+                phase
+            } else if phase < 3.0 {
+                2.0 - phase
+            } else {
+                phase - 4.0
+            };
+            joints[j].acceleration * quarter_s * shape
+        };
+        let mut at = [0.0; 3];
+        let steps = swings * 24;
+        let dt = period_s / 24.0;
+        let mut points = Vec::new();
+        for step in 0..=steps {
+            let time_s = f64::from(step) * dt;
+            let velocities: Vec<f64> = (0..3).map(|j| velocity(j, time_s)).collect();
+            points.push(TrajectoryPoint { time_s, positions: at.to_vec(), velocities });
+            at = std::array::from_fn(|j| at[j] + 0.5 * (velocity(j, time_s) + velocity(j, time_s + dt)) * dt);
+        }
+        let trajectory = Trajectory { joints: joints.iter().map(|j| j.name.clone()).collect(), points };
+        let stiff = Controller { of: "base", stiffness: 100.0, most_off: 10.0, slides: 2 };
+        Motion::new(
+            Curve::of(joints, &trajectory).unwrap(),
+            [0.0; 3],
+            stiff,
+            Some((f64::from(steps) * dt, String::new())),
+        )
+    }
+
+    #[test]
+    fn what_always_slows_down_somewhere_comes_to_rest_soon_and_nearly_within_its_limits() {
+        let robot = Robot::aimm();
+        let joints = robot.base_joints();
+        let fastest = (0..3).map(|j| joints[j].velocity / joints[j].acceleration).fold(f64::INFINITY, f64::min);
+        let motion = swings(&robot, 4.0 * fastest);
+        // A controller overshoots: what the joints do anyway is more than their limits at some places.
+        let steps = (motion.lasts_s() / STEP.as_secs_f64()) as u32;
+        let anyway: Vec<[f64; 3]> =
+            (0..steps).map(|i| motion.derivatives(f64::from(i) * STEP.as_secs_f64()).1).collect();
+        let most: [f64; 3] =
+            std::array::from_fn(|j| anyway.iter().fold(joints[j].acceleration, |most, a| most.max(a[j].abs())));
+        for from_s in (0..24).map(|i| 5.0 + f64::from(i) * fastest / 6.0) {
+            let limits = limits(joints, 1.0);
+            let pace = Pace::change(Timestamp::default(), [1.0, 0.0], &motion, from_s, &limits);
+            let lasts_s = pace.settles().since(Timestamp::default()).as_secs_f64();
+            assert!(lasts_s < 3.0 * fastest, "{lasts_s} s from {from_s} s on");
+            let dt = STEP.as_secs_f64();
+            for pair in pace.course.windows(2) {
+                let ([passed, rate], slope) = (pair[0], (pair[1][1] - pair[0][1]) / dt);
+                let (velocity, acceleration) = motion.derivatives(from_s + passed + 0.5 * rate * dt);
+                for j in 0..3 {
+                    let does = acceleration[j] * rate * rate + velocity[j] * slope;
+                    assert!(does.abs() < most[j] + URGENT * joints[j].acceleration, "{does} of joint {j}");
+                }
+            }
+        }
+    }
 }

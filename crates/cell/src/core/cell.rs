@@ -275,11 +275,11 @@ impl Cell {
             let moved = motion_due.and_then(|due| Some((due, self.clock.real_time(due)?)));
             let stands = self.braking.values().map(Braking::ends).min();
             let due = moved.map(|(_, due)| due).into_iter().chain(self.faults.next()).chain(stands).min();
-            let Some(due) = due.filter(|due| *due <= now) else {
-                self.pass_until(now, out);
-                break;
-            };
-            self.pass_until(due, out);
+            let due = due.filter(|due| *due <= now);
+            if self.pass_until(due.unwrap_or(now), out) {
+                continue;
+            }
+            let Some(due) = due else { break };
             self.deviate(out);
             self.come_to_rest(out);
             let Some((motion_due, _)) = moved.filter(|(_, moved)| *moved <= due) else { continue };
@@ -392,9 +392,6 @@ impl Cell {
         for module in standing {
             let Some(braking) = self.braking.remove(&module) else { continue };
             braking.place(self.now, &mut self.resting);
-            if module == Module::Arm {
-                self.contacts.arrived();
-            }
             let tracking = Some(braking.tracking(self.now));
             out.push(Command::Ended { ticket: braking.ticket, ending: braking.ending, tracking });
         }

@@ -214,10 +214,11 @@ impl Contacts {
         }
     }
 
-    /// What was not meant: those that are over, and those that go on.
+    /// What was not meant: those that are over, and, as it looks now, those that go on and those of which it is not known yet.
     pub(super) fn unintended(&self) -> Vec<Contact> {
-        let open = self.open.values().map(|episode| &episode.contact).filter(|contact| contact.is_unintended());
-        self.judged.iter().chain(open).cloned().collect()
+        let open = self.open.values().map(|episode| &episode.contact);
+        let undecided = open.chain(self.waiting.iter().map(|(_, contact)| contact));
+        self.judged.iter().chain(undecided.filter(|contact| contact.is_unintended())).cloned().collect()
     }
 
     /// What is over, was not meant, and has not been told yet.
@@ -305,5 +306,29 @@ fn finger_at(things: &[Thing; 2]) -> Option<usize> {
     match things {
         [Thing::Link(link), Thing::Object(object)] if link.starts_with("finger") => Some(*object),
         _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_finger_hit_in_the_last_motion_is_told_though_nothing_follows_it() {
+        let hit = Contact {
+            began: Timestamp::default(),
+            ended: Timestamp::default(),
+            bodies: ["finger_left".to_owned(), "cup_1".to_owned()],
+            depth_m: 0.0,
+            pushed_m: 0.02,
+            at: [0.0; 3],
+            speed_m_s: 0.1,
+            meant: None,
+        };
+        let mut contacts = Contacts { waiting: vec![(0, hit.clone())], ..Contacts::default() };
+        assert_eq!(contacts.unintended(), [hit]);
+        // It was what the fingers came to.
+        contacts.closed(Some(0));
+        assert_eq!(contacts.unintended().len(), 1, "it was pushed too far for that");
     }
 }

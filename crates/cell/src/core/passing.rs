@@ -10,23 +10,29 @@ use ratn_model::time::Timestamp;
 const OPEN_M: f64 = 1e-4;
 
 impl Cell {
-    /// Time goes on to `time`, step by step where something moves.
-    pub(super) fn pass_until(&mut self, time: Timestamp, out: &mut Vec<Command>) {
+    /// Time goes on to `time`, step by step where something moves; to the step at which what is held was lost, where that comes first:
+    /// then something else may be due before `time`. Whether it did.
+    pub(super) fn pass_until(&mut self, time: Timestamp, out: &mut Vec<Command>) -> bool {
         while self.environment.next_step() <= time {
             if self.environment.is_at_rest() && !self.may_move() {
                 self.environment.skip_until(time);
                 break;
             }
             self.drain_until(self.environment.next_step());
-            self.step(out);
+            if self.step(out) {
+                return true;
+            }
         }
         self.drain_until(time);
+        false
     }
 
-    fn step(&mut self, out: &mut Vec<Command>) {
+    /// Whether what was held was lost.
+    fn step(&mut self, out: &mut Vec<Command>) -> bool {
         let configuration = self.configuration();
         let tool = self.robot.tool_pose(&configuration);
-        if let Some(lost) = self.keep_hold(&tool) {
+        let lost = self.keep_hold(&tool);
+        if let Some(lost) = lost {
             let holds = if self.is_active(Module::Base) { "base" } else { "arm" };
             let reason = format!("{} slipped out of the fingers; the {holds} holds", self.ids[lost]);
             let moves = |a: &Activity| matches!(a.kind, Kind::Follow(_));
@@ -44,6 +50,7 @@ impl Cell {
             fingers_solid: solid,
         };
         self.contacts.observe(&self.environment.touches(), doing, &self.environment, &self.ids);
+        lost.is_some()
     }
 
     /// Whether something may move that the environment does not know of: the robot, or what it holds.

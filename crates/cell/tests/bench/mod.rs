@@ -21,6 +21,8 @@ pub(crate) struct Bench {
     pub(crate) cell: Cell,
     pub(crate) now: Timestamp,
     tickets: u64,
+    /// How often it is told the time besides.
+    pub(crate) tick: Option<Duration>,
     /// What happened.
     pub(crate) lines: Vec<Line>,
 }
@@ -32,7 +34,7 @@ impl Bench {
 
     pub(crate) fn of(config: CellConfig) -> Bench {
         let cell = Cell::new(config).unwrap();
-        Bench { cell, now: Timestamp::default(), tickets: 0, lines: Vec::new() }
+        Bench { cell, now: Timestamp::default(), tickets: 0, tick: None, lines: Vec::new() }
     }
 
     pub(crate) fn start(&mut self, request: Request) -> (Ticket, Vec<Command>) {
@@ -58,7 +60,8 @@ impl Bench {
     pub(crate) fn perform(&mut self, request: Request) -> Ending {
         let (ticket, mut commands) = self.start(request);
         while commands.is_empty() {
-            self.now = self.cell.next_wake().expect("the goal is under way");
+            let wakes = self.cell.next_wake().expect("the goal is under way");
+            self.now = self.tick.map_or(wakes, |tick| wakes.min(self.now + tick));
             commands = self.handle(Event::Tick);
         }
         let [Command::Ended { ticket: ended, ending, .. }] = &commands[..] else { panic!("{commands:?}") };
