@@ -4,7 +4,7 @@
 //! from 1 to 0, step by step, as fast as the joints allow: each is accelerated by q″r² + q′ṙ (Bobrow, Dubowsky and Gibson,
 //! "Time-optimal control of robotic manipulators along specified paths", IJRR 1985), and the most negative ṙ is taken with which none
 //! exceeds its limit. Where one of them slows down by itself as hard as it may, that is ṙ = 0, and there may always be one: so the rate
-//! falls by at least what [`URGENT`] of each limit does, and such a joint brakes by so much above its limit. To set out again the rate rises in the
+//! falls by at least what `URGENT` of each limit does, and such a joint brakes by so much above its limit. To set out again the rate rises in the
 //! same way, and may wait. So nothing leaves the path that was checked. The jerk is not limited: the rate's slope steps.
 //!
 //! A stop on request, a hold and a lost lease brake within the limits that motions are planned by. An emergency stop is of category 1
