@@ -115,7 +115,9 @@ impl StorageConfig {
         Ok(match self.engine {
             Engine::Log => {
                 let directory = self.directory.clone().unwrap_or_else(|| role.into());
-                Arc::new(crate::durable_actor::Journal::log(self, &directory))
+                // A copy is on the disk when it counts, whatever its daemon waits for later.
+                let config = StorageConfig { durability: Durability::Group, ..self.clone() };
+                Arc::new(crate::durable_actor::Journal::log(&config, &directory))
             }
             Engine::Etcd => Arc::new(crate::standby::etcd(self, role, "a copy or a look", None)?),
         })

@@ -168,20 +168,23 @@ impl Link {
         provider.may_move(&lost.cloned().collect::<Vec<_>>()).await;
         let mut offered = Wanted::new();
         let mut refused = Wanted::new();
+        // What the provider has been asked to offer, and offers by itself as soon as it can.
+        let mut asked: BTreeSet<String> = BTreeSet::new();
         loop {
             let wanted = self.wanted.borrow_and_update().clone();
-            for id in offered.keys().filter(|id| !wanted.contains_key(*id)).cloned().collect::<Vec<_>>() {
+            for id in asked.extract_if(.., |id| !wanted.contains_key(id)) {
                 offered.remove(&id);
                 if let Err(error) = provider.withdraw(&id).await {
                     tracing::warn!(id, %error, "the resource manager does not let a resource go");
                 }
             }
             refused.retain(|id, resource| wanted.get(id) == Some(resource));
-            let draining = self.withdraw_drained(&provider, &mut offered).await;
+            let draining = self.withdraw_drained(&provider, &mut offered, &mut asked).await;
             let is_new = |(id, resource): &(&String, &Resource)| {
                 offered.get(*id) != Some(*resource) && !refused.contains_key(*id) && !draining.contains(*id)
             };
-            let new = wanted.iter().filter(is_new).map(|(_, resource)| resource.clone()).collect();
+            let new: Vec<Resource> = wanted.iter().filter(is_new).map(|(_, resource)| resource.clone()).collect();
+            asked.extend(new.iter().map(|resource| resource.id.clone()));
             let mut settled = draining.is_empty();
             for (id, done) in provider.offer_all(new).await {
                 let resource = wanted.get(&id).cloned().into_iter().map(|resource| (id.clone(), resource));
@@ -199,6 +202,7 @@ impl Link {
                     }
                     Err(error) => {
                         tracing::error!(id, %error, "the resource manager does not take the resource");
+                        asked.remove(&id);
                         refused.extend(resource);
                         self.report(OfferEvent::Refused(id, error.to_string())).await;
                     }
@@ -248,13 +252,19 @@ impl Link {
     }
 
     /// Withdraws the draining resources that nobody holds; returns all that are draining.
-    async fn withdraw_drained(&mut self, provider: &Provider, offered: &mut Wanted) -> BTreeSet<String> {
+    async fn withdraw_drained(
+        &mut self,
+        provider: &Provider,
+        offered: &mut Wanted,
+        asked: &mut BTreeSet<String>,
+    ) -> BTreeSet<String> {
         let Some(lifecycle) = &mut self.lifecycle else { return BTreeSet::new() };
         let draining = lifecycle.draining.borrow_and_update().clone();
         for id in &draining {
-            let gone = !offered.contains_key(id) || provider.withdraw_unless_held(id).await;
+            let gone = !asked.contains(id) || provider.withdraw_unless_held(id).await;
             if gone {
                 offered.remove(id);
+                asked.remove(id);
             }
             let _ = lifecycle
                 .events

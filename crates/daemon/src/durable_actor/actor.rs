@@ -180,14 +180,19 @@ impl<C: Core> Actor<C> {
     /// log that is closed takes nothing.
     async fn write_last(&mut self) {
         let until = Instant::now() + LAST_WRITES;
-        while self.context.stopped().is_none() && !self.journal.is_written() && Instant::now() < until {
+        while self.context.stopped().is_none() && Instant::now() < until {
+            let written = self.journal.is_written();
+            self.deliver();
+            // All was handed out, and led to nothing new.
+            if written && self.journal.is_written() {
+                return;
+            }
             tokio::select! {
                 biased;
                 progress = self.journal.changed() => if !matches!(progress, Ok(Progress { fault: None, .. })) { return },
                 () = tokio::time::sleep(TICK) => {}
             }
             self.vitals.beat();
-            self.deliver();
         }
     }
 

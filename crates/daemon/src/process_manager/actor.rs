@@ -249,6 +249,7 @@ impl Actor {
     /// Ends every worker, whatever it takes.
     async fn end(&mut self, outcomes: &mut mpsc::Receiver<Outcome>) {
         self.watchers.clear();
+        self.processes.end_with_the_manager();
         let commands = self.pools.shut_down(self.now(), SHUTDOWN_PATIENCE);
         self.perform(commands);
         let last = Instant::now() + SHUTDOWN_PATIENCE + KILL_PATIENCE;

@@ -134,7 +134,10 @@ pub(super) async fn settle(
     });
     let adopted: Vec<Adopted> = futures::future::join_all(settled).await.into_iter().flatten().collect();
     for intent in &unknown {
-        tracing::info!(id = intent.id, "the last process manager was killed while it started this worker");
+        tracing::info!(
+            id = intent.id,
+            "the last process manager ended while it started this worker, or while this worker moved something"
+        );
         intent.group.iter().filter(|group| group.exists()).for_each(|group| end_group(group));
         remove_files(&intent.id, &intent.template, directory);
     }

@@ -83,6 +83,8 @@ pub(super) struct Processes {
     roster: Roster,
     tracker: Tracker,
     senders: EventSenders,
+    /// The process manager ends, and all of them with it.
+    ending: bool,
     by_id: BTreeMap<String, Process>,
     ended_logs: EndedLogs,
     /// Reaps orphans: waits for those that have ended.
@@ -147,6 +149,7 @@ impl Processes {
             jobs: spawner::start(outcome.clone(), tracker.clone())?,
             outcomes: outcome,
             roster,
+            ending: false,
             reaping: tracker.children().map(|children| {
                 AbortOnDropHandle::new(tokio::spawn(exit_on_panic("the reaper of orphans", reap(children))))
             }),
@@ -307,6 +310,11 @@ impl Processes {
         spawner::watch_adopted(adopted, &self.log_file(&id), self.max_log_bytes, tracker, self.outcomes.clone());
     }
 
+    /// From now on workers end because their process manager does.
+    pub(super) fn end_with_the_manager(&mut self) {
+        self.ending = true;
+    }
+
     /// The process of a worker has ended.
     pub(super) fn exited(&mut self, id: &str) {
         if let Some(Process { directory, attended, .. }) = self.by_id.remove(id) {
@@ -319,7 +327,11 @@ impl Processes {
                 let _ = std::fs::remove_file(file);
             }
         }
-        self.roster.gone(id);
+        if self.ending {
+            self.roster.ended_with_its_manager(id);
+        } else {
+            self.roster.gone(id);
+        }
         self.ended_logs.add(self.log_file(id));
     }
 

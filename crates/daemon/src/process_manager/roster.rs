@@ -38,7 +38,8 @@ pub(super) struct Entry {
     pub(super) template: Template,
 }
 
-/// A worker that is about to be started: written before its process is there, so that somebody knows of it however this ends.
+/// A worker that is about to be started: written before its process is there, so that somebody knows of it however this ends. Also one that
+/// moved something and ended with its process manager.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Intent {
     pub(super) id: String,
@@ -153,6 +154,16 @@ impl Roster {
         let started = self.starting.remove(id).is_some();
         if self.there.remove(id).is_some() || started {
             self.append(&Line::Gone { id: id.to_owned() });
+        }
+    }
+
+    /// It has ended with its process manager. Where it moved something, that may still move: the next process manager hears that it was there.
+    pub(super) fn ended_with_its_manager(&mut self, id: &str) {
+        let moved = self.there.get(id).map(|entry| &entry.template).filter(|template| template.standstill_ms.is_some());
+        let moved = moved.cloned();
+        self.gone(id);
+        if let Some(template) = moved {
+            self.starts(Intent { id: id.to_owned(), group: None, template });
         }
     }
 
@@ -281,6 +292,22 @@ mod tests {
         roster.keep_only(&["began"].into());
         drop(roster);
         assert!(Roster::take(&directory).unwrap().2.is_empty());
+    }
+
+    #[test]
+    fn a_successor_hears_of_what_moved_and_ended_with_the_last_one() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
+        let (mut roster, ..) = Roster::take(&directory).unwrap();
+        let moving = Template { standstill_ms: Some(6_000), ..Template::new("arm", "Arm") };
+        roster.began(Entry { template: moving.clone(), ..entry("arm-1") });
+        roster.began(entry("planner-1"));
+        for id in ["arm-1", "planner-1"] {
+            roster.ended_with_its_manager(id);
+        }
+        drop(roster);
+        let (_, left, ended) = Roster::take(&directory).unwrap();
+        assert_eq!((left, ended), (Vec::new(), vec![Intent { id: "arm-1".into(), group: None, template: moving }]));
     }
 
     #[test]

@@ -300,6 +300,12 @@ impl Template {
         }
         let standstill = self.standstill_ms.is_none_or(|ms| (1..=LONGEST_STANDSTILL_MS).contains(&ms));
         rule(key("standstill_ms"), standstill, format!("from 1 to {LONGEST_STANDSTILL_MS} ms"))?;
+        let one = self.standstill_ms.is_none() || max == 1;
+        rule(
+            key("max"),
+            one,
+            "1 where standstill_ms is set: two workers cannot move the same robot, and each robot has a template of its own",
+        )?;
         rule(key("crash_limit"), self.crash_limit >= 1, "at least 1")?;
         rule(key("backoff_ms"), self.backoff_ms >= 1, "at least 1 ms")?;
         rule(key("max_backoff_ms"), self.max_backoff_ms >= self.backoff_ms, "at least backoff_ms")?;
@@ -361,4 +367,19 @@ fn max_backoff() -> u64 {
 
 fn crash_limit() -> u32 {
     5
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_moves_has_one_worker() {
+        let arms = |max| Template { standstill_ms: Some(6_000), max: Some(max), ..Template::new("arm", "Arm") };
+        assert!(arms(1).check("templates[0]").is_ok());
+        let refused = arms(2).check("templates[0]").map_err(|error| error.to_string());
+        assert!(
+            refused.is_err_and(|why| why.contains("templates[0].max") && why.contains("1 where standstill_ms is set"))
+        );
+    }
 }

@@ -106,14 +106,13 @@ impl Serve<SessionCalls> for CallerService {
             audit::begin(&self.caller, &request_id, withdraw).ended(&Ok(()));
             withdrawn = true;
         }
-        // Also beyond the quota, or the lease of a lost answer would stay.
-        if unheard {
-            self.service.undo_later(&self.caller, &session_id, request_id);
-        }
-        // The end of a call was counted with the call.
+        // The end of a call was counted with the call. What counts anew is refused before it makes any work.
         let counts = self.quotas.as_ref().filter(|_| !withdrawn);
         if let Some(Err(refused)) = counts.map(|quotas| quotas.admit(&self.caller, WITHDRAW, Instant::now())) {
             return Some(Err(refused));
+        }
+        if unheard {
+            self.service.undo_later(&self.caller, &session_id, request_id);
         }
         Some(Ok(Kind::Withdraw(v1::WithdrawResponse { withdrawn })))
     }
