@@ -1,32 +1,44 @@
 //! Reading Collada (.dae): the geometries that the scene shows, moved as its nodes say, in metres by its `unit`.
 //!
 //! As in ROS the `up_axis` is not applied: the axes are those of the file. Triangles and polygons are read; materials, normals, textures
-//! and cameras say nothing of the shape. Skinned meshes are refused.
+//! and cameras say nothing of the shape. Skinned meshes and polygons with holes are refused, and faces that do not use up their list of
+//! corners. A geometry is read once, however often the scene shows it.
 
-use crate::mesh::MeshError;
+use crate::mesh::{MAX_TRIANGLES, MeshError};
+use crate::polygon;
 use std::collections::BTreeMap;
+use std::rc::Rc;
 use xml::reader::{EventReader, XmlEvent};
 
 type Matrix = [[f64; 4]; 3];
+type Triangle = [[f64; 3]; 3];
 
 /// Nodes in nodes at the most, also where they are instances.
 const DEEPEST: usize = 64;
 
+/// Elements of the scene at the most, those of a node as often as an instance shows it; a long text counts for more.
+const MOST_SHOWN: usize = 1_000_000;
+const LONG_TEXT: usize = 1_000;
+
 /// Elements of a file at the most.
 const MOST_ELEMENTS: usize = 1_000_000;
+
+/// The greatest `offset` of an input and `stride` of an accessor.
+const MOST_APART: usize = 1_000;
 
 const IDENTITY: Matrix = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
 
 /// The triangles of a file.
-pub(crate) fn triangles(bytes: &[u8], most: usize) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
+pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
     let root = read(bytes)?;
     let mut by_id = BTreeMap::new();
     collect(&root, &mut by_id);
-    let unit = root.child("asset").and_then(|asset| asset.child("unit"));
-    let meter = unit.and_then(|unit| unit.attribute("meter")).map_or(Ok(1.0), |text| {
-        text.trim().parse::<f64>().map_err(|_| root.wrong("the `meter` of its `unit` is no number"))
-    })?;
-    let mut file = File { by_id, triangles: Vec::new(), most };
+    let meter = match root.child("asset").and_then(|asset| asset.child("unit")) {
+        Some(unit) => meter(unit)?,
+        None => 1.0,
+    };
+    let mut file =
+        File { by_id, geometries: BTreeMap::new(), positions: BTreeMap::new(), triangles: Vec::new(), shown: 0 };
     let scene = root.child("scene").and_then(|scene| scene.child("instance_visual_scene"));
     match scene {
         Some(instance) => {
@@ -39,7 +51,7 @@ pub(crate) fn triangles(bytes: &[u8], most: usize) -> Result<Vec<[[f64; 3]; 3]>,
         None => {
             for library in root.children_named("library_geometries") {
                 for geometry in library.children_named("geometry") {
-                    file.geometry(geometry, &IDENTITY)?;
+                    file.show(geometry, &IDENTITY)?;
                 }
             }
         }
@@ -48,6 +60,13 @@ pub(crate) fn triangles(bytes: &[u8], most: usize) -> Result<Vec<[[f64; 3]; 3]>,
         *corner = corner.map(|c| c * meter);
     }
     Ok(file.triangles)
+}
+
+/// The length of the file's unit, in metres.
+fn meter(unit: &Element) -> Result<f64, MeshError> {
+    let text = unit.attribute("meter").unwrap_or("1").trim();
+    let meter = text.parse::<f64>().ok().filter(|meter| *meter > 0.0 && meter.is_finite());
+    meter.ok_or_else(|| unit.wrong(format!("the `meter` of its `unit` is `{text}`: expected a number above zero")))
 }
 
 /// An element of the file.
@@ -95,6 +114,20 @@ impl Element {
         let parse = |text: &str| text.trim().parse().map_err(|_| self.wrong(format!("`{name}` is no whole number")));
         self.attribute(name).map_or(Ok(other), parse)
     }
+
+    /// As [`Element::count`], at least `least` and no more than [`MOST_APART`].
+    fn bounded(&self, name: &str, other: usize, least: usize) -> Result<usize, MeshError> {
+        let count = self.count(name, other)?;
+        if !(least..=MOST_APART).contains(&count) {
+            return Err(self.wrong(format!("its `{name}` is {count}: expected {least} to {MOST_APART}")));
+        }
+        Ok(count)
+    }
+}
+
+fn determinant(m: &Matrix) -> f64 {
+    let minor = |i: usize, j: usize| m[1][i] * m[2][j] - m[1][j] * m[2][i];
+    m[0][0] * minor(1, 2) - m[0][1] * minor(0, 2) + m[0][2] * minor(0, 1)
 }
 
 fn read(bytes: &[u8]) -> Result<Element, MeshError> {
@@ -143,8 +176,14 @@ fn collect<'e>(element: &'e Element, by_id: &mut BTreeMap<&'e str, &'e Element>)
 
 struct File<'e> {
     by_id: BTreeMap<&'e str, &'e Element>,
-    triangles: Vec<[[f64; 3]; 3]>,
-    most: usize,
+    /// What has been read, by the place of its element in memory: triangles of geometries as the file has them,
+    geometries: BTreeMap<*const Element, Rc<[Triangle]>>,
+    /// and positions of `vertices` and of sources.
+    positions: BTreeMap<*const Element, Rc<[[f64; 3]]>>,
+    /// Of the scene.
+    triangles: Vec<Triangle>,
+    /// Elements so far.
+    shown: usize,
 }
 
 impl<'e> File<'e> {
@@ -156,12 +195,23 @@ impl<'e> File<'e> {
         self.by_id.get(name).copied().ok_or_else(|| element.wrong(format!("there is no element with the id `{name}`")))
     }
 
+    fn count(&mut self, element: &Element) -> Result<(), MeshError> {
+        self.shown += 1 + element.text.len() / LONG_TEXT;
+        if self.shown > MOST_SHOWN {
+            let reason = "the scene shows too many nodes, or instances of them";
+            return Err(element.wrong(format!("{reason}: at most {MOST_SHOWN} elements are supported, export it flat")));
+        }
+        Ok(())
+    }
+
     fn node(&mut self, node: &'e Element, above: &Matrix, depth: usize) -> Result<(), MeshError> {
+        self.count(node)?;
         if depth > DEEPEST {
             return Err(node.wrong("its nodes are instances of each other without end, or too deep"));
         }
         let mut place = *above;
         for child in &node.children {
+            self.count(child)?;
             let step = match child.name.as_str() {
                 "matrix" => matrix(&child.floats::<16>()?),
                 "translate" => {
@@ -182,7 +232,7 @@ impl<'e> File<'e> {
             match child.name.as_str() {
                 "node" => self.node(child, &place, depth + 1)?,
                 "instance_node" => self.node(self.named(child, "url")?, &place, depth + 1)?,
-                "instance_geometry" => self.geometry(self.named(child, "url")?, &place)?,
+                "instance_geometry" => self.show(self.named(child, "url")?, &place)?,
                 "instance_controller" => {
                     return Err(child.wrong("skinned meshes are not supported: export it without controllers"));
                 }
@@ -192,72 +242,203 @@ impl<'e> File<'e> {
         Ok(())
     }
 
-    fn geometry(&mut self, geometry: &'e Element, place: &Matrix) -> Result<(), MeshError> {
+    /// Adds the triangles of a geometry to the scene.
+    fn show(&mut self, geometry: &'e Element, place: &Matrix) -> Result<(), MeshError> {
+        self.count(geometry)?;
+        let triangles = match self.geometries.get(&std::ptr::from_ref(geometry)) {
+            Some(read) => read.clone(),
+            None => {
+                let read: Rc<[Triangle]> = self.geometry(geometry)?.into();
+                self.geometries.insert(geometry, read.clone());
+                read
+            }
+        };
+        let all = self.triangles.len() + triangles.len();
+        if all > MAX_TRIANGLES {
+            return Err(MeshError::Count { triangles: all });
+        }
+        // What is mirrored is turned, so that the same side is outside.
+        let is_mirrored = determinant(place) < 0.0;
+        self.triangles.extend(triangles.iter().map(|triangle| {
+            let [a, b, c] = triangle.map(|corner| apply(place, corner));
+            if is_mirrored { [a, c, b] } else { [a, b, c] }
+        }));
+        Ok(())
+    }
+
+    fn geometry(&mut self, geometry: &'e Element) -> Result<Vec<Triangle>, MeshError> {
         let mesh = geometry.child("mesh").ok_or_else(|| geometry.wrong("a geometry that is no `mesh`"))?;
+        let mut triangles = Vec::new();
         for part in &mesh.children {
             match part.name.as_str() {
-                "triangles" | "polylist" | "polygons" => self.faces(part, place)?,
+                "triangles" | "polylist" | "polygons" => self.faces(part, &mut triangles)?,
                 "trifans" | "tristrips" => {
                     return Err(part.wrong(format!("`{}` are not supported: export triangles", part.name)));
                 }
                 _ => {}
             }
         }
-        Ok(())
+        Ok(triangles)
     }
 
-    fn faces(&mut self, part: &'e Element, place: &Matrix) -> Result<(), MeshError> {
+    fn faces(&mut self, part: &'e Element, triangles: &mut Vec<Triangle>) -> Result<(), MeshError> {
         let (mut stride, mut source) = (0, None);
         for input in part.children_named("input") {
-            let offset = input.count("offset", 0)?;
+            let offset = input.bounded("offset", 0, 0)?;
             stride = stride.max(offset + 1);
             if input.attribute("semantic") == Some("VERTEX") {
                 source = Some((offset, self.named(input, "source")?));
             }
         }
         let (offset, vertices) = source.ok_or_else(|| part.wrong("it has no input of the semantic VERTEX"))?;
+        let positions = self.positions(vertices)?;
+        let faces = Faces { part, positions: &positions, stride, offset };
+        let count = faces.read(triangles)?;
+        if part.attribute("count").is_some() && part.count("count", 0)? != count {
+            let announced = part.attribute("count").unwrap_or("");
+            return Err(part.wrong(format!("its `count` is {announced}, but it has {count} faces: it is not whole")));
+        }
+        Ok(())
+    }
+
+    /// The positions of `vertices`.
+    fn positions(&mut self, vertices: &'e Element) -> Result<Rc<[[f64; 3]]>, MeshError> {
+        if let Some(read) = self.positions.get(&std::ptr::from_ref(vertices)) {
+            return Ok(read.clone());
+        }
         let mut inputs = vertices.children_named("input");
         let input = inputs.find(|input| input.attribute("semantic") == Some("POSITION"));
         let input = input.ok_or_else(|| vertices.wrong("it has no input of the semantic POSITION"))?;
-        let positions = positions(self.named(input, "source")?)?;
-        let indices = part.children_named("p").map(Element::numbers).collect::<Result<Vec<Vec<usize>>, _>>()?;
-        let sizes: Vec<usize> = match part.name.as_str() {
-            "polygons" => indices.iter().map(|indices| indices.len() / stride).collect(),
-            "polylist" => part.child("vcount").map_or(Ok(Vec::new()), Element::numbers)?,
-            _ => vec![3; indices.iter().map(Vec::len).sum::<usize>() / (3 * stride)],
+        let source = self.named(input, "source")?;
+        let read = match self.positions.get(&std::ptr::from_ref(source)) {
+            Some(read) => read.clone(),
+            None => self.source(source)?.into(),
         };
-        let indices = indices.concat();
-        let mut corners = indices.chunks_exact(stride).map(|corner| corner[offset]);
+        self.positions.insert(source, read.clone());
+        self.positions.insert(vertices, read.clone());
+        Ok(read)
+    }
+
+    fn source(&self, source: &Element) -> Result<Vec<[f64; 3]>, MeshError> {
+        let accessor = source.child("technique_common").and_then(|common| common.child("accessor"));
+        let array = accessor.and_then(|accessor| self.named(accessor, "source").ok());
+        let array = array.or_else(|| source.child("float_array"));
+        let array = array.filter(|array| array.name == "float_array");
+        let array = array.ok_or_else(|| source.wrong("it has no `float_array`"))?;
+        positions(source, accessor, &array.numbers()?)
+    }
+}
+
+/// The faces of one `triangles`, `polylist` or `polygons`.
+struct Faces<'e> {
+    part: &'e Element,
+    positions: &'e [[f64; 3]],
+    /// Numbers of a corner, and which of them names the vertex.
+    stride: usize,
+    offset: usize,
+}
+
+impl Faces<'_> {
+    /// Adds the triangles of all faces; gives the number of faces.
+    fn read(&self, triangles: &mut Vec<Triangle>) -> Result<usize, MeshError> {
+        let part = self.part;
+        if part.child("ph").is_some() {
+            return Err(part.wrong("polygons with holes (`ph`) are not supported: export triangles"));
+        }
+        let mut count = 0;
+        if part.name == "polygons" {
+            for list in part.children_named("p") {
+                self.face(&self.corners(list)?, triangles)?;
+                count += 1;
+            }
+            return Ok(count);
+        }
+        let mut corners = Vec::new();
+        for list in part.children_named("p") {
+            corners.extend(self.corners(list)?);
+        }
+        let sizes: Vec<usize> = match part.child("vcount") {
+            Some(vcount) if part.name == "polylist" => vcount.numbers()?,
+            None if part.name == "polylist" && !corners.is_empty() => {
+                return Err(part.wrong("a `polylist` without `vcount`: how many corners its faces have is not said"));
+            }
+            _ => vec![3; corners.len().div_ceil(3)],
+        };
+        let mut rest = &corners[..];
         for size in sizes {
-            let face: Vec<usize> = corners.by_ref().take(size).collect();
-            if face.len() < size || size < 3 {
-                return Err(part.wrong("a face has fewer than three corners, or the list of corners ends too early"));
-            }
-            let place = |index: &usize| {
-                let corner = positions.get(*index);
-                corner
-                    .map(|corner| apply(place, *corner))
-                    .ok_or_else(|| part.wrong(format!("a face names vertex {index}, there are {}", positions.len())))
-            };
-            let face = face.iter().map(place).collect::<Result<Vec<[f64; 3]>, _>>()?;
-            self.triangles.extend((1..size - 1).map(|i| [face[0], face[i], face[i + 1]]));
-            if self.triangles.len() > self.most {
-                return Err(MeshError::Count { triangles: self.triangles.len() });
-            }
+            let (face, others) = rest.split_at_checked(size).ok_or_else(|| {
+                part.wrong(format!(
+                    "a face of `{}` has {size} corners, but the list of corners ends too early",
+                    part.name
+                ))
+            })?;
+            self.face(face, triangles)?;
+            rest = others;
+            count += 1;
+        }
+        match rest.len() {
+            0 => Ok(count),
+            left => Err(part.wrong(format!("{left} corners of `{}` belong to no face by its `vcount`", part.name))),
+        }
+    }
+
+    /// The vertices that a list names.
+    fn corners(&self, list: &Element) -> Result<Vec<usize>, MeshError> {
+        let indices: Vec<usize> = list.numbers()?;
+        if !indices.len().is_multiple_of(self.stride) {
+            let (count, stride, name) = (indices.len(), self.stride, &self.part.name);
+            return Err(list.wrong(format!("{count} numbers in a `p` of `{name}`: expected a multiple of {stride}")));
+        }
+        Ok(indices.chunks_exact(self.stride).map(|corner| corner[self.offset]).collect())
+    }
+
+    fn face(&self, indices: &[usize], triangles: &mut Vec<Triangle>) -> Result<(), MeshError> {
+        let part = self.part;
+        if indices.len() < 3 {
+            return Err(part.wrong(format!("a face of `{}` has fewer than three corners", part.name)));
+        }
+        let corner = |index: &usize| {
+            let beyond = || part.wrong(format!("a face names vertex {index}, there are {}", self.positions.len()));
+            self.positions.get(*index).copied().ok_or_else(beyond)
+        };
+        let face = indices.iter().map(corner).collect::<Result<Vec<[f64; 3]>, _>>()?;
+        triangles.extend(polygon::triangles(&face).map_err(|reason| part.wrong(reason))?);
+        if triangles.len() > MAX_TRIANGLES {
+            return Err(MeshError::Count { triangles: triangles.len() });
         }
         Ok(())
     }
 }
 
-fn positions(source: &Element) -> Result<Vec<[f64; 3]>, MeshError> {
-    let array = source.child("float_array").ok_or_else(|| source.wrong("it has no `float_array`"))?;
-    let accessor = source.child("technique_common").and_then(|common| common.child("accessor"));
-    let stride = accessor.map_or(Ok(3), |accessor| accessor.count("stride", 3))?;
-    if stride < 3 {
-        return Err(source.wrong("a position has at least three coordinates"));
+/// Positions among numbers, as an accessor says; its parameters without a name are passed over.
+fn positions(source: &Element, accessor: Option<&Element>, numbers: &[f64]) -> Result<Vec<[f64; 3]>, MeshError> {
+    let Some(accessor) = accessor else {
+        return Ok(numbers.chunks_exact(3).map(|at| [at[0], at[1], at[2]]).collect());
+    };
+    let stride = accessor.bounded("stride", 3, 1)?;
+    let named = |(_, param): &(usize, &Element)| param.attribute("name").is_some_and(|name| !name.is_empty());
+    let mut places: Vec<usize> =
+        accessor.children_named("param").enumerate().filter(named).map(|(place, _)| place).collect();
+    if accessor.child("param").is_none() {
+        places = (0..stride.min(3)).collect();
     }
-    let numbers: Vec<f64> = array.numbers()?;
-    Ok(numbers.chunks_exact(stride).map(|at| [at[0], at[1], at[2]]).collect())
+    let (Some([x, y, z]), true) = (places.first_chunk::<3>().copied(), places.iter().all(|place| *place < stride))
+    else {
+        return Err(source.wrong("a position has three coordinates: its accessor names fewer, or more than its stride"));
+    };
+    let offset = accessor.count("offset", 0)?;
+    let all = numbers.get(offset..).unwrap_or(&[]);
+    let count = accessor.count("count", all.len() / stride)?;
+    // The last one may end before its stride.
+    let last = [x, y, z].into_iter().max().unwrap_or(0);
+    let needed = count.checked_sub(1).map_or(Some(0), |others| others.checked_mul(stride)?.checked_add(last + 1));
+    if needed.is_none_or(|needed| needed > all.len()) {
+        let there = numbers.len();
+        return Err(
+            accessor.wrong(format!("{count} positions of stride {stride} are announced, there are {there} numbers"))
+        );
+    }
+    Ok((0..count).map(|i| [all[i * stride + x], all[i * stride + y], all[i * stride + z]]).collect())
 }
 
 fn matrix(rows: &[f64; 16]) -> Matrix {

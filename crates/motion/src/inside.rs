@@ -1,24 +1,53 @@
-//! What is inside a mesh: where its parts are closed, a straight line upwards from inside leaves it once more than it enters it.
+//! What is inside a mesh: where its closed parts (`closed_parts.rs`) are solid. Which way the triangles of a file are turned
+//! makes no difference to a part that stands for itself, nor where parts overlap.
 //!
-//! A part is what hangs together by common corners. It is closed where every edge belongs to as many triangles in one direction as
-//! in the other, or at least to an even number; what is not closed has no inside. The triangles are listed by the cells of a grid that
-//! they lie above, so a line looks at a few of them.
+//! A part holds a point if a straight line upwards from there leaves it more often than it enters it (or the other way round). It is solid by
+//! itself, and so is a part wholly inside another that is turned as the outermost part around it; one that is turned the other way is a
+//! hollow. Where the file does not say how a part is turned, it is a hollow inside what is solid, and solid inside a hollow. Solid parts
+//! count one, hollows count minus one: inside is where the sum is not zero.
+//!
+//! The triangles are listed by the cells of a grid that they lie above, so a line looks at a few of them.
 
+use crate::closed_parts::{self, closed_parts};
 use crate::mesh::Mesh;
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 
 /// Cells along one side of the grid at the most.
 const MOST_CELLS: usize = 256;
 
+/// Triangles that are looked at to find parts inside others, at the most; parts that are left then count as solid.
+const MOST_LOOKS: usize = 200_000_000;
+
 type Corner = [f64; 3];
+
+/// A closed part.
+#[derive(Debug, Clone, Copy)]
+struct Part {
+    /// Whether the winding number tells what it holds; else the number of crossings.
+    is_oriented: bool,
+    /// How it is turned, as [`ClosedPart::sense`](closed_parts::ClosedPart::sense).
+    sense: i32,
+    /// 1 where it is solid, -1 where it is a hollow.
+    weight: i32,
+}
+
+/// Where a line crosses the surface.
+#[derive(Debug, Clone, Copy)]
+struct Crossing {
+    z: f64,
+    /// Seen from above or from below.
+    turn: i32,
+    part: u32,
+}
 
 /// The inside of a mesh.
 #[derive(Debug, Clone)]
 pub struct Inside {
     /// Of parts that are closed.
     triangles: Vec<[Corner; 3]>,
-    /// Whether triangles that are seen from outside turn to the left, or all to the right; else only their number tells.
-    oriented: bool,
+    /// Per triangle.
+    part: Vec<u32>,
+    parts: Vec<Part>,
     least: Corner,
     greatest: Corner,
     counts: [usize; 2],
@@ -32,23 +61,29 @@ pub struct Inside {
 impl Inside {
     /// The inside of a mesh.
     pub fn new(mesh: &Mesh) -> Inside {
-        let parts = Parts::new(mesh);
-        let triangles: Vec<[Corner; 3]> = parts.closed(mesh);
+        let (mut triangles, mut part, mut parts) = (Vec::new(), Vec::new(), Vec::new());
+        for (index, closed) in closed_parts(mesh).into_iter().enumerate() {
+            part.extend(std::iter::repeat_n(index as u32, closed.triangles.len()));
+            parts.push(Part { is_oriented: closed.is_oriented, sense: closed.sense, weight: 1 });
+            triangles.extend(closed.triangles);
+        }
         let corners = || triangles.iter().flatten();
         let least: Corner = std::array::from_fn(|i| corners().map(|c| c[i]).fold(f64::INFINITY, f64::min));
         let greatest: Corner = std::array::from_fn(|i| corners().map(|c| c[i]).fold(f64::NEG_INFINITY, f64::max));
         let side = ((triangles.len() as f64).sqrt().ceil() as usize).clamp(1, MOST_CELLS);
         let mut inside = Inside {
-            oriented: parts.oriented,
+            part,
+            parts,
             least,
             greatest,
             counts: [side; 2],
             starts: vec![0; side * side + 1],
             listed: Vec::new(),
-            corners: parts.corners,
+            corners: closed_parts::corners(mesh),
             triangles,
         };
         inside.list();
+        inside.find_hollows();
         inside
     }
 
@@ -73,34 +108,128 @@ impl Inside {
         if !within {
             return false;
         }
-        let above = self.crossings(point[0], point[1]).into_iter().filter(|(z, _)| *z > point[2]);
-        self.is_inside(above.map(|(_, turn)| turn))
+        self.holding(point).iter().map(|part| self.parts[*part as usize].weight).sum::<i32>() != 0
     }
 
     /// The intervals of z in which the vertical line at (x, y) is inside.
     pub fn column(&self, x: f64, y: f64) -> Vec<[f64; 2]> {
         let mut crossings = self.crossings(x, y);
-        crossings.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let mut intervals: Vec<[f64; 2]> = Vec::new();
-        for i in 1..crossings.len() {
-            if self.is_inside(crossings[i..].iter().map(|(_, turn)| *turn)) {
-                intervals.push([crossings[i - 1].0, crossings[i].0]);
+        // From above.
+        crossings.sort_by(|a, b| b.z.total_cmp(&a.z));
+        let mut tallies: Vec<Tally> = Vec::new();
+        let (mut sum, mut intervals) = (0, Vec::new());
+        for pair in crossings.windows(2) {
+            let here = pair[0];
+            let weight =
+                |tally: &Tally| if tally.holds(&self.parts) { self.parts[tally.part as usize].weight } else { 0 };
+            let known = tallies.iter().position(|tally| tally.part == here.part).unwrap_or_else(|| {
+                tallies.push(Tally { part: here.part, count: 0, sum: 0 });
+                tallies.len() - 1
+            });
+            sum -= weight(&tallies[known]);
+            tallies[known].add(here.turn);
+            sum += weight(&tallies[known]);
+            if sum != 0 {
+                intervals.push([pair[1].z, here.z]);
             }
         }
+        intervals.reverse();
         intervals
     }
 
-    /// From what a line upwards crosses.
-    fn is_inside(&self, turns: impl Iterator<Item = i32>) -> bool {
-        let (count, sum) = turns.fold((0, 0), |(count, sum), turn| (count + 1, sum + turn));
-        if self.oriented { sum != 0 } else { count % 2 == 1 }
+    /// The parts that hold a point, sorted.
+    fn holding(&self, [x, y, z]: Corner) -> Vec<u32> {
+        let mut above: Vec<Crossing> = self.crossings(x, y).into_iter().filter(|crossing| crossing.z > z).collect();
+        above.sort_unstable_by_key(|crossing| crossing.part);
+        let tally = |same: &[Crossing]| {
+            let mut tally = Tally { part: same[0].part, count: 0, sum: 0 };
+            same.iter().for_each(|crossing| tally.add(crossing.turn));
+            tally
+        };
+        let tallies = above.chunk_by(|a, b| a.part == b.part).map(tally);
+        tallies.filter(|tally| tally.holds(&self.parts)).map(|tally| tally.part).collect()
     }
 
-    /// Where the vertical line at (x, y) crosses the surface, and whether it is seen there from above or from below.
-    fn crossings(&self, x: f64, y: f64) -> Vec<(f64, i32)> {
+    /// Where the vertical line at (x, y) crosses the surface.
+    fn crossings(&self, x: f64, y: f64) -> Vec<Crossing> {
         let Some(cell) = self.cell(x, y) else { return Vec::new() };
-        let listed = &self.listed[self.starts[cell] as usize..self.starts[cell + 1] as usize];
-        listed.iter().filter_map(|t| crossing(&self.triangles[*t as usize], x, y)).collect()
+        let crossing = |triangle: &u32| {
+            let (z, turn) = crossing(&self.triangles[*triangle as usize], x, y)?;
+            Some(Crossing { z, turn, part: self.part[*triangle as usize] })
+        };
+        self.listed(cell).iter().filter_map(crossing).collect()
+    }
+
+    /// The triangles above a cell.
+    fn listed(&self, cell: usize) -> &[u32] {
+        &self.listed[self.starts[cell] as usize..self.starts[cell + 1] as usize]
+    }
+
+    /// Finds the parts that are hollows of others, the largest first.
+    fn find_hollows(&mut self) {
+        let first = self.parts.first().map_or(0, |part| part.sense);
+        if first != 0 && self.parts.iter().all(|part| part.sense == first) {
+            return;
+        }
+        // The triangles of a part follow each other.
+        let ranges: Vec<std::ops::Range<usize>> = self
+            .part
+            .chunk_by(|a, b| a == b)
+            .scan(0, |end, same| {
+                let start = *end;
+                *end += same.len();
+                Some(start..*end)
+            })
+            .collect();
+        let size = |range: &std::ops::Range<usize>| -> f64 {
+            let corners = || self.triangles[range.clone()].iter().flatten();
+            let side = |i: usize| {
+                let [least, greatest] =
+                    [f64::min, f64::max].map(|pick| corners().map(|c| c[i]).reduce(pick).unwrap_or(0.0));
+                greatest - least
+            };
+            side(0) * side(1) * side(2)
+        };
+        let sizes: Vec<f64> = ranges.iter().map(size).collect();
+        let mut order: Vec<usize> = (0..sizes.len()).collect();
+        order.sort_by(|a, b| sizes[*b].total_cmp(&sizes[*a]));
+        let mut looks = 0;
+        for part in order {
+            let around = self.around(part, &ranges[part], &mut looks);
+            let outermost = around.iter().copied().filter(|other| self.parts[*other].sense != 0);
+            let outermost = outermost.max_by(|a, b| sizes[*a].total_cmp(&sizes[*b]));
+            let solid: i32 = around.iter().map(|other| self.parts[*other].weight).sum();
+            let sense = self.parts[part].sense;
+            let is_hollow = match outermost.filter(|_| sense != 0) {
+                Some(outermost) => self.parts[outermost].sense != sense,
+                None => sense == 0 && solid > 0,
+            };
+            self.parts[part].weight = if is_hollow { -1 } else { 1 };
+        }
+    }
+
+    /// The parts that a part is wholly inside of, by all its corners and the middles of its triangles.
+    fn around(&self, part: usize, range: &std::ops::Range<usize>, looks: &mut usize) -> Vec<usize> {
+        let mut around: Option<BTreeSet<u32>> = None;
+        for triangle in &self.triangles[range.clone()] {
+            let [a, b, c] = *triangle;
+            let middle = std::array::from_fn(|i| (a[i] + b[i] + c[i]) / 3.0);
+            for point in [a, b, c, middle] {
+                *looks += self.cell(point[0], point[1]).map_or(0, |cell| self.listed(cell).len());
+                if *looks > MOST_LOOKS {
+                    return Vec::new();
+                }
+                let mut holding = self.holding(point);
+                holding.retain(|other| {
+                    *other as usize != part && around.as_ref().is_none_or(|around| around.contains(other))
+                });
+                if holding.is_empty() {
+                    return Vec::new();
+                }
+                around = Some(holding.into_iter().collect());
+            }
+        }
+        around.into_iter().flatten().map(|other| other as usize).collect()
     }
 
     fn cell(&self, x: f64, y: f64) -> Option<usize> {
@@ -146,6 +275,25 @@ impl Inside {
     }
 }
 
+/// How often a line has crossed a part.
+#[derive(Debug)]
+struct Tally {
+    part: u32,
+    count: u32,
+    sum: i32,
+}
+
+impl Tally {
+    fn add(&mut self, turn: i32) {
+        self.count += 1;
+        self.sum += turn;
+    }
+
+    fn holds(&self, parts: &[Part]) -> bool {
+        if parts[self.part as usize].is_oriented { self.sum != 0 } else { self.count % 2 == 1 }
+    }
+}
+
 /// Where a vertical line crosses a triangle. A line through an edge or a corner crosses exactly one of the triangles beside it: edges are
 /// looked at in one direction for both, and what is on an edge belongs to one side.
 fn crossing(triangle: &[Corner; 3], x: f64, y: f64) -> Option<(f64, i32)> {
@@ -171,83 +319,6 @@ fn crossing(triangle: &[Corner; 3], x: f64, y: f64) -> Option<(f64, i32)> {
     let z = a[2] - (normal[0] * (x - a[0]) + normal[1] * (y - a[1])) / normal[2];
     let [least, greatest] = [f64::min, f64::max].map(|pick| triangle.iter().map(|c| c[2]).reduce(pick).unwrap_or(a[2]));
     Some((if z.is_finite() { z.clamp(least, greatest) } else { a[2] }, beyond))
-}
-
-/// Which triangles hang together.
-struct Parts {
-    /// Per triangle, its part.
-    part: Vec<usize>,
-    /// Per part.
-    is_closed: Vec<bool>,
-    oriented: bool,
-    corners: Vec<Corner>,
-}
-
-impl Parts {
-    fn new(mesh: &Mesh) -> Parts {
-        let mut numbers: BTreeMap<[u64; 3], usize> = BTreeMap::new();
-        // Minus zero is zero.
-        let key = |corner: &Corner| corner.map(|c| (c + 0.0).to_bits());
-        let mut indices: Vec<[usize; 3]> = Vec::with_capacity(mesh.triangles().len());
-        for triangle in mesh.triangles() {
-            let mut number = |i: usize| {
-                let next = numbers.len();
-                *numbers.entry(key(&triangle[i])).or_insert(next)
-            };
-            indices.push([number(0), number(1), number(2)]);
-        }
-        let mut joined: Vec<usize> = (0..numbers.len()).collect();
-        for [a, b, c] in &indices {
-            for other in [b, c] {
-                let (first, second) = (root(&mut joined, *a), root(&mut joined, *other));
-                joined[first] = second;
-            }
-        }
-        // Per edge, from the lower corner to the higher: how often it is walked, and how much more often upwards.
-        let mut edges: BTreeMap<(usize, usize), (u32, i32)> = BTreeMap::new();
-        for triangle in &indices {
-            for i in 0..3 {
-                let (from, to) = (triangle[i], triangle[(i + 1) % 3]);
-                if from != to {
-                    let edge = edges.entry((from.min(to), from.max(to))).or_default();
-                    edge.0 += 1;
-                    edge.1 += if from < to { 1 } else { -1 };
-                }
-            }
-        }
-        let mut order: BTreeMap<usize, usize> = BTreeMap::new();
-        let (mut part, mut corners) = (Vec::with_capacity(indices.len()), Vec::new());
-        for (triangle, corner) in indices.iter().zip(mesh.triangles()) {
-            let next = order.len();
-            let index = *order.entry(root(&mut joined, triangle[0])).or_insert(next);
-            if index == next {
-                corners.push(corner[0]);
-            }
-            part.push(index);
-        }
-        let mut is_closed = vec![true; corners.len()];
-        let mut turned = vec![false; corners.len()];
-        for ((from, _), (count, sum)) in &edges {
-            let index = order[&root(&mut joined, *from)];
-            is_closed[index] &= count % 2 == 0;
-            turned[index] |= *sum != 0;
-        }
-        let oriented = is_closed.iter().zip(&turned).all(|(closed, turned)| !(*closed && *turned));
-        Parts { part, is_closed, oriented, corners }
-    }
-
-    fn closed(&self, mesh: &Mesh) -> Vec<[Corner; 3]> {
-        let triangles = mesh.triangles().iter().zip(&self.part);
-        triangles.filter(|(_, part)| self.is_closed[**part]).map(|(triangle, _)| *triangle).collect()
-    }
-}
-
-fn root(joined: &mut [usize], mut corner: usize) -> usize {
-    while joined[corner] != corner {
-        joined[corner] = joined[joined[corner]];
-        corner = joined[corner];
-    }
-    corner
 }
 
 #[cfg(test)]
@@ -304,5 +375,84 @@ mod tests {
         let inside = inside(triangles);
         assert!(inside.contains([0.5; 3]) && !inside.contains([2.2, 0.2, 0.1]));
         assert!(super::tests::inside(vec![[[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]]).is_empty());
+    }
+
+    fn turned(triangles: &[[Corner; 3]]) -> Vec<[Corner; 3]> {
+        triangles.iter().map(|[a, b, c]| [*a, *c, *b]).collect()
+    }
+
+    /// What is inside of both, by columns and by points.
+    fn agree(inside: &Inside, expected: impl Fn(Corner) -> bool, what: &str) {
+        for i in 0..17 * 17 * 17 {
+            // Off the corners and faces, which belong to neither side.
+            let at = [i % 17, i / 17 % 17, i / 289].map(|i| f64::from(i) * 0.31 - 0.487);
+            assert_eq!(inside.contains(at), expected(at), "{what}: {at:?}");
+            let column = inside.column(at[0], at[1]).iter().any(|[low, high]| *low <= at[2] && at[2] <= *high);
+            assert_eq!(column, expected(at), "{what}, column: {at:?}");
+        }
+    }
+
+    fn within(at: Corner, least: f64, greatest: f64) -> bool {
+        at.iter().all(|c| least < *c && *c < greatest)
+    }
+
+    #[test]
+    fn what_is_there_from_both_sides_is_solid_like_what_is_there_once() {
+        let one = block([0.0; 3], [3.0; 3]);
+        let sides = [one.clone(), turned(&one)].concat();
+        agree(&inside(sides.clone()), |at| within(at, 0.0, 3.0), "both sides");
+        agree(&inside([one.clone(), one.clone()].concat()), |at| within(at, 0.0, 3.0), "twice");
+        agree(&inside([sides.clone(), one.clone()].concat()), |at| within(at, 0.0, 3.0), "three times");
+        let mut mixed: Vec<_> = turned(&one)
+            .into_iter()
+            .enumerate()
+            .map(|(i, t)| if i % 3 == 0 { [t[1], t[0], t[2]] } else { t })
+            .collect();
+        mixed.extend(one.clone());
+        agree(&inside(mixed), |at| within(at, 0.0, 3.0), "both sides, some of them twice");
+        // Some of the triangles are there from both sides.
+        let some = [one.clone(), turned(&one[..3])].concat();
+        agree(&inside(some), |at| within(at, 0.0, 3.0), "some from both sides");
+        // A room: the walls between two blocks, both from both sides.
+        let room = [sides, block([1.0; 3], [2.0; 3]), turned(&block([1.0; 3], [2.0; 3]))].concat();
+        agree(&inside(room), |at| within(at, 0.0, 3.0) && !within(at, 1.0, 2.0), "a room");
+    }
+
+    #[test]
+    fn a_wall_that_two_blocks_share_is_none_of_the_outside() {
+        let (left, right) = (block([0.0; 3], [1.5, 3.0, 3.0]), block([1.5, 0.0, 0.0], [3.0; 3]));
+        for (left, right) in [(left.clone(), right.clone()), (turned(&left), right.clone()), (left, turned(&right))] {
+            let both = inside([left.clone(), right].concat());
+            agree(&both, |at| within(at, 0.0, 3.0), "two blocks with a wall");
+        }
+    }
+
+    #[test]
+    fn parts_that_overlap_are_solid_however_each_is_turned() {
+        let (first, second) = (block([0.0; 3], [3.0; 3]), block([2.0; 3], [4.0; 3]));
+        let third = block([1.0, 1.0, -0.4], [2.5, 2.5, 4.2]);
+        for turns in 0..8 {
+            let turn =
+                |bit: usize, part: &[[Corner; 3]]| if turns >> bit & 1 == 1 { turned(part) } else { part.to_vec() };
+            let all = inside([turn(0, &first), turn(1, &second), turn(2, &third)].concat());
+            let through = |at: Corner| (0..2).all(|i| 1.0 < at[i] && at[i] < 2.5) && -0.4 < at[2] && at[2] < 4.2;
+            agree(&all, |at| within(at, 0.0, 3.0) || within(at, 2.0, 4.0) || through(at), &format!("turns {turns:b}"));
+        }
+    }
+
+    #[test]
+    fn a_hollow_stays_one_when_all_is_mirrored_and_an_island_in_it_is_solid() {
+        let part = |least: f64, greatest: f64, is_turned: bool| {
+            let block = block([least; 3], [greatest; 3]);
+            if is_turned { turned(&block) } else { block }
+        };
+        for is_mirrored in [false, true] {
+            let all = [part(0.0, 4.0, is_mirrored), part(0.5, 3.5, !is_mirrored), part(1.5, 2.5, is_mirrored)].concat();
+            let expected = |at: Corner| within(at, 0.0, 4.0) && (!within(at, 0.5, 3.5) || within(at, 1.5, 2.5));
+            agree(&inside(all), expected, "an island");
+            // What is turned alike is one within the other.
+            let nested = [part(0.0, 4.0, is_mirrored), part(0.5, 3.5, is_mirrored)].concat();
+            agree(&inside(nested), |at| within(at, 0.0, 4.0), "nested");
+        }
     }
 }

@@ -1,11 +1,11 @@
-//! Triangle meshes as collision shapes: read from STL, binary or text, OBJ and Collada, and held by spheres.
+//! Triangle meshes as collision shapes: read from STL, OBJ and Collada, and held by spheres.
 //!
 //! For the cover the mesh is put into a grid; the cells that the surface passes through and those that it closes in get a sphere
 //! around each. So everything of the mesh is in a sphere by construction, its inside too where it is closed. Files are found and
 //! read by `mesh_files` or by whoever uses the crate.
 
 use crate::spheres::Sphere;
-use crate::{collada, obj};
+use crate::{collada, obj, stl};
 use parry3d::math::Vector;
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
@@ -18,10 +18,6 @@ pub const MAX_TRIANGLES: usize = 1_000_000;
 const MAX_SPHERES: usize = 96;
 const FINEST: usize = 24;
 
-/// Bytes before the triangles of a binary STL, and of each of them.
-const HEADER: usize = 84;
-const RECORD: usize = 50;
-
 /// Surfaces that lie between two cells belong to both, in cells.
 const SKIN: f64 = 1e-6;
 
@@ -31,7 +27,7 @@ pub enum MeshError {
     /// Of another kind.
     #[error("only STL, OBJ and Collada (.dae) meshes are supported; convert it")]
     Kind,
-    /// Something in an OBJ or Collada file that cannot be read.
+    /// Something in a file of text that cannot be read.
     #[error("line {line}: {reason}")]
     Text {
         /// Counted from 1.
@@ -58,6 +54,12 @@ pub enum MeshError {
     Line {
         /// Counted from 1.
         line: usize,
+    },
+    /// A scale that leaves no volume.
+    #[error("its scale is {scale:?}: each number is finite and not zero; a negative one mirrors")]
+    Scale {
+        /// Along x, y, z.
+        scale: [f64; 3],
     },
     /// Not finite.
     #[error("a corner of triangle {triangle} is not finite, or it is beyond a kilometre")]
@@ -105,44 +107,36 @@ impl Mesh {
     }
 
     /// Reads a file, by the end of its name: `.stl`, `.obj` or `.dae`; its numbers are multiplied by `scale` along x, y, z to be metres.
+    /// Where a scale mirrors, triangles are turned, so that the same side is outside.
     ///
     /// # Errors
     /// [`MeshError`] says what is wrong with it.
     pub fn read(name: &str, bytes: &[u8], scale: [f64; 3]) -> Result<Mesh, MeshError> {
+        if scale.iter().any(|s| *s == 0.0 || !s.is_finite()) {
+            return Err(MeshError::Scale { scale });
+        }
         let name = name.to_ascii_lowercase();
         let mut triangles = match name.rsplit_once('.') {
-            Some((_, "stl")) => return Mesh::stl(bytes, scale),
+            Some((_, "stl")) => stl::triangles(bytes)?,
             Some((_, "obj")) => obj::triangles(bytes)?,
-            Some((_, "dae")) => collada::triangles(bytes, MAX_TRIANGLES)?,
+            Some((_, "dae")) => collada::triangles(bytes)?,
             _ => return Err(MeshError::Kind),
         };
         for corner in triangles.iter_mut().flatten() {
             *corner = std::array::from_fn(|i| corner[i] * scale[i]);
         }
+        if scale.iter().product::<f64>() < 0.0 {
+            triangles.iter_mut().for_each(|triangle| triangle.swap(1, 2));
+        }
         Mesh::new(triangles)
     }
 
-    /// Reads an STL; its numbers are multiplied by `scale` along x, y, z to be metres.
+    /// Reads an STL, as [`Mesh::read`].
     ///
     /// # Errors
     /// [`MeshError`] says what is wrong with it.
     pub fn stl(bytes: &[u8], scale: [f64; 3]) -> Result<Mesh, MeshError> {
-        let announced = bytes.get(HEADER - 4..HEADER).and_then(|b| b.try_into().ok()).map(u32::from_le_bytes);
-        let count = announced.map_or(0, |count| count as usize);
-        // A binary header may begin with `solid`, the length decides.
-        let is_binary = announced.is_some() && bytes.len() == HEADER.saturating_add(count.saturating_mul(RECORD));
-        let mut triangles = match std::str::from_utf8(bytes) {
-            _ if is_binary => bytes[HEADER..].chunks_exact(RECORD).map(record).collect(),
-            Ok(text) if text.trim_start().starts_with("solid") => lines(text)?,
-            _ => return Err(MeshError::Triangles { triangles: count, bytes: bytes.len() }),
-        };
-        if triangles.is_empty() {
-            return Err(MeshError::Triangles { triangles: 0, bytes: bytes.len() });
-        }
-        for corner in triangles.iter_mut().flatten() {
-            *corner = std::array::from_fn(|i| corner[i] * scale[i]);
-        }
-        Mesh::new(triangles)
+        Mesh::read(".stl", bytes, scale)
     }
 
     /// Corners of the triangles.
@@ -179,35 +173,6 @@ impl Meshed {
         let spheres = self.mesh.cover(padding).into_iter();
         spheres.map(|s| Sphere { centre: self.pose.transform(s.centre), ..s }).collect()
     }
-}
-
-fn record(bytes: &[u8]) -> [[f64; 3]; 3] {
-    // After the normal.
-    let number = |i: usize| -> f64 {
-        let at = 12 + 4 * i;
-        f64::from(f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]))
-    };
-    std::array::from_fn(|corner| std::array::from_fn(|i| number(3 * corner + i)))
-}
-
-fn lines(text: &str) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
-    let (mut triangles, mut corners) = (Vec::new(), Vec::new());
-    for (index, line) in text.lines().enumerate() {
-        let wrong = MeshError::Line { line: index + 1 };
-        let mut words = line.split_whitespace();
-        match words.next() {
-            Some("vertex") => {
-                let numbers: Vec<f64> = words.map_while(|word| word.parse().ok()).collect();
-                corners.push(<[f64; 3]>::try_from(numbers).map_err(|_| wrong)?);
-            }
-            Some("endfacet") => {
-                let triangle = <[[f64; 3]; 3]>::try_from(std::mem::take(&mut corners)).map_err(|_| wrong)?;
-                triangles.push(triangle);
-            }
-            _ => {}
-        }
-    }
-    Ok(triangles)
 }
 
 /// Cells over the box that holds a mesh.

@@ -1,8 +1,9 @@
 //! Reading Wavefront OBJ: vertices and faces; normals, textures, groups and materials say nothing of the shape.
 
-use crate::mesh::MeshError;
+use crate::mesh::{MAX_TRIANGLES, MeshError};
+use crate::polygon;
 
-/// The triangles of a file; a face of more corners is cut from its first one.
+/// The triangles of a file; a face of more corners is cut ([`polygon`]).
 pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
     let text = std::str::from_utf8(bytes).map_err(|error| {
         let line = bytes[..error.valid_up_to()].iter().filter(|b| **b == b'\n').count() + 1;
@@ -24,7 +25,10 @@ pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
                 if corners.len() < 3 {
                     return Err(wrong(format!("a face `f` has at least three corners, this has {}", corners.len())));
                 }
-                triangles.extend((1..corners.len() - 1).map(|i| [corners[0], corners[i], corners[i + 1]]));
+                triangles.extend(polygon::triangles(&corners).map_err(wrong)?);
+                if triangles.len() > MAX_TRIANGLES {
+                    return Err(MeshError::Count { triangles: triangles.len() });
+                }
             }
             _ => {}
         }

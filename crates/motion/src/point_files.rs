@@ -1,12 +1,16 @@
-//! Reading points from files: PCD and PLY as text, or three numbers per line (`.xyz`, `.csv`, `.txt`).
+//! Reading points from files: PCD and PLY, or three numbers per line (`.xyz`, `.csv`, `.txt`).
+//!
+//! A file that was cut off is refused where its format says how long it is; a list of lines does not.
 
 use crate::cloud::MAX_POINTS;
+use crate::{pcd, ply};
+use std::borrow::Cow;
 
 /// Why there are no points.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PointsError {
     /// Of another kind.
-    #[error("points are read from .xyz, .csv, .txt, .pcd or .ply as text; convert it")]
+    #[error("points are read from .xyz, .csv, .txt, .pcd or .ply; convert it")]
     Kind,
     /// A line that cannot be read.
     #[error("line {line}: {reason}")]
@@ -16,69 +20,91 @@ pub enum PointsError {
         /// What is wrong.
         reason: String,
     },
+    /// Binary data that cannot be read.
+    #[error("at byte {offset}: {reason}")]
+    Byte {
+        /// Counted from 0.
+        offset: usize,
+        /// What is wrong.
+        reason: String,
+    },
 }
 
-/// The points of a file, by the end of its name. What a camera did not see (`nan`) is left out.
+/// The points of a file, by the end of its name. What a camera did not see (`nan`, `inf`) is left out.
 ///
 /// # Errors
-/// [`PointsError`] names the line.
+/// [`PointsError`] names the line, or the byte.
 pub fn points(name: &str, bytes: &[u8]) -> Result<Vec<[f32; 3]>, PointsError> {
-    let text = String::from_utf8_lossy(bytes);
-    let mut lines = text.lines().enumerate();
     let kind = name.to_ascii_lowercase();
-    let most = match kind.rsplit_once('.') {
-        Some((_, "xyz" | "csv" | "txt")) => MAX_POINTS + 1,
-        Some((_, "pcd")) => header(&mut lines, "DATA ascii", "DATA ", "FIELDS x y z", "POINTS ")?,
-        Some((_, "ply")) => header(&mut lines, "end_header", "format binary", "", "element vertex ")?,
+    let points = match kind.rsplit_once('.') {
+        Some((_, "xyz" | "csv" | "txt")) => columns(bytes)?,
+        Some((_, "pcd")) => pcd::points(bytes)?,
+        Some((_, "ply")) => ply::points(bytes)?,
         _ => return Err(PointsError::Kind),
     };
+    let is_seen = |point: &&[f64; 3]| point.iter().all(|c| c.is_finite());
+    // What is too large for `f32` becomes infinite, which a cloud refuses.
+    Ok(points.iter().filter(is_seen).map(|point| point.map(|c| c as f32)).collect())
+}
+
+/// Three numbers at the beginning of each line, between semicolons, commas or spaces, the first of these that is there.
+fn columns(bytes: &[u8]) -> Result<Vec<[f64; 3]>, PointsError> {
     let mut points = Vec::new();
-    for (index, line) in lines {
-        let words = line.split('#').next().unwrap_or("").split([',', ';', ' ', '\t', '\r']);
-        let words: Vec<&str> = words.filter(|word| !word.is_empty()).collect();
-        if words.is_empty() {
+    for (index, line) in Lines::new(bytes) {
+        let wrong = |reason: String| PointsError::Line { line: index, reason };
+        let line = line.split('#').next().unwrap_or("").trim();
+        if line.is_empty() {
             continue;
         }
-        if points.len() >= most.min(MAX_POINTS + 1) {
-            break;
+        if points.len() == MAX_POINTS {
+            return Err(wrong(format!("more than {MAX_POINTS} points: thin it first")));
         }
-        let numbers: Vec<f32> = words.iter().take(3).map_while(|word| word.parse().ok()).collect();
-        let reason = "a point has three numbers".to_owned();
-        let point = <[f32; 3]>::try_from(numbers).map_err(|_| PointsError::Line { line: index + 1, reason })?;
+        let between = [';', ','].into_iter().find(|between| line.contains(*between));
+        let words: Vec<&str> = match between {
+            Some(between) => line.split(between).take(3).map(str::trim).collect(),
+            None => line.split_whitespace().take(3).collect(),
+        };
+        let numbers: Vec<f64> = words.iter().map_while(|word| word.parse().ok()).collect();
+        let point = <[f64; 3]>::try_from(numbers).map_err(|_| wrong("a point has three numbers".to_owned()))?;
         points.push(point);
     }
-    points.retain(|point| point.iter().all(|c| c.is_finite()));
     Ok(points)
 }
 
-/// Reads past a header up to the line `last`; gives the number of points that it announces.
-fn header<'t>(
-    lines: &mut impl Iterator<Item = (usize, &'t str)>,
-    last: &str,
-    refused: &str,
-    fields: &str,
-    count: &str,
-) -> Result<usize, PointsError> {
-    let mut announced = usize::MAX;
-    let mut line = 0;
-    for (index, text) in lines {
-        line = index + 1;
-        let text = text.trim();
-        if text == last {
-            return Ok(announced);
-        }
-        if let Some(number) = text.strip_prefix(count) {
-            let reason = "the number of points is no whole number".to_owned();
-            announced = number.trim().parse().map_err(|_| PointsError::Line { line, reason })?;
-        }
-        if text.starts_with(refused) {
-            let reason = format!("`{text}`: only text is read; save it as text");
-            return Err(PointsError::Line { line, reason });
-        }
-        if !fields.is_empty() && text.starts_with("FIELDS") && !text.starts_with(fields) {
-            let reason = format!("`{text}`: its first fields are not x, y, z");
-            return Err(PointsError::Line { line, reason });
-        }
+/// The lines of a file, counted from 1; after some of them it may be binary.
+#[derive(Debug)]
+pub(crate) struct Lines<'b> {
+    rest: &'b [u8],
+    line: usize,
+}
+
+impl<'b> Lines<'b> {
+    pub(crate) fn new(bytes: &'b [u8]) -> Lines<'b> {
+        Lines { rest: bytes, line: 0 }
     }
-    Err(PointsError::Line { line, reason: format!("it ends before `{last}`") })
+
+    /// The number of the last line that was given.
+    pub(crate) fn line(&self) -> usize {
+        self.line
+    }
+
+    /// What comes after it.
+    pub(crate) fn rest(&self) -> &'b [u8] {
+        self.rest
+    }
+}
+
+impl<'b> Iterator for Lines<'b> {
+    type Item = (usize, Cow<'b, str>);
+
+    fn next(&mut self) -> Option<(usize, Cow<'b, str>)> {
+        if self.rest.is_empty() {
+            return None;
+        }
+        let end = self.rest.iter().position(|byte| *byte == b'\n').unwrap_or(self.rest.len());
+        let line = String::from_utf8_lossy(&self.rest[..end]);
+        self.rest = self.rest.get(end + 1..).unwrap_or(&[]);
+        self.line += 1;
+        Some((self.line, line))
+    }
 }

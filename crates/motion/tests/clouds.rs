@@ -366,7 +366,7 @@ fn bad_files_are_refused_by_line_and_reason() {
 
     let points = |name: &str, text: &str| point_files::points(name, text.as_bytes()).unwrap_err().to_string();
     assert_eq!(points("a.xyz", "1 2 3\n4 5\n"), "line 2: a point has three numbers");
-    assert!(points("a.pcd", "FIELDS x y z\nDATA binary\n").contains("line 2: `DATA binary`: only text is read"));
+    assert_eq!(points("a.pcd", "FIELDS x y z\nDATA ascii\n"), "line 2: its header has no POINTS, nor WIDTH and HEIGHT");
     assert!(points("a.las", "").contains("convert it"));
 }
 
@@ -377,7 +377,10 @@ fn points_are_read_from_text_pcd_and_ply() {
         ("a.xyz", "# two\n1 2 3\n\nnan nan nan\n4 5 6 255 0 0\n"),
         ("a.csv", "1,2,3\n4,5,6\n"),
         ("a.PCD", "VERSION .7\nFIELDS x y z rgb\nPOINTS 2\nDATA ascii\n1 2 3 0\n4 5 6 0\n"),
-        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 2\nelement face 1\nend_header\n1 2 3\n4 5 6\n3 0 1 1\n"),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n1 2 3\n4 5 6\n3 0 1 1\n",
+        ),
     ] {
         assert_eq!(point_files::points(name, text.as_bytes()).unwrap(), expected, "{name}");
     }
