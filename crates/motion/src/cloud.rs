@@ -14,6 +14,9 @@ pub const MAX_POINTS: usize = 4_000_000;
 /// The largest radius, in metres.
 pub const MAX_RADIUS_M: f64 = 1.0;
 
+/// The least bound of thinning, in metres: `f32` holds what is a kilometre away no better than by 0.06 mm.
+pub const LEAST_THINNING_M: f64 = 1e-6;
+
 /// How far from the origin a point may be, in metres.
 const FARTHEST_M: f32 = 1e3;
 
@@ -40,6 +43,12 @@ pub enum CloudError {
     Radius {
         /// In metres.
         radius_m: f64,
+    },
+    /// A cloud cannot be thinned so.
+    #[error("the bound of thinning is {bound_m} m: expected 0, or {LEAST_THINNING_M} to {MAX_RADIUS_M}")]
+    Thinning {
+        /// In metres.
+        bound_m: f64,
     },
 }
 
@@ -117,19 +126,22 @@ impl Cloud {
     }
 
     /// Fewer and larger balls that hold all of these and stand out of them by at most `bound_m` metres: of all points in one cell of a grid
-    /// one is left.
+    /// one is left. A bound of 0 changes nothing.
     ///
     /// # Errors
-    /// [`CloudError::Radius`] where the balls become too large.
+    /// [`CloudError::Thinning`] where the bound is no such length, [`CloudError::Radius`] where the balls become too large.
     pub fn thinned(&self, bound_m: f64) -> Result<Cloud, CloudError> {
-        let side = (bound_m / 3_f64.sqrt()) as f32;
-        if side <= 0.0 {
+        if bound_m == 0.0 {
             return Ok(self.clone());
         }
+        if !(LEAST_THINNING_M..=MAX_RADIUS_M).contains(&bound_m) {
+            return Err(CloudError::Thinning { bound_m });
+        }
+        let side = bound_m / 3_f64.sqrt();
         let mut taken = BTreeSet::new();
-        let is_first = |point: &&[f32; 3]| taken.insert(point.map(|c| (c / side).floor() as i64));
+        let is_first = |point: &&[f32; 3]| taken.insert(point.map(|c| (f64::from(c) / side).floor() as i64));
         let points: Vec<[f32; 3]> = self.points.iter().filter(is_first).copied().collect();
-        // What `f32` rounds is less than a thousandth of a cell.
+        // A little more than the diagonal of a cell, for rounding.
         Cloud::new(&self.name, &points, self.radius_m + bound_m * 1.001)
     }
 

@@ -4,7 +4,7 @@
 //! under the heights is filled down to a bottom. Heights are read from text (a row per line; commas, semicolons or spaces) or from a grey
 //! image (PGM, text or binary, of 8 or 16 bits); the first line is the row with the greatest y, as one sees it from above.
 
-use crate::mesh::{Mesh, MeshError};
+use crate::mesh::{MAX_TRIANGLES, Mesh, MeshError};
 
 /// Heights along one side at the most.
 pub const MOST_ALONG: usize = 4096;
@@ -87,6 +87,11 @@ impl Heights {
     /// [`HeightsError::Mesh`] where it is not finite or has too many triangles.
     pub fn solid(&self, size: [f64; 2], bottom: f64) -> Result<Mesh, HeightsError> {
         let (columns, rows) = (self.columns, self.heights.len() / self.columns);
+        // Two between four heights, three below each height at the edge.
+        let count = 2 * (columns - 1) * (rows - 1) + 6 * (columns + rows - 2);
+        if count > MAX_TRIANGLES {
+            return Err(MeshError::Count { triangles: count }.into());
+        }
         let least = self.heights.iter().copied().fold(f64::INFINITY, f64::min);
         // Above the least height the bottom would cut the surface.
         let bottom = bottom.min(least - 1e-3);
@@ -94,7 +99,7 @@ impl Heights {
         let flat = |x: usize, y: usize| [along(x, columns, size[0]), along(y, rows, size[1])];
         let top = |(x, y): (usize, usize)| [flat(x, y)[0], flat(x, y)[1], self.heights[y * columns + x]];
         let low = |(x, y): (usize, usize)| [flat(x, y)[0], flat(x, y)[1], bottom];
-        let mut triangles = Vec::new();
+        let mut triangles = Vec::with_capacity(count);
         for y in 0..rows - 1 {
             for x in 0..columns - 1 {
                 let [a, b, c, d] = [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)];
@@ -125,15 +130,20 @@ fn text(bytes: &[u8]) -> Result<(usize, Vec<f64>), HeightsError> {
     for (index, line) in text.lines().enumerate() {
         let wrong = |reason: String| HeightsError::Text { line: index + 1, reason };
         let line = line.split('#').next().unwrap_or("");
-        let words: Vec<&str> = line.split([',', ';', ' ', '\t', '\r']).filter(|word| !word.is_empty()).collect();
-        if words.is_empty() {
+        let words = || line.split([',', ';', ' ', '\t', '\r']).filter(|word| !word.is_empty());
+        let count = words().count();
+        if count == 0 {
             continue;
         }
-        if columns > 0 && words.len() != columns {
-            return Err(wrong(format!("{} heights, the rows before it have {columns}", words.len())));
+        if columns > 0 && count != columns {
+            return Err(wrong(format!("{count} heights, the rows before it have {columns}")));
         }
-        columns = words.len();
-        for word in words {
+        columns = count;
+        let rows = heights.len() / columns + 1;
+        if columns > MOST_ALONG || rows > MOST_ALONG {
+            return Err(HeightsError::Size { columns, rows });
+        }
+        for word in words() {
             let height: f64 = word.parse().map_err(|_| wrong(format!("`{word}` is no number")))?;
             if !height.is_finite() {
                 return Err(wrong(format!("`{word}` is not finite: fill in what was not seen")));

@@ -18,6 +18,10 @@ const MOST_CELLS: usize = 256;
 /// Triangles that are looked at to find parts inside others, at the most; parts that are left then count as solid.
 const MOST_LOOKS: usize = 200_000_000;
 
+/// How often triangles are listed at the most, for each of them and beside that; the grid becomes coarser where it would be more often.
+const MOST_LISTED: usize = 16;
+const MOST_LISTED_MORE: usize = 65_536;
+
 type Corner = [f64; 3];
 
 /// A closed part.
@@ -50,7 +54,10 @@ pub struct Inside {
     parts: Vec<Part>,
     least: Corner,
     greatest: Corner,
-    counts: [usize; 2],
+    /// The least and the greatest x and y of the grid.
+    grid: [[f64; 2]; 2],
+    /// Cells along each side.
+    side: usize,
     /// Per cell, where its triangles begin in `listed`.
     starts: Vec<u32>,
     listed: Vec<u32>,
@@ -70,14 +77,15 @@ impl Inside {
         let corners = || triangles.iter().flatten();
         let least: Corner = std::array::from_fn(|i| corners().map(|c| c[i]).fold(f64::INFINITY, f64::min));
         let greatest: Corner = std::array::from_fn(|i| corners().map(|c| c[i]).fold(f64::NEG_INFINITY, f64::max));
-        let side = ((triangles.len() as f64).sqrt().ceil() as usize).clamp(1, MOST_CELLS);
+        let grid = [least, greatest].map(|corner| [corner[0], corner[1]]);
         let mut inside = Inside {
             part,
             parts,
             least,
             greatest,
-            counts: [side; 2],
-            starts: vec![0; side * side + 1],
+            grid,
+            side: 0,
+            starts: Vec::new(),
             listed: Vec::new(),
             corners: closed_parts::corners(mesh),
             triangles,
@@ -85,6 +93,13 @@ impl Inside {
         inside.list();
         inside.find_hollows();
         inside
+    }
+
+    /// The same, ready for points with x and y from `least` to `greatest` only: others are not inside any more.
+    pub(crate) fn above(mut self, [least, greatest]: [[f64; 2]; 2]) -> Inside {
+        self.grid = [[0, 1].map(|i| self.grid[0][i].max(least[i])), [0, 1].map(|i| self.grid[1][i].min(greatest[i]))];
+        self.list();
+        self
     }
 
     /// Whether there is any.
@@ -232,44 +247,67 @@ impl Inside {
         around.into_iter().flatten().map(|other| other as usize).collect()
     }
 
+    /// How many triangles are looked at for a vertical line at (x, y).
+    pub(crate) fn load(&self, x: f64, y: f64) -> usize {
+        self.cell(x, y).map_or(0, |cell| self.listed(cell).len())
+    }
+
     fn cell(&self, x: f64, y: f64) -> Option<usize> {
-        let along = |i: usize, at: f64| {
-            let inside = self.least[i] <= at && at <= self.greatest[i];
-            inside.then(|| self.slot(i, at))
-        };
-        Some(along(0, x)? * self.counts[1] + along(1, y)?)
+        let [least, greatest] = self.grid;
+        let along = |i: usize, at: f64| (least[i] <= at && at <= greatest[i]).then(|| self.slot(i, at));
+        Some(along(0, x)? * self.side + along(1, y)?)
     }
 
     fn slot(&self, i: usize, at: f64) -> usize {
-        let extent = (self.greatest[i] - self.least[i]).max(1e-12);
-        (((at - self.least[i]) / extent * self.counts[i] as f64) as usize).min(self.counts[i] - 1)
+        let [least, greatest] = self.grid.map(|side| side[i]);
+        let extent = (greatest - least).max(1e-12);
+        (((at - least) / extent * self.side as f64) as usize).min(self.side - 1)
     }
 
-    /// Counts first, then fills.
-    fn list(&mut self) {
-        let cells = |inside: &Inside, triangle: &[Corner; 3]| -> Vec<usize> {
-            let range = |i: usize| {
-                let along = triangle.map(|c| c[i]);
-                let least = along.into_iter().fold(f64::INFINITY, f64::min);
-                let greatest = along.into_iter().fold(f64::NEG_INFINITY, f64::max);
-                inside.slot(i, least)..=inside.slot(i, greatest)
-            };
-            let columns = range(1);
-            range(0).flat_map(|x| columns.clone().map(move |y| (x, y))).map(|(x, y)| x * inside.counts[1] + y).collect()
+    /// The first and the last cell along x, then along y, that a triangle may lie above.
+    fn beneath(&self, triangle: &[Corner; 3]) -> Option<[[usize; 2]; 2]> {
+        let range = |i: usize| {
+            let along = triangle.map(|c| c[i]);
+            let least = along.into_iter().fold(f64::INFINITY, f64::min);
+            let greatest = along.into_iter().fold(f64::NEG_INFINITY, f64::max);
+            let is_there = greatest >= self.grid[0][i] && least <= self.grid[1][i];
+            is_there.then(|| [self.slot(i, least), self.slot(i, greatest)])
         };
-        let all: Vec<Vec<usize>> = self.triangles.iter().map(|t| cells(self, t)).collect();
-        for cell in all.iter().flatten() {
-            self.starts[cell + 1] += 1;
+        Some([range(0)?, range(1)?])
+    }
+
+    /// Counts first, then fills; as fine as the bound on the lists allows.
+    fn list(&mut self) {
+        let most = MOST_LISTED * self.triangles.len() + MOST_LISTED_MORE;
+        self.side = ((self.triangles.len() as f64).sqrt().ceil() as usize).clamp(1, MOST_CELLS);
+        loop {
+            let beneath = self.triangles.iter().filter_map(|triangle| self.beneath(triangle));
+            let count: usize = beneath.map(|[x, y]| (x[1] - x[0] + 1) * (y[1] - y[0] + 1)).sum();
+            if count <= most || self.side == 1 {
+                break;
+            }
+            self.side = self.side.div_ceil(2);
         }
-        for cell in 0..self.starts.len() - 1 {
-            self.starts[cell + 1] += self.starts[cell];
+        let mut starts = vec![0_u32; self.side * self.side + 1];
+        self.visit(&mut |cell, _| starts[cell + 1] += 1);
+        for cell in 0..starts.len() - 1 {
+            starts[cell + 1] += starts[cell];
         }
-        let mut next = self.starts.clone();
-        self.listed = vec![0; all.iter().map(Vec::len).sum()];
-        for (triangle, cells) in all.iter().enumerate() {
-            for cell in cells {
-                self.listed[next[*cell] as usize] = triangle as u32;
-                next[*cell] += 1;
+        let mut next = starts.clone();
+        let mut listed = vec![0; starts.last().map_or(0, |end| *end as usize)];
+        self.visit(&mut |cell, triangle| {
+            listed[next[cell] as usize] = triangle;
+            next[cell] += 1;
+        });
+        (self.starts, self.listed) = (starts, listed);
+    }
+
+    /// Shows each cell with each triangle that may lie above it.
+    fn visit(&self, show: &mut dyn FnMut(usize, u32)) {
+        for (number, triangle) in self.triangles.iter().enumerate() {
+            let Some([x, y]) = self.beneath(triangle) else { continue };
+            for row in x[0]..=x[1] {
+                (y[0]..=y[1]).for_each(|column| show(row * self.side + column, number as u32));
             }
         }
     }

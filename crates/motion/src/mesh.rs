@@ -106,6 +106,11 @@ impl Mesh {
         }
     }
 
+    /// Triangles of a mesh, or some of them, that were moved.
+    pub(crate) fn placed(triangles: Vec<[[f64; 3]; 3]>) -> Mesh {
+        Mesh { triangles }
+    }
+
     /// Reads a file, by the end of its name: `.stl`, `.obj` or `.dae`; its numbers are multiplied by `scale` along x, y, z to be metres.
     /// Where a scale mirrors, triangles are turned, so that the same side is outside.
     ///

@@ -1,20 +1,29 @@
 //! Clouds and meshes as the vector kernels want them: balls within the robot's reach.
 //!
-//! The surface of a mesh is held by balls ([`surface`](crate::surface)). Cells of the grid that the surface does not pass through are solid or
-//! free as a whole. In the others a lattice of balls fills what is inside, so narrow that a sphere with its centre between them touches one
-//! or the surface.
+//! What of a mesh is beyond the reach is cut off first, so all work is bounded by the reach and the resolution, however large the mesh is.
+//! The grid lies over what is left of it, and the surface, held by balls ([`surface`](crate::surface)), is marked in the whole grid. So the
+//! cells that it does not pass through are solid or free as a whole, and so is each part of them that hangs together. The others are cut
+//! into small cells, so narrow that a sphere with its centre in one either touches the surface or is on the same side of it as the middle
+//! of the small cell. Where the bounds do not allow such narrow ones, small cells that the surface passes through are solid.
 
 use crate::cloud::Cloud;
 use crate::inside::Inside;
-use crate::simd::{self, Isa, Layout};
-use crate::surface;
+use crate::mesh::Mesh;
+use crate::simd::{self, Filling, Isa, Layout};
+use crate::surface::{self, Bounds};
 use crate::surroundings::MeshObstacle;
+use std::ops::RangeInclusive;
 
 /// The most by which a sphere may grow between two postures and still be judged exactly, in metres.
 const GROWTH_M: f64 = 0.03;
 
-/// The narrowest lattice, in metres: a sphere of the robot with a radius below √3/2 of that, and wholly inside a mesh, may be missed.
+/// The narrowest small cells, in metres, and how many there are along a side of a cell at the most.
 const LEAST_SPACING_M: f64 = 0.004;
+const MOST_PER_SIDE: usize = 32;
+
+/// Small cells of one mesh at the most, and triangles that are looked at to fill them; both decide together with the reach how narrow they are.
+const MOST_SMALL_CELLS: usize = 1 << 29;
+const MOST_LOOKS: usize = 1 << 26;
 
 /// A robot's spheres.
 #[derive(Debug, Clone)]
@@ -32,6 +41,12 @@ impl Reached {
             away <= (reach + radius).powi(2)
         })
     }
+
+    /// A box that holds all shells.
+    fn bounds(&self) -> Bounds {
+        let corners = |(anchor, reach): &([f64; 3], f64)| [-reach, *reach].map(|by| anchor.map(|c| c + by));
+        Bounds::about(self.shells.iter().flat_map(corners))
+    }
 }
 
 /// The balls of a cloud that the robot reaches; `None` without any.
@@ -40,84 +55,141 @@ pub(crate) fn cloud(cloud: &Cloud, robot: &Reached, isa: Isa) -> Option<simd::Cl
     let reached = |p: &&[f32; 3]| robot.reaches(&p.map(f64::from), radius);
     let points: Vec<[f32; 3]> = cloud.points().iter().filter(reached).copied().collect();
     let reach = (robot.radii[1] + radius + GROWTH_M) as f32;
-    let layout = over(&points, reach)?;
+    let side = |i: usize, pick: fn(f32, f32) -> f32| points.iter().map(|p| p[i]).reduce(pick);
+    let (mut least, mut greatest) = ([0.0; 3], [0.0; 3]);
+    for i in 0..3 {
+        (least[i], greatest[i]) = (side(i, f32::min)?, side(i, f32::max)?);
+    }
+    let layout = Layout::over(points.len(), least, greatest, reach, 0.0);
     Some(simd::Cloud::new(&points, radius as f32, layout, reach, isa))
 }
 
 /// A mesh, where the robot reaches it; `None` where it does not.
 pub(crate) fn mesh(obstacle: &MeshObstacle, robot: &Reached, isa: Isa) -> Option<simd::Cloud> {
-    let radius = surface::radius(&obstacle.mesh, obstacle.overhang_m);
-    let in_world = |point: [f64; 3]| obstacle.pose.transform(point);
-    let surface: Vec<[f64; 3]> = surface::centres(&obstacle.mesh, radius)
-        .into_iter()
-        .map(in_world)
-        .filter(|p| robot.reaches(p, radius))
-        .collect();
-    let mut points: Vec<[f32; 3]> = surface.iter().map(|p| p.map(|c| c as f32)).collect();
-    let reach = (robot.radii[1] + radius + GROWTH_M) as f32;
-    let inside = Inside::new(&obstacle.mesh);
-    let layout = match over(&points, reach) {
-        Some(layout) => layout,
-        // The robot may stand deep inside.
-        None if !inside.is_empty()
-            && robot.shells.iter().any(|(a, _)| inside.contains(obstacle.pose.inverse().transform(*a))) =>
-        {
-            let corners: Vec<[f32; 3]> =
-                robot.shells.iter().flat_map(|(a, r)| [-1.0, 1.0].map(|s| a.map(|c| (c + s * r) as f32))).collect();
-            over(&corners, reach)?
-        }
-        None => return None,
-    };
+    let in_world = |triangle: &[[f64; 3]; 3]| triangle.map(|corner| obstacle.pose.transform(corner));
+    let triangles: Vec<[[f64; 3]; 3]> = obstacle.mesh.triangles().iter().map(in_world).collect();
+    let near = robot.bounds().and(&Bounds::about(triangles.iter().flatten().copied()))?;
+    let margin = |radius: f64| robot.radii[1] + radius + GROWTH_M;
+    let wanted = obstacle.overhang_m;
+    let (radius, count) = surface::balls(&triangles, &near.grown(margin(wanted)), wanted);
+    let reach = margin(radius) as f32;
+    let [least, greatest] = [near.least, near.greatest].map(|corner| corner.map(|c| c as f32));
+    let layout = Layout::over(count, least, greatest, reach, radius as f32);
+    let grid = bounds(&layout);
+    let centres = surface::centres(&triangles, &grid, radius);
     let mut crossed = Marks::new(layout);
-    for point in &points {
-        crossed.mark(point, radius as f32);
+    for centre in &centres {
+        crossed.mark(&centre.map(|c| c as f32), radius as f32);
     }
-    if inside.is_empty() {
-        return Some(simd::Cloud::new(&points, radius as f32, layout, reach, isa));
-    }
-    let wide = crossed.widened();
-    let spacing = (robot.radii[0] * 2.0 / 3_f64.sqrt() * 0.99).min(f64::from(layout.cell)).max(LEAST_SPACING_M);
-    lattice(&inside, spacing, &mut |point| {
-        let at = in_world(point).map(|c| c as f32);
-        if wide.is_marked(&at) {
-            points.push(at);
-        }
-    });
+    let reached = centres.into_iter().filter(|centre| robot.reaches(centre, radius));
+    let points: Vec<[f32; 3]> = reached.map(|centre| centre.map(|c| c as f32)).collect();
     let mut cloud = simd::Cloud::new(&points, radius as f32, layout, reach, isa);
-    let to_mesh = obstacle.pose.inverse();
+    let [least, greatest] = [grid.least, grid.greatest].map(|corner| [corner[0], corner[1]]);
+    let inside = Inside::new(&Mesh::placed(triangles)).above([least, greatest]);
+    if inside.is_empty() {
+        return (!points.is_empty()).then_some(cloud);
+    }
+    let mut is_solid = !points.is_empty();
     for part in crossed.free_parts() {
-        let centre = layout.centre(part[0]).map(f64::from);
-        if inside.contains(to_mesh.transform(centre)) {
+        if inside.contains(layout.centre(part[0]).map(f64::from)) {
+            is_solid = true;
             part.into_iter().for_each(|cell| cloud.solidify(cell));
         }
     }
-    Some(cloud)
+    let half_diagonal = f64::from(layout.cell) * 3_f64.sqrt() / 2.0;
+    let is_reached = |cell: &usize| robot.reaches(&layout.centre(*cell).map(f64::from), half_diagonal);
+    let split: Vec<usize> = crossed.cells().filter(is_reached).collect();
+    cloud.fill_with(filling(&inside, &layout, &split, (&points, radius), robot.radii[0]));
+    is_solid.then_some(cloud)
 }
 
-fn over(points: &[[f32; 3]], margin: f32) -> Option<Layout> {
-    let side = |i: usize, pick: fn(f32, f32) -> f32| points.iter().map(|p| p[i]).reduce(pick);
-    let mut least = [0.0; 3];
-    let mut greatest = [0.0; 3];
-    for i in 0..3 {
-        (least[i], greatest[i]) = (side(i, f32::min)?, side(i, f32::max)?);
+fn bounds(layout: &Layout) -> Bounds {
+    Bounds { least: layout.least.map(f64::from), greatest: layout.greatest.map(f64::from) }
+}
+
+/// What is inside in the cells that the surface passes through, in the order of their numbers; balls of a radius about `points` hold the surface.
+fn filling(
+    inside: &Inside,
+    layout: &Layout,
+    cells: &[usize],
+    (points, radius): (&[[f32; 3]], f64),
+    least_radius: f64,
+) -> Filling {
+    let cell = f64::from(layout.cell);
+    // Half of the diagonal of a small cell is less than the smallest sphere's radius.
+    let wanted = least_radius * 2.0 / 3_f64.sqrt() * 0.99;
+    let mut per_side = ((cell / wanted.max(LEAST_SPACING_M)).ceil() as usize).clamp(1, MOST_PER_SIDE);
+    let columns: Vec<&[usize]> = cells.chunk_by(|a, b| a / layout.counts[2] == b / layout.counts[2]).collect();
+    let middle = |column: &[usize], [x, y]: [usize; 2], per_side: usize| -> [f64; 2] {
+        let at = layout.slots(column[0]);
+        let along = |i: usize, small: usize| {
+            f64::from(layout.least[i]) + (at[i] as f64 + (small as f64 + 0.5) / per_side as f64) * cell
+        };
+        [along(0, x), along(1, y)]
+    };
+    // A few places of each column tell what it costs.
+    let loads = columns.iter().map(|column| {
+        let places = [[0, 0], [0, 3], [1, 1], [2, 2], [3, 0], [3, 3]].map(|small| middle(column, small, 4));
+        places.iter().map(|[x, y]| 1 + inside.load(*x, *y)).max().unwrap_or(1)
+    });
+    let load: usize = loads.sum();
+    // Where small cells are too wide, every ball is marked in them.
+    let is_too_wide = |per_side: usize| cell / per_side as f64 > wanted;
+    let marked = |per_side: usize| {
+        let across = (2.0 * radius * per_side as f64 / cell + 2.0) as usize;
+        if is_too_wide(per_side) { points.len() * across * across } else { 0 }
+    };
+    let fits = |per_side: usize| {
+        let small_cells = per_side.pow(3) * cells.len();
+        small_cells <= MOST_SMALL_CELLS && per_side.pow(2) * load + marked(per_side) <= MOST_LOOKS
+    };
+    while per_side > 1 && !fits(per_side) {
+        per_side -= 1;
     }
-    Some(Layout::over(points.len(), least, greatest, margin))
-}
-
-/// All places of a lattice that are inside.
-fn lattice(inside: &Inside, spacing: f64, take: &mut dyn FnMut([f64; 3])) {
-    let (least, greatest) = inside.extents();
-    let count = |i: usize| ((greatest[i] - least[i]) / spacing) as usize + 1;
-    for x in 0..count(0) {
-        for y in 0..count(1) {
-            let at = [least[0] + (x as f64 + 0.5) * spacing, least[1] + (y as f64 + 0.5) * spacing];
-            for [from, to] in inside.column(at[0], at[1]) {
-                let first = ((from - least[2]) / spacing - 0.5).ceil().max(0.0) as usize;
-                let heights = (first..).map(|z| least[2] + (z as f64 + 0.5) * spacing).take_while(|z| *z <= to);
-                heights.for_each(|z| take([at[0], at[1], z]));
+    let spacing = cell / per_side as f64;
+    let mut filling = Filling::new(layout, per_side);
+    let small = |i: usize, at: f64| ((at - f64::from(layout.least[i])) / spacing).max(0.0);
+    for column in columns {
+        for small_xy in (0..per_side).flat_map(|x| (0..per_side).map(move |y| [x, y])) {
+            let [x, y] = middle(column, small_xy, per_side);
+            for [from, to] in inside.column(x, y) {
+                // Those whose middle is inside.
+                let (first, end) =
+                    ((small(2, from) - 0.5).ceil().max(0.0) as usize, (small(2, to) + 0.5).floor() as usize);
+                for &index in column {
+                    let base = layout.slots(index)[2] * per_side;
+                    if let Some(part) = shared(first, end, base, per_side) {
+                        filling.fill(index, small_xy, part);
+                    }
+                }
             }
         }
     }
+    if is_too_wide(per_side) {
+        let split = Marks::of(*layout, cells);
+        for point in points {
+            let range = |i: usize, by: f64| small(i, f64::from(point[i]) + by * 1.01) as usize;
+            let [from, to] = [-radius, radius].map(|by| [range(0, by), range(1, by), range(2, by)]);
+            for (x, y) in (from[0]..=to[0]).flat_map(|x| (from[1]..=to[1]).map(move |y| (x, y))) {
+                for z in from[2] / per_side..=to[2] / per_side {
+                    let at = [x / per_side, y / per_side, z];
+                    if (0..3).any(|i| at[i] >= layout.counts[i]) || !split.marked[layout.index(at)] {
+                        continue;
+                    }
+                    if let Some(part) = shared(from[2], to[2] + 1, z * per_side, per_side) {
+                        filling.fill(layout.index(at), [x % per_side, y % per_side], part);
+                    }
+                }
+            }
+        }
+    }
+    filling
+}
+
+/// What of `first..end` is in the `count` numbers from `base` on, counted from there.
+fn shared(first: usize, end: usize, base: usize, count: usize) -> Option<RangeInclusive<usize>> {
+    let (from, to) = (first.max(base), end.min(base + count));
+    (from < to).then(|| from - base..=to - base - 1)
 }
 
 /// Cells of a grid that are marked.
@@ -146,27 +218,16 @@ impl Marks {
         }
     }
 
-    fn is_marked(&self, point: &[f32; 3]) -> bool {
-        self.marked[self.layout.index(std::array::from_fn(|i| self.layout.slot(i, point[i])))]
+    /// Where these are marked.
+    fn of(layout: Layout, cells: &[usize]) -> Marks {
+        let mut marks = Marks::new(layout);
+        cells.iter().for_each(|cell| marks.marked[*cell] = true);
+        marks
     }
 
-    /// With the cells beside, those at corners too.
-    fn widened(&self) -> Marks {
-        let mut wide = Marks::new(self.layout);
-        let counts = self.layout.counts;
-        for index in (0..self.marked.len()).filter(|index| self.marked[*index]) {
-            let at = self.layout.slots(index);
-            let range = |i: usize| at[i].saturating_sub(1)..=(at[i] + 1).min(counts[i] - 1);
-            for x in range(0) {
-                for y in range(1) {
-                    for z in range(2) {
-                        let index = self.layout.index([x, y, z]);
-                        wide.marked[index] = true;
-                    }
-                }
-            }
-        }
-        wide
+    /// The cells that are marked, in the order of their numbers.
+    fn cells(&self) -> impl Iterator<Item = usize> {
+        self.marked.iter().enumerate().filter(|(_, marked)| **marked).map(|(cell, _)| cell)
     }
 
     /// The cells that are not marked, by parts that hang together by sides.

@@ -8,11 +8,11 @@
 //! Clouds (`cloud`), meshes (`mesh`) and heights (`heightfield`) are in files of their own, which the caller reads; the points of a small
 //! cloud may stand in the problem itself.
 
-use crate::cloud::Cloud;
+use crate::cloud::{self, Cloud};
 use crate::geometry::Geometry;
 use crate::heightfield::Heights;
 use crate::mechanism::Mechanism;
-use crate::mesh::Mesh;
+use crate::mesh::{self, Mesh};
 use crate::point_files;
 use crate::space::Obstacle;
 use crate::surroundings::{MeshObstacle, OVERHANG_M, Surroundings};
@@ -20,6 +20,13 @@ use ratn_model::pose::Pose;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+
+/// Points of all clouds of a file, and triangles of all its meshes and heightfields, at the most: a file may name a large one often.
+const MOST_POINTS: usize = 4 * cloud::MAX_POINTS;
+const MOST_TRIANGLES: usize = 4 * mesh::MAX_TRIANGLES;
+
+/// The greatest distance from the robot that a `self_filter` leaves out, in metres.
+const MOST_SELF_FILTER_M: f64 = 1.0;
 
 /// All problems of a file.
 #[derive(Debug, Clone, PartialEq)]
@@ -112,7 +119,7 @@ impl Problems {
         text: &str,
         load: &mut dyn FnMut(&str) -> Result<Vec<u8>, String>,
     ) -> Result<Problems, ProblemError> {
-        let mut files = Files { load, loaded: BTreeMap::new(), meshes: BTreeMap::new() };
+        let mut files = Files { load, loaded: BTreeMap::new(), meshes: BTreeMap::new(), points: 0, triangles: 0 };
         let file: File = serde_json::from_str(text)?;
         let twice = file.joints.iter().enumerate().find(|(i, name)| file.joints[..*i].contains(name));
         if let Some((_, joint)) = twice {
@@ -222,8 +229,11 @@ fn upright() -> [f64; 4] {
 struct Files<'l> {
     load: &'l mut dyn FnMut(&str) -> Result<Vec<u8>, String>,
     loaded: BTreeMap<String, Arc<Vec<u8>>>,
-    /// By file, and the scale as it is written.
+    /// By file, and what is made of it.
     meshes: BTreeMap<(String, String), Arc<Mesh>>,
+    /// How many all clouds and all meshes have.
+    points: usize,
+    triangles: usize,
 }
 
 impl Files<'_> {
@@ -236,14 +246,39 @@ impl Files<'_> {
         Ok(bytes)
     }
 
-    fn mesh(&mut self, name: &str, scale: [f64; 3]) -> Result<Arc<Mesh>, String> {
-        let key = (name.to_owned(), format!("{scale:?}"));
+    /// The mesh that `make` makes of a file; `how` tells apart what is made of the same file.
+    fn mesh(
+        &mut self,
+        name: &str,
+        how: String,
+        make: impl FnOnce(&[u8]) -> Result<Mesh, String>,
+    ) -> Result<Arc<Mesh>, String> {
+        let key = (name.to_owned(), how);
         if let Some(mesh) = self.meshes.get(&key) {
             return Ok(Arc::clone(mesh));
         }
-        let mesh = Arc::new(Mesh::read(name, &self.bytes(name)?, scale).map_err(|error| error.to_string())?);
+        let mesh = Arc::new(make(&self.bytes(name)?)?);
+        self.triangles += mesh.triangles().len();
+        if self.triangles > MOST_TRIANGLES {
+            let sum = self.triangles;
+            return Err(format!(
+                "with it all meshes have {sum} triangles, at most {MOST_TRIANGLES} in one file of problems: simplify them"
+            ));
+        }
         self.meshes.insert(key, Arc::clone(&mesh));
         Ok(mesh)
+    }
+
+    /// Counts the points of a cloud.
+    fn count(&mut self, cloud: &Cloud) -> Result<(), String> {
+        self.points += cloud.points().len();
+        let sum = self.points;
+        match sum > MOST_POINTS {
+            true => Err(format!(
+                "with it all clouds have {sum} points, at most {MOST_POINTS} in one file of problems: thin them"
+            )),
+            false => Ok(()),
+        }
     }
 }
 
@@ -338,7 +373,15 @@ impl PointsEntry {
         };
         let cloud = Cloud::new(name, &points, self.radius).and_then(|cloud| cloud.moved(pose));
         let thinned = cloud.and_then(|cloud| cloud.thinned(self.thin.unwrap_or(0.0)));
-        thinned.map_err(|error| format!("object `{name}`: {error}"))
+        let wrong = |reason: String| format!("object `{name}`: {reason}");
+        if let Some(margin_m) = self.self_filter
+            && !(0.0..=MOST_SELF_FILTER_M).contains(&margin_m)
+        {
+            return Err(wrong(format!("its `self_filter` is {margin_m} m: expected 0 to {MOST_SELF_FILTER_M}")));
+        }
+        let thinned = thinned.map_err(|error| wrong(error.to_string()))?;
+        files.count(&thinned).map_err(wrong)?;
+        Ok(thinned)
     }
 }
 
@@ -349,7 +392,8 @@ impl MeshEntry {
             Some(Scale::All(scale)) => [scale; 3],
             Some(Scale::Each(scale)) => scale,
         };
-        files.mesh(&self.file, scale)
+        let read = |bytes: &[u8]| Mesh::read(&self.file, bytes, scale).map_err(|error| error.to_string());
+        files.mesh(&self.file, format!("{scale:?}"), read)
     }
 }
 
@@ -358,9 +402,13 @@ impl HeightsEntry {
         if !self.size.iter().all(|s| *s > 0.0 && s.is_finite()) {
             return Err("its `size` is two lengths in metres".to_owned());
         }
-        let heights = Heights::read(&files.bytes(&self.file)?, self.scale.unwrap_or(1.0));
-        let solid = heights.and_then(|heights| heights.solid(self.size, self.bottom));
-        Ok(Arc::new(solid.map_err(|error| error.to_string())?))
+        let HeightsEntry { size, scale, bottom, .. } = self;
+        let scale = scale.unwrap_or(1.0);
+        let read = |bytes: &[u8]| {
+            let solid = Heights::read(bytes, scale).and_then(|heights| heights.solid(size, bottom));
+            solid.map_err(|error| error.to_string())
+        };
+        files.mesh(&self.file, format!("{size:?} {scale} {bottom}"), read)
     }
 }
 

@@ -183,6 +183,27 @@ fn a_thinned_cloud_holds_the_whole_one_within_its_bound() {
 }
 
 #[test]
+fn thinning_by_next_to_nothing_is_refused_and_by_a_micrometre_it_loses_nothing() {
+    let mut random = ChaCha8Rng::seed_from_u64(11);
+    let mut points = scattered(&mut random, 2_000);
+    points.push([999.0, -999.0, 999.0]);
+    points.push([999.1, -999.0, 999.0]);
+    let whole = Cloud::new("cloud", &points, 0.01).unwrap();
+    for bound in [1e-7, 1e-30, 1e-320, -0.01, 1.5, f64::NAN, f64::INFINITY] {
+        let refused = whole.thinned(bound).unwrap_err().to_string();
+        assert!(
+            refused.starts_with("the bound of thinning is ") && refused.ends_with(" m: expected 0, or 0.000001 to 1"),
+            "{refused}"
+        );
+    }
+    let thin = whole.thinned(1e-6).unwrap();
+    for point in whole.points() {
+        let is_near = |kept: &&[f32; 3]| (0..3).map(|i| f64::from(kept[i] - point[i]).powi(2)).sum::<f64>() <= 1e-12;
+        assert!(thin.points().iter().any(|kept| is_near(&kept)), "{point:?} is gone");
+    }
+}
+
+#[test]
 fn what_a_camera_saw_of_the_robot_is_left_out_and_nothing_else() {
     let mechanism = chain(4);
     let posture = [0.3, -0.4, 0.5, 0.2];
@@ -261,6 +282,121 @@ fn a_solid_mesh_is_the_block_that_it_is_the_surface_of() {
         }
     }
     assert!(free > 500 && touching > 500 && undecided < free / 10, "{free} free, {touching} touching, {undecided}");
+}
+
+/// What the vector checks say of a solid mesh beside what a primitive shape of the same form is; says how many were free, touching and undecided.
+fn beside_a_block(mechanism: &Mechanism, half: [f64; 3], pose: Pose, random: &mut impl Rng) -> [usize; 3] {
+    let primitive = [Obstacle { name: "block".into(), pose, geometry: Geometry::Box { half } }];
+    let mesh = Arc::new(Mesh::new(block(half)).unwrap());
+    let meshes = [MeshObstacle { name: "block".into(), pose, mesh, overhang_m: OVERHANG_M }];
+    let exact = Exact::new(mechanism, &primitive);
+    let mut padded = mechanism.clone();
+    padded.pad_all(OVERHANG_M + 1e-3);
+    let larger = Exact::new(&padded, &primitive);
+    let mut spaces: Vec<Space> =
+        Isa::available().into_iter().map(|isa| Space::with_isa(mechanism, &meshes[..], isa)).collect();
+    let mut counts = [0; 3];
+    for _ in 0..150 {
+        let state = posture(random, mechanism);
+        let at = positions(mechanism, &state);
+        let touch = exact.touch(&at);
+        for space in &mut spaces {
+            match (space.is_free(&state), &touch) {
+                (true, None) => counts[0] += 1,
+                (true, Some(touch)) => panic!("{:?} misses that {touch}, {half:?} at {pose:?}", space.isa()),
+                (false, Some(_)) => counts[1] += 1,
+                (false, None) => {
+                    counts[2] += 1;
+                    assert!(
+                        larger.touch(&at).is_some(),
+                        "{:?} sees a touch that is none: {half:?} at {pose:?}",
+                        space.isa()
+                    );
+                }
+            }
+        }
+    }
+    counts
+}
+
+#[test]
+fn a_solid_mesh_far_beyond_the_reach_is_solid_where_its_surface_is_near_and_where_it_is_not() {
+    let mechanism = chain(3);
+    let mut random = ChaCha8Rng::seed_from_u64(8);
+    let mut sum = [0; 3];
+    for case in 0..6 {
+        // Wrong units make millimetres metres: the largest are 300 m wide.
+        let half: [f64; 3] = std::array::from_fn(|_| random.random_range(3.0..[10.0, 150.0][case % 2]));
+        let mut pose = random_pose(&mut random, 0.3);
+        // Deep inside; beside one side; beside an edge.
+        for (axis, half) in half.iter().enumerate().take(case / 2 % 3) {
+            let mut side = [0.0; 3];
+            side[axis] = *half;
+            let side = pose.rotate(side);
+            pose.position = std::array::from_fn(|i| pose.position[i] + side[i]);
+        }
+        let counts = beside_a_block(&mechanism, half, pose, &mut random);
+        sum = std::array::from_fn(|i| sum[i] + counts[i]);
+        assert!(case / 2 % 3 > 0 || counts[0] == 0, "free deep inside: {counts:?}");
+    }
+    assert!(sum[0] > 100 && sum[1] > 300 && sum[2] < sum[0] / 10, "{sum:?}");
+}
+
+#[test]
+fn the_ground_is_solid_below_and_free_above_as_far_as_the_robot_reaches() {
+    let mechanism = chain(3);
+    let mut random = ChaCha8Rng::seed_from_u64(9);
+    for (size, depth) in [(3.0, 0.5), (40.0, 0.5), (40.0, 30.0)] {
+        // A slope with steps across it.
+        let height = |x: usize, y: usize| 0.02 * x as f64 - 0.25 + if y % 7 == 3 { 0.06 } else { 0.0 };
+        let heights = Heights::new(25, (0..625).map(|i| height(i % 25, i / 25)).collect()).unwrap();
+        let mesh = Arc::new(heights.solid([size; 2], -depth).unwrap());
+        let meshes =
+            [MeshObstacle { name: "ground".into(), pose: Pose::at(0.0, 0.0, -0.25), mesh, overhang_m: OVERHANG_M }];
+        let exact = Exact::new(&mechanism, &meshes[..]);
+        let mut padded = mechanism.clone();
+        padded.pad_all(OVERHANG_M + 1e-3);
+        let larger = Exact::new(&padded, &meshes[..]);
+        let mut space = Space::new(&mechanism, &meshes[..]);
+        let (mut free, mut touching) = (0, 0);
+        for _ in 0..300 {
+            let state = posture(&mut random, &mechanism);
+            let at = positions(&mechanism, &state);
+            match (space.is_free(&state), exact.touch(&at)) {
+                (true, None) => free += 1,
+                (true, Some(touch)) => panic!("missed over {size} m: {touch}"),
+                (false, Some(_)) => touching += 1,
+                (false, None) => assert!(larger.touch(&at).is_some(), "a touch that is none over {size} m"),
+            }
+        }
+        assert!(free > 30 && touching > 30, "{free} free, {touching} touching over {size} m");
+    }
+}
+
+#[test]
+fn slivers_and_many_large_triangles_take_no_more_than_in_proportion_to_their_number() {
+    let mechanism = chain(3);
+    let mut random = ChaCha8Rng::seed_from_u64(10);
+    for width in [1e-6, 1.0, 900.0] {
+        let mut triangles = Vec::new();
+        for _ in 0..3_000 {
+            let mut corner = || -> [f64; 3] { std::array::from_fn(|_| random.random_range(-900.0..900.0)) };
+            let (a, b) = (corner(), corner());
+            let aside: [f64; 3] =
+                std::array::from_fn(|i| (a[i] + width * if i == 2 { 1.0 } else { 0.3 }).clamp(-990.0, 990.0));
+            triangles.extend([[a, b, aside], [a, aside, b]]);
+        }
+        let mesh = Arc::new(Mesh::new(triangles).unwrap());
+        let inside = Inside::new(&mesh);
+        assert!(!inside.contains([1e-3, 0.0, 950.0]));
+        let meshes = [MeshObstacle { name: "slivers".into(), pose: Pose::IDENTITY, mesh, overhang_m: OVERHANG_M }];
+        let mut space = Space::new(&mechanism, &meshes[..]);
+        let exact = Exact::new(&mechanism, &meshes[..]);
+        for _ in 0..50 {
+            let state = posture(&mut random, &mechanism);
+            assert!(!space.is_free(&state) || exact.touch(&positions(&mechanism, &state)).is_none());
+        }
+    }
 }
 
 #[test]
@@ -362,6 +498,12 @@ fn bad_files_are_refused_by_line_and_reason() {
     assert_eq!(heights(b"1, x\n"), "line 1: `x` is no number");
     assert_eq!(heights(b"1 nan\n"), "line 1: `nan` is not finite: fill in what was not seen");
     assert_eq!(heights(b"1 2\n"), "2 × 1 heights: expected 2 to 4096 along each side");
+    let wide = "0 ".repeat(5000);
+    assert_eq!(heights(wide.as_bytes()), "5000 × 1 heights: expected 2 to 4096 along each side");
+    let long = "0 0\n".repeat(5000);
+    assert_eq!(heights(long.as_bytes()), "2 × 4097 heights: expected 2 to 4096 along each side");
+    let large = Heights::new(4096, vec![0.0; 4096 * 4096]).unwrap().solid([1.0; 2], -0.1).unwrap_err().to_string();
+    assert_eq!(large, "it has 33587190 triangles: expected 1 to 1000000; simplify it");
     assert_eq!(heights(b"P5 2 2 65535\n\0\0"), "at byte 15: it ends here, 2 × 2 values of 2 bytes begin at byte 13");
 
     let points = |name: &str, text: &str| point_files::points(name, text.as_bytes()).unwrap_err().to_string();
@@ -448,4 +590,12 @@ fn a_problem_names_clouds_meshes_and_heights_with_their_files() {
         refused(r#"{"name": "seen", "type": "cloud", "radius": 0.01}"#, "").contains("either a `file` or `points`")
     );
     assert!(refused(&here.replace("0.01", "0"), "").contains("object `seen`: the radius of its points is 0 m"));
+    assert!(
+        refused(&here.replace("0.03", "-1"), "").contains("object `seen`: its `self_filter` is -1 m: expected 0 to 1")
+    );
+    let pile = |name: &str, size: f64| {
+        format!(r#"{{"name": "{name}", "type": "heightfield", "file": "pile.csv", "size": [{size}, {size}]}}"#)
+    };
+    let piles = one(&[pile("a", 1.0), pile("b", 1.0), pile("c", 2.0)].join(", "), "1 1\n1 1\n").meshes;
+    assert!(Arc::ptr_eq(&piles[0].mesh, &piles[1].mesh) && !Arc::ptr_eq(&piles[0].mesh, &piles[2].mesh));
 }

@@ -5,7 +5,10 @@
 //! between them; p is left out where the whole cell is). The lists are made by halving: a part of the grid passes on to its halves only
 //! what it has not left out. So the answer from the list of the cell that a centre is in is exact, for any radius; the distances of
 //! the cells' centres decide for most spheres that they touch nothing. What is beside the grid is further from the points than
-//! any sphere reaches for which there are lists.
+//! any sphere reaches for which there are lists; a larger sphere there counts as touching where the distances do not rule it out.
+//!
+//! Balls may be all over the surface of something solid. Cells that are solid as a whole say so instead of a list; of others it is known in
+//! small cells which side of the surface they are on, which decides for a sphere that meets no ball.
 //!
 //! Nearest neighbours by cells with the sites of their Voronoi diagrams are old (Clarkson, SIAM J. Comput. 1988); that spheres of a robot
 //! are looked up in a structure laid out for vectors is from Ramsey, Kingston, Thomason, Kavraki: *Collision-Affording Point Trees* (RSS
@@ -35,6 +38,9 @@ const ROUND: f32 = 12_582_912.0;
 /// The list of a cell where every centre touches.
 const SOLID: [u32; 2] = [u32::MAX; 2];
 
+/// The place of a cell that is not filled in part.
+const NOT_FILLED: u32 = u32::MAX;
+
 /// Sixteen points, or fewer and such as are infinitely far away.
 type Points = [Block; 3];
 
@@ -54,6 +60,54 @@ pub(crate) struct Cloud {
     /// Per cell, where its points are in `points`; nothing where no sphere is large enough.
     lists: Vec<[u32; 2]>,
     points: Vec<Points>,
+    /// Spheres whose radius and that of the balls are together at most this are judged exactly.
+    reach: f32,
+    filling: Option<Filling>,
+}
+
+/// What is solid of cells that are so in part: each of them is cut into smaller ones, and of these it is known whether they are solid.
+#[derive(Debug, Clone)]
+pub(crate) struct Filling {
+    /// How many small cells there are along a side of a cell.
+    pub(crate) per_side: usize,
+    /// Per cell, where its bits begin in `bits`, a whole number of words.
+    starts: Vec<u32>,
+    bits: Vec<u64>,
+}
+
+impl Filling {
+    /// Nothing is solid yet.
+    pub(crate) fn new(layout: &Layout, per_side: usize) -> Filling {
+        Filling { per_side, starts: vec![NOT_FILLED; layout.cells()], bits: Vec::new() }
+    }
+
+    /// Makes small cells of a column solid, from one to another along z.
+    pub(crate) fn fill(&mut self, cell: usize, [x, y]: [usize; 2], z: std::ops::RangeInclusive<usize>) {
+        if self.starts[cell] == NOT_FILLED {
+            self.starts[cell] = self.bits.len() as u32;
+            self.bits.resize(self.bits.len() + self.per_side.pow(3).div_ceil(64), 0);
+        }
+        let first = self.starts[cell] as usize * 64 + (x * self.per_side + y) * self.per_side;
+        for bit in z.map(|z| first + z) {
+            self.bits[bit / 64] |= 1 << (bit % 64);
+        }
+    }
+
+    /// Whether the small cell that a centre is in is solid; `None` in a cell of which nothing is.
+    #[inline]
+    fn is_solid(&self, layout: &Layout, cell: usize, centre: [f32; 3]) -> Option<bool> {
+        let start = self.starts[cell];
+        if start == NOT_FILLED {
+            return None;
+        }
+        let at = layout.slots(cell);
+        let [x, y, z]: [usize; 3] = std::array::from_fn(|i| {
+            let along = (centre[i] - layout.least[i]) / layout.cell - at[i] as f32;
+            ((along * self.per_side as f32).max(0.0) as usize).min(self.per_side - 1)
+        });
+        let bit = start as usize * 64 + (x * self.per_side + y) * self.per_side + z;
+        Some(self.bits[bit / 64] >> (bit % 64) & 1 == 1)
+    }
 }
 
 /// Where the cells are.
@@ -66,12 +120,12 @@ pub(crate) struct Layout {
 }
 
 impl Layout {
-    /// Over a box that holds so many points, and `margin` around.
-    pub(crate) fn over(points: usize, least: [f32; 3], greatest: [f32; 3], margin: f32) -> Layout {
+    /// Over a box that holds so many points, and `margin` around, in cells of a side of `least_cell` at least.
+    pub(crate) fn over(points: usize, least: [f32; 3], greatest: [f32; 3], margin: f32, least_cell: f32) -> Layout {
         let most = (points as f32 * CELLS_PER_POINT).clamp(LEAST_CELLS, MOST_CELLS);
         let extents: [f32; 3] = std::array::from_fn(|i| greatest[i] - least[i] + 2.0 * margin);
         let volume = extents.iter().map(|e| e.max(LEAST_CELL_M)).product::<f32>();
-        let mut cell = (volume / most).cbrt().max(LEAST_CELL_M);
+        let mut cell = (volume / most).cbrt().max(LEAST_CELL_M).max(least_cell);
         loop {
             let counts = extents.map(|e| (e / cell).ceil().max(1.0) as usize);
             if counts.iter().product::<usize>() as f32 <= 2.0 * most {
@@ -119,7 +173,8 @@ impl Cloud {
         let (near, lists) = (vec![f32::INFINITY; cells], vec![[0; 2]; cells]);
         let side = |i: usize, sign: f32| points.iter().map(|p| p[i] * sign).fold(f32::INFINITY, f32::min) - radius;
         let (least, minus_greatest) = (std::array::from_fn(|i| side(i, 1.0)), std::array::from_fn(|i| side(i, -1.0)));
-        let mut cloud = Cloud { radius, least, minus_greatest, layout, near, lists, points: Vec::new() };
+        let (listed, filling) = (Vec::new(), None);
+        let mut cloud = Cloud { radius, least, minus_greatest, layout, near, lists, points: listed, reach, filling };
         let mut blocks: Vec<Points> = Vec::with_capacity(points.len().div_ceil(16));
         for sixteen in points.chunks(16) {
             let mut block = FAR;
@@ -140,6 +195,23 @@ impl Cloud {
     pub(crate) fn solidify(&mut self, cell: usize) {
         self.near[cell] = f32::NEG_INFINITY;
         self.lists[cell] = SOLID;
+        self.hold(cell);
+    }
+
+    /// Makes centres touch that are in small cells that are solid. A sphere that meets no ball is then wholly on one side of the surface.
+    pub(crate) fn fill_with(&mut self, filling: Filling) {
+        for cell in (0..filling.starts.len()).filter(|cell| filling.starts[*cell] != NOT_FILLED) {
+            self.near[cell] = f32::NEG_INFINITY;
+            self.hold(cell);
+        }
+        self.filling = Some(filling);
+    }
+
+    /// Makes the box of all balls hold a cell.
+    fn hold(&mut self, cell: usize) {
+        let (centre, half) = (self.layout.centre(cell), self.layout.cell * 0.501);
+        self.least = std::array::from_fn(|i| self.least[i].min(centre[i] - half));
+        self.minus_greatest = std::array::from_fn(|i| self.minus_greatest[i].min(-centre[i] - half));
     }
 
     /// Whether one sphere touches a ball.
@@ -225,9 +297,14 @@ impl Cloud {
     #[inline(always)]
     fn touches<V: Lanes>(&self, centre: [f32; 3], radius: f32, cell: usize) -> bool {
         let [first, end] = self.lists[cell];
-        if first == end {
-            // Nothing is listed so far from all points: solid, or a sphere that is larger than was announced.
+        let is_filled = || self.filling.as_ref().and_then(|filling| filling.is_solid(&self.layout, cell, centre));
+        if radius > self.reach && (first == end || self.is_off_the_grid(&centre)) {
+            // Larger than was announced: the lists are of centres in the grid, and of places less far from all points.
             return true;
+        }
+        if first == end {
+            // Solid, in whole or in part.
+            return is_filled().unwrap_or(true);
         }
         let reach = V::splat(radius * radius);
         for points in &self.points[first as usize..end as usize] {
@@ -237,7 +314,11 @@ impl Cloud {
                 }
             }
         }
-        false
+        is_filled().unwrap_or(false)
+    }
+
+    fn is_off_the_grid(&self, centre: &[f32; 3]) -> bool {
+        (0..3).any(|i| centre[i] < self.layout.least[i] || centre[i] > self.layout.greatest[i])
     }
 }
 
@@ -399,5 +480,53 @@ fn thin<V: Lanes>(points: &mut Vec<Points>, middle: &[f32; 3], size: [f32; 3], s
         spare.clear();
         keep::<V>(points, middle, &nearest, size, spare);
         std::mem::swap(points, spare);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    #[test]
+    fn a_sphere_of_any_size_anywhere_is_never_missed_and_judged_exactly_where_it_was_announced() {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let (radius, reach) = (0.005, 0.05);
+        let mut exact = 0;
+        for _ in 0..30 {
+            let mut place = |half: f32| -> [f32; 3] { std::array::from_fn(|_| random.random_range(-half..half)) };
+            let points: Vec<[f32; 3]> = (0..40).map(|_| place(0.5)).collect();
+            let layout = Layout::over(points.len(), [-0.5; 3], [0.5; 3], reach, 0.0);
+            let cloud = Cloud::new(&points, radius, layout, reach, Isa::detect());
+            for case in 0..400 {
+                let centre = place(if case % 2 == 0 { 0.6 } else { 1.5 });
+                let away = |p: &[f32; 3]| (0..3).map(|i| (p[i] - centre[i]).powi(2)).sum::<f32>().sqrt();
+                let nearest = points.iter().map(away).fold(f32::INFINITY, f32::min);
+                assert!(cloud.touches_sphere(centre, nearest - radius + 1e-4), "{nearest} from {centre:?} is missed");
+                if nearest - 1e-4 <= reach {
+                    exact += 1;
+                    assert!(!cloud.touches_sphere(centre, nearest - radius - 1e-4), "{nearest} from {centre:?}");
+                }
+            }
+        }
+        assert!(exact > 50, "{exact}");
+    }
+
+    #[test]
+    fn what_is_filled_is_solid_small_cell_by_small_cell_and_free_beside_it() {
+        let layout = Layout::over(1, [0.0; 3], [1.0; 3], 0.1, 0.0);
+        let mut filling = Filling::new(&layout, 5);
+        let cell = layout.index([3, 4, 5]);
+        filling.fill(cell, [1, 2], 2..=3);
+        let mut cloud = Cloud::new(&[], 0.005, layout, 0.1, Isa::detect());
+        cloud.fill_with(filling);
+        let corner = layout.centre(cell).map(|c| c - layout.cell / 2.0);
+        for small in 0..125 {
+            let [x, y, z] = [small / 25, small / 5 % 5, small % 5];
+            let at = [x, y, z].map(|s| (s as f32 + 0.5) / 5.0 * layout.cell);
+            let touches = cloud.touches_sphere(std::array::from_fn(|i| corner[i] + at[i]), 0.001);
+            assert_eq!(touches, x == 1 && y == 2 && (2..=3).contains(&z), "{x} {y} {z}");
+        }
     }
 }

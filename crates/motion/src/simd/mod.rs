@@ -6,7 +6,7 @@ mod kernel;
 mod lanes;
 mod nearest;
 
-pub(crate) use cloud::{Cloud, Layout};
+pub(crate) use cloud::{Cloud, Filling, Layout};
 pub(crate) use kernel::{Compiled, Edge, Frame, Group, Obstacle, Rigid, Row, Scratch, SelfPair};
 pub(crate) use lanes::Block;
 #[allow(unreachable_pub, reason = "`space` makes it public")]
