@@ -3,8 +3,12 @@
 
 mod support;
 
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use ratn_daemon::process_manager::{Readiness, Template};
 use ratn_model::resource::{Lease, ResourceClass};
-use ratn_proto::types::{Goal, Resource};
+use ratn_model::value::Value;
+use ratn_proto::types::{Goal, Resource, ResourceEventKind};
 use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
 use ratn_worker::client::{AcquireOptions, ActionClient, ResourceClient, fresh_id};
 use ratn_worker::endpoint::Endpoint;
@@ -230,4 +234,46 @@ async fn a_confirmation_is_repeated_until_the_manager_answers() {
     assert_eq!(driver.session.state().borrow().generation, 1, "the same session");
     drop(driver.provider);
     manager.end().await;
+}
+
+/// A driver in a pool, which is not started again when it has crashed.
+fn pooled(standstill_ms: Option<u64>) -> Template {
+    Template {
+        program: Some("/bin/sh".into()),
+        args: ["-c", "echo ready; exec sleep 1000"].map(str::to_owned).to_vec(),
+        readiness: Readiness::Line { contains: "ready".to_owned() },
+        start_timeout_s: 15.0,
+        crash_limit: 1,
+        standstill_ms,
+        ..Template::new("arm", "PooledArm")
+    }
+}
+
+/// How long after the end of the last process manager the next one offers the driver, whose process crashed before that end.
+async fn offered_anew_after(next: Template) -> Duration {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let mut watch = system.watch(&manager, &["PooledArm"]).await;
+    let first = system.process_manager(vec![pooled(Some(4_000))]).await;
+    let Some(Value::Int(pid)) = watch.created("PooledArm").await.attributes.remove("pid") else { panic!("no pid") };
+    kill(Pid::from_raw(i32::try_from(pid).unwrap()), Signal::SIGKILL).unwrap();
+    watch.event(|event| event.kind == ResourceEventKind::Deleted).await;
+    first.end().await;
+    let ended = Instant::now();
+    let _second = system.process_manager(vec![next]).await;
+    watch.created("PooledArm").await;
+    ended.elapsed()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_worker_that_crashed_moved_is_offered_by_the_next_process_manager_when_the_bound_of_then_has_passed() {
+    let another = Template { name: "another".to_owned(), ..pooled(Some(100)) };
+    let (same, lower, none, renamed) = tokio::join!(
+        offered_anew_after(pooled(Some(4_000))),
+        offered_anew_after(pooled(Some(100))),
+        offered_anew_after(pooled(None)),
+        offered_anew_after(another),
+    );
+    let after = [same, lower, none, renamed];
+    assert!(after.iter().all(|after| *after >= Duration::from_secs(4)), "{after:?}");
 }

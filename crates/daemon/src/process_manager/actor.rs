@@ -7,7 +7,7 @@ use super::offered;
 use super::pools::{Command, Event, PoolError, Pools, Restart};
 use super::predecessor::Adopted;
 use super::processes::{ManagerContact, ProcessEvents, Processes};
-use super::roster::Roster;
+use super::roster::{Motions, Roster};
 use super::session_file::SessionFile;
 use super::spawner::Outcome;
 use super::tracking::Tracker;
@@ -74,6 +74,8 @@ pub(super) struct Parts {
     pub(super) before: Vec<String>,
     /// The workers among them that were taken over.
     pub(super) adopted: Vec<Adopted>,
+    /// What the others moved and may still move.
+    pub(super) motions: Motions,
     /// The resources that the link shall offer.
     pub(super) wanted: watch::Sender<Wanted>,
     /// The ids of offered resources that are withdrawn as soon as nobody holds them.
@@ -122,9 +124,7 @@ pub(super) fn start(
     let (processes, events) = Processes::start(&config, parts.directory, parts.told, parts.roster, parts.tracker)?;
     let mut pools = Pools::new(&config.host, config.templates).with_labels(config.labels.clone());
     pools.go_on_after(&parts.before);
-    let is_adopted = |id: &String| adopted.iter().any(|one| one.entry.id == *id);
-    let ended: Vec<String> = parts.before.iter().filter(|id| !is_adopted(id)).cloned().collect();
-    pools.ended_before(Timestamp(0), &ended);
+    pools.moved_before(Timestamp(0), &parts.motions);
     let actor = Actor {
         pools,
         processes,
@@ -226,7 +226,7 @@ impl Actor {
 
     fn adopt(&mut self, adopted: Adopted) {
         let (worker, outdated) = (adopted.status(), adopted.outdated);
-        let Some(commands) = self.pools.adopt(self.now(), &worker, outdated) else { return };
+        let Some(commands) = self.pools.adopt(self.now(), &worker, adopted.standstill, outdated) else { return };
         self.processes.adopt(adopted);
         self.perform(commands);
     }
@@ -249,7 +249,6 @@ impl Actor {
     /// Ends every worker, whatever it takes.
     async fn end(&mut self, outcomes: &mut mpsc::Receiver<Outcome>) {
         self.watchers.clear();
-        self.processes.end_with_the_manager();
         let commands = self.pools.shut_down(self.now(), SHUTDOWN_PATIENCE);
         self.perform(commands);
         let last = Instant::now() + SHUTDOWN_PATIENCE + KILL_PATIENCE;
@@ -351,6 +350,8 @@ impl Actor {
     }
 
     fn perform(&mut self, commands: Vec<Command>) {
+        // Before anything of it is offered.
+        self.processes.keep_motions(&self.pools.motions(self.now()));
         let mut commands = VecDeque::from(commands);
         while let Some(command) = commands.pop_front() {
             match command {
@@ -363,7 +364,7 @@ impl Actor {
                 }
                 Command::Terminate { id } => self.processes.signal(&id, Signal::SIGTERM),
                 Command::Kill { id } => self.processes.signal(&id, Signal::SIGKILL),
-                Command::Offer { worker, kind } => self.offer(&worker, &kind),
+                Command::Offer { worker, kind, standstill } => self.offer(&worker, &kind, standstill),
                 Command::Withdraw { id } => {
                     self.wanted.send_if_modified(|wanted| wanted.remove(&id).is_some());
                     self.drains.send_if_modified(|drains| drains.remove(&id));
@@ -387,9 +388,8 @@ impl Actor {
         });
     }
 
-    fn offer(&self, worker: &WorkerStatus, kind: &str) {
-        let standstill_ms = self.pools.template(&worker.template).and_then(|template| template.standstill_ms);
-        let resource = offered::worker(&self.host, &self.labels, worker, kind, standstill_ms);
+    fn offer(&self, worker: &WorkerStatus, kind: &str, standstill: Option<Duration>) {
+        let resource = offered::worker(&self.host, &self.labels, worker, kind, standstill);
         self.wanted.send_modify(|wanted| {
             wanted.insert(worker.id.clone(), resource);
         });

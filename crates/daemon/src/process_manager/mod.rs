@@ -102,22 +102,24 @@ pub async fn run_as(
     for obstacle in config.obstacles() {
         tracing::warn!("{obstacle}: its workers cannot be started");
     }
-    let (mut roster, left, unknown) = Roster::take_within(&directory, TAKE_PATIENCE).await?;
+    let (mut roster, left) = Roster::take_within(&directory, TAKE_PATIENCE).await?;
     let tracker = Tracker::start(&config, &directory).context("cannot keep track of workers")?;
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
     // Before anything is offered: what the last process manager offered goes where it is not wanted any more.
-    let before: Vec<String> =
-        left.iter().map(|entry| &entry.id).chain(unknown.iter().map(|intent| &intent.id)).cloned().collect();
+    let starting = left.starting.iter().map(|intent| &intent.id);
+    let before: Vec<String> = left.workers.iter().map(|entry| &entry.id).chain(starting).cloned().collect();
+    let mut motions = left.motions.clone();
     let session_file = SessionFile::of(&directory);
     let session = session_file.id().context("cannot keep the session's name")?;
     let told = ManagerContact { manager: processes::manager_of(&config, &directory), session: session.clone() };
-    let adopted = predecessor::settle(left, unknown, &config.templates, &told, &directory, &tracker).await;
+    let adopted = predecessor::settle(left, &config.templates, &told, &directory, &tracker).await;
     roster.keep_only(&adopted.iter().map(|one| one.entry.id.as_str()).collect());
+    // Of a template with an adopted worker, the link waits where that worker was not offered before.
+    motions.retain(|name, _| adopted.iter().all(|one| one.entry.template.name != *name));
     let (wanted, to_offer) = watch::channel(Wanted::new());
     let workers = adopted.iter().map(|one| {
-        let template = &one.entry.template;
-        offered::worker(&config.host, &config.labels, &one.status(), &template.kind, template.standstill_ms)
+        offered::worker(&config.host, &config.labels, &one.status(), &one.entry.template.kind, one.standstill)
     });
     let host = offered::host(&config, &endpoint);
     let offered = workers.chain([host.clone()]);
@@ -159,6 +161,7 @@ pub async fn run_as(
         tracker,
         before,
         adopted,
+        motions,
         wanted,
         drains,
         offer_events,

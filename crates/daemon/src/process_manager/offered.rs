@@ -46,11 +46,11 @@ pub(super) fn worker(
     labels: &Labels,
     worker: &WorkerStatus,
     kind: &str,
-    standstill_ms: Option<u64>,
+    standstill: Option<Duration>,
 ) -> Resource {
     let resource = of_host(worker.id.clone(), ResourceClass::Process, kind, host, labels);
-    let resource = match standstill_ms {
-        Some(bound) => resource.with_standstill(Duration::from_millis(bound)),
+    let resource = match standstill {
+        Some(bound) => resource.with_standstill(bound),
         None => resource,
     };
     // One that is no server has none.
@@ -92,11 +92,11 @@ mod tests {
             age_s: 0,
             held: false,
         };
-        let bound = |standstill_ms| {
-            let offered = worker("compute", &Labels::new(), &status, "Arm", standstill_ms);
+        let bound = |standstill| {
+            let offered = worker("compute", &Labels::new(), &status, "Arm", standstill);
             offered.attributes.get(STANDSTILL_ATTRIBUTE).cloned()
         };
-        assert_eq!(bound(Some(6_000)), Some(Value::Int(6_000)));
+        assert_eq!(bound(Some(Duration::from_secs(6))), Some(Value::Int(6_000)));
         assert_eq!(bound(None), None);
     }
 }

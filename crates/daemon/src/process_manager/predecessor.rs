@@ -11,7 +11,7 @@
 use super::account;
 use super::limits::end_group;
 use super::processes::ManagerContact;
-use super::roster::{Entry, Intent};
+use super::roster::{Entry, LeftBehind, Motions};
 use super::spawner;
 use super::template::Template;
 use super::tracking::Tracker;
@@ -38,6 +38,9 @@ pub(super) struct Adopted {
     /// As long as this is open, it has a parent.
     pub(super) parent_lives: UnixStream,
     pub(super) exit: Exit,
+    /// What it moves may go on for so long when its process is gone: the widest of the bounds of its template then, its template now, and
+    /// what was written down of it. Nothing for one that moves nothing.
+    pub(super) standstill: Option<Duration>,
     /// Its template has changed, or the resource manager's place: it is to be replaced.
     pub(super) outdated: bool,
 }
@@ -97,16 +100,16 @@ pub(super) fn adopt_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
 
 /// Adopts or ends all of them; those that were adopted. Returns when the others are gone, and so is what was being started.
 pub(super) async fn settle(
-    left: Vec<Entry>,
-    unknown: Vec<Intent>,
+    left: LeftBehind,
     templates: &[Template],
     told: &ManagerContact,
     directory: &RuntimeDirectory,
     tracker: &Tracker,
 ) -> Vec<Adopted> {
-    let settled = left.into_iter().map(async |entry| {
+    let motions = &left.motions;
+    let settled = left.workers.into_iter().map(async |entry| {
         let adopted = match Exit::of(&entry) {
-            Some(exit) => match greet(&entry, exit, templates, told, directory).await {
+            Some(exit) => match greet(&entry, exit, templates, motions, told, directory).await {
                 Ok(adopted) => Some(adopted),
                 Err((exit, why)) => {
                     tracing::info!(
@@ -133,11 +136,8 @@ pub(super) async fn settle(
         adopted
     });
     let adopted: Vec<Adopted> = futures::future::join_all(settled).await.into_iter().flatten().collect();
-    for intent in &unknown {
-        tracing::info!(
-            id = intent.id,
-            "the last process manager ended while it started this worker, or while this worker moved something"
-        );
+    for intent in &left.starting {
+        tracing::info!(id = intent.id, "the last process manager ended while it started this worker");
         intent.group.iter().filter(|group| group.exists()).for_each(|group| end_group(group));
         remove_files(&intent.id, &intent.template, directory);
     }
@@ -155,6 +155,7 @@ async fn greet(
     entry: &Entry,
     exit: Exit,
     templates: &[Template],
+    motions: &Motions,
     told: &ManagerContact,
     directory: &RuntimeDirectory,
 ) -> Result<Adopted, (Exit, &'static str)> {
@@ -163,6 +164,10 @@ async fn greet(
     };
     if !(template.adopt && entry.template.adopt) {
         return Err((exit, "its template does not say `adopt`"));
+    }
+    // Others of its template are no longer kept from moving what it moves.
+    if template.standstill_ms.is_none() && entry.template.standstill_ms.is_some() {
+        return Err((exit, "it moves something, and its template does not say `standstill_ms` any more"));
     }
     // The one that it was told of may be somebody else's, whose leases it would confirm.
     if entry.session.as_ref() != Some(&told.session) {
@@ -176,7 +181,9 @@ async fn greet(
         Ok(Ok(parent_lives)) => {
             let outdated = is_outdated(entry, template, told);
             tracing::info!(id = entry.id, pid = entry.pid, outdated, "a worker of the last process manager is adopted");
-            Ok(Adopted { entry: entry.clone(), parent_lives, exit, outdated })
+            let said = entry.template.standstill().max(template.standstill());
+            let standstill = said.max(motions.get(&template.name).copied());
+            Ok(Adopted { entry: entry.clone(), parent_lives, exit, standstill, outdated })
         }
         _ => Err((exit, "it does not listen for a successor")),
     }
@@ -239,5 +246,35 @@ mod tests {
         assert!(!outdated(Some("http://127.0.0.1:2")));
         assert!(outdated(Some("http://127.0.0.1:1")));
         assert!(outdated(None), "nobody knows");
+    }
+
+    #[tokio::test]
+    async fn a_worker_that_moves_something_is_not_adopted_where_its_template_has_no_bound_any_more() {
+        let place = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(place.path()).unwrap();
+        let told = ManagerContact { manager: "http://127.0.0.1:2".parse().unwrap(), session: "s".to_owned() };
+        let template = Template { adopt: true, ..Template::new("arm", "Arm") };
+        let pid = std::process::id();
+        let entry = Entry {
+            id: "arm-1".to_owned(),
+            pid,
+            began: began(pid).unwrap(),
+            endpoint: Some("unix:/w".to_owned()),
+            manager: None,
+            session: Some("s".to_owned()),
+            limits: String::new(),
+            groups: Vec::new(),
+            template: Template { standstill_ms: Some(6_000), ..template.clone() },
+        };
+        let listener = tokio::net::UnixListener::bind(adopt_socket(&directory, &entry.id)).unwrap();
+        let motions = Motions::from([("arm".to_owned(), Duration::from_secs(9))]);
+        let exit = Exit::of(&entry).unwrap();
+        let (_, why) = greet(&entry, exit, &[template], &motions, &told, &directory).await.unwrap_err();
+        assert!(why.contains("standstill_ms"), "{why}");
+        let exit = Exit::of(&entry).unwrap();
+        let lower = Template { standstill_ms: Some(100), ..entry.template.clone() };
+        let adopted = greet(&entry, exit, &[lower], &motions, &told, &directory).await.unwrap();
+        assert_eq!((adopted.standstill, adopted.outdated), (Some(Duration::from_secs(9)), true));
+        drop(listener);
     }
 }

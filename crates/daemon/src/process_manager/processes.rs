@@ -9,7 +9,7 @@ use super::log_file::log_file;
 use super::parameter;
 use super::predecessor::{self, Adopted, adopt_socket};
 use super::readiness::{HealthCheck, Readiness, ReadinessCheck};
-use super::roster::{Entry, Intent, Roster};
+use super::roster::{Entry, Intent, Motions, Roster};
 use super::spawner::{self, Job, Outcome};
 use super::template::Template;
 use super::tracking::{Children, Tracker};
@@ -83,8 +83,6 @@ pub(super) struct Processes {
     roster: Roster,
     tracker: Tracker,
     senders: EventSenders,
-    /// The process manager ends, and all of them with it.
-    ending: bool,
     by_id: BTreeMap<String, Process>,
     ended_logs: EndedLogs,
     /// Reaps orphans: waits for those that have ended.
@@ -149,7 +147,6 @@ impl Processes {
             jobs: spawner::start(outcome.clone(), tracker.clone())?,
             outcomes: outcome,
             roster,
-            ending: false,
             reaping: tracker.children().map(|children| {
                 AbortOnDropHandle::new(tokio::spawn(exit_on_panic("the reaper of orphans", reap(children))))
             }),
@@ -310,9 +307,9 @@ impl Processes {
         spawner::watch_adopted(adopted, &self.log_file(&id), self.max_log_bytes, tracker, self.outcomes.clone());
     }
 
-    /// From now on workers end because their process manager does.
-    pub(super) fn end_with_the_manager(&mut self) {
-        self.ending = true;
+    /// What may move from now on, for a successor.
+    pub(super) fn keep_motions(&mut self, motions: &Motions) {
+        self.roster.keep_motions(motions);
     }
 
     /// The process of a worker has ended.
@@ -327,11 +324,7 @@ impl Processes {
                 let _ = std::fs::remove_file(file);
             }
         }
-        if self.ending {
-            self.roster.ended_with_its_manager(id);
-        } else {
-            self.roster.gone(id);
-        }
+        self.roster.gone(id);
         self.ended_logs.add(self.log_file(id));
     }
 

@@ -1,5 +1,6 @@
 //! Which workers there are, in a file of the runtime directory, so that a process manager that is started after one that was killed
-//! knows whom that one left behind. Lines are appended as workers come and go; a lock keeps a second process manager away.
+//! knows whom that one left behind, and what may still move though its worker is gone. Lines are appended as workers come and go; a lock
+//! keeps a second process manager away.
 
 use super::template::Template;
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -38,8 +39,7 @@ pub(super) struct Entry {
     pub(super) template: Template,
 }
 
-/// A worker that is about to be started: written before its process is there, so that somebody knows of it however this ends. Also one that
-/// moved something and ended with its process manager.
+/// A worker that is about to be started: written before its process is there, so that somebody knows of it however this ends.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Intent {
     pub(super) id: String,
@@ -48,14 +48,42 @@ pub(super) struct Intent {
     pub(super) template: Template,
 }
 
+/// What the last process manager left.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct LeftBehind {
+    /// The workers that it had.
+    pub(super) workers: Vec<Entry>,
+    /// The workers that it was starting.
+    pub(super) starting: Vec<Intent>,
+    /// What may still move for somebody.
+    pub(super) motions: Motions,
+}
+
+/// By the name of a template: what its workers move may go on for so long when their processes are gone.
+pub(super) type Motions = BTreeMap<String, Duration>;
+
 /// What happened to a worker.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Line {
     Starts(Box<Intent>),
     Began(Box<Entry>),
-    Serves { id: String, endpoint: String },
-    Gone { id: String },
+    Serves {
+        id: String,
+        endpoint: String,
+    },
+    Gone {
+        id: String,
+    },
+    /// From now on a worker of the template may move something, within this bound after its end.
+    Moves {
+        template: String,
+        standstill_ms: u64,
+    },
+    /// Nothing moves any more by a worker of the template.
+    Rests {
+        template: String,
+    },
 }
 
 /// A process manager that cannot be one.
@@ -85,6 +113,8 @@ pub(super) struct Roster {
     lines: usize,
     there: BTreeMap<String, Entry>,
     starting: BTreeMap<String, Intent>,
+    /// In milliseconds.
+    motions: BTreeMap<String, u64>,
     _lock: File,
 }
 
@@ -93,7 +123,7 @@ impl Roster {
     pub(super) async fn take_within(
         directory: &RuntimeDirectory,
         patience: Duration,
-    ) -> Result<(Roster, Vec<Entry>, Vec<Intent>), RosterError> {
+    ) -> Result<(Roster, LeftBehind), RosterError> {
         let until = Instant::now() + patience;
         loop {
             match Roster::take(directory) {
@@ -103,8 +133,8 @@ impl Roster {
         }
     }
 
-    /// Takes the place of the one process manager of a runtime directory; whom the last one left behind, and whom it was starting.
-    pub(super) fn take(directory: &RuntimeDirectory) -> Result<(Roster, Vec<Entry>, Vec<Intent>), RosterError> {
+    /// Takes the place of the one process manager of a runtime directory; what the last one left behind.
+    pub(super) fn take(directory: &RuntimeDirectory) -> Result<(Roster, LeftBehind), RosterError> {
         let directory = directory.path();
         let path = directory.join("workers");
         let failed = |source| RosterError::Io { file: path.clone(), source };
@@ -116,12 +146,16 @@ impl Roster {
             Err(TryLockError::WouldBlock) => return Err(RosterError::Taken { directory: directory.to_owned() }),
             Err(TryLockError::Error(source)) => return Err(failed(source)),
         }
-        let (left, starting) = read(&path).map_err(failed)?;
+        let (there, starting, motions) = read(&path).map_err(failed)?;
+        let left = LeftBehind {
+            workers: there.values().cloned().collect(),
+            starting: starting.values().cloned().collect(),
+            motions: motions.iter().map(|(name, ms)| (name.clone(), Duration::from_millis(*ms))).collect(),
+        };
         let file = File::options().append(true).create(true).open(&path).map_err(failed)?;
-        let mut roster =
-            Roster { path: path.clone(), file, lines: 0, there: left.clone(), starting: starting.clone(), _lock: lock };
+        let mut roster = Roster { path: path.clone(), file, lines: 0, there, starting, motions, _lock: lock };
         roster.write_anew().map_err(failed)?;
-        Ok((roster, left.into_values().collect(), starting.into_values().collect()))
+        Ok((roster, left))
     }
 
     /// All others are gone.
@@ -157,20 +191,29 @@ impl Roster {
         }
     }
 
-    /// It has ended with its process manager. Where it moved something, that may still move: the next process manager hears that it was there.
-    pub(super) fn ended_with_its_manager(&mut self, id: &str) {
-        let moved = self.there.get(id).map(|entry| &entry.template).filter(|template| template.standstill_ms.is_some());
-        let moved = moved.cloned();
-        self.gone(id);
-        if let Some(template) = moved {
-            self.starts(Intent { id: id.to_owned(), group: None, template });
+    /// What may move now; called before a worker that moves something is offered. A successor that hears of a motion waits for its bound,
+    /// however this process manager and its workers end.
+    pub(super) fn keep_motions(&mut self, now: &Motions) {
+        let ms = |bound: &Duration| u64::try_from(bound.as_millis()).unwrap_or(u64::MAX);
+        let now: BTreeMap<String, u64> = now.iter().map(|(name, bound)| (name.clone(), ms(bound))).collect();
+        if now == self.motions {
+            return;
+        }
+        let before = std::mem::replace(&mut self.motions, now.clone());
+        for (template, standstill_ms) in &now {
+            if before.get(template) != Some(standstill_ms) {
+                self.append(&Line::Moves { template: template.clone(), standstill_ms: *standstill_ms });
+            }
+        }
+        for template in before.into_keys().filter(|template| !now.contains_key(template)) {
+            self.append(&Line::Rests { template });
         }
     }
 
     /// The workers go on where it cannot be written: only a successor would not know of them.
     fn append(&mut self, line: &Line) {
         self.lines += 1;
-        let written = if self.lines > (self.there.len() + self.starting.len()) * 2 + MOST_OLD_LINES {
+        let written = if self.lines > self.known() * 2 + MOST_OLD_LINES {
             self.write_anew()
         } else {
             write(&mut self.file, line)
@@ -178,6 +221,10 @@ impl Roster {
         if let Err(error) = written {
             tracing::warn!(file = %self.path.display(), %error, "the list of workers is not written");
         }
+    }
+
+    fn known(&self) -> usize {
+        self.there.len() + self.starting.len() + self.motions.len()
     }
 
     /// Beside the old one, so that there is always a whole one.
@@ -190,8 +237,11 @@ impl Roster {
         for intent in self.starting.values() {
             write(&mut file, &Line::Starts(Box::new(intent.clone())))?;
         }
+        for (template, standstill_ms) in &self.motions {
+            write(&mut file, &Line::Moves { template: template.clone(), standstill_ms: *standstill_ms })?;
+        }
         std::fs::rename(&next, &self.path)?;
-        (self.file, self.lines) = (file, self.there.len() + self.starting.len());
+        (self.file, self.lines) = (file, self.known());
         Ok(())
     }
 }
@@ -202,14 +252,19 @@ fn write(file: &mut File, line: &Line) -> io::Result<()> {
     file.write_all(text.as_bytes())
 }
 
-/// A line that was cut off by the end of its writer says nothing.
-fn read(path: &Path) -> io::Result<(BTreeMap<String, Entry>, BTreeMap<String, Intent>)> {
+/// The workers that were there, those that were being started, and the motions.
+type Known = (BTreeMap<String, Entry>, BTreeMap<String, Intent>, BTreeMap<String, u64>);
+
+/// A line that was cut off by the end of its writer says nothing. A worker that moves something may have moved it also where no line says
+/// so: an older version wrote none, and a session of another caller may have offered a worker that this host had not offered yet.
+fn read(path: &Path) -> io::Result<Known> {
     let text = match std::fs::read_to_string(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => String::new(),
         read => read?,
     };
     let mut there: BTreeMap<String, Entry> = BTreeMap::new();
-    let mut starting = BTreeMap::new();
+    let mut starting: BTreeMap<String, Intent> = BTreeMap::new();
+    let mut motions: BTreeMap<String, u64> = BTreeMap::new();
     for line in text.lines().filter_map(|line| serde_json::from_str(line).ok()) {
         match line {
             Line::Starts(intent) => drop(starting.insert(intent.id.clone(), *intent)),
@@ -226,9 +281,16 @@ fn read(path: &Path) -> io::Result<(BTreeMap<String, Entry>, BTreeMap<String, In
                 starting.remove(&id);
                 there.remove(&id);
             }
+            Line::Moves { template, standstill_ms } => drop(motions.insert(template, standstill_ms)),
+            Line::Rests { template } => drop(motions.remove(&template)),
         }
     }
-    Ok((there, starting))
+    let left = there.values().map(|entry| &entry.template).chain(starting.values().map(|intent| &intent.template));
+    for (name, bound) in left.filter_map(|template| Some((&template.name, template.standstill_ms?))) {
+        let known = motions.entry(name.clone()).or_default();
+        *known = bound.max(*known);
+    }
+    Ok((there, starting, motions))
 }
 
 #[cfg(test)]
@@ -254,8 +316,8 @@ mod tests {
     fn a_successor_knows_whom_the_last_one_left_and_two_at_a_time_there_are_not() {
         let parent = tempfile::tempdir().unwrap();
         let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
-        let (mut roster, left, starting) = Roster::take(&directory).unwrap();
-        assert!(left.is_empty() && starting.is_empty());
+        let (mut roster, left) = Roster::take(&directory).unwrap();
+        assert_eq!(left, LeftBehind::default());
         assert!(matches!(Roster::take(&directory), Err(RosterError::Taken { .. })));
         for id in ["a", "b", "c"] {
             roster.began(entry(id));
@@ -264,12 +326,12 @@ mod tests {
         roster.gone("a");
         roster.file.write_all(b"{\"gone\":{\"id\":\"b").unwrap();
         drop(roster);
-        let (mut roster, left, _) = Roster::take(&directory).unwrap();
+        let (mut roster, left) = Roster::take(&directory).unwrap();
         let served = Entry { endpoint: Some("unix:/b".to_owned()), ..entry("b") };
-        assert_eq!(left, [served.clone(), entry("c")]);
+        assert_eq!(left.workers, [served.clone(), entry("c")]);
         roster.keep_only(&["b"].into());
         drop(roster);
-        assert_eq!(Roster::take(&directory).unwrap().1, [served]);
+        assert_eq!(Roster::take(&directory).unwrap().1.workers, [served]);
     }
 
     #[test]
@@ -285,29 +347,41 @@ mod tests {
         roster.gone("failed");
         drop(roster);
         for _ in 0..2 {
-            let (_, left, starting) = Roster::take(&directory).unwrap();
-            assert_eq!((left, starting), (vec![entry("began")], vec![intent("unknown")]));
+            let (_, left) = Roster::take(&directory).unwrap();
+            assert_eq!((left.workers, left.starting), (vec![entry("began")], vec![intent("unknown")]));
         }
         let (mut roster, ..) = Roster::take(&directory).unwrap();
         roster.keep_only(&["began"].into());
         drop(roster);
-        assert!(Roster::take(&directory).unwrap().2.is_empty());
+        assert!(Roster::take(&directory).unwrap().1.starting.is_empty());
     }
 
     #[test]
-    fn a_successor_hears_of_what_moved_and_ended_with_the_last_one() {
+    fn every_successor_hears_of_what_moves_until_it_rests_whatever_became_of_the_workers() {
         let parent = tempfile::tempdir().unwrap();
         let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
-        let (mut roster, ..) = Roster::take(&directory).unwrap();
         let moving = Template { standstill_ms: Some(6_000), ..Template::new("arm", "Arm") };
+        let motions = |ms| Motions::from([("arm".to_owned(), Duration::from_millis(ms))]);
+        let (mut roster, ..) = Roster::take(&directory).unwrap();
         roster.began(Entry { template: moving.clone(), ..entry("arm-1") });
-        roster.began(entry("planner-1"));
-        for id in ["arm-1", "planner-1"] {
-            roster.ended_with_its_manager(id);
-        }
+        roster.keep_motions(&motions(9_000));
+        roster.gone("arm-1");
         drop(roster);
-        let (_, left, ended) = Roster::take(&directory).unwrap();
-        assert_eq!((left, ended), (Vec::new(), vec![Intent { id: "arm-1".into(), group: None, template: moving }]));
+        for _ in 0..2 {
+            let (mut roster, left) = Roster::take(&directory).unwrap();
+            assert_eq!(left, LeftBehind { motions: motions(9_000), ..LeftBehind::default() });
+            roster.keep_only(&BTreeSet::new());
+        }
+        let (mut roster, _) = Roster::take(&directory).unwrap();
+        roster.keep_motions(&Motions::new());
+        roster.starts(Intent { id: "arm-2".to_owned(), group: None, template: moving.clone() });
+        drop(roster);
+        let (mut roster, left) = Roster::take(&directory).unwrap();
+        assert_eq!(left.motions, motions(6_000), "as an older version wrote it");
+        roster.keep_only(&BTreeSet::new());
+        roster.keep_motions(&Motions::new());
+        drop(roster);
+        assert_eq!(Roster::take(&directory).unwrap().1, LeftBehind::default());
     }
 
     #[test]
@@ -322,6 +396,6 @@ mod tests {
         }
         assert!(roster.lines <= MOST_OLD_LINES + 3);
         drop(roster);
-        assert_eq!(Roster::take(&directory).unwrap().1, [entry("stays")]);
+        assert_eq!(Roster::take(&directory).unwrap().1.workers, [entry("stays")]);
     }
 }

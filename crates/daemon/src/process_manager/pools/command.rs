@@ -107,6 +107,8 @@ pub enum Command {
         worker: WorkerStatus,
         /// The kind of resource that it is.
         kind: String,
+        /// What it moves may go on for so long after its end; nothing for one that moves nothing.
+        standstill: Option<Duration>,
     },
     /// Withdraw the worker's resource; who holds it loses it.
     Withdraw {

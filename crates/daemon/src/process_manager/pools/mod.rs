@@ -11,6 +11,7 @@
 mod command;
 mod demand;
 mod liveness;
+mod motion;
 mod pool;
 mod restart;
 mod size;
@@ -21,6 +22,7 @@ pub use command::{Command, Event, PoolError};
 
 use super::config::Labels;
 use super::template::Template;
+use motion::Motion;
 use pool::Pool;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{Demand, PoolStatus, Scale, WorkerStatus};
@@ -43,6 +45,8 @@ pub struct Pools {
     host: String,
     labels: Labels,
     pools: BTreeMap<String, Pool>,
+    /// By template: what workers of templates that are gone from the config moved.
+    motions_of_unknown: BTreeMap<String, Motion>,
     /// It takes no new work.
     draining: bool,
     ending: bool,
@@ -53,7 +57,8 @@ impl Pools {
     pub fn new(host: impl Into<String>, templates: impl IntoIterator<Item = Template>) -> Pools {
         let host = host.into();
         let pools = templates.into_iter().map(|template| (template.name.clone(), Pool::new(template, &host))).collect();
-        Pools { host, labels: Labels::new(), pools, draining: false, ending: false }
+        let motions_of_unknown = BTreeMap::new();
+        Pools { host, labels: Labels::new(), pools, motions_of_unknown, draining: false, ending: false }
     }
 
     /// On a host of which this is said.
@@ -133,22 +138,40 @@ impl Pools {
         }
     }
 
-    /// These workers of a process manager before this one have ended. What they moved may still move.
-    pub fn ended_before(&mut self, now: Timestamp, ids: &[String]) {
-        for id in ids {
-            if let Some((template, _)) = self.parts_of(id)
-                && let Some(pool) = self.pools.get_mut(template)
-            {
-                pool.may_move(now);
+    /// What workers of a process manager before this one moved may still move: by template, for how long. Where a template is gone, each
+    /// one that moves something may be that template under another name.
+    pub fn moved_before(&mut self, now: Timestamp, motions: &BTreeMap<String, Duration>) {
+        for (template, bound) in motions {
+            if let Some(pool) = self.pools.get_mut(template) {
+                pool.moved_before(now, *bound);
+                continue;
             }
+            self.motions_of_unknown.entry(template.clone()).or_default().goes_on(now, *bound);
+            let moving = self.pools.values_mut().filter(|pool| pool.template().standstill().is_some());
+            moving.for_each(|pool| pool.moved_before(now, *bound));
         }
     }
 
-    /// Takes over a worker that serves already, of a process manager that is gone; what to do. Nothing where its pool is not known.
-    pub fn adopt(&mut self, now: Timestamp, worker: &WorkerStatus, outdated: bool) -> Option<Vec<Command>> {
+    /// By template: for how long what its workers moved may go on when all of their processes end now. A successor has to wait for that.
+    pub fn motions(&self, now: Timestamp) -> BTreeMap<String, Duration> {
+        let of_pools = self.pools.iter().filter_map(|(name, pool)| Some((name, pool.motion(now)?)));
+        let of_unknown = self.motions_of_unknown.iter().filter_map(|(name, motion)| Some((name, motion.bound(now)?)));
+        of_pools.chain(of_unknown).map(|(name, bound)| (name.clone(), bound)).collect()
+    }
+
+    /// Takes over a worker that serves already, of a process manager that is gone, with the bound of what it moves; what to do. Nothing
+    /// where its pool is not known.
+    pub fn adopt(
+        &mut self,
+        now: Timestamp,
+        worker: &WorkerStatus,
+        standstill: Option<Duration>,
+        outdated: bool,
+    ) -> Option<Vec<Command>> {
         let mut commands = Vec::new();
         let (_, number) = self.parts_of(&worker.id)?;
-        self.pools.get_mut(&worker.template)?.adopt(now, number, worker, outdated, &mut commands);
+        let pool = self.pools.get_mut(&worker.template)?;
+        pool.adopt(now, number, worker, (standstill, outdated), &mut commands);
         Some(commands)
     }
 

@@ -1,6 +1,7 @@
 //! The workers of one template: as many as its size says, replaced as its restarts allow.
 
 use super::command::{Command, PoolError};
+use super::motion::Motion;
 use super::restart::Restarts;
 use super::size::{Size, retiring};
 use super::worker::Worker;
@@ -29,8 +30,8 @@ pub(super) struct Pool {
     last_number: u64,
     /// For so many more than the minimum the machine has room; `None` where none is needed.
     room: Option<u32>,
-    /// What its workers moved may still move until then.
-    at_rest_from: Timestamp,
+    /// Of the workers that are gone.
+    motion: Motion,
     /// Workers that ended unasked, and how the last one did.
     crashes: u64,
     last_exit: String,
@@ -46,7 +47,7 @@ impl Pool {
             last_number: 0,
             // Until the machine has been looked at.
             room: template.needs.is_something().then_some(0),
-            at_rest_from: Timestamp(0),
+            motion: Motion::default(),
             crashes: 0,
             last_exit: String::new(),
             host: host.to_owned(),
@@ -104,7 +105,7 @@ impl Pool {
         let restart = self.restarts.pause_until().filter(|_| self.missing() > 0);
         let (_, retires) = self.retiring(Timestamp(0));
         let waits = self.workers.values().any(Worker::waits_for_rest) && !self.moves_until_an_end();
-        let rest = waits.then_some(self.at_rest_from);
+        let rest = waits.then_some(self.motion.until());
         self.workers.values().filter_map(Worker::deadline).chain(restart).chain(retires).chain(rest).min()
     }
 
@@ -180,11 +181,11 @@ impl Pool {
         now: Timestamp,
         number: u64,
         worker: &WorkerStatus,
-        outdated: bool,
+        (standstill, outdated): (Option<Duration>, bool),
         commands: &mut Vec<Command>,
     ) {
         self.go_on_after(number);
-        let mut adopted = Worker::starting(now, worker.id.clone(), &self.template);
+        let mut adopted = Worker::starting(now, worker.id.clone(), &self.template).with_standstill(standstill);
         adopted.spawned(worker.pid, worker.limits.clone(), commands);
         adopted.serving(now, &worker.endpoint);
         adopted.offer(&self.template.kind, commands);
@@ -209,8 +210,8 @@ impl Pool {
         let exited = worker.exited(reason);
         let reason = exited.reason.clone();
         commands.push(Command::Notify(exited));
-        if !worker.is_at_rest() {
-            self.may_move(now);
+        if let Some(bound) = worker.motion() {
+            self.motion.goes_on(now, bound);
         }
         if !worker.is_stopping() {
             let words = if last_words.is_empty() { String::new() } else { format!("; its last words: {last_words}") };
@@ -231,22 +232,24 @@ impl Pool {
 
     /// Offers those that serve, where nothing moves for who held one of before.
     fn offer(&mut self, now: Timestamp, commands: &mut Vec<Command>) {
-        if self.at_rest_from <= now && !self.moves_until_an_end() {
+        if self.motion.is_over(now) && !self.moves_until_an_end() {
             self.workers.values_mut().for_each(|worker| worker.offer(&self.template.kind, commands));
         }
     }
 
-    /// What its workers move may move as long as its template says, though no process does anything for it any more.
-    pub(super) fn may_move(&mut self, now: Timestamp) {
-        if let Some(bound) = self.template.standstill() {
-            self.at_rest_from = now + bound;
-        }
+    /// What a worker of a process manager before this one moved may go on for so long, or for as long as the template says now.
+    pub(super) fn moved_before(&mut self, now: Timestamp, bound: Duration) {
+        self.motion.goes_on(now, bound.max(self.template.standstill().unwrap_or_default()));
+    }
+
+    /// For how long what its workers moved may go on when all of their processes end now; nothing where nothing moves.
+    pub(super) fn motion(&self, now: Timestamp) -> Option<Duration> {
+        self.workers.values().filter_map(Worker::motion).chain(self.motion.bound(now)).max()
     }
 
     /// Whether one that is being ended may move something until its process is gone, and for the bound after that.
     fn moves_until_an_end(&self) -> bool {
-        let ends = |worker: &Worker| worker.is_ending() && !worker.is_at_rest();
-        self.template.standstill().is_some() && self.workers.values().any(ends)
+        self.workers.values().any(|worker| worker.is_ending() && worker.motion().is_some())
     }
 
     /// A worker's resource is there.

@@ -138,7 +138,7 @@ fn the_minimum_is_kept_and_a_worker_is_ready_once_its_resource_is_there() {
     pools.spawned("planner-1@compute");
     pools.serving(at(1.0), "planner-1@compute");
     let commands = pools.take_commands();
-    assert!(matches!(&commands[1], Command::Offer { worker, kind }
+    assert!(matches!(&commands[1], Command::Offer { worker, kind, .. }
         if worker.endpoint == "unix:/w" && worker.pid == 4711 && kind == "PathPlanner"));
     assert_eq!(pools.status()[0].workers[0].state, WorkerState::Starting);
     pools.handle(at(1.0), Event::Offered { id: "planner-1@compute".to_owned() });
@@ -790,20 +790,78 @@ fn one_that_moves_is_restarted_after_the_end_of_the_one_before_it() {
     assert_eq!(started(&mut pools), ["planner-2@compute"]);
 }
 
+fn seconds(seconds: u64) -> Duration {
+    Duration::from_secs(seconds)
+}
+
 #[test]
-fn what_moved_for_a_process_manager_of_before_is_offered_when_the_bound_has_passed() {
-    for (left, offers) in [("planner-7@compute", 0), ("another-7@compute", 1)] {
-        let template = Template { standstill_ms: Some(6_000), liveness: SELDOM, ..Template::new("planner", "Arm") };
-        let mut pools = Rig { pools: Pools::new("compute", [template]), commands: Vec::new() };
-        pools.pools.ended_before(at(0.0), &[left.to_owned()]);
-        pools.advance(at(0.0));
-        let id = started(&mut pools).remove(0);
+fn what_moved_for_a_process_manager_of_before_is_offered_when_the_wider_bound_has_passed() {
+    let wide = 30.0;
+    for (template, of_then, from) in
+        [("planner", 6, 6.0), ("planner", 2, 6.0), ("planner", 30, wide), ("gone", 30, wide)]
+    {
+        let mut pools = moving(|_| {});
+        let motions = [(template.to_owned(), seconds(of_then))].into();
+        pools.pools.moved_before(at(0.0), &motions);
+        assert_eq!(
+            pools.motions(at(0.0)).get(template),
+            Some(&Duration::from_secs_f64(from)),
+            "of that a successor hears"
+        );
+        let id = pools.ids().remove(0);
         pools.spawned(&id);
         pools.serving(at(1.0), &id);
-        assert_eq!(offered(&mut pools).len(), offers);
-        pools.advance(at(6.0));
-        assert_eq!(offered(&mut pools).len(), 1 - offers);
+        pools.advance(at(from - 0.1));
+        assert_eq!(offered(&mut pools).len(), 0, "{template}, {of_then} s");
+        pools.advance(at(from));
+        assert_eq!(offered(&mut pools), [id], "{template}, {of_then} s");
     }
+}
+
+#[test]
+fn what_moved_for_a_process_manager_of_before_is_waited_for_also_where_its_template_moves_nothing_any_more() {
+    let mut pools = pools(|_| {});
+    pools.pools.moved_before(at(0.0), &[("planner".to_owned(), seconds(6))].into());
+    pools.spawned("planner-1@compute");
+    pools.serving(at(1.0), "planner-1@compute");
+    assert_eq!(offered(&mut pools), [] as [&str; 0]);
+    pools.advance(at(6.0));
+    assert_eq!(offered(&mut pools), ["planner-1@compute"]);
+}
+
+#[test]
+fn a_successor_hears_of_what_moves_from_its_offer_on_until_it_rests() {
+    let mut pools = moving(|_| {});
+    let motion = |pools: &Rig, now: f64| pools.motions(at(now)).get("planner").copied();
+    pools.spawned("planner-1@compute");
+    assert_eq!(motion(&pools, 0.0), None, "nobody can hold it yet");
+    pools.serving(at(1.0), "planner-1@compute");
+    assert_eq!(motion(&pools, 1.0), Some(seconds(6)));
+    pools.exited(at(20.0), "planner-1@compute", "killed by signal 9", "");
+    assert_eq!((motion(&pools, 25.9), motion(&pools, 26.0)), (Some(seconds(6)), None));
+    pools.bring_up(at(26.0), "planner-2@compute");
+    assert_eq!(motion(&pools, 26.0), Some(seconds(6)));
+    retires(&mut pools, "planner-2@compute", at(40.0));
+    assert_eq!(motion(&pools, 40.0), None, "nobody held it");
+}
+
+#[test]
+fn one_that_was_adopted_has_the_bound_that_it_was_adopted_with() {
+    let mut pools = moving(|_| {});
+    let mut left = moving(|_| {});
+    left.bring_up(at(0.0), "planner-1@compute");
+    let left = left.status()[0].workers[0].clone();
+    // Not the one that was started at the beginning.
+    pools.exited(at(0.0), "planner-1@compute", "was not there", "");
+    let commands = pools.pools.adopt(at(0.0), &left, Some(seconds(30)), false).unwrap();
+    let bound = |command: &Command| match command {
+        Command::Offer { standstill, .. } => Some(*standstill),
+        _ => None,
+    };
+    assert_eq!(commands.iter().find_map(bound), Some(Some(seconds(30))));
+    pools.handle(at(0.0), Event::Offered { id: left.id.clone() });
+    pools.exited(at(1.0), &left.id, "killed by signal 9", "");
+    assert_eq!((pools.motions(at(30.9)).len(), pools.motions(at(31.0)).len()), (1, 0));
 }
 
 #[test]

@@ -15,6 +15,7 @@ use super::liveness;
 use crate::process_manager::template::Template;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{WorkerState, WorkerStatus};
+use std::time::Duration;
 
 #[derive(Debug)]
 pub(super) struct Worker {
@@ -32,6 +33,8 @@ pub(super) struct Worker {
     outdated: bool,
     /// Nothing moves by it: it was not offered yet, or was withdrawn while nobody held it.
     at_rest: bool,
+    /// What it moves may go on for so long after its end; nothing for one that moves nothing.
+    standstill: Option<Duration>,
     pid: u32,
     /// What it may use of the machine, for people.
     limits: String,
@@ -75,6 +78,7 @@ impl Worker {
             refused: None,
             outdated: false,
             at_rest: true,
+            standstill: template.standstill(),
             pid: 0,
             limits: String::new(),
             endpoint: String::new(),
@@ -83,6 +87,11 @@ impl Worker {
 
     pub(super) fn id(&self) -> &str {
         &self.id
+    }
+
+    /// As one that may move something for so long after its end.
+    pub(super) fn with_standstill(self, standstill: Option<Duration>) -> Worker {
+        Worker { standstill, ..self }
     }
 
     /// Its process is there. One that was to end before is ended now.
@@ -113,7 +122,8 @@ impl Worker {
         if self.waits_for_rest() {
             self.phase = Phase::Serving { offered: true };
             self.at_rest = false;
-            commands.push(Command::Offer { worker: self.status(), kind: kind.to_owned() });
+            let standstill = self.standstill;
+            commands.push(Command::Offer { worker: self.status(), kind: kind.to_owned(), standstill });
         }
     }
 
@@ -313,9 +323,9 @@ impl Worker {
         matches!(self.phase, Phase::Stopping { .. } | Phase::Failed { .. })
     }
 
-    /// Whether nothing moves by it.
-    pub(super) fn is_at_rest(&self) -> bool {
-        self.at_rest
+    /// For how long what it moves may go on after its end; nothing where nothing moves by it.
+    pub(super) fn motion(&self) -> Option<Duration> {
+        self.standstill.filter(|_| !self.at_rest)
     }
 
     /// Whether it serves, and is to answer.
@@ -424,9 +434,9 @@ mod tests {
         let mut worker = worker();
         assert!(commands(|c| worker.spawned(4711, String::new(), c)).is_empty());
         worker.serving(at(1.0), "unix:/w");
-        assert!(worker.is_at_rest(), "nobody can hold it yet");
+        assert_eq!(worker.motion(), None, "nobody can hold it yet");
         let offered = commands(|c| worker.offer("PathPlanner", c));
-        assert!(matches!(&offered[..], [Command::Offer { worker, kind }]
+        assert!(matches!(&offered[..], [Command::Offer { worker, kind, standstill: None }]
             if worker.endpoint == "unix:/w" && worker.pid == 4711 && kind == "PathPlanner"));
         assert_eq!(worker.status().state, WorkerState::Starting);
         worker.offered(at(1.5), &mut Vec::new());
