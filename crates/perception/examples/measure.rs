@@ -1,6 +1,7 @@
 //! How well and how fast random tables are detected: one JSON document on standard output. Run it by `scripts/bench-perception`.
 //!
-//! `measure [--tables N] [--first SEED] [--pictures DIR]`; with `--pictures` the image of every table on which something went
+//! `measure [--tables N] [--first SEED] [--drawn things|models] [--pictures DIR]`: objects are seen as things with details of their own, by
+//! a sensor with correlated noise and flying pixels, or as the detector's own models under independent noise. With `--pictures` the image of every table on which something went
 //! wrong is kept, with what was found drawn into it.
 
 #![allow(clippy::print_stdout, clippy::disallowed_methods, reason = "an example prints")]
@@ -9,6 +10,7 @@ use ratn_perception::camera::Camera;
 use ratn_perception::detection::{ObjectClass, segment};
 use ratn_perception::noise::Noise;
 use ratn_perception::picture::Picture;
+use ratn_perception::sensor::Sensor;
 use ratn_perception::trial::{self, Match, Placed};
 use std::path::PathBuf;
 
@@ -27,32 +29,49 @@ const SETTINGS: [Setting; 3] = [
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let (mut tables, mut first, mut pictures) = (200_u64, 0_u64, None::<PathBuf>);
+    let mut as_things = true;
     let mut arguments = std::env::args().skip(1);
     while let Some(name) = arguments.next() {
         let value = arguments.next().ok_or(format!("{name} needs a value"))?;
         match name.as_str() {
             "--tables" => tables = value.parse()?,
             "--first" => first = value.parse()?,
+            "--drawn" if value == "things" || value == "models" => as_things = value == "things",
             "--pictures" => pictures = Some(value.into()),
             _ => return Err(format!("unknown argument {name}").into()),
         }
     }
-    let measured: Result<Vec<String>, _> =
-        SETTINGS.iter().map(|setting| measure(setting, first..first + tables, pictures.as_deref())).collect();
-    println!("{{\"tables\": {tables}, \"first_seed\": {first}, \"settings\": [{}]}}", measured?.join(",\n"));
+    let measured: Result<Vec<String>, _> = SETTINGS
+        .iter()
+        .map(|setting| measure(setting, first..first + tables, as_things, pictures.as_deref()))
+        .collect();
+    let drawn = if as_things { "things" } else { "models" };
+    println!(
+        "{{\"drawn\": \"{drawn}\", \"tables\": {tables}, \"first_seed\": {first}, \"settings\": [{}]}}",
+        measured?.join(",\n")
+    );
     Ok(())
 }
 
 fn measure(
     setting: &Setting,
     seeds: std::ops::Range<u64>,
+    as_things: bool,
     pictures: Option<&std::path::Path>,
 ) -> Result<String, Box<dyn std::error::Error>> {
     let camera = Camera::looking(setting.eye, trial::TABLE, trial::OPTICS);
     let (mut matches, mut phantoms, mut times): (Vec<Match>, usize, Vec<f64>) = Default::default();
     for seed in seeds {
-        let table: Vec<Placed> = trial::random_table(seed, 1 + (seed % 8) as usize, &camera);
-        let image = trial::table_image(&table, &camera, &Noise::DEFAULT, seed, setting.frames);
+        let count = 1 + (seed % 8) as usize;
+        let (table, image): (Vec<Placed>, _) = if as_things {
+            let table = trial::random_things(seed, count, &camera);
+            let image = trial::things_image(&table, &camera, &Sensor::DEFAULT, seed, setting.frames);
+            (table, image)
+        } else {
+            let table = trial::random_table(seed, count, &camera);
+            let image = trial::table_image(&table, &camera, &Noise::DEFAULT, seed, setting.frames);
+            (table, image)
+        };
         let start = processor_s()?;
         let found = segment(&image, &camera, &trial::region(), &ObjectClass::ALL, &[])?;
         times.push((processor_s()? - start) * 1e3);

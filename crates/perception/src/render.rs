@@ -1,7 +1,10 @@
 //! Depth images by ray casting (parry3d).
 //!
 //! One ray per pixel through its centre. A body is only tried for the pixels that the projection of its bounding box
-//! covers, so the cost is about the area that the bodies cover in the image.
+//! covers, so the cost is about the area that the bodies cover in the image. [`scan`] has, beside the depth, what a sensor's noise
+//! depends on: how obliquely each pixel sees its surface, and how much of the light that surface swallows ([`Surface`]).
+
+mod grain;
 
 use crate::camera::{Camera, DepthImage, Intrinsics};
 use parry3d::math::{Pose, Rotation, Vector};
@@ -17,6 +20,40 @@ pub struct Body {
     /// Where it is.
     pub pose: Pose,
 }
+
+/// What a surface does to the light of a depth camera.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Surface {
+    /// How rough it is: the standard deviation of its relief, in metres.
+    pub grain_m: f64,
+    /// How much of it is dark and hardly returns anything, 0 to 1, in patches of about 1 cm.
+    pub dark: f64,
+    /// How much of what returns is lost where it mirrors the projector straight into the camera, 0 to 1.
+    pub gloss: f64,
+    /// Where its relief and its patches begin: another number is another piece of the same material.
+    pub origin: f64,
+}
+
+impl Surface {
+    /// Painted, even, without gloss.
+    pub const MATT: Surface = Surface { grain_m: 0.0001, dark: 0.0, gloss: 0.0, origin: 0.0 };
+}
+
+/// What can be seen, pixel by pixel.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rendering {
+    /// The true depths.
+    pub depth: DepthImage,
+    /// The cosine between each pixel's ray and its surface's normal: 1 is seen straight on, 0 edge-on.
+    pub facing: Vec<f32>,
+    /// How much of a pixel's light its surface swallows or mirrors away, 0 to 1.
+    pub lost: Vec<f32>,
+}
+
+/// A surface whose normal is within this cosine of the ray mirrors the projector, which is beside the camera, into it: 5°.
+const MIRRORED: f32 = 0.9962;
+/// How much of the light a dark patch swallows.
+const SWALLOWED: f64 = 0.9;
 
 /// No surface farther than this is seen, in metres.
 pub const FAR: f32 = 8.0;
@@ -73,6 +110,45 @@ pub fn render(camera: &Camera, bodies: &[Body]) -> DepthImage {
         }
     }
     DepthImage { width, height, depth }
+}
+
+/// What the camera can see of bodies with their surfaces, without noise.
+pub fn scan(camera: &Camera, bodies: &[(Body, Surface)]) -> Rendering {
+    let Intrinsics { width, height, .. } = camera.intrinsics;
+    let eye = parry_pose(&camera.pose);
+    let mut depth = vec![FAR; width * height];
+    let (mut facing, mut lost) = (vec![0.0; width * height], vec![0.0; width * height]);
+    for (body, surface) in bodies {
+        let seen = eye.inverse() * body.pose;
+        let Some(window) = window(&camera.intrinsics, body, &seen) else { continue };
+        for row in window.rows.clone() {
+            for column in window.columns.clone() {
+                let [x, y, _] = camera.intrinsics.ray(column, row);
+                // The direction has z = 1, so the time of impact is the depth.
+                let way = Vector::new(x as f32, y as f32, 1.0);
+                let pixel = row * width + column;
+                let ray = Ray::new(Vector::ZERO, way);
+                let Some(hit) = body.shape.cast_ray_and_get_normal(&seen, &ray, depth[pixel], true) else { continue };
+                if hit.time_of_impact >= depth[pixel] {
+                    continue;
+                }
+                let at = seen.inverse_transform_point(way * hit.time_of_impact);
+                let local = [at.x, at.y, at.z].map(f64::from);
+                let straight = (hit.normal.dot(way) / way.length()).abs();
+                depth[pixel] = hit.time_of_impact + grain::relief(surface, local) as f32;
+                facing[pixel] = straight;
+                let mirrored = if straight > MIRRORED { surface.gloss } else { 0.0 };
+                let swallowed = if grain::is_dark(surface, local) { SWALLOWED } else { 0.0 };
+                lost[pixel] = mirrored.max(swallowed) as f32;
+            }
+        }
+    }
+    for d in &mut depth {
+        if *d >= FAR {
+            *d = 0.0;
+        }
+    }
+    Rendering { depth: DepthImage { width, height, depth }, facing, lost }
 }
 
 pub(crate) struct Window {
@@ -144,6 +220,20 @@ mod tests {
             assert!((image.at(160, 160).unwrap() - 2.0).abs() < 1e-3);
             assert_eq!(image.at(0, 0), None);
         }
+    }
+
+    #[test]
+    fn a_scan_knows_how_obliquely_a_pixel_sees_and_what_mirrors_or_is_dark() {
+        let wall = Body::new(&Shape::Box { size: [6.0, 6.0, 0.2] }, &ModelPose::at(0.0, 0.0, 2.1));
+        let scan = |surface| scan(&looking_forward(), &[(wall.clone(), surface)]);
+        let shining = scan(Surface { gloss: 0.7, ..Surface::MATT });
+        assert!(shining.depth.depth.iter().all(|d| (d - 2.0).abs() < 1e-3));
+        // In the middle it is seen straight on, in a corner at 31°.
+        assert!(shining.facing[120 * 320 + 160] > 0.999 && (shining.facing[0] - 0.856).abs() < 0.01);
+        assert!((shining.lost[120 * 320 + 160] - 0.7).abs() < 1e-6 && shining.lost[0] == 0.0);
+        let patchy = scan(Surface { dark: 0.2, ..Surface::MATT });
+        let dark = patchy.lost.iter().filter(|lost| **lost > 0.5).count() as f64 / patchy.lost.len() as f64;
+        assert!((0.15..0.25).contains(&dark), "{dark}");
     }
 
     #[test]

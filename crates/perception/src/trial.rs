@@ -7,7 +7,9 @@
 use crate::camera::{Camera, DepthImage, Intrinsics};
 use crate::detection::{Detection, Model, ObjectClass, Region, Symmetry};
 use crate::noise::{Noise, observe};
-use crate::render::{Body, render};
+use crate::render::{Body, Surface, render, scan};
+use crate::sensor::{Sensor, sense};
+use crate::shapes::{HANDLE_M, Individual, drawn};
 use crate::vector::{cross, dot};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -100,8 +102,26 @@ pub fn random_model(class: ObjectClass, random: &mut impl Rng) -> Model {
     class.model(&dimensions)
 }
 
-/// A table with so many objects, as the camera will see each of them. The same seed gives the same table.
+/// A table with so many objects, as the camera will see each of them: each is exactly its model. The same seed gives the same table.
 pub fn random_table(seed: u64, count: usize, camera: &Camera) -> Vec<Placed> {
+    laid(seed, count, camera, Drawn::Models)
+}
+
+/// The same with room for the handles of cups, and seen as [`things_image`] shows it.
+pub fn random_things(seed: u64, count: usize, camera: &Camera) -> Vec<Placed> {
+    laid(seed, count, camera, Drawn::Things)
+}
+
+/// As what an object is seen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Drawn {
+    /// As the detector's own model.
+    Models,
+    /// With the details of [`crate::shapes`].
+    Things,
+}
+
+fn laid(seed: u64, count: usize, camera: &Camera, drawn: Drawn) -> Vec<Placed> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut table: Vec<Placed> = Vec::new();
     // A table so full that nothing fits is laid anew.
@@ -118,7 +138,7 @@ pub fn random_table(seed: u64, count: usize, camera: &Camera) -> Vec<Placed> {
         let at = [along(0), along(1), TABLE[2] + height / 2.0];
         let pose = Pose::from_rpy(at, 0.0, 0.0, random.random_range(-PI..PI));
         table.push(Placed { model, pose });
-        if !is_clear(&table) || !all_visible(&table, camera) {
+        if !is_clear(&table, drawn) || !all_visible(&table, camera, drawn) {
             table.pop();
             failures += 1;
             if failures % 400 == 0 {
@@ -131,12 +151,27 @@ pub fn random_table(seed: u64, count: usize, camera: &Camera) -> Vec<Placed> {
 
 /// What the camera shows of a table, averaged over frames, with the table, the floor and the robot's base.
 pub fn table_image(table: &[Placed], camera: &Camera, noise: &Noise, seed: u64, frames: u32) -> DepthImage {
-    let mut bodies: Vec<Body> = table.iter().map(Placed::body).collect();
-    let [x, y, z] = TABLE;
-    bodies.push(Body::new(&Shape::Box { size: [TABLE_SIZE[0], TABLE_SIZE[1], 0.05] }, &Pose::at(x, y, z - 0.025)));
-    bodies.push(Body::new(&Shape::Box { size: [10.0, 10.0, 0.1] }, &Pose::at(0.0, 0.0, -0.05)));
-    bodies.push(Body::new(&Shape::Box { size: [0.9, 0.6, 0.6] }, &Pose::at(-0.1, 0.0, 0.3)));
+    let bodies: Vec<Body> = table.iter().map(Placed::body).chain(surroundings()).collect();
     observe(&render(camera, &bodies), &camera.intrinsics, noise, seed, 0, frames)
+}
+
+/// The same with what is on the table drawn by [`crate::shapes`], as a real sensor would see it.
+pub fn things_image(table: &[Placed], camera: &Camera, sensor: &Sensor, seed: u64, frames: u32) -> DepthImage {
+    let surroundings = surroundings().map(|body| (body, Surface::MATT));
+    let bodies: Vec<(Body, Surface)> = table.iter().map(Placed::thing).chain(surroundings).collect();
+    sense(&scan(camera, &bodies), &camera.intrinsics, sensor, seed, 0, frames)
+}
+
+/// The table, the floor and the robot's base.
+fn surroundings() -> impl Iterator<Item = Body> {
+    let [x, y, z] = TABLE;
+    [
+        ([TABLE_SIZE[0], TABLE_SIZE[1], 0.05], Pose::at(x, y, z - 0.025)),
+        ([10.0, 10.0, 0.1], Pose::at(0.0, 0.0, -0.05)),
+        ([0.9, 0.6, 0.6], Pose::at(-0.1, 0.0, 0.3)),
+    ]
+    .into_iter()
+    .map(|(size, pose)| Body::new(&Shape::Box { size }, &pose))
 }
 
 /// Which objects were found, how well, and what was found that is not there. Nearest pairs first.
@@ -183,35 +218,43 @@ fn angle(truth: &Placed, found: &Pose) -> f64 {
 }
 
 impl Placed {
-    /// What the camera sees of it.
+    /// The thing that it is, with the details of its own, and its surface.
+    pub fn thing(&self) -> (Body, Surface) {
+        let (shape, surface) = drawn(&self.model, Individual::of(&self.model));
+        (Body { shape, pose: crate::render::parry_pose(&self.pose) }, surface)
+    }
+
+    /// Its model.
     pub fn body(&self) -> Body {
         Body { shape: self.model.solid(), pose: crate::render::parry_pose(&self.pose) }
     }
 
     /// Circles that hold it, seen from above: one, or four along something slender.
-    fn circles(&self) -> Vec<([f64; 2], f64)> {
+    fn circles(&self, drawn: Drawn) -> Vec<([f64; 2], f64)> {
         let [length, width, _] = self.model.size();
         let pieces = if length > 3.0 * width { 4 } else { 1 };
         let part = length / f64::from(pieces);
         let circle = |i: i32| {
             let centre = self.pose.transform([part * (f64::from(i) + 0.5) - length / 2.0, 0.0, 0.0]);
             let round = self.model.class().symmetry() == Symmetry::Round;
-            ([centre[0], centre[1]], if round { width / 2.0 } else { part.hypot(width) / 2.0 })
+            let has_handle = drawn == Drawn::Things && Individual::of(&self.model).has_handle;
+            let handle = if has_handle { HANDLE_M } else { 0.0 };
+            ([centre[0], centre[1]], if round { width / 2.0 + handle } else { part.hypot(width) / 2.0 })
         };
         (0..pieces).map(circle).collect()
     }
 }
 
 /// Whether the last object has room beside the others.
-fn is_clear(table: &[Placed]) -> bool {
+fn is_clear(table: &[Placed], drawn: Drawn) -> bool {
     let Some((last, others)) = table.split_last() else { return true };
     let apart = |a: &([f64; 2], f64), b: &([f64; 2], f64)| (a.0[0] - b.0[0]).hypot(a.0[1] - b.0[1]) > a.1 + b.1 + GAP_M;
-    let own = last.circles();
-    others.iter().flat_map(Placed::circles).all(|other| own.iter().all(|circle| apart(circle, &other)))
+    let own = last.circles(drawn);
+    others.iter().flat_map(|other| other.circles(drawn)).all(|other| own.iter().all(|circle| apart(circle, &other)))
 }
 
 /// Whether every object shows enough of itself. A coarse image does.
-fn all_visible(table: &[Placed], camera: &Camera) -> bool {
+fn all_visible(table: &[Placed], camera: &Camera, drawn: Drawn) -> bool {
     let optics = camera.intrinsics;
     let scale = 4.0;
     let coarse = Intrinsics {
@@ -223,7 +266,11 @@ fn all_visible(table: &[Placed], camera: &Camera) -> bool {
         cy: (optics.cy - 1.5) / scale,
     };
     let camera = Camera { intrinsics: coarse, pose: camera.pose };
-    let alone: Vec<DepthImage> = table.iter().map(|object| render(&camera, &[object.body()])).collect();
+    let body = |object: &Placed| match drawn {
+        Drawn::Models => object.body(),
+        Drawn::Things => object.thing().0,
+    };
+    let alone: Vec<DepthImage> = table.iter().map(|object| render(&camera, &[body(object)])).collect();
     let nearest =
         |pixel: usize| alone.iter().map(|image| image.depth[pixel]).filter(|d| *d > 0.0).fold(f32::MAX, f32::min);
     alone.iter().all(|image| {

@@ -1,0 +1,22 @@
+//! The relief of a surface and the dark patches on it: smooth random fields in space, fixed to the body.
+
+use super::Surface;
+use crate::sensor::field;
+
+/// From one bump of the relief to the next, in metres.
+const BUMP_M: f64 = 0.006;
+/// About how large a dark patch is, in metres.
+pub(super) const PATCH_M: f64 = 0.012;
+
+/// How far behind its mean a surface is at a place of its body, in metres.
+pub(super) fn relief(surface: &Surface, at: [f64; 3]) -> f64 {
+    if surface.grain_m == 0.0 {
+        return 0.0;
+    }
+    surface.grain_m * field::in_space(at.map(|c| c / BUMP_M + surface.origin))
+}
+
+/// Whether a dark patch is there.
+pub(super) fn is_dark(surface: &Surface, at: [f64; 3]) -> bool {
+    surface.dark > 0.0 && field::share_below(field::in_space(at.map(|c| c / PATCH_M - surface.origin))) < surface.dark
+}
